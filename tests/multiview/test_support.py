@@ -12,7 +12,7 @@ from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import Depths, depths_of
-from thermoxels_ns.multiview.support import supporting_photographs
+from thermoxels_ns.multiview.votes import supporting_photographs
 from thermoxels_ns.synthetic.box_solid import BoxSolid
 
 VOXEL = 0.05

@@ -113,7 +113,14 @@ def test_updates(make):
 def test_a_training_that_refines_and_prunes(tmp_path):
     """What a checkpoint holds, model and optimisers, after steps on both sides of refinement, pruning and thinning."""
     scene = write_boxed_scene(make_scene("sphere"), tmp_path / "scene", 6, 1, width=40, height=30)
-    schedule = {"resolutions": [8, 16], "refine_at": [6], "prune_at": [9], "thin_at": [11], "distortion_ramp": [2, 4]}
+    schedule = {
+        "resolutions": [8, 16],
+        "voxel_pixels": 0.0,
+        "refine_at": [6],
+        "prune_at": [9],
+        "thin_at": [11],
+        "distortion_ramp": [2, 4],
+    }
     # So few steps form no surface: rays end in a fog, of which pruning and thinning take the thinnest parts.
     schedule |= {"start_density": 3.0, "prune_threshold": 0.02, "thin_threshold": 0.04, "prune_dilation": 0}
     results = []
@@ -165,7 +172,14 @@ class NoProductOfLongVectors(TorchDispatchMode):
 def test_a_training_with_large_batches(tmp_path):
     """Every tensor with a row per ray is one that torch splits among its threads."""
     scene = write_boxed_scene(make_scene("sphere"), tmp_path / "scene", 6, 1, width=40, height=30)
-    settings = {"resolutions": [8], "refine_at": [], "start_density": 3.0, "prune_at": [3], "prune_threshold": 0.02}
+    settings = {
+        "resolutions": [8],
+        "voxel_pixels": 0.0,
+        "refine_at": [],
+        "start_density": 3.0,
+        "prune_at": [3],
+        "prune_threshold": 0.02,
+    }
     settings |= {"per_image_offset": "on", "thermal_background": "learned", "background": "on"}
     results = []
     for count in COUNTS:

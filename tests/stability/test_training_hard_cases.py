@@ -154,7 +154,14 @@ def test_image_without_a_valid_thermal_pixel_in_evaluation_does_not_spoil_the_av
     assert np.isfinite(metrics["thermal_mae_c"]) and np.isfinite(metrics["thermal_psnr"])
 
 
-SCHEDULE = {"resolutions": [8, 16], "refine_at": [30], "prune_at": [50], "thin_at": [60], "distortion_ramp": [5, 20]}
+SCHEDULE = {
+    "resolutions": [8, 16],
+    "voxel_pixels": 0.0,
+    "refine_at": [30],
+    "prune_at": [50],
+    "thin_at": [60],
+    "distortion_ramp": [5, 20],
+}
 
 
 @pytest.mark.parametrize("rate", [100.0, 1e6])

@@ -70,7 +70,7 @@ def test_a_number_of_steps_that_a_quality_replaces_is_named(scene, tmp_path, cap
     made.setup()
     assert made.config.max_num_iterations == 800 and made._start_step == 0
     said = words(capsys)
-    assert "quality draft: 64 voxels and 800 steps, in place of 128 voxels and 2 steps" in said
+    assert "quality draft: about 64 voxels and 800 steps, in place of about 128 voxels and 2 steps" in said
     assert "goes on from" not in said and writer.GLOBAL_BUFFER["max_iter"] == 800
 
 

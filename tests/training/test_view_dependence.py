@@ -13,7 +13,14 @@ from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 RISES = 9
 """Step from which colour depends on the direction."""
 STEPS = 14
-COURSE = {"resolutions": [8, 16], "refine_at": [4], "prune_at": [6], "thin_at": [RISES], "distortion_ramp": [2, 4]}
+COURSE = {
+    "resolutions": [8, 16],
+    "voxel_pixels": 0.0,
+    "refine_at": [4],
+    "prune_at": [6],
+    "thin_at": [RISES],
+    "distortion_ramp": [2, 4],
+}
 COURSE |= {"start_density": 3.0, "prune_threshold": 0.02, "thin_threshold": 0.04, "prune_dilation": 0}
 COURSE |= {"view_dependence_from": RISES}
 

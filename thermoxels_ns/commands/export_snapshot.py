@@ -211,7 +211,7 @@ def _with_support(
     """
     from thermoxels_ns.mesh.boundary.visibility import facet_views
     from thermoxels_ns.mesh.build import apply_transform
-    from thermoxels_ns.multiview.support import supporting_photographs
+    from thermoxels_ns.multiview.votes import supporting_photographs
 
     mesh = built.mesh
     assert mesh.boundary is not None

@@ -224,7 +224,7 @@ class ThermalDataParser(DataParser):
         if rays is None and config.refine_poses == "auto":
             file, fitted = refine_poses(given, split.train, CONSOLE.print)
         evidence = find_scene_box(file, config.scene_box, split.train)
-        world, box = self._place(file, evidence)
+        world, box, pixel_size = self._place(file, evidence)
         paths, training = [f.thermal for f in file.frames], {file.frames[index].thermal for index in split.train}
         survey = survey_thermal_files(paths, file.unit, config.valid_range_c, file.bounds_c, training)
         _refuse_several_sizes(file.frames, survey.shapes)
@@ -246,7 +246,6 @@ class ThermalDataParser(DataParser):
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
         if rays is not None:
             rays = rays.moved(world.rotation, world.translation, world.scale)
-        pixel_size = world.scale * evidence.pixel_size(world.rotation)
         return _Scene(file, split, survey, world, box, pixel_size, rays, file is not given, fitted)
 
     def _oriented(self, poses: npt.NDArray[np.float64]) -> torch.Tensor:
@@ -264,8 +263,8 @@ class ThermalDataParser(DataParser):
             raise SceneError("orientation_method, center_method", expected=expected, got=got, remedy=remedy)
         return oriented
 
-    def _place(self, file: SceneFile, evidence: BoxEvidence) -> tuple[_World, SceneBox]:
-        """Choose orientation, origin and scale, and express the scene box in the new world."""
+    def _place(self, file: SceneFile, evidence: BoxEvidence) -> tuple[_World, SceneBox, float]:
+        """Choose orientation, origin and scale, and express the scene box and a pixel's width in the new world."""
         config = self.config
         oriented = self._oriented(np.stack([frame.pose for frame in file.frames]))
         rotation = _nearest_rotation(oriented[:, :3].numpy().astype(np.float64))
@@ -286,7 +285,8 @@ class ThermalDataParser(DataParser):
             got, remedy = config.scale_factor, "Pass --scale-factor 1."
             raise SceneError("scale_factor", expected="a finite number above 0", got=got, remedy=remedy)
         placed = scale * (box + translation)
-        return _World(rotation, translation, scale), SceneBox(aabb=torch.from_numpy(placed.astype(np.float32)))
+        placed_box = SceneBox(aabb=torch.from_numpy(placed.astype(np.float32)))
+        return _World(rotation, translation, scale), placed_box, scale * evidence.pixel_size(box, rotation)
 
 
 def _share_that_meets(frames: list[Frame], world: _World, box: SceneBox, source: str) -> float:

@@ -66,13 +66,13 @@ class BoxEvidence:
             return box_of_points(self.points, self.frames, rotation, self.tail)
         return box_of_cameras(self.frames, rotation)
 
-    def pixel_size(self, rotation: FloatArray) -> float:
+    def pixel_size(self, box: Box, rotation: FloatArray) -> float:
         """Width of a photograph's pixel where most of what is seen in the box stands, in input units.
 
         The median over what photographs see of the points in the box; without points, what a pixel covers in the nearer
         half of the box. Infinite where no photograph of a perspective camera looks at it.
         """
-        low, high = self.box(rotation)
+        low, high = box
         if self.points is not None:
             inside = ((self.points @ rotation.T >= low) & (self.points @ rotation.T <= high)).all(axis=1)
             points, quantile = self.points[inside], 0.5

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.feature_rays import FeatureRays
-from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.differences import matters, photograph_differences
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs, thermal_at
 from thermoxels_ns.multiview.stereo import (
@@ -72,7 +71,6 @@ def evidence_of_photographs(
     depths = depths_of_dataset(dataset, near, lo, hi)
     if depths is None:
         return None
-    depths, backdrop = depths_before_backdrop(depths)
     photographs = depths.photographs
     few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
     span_k = dataset.temperature_range.span_k
@@ -84,8 +82,7 @@ def evidence_of_photographs(
     if offsets and found is not None and matters(found.offset, found.offset_error, LEAST_OFFSET_K / span_k):
         offset, photographs = found.offset, found.without_offsets(photographs)
         say(f"thermal images are offset against each other by {np.std(offset) * span_k:.2f} K: corrected")
-    if log_gain is not None or offset is not None:
-        backdrop = plain_backdrop(photographs, depths.depth)[0]
+    depths, backdrop = depths_before_backdrop(replace(depths, photographs=photographs))
     say(
         f"depths: {len(photographs)} photographs agree about {depths.share:.1%} of their pixels{few}; "
         f"a plain backdrop fills {backdrop.mean():.1%}; {time.perf_counter() - began:.1f} s"

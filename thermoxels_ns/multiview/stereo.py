@@ -12,13 +12,7 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.threads import run_ranges
 from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.photographs import Photographs
-from thermoxels_ns.multiview.stereo_kernels import (
-    aggregate,
-    correlate,
-    other_views,
-    refine_depths,
-    weigh_patches,
-)
+from thermoxels_ns.multiview.stereo_kernels import aggregate, correlate, other_views, refine_depths, weigh_patches
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -162,37 +156,42 @@ def _refine(
     error: npt.NDArray[np.float32],
 ) -> None:
     """Refine depths (pixels,) and their errors in `larger` photographs: surfaces are as exact as depths are."""
-    views = [_View.of(larger, number) for number in range(len(larger))]
+    turns, shifts = larger.matrices[:, :, :3], larger.matrices[:, :, 3]
+    pictures = [_brightness(larger, number) for number in range(len(larger))]
 
     def work(begin: int, end: int) -> None:
         for number in range(begin, end):
             (width, height), first = photographs.sizes[number], photographs.firsts[number]
             pixels = slice(first, first + width * height)
-            view = views[number]
-            ratio = view.shape[1] / width
-            near = [views[other] for other in neighbours[number] if views[other].shape == view.shape]
+            ratio = larger.sizes[number, 0] / width
+            near = [other for other in neighbours[number] if pictures[other].shape == pictures[number].shape]
             if ratio <= 1.0 or not near or np.isnan(depth[pixels]).all():
                 continue
-            coarse, planes = depth[pixels].copy(), error[pixels].copy()
+            view = _View.of(larger, number)
             refine_depths(
-                0,
-                len(coarse),
                 width,
-                coarse,
-                planes,
+                depth[pixels].copy(),
+                error[pixels].copy(),
                 ratio,
                 view.features,
-                view.channels[0],
-                np.stack([other.channels[0] for other in near]),
-                np.stack([other.matrix[:, :3] @ view.inverse for other in near]),
-                np.stack([other.matrix[:, :3] @ view.centre + other.matrix[:, 3] for other in near]),
+                pictures[number],
+                np.stack([pictures[other] for other in near]),
+                turns[near] @ view.inverse,
+                turns[near] @ view.centre + shifts[near],
                 (REFINED_RADIUS, REFINED_LIKENESS, SPREAD, LEAST_WEIGHT, int(np.ceil(2.0 * ratio)), LEAST_CORRELATION),
                 float(view.noise[0]),
                 depth[pixels],
                 error[pixels],
             )
 
-    run_ranges(work, len(views), 1)
+    run_ranges(work, len(larger), 1)
+
+
+def _brightness(photographs: Photographs, number: int) -> npt.NDArray[np.float32]:
+    """Brightness of one photograph, shape (h, w); `_OUTSIDE` where masked."""
+    (width, height), first = photographs.sizes[number], photographs.firsts[number]
+    mean = photographs.colours[first : first + width * height].mean(axis=1).reshape(height, width)
+    return np.nan_to_num(mean, nan=_OUTSIDE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,13 +211,11 @@ class _View:
     def of(cls, photographs: Photographs, number: int) -> _View:
         width, height = photographs.sizes[number]
         pixels = slice(photographs.firsts[number], photographs.firsts[number] + width * height)
-        colours, warm = photographs.colours[pixels], photographs.thermal[pixels, None]
-        channels = [colours.mean(1, keepdims=True)] + [warm] * bool(np.isfinite(warm).any())
-        features = np.nan_to_num(np.concatenate([colours / 3.0, *channels[1:]], axis=1))
-        channels = np.nan_to_num(np.concatenate(channels, axis=1), nan=_OUTSIDE)
-        matrix = photographs.matrices[number]
-        features = np.ascontiguousarray(features.reshape(height, width, -1), dtype=np.float32)
-        channels = np.ascontiguousarray(channels.T.reshape(-1, height, width), dtype=np.float32)
+        warm, matrix = photographs.thermal[pixels].reshape(height, width), photographs.matrices[number]
+        measured = [warm] * bool(np.isfinite(warm).any())
+        channels = np.stack([_brightness(photographs, number), *(np.nan_to_num(t, nan=_OUTSIDE) for t in measured)])
+        thirds = photographs.colours[pixels].reshape(height, width, 3) / np.float32(3.0)
+        features = np.nan_to_num(np.dstack([thirds, *measured]))
         return cls(channels, features, matrix, np.linalg.inv(matrix[:, :3]), photographs.centres[number])
 
     @property

@@ -19,6 +19,26 @@ def _difference(features, row, column, i, j):
 
 
 @kernel
+def _weigh(features, row, column, radius, likeness, spread, least_weight, around, weights):
+    """Fill the weights of the patch around one pixel, see `weigh_patches`, which do not sum to 1 yet.
+
+    `around` is room for nine numbers.
+    """
+    k = 0
+    for i in range(row - 1, row + 2):
+        for j in range(column - 1, column + 2):
+            around[k] = _difference(features, row, column, i, j)
+            k += 1
+    scale = max(likeness, spread * np.sort(around)[5])  # the first is the pixel itself
+    k = 0
+    for i in range(row - radius, row + radius + 1):
+        for j in range(column - radius, column + radius + 1):
+            weight = np.exp(-((_difference(features, row, column, i, j) / scale) ** 2))
+            weights[k] = weight if weight >= least_weight else 0.0
+            k += 1
+
+
+@kernel
 def weigh_patches(features, channels, radius, likeness, spread, least_weight, noise, weights, means, variances):
     """Fill weights, means and variances of the patch around each pixel: who looks like the pixel belongs to it.
 
@@ -30,27 +50,14 @@ def weigh_patches(features, channels, radius, likeness, spread, least_weight, no
     `noise` (c,), a variance, among what belongs to it. Means and variances are (c, h, w).
     """
     count, height, width = channels.shape
-    around = np.empty(9, np.float64)
+    around, own = np.empty(9), np.empty((2 * radius + 1) ** 2)
     weights[:] = 0.0
     means[:] = 0.0
     variances[:] = 0.0
     for row in range(radius, height - radius):
         for column in range(radius, width - radius):
-            k = 0
-            for i in range(row - 1, row + 2):
-                for j in range(column - 1, column + 2):
-                    around[k] = _difference(features, row, column, i, j)
-                    k += 1
-            scale = max(likeness, spread * np.sort(around)[5])  # the first is the pixel itself
-            total, k = 0.0, 0
-            for i in range(row - radius, row + radius + 1):
-                for j in range(column - radius, column + radius + 1):
-                    weight = np.exp(-((_difference(features, row, column, i, j) / scale) ** 2))
-                    if weight >= least_weight:
-                        weights[k, row, column] = weight
-                        total += weight
-                    k += 1
-            weights[:, row, column] /= total
+            _weigh(features, row, column, radius, likeness, spread, least_weight, around, own)
+            weights[:, row, column] = own / own.sum()
             for channel in range(count):
                 mean, square, hidden, k = 0.0, 0.0, False, 0
                 for i in range(row - radius, row + radius + 1):
@@ -173,9 +180,9 @@ def aggregate(cost, features, small, large, edge, total):
 
 @kernel(fastmath={"contract"})
 def refine_depths(
-    begin, end, width, depth, error, ratio, features, picture, others, turns, shifts, options, noise, refined, spacing
+    width, depth, error, ratio, features, picture, others, turns, shifts, options, noise, refined, spacing
 ):
-    """Move the depths of pixels `begin` to `end` to where larger pictures agree best, and say how far steps are apart.
+    """Move the depths of a photograph to where larger pictures agree best, and say how far steps are apart.
 
     Of a pixel of the small photograph, the patch around its middle is taken from the larger one, weighted as in
     `weigh_patches`, and laid on the plane that the depths around it say. It is tried at some inverse depths before and
@@ -183,8 +190,6 @@ def refine_depths(
     counts. What has no texture, agrees badly, or agrees best at an end stays as it is.
 
     Args:
-        begin: First pixel.
-        end: Behind the last pixel.
         width: Columns of the small photograph.
         depth: Depth of its pixels, (pixels,), [world units]; NaN: not known.
         error: Distance of the planes on which these were found.
@@ -204,7 +209,7 @@ def refine_depths(
     side, count, half = 2 * radius + 1, len(others), (len(others) + 1) // 2
     weights, own = np.empty(side * side), np.empty(side * side)
     around, scores, best = np.empty(9), np.empty(2 * steps + 1), np.empty(half)
-    for n in range(begin, end):
+    for n in range(len(depth)):
         if np.isnan(depth[n]):
             continue
         u, v = (n % width + 0.5) * ratio, (n // width + 0.5) * ratio
@@ -220,16 +225,11 @@ def refine_depths(
                 if abs(before - depth[n]) <= 2.0 * error[n] and abs(behind - depth[n]) <= 2.0 * error[n]:
                     slope = 0.5 * (1.0 / behind - 1.0 / before) / ratio
                     slope_u, slope_v = (slope, slope_v) if axis == 0 else (slope_u, slope)
-        k = 0
-        for i in range(row - 1, row + 2):
-            for j in range(column - 1, column + 2):
-                around[k] = _difference(features, row, column, i, j)
-                k += 1
-        scale, total, mean, variance, k = max(likeness, spread * np.sort(around)[5]), 0.0, 0.0, 0.0, 0
+        _weigh(features, row, column, radius, likeness, spread, least_weight, around, weights)
+        total, mean, variance, k = 0.0, 0.0, 0.0, 0
         for i in range(row - radius, row + radius + 1):
             for j in range(column - radius, column + radius + 1):
-                weight = np.exp(-((_difference(features, row, column, i, j) / scale) ** 2))
-                weights[k] = weight if weight >= least_weight and picture[i, j] >= 0.0 else 0.0
+                weights[k] *= picture[i, j] >= 0.0
                 own[k] = picture[i, j]
                 total += weights[k]
                 mean += weights[k] * own[k]

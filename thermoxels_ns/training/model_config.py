@@ -17,7 +17,6 @@ from thermoxels_ns.render.renderers import Backend
 from thermoxels_ns.training.schedule import QUALITIES, schedule_for
 
 _STANDARD = schedule_for(*QUALITIES["standard"])
-_NAMED = [schedule_for(*quality).resolutions for quality in QUALITIES.values()]
 MOST_VOXELS = 1.5  # Voxels along the longest side that a scene may ask for, relative to the last of the resolutions
 STEP_OF_COARSEST = 8  # Of so many voxels the coarsest resolution is a multiple
 
@@ -223,12 +222,11 @@ class ThermoxelsModelConfig(ModelConfig):
     def suited_to(self, voxels: float) -> ThermoxelsModelConfig:
         """The settings for a scene along whose longest side that many voxels of `voxel_pixels` stand.
 
-        All resolutions grow or shrink alike, and at most to `MOST_VOXELS` times as many; those that are of no named
-        quality were chosen by somebody, and stay. They are rounded up, unless a
-        quarter of a step is all that is missing: fewer voxels cost more than they save (courtyard: F 0.81, 0.86 and
+        All resolutions grow or shrink alike, and at most to `MOST_VOXELS` times as many. They are rounded up, unless
+        less than a quarter of a step would be added: fewer voxels cost more than they save (courtyard: F 0.81, 0.86 and
         0.89 of what is seen with 96, 112 and 128 voxels).
         """
-        if not self.voxel_pixels or not math.isfinite(voxels) or self.resolutions not in _NAMED:
+        if not self.voxel_pixels or not math.isfinite(voxels):
             return self
         first, last = self.resolutions[0], self.resolutions[-1]
         wanted = min(voxels, MOST_VOXELS * last) * first / last

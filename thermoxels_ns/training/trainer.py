@@ -69,7 +69,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         if self.quality is None:
             return
         model: Any = self.pipeline.model
-        self.replaced = f"{max(model.resolutions)} voxels and {self.max_num_iterations} steps"
+        self.replaced = f"about {max(model.resolutions)} voxels and {self.max_num_iterations} steps"
         self.follow_schedule(schedule_for(*QUALITIES[self.quality]))
 
     def set_experiment_name(self) -> None:
@@ -181,7 +181,7 @@ class ThermoxelsTrainer(Trainer):
         quality, replaced = self.config.quality, self.config.replaced
         if quality is not None:
             resolution, steps, _ = QUALITIES[quality]
-            said = f"{resolution} voxels and {steps} steps"
+            said = f"about {resolution} voxels and {steps} steps"
             CONSOLE.log(
                 f"quality {quality}: {said}" + (f", in place of {replaced}" if replaced not in ("", said) else "")
             )
