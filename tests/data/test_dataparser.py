@@ -567,6 +567,13 @@ def test_what_no_scene_means_is_refused(scene_folder, change, named):
     assert "\n" not in str(caught.value)
 
 
+def test_a_sky_far_below_the_bounds_is_no_other_unit(scene_folder):
+    scene = scene_folder()
+    all_in(".npy", np.eye(18, 24) - 80.0)(scene)
+    scene.rewrite()
+    assert parse(scene.path).metadata["temperature_range"].min_c == pytest.approx(-80.0)
+
+
 def test_bad_options(scene_folder):
     scene = scene_folder()
     for option in ({"downscale_factor": 0}, {"scale_factor": 0.0}, {"eval_mode": "interval", "eval_interval": 1}):

@@ -2,8 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from thermoxels_ns.multiview.backdrop import mean_colours, plain_backdrop
+from thermoxels_ns.multiview.backdrop import mean_colours, plain_backdrop, upwards
 from thermoxels_ns.multiview.differences import Differences
 from thermoxels_ns.multiview.photographs import Photographs
 
@@ -11,10 +12,10 @@ WIDTH, HEIGHT, FOCAL = 60, 48, 50.0
 SKY, WALL, GROUND, DARK = (0.55, 0.57, 0.6), (0.9, 0.88, 0.85), (0.3, 0.35, 0.2), (0.1, 0.1, 0.15)
 
 
-def house(sky=SKY, wall=WALL, wall_warmth=np.nan, turns: int = 0) -> tuple[Photographs, np.ndarray]:
+def house(sky=SKY, wall=WALL, wall_warmth=np.nan, turns=(0,) * 6) -> tuple[Photographs, np.ndarray]:
     """Six photographs of a plain wall with a dark roof and window above plain ground, and where the sky is.
 
-    With `turns` the camera was held turned by that many quarter turns.
+    With `turns` the camera was held turned by that many quarter turns for each photograph.
     """
     picture = np.empty((HEIGHT, WIDTH, 3), np.float32)
     warm = np.full((HEIGHT, WIDTH), 0.1 if np.isfinite(wall_warmth) else np.nan, np.float32)
@@ -25,40 +26,52 @@ def house(sky=SKY, wall=WALL, wall_warmth=np.nan, turns: int = 0) -> tuple[Photo
     is_sky[12:14, 13:47] = is_sky[14:36, 15:45] = is_sky[36:] = False
     noise = np.random.default_rng(0).normal(0.0, 0.004, (6, HEIGHT, WIDTH, 3))
     level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x right, y down, z forward; z up in world
-    matrices, pictures, warmths = [], [], []
+    matrices, sizes, pictures, warmths, skies = [], [], [], [], []
     for number in range(6):
         bearing = 0.1 * number
         turn = np.array([[np.cos(bearing), np.sin(bearing), 0], [-np.sin(bearing), np.cos(bearing), 0], [0, 0, 1.0]])
-        quarter = np.linalg.matrix_power(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), turns)
-        shown = np.rot90(picture + noise[number], turns)
+        quarter = np.linalg.matrix_power(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), turns[number])
+        shown = np.rot90(picture + noise[number], turns[number])
         middle = np.array([[FOCAL, 0, shown.shape[1] / 2], [0, FOCAL, shown.shape[0] / 2], [0, 0, 1]])
         centre = np.array([0.2 * number, -3.0, 1.0])
         rotation = quarter @ level @ turn
         matrices.append(middle @ np.column_stack((rotation, -rotation @ centre)))
         pictures.append(shown.reshape(-1, 3))
-        warmths.append(np.rot90(warm, turns).ravel())
-    sizes = np.full((6, 2), np.rot90(picture, turns).shape[1::-1])
+        sizes.append(shown.shape[1::-1])
+        warmths.append(np.rot90(warm, turns[number]).ravel())
+        skies.append(np.rot90(is_sky, turns[number]).ravel())
     seen = Photographs(
         np.stack(matrices),
         np.array([[0.2 * number, -3.0, 1.0] for number in range(6)]),
-        sizes,
+        np.array(sizes),
         np.arange(6) * WIDTH * HEIGHT,
         np.concatenate(pictures).astype(np.float32),
         np.concatenate(warmths).astype(np.float32),
     )
-    return seen, np.tile(np.rot90(is_sky, turns).ravel(), 6)
+    return seen, np.concatenate(skies)
 
 
 def found(seen: Photographs) -> np.ndarray:
     return plain_backdrop(seen, np.full(len(seen.colours), np.nan, np.float32))[0]
 
 
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+@pytest.mark.parametrize("turns", [(0,) * 6, (1,) * 6, (3,) * 6, (0, 2, 0, 0, 0, 0)])
 def test_the_sky_is_found_and_neither_wall_nor_ground(turns):
     seen, is_sky = house(turns=turns)
     backdrop = found(seen)
     assert not backdrop[~is_sky].any()
     assert backdrop[is_sky].mean() > 0.9
+
+
+@pytest.mark.parametrize("turns", [0, 1, 3])
+def test_up_is_found_whatever_the_axes_of_the_world_are(turns):
+    """Worlds of structure from motion stand in any direction: a street's sky is not at their z axis."""
+    seen, is_sky = house(turns=(turns,) * 6)
+    tilt = Rotation.from_rotvec([1.3, -0.4, 2.0]).as_matrix()
+    matrices = np.concatenate((seen.matrices[:, :, :3] @ tilt.T, seen.matrices[:, :, 3:]), axis=2)
+    turned = replace(seen, matrices=matrices, centres=seen.centres @ tilt.T)
+    assert np.allclose(upwards(turned), tilt[:, 2], atol=1e-6)
+    assert found(turned)[is_sky].mean() > 0.9 and not found(turned)[~is_sky].any()
 
 
 def test_a_white_wall_under_a_white_sky_is_none():

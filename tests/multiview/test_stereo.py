@@ -54,6 +54,19 @@ def test_larger_photographs_halve_the_error():
     assert np.allclose(fine.error[moved] * 3.0, coarse.error[moved], rtol=0.5)
 
 
+def test_where_texture_fades_depths_come_from_what_lies_beside():
+    """Costs are added up along paths: alone, no pixel in the middle of the stripe knows its depth."""
+    seen = photographs()
+    origins, along = seen.of_pixels(np.arange(len(seen.colours)))
+    across = np.abs(origins[:, 0] + TRUE_DEPTH * along[:, 0])
+    contrast = np.clip(across / 0.2, 0.0, 1.0)[:, None] ** 2
+    found = depths(replace(seen, colours=(0.5 + contrast * (seen.colours - 0.5)).astype(np.float32)))
+    middle = across < 0.04
+    known = np.isfinite(found.depth) & middle
+    assert known.sum() > 0.3 * middle.sum()
+    assert np.median(np.abs(found.depth[known] - TRUE_DEPTH)) < 0.012
+
+
 def test_a_plane_of_one_colour_is_found_by_its_temperature():
     seen = photographs()
     plain = replace(seen, colours=np.full_like(seen.colours, 0.5))

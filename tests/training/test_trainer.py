@@ -136,6 +136,22 @@ def test_a_schedule_is_one_that_a_model_accepts(resolution, steps):
         assert max(everything) == schedule.thin_at[0]
 
 
+@pytest.mark.parametrize(
+    ("typed", "pixels"),
+    [
+        ((), 1.6),
+        (("--pipeline.model.resolutions", "32", "64", "128"), 0.0),
+        (("--pipeline.model.resolutions", "32", "64", "128", "--pipeline.model.voxel-pixels", "1.6"), 1.6),
+    ],
+)
+def test_typed_resolutions_stay_whatever_the_photographs_ask_for(scene, tmp_path, monkeypatch, typed, pixels):
+    config = configured(scene, tmp_path, *typed)
+    config.pipeline.model.voxel_pixels = 1.6
+    monkeypatch.setattr("sys.argv", ["ns-train", "thermoxels", *typed])
+    config.save_config()
+    assert config.pipeline.model.voxel_pixels == pixels
+
+
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_a_quality_sets_resolution_and_length_and_leaves_the_defaults_alone(quality):
     before = deepcopy(thermoxels.config)

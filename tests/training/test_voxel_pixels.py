@@ -2,9 +2,13 @@ import math
 
 import numpy as np
 import pytest
+import torch
+from nerfstudio.data.scene_box import SceneBox
 
+from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.model_config import MOST_VOXELS, ThermoxelsModelConfig
 
 
@@ -28,6 +32,20 @@ def test_resolutions_grow_and_shrink_alike_and_up_to_a_limit(voxels, expected):
 @pytest.mark.parametrize(("pixels", "voxels"), [(0.0, 50.0), (2.0, math.inf)])
 def test_resolutions_stay_where_nothing_is_asked_or_known(pixels, voxels):
     assert ThermoxelsModelConfig(voxel_pixels=pixels).suited_to(voxels).resolutions == (32, 64, 128)
+
+
+@pytest.mark.parametrize(
+    ("pixel_size", "expected"), [(2.0 / 160 / 1.6, (40, 80, 160)), (1e-6, (48, 96, 192)), (None, (32, 64, 128))]
+)
+def test_a_model_has_the_voxels_that_its_photographs_ask_for(pixel_size, expected):
+    metadata = {"temperature_range": TemperatureRange(10.0, 30.0)}
+    if pixel_size is not None:
+        metadata["pixel_size"] = pixel_size
+    box = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]]))
+    config = ThermoxelsModelConfig(voxel_pixels=1.6)
+    model = config.setup(scene_box=box, num_train_data=4, metadata=metadata)
+    assert isinstance(model, ThermoxelsModel) and model.config.resolutions == expected
+    assert max(model.grid.lattice.cell_shape) == expected[0]
 
 
 @pytest.mark.parametrize("given", [False, True])

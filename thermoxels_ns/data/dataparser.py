@@ -334,10 +334,13 @@ def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int
 
 
 def _refuse_beyond_bounds(middles_c: dict[Path, float], bounds_c: tuple[float, float]) -> None:
-    """Refuse files whose median is further from the declared bounds than these are wide: they have another unit."""
-    margin = max(bounds_c[1] - bounds_c[0], _SAME_PLACE_K)
+    """Refuse files whose median is above the declared bounds by more than their width: they hold kelvins.
+
+    Below the bounds nothing is refused: a clear sky may be colder than anybody declares.
+    """
+    most = bounds_c[1] + max(bounds_c[1] - bounds_c[0], _SAME_PLACE_K)
     for path, middle in middles_c.items():
-        if not bounds_c[0] - margin <= middle <= bounds_c[1] + margin:
+        if middle > most:
             expected = f"temperatures near {bounds_c[0]:g} to {bounds_c[1]:g} C, as {BOUNDS_NAME} says"
             got = f"{middle:.2f} C in the middle"
             remedy = f"Subtract 273.15 if the file holds kelvins; else correct {BOUNDS_NAME}, or remove it."

@@ -12,6 +12,7 @@ FloatArray = npt.NDArray[np.float64]
 
 PLAIN = 0.03  # Difference of a channel from one pixel to the next, of 1, up to which a photograph is plain
 STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which a photograph has no top
+LEVEL = 10.0  # Weight of how level one side of a photograph is, for finding up, relative to how steep the other is
 COLOUR_TOLERANCE = 0.06  # Difference from the backdrop's colour up to which a pixel shows it, of 1
 THERMAL_TOLERANCE = 0.1  # Difference from its temperature, of the scene's range
 VOTES = 2  # Photographs that show a surface, for each that shows a backdrop, from which on it is one
@@ -32,7 +33,7 @@ def plain_backdrop(
     took that of an outline (drawn courtyard: 2.6 % of all depths lie on the sky, 0.6 % without those).
     """
     open_above, plain = (np.zeros(len(photographs.colours), dtype=bool) for _ in range(2))
-    directions = np.empty((len(open_above), 3))
+    directions, up = np.empty((len(open_above), 3)), upwards(photographs)
     for number in range(len(photographs)):
         (width, height), first = photographs.sizes[number], photographs.firsts[number]
         pixels, shape = slice(first, first + width * height), (height, width)
@@ -42,7 +43,7 @@ def plain_backdrop(
         directions[pixels] = along / np.linalg.norm(along, axis=1, keepdims=True)
         even = even_pixels(photographs.colours[pixels].reshape(*shape, 3)) & np.isnan(depth[pixels]).reshape(shape)
         plain[pixels] = even.ravel()
-        turns = _turns(inverse)
+        turns = _turns(inverse, up)
         if turns is not None:
             open_above[pixels] = np.rot90(np.logical_and.accumulate(np.rot90(even, turns), axis=0), -turns).ravel()
     if open_above.mean() < 1e-3:
@@ -91,14 +92,32 @@ def backdrop_without_walls(
     return kept
 
 
-def _turns(inverse: FloatArray) -> int | None:
+def upwards(photographs: Photographs) -> FloatArray:
+    """The direction that is up in the world, (3,): cameras are held level, upright or all of them on their side.
+
+    It is as perpendicular to one side of the photographs and as parallel to the other as it can be. Upright photographs
+    tell its sign; of those on their side, up is where they are brighter.
+    """
+    sides = np.linalg.inv(photographs.matrices[:, :, :3]).transpose(2, 0, 1)[:2]  # to the right, and down
+    right, down = sides / np.linalg.norm(sides, axis=2, keepdims=True)
+    squares = down.T @ down, right.T @ right
+    found = [np.linalg.eigh(steep - LEVEL * level) for steep, level in (squares, squares[::-1])]
+    if found[0].eigenvalues[2] >= found[1].eigenvalues[2]:
+        up = found[0].eigenvectors[:, 2]
+        return up if (down @ up).sum() <= 0.0 else -up
+    up = found[1].eigenvectors[:, 2]
+    along = photographs.of_pixels(np.arange(len(photographs.colours)))[1] @ up
+    return up if np.nansum((along - along.mean()) * photographs.colours.mean(axis=1)) >= 0.0 else -up
+
+
+def _turns(inverse: FloatArray, up: FloatArray) -> int | None:
     """Quarter turns (of `np.rot90`) that bring the side of a photograph at which the sky is to its top."""
-    right, down, forward = (inverse[:, axis] / np.linalg.norm(inverse[:, axis]) for axis in range(3))
-    if abs(forward[2]) > STEEPEST:
+    right, down, forward = inverse.T @ up / np.linalg.norm(inverse, axis=0)
+    if abs(forward) > STEEPEST:
         return None
-    if abs(down[2]) >= abs(right[2]):
-        return 0 if down[2] < 0 else 2
-    return 1 if right[2] > 0 else 3
+    if abs(down) >= abs(right):
+        return 0 if down < 0 else 2
+    return 1 if right > 0 else 3
 
 
 def even_pixels(picture: npt.NDArray[np.float32], most: float = PLAIN) -> npt.NDArray[np.bool_]:

@@ -90,11 +90,11 @@ def depths_of(
     For each photograph, its neighbours are drawn onto planes parallel to it, one behind the other, and compared with it
     patch by patch (plane sweep, Collins 1996; normalised cross-correlation), by brightness and, where the same camera
     measured it, temperature. How little they agree is a cost, which is added up along paths through the photograph
-    (semi-global matching, Hirschmueller 2008), so that a plain area takes its depth from what surrounds it. The plane
-    of least cost is the depth of a pixel if it beats all but its neighbours by `MARGIN`. It counts where depths of
-    other photographs, found on their own, lie in the same place, and not too many that others confirm lie behind it.
-    Within a patch only pixels that look like the middle one count: else an outline gives its depth to all that lies
-    beside it.
+    (semi-global matching, Hirschmueller 2008), so that where texture fades, a pixel takes its depth from those beside
+    it that look alike. The plane of least cost is the depth of a pixel if it beats all but its neighbours by `MARGIN`.
+    It counts where depths of other photographs, found on their own, lie in the same place, and not too many that others
+    confirm lie behind it. Within a patch only pixels that look like the middle one count: else an outline gives its
+    depth to all that lies beside it.
 
     Args:
         photographs: Pinhole photographs, best some 160 pixels wide: cost grows with the third power of their size.

@@ -72,7 +72,7 @@ class ThermoxelsModel(Model):
         box = self.scene_box.aabb.double().numpy()
         voxel = self.config.voxel_pixels * (self.kwargs.get("metadata") or {}).get("pixel_size", math.inf)
         longest = float((box[1] - box[0]).max())
-        self.config = config = self.config.suited_to(longest / voxel if voxel else math.inf)
+        self.config = config = self.config.suited_to(longest / voxel if 0.0 < voxel < math.inf else math.inf)
         torch.manual_seed(config.seed)
         self.loss_weights = config.loss_weights()
         temperature_range = (self.kwargs.get("metadata") or {}).get("temperature_range")

@@ -1,0 +1,75 @@
+"""How many pixels of photographs get a depth before a training, and how far off these are, on synthetic scenes.
+
+    python tests/benchmarks/photograph_depths.py --output RUNS
+    python tests/benchmarks/photograph_depths.py --output RUNS --scenes wild-20 house-corner+white
+
+The photographs are compared as a training compares them, in the box of what they truly see. `body` are pixels that
+truly show the scene's solid, `known` the share of them with a depth; median error and the share that is more than 3 %
+off are relative to the true depth; `sky` is the share of all depths on pixels that show nothing of the solid, `beside`
+the same before those go that look like the backdrop beside it. Seconds are those of the comparison.
+"""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from measuring import synthetic_scene
+
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.dataset import ThermalDataset
+from thermoxels_ns.multiview.evidence import depths_of_dataset
+from thermoxels_ns.multiview.photographs import Photographs
+from thermoxels_ns.multiview.stereo import Depths, depths_before_backdrop
+from thermoxels_ns.synthetic.raycast import first_surface
+from thermoxels_ns.synthetic.scene_truth import SyntheticScene
+
+
+@dataclass
+class PhotographDepths:
+    """Compare the depths that photographs agree on with the truth."""
+
+    output: Path
+    """Folder for scenes; one that is there is not written again."""
+    scenes: tuple[str, ...] = ("house-corner", "courtyard", "house-corner+white", "facade", "street")
+    """Synthetic scenes by name."""
+
+    def main(self) -> None:
+        print("| scene | body | known | median error | over 3 % off | sky | beside | seconds |")
+        print("|---|---:|---:|---:|---:|---:|---:|---:|", flush=True)
+        for name in self.scenes:
+            scene = synthetic_scene(name, self.output / name / "scene")
+            box = tuple(map(tuple, np.asarray(scene.scene_box).tolist()))
+            outputs = ThermalDataParserConfig(data=self.output / name / "scene", scene_box=box).setup()
+            parsed = outputs.get_dataparser_outputs("train")
+            lo, hi = parsed.scene_box.aabb.double().numpy()
+            began = time.perf_counter()
+            found = depths_of_dataset(ThermalDataset(parsed), 0.0, lo, hi)
+            seconds = time.perf_counter() - began
+            assert found is not None
+            centre = parsed.dataparser_transform.double().numpy()
+            truth = true_depths(scene, found.photographs, centre, float(parsed.dataparser_scale))
+            print(row(name, found, truth, seconds), flush=True)
+
+
+def true_depths(scene: SyntheticScene, photographs: Photographs, transform: np.ndarray, scale: float) -> np.ndarray:
+    """Depth along the optical axis of the solid in each pixel, (pixels,), [world units]; NaN where it shows another."""
+    origins, along = photographs.of_pixels(np.arange(len(photographs.colours)))
+    origins = (origins / scale - transform[:, 3]) @ transform[:, :3]
+    length = np.linalg.norm(along, axis=1)
+    distance, own = first_surface(scene, origins, along / length[:, None] @ transform[:, :3])
+    return np.where(own, distance * scale / length, np.nan)
+
+
+def row(name: str, found: Depths, truth: np.ndarray, seconds: float) -> str:
+    body, before = np.isfinite(truth), np.isfinite(found.depth)
+    known = np.isfinite(depths_before_backdrop(found)[0].depth)
+    off = np.abs(found.depth / truth - 1.0)[known & body]
+    shares = body.mean(), known[body].mean(), np.median(off), np.mean(off > 0.03), 1 - body[known].mean()
+    cells = [f"{share:.2%}" for share in (*shares, 1 - body[before].mean())]
+    return f"| {name} | {' | '.join(cells)} | {seconds:.0f} |"
+
+
+if __name__ == "__main__":
+    tyro.cli(PhotographDepths).main()
