@@ -6,14 +6,16 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.multiview.photographs import Photographs
+from thermoxels_ns.multiview.photographs import SATURATED, Photographs
 
 FloatArray = npt.NDArray[np.float64]
 
 PLAIN = 0.03  # Difference of a channel from one pixel to the next, of 1, up to which a photograph is plain
 STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which a photograph has no top
 LEVEL = 10.0  # Weight of how level one side of a photograph is, for finding up, relative to how steep the other is
-COLOUR_TOLERANCE = 0.06  # Difference from the backdrop's colour up to which a pixel shows it, of 1
+COLOUR_TOLERANCE = 0.1
+"""Difference from the backdrop's colour up to which a pixel shows it, of 1. On eight drawn scenes and a real street,
+0.06 finds less of the sky (saharov32: 54 % instead of 69 %), and neither takes more than 1 % of a body's pixels."""
 THERMAL_TOLERANCE = 0.1  # Difference from its temperature, of the scene's range
 VOTES = 2  # Photographs that show a surface, for each that shows a backdrop, from which on it is one
 _WIDEST, _ROUNDS = 0.3, 8
@@ -49,7 +51,7 @@ def plain_backdrop(
     if open_above.mean() < 1e-3:
         return np.zeros_like(open_above), np.zeros_like(open_above)
     values = np.column_stack((photographs.colours, photographs.thermal))
-    beside = _alike(values, directions, open_above, photographs.saturated)
+    beside = _alike(values, directions, open_above, photographs.measured)
     alike = plain & beside
     open_above &= alike
     for (width, height), first in zip(photographs.sizes, photographs.firsts):
@@ -136,11 +138,12 @@ def _alike(
     values: npt.NDArray[np.float32],
     directions: FloatArray,
     chosen: npt.NDArray[np.bool_],
-    saturated: npt.NDArray[np.bool_] | None = None,
+    measured: npt.NDArray[np.float32] | None = None,
 ) -> npt.NDArray[np.bool_]:
     """Which pixels look as most of the chosen do, by colour and, where it is known, temperature (pixels, 4).
 
-    What is `saturated` (pixels, 3) looks like anything as bright or brighter.
+    Between the colour corrected and the colour `measured` (pixels, 3) any will do, as what is nearly overexposed does
+    not follow the exposure; what is saturated may be any brighter.
     """
     x, y, z = directions.T
     basis = np.column_stack((np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0))
@@ -162,9 +165,12 @@ def _alike(
             ridge = 1e-3 * max(1, len(rows)) * np.diag([0.0] + [1.0] * (basis.shape[1] - 1))
             fitted[:, channel] = np.linalg.lstsq(rows.T @ rows + ridge, rows.T @ seen[used, channel], rcond=None)[0]
         expected = basis[some] @ fitted
-    off = np.abs(values - basis @ fitted) / tolerance
-    if saturated is not None:
-        off[:, :3][saturated & (basis @ fitted[:, :3] > values[:, :3])] = 0.0
+    expected, lowest, highest = basis @ fitted, values, values
+    if measured is not None:
+        lowest, highest = values.copy(), values.copy()
+        lowest[:, :3] = np.minimum(values[:, :3], measured)
+        highest[:, :3] = np.where(measured >= SATURATED, np.inf, np.maximum(values[:, :3], measured))
+    off = np.maximum(lowest - expected, expected - highest) / tolerance
     return (np.nan_to_num(off) <= 1.0).all(1)
 
 

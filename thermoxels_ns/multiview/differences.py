@@ -14,7 +14,6 @@ FloatArray = npt.NDArray[np.float64]
 
 MOST_PIXELS = 1500  # Pixels of each photograph that are looked up in the others
 DARKEST, BRIGHTEST = 0.06, 0.94  # Channels between which a pixel tells a gain: noise below, saturation above
-SATURATED = 0.98  # Channel from which on a pixel, a mean of several, may have been brighter
 FEWEST_PAIRS = 30  # Pixels that two photographs must share to be compared
 SYSTEMATIC = 0.02
 """Standard deviation, of 1, of what a channel's median ratio between two photographs is off by besides noise: gloss,
@@ -38,7 +37,7 @@ class Differences:
     def without_gains(self, photographs: Photographs) -> Photographs:
         """The photographs as they would be had all the same gains."""
         gain = np.exp(self.log_gain).astype(np.float32)[photographs.numbers]
-        return replace(photographs, colours=photographs.colours / gain, saturated=photographs.colours >= SATURATED)
+        return replace(photographs, colours=photographs.colours / gain, measured=photographs.colours)
 
     def without_offsets(self, photographs: Photographs) -> Photographs:
         """The photographs as they would be had all thermal images the same offset."""

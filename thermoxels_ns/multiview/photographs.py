@@ -14,6 +14,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from thermoxels_ns.core.camera import Camera
 
 MOST_PHOTOGRAPHS = 64  # Photographs compared; of more, that many are taken at equal distances in the list
+SATURATED = 0.98  # Channel from which on a pixel, a mean of several, may have been brighter
 LONGEST_SIDE = 160  # Pixels along the longer side at which photographs are compared; larger ones are averaged down
 
 
@@ -31,8 +32,8 @@ class Photographs:
     """Normalised temperature, shape (pixels,); NaN where unknown, or measured by a camera of its own."""
     near: float = 0.0  # Depth up to which a photograph shows nothing, [world units]
     index: npt.NDArray[np.int64] | None = None  # Number of each photograph in its dataset; None: of no dataset
-    saturated: npt.NDArray[np.bool_] | None = None
-    """Channels that were at least as bright as `colours` say, shape (pixels, 3); None: not known."""
+    measured: npt.NDArray[np.float32] | None = None
+    """Channels before differences of gain were corrected, shape (pixels, 3); None: none was."""
 
     @property
     def numbers(self) -> npt.NDArray[np.int64]:

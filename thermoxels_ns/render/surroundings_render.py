@@ -12,6 +12,9 @@ from thermoxels_ns.field.surroundings import Surroundings
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import Backend, render_rays
 
+STEPS_PER_VOXEL = 1.0
+"""Samples per voxel edge: what stands behind is soft anyway (a figure in a street: 17.1 dB, and 16.9 dB with two)."""
+
 
 @dataclass(frozen=True)
 class SurroundingsRender:
@@ -37,7 +40,14 @@ def render_surroundings(
     ray = chosen[cut.ray]
     wants = (None if bits is None else bits[ray] for bits in (request.rgb_rays, request.thermal_rays))
     pieces = RayRequest(cut.origins, cut.directions, 0.0, cut.lengths, *wants)
-    plain = replace(options, distortion_scale=None, sparsity=False, sh_degree=None, colour_channels=None)
+    plain = replace(
+        options,
+        steps_per_voxel=min(STEPS_PER_VOXEL, options.steps_per_voxel),
+        distortion_scale=None,
+        sparsity=False,
+        sh_degree=None,
+        colour_channels=None,
+    )
     seen = render_rays(surroundings.grid, pieces, plain, backend)
     values = seen.thermal if seen.rgb is None else torch.cat((seen.rgb, seen.thermal), 1)
     total = values.new_zeros(len(asked), values.shape[1])

@@ -148,11 +148,12 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             optimizer.change_columns(old, model.grid.sh, change)
             attributes.optimizers.parameters["sh"] = [model.grid.sh]
 
+    early = min(steps | decisions) // 3
     return [
         TrainingCallback(before, model.update_to_step),
         TrainingCallback(before, carve, iters=(0,)),
-        TrainingCallback(before, change_surroundings, iters=(0,)),
-        TrainingCallback(before, look_at_walls, iters=tuple(sorted({*factors, min(steps | decisions) // 3}))),
+        TrainingCallback(before, change_surroundings, iters=tuple({0, early})),
+        TrainingCallback(before, look_at_walls, iters=tuple(sorted({*factors, early}))),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
         TrainingCallback(before, widen),
     ]

@@ -135,7 +135,8 @@ def _roughness(values: FloatArray, near: IntArray) -> tuple[FloatArray, FloatArr
         beside = np.abs(first[2:4])
         slope += np.where(np.isfinite(beside), beside, 0.0).max(axis=0) ** 2
     slope = np.sqrt(slope)
-    return np.sqrt(squared / 60.0) / np.maximum(slope, np.finfo(np.float64).tiny), slope
+    with np.errstate(over="ignore"):  # infinitely rough, where nothing rises
+        return np.sqrt(squared / 60.0) / np.maximum(slope, np.finfo(np.float64).tiny), slope
 
 
 def _belief(rough: FloatArray, near: IntArray, shape: tuple[int, ...]) -> tuple[Float32Array, BoolArray]:
