@@ -6,7 +6,8 @@
 The photographs are compared as a training compares them, in the box of what they truly see. `body` are pixels that
 truly show the scene's solid, `known` the share of them with a depth; median error and the share that is more than 3 %
 off are relative to the true depth; `sky` is the share of all depths on pixels that show nothing of the solid (the sky,
-or what else stands around), `beside` the same before those go that look like the backdrop beside it. Seconds are those of the comparison.
+or what else stands around), `beside` the same before those go that look like the backdrop beside it. Seconds are those
+of the comparison.
 """
 
 import time

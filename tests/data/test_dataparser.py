@@ -567,6 +567,20 @@ def test_what_no_scene_means_is_refused(scene_folder, change, named):
     assert "\n" not in str(caught.value)
 
 
+def test_a_box_that_was_found_is_the_same_when_it_is_given(scene_folder):
+    scene = scene_folder(scene_box=None)
+    found = parse(scene.path)
+    given = parse(scene.path, scene_box=found.metadata["input_box"])
+    assert torch.equal(found.scene_box.aabb, given.scene_box.aabb)
+    assert found.dataparser_scale == given.dataparser_scale
+    assert torch.equal(found.dataparser_transform, given.dataparser_transform)
+    tilt = np.array([[1.0, 0, 0, 0], [0, 0.8, -0.6, 0], [0, 0.6, 0.8, 0], [0, 0, 0, 1]])
+    for frame in scene.meta["frames"]:
+        frame["transform_matrix"] = (tilt @ frame["transform_matrix"]).tolist()
+    scene.rewrite()
+    assert parse(scene.path, orientation_method="up").metadata["input_box"] is None
+
+
 def test_a_sky_far_below_the_bounds_is_no_other_unit(scene_folder):
     scene = scene_folder()
     all_in(".npy", np.eye(18, 24) - 80.0)(scene)

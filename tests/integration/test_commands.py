@@ -51,6 +51,7 @@ def test_eval_reports_every_metric(trained: Trained, tmp_path):
     assert set(METRICS) <= set(results) and "lpips" not in results
     assert all(np.isfinite(results[name]) for name in METRICS)
     assert results["psnr"] > 15 and results["thermal_mae_c"] < 15
+    assert "box from the option scene_box" in " ".join(result.stdout.split())  # the run keeps what training found
     assert len(list(pictures.glob("*thermal*.png"))) == 2
 
 

@@ -125,6 +125,7 @@ class _Scene:
     survey: ThermalSurvey
     world: _World
     box: SceneBox
+    input_box: tuple[tuple[float, ...], ...] | None  # the same in input coordinates; None: turned against their axes
     pixel_size: float  # width of a photograph's pixel where most of what is seen stands, in nerfstudio's world
     feature_rays: FeatureRays | None  # what the training photographs see of the tracks; nerfstudio's world
     adjusted: bool  # whether the poses of training photographs are others than the json's
@@ -138,10 +139,11 @@ class ThermalDataParser(DataParser):
     The outputs' metadata hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``, ``thermal_cameras``
     (`Cameras` of the split, or None where a pair shares camera and resolution), ``thermal_unit``, ``valid_range_c``,
     ``thermal_dead_pixels`` (a mask per resolution), ``image_scale`` (1 / downscale_factor), ``pixel_size`` (width of a
-    pixel where most of what is seen stands, in the world), ``scene_name`` and, for train, ``feature_rays``
-    (`FeatureRays`, or None where the scene has no tracks). ``fitted_poses`` (n, 3, 4) say where held-out photographs
-    themselves say that they were taken, and ``adjusted_poses`` (camera to world in input coordinates, by the
-    photograph's name) those of training, both None where no pose was adjusted.
+    pixel where most of what is seen stands, in the world), ``input_box`` (the scene box in input coordinates, None if
+    the world is turned), ``scene_name`` and, for train, ``feature_rays`` (`FeatureRays`, or None without tracks).
+    ``fitted_poses`` (n, 3, 4) say where held-out photographs themselves say that they were taken, and
+    ``adjusted_poses`` (camera to world in input coordinates, by the photograph's name) those of training, both None
+    where no pose was adjusted.
     """
 
     config: ThermalDataParserConfig
@@ -184,6 +186,7 @@ class ThermalDataParser(DataParser):
                 "valid_range_c": tuple(self.config.valid_range_c),
                 "thermal_dead_pixels": scene.survey.dead_pixels,
                 "pixel_size": scene.pixel_size / factor,
+                "input_box": scene.input_box,
                 "scene_name": scene.file.folder.resolve().name,
                 "feature_rays": scene.feature_rays if split == "train" else None,
                 "fitted_poses": self._fitted_poses(scene, chosen),
@@ -224,7 +227,7 @@ class ThermalDataParser(DataParser):
         if rays is None and config.refine_poses == "auto":
             file, fitted = refine_poses(given, split.train, CONSOLE.print)
         evidence = find_scene_box(file, config.scene_box, split.train)
-        world, box, pixel_size = self._place(file, evidence)
+        world, box, input_box, pixel_size = self._place(file, evidence)
         paths, training = [f.thermal for f in file.frames], {file.frames[index].thermal for index in split.train}
         survey = survey_thermal_files(paths, file.unit, config.valid_range_c, file.bounds_c, training)
         _refuse_several_sizes(file.frames, survey.shapes)
@@ -246,7 +249,7 @@ class ThermalDataParser(DataParser):
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
         if rays is not None:
             rays = rays.moved(world.rotation, world.translation, world.scale)
-        return _Scene(file, split, survey, world, box, pixel_size, rays, file is not given, fitted)
+        return _Scene(file, split, survey, world, box, input_box, pixel_size, rays, file is not given, fitted)
 
     def _oriented(self, poses: npt.NDArray[np.float64]) -> torch.Tensor:
         """nerfstudio's choice of rotation and shift for these poses (n, 4, 4), shape (3, 4) float32."""
@@ -263,7 +266,9 @@ class ThermalDataParser(DataParser):
             raise SceneError("orientation_method, center_method", expected=expected, got=got, remedy=remedy)
         return oriented
 
-    def _place(self, file: SceneFile, evidence: BoxEvidence) -> tuple[_World, SceneBox, float]:
+    def _place(
+        self, file: SceneFile, evidence: BoxEvidence
+    ) -> tuple[_World, SceneBox, tuple[tuple[float, ...], ...] | None, float]:
         """Choose orientation, origin and scale, and express the scene box and a pixel's width in the new world."""
         config = self.config
         oriented = self._oriented(np.stack([frame.pose for frame in file.frames]))
@@ -286,7 +291,8 @@ class ThermalDataParser(DataParser):
             raise SceneError("scale_factor", expected="a finite number above 0", got=got, remedy=remedy)
         placed = scale * (box + translation)
         placed_box = SceneBox(aabb=torch.from_numpy(placed.astype(np.float32)))
-        return _World(rotation, translation, scale), placed_box, scale * evidence.pixel_size(box, rotation)
+        input_box = tuple(map(tuple, box.tolist())) if np.array_equal(rotation, np.eye(3)) else None
+        return _World(rotation, translation, scale), placed_box, input_box, scale * evidence.pixel_size(box, rotation)
 
 
 def _share_that_meets(frames: list[Frame], world: _World, box: SceneBox, source: str) -> float:

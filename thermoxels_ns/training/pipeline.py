@@ -76,7 +76,12 @@ class ThermoxelsPipeline(VanillaPipeline):
         datamanager: Any = self.datamanager
         outputs = datamanager.train_dataparser_outputs
         placed = torch.cat(
-            (outputs.dataparser_transform.double() * outputs.dataparser_scale, outputs.scene_box.aabb.T), 1
+            (
+                outputs.dataparser_transform.double() * outputs.dataparser_scale,
+                outputs.scene_box.aabb.T,
+                outputs.cameras.camera_to_worlds.double().mean(0),
+            ),
+            1,
         )
         self.register_buffer("world_from_input", placed)
 

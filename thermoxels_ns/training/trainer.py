@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
+from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +18,13 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from thermoxels_ns.core.checks import check_ranges, hold_folder, plain_os_errors, writable_folder
+from thermoxels_ns.core.checks import (
+    check_ranges,
+    hold_folder,
+    plain_os_errors,
+    replace_when_done,
+    writable_folder,
+)
 from thermoxels_ns.core.config_loader import ConfigLoader
 from thermoxels_ns.core.errors import CheckpointError, OutputError, ThermoxelsError
 from thermoxels_ns.core.option_help import typed, typed_value
@@ -188,8 +195,24 @@ class ThermoxelsTrainer(Trainer):
         self.config.follow_checkpoint()
         with plain_os_errors(self.base_dir):
             super().setup(test_mode)
+        if self.local_rank == 0:
+            self._keep_what_was_found()
         # nerfstudio takes the shares and times that it shows from the number of steps without those before.
         writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
+
+    def _keep_what_was_found(self) -> None:
+        """Write the box and the resolutions that photographs asked for into config.yml: nobody has to find them again.
+
+        A box in a world that was turned is not one in input coordinates, and is found again.
+        """
+        kept: Any = deepcopy(self.config)
+        pipeline: Any = getattr(self.pipeline, "module", self.pipeline)
+        model, parser = kept.pipeline.model, kept.pipeline.datamanager.dataparser
+        model.resolutions, model.voxel_pixels = pipeline.model.config.resolutions, 0.0
+        if (box := pipeline.datamanager.train_dataparser_outputs.metadata.get("input_box")) is not None:
+            parser.scene_box = box
+        with plain_os_errors(self.base_dir), replace_when_done(self.base_dir / "config.yml") as path:
+            path.write_text(yaml.dump(kept), encoding="utf-8")
 
     def train(self) -> None:
         """Train; an `OutputError` where results cannot be written."""
