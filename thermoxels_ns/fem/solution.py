@@ -107,6 +107,8 @@ class HeatSolution:
     time_error_k: float = float("nan")
     """Estimated largest error of the steps at any temperature, their estimates added up, [K]; NaN for fixed steps."""
     unbalanced_w: float = 0.0  # Most heat that a step left unbalanced at all nodes, round-off included, [W]
+    overshoot_k: float = 0.0
+    """How far any temperature left the range of the start and of the surroundings, [K]; 0 up to 0.01 K."""
     assembled: Assembled = field(default_factory=Assembled)
 
 
@@ -128,6 +130,7 @@ class SteadySolution:
     empty with linear tetrahedra."""
     unbalanced_w: float = 0.0
     """Heat that is unbalanced at all nodes, round-off included, [W]; heat flows are uncertain by no more."""
+    overshoot_k: float = 0.0  # How far any temperature is out of the range of the surroundings, [K]; 0 up to 0.01 K
     error: ErrorSize | None = None
     """Estimated errors of linear tetrahedra on this mesh, see `p1_error`; None if there is no estimate."""
 

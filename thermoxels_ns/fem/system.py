@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
-
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
@@ -135,12 +133,6 @@ class HeatSystem:
     def lumped(self) -> bool:
         """Whether masses, convection and radiation are all on the diagonal."""
         return self._space.lumped and self._space.lumped_boundary
-
-    def with_stiffness(self, stiffness: sparse.csr_matrix) -> HeatSystem:
-        """Copy the system with another K between the same nodes; all else is shared."""
-        other = copy(self)
-        other._stiffness, other._fixed_rows, other._kept_matrix = stiffness, None, None
-        return other
 
     @property
     def start_k(self) -> Vector:

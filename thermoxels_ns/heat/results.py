@@ -112,6 +112,8 @@ class HeatResults:
     effects: tuple[EffectResult, ...]
     regions: tuple[RegionResult, ...]
     balance: EnergyBalance
+    overshoot_k: float
+    """How far any temperature left the range of what surrounds the body, and of its start, [K]; 0 up to 0.01 K."""
     coldest: Spot
     hottest: Spot
 
@@ -128,6 +130,7 @@ def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes 
         effects=_effects(problem, solution, selection, lengths),
         regions=_regions(problem, solution, selection, nodes),
         balance=_balance(solution, lengths),
+        overshoot_k=solution.overshoot_k,
         coldest=_first_spot(selection, nodes, int(states.argmin())),
         hottest=_first_spot(selection, nodes, int(states.argmax())),
     )
