@@ -36,6 +36,10 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
     with radiation's slope in h. The flows of T + b + c less those of T are the errors of flows. Where temperatures are
     singular b is not all that is missed, only what half the mesh size would find, 1 - 0.3 of it (Richardson).
 
+    Where two materials side by side touch one air, nodes that they share have one temperature, and the film heats half
+    a cell of the one material as if it were the other. The temperature of its own falls within k / h of the edge, as
+    exp(-h x / k): what the film brings beyond that is counted as missed.
+
     Where sources act the error is at least s h^2 / (16 k), half of what a source bends the temperature in a tetrahedron
     of the extent h along its gradient; what leaves at once through the surface beside it is not in s.
 
@@ -49,22 +53,35 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
     even, level_k = np.zeros(num_nodes, dtype=bool), _EQUAL * float(np.ptp(relative_k))
     even[fixed.nodes] = True
     with np.errstate(all="ignore"):
-        gradient, mean = _recovered(points, tets, place, relative_k)
+        gradient, volumes_m3 = _recovered(points, tets, place, relative_k)
         bent_w = np.zeros(num_nodes)
         _add_bubbles(points, tets, place, gradient, conductivity, relative_k, even, level_k, TET_EDGES, bent_w)
-        surfaces = []
+        shared, surfaces = np.count_nonzero(volumes_m3, axis=0) > 1, []
+        of_region = np.zeros(len(volumes_m3))
+        of_region[problem.mesh.region] = conductivity
         for form in system.surface_forms:
             nodes = form.nodes
             strength = form.basis.dx.sum(axis=1) * form.slope_w_m2k(relative_k, time_s).mean(axis=1)
+            # The gradient of the material behind each triangle: nodes that two share have one in each.
+            region = volumes_m3[:, nodes].min(axis=2).argmax(axis=0)
+            behind = region[:, None] * num_nodes + nodes
             bubble_k = np.empty(nodes.shape)
             for corner in range(3):
                 i, j = nodes[:, corner - 2], nodes[:, corner - 1]
-                bubble_k[:, corner] = np.sum((mean[i] - mean[j]) * (points[j] - points[i]), axis=1) / 8.0
+                turn = gradient[behind[:, corner - 2]] - gradient[behind[:, corner - 1]]
+                bubble_k[:, corner] = np.sum(turn * (points[j] - points[i]), axis=1) / 8.0
                 bubble_k[even[i] & even[j] & (np.abs(relative_k[i] - relative_k[j]) <= level_k), corner] = 0.0
+            thin = strength * np.sqrt(2.0 / form.basis.dx.sum(axis=1)) / of_region[region]  # a cell's width over k / h
+            own = ~shared[nodes]
+            jumps = np.where(own.all(axis=1), 0.0, np.fmax(1.0 + 2.0 * np.expm1(-thin) / thin, 0.0))[:, None]
+            count = np.maximum(own.sum(axis=1, keepdims=True), 1)
+            own_k = np.where(own, relative_k[nodes], 0.0).sum(axis=1, keepdims=True) / count
+            beyond_k = np.where(own | ~own.any(axis=1, keepdims=True), 0.0, jumps * (own_k - relative_k[nodes]) / 3.0)
+            bubble_k *= 1.0 - jumps
             lumping_k = relative_k[nodes].mean(axis=1, keepdims=True) - relative_k[nodes]
-            around_k = lumping_k / 4.0 + (2.0 * bubble_k.sum(axis=1, keepdims=True) - bubble_k) / 15.0
+            around_k = lumping_k / 4.0 + (2.0 * bubble_k.sum(axis=1, keepdims=True) - bubble_k) / 15.0 + beyond_k
             bent_w += sums_by_number(nodes.ravel(), (strength[:, None] * around_k).ravel(), num_nodes)
-            surfaces.append((form.effect, nodes, strength, bubble_k))
+            surfaces.append((form.effect, nodes, strength, bubble_k.mean(axis=1) + beyond_k.sum(axis=1)))
         matrix = system.matrix(time_s, np.inf)
         if system.nonlinear:
             matrix = sparse.csr_matrix(matrix + system.radiation_slope(relative_k, time_s))
@@ -73,8 +90,8 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
         inner = matrix if len(free) == num_nodes else sparse.csr_matrix(matrix[free][:, free])
         error_k[free] = LinearSolver(inner, relative_tolerance=_TOLERANCE).solve(rest_w[free]).x
         missed_w = {heat.effect: 0.0 for heat in solution.effects}
-        for effect, nodes, strength, bubble_k in surfaces:
-            missed_w[effect] -= float(np.sum(strength * (error_k[nodes] + bubble_k).mean(axis=1)))
+        for effect, nodes, strength, between_k in surfaces:
+            missed_w[effect] -= float(np.sum(strength * (error_k[nodes].mean(axis=1) + between_k)))
         kept_w = fixed.shares @ (matrix @ error_k + bent_w)[fixed.nodes]
         for (effect, _), heat_w in zip(fixed.groups, kept_w):
             missed_w[effect] += float(heat_w)
@@ -82,7 +99,8 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
         largest_k = float(np.max(np.abs(error_k)))
         kept_w = np.abs(system.exchanged_heat(relative_k, time_s)) if system.sources else np.zeros(0)
         for form in system.sources:
-            inside, slope = tets[form.term.tets], mean[tets[form.term.tets]].mean(axis=1)
+            inside = tets[form.term.tets]
+            slope = gradient[place[form.term.tets, None] + inside].mean(axis=1)
             along = np.square(np.ptp(relative_k[inside], axis=1)) / np.sum(np.square(slope), axis=1)
             square_m2 = np.fmin(along, np.sum(np.square(np.ptp(points[inside], axis=1)), axis=1))
             volumes_m3 = system.space.tet_volumes_m3(np.arange(len(tets)))
@@ -97,7 +115,7 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
 def _recovered(
     points: Vector, tets: npt.NDArray[np.int64], place: npt.NDArray[np.int64], values: Vector
 ) -> tuple[Vector, Vector]:
-    """Gradient at each node of each region, shape (r * n, 3), and its means over the regions, shape (n, 3), [K / m]."""
+    """Gradient at each node of each region, shape (r * n, 3), [K / m], and its tetrahedra there, shape (r, n), [m3]."""
     size = (int(place.max()) // len(points) + 1) * len(points)
     gradient, volumes, nodal = np.empty((len(tets), 3)), np.empty(len(tets)), np.zeros((size, 3))
     _gradients(points, tets, values, gradient, volumes)
@@ -106,8 +124,7 @@ def _recovered(
         total[:] = 0.0
         _add_defects(tets, place, gradient, volumes, nodal, total)
         nodal += total[:, :3] / np.maximum(total[:, 3:], np.finfo(np.float64).tiny)
-    weights = total[:, 3].reshape(-1, len(points), 1)
-    return nodal, (weights * nodal.reshape(-1, len(points), 3)).sum(axis=0) / weights.sum(axis=0)
+    return nodal, total[:, 3].reshape(-1, len(points))
 
 
 @kernel
