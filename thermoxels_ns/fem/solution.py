@@ -105,7 +105,8 @@ class HeatSolution:
     steps: int = 0
     step_lengths_s: tuple[npt.NDArray[np.float64], ...] = ()  # Lengths of the steps in each interval, [s]
     time_error_k: float = float("nan")
-    """Estimated largest error of the steps at any temperature, their estimates added up, [K]; NaN for fixed steps."""
+    """Estimated largest error of the steps at any temperature, [K]: of adaptive ones their estimates added up, of equal
+    ones by steps of twice the length, if asked for; else NaN."""
     unbalanced_w: float = 0.0  # Most heat that a step left unbalanced at all nodes, round-off included, [W]
     overshoot_k: float = 0.0
     """How far any temperature left the range of the start and of the surroundings, [K]; 0 up to 0.01 K."""

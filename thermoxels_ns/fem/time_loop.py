@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +44,7 @@ def solve_heat(
     lumped_boundary: bool = True,
     relative_tolerance: float = 1e-12,
     allow_unconverged: bool = False,
+    estimate_steps: bool = False,
     progress: Callable[[float, int], None] | None = None,
 ) -> HeatSolution:
     """Follow the temperatures of a body through time.
@@ -61,6 +62,8 @@ def solve_heat(
         lumped_boundary: Evaluate convection and radiation at the nodes, for the same reason.
         relative_tolerance: Of the linear solver in each step.
         allow_unconverged: Return what was computed, with the reason in `status`, instead of raising.
+        estimate_steps: Tell the error of equal steps too (`time_error_k`), by steps of twice the length beside them,
+            which takes about half as long again. Adaptive steps tell it anyway.
         progress: Called after every step with the share of the duration that is done and the number of steps.
 
     Raises:
@@ -80,18 +83,23 @@ def solve_heat(
     if scheme is None:
         scheme = BACKWARD_EULER if isinstance(time, TimeSteps) else SDIRK2
     loop = _TimeLoop(system, scheme, time, relative_tolerance)
+    doubled = _DoubledSteps(loop.runge_kutta, states[0]) if estimate_steps and isinstance(time, TimeSteps) else None
     failure = ""
     for taken in loop.steps(states[0]):
         failure = taken.failure or too_cold(system, taken.step.relative_k)
         if failure:
             break
         balance.add(taken.step, taken.step_s, ends_interval=taken.ends_interval)
+        if doubled is not None:
+            doubled.follow(taken.step.relative_k, taken.step_s)
         if progress is not None:
             progress(balance.followed_s / time.duration_s, balance.steps)
     if failure and not allow_unconverged:
         raise HeatError(failure)
-    status = failure or balance.success(loop.describe()) + _skips(problem, time)
-    return balance.close(status, not failure, adaptive=adaptive)
+    said = "" if doubled is None else doubled.describe()
+    status = failure or balance.success(loop.describe()) + said + _skips(problem, time)
+    solution = balance.close(status, not failure, adaptive=adaptive)
+    return solution if doubled is None else replace(solution, time_error_k=doubled.most_k)
 
 
 @dataclass(frozen=True)
@@ -104,12 +112,48 @@ class _Taken:
     failure: str = ""  # Why the computation ends here; empty if the step was accepted
 
 
+class _DoubledSteps:
+    """Follows equal steps with steps of twice their length, to tell their error (Richardson 1911).
+
+    Steps of half the length leave 1 / 2^p of the error of a scheme of order p, so that both differ by 2^p - 1 of the
+    error of the shorter ones.
+    """
+
+    def __init__(self, runge_kutta: RungeKutta, start_k: Vector) -> None:
+        self._runge_kutta, self._state_k = runge_kutta, start_k.copy()
+        self._steps, self._now_s, self._last_k = 0, 0.0, float("nan")
+        self.most_k = float("nan")
+        """Largest error of the shorter steps at any temperature so far, [K]; NaN before the second one."""
+
+    def follow(self, relative_k: Vector, step_s: float) -> None:
+        """Compare with the temperatures after the next of the equal steps, shape (n,), [K]; every second one counts."""
+        self._steps += 1
+        if self._steps % 2:
+            return
+        step = self._runge_kutta.step(self._state_k, self._now_s, 2.0 * step_s)
+        self._state_k, self._now_s = step.relative_k, self._now_s + 2.0 * step_s
+        if step.converged:
+            self._last_k = float(np.max(np.abs(relative_k - step.relative_k))) / (
+                2.0**self._runge_kutta.scheme.order - 1
+            )
+            self.most_k = float(np.fmax(self.most_k, self._last_k))
+
+    def describe(self) -> str:
+        """Say it in a sentence, or nothing."""
+        if not np.isfinite(self.most_k):
+            return " The error of the steps is not estimated: it takes two of them."
+        return (
+            f" The steps make an error of about {self.most_k:.2g} K at most and {self._last_k:.2g} K at the end (from "
+            "steps of twice the length)."
+        )
+
+
 class _TimeLoop:
     """Takes one step after the other; no adaptive step is longer than effects can be followed by."""
 
     def __init__(self, system: HeatSystem, scheme: Scheme, time: Steps, relative_tolerance: float) -> None:
         self._system, self._scheme, self._time = system, scheme, time
-        self._runge_kutta = RungeKutta(system, scheme, relative_tolerance=relative_tolerance)
+        self.runge_kutta = RungeKutta(system, scheme, relative_tolerance=relative_tolerance)
         self._allowed_k = STEP_SHARE * time.tolerance_k if isinstance(time, AdaptiveSteps) else np.inf
         self._repeated = 0
 
@@ -133,7 +177,7 @@ class _TimeLoop:
         for now_s, lengths_s in zip(time.times_s.tolist(), intervals):
             for number, step_s in enumerate(lengths_s, start=1):
                 count += 1
-                step = self._runge_kutta.step(relative_k, now_s, step_s)
+                step = self.runge_kutta.step(relative_k, now_s, step_s)
                 failure = ""
                 if not step.converged:
                     remedy = "Use shorter steps or check the mesh's quality."
@@ -148,7 +192,7 @@ class _TimeLoop:
             while now_s < end_s:
                 left_s = float(end_s) - now_s
                 step_s = _fitted(min(wished_s, self._system.problem.resolution_s), left_s)
-                step = self._runge_kutta.step(relative_k, now_s, step_s, estimate=True)
+                step = self.runge_kutta.step(relative_k, now_s, step_s, estimate=True)
                 factor = self._factor(step)
                 if not step.converged or step.error_k > self._allowed_k:
                     self._repeated += 1
