@@ -7,6 +7,7 @@ from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.scene_bodies import Z_UP, room, tagged_body, wall
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
+from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.run import (
     body_warnings,
     doubtful_temperatures,
@@ -149,3 +150,20 @@ def test_bodies_that_lie_in_each_other_or_touch_without_shared_nodes_are_named(s
     assert (
         body_warnings(first) == () and body_warnings(both(first, replace(second, points_m=second.points_m + 1.0))) == ()
     )
+
+
+def test_parts_that_touch_without_shared_nodes_are_solved_and_said_to_exchange_nothing() -> None:
+    """Air on the one end warms the one box, air on the other end cools the other one, and no heat flows."""
+    axis = planes(0.0, 0.4, step=0.1)
+    first = box_mesh(axis, axis, axis, temperature_c=15.0)
+    second = replace(first, points_m=first.points_m + np.array([0.4, 0.0, 0.0]))
+    tags = first.boundary
+    assert tags is not None
+    patch = np.concatenate([np.where(tags.patch == inner, 2, tags.patch) for inner in (1, 0)])
+    arrays = {name: np.concatenate([getattr(tags, name)] * 2) for name in ("normal", "area_factor", "seen")}
+    mesh = replace(both(first, second), boundary=replace(tags, patch=patch, **arrays))
+    airs = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0)
+    run = run_scene(HeatScene(CONCRETE, convection=airs, adiabatic=("y*", "z*")), mesh, Goals())
+    assert run.solution.converged and "flat" not in run.solution.status
+    assert any("25 nodes of the mesh lie at the place of another one" in warning for warning in run.warnings)
+    assert sorted({round(float(end), 6) for end in run.solution.temperature_c}) == [0.0, 20.0]

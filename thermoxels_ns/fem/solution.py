@@ -64,6 +64,15 @@ class EffectHeat:
 
 
 @dataclass(frozen=True)
+class FacetHeat:
+    """Heat that one effect brings into the body through single boundary triangles, at one moment."""
+
+    effect: str
+    facets: npt.NDArray[np.int64]  # Numbers of the triangles, shape (k,)
+    heat_w: npt.NDArray[np.float64]  # Heat flow into the body through each, shape (k,), [W]
+
+
+@dataclass(frozen=True)
 class ErrorSize:
     """Errors of a solution."""
 
@@ -110,6 +119,8 @@ class HeatSolution:
     unbalanced_w: float = 0.0  # Most heat that a step left unbalanced at all nodes, round-off included, [W]
     overshoot_k: float = 0.0
     """How far any temperature left the range of the start and of the surroundings, [K]; 0 up to 0.01 K."""
+    last_facet_heat: tuple[FacetHeat, ...] = ()
+    """Heat flow of each effect through boundary triangles at the end; fixed nodes count as if they stored nothing."""
     assembled: Assembled = field(default_factory=Assembled)
 
 
@@ -132,6 +143,7 @@ class SteadySolution:
     unbalanced_w: float = 0.0
     """Heat that is unbalanced at all nodes, round-off included, [W]; heat flows are uncertain by no more."""
     overshoot_k: float = 0.0  # How far any temperature is out of the range of the surroundings, [K]; 0 up to 0.01 K
+    last_facet_heat: tuple[FacetHeat, ...] = ()  # Heat flow of each effect through boundary triangles
     error: ErrorSize | None = None
     """Estimated errors of linear tetrahedra on this mesh, see `p1_error`; None if there is no estimate."""
 

@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.fem.error_estimate import p1_error
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation
-from thermoxels_ns.fem.p1_error import p1_error
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
 from thermoxels_ns.fem.system import HeatSystem
@@ -75,6 +75,7 @@ def solve_steady(
         edge_temperature_c=temperature_c[num_mesh_nodes:],
         unbalanced_w=solution.unbalanced_w,
         overshoot_k=overshoot_k,
+        last_facet_heat=system.facet_heat(relative_k, time_s),
     )
     estimated = order == 1 and system.lumped and not failure
     return replace(found, error=p1_error(system, found, time_s)) if estimated else found

@@ -309,7 +309,7 @@ class HeatBalance:
         spread = float(np.sum(mass * np.abs(states_k[0] - mean)))
         scale = max(float(content[0]), exchanged)
         spread_scale = max(spread + exchanged, _NOTHING * float(content[0]))
-        lengths = np.diff(times_s)
+        lengths, last_facet_heat = np.diff(times_s), system.facet_heat(states_k[-1], float(times_s[-1]))
         states_k += system.reference_c
         kinds = [effect.kind for effect in system.problem.effects]
         return HeatSolution(
@@ -329,6 +329,7 @@ class HeatBalance:
             step_lengths_s=tuple(np.array(lengths) for lengths in self._lengths_s[:done]),
             time_error_k=self._error_k if adaptive else float("nan"),
             unbalanced_w=self._unbalanced_w,
+            last_facet_heat=last_facet_heat,
             overshoot_k=self._overshoot_k if self._overshooting else 0.0,
             assembled=system.assembled,
         )

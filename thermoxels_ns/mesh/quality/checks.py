@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.mesh.quality.face_count import Groups, boundary_facets, group_pairs
@@ -77,9 +77,12 @@ def count_tets_in_other_bodies(mesh: TetMesh) -> int:
     pairs = sparse.coo_matrix(
         (np.ones(3 * len(tets), bool), (np.repeat(tets[:, 0], 3), tets[:, 1:].ravel())), shape=(len(points),) * 2
     )
-    bodies, of_node = connected_components(pairs, directed=False)
-    body, centres, found = of_node[tets[:, 0]], points[tets].mean(axis=1), 0
-    by_body = np.split(np.argsort(body, kind="stable"), np.cumsum(np.bincount(body, minlength=bodies))[:-1])
+    of_node = connected_components(pairs, directed=False)[1]
+    body, sizes = np.unique(of_node[tets[:, 0]], return_inverse=True, return_counts=True)[1:]
+    if len(sizes) == 1:
+        return 0
+    centres, found = points[tets].mean(axis=1), 0
+    by_body = np.split(np.argsort(body, kind="stable"), np.cumsum(sizes)[:-1])
     low, high = (np.array([end(points[tets[own]], axis=(0, 1)) for own in by_body]) for end in (np.min, np.max))
     for number, own in enumerate(by_body[:-1]):
         close = np.all((low <= high[number]) & (high >= low[number]), axis=1)
@@ -89,7 +92,7 @@ def count_tets_in_other_bodies(mesh: TetMesh) -> int:
         others = np.concatenate([by_body[other] for other in np.flatnonzero(close)])
         for around, inside in ((own, others), (others, own)):
             tried = inside[:: len(inside) // _MOST_TRIED + 1]
-            near = cKDTree(centres[around]).query(centres[tried], k=range(1, min(len(around), _NEAREST) + 1))[1]
+            near = KDTree(centres[around]).query(centres[tried], k=range(1, min(len(around), _NEAREST) + 1))[1]
             corner = points[tets[around[near]]]
             sides = np.swapaxes(corner[:, :, 1:] - corner[:, :, :1], 2, 3)
             shares = np.linalg.solve(sides, (centres[tried][:, None] - corner[:, :, 0])[..., None])[..., 0]
