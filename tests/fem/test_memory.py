@@ -55,8 +55,9 @@ def peak(run) -> int:
     ],
 )
 def test_it_takes_what_was_said(mesh, concrete, effects, solve, said) -> None:
+    """Or half of it where angles are right, as on a lattice: nothing couples along their edges then."""
     problem = HeatProblem(mesh, concrete, effects=effects)
-    assert 1 / 1.5 < peak_bytes(problem, **said) / peak(lambda: solve(problem)) < 1.5
+    assert 1 / 1.5 < peak_bytes(problem, **said) / peak(lambda: solve(problem)) < 2.0
 
 
 def test_what_does_not_fit_is_refused() -> None:

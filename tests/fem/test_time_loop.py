@@ -9,10 +9,11 @@ from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.runge_kutta import Step
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.time_loop import HeatBalance, solve_heat
-from thermoxels_ns.heat.effects import AbsorbedSolar, Convection
+from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Radiation
 from thermoxels_ns.heat.sun import moving_sun
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -115,3 +116,19 @@ def test_heat_that_nothing_accounts_for_is_told_beside_what_is_stored() -> None:
     found = balance.close("", True, adaptive=False)
     assert found.energy_residual_of_spread == pytest.approx(0.1 / 3.0, rel=1e-9)
     assert found.energy_residual == pytest.approx(0.1 / 273.15, rel=1e-9)
+
+
+@pytest.mark.parametrize("radiates", [False, True])
+def test_equal_steps_tell_their_error(radiates) -> None:
+    """A wall in air that swings over a day, with steps of 1200 s: against steps of 75 s."""
+    swing = Varying(lambda places, time_s: 10.0 + 8.0 * np.sin(2.0 * np.pi * time_s / 86400.0))
+    mesh = box_mesh(planes(0.0, 0.3, step=0.05), [0.0, 0.1], [0.0, 0.1], temperature_c=10.0)
+    effects = (Convection(("x1",), 25.0, swing), *([Radiation(("x1",), 0.9, 0.0)] if radiates else []))
+    problem = HeatProblem(mesh, CONCRETE, effects=effects)
+    found = solve_heat(problem, TimeSteps(72, 1200.0), estimate_steps=True)
+    exact = solve_heat(problem, TimeSteps(1152, 75.0)).temperature_c[::16]
+    true_k = float(np.abs(found.temperature_c - exact).max())
+    assert 0.5 < found.time_error_k / true_k < 2.0
+    assert f"an error of about {found.time_error_k:.2g} K at most" in found.status
+    assert np.isnan(solve_heat(problem, TimeSteps(72, 1200.0)).time_error_k)
+    assert "takes two of them" in solve_heat(problem, TimeSteps(1, 1200.0), estimate_steps=True).status

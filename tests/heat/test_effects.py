@@ -48,6 +48,11 @@ def at_once(mesh: TetMesh, material, *effects: Effect) -> HeatSolution:
         (lambda: HeatFlux(("*",), np.ones(3)), "flux_w_m2: expected a number or a Varying"),
         (lambda: HeatFlux(("*",), lambda places, time_s: 1.0), r"Wrap a function: Varying\(function"),
         (lambda: Radiation(("*",), 1.01, 20.0), "emissivity: expected .*at least 0 and at most 1"),
+        (
+            lambda: Radiation(("*",), 0.9, 1e300),
+            r"surroundings_c: expected .*at most 10000 \[degrees Celsius\], got 1e\+300",
+        ),
+        (lambda: Convection(("*",), 5.0, 1e6), "air_c: expected .*at most 10000"),
         (lambda: GroundContact(("*",), 0.0, 10.0), "resistance_m2k_w: expected a finite number above 0"),
     ],
 )

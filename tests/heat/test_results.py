@@ -6,7 +6,6 @@ import pytest
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, planes
-from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
@@ -138,16 +137,16 @@ def test_heat_by_part_agrees_with_the_solver_and_adds_up() -> None:
     )
     problem = HeatProblem(mesh, CONCRETE, effects=effects)
     solution = solve_steady(problem)
-    by_patch = heat_by_part(problem, solution.temperature_c, 0.0, mesh.boundary.patch, mesh.boundary.patch_names)
-    for ours, theirs in zip(by_patch, solution.effects, strict=True):
-        assert (ours.effect, ours.group_names) == (theirs.effect, theirs.group_names)
-        np.testing.assert_allclose(ours.group_heat_w, theirs.group_heat_w, rtol=1e-9, atol=1e-9)
-    random = rng.integers(0, 3, len(mesh.facets))
-    shuffled = heat_by_part(problem, solution.temperature_c, 0.0, random, ("a", "b", "c"))
-    for ours, theirs in zip(shuffled, solution.effects, strict=True):
-        assert ours.heat_w == pytest.approx(theirs.heat_w, rel=1e-9, abs=1e-9)
-    with pytest.raises(HeatError, match="part: expected shape"):
-        heat_by_part(problem, solution.temperature_c, 0.0, random[1:], ("a", "b", "c"))
+    assert [heat.effect for heat in solution.last_facet_heat] == [
+        solution.effects[number].effect for number in (0, 2, 1, 3)
+    ]
+    by_patch = heat_by_part(solution, mesh.boundary.patch, len(mesh.boundary.patch_names))
+    for number, name in enumerate(mesh.boundary.patch_names):
+        columns = [(heat, heat.group_names.index(name)) for heat in solution.effects if name in heat.group_names]
+        theirs_w = sum(float(heat.group_heat_w[0, column]) for heat, column in columns)
+        assert by_patch[number] == pytest.approx(theirs_w, rel=1e-9, abs=1e-9)
+    shuffled = heat_by_part(solution, rng.integers(0, 3, len(mesh.facets)), 3)
+    assert shuffled.sum() == pytest.approx(by_patch.sum(), abs=1e-9)
 
 
 def test_true_areas_count() -> None:

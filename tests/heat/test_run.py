@@ -6,8 +6,17 @@ import pytest
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.scene_bodies import Z_UP, room, tagged_body, wall
-from thermoxels_ns.fem.problem import TimeSteps
-from thermoxels_ns.heat.run import inner_surface_warnings, patch_warnings, run_scene, shell_warnings, unused_settings
+from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
+from thermoxels_ns.heat.effects import Convection
+from thermoxels_ns.heat.run import (
+    body_warnings,
+    doubtful_temperatures,
+    inner_surface_warnings,
+    patch_warnings,
+    run_scene,
+    shell_warnings,
+    unused_settings,
+)
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import InsideAir, OutsideAir
 from thermoxels_ns.heat.solving import Goals
@@ -97,3 +106,64 @@ def test_walls_that_came_out_thicker_than_asked_are_named(volume, said) -> None:
     export = {"options": {"wall_thickness": 0.3}, "mesh": {"volume": volume, "area": 200.0}}
     warnings = shell_warnings(HeatScene(CONCRETE, **AIRS), export)
     assert [("0.3 m thick" in one and "0.6 m on average" in one) for one in warnings] == [True] * said
+
+
+@pytest.mark.parametrize("time", [TimeSteps(2, 3600.0), AdaptiveSteps(7200.0)])
+def test_a_series_that_ends_before_the_run_is_named(tmp_path, time) -> None:
+    path = tmp_path / "air.csv"
+    path.write_text("hours,air_c\n0,10\n1,12\n")
+    airs = {"outside_air": OutsideAir(10.0, "iso-6946-combined", air_series=str(path))}
+    (warning,) = unused_settings(HeatScene(CONCRETE, time, **airs))
+    assert "outside_air is from 0 to 1 hours" in warning and "from 0 to 2 hours" in warning
+    assert unused_settings(HeatScene(CONCRETE, TimeSteps(60, 60.0), **airs)) == ()
+
+
+def test_air_that_was_given_in_kelvin_is_named() -> None:
+    airs = {"inside_air": InsideAir(293.15, "iso-6946-combined"), "outside_air": AIRS["outside_air"]}
+    (warning,) = doubtful_temperatures(HeatScene(CONCRETE, **airs))
+    assert "The air of inside_air has 293.15 degrees Celsius" in warning and "give air_c: 20." in warning
+    assert doubtful_temperatures(HeatScene(CONCRETE, **AIRS)) == ()
+
+
+def both(first: TetMesh, second: TetMesh) -> TetMesh:
+    """Two meshes in one, without merging nodes; tags are left out."""
+    count = len(first.points_m)
+    joined = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)])
+        for name in ("points_m", "temperature_c", "observed", "facet_tags", "region")
+    }
+    arrays = {
+        name: np.concatenate([getattr(first, name), getattr(second, name) + count]) for name in ("tets", "facets")
+    }
+    return replace(first, boundary=None, **joined, **arrays)
+
+
+@pytest.mark.parametrize(("shift_m", "overlap", "twins"), [(0.0, True, False), (0.03, True, False), (0.4, False, True)])
+def test_bodies_that_lie_in_each_other_or_touch_without_shared_nodes_are_named(shift_m, overlap, twins) -> None:
+    axis = planes(0.0, 0.4, step=0.1)
+    first = box_mesh(axis, axis, axis)
+    second = replace(first, points_m=first.points_m + np.array([shift_m, 0.0, 0.0]))
+    (warning,) = body_warnings(both(first, second))
+    assert ("Bodies of the mesh overlap" in warning) is overlap and (
+        "nodes of the mesh lie at the place" in warning
+    ) is twins
+    assert (
+        body_warnings(first) == () and body_warnings(both(first, replace(second, points_m=second.points_m + 1.0))) == ()
+    )
+
+
+def test_parts_that_touch_without_shared_nodes_are_solved_and_said_to_exchange_nothing() -> None:
+    """Air on the one end warms the one box, air on the other end cools the other one, and no heat flows."""
+    axis = planes(0.0, 0.4, step=0.1)
+    first = box_mesh(axis, axis, axis, temperature_c=15.0)
+    second = replace(first, points_m=first.points_m + np.array([0.4, 0.0, 0.0]))
+    tags = first.boundary
+    assert tags is not None
+    patch = np.concatenate([np.where(tags.patch == inner, 2, tags.patch) for inner in (1, 0)])
+    arrays = {name: np.concatenate([getattr(tags, name)] * 2) for name in ("normal", "area_factor", "seen")}
+    mesh = replace(both(first, second), boundary=replace(tags, patch=patch, **arrays))
+    airs = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0)
+    run = run_scene(HeatScene(CONCRETE, convection=airs, adiabatic=("y*", "z*")), mesh, Goals())
+    assert run.solution.converged and "flat" not in run.solution.status
+    assert any("25 nodes of the mesh lie at the place of another one" in warning for warning in run.warnings)
+    assert sorted({round(float(end), 6) for end in run.solution.temperature_c}) == [0.0, 20.0]

@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.heat_meshes import box_mesh
 from tests.support.obtuse_bodies import AT_THE_BOUNDS, BLOCKS, CONCRETE, STEP_S, body, faults, spots, stuffed
-from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, box_distance, centres, stiffness, tet_mesh, turn
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, box_distance, centres, stiffness, turn
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import CRANK_NICOLSON, SDIRK2
@@ -15,7 +15,6 @@ from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, Radiation
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.quality.report import check_mesh
-from thermoxels_ns.mesh.stuffing.isosurface import stuff
 
 
 def test_these_meshes_do_have_obtuse_angles() -> None:
@@ -41,7 +40,7 @@ def test_range_and_balance_at_any_step_and_any_cooling(shape, fourier, strength,
     effects += (Radiation(("*",), 0.9, 100.0),) if sky else ()
     low, high = (-40.0 if strength else -30.0), (100.0 if sky else 90.0)
     problem = HeatProblem(body(shape, spots), CONCRETE, effects=effects)
-    assert faults(solve_heat(problem, TimeSteps(3, fourier * STEP_S)), low, high) == []
+    assert faults(solve_heat(problem, TimeSteps(3, fourier * STEP_S)), low, high, shape) == []
 
 
 @pytest.mark.parametrize("shape", [*BLOCKS, "slab at 30 degrees", AT_THE_BOUNDS])
@@ -52,7 +51,7 @@ def test_two_materials_in_turns(shape, contrast) -> None:
     effects = (Convection(("*",), 10.0, -10.0), Radiation(("*",), 0.9, 30.0))
     problem = HeatProblem(body(shape, 20.0, regions=True), materials, effects=effects)
     for fourier in (1e-3, 1.0, 1e6):
-        assert faults(solve_heat(problem, TimeSteps(3, fourier * STEP_S)), -10.0, 30.0) == []
+        assert faults(solve_heat(problem, TimeSteps(3, fourier * STEP_S)), -10.0, 30.0, shape) == []
     steady = solve_steady(problem)
     assert steady.energy_residual < 1e-9
     assert steady.temperature_c.min() >= -10.0 - 1e-2 and steady.temperature_c.max() <= 30.0 + 1e-2
@@ -66,7 +65,13 @@ def test_radiation_between_1000_k_and_3_k(shape, start_c, sky_c) -> None:
     problem = HeatProblem(body(shape, start_c, size=4), CONCRETE, effects=(Radiation(("*",), 1.0, sky_c),))
     low, high = sorted((start_c, sky_c))
     for fourier in (1e-3, 10.0, 1e6):
-        assert faults(solve_heat(problem, TimeSteps(3, fourier * STEP_S)), low, high) == []
+        try:
+            solution = solve_heat(problem, TimeSteps(3, fourier * STEP_S))
+        except HeatError as refusal:
+            # Beside obtuse angles a temperature may fall below absolute zero.
+            assert shape not in BLOCKS[:2] and "below absolute zero" in str(refusal)
+            continue
+        assert faults(solution, low, high, shape) == []
     np.testing.assert_allclose(solve_steady(problem).temperature_c, sky_c, atol=1e-4)
 
 
@@ -75,7 +80,7 @@ def test_adaptive_steps_through_a_shock(shape) -> None:
     effects = (Convection(("*",), 1e4, -50.0), Radiation(("*",), 0.9, -80.0))
     problem = HeatProblem(body(shape, 200.0), CONCRETE, effects=effects)
     time = AdaptiveSteps(3600.0, 0.1, outputs=4) if shape in BLOCKS else AdaptiveSteps(1800.0, 0.5, outputs=2)
-    assert faults(solve_heat(problem, time), -80.0, 200.0) == []
+    assert faults(solve_heat(problem, time), -80.0, 200.0, shape) == []
 
 
 def test_a_wall_of_one_element() -> None:
@@ -112,21 +117,14 @@ def jump() -> HeatProblem:
     return HeatProblem(body("sphere"), CONCRETE, effects=(FixedTemperature(("x1",), 100.0),))
 
 
-def test_what_is_left_out_is_said_and_only_where_needed() -> None:
-    short = solve_heat(jump(), TimeSteps(2, 1e-2 * STEP_S))
-    assert faults(short, 20.0, 100.0) == []
-    assert "positive off-diagonals were left out" in short.status
-    # Long steps are smooth: nothing to mend, and nothing that changes the answer.
-    long = solve_heat(jump(), TimeSteps(4, 20.0 * STEP_S))
-    assert faults(long, 20.0, 100.0) == []
-    assert "left" not in long.status
-
-
-@pytest.mark.parametrize("options", [{"scheme": CRANK_NICOLSON}, {"scheme": SDIRK2}, {"lumped": False}])
-def test_fixed_steps_say_when_a_temperature_leaves_its_range(options) -> None:
+@pytest.mark.parametrize("options", [{}, {"scheme": CRANK_NICOLSON}, {"scheme": SDIRK2}, {"lumped": False}])
+def test_steps_say_when_a_temperature_leaves_its_range(options) -> None:
     solution = solve_heat(jump(), TimeSteps(2, 1e-2 * STEP_S), **options)
-    assert solution.temperature_c.min() < 20.0 - 1e-3
-    assert "In 2 a temperature left its range" in solution.status or "In 1 a temperature" in solution.status
+    beyond_k = 20.0 - float(solution.temperature_c.min())
+    said = re.search(r"In [12] a temperature left the range .*, by up to ([\d.]+) K", solution.status)
+    assert beyond_k > 0.01 and said and float(said[1]) >= 0.94 * beyond_k
+    # Long steps are smooth.
+    assert options or "left" not in solve_heat(jump(), TimeSteps(4, 20.0 * STEP_S)).status
 
 
 @pytest.mark.parametrize("material", [CONCRETE, Material("aluminium", 200.0, 2700.0, 900.0)], ids=lambda m: m.name)
@@ -136,16 +134,4 @@ def test_round_off_near_equilibrium_is_no_temperature_out_of_range(material, ste
     mesh = box_mesh(*(np.linspace(0.0, 0.2, count) for count in (11, 6, 6)), temperature_c=60.0)
     problem = HeatProblem(mesh, material, effects=(Convection(("*",), 500.0, -10.0),))
     status = solve_heat(problem, TimeSteps(24, step_s)).status
-    assert "range" not in status and "obtuse" not in status, status
-
-
-def test_steps_are_not_shortened_for_less_than_a_thousandth_of_the_tolerance() -> None:
-    """In strong convection most steps leave the range by a little, which watching to round-off would not allow."""
-    mesh = tet_mesh(stuff(SHAPES["sphere"].level(8)), 0.1)
-    mesh = replace(mesh, temperature_c=np.full(len(mesh.points_m), 20.0))
-    problem = HeatProblem(mesh, CONCRETE, effects=(Convection(("*",), 1e4, 5.0),))
-    found = solve_heat(problem, AdaptiveSteps(10 * 86400.0, 0.01))
-    assert found.temperature_c.min() > 5.0 - 1e-5 and found.temperature_c.max() < 20.0 + 1e-5
-    safe = re.search(r"(\d+) were taken with backward Euler", found.status)
-    assert found.steps < 390  # 335; watching to round-off takes 443
-    assert safe and int(safe[1]) < 270  # 178; watching to round-off takes 369
+    assert "range" not in status, status

@@ -17,7 +17,6 @@ from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.quantities import Bounded
-from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Assembled
 from thermoxels_ns.fem.space import Space, sums_by_number
 from thermoxels_ns.fem.terms import ConvectionTerm, FixedTerm, FluxTerm, RadiationTerm, SourceTerm
@@ -68,7 +67,7 @@ class _Boundary:
 
     def __init__(self, effect: str, facets: npt.NDArray[np.int64], space: Space) -> None:
         selection = space.selection
-        self.effect = effect
+        self.effect, self.facets = effect, facets
         self.basis = space.surface(facets)
         self.nodes = space.facet_nodes(facets)
         self._numbers, self._space = self.nodes.T.ravel(), space
@@ -105,9 +104,17 @@ class _Boundary:
         matrix.eliminate_zeros()
         return matrix
 
-    def sums(self, flux_w_m2: Vector) -> Vector:
-        """Integrals over each patch, [W]."""
-        return sums_by_number(self.group, (flux_w_m2 * self.basis.dx).sum(axis=1), len(self.groups))
+    def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
+        """Heat flux into the body at the points of integration, or even over each triangle, [W / m2]."""
+        raise NotImplementedError
+
+    def facet_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
+        """Heat flow into the body through each triangle, shape (k,), [W]."""
+        return (self.flux_w_m2(relative_k, time_s) * self.basis.dx).sum(axis=1)
+
+    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
+        """Heat flow into the body through each patch, [W]."""
+        return sums_by_number(self.group, self.facet_heat_w(relative_k, time_s), len(self.groups))
 
 
 class ConvectionForm(_Boundary):
@@ -143,10 +150,10 @@ class ConvectionForm(_Boundary):
         """h of each triangle, shape (k, 1), [W / (m2 K)]."""
         return self.at(self.term.coefficient_w_m2k, time_s)
 
-    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat flow into the body through each patch, [W]."""
+    def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
+        """h (T_ambient - T), [W / m2]."""
         apart_k = self.ambient_k(time_s) - self.surface_k(relative_k)
-        return self.sums(self.at(self.term.coefficient_w_m2k, time_s) * apart_k)
+        return self.at(self.term.coefficient_w_m2k, time_s) * apart_k
 
 
 class FluxForm(_Boundary):
@@ -161,18 +168,18 @@ class FluxForm(_Boundary):
 
     def load(self, time_s: float) -> Vector:
         """Entries integral(q phi_i), [W]."""
-        return self.vector(self._flux_w_m2(time_s))
+        return self.vector(self._given_w_m2(time_s))
 
-    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat flow into the body through each patch, [W]."""
-        return self.sums(self._flux_w_m2(time_s))
+    def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
+        """The flux, [W / m2], whatever the temperature."""
+        return self._given_w_m2(time_s)
 
     def signs(self, time_s: float) -> tuple[bool, bool]:
         """Whether it cools and whether it heats somewhere."""
-        flux = self._flux_w_m2(time_s)
+        flux = self._given_w_m2(time_s)
         return bool(np.any(flux < 0.0)), bool(np.any(flux > 0.0))
 
-    def _flux_w_m2(self, time_s: float) -> Vector:
+    def _given_w_m2(self, time_s: float) -> Vector:
         flux = np.ones((len(self.nodes), 1))
         for factor in self._factors:
             flux = flux * self.at(factor, time_s)
@@ -230,7 +237,7 @@ class RadiationForm(_Boundary):
 
     def load(self, relative_k: Vector, time_s: float) -> Vector:
         """Entries integral(sigma eps (T_s^4 - T^4) phi_i), [W]."""
-        return self.vector(self._flux_w_m2(relative_k, time_s))
+        return self.vector(self.flux_w_m2(relative_k, time_s))
 
     def slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
         """Minus the derivative of the load, entries integral(4 sigma eps T^3 phi_i phi_j), [W / K]."""
@@ -249,14 +256,11 @@ class RadiationForm(_Boundary):
         """Nodes whose temperature its surroundings pull on: the coefficient is above 0 there."""
         return np.unique(self.nodes[self._strength(time_s)[:, 0] > 0.0])
 
-    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat flow into the body through each patch, [W]."""
-        return self.sums(self._flux_w_m2(relative_k, time_s))
-
     def _strength(self, time_s: float) -> Vector:
         return self.term.stefan_boltzmann_w_m2k4 * self.at(self.term.emissivity, time_s)
 
-    def _flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
+    def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
+        """Sigma eps (T_s^4 - T^4), [W / m2]."""
         surface, around = self.surface_k(relative_k), self.surroundings_k(time_s)
         t, s = surface + self._reference_k, around + self._reference_k
         # s^4 - t^4 = (s - t) (s + t) (s^2 + t^2): no digits are lost where both are close.
@@ -308,20 +312,35 @@ class FixedNodes:
         self._kept: dict[float, Vector] = {}
 
     @cached_property
-    def shares(self) -> sparse.csr_matrix:
-        """Share of each node's heat that belongs to each group, by the area around the node, shape (g, d)."""
-        rows, columns, areas, before = [], [], [], 0
-        for form in self._forms:
-            width = form.owners.shape[1]
-            rows.append(np.repeat(before + form.group, width))
-            columns.append(np.searchsorted(self.nodes, form.owners.ravel()))
-            areas.append(np.repeat(form.area_m2, width))
-            before += len(form.groups)
-        if not rows:
+    def facet_shares(self) -> sparse.csr_matrix:
+        """Share of each node's heat that belongs to each triangle, by area, those of one effect after the other's."""
+        if not self._forms:
             return sparse.csr_matrix((0, 0))
-        column, area = np.concatenate(columns), np.concatenate(areas)
+        owners = np.concatenate([form.owners for form in self._forms])
+        column, width = np.searchsorted(self.nodes, owners.ravel()), owners.shape[1]
+        area = np.repeat(np.concatenate([form.area_m2 for form in self._forms]), width)
         share = area / np.bincount(column, area, len(self.nodes))[column]
-        return sparse.csr_matrix((share, (np.concatenate(rows), column)), (before, len(self.nodes)))
+        begins = width * np.arange(len(owners) + 1)
+        return sparse.csr_matrix((share, column, begins), (len(owners), len(self.nodes)))
+
+    @cached_property
+    def shares(self) -> sparse.csr_matrix:
+        """Share of each node's heat that belongs to each group, shape (g, d)."""
+        if not self._forms:
+            return sparse.csr_matrix((0, 0))
+        counts = np.cumsum([0, *(len(form.groups) for form in self._forms)])
+        group = np.concatenate([before + form.group for before, form in zip(counts, self._forms)])
+        ones = np.ones(len(group))
+        sums = sparse.csr_matrix((ones, (group, np.arange(len(group)))), (int(counts[-1]), len(group)))
+        return sparse.csr_matrix(sums @ self.facet_shares)
+
+    def facet_heat_w(self, kept_w: Vector) -> list[tuple[str, npt.NDArray[np.int64], Vector]]:
+        """Effect, triangles and the heat flow into the body through each, [W], from that at `nodes`, shape (d,)."""
+        heat_w, begin, found = self.facet_shares @ kept_w, 0, []
+        for form in self._forms:
+            found.append((form.effect, form.term.facets, heat_w[begin : begin + len(form.owners)]))
+            begin += len(form.owners)
+        return found
 
     @cached_property
     def free(self) -> npt.NDArray[np.int64]:
@@ -387,20 +406,18 @@ def effect_forms(
     space: Space,
     reference_c: float,
     assembled: Assembled | None = None,
-    *,
-    where: Selection | None = None,
 ) -> EffectForms:
     """Turn effects into terms and terms into forms; what acts nowhere has none.
 
-    `assembled` counts fixed temperatures, which are ready at once. Effects are looked for in the patches and regions of
-    `where`, if others than those that `space` adds up heat by. Raises `HeatError` if the mesh lacks one of them.
+    `assembled` counts fixed temperatures, which are ready at once. Raises `HeatError` if the mesh lacks a patch or
+    region of an effect.
     """
     convection: list[ConvectionForm] = []
     loads: list[FluxForm | SourceForm] = []
     radiation: list[RadiationForm] = []
     fixed: list[FixedForm] = []
     for label, effect in zip(effect_labels(problem), problem.effects):
-        for bare in effect.terms(space.selection if where is None else where):
+        for bare in effect.terms(space.selection):
             if not len(bare.tets if isinstance(bare, SourceTerm) else bare.facets):
                 continue
             term = replace(bare, effect=label)

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 DEFAULT_MEMORY_BYTES = 4 * 2**30  # Most memory that a solution may need, [bytes]
 
-_SAMPLE = 500  # Tetrahedra of the sample: more would take as long as a small body's solution
-_RUNS = 4  # Runs of successive tetrahedra in it
-_FACES = np.array([(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])  # Corners of the face opposite to each corner
-_RIGHT = 1e-9  # Cosine up to which an angle between faces counts as right
 _VECTORS = 15  # Vectors of the nodes that are alive at the peak, besides the temperatures that are kept
 _FRAGMENTS = 1.15  # What the allocator and what lives shortly add, by measurement
 _BYTES_PER_FACET = 400.0  # What an effect needs per boundary triangle
@@ -26,9 +19,9 @@ def peak_bytes(
 ) -> float:
     """Estimate the most memory that a computation takes besides the problem itself, [bytes].
 
-    The arrays that are alive together are counted; couplings on a sample, because lattices have none along edges
-    between right angles. Interpreter and libraries, which need about 150 MB, come on top, and so does multigrid, which
-    takes over where conjugate gradients are slow and needs about as much as the matrices.
+    The arrays that are alive together are counted, with a coupling along every edge: lattices, which have none along
+    edges between right angles, take about half. Interpreter and libraries, which need about 150 MB, come on top, and so
+    does multigrid, which takes over where conjugate gradients are slow and needs about as much as the matrices.
 
     Every refinement makes eight tetrahedra of each; `times` are those whose temperatures are kept, 1 for a steady
     state; of `adaptive` time steps, matrices of two lengths are kept.
@@ -45,8 +38,7 @@ def peak_bytes(
     if order == 2:
         matrices = _BYTES_PER_TET_OF_ORDER_2 * len(mesh.tets) + _BYTES_PER_UNKNOWN_OF_ORDER_2 * (nodes + edges)
         return finer * (matrices + states)
-    couplings = edges * _coupled_share(mesh)
-    matrix, half = 24.0 * couplings + 16.0 * nodes, 16.0 * couplings
+    matrix, half = 24.0 * edges + 16.0 * nodes, 16.0 * edges
     radiates = any(effect.kind == "radiation" for effect in problem.effects)
     # K, the matrix of a step and its scaled entries; what radiation adds; a second length and estimates again.
     matrices = 2.0 * matrix + half + radiates * 1.3 * matrix + 2.0 * adaptive * (matrix + half)
@@ -68,24 +60,3 @@ def check_memory(needed: float, allowed: float, remedy: str) -> None:
     if needed > allowed:
         expected, got = f"at most {describe_bytes(allowed)}", f"about {describe_bytes(needed)}"
         raise HeatError("memory of the heat problem", expected=expected, got=got, remedy=remedy)
-
-
-def _coupled_share(mesh: TetMesh) -> float:
-    """Share of the edges in some runs of tetrahedra that do not lie between faces at a right angle only."""
-    length, total = min(_SAMPLE // _RUNS, len(mesh.tets)), len(mesh.tets)
-    begins = np.linspace(0, total - length, _RUNS).astype(np.int64)
-    # Short runs may overlap where there are few tetrahedra: one that counts twice changes no share of coupled edges.
-    chosen = (begins[:, None] + np.arange(length)).ravel() if total > _SAMPLE else np.arange(total)
-    points, nodes = mesh.points_m, mesh.tets[chosen]
-    corners = points[nodes]
-    faces = corners[:, _FACES]
-    normals = np.cross(faces[:, :, 1] - faces[:, :, 0], faces[:, :, 2] - faces[:, :, 0])
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    first, second = np.triu_indices(4, 1)
-    # The angle that couples the ends of an edge is the one between the two faces opposite to them.
-    couples = np.abs(np.sum(normals[:, first] * normals[:, second], axis=-1)) > _RIGHT
-    low, high = np.minimum(nodes[:, first], nodes[:, second]), np.maximum(nodes[:, first], nodes[:, second])
-    keys = np.sort((2 * (low * len(points) + high) + couples).ravel())
-    # Of the same edge, one that couples its ends stands last.
-    last = np.append(keys[1:] >> 1 != keys[:-1] >> 1, True)
-    return float(np.mean(keys[last] & 1))

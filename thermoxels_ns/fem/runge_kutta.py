@@ -31,8 +31,6 @@ class Step:
     converged: bool
     status: str
     unbalanced_w: float = 0.0  # Heat that is unbalanced at all nodes in its stages, [W]
-    limited: bool = False  # Whether the maximum-principle limiter changed the equations
-    in_range: bool = True  # Whether all temperatures are in the range of the start and of the surroundings
 
 
 class RungeKutta:

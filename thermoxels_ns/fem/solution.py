@@ -64,6 +64,15 @@ class EffectHeat:
 
 
 @dataclass(frozen=True)
+class FacetHeat:
+    """Heat that one effect brings into the body through single boundary triangles, at one moment."""
+
+    effect: str
+    facets: npt.NDArray[np.int64]  # Numbers of the triangles, shape (k,)
+    heat_w: npt.NDArray[np.float64]  # Heat flow into the body through each, shape (k,), [W]
+
+
+@dataclass(frozen=True)
 class ErrorSize:
     """Errors of a solution."""
 
@@ -105,8 +114,13 @@ class HeatSolution:
     steps: int = 0
     step_lengths_s: tuple[npt.NDArray[np.float64], ...] = ()  # Lengths of the steps in each interval, [s]
     time_error_k: float = float("nan")
-    """Estimated largest error of the steps at any temperature, their estimates added up, [K]; NaN for fixed steps."""
+    """Estimated largest error of the steps at any temperature, [K]: of adaptive ones their estimates added up, of equal
+    ones by steps of twice the length, if asked for; else NaN."""
     unbalanced_w: float = 0.0  # Most heat that a step left unbalanced at all nodes, round-off included, [W]
+    overshoot_k: float = 0.0
+    """How far any temperature left the range of the start and of the surroundings, [K]; 0 up to 0.01 K."""
+    last_facet_heat: tuple[FacetHeat, ...] = ()
+    """Heat flow of each effect through boundary triangles at the end; fixed nodes count as if they stored nothing."""
     assembled: Assembled = field(default_factory=Assembled)
 
 
@@ -128,6 +142,8 @@ class SteadySolution:
     empty with linear tetrahedra."""
     unbalanced_w: float = 0.0
     """Heat that is unbalanced at all nodes, round-off included, [W]; heat flows are uncertain by no more."""
+    overshoot_k: float = 0.0  # How far any temperature is out of the range of the surroundings, [K]; 0 up to 0.01 K
+    last_facet_heat: tuple[FacetHeat, ...] = ()  # Heat flow of each effect through boundary triangles
     error: ErrorSize | None = None
     """Estimated errors of linear tetrahedra on this mesh, see `p1_error`; None if there is no estimate."""
 

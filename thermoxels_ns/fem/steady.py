@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.implicit_equation import ImplicitEquation, ImplicitSolution
-from thermoxels_ns.fem.limiter import LEVEL_ROUND_OFF, MOST_SLACK, RANGE_ROUND_OFF, PositiveOffDiagonals, solve_in_range
-from thermoxels_ns.fem.p1_error import p1_error
+from thermoxels_ns.fem.error_estimate import p1_error
+from thermoxels_ns.fem.implicit_equation import ImplicitEquation
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
 from thermoxels_ns.fem.system import HeatSystem
 
-_ERROR_OVER_TOLERANCE = 1e3
-"""Error of a temperature that the linear solver's tolerance may leave, as a share of the range over the tolerance."""
+Vector = npt.NDArray[np.float64]
+
+OVERSHOOT_K = 0.01  # How far out of its range a temperature may be without a word, [K]
 
 
 def solve_steady(
@@ -31,9 +31,8 @@ def solve_steady(
 ) -> SteadySolution:
     """Find the temperatures at which the effects of a problem balance, div(k grad T) + s = 0.
 
-    With the defaults no temperature leaves the range of the surroundings, unless a flux or source drives it out, on any
-    mesh: the limiter leaves out positive off-diagonals where obtuse angles would let one leave. If other choices let
-    one leave, the status says so.
+    With linear tetrahedra without obtuse angles no temperature leaves the range of the surroundings, unless a flux or
+    source drives it out. Where one does leave it, the status says by how much.
 
     Args:
         problem: Body, materials and effects. Its initial temperatures are where iterations start.
@@ -52,8 +51,8 @@ def solve_steady(
     """
     system = HeatSystem(problem, lumped=order == 1, lumped_boundary=lumped_boundary, order=order)
     check_held(system, time_s)
-    state = _limited_state(system, time_s, relative_tolerance)
-    solution, given, system = state.solution, system, state.system
+    equation = ImplicitEquation(system, time_s, np.inf, relative_tolerance=relative_tolerance)
+    solution = equation.solve(system.start_k, time_s)
     failure = too_cold(system, solution.relative_k)
     if not solution.converged:
         failure = f"No steady state was found. {solution.status} Check the mesh's quality and the effects."
@@ -63,95 +62,46 @@ def solve_steady(
     group_heat = heat_of_groups_w(system, relative_k, time_s)
     flows_w = 0.0 if system.is_still(relative_k, time_s) else max(solution.flows_w, 0.5 * np.abs(group_heat).sum())
     temperature_c = relative_k + system.reference_c
+    overshoot_k, overshoot = _overshoot(system, relative_k, time_s)
     found = SteadySolution(
         temperature_c=temperature_c[:num_mesh_nodes],
         effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
         energy_residual=0.5 * abs(float(group_heat.sum())) / flows_w if flows_w > 0.0 else 0.0,
-        status=failure or f"The steady state was found. {solution.status}{state.describe()}",
+        status=failure or f"The steady state was found. {solution.status}{overshoot}",
         converged=not failure,
         iterations=solution.iterations,
         newton_iterations=solution.newton_iterations,
         assembled=system.assembled,
         edge_temperature_c=temperature_c[num_mesh_nodes:],
         unbalanced_w=solution.unbalanced_w,
+        overshoot_k=overshoot_k,
+        last_facet_heat=system.facet_heat(relative_k, time_s),
     )
-    estimated = order == 1 and given.lumped and not failure
-    return replace(found, error=p1_error(given, found, time_s)) if estimated else found
+    estimated = order == 1 and system.lumped and not failure
+    return replace(found, error=p1_error(system, found, time_s)) if estimated else found
 
 
-@dataclass(frozen=True)
-class _LimitedState:
-    """A steady state, the equations that it fulfils, positive off-diagonals left out and nodes outside, counted."""
-
-    solution: ImplicitSolution  # Temperatures and how they were found; iterations of all repetitions count
-    system: HeatSystem
-    left_out: int
-    outside: int
-    outside_k: float  # By how much at most, [K]
-
-    def describe(self) -> str:
-        """Say what was done and what was not, or nothing."""
-        sentence = ""
-        if self.left_out:
-            sentence += (
-                " Obtuse angles would have let temperatures leave the range of the surroundings; "
-                f"{self.left_out} positive off-diagonals were left out."
-            )
-        if self.outside:
-            sentence += (
-                f" The temperature of {self.outside} of {self.system.num_nodes} nodes is up to {self.outside_k:.2g} K "
-                "out of the range of the surroundings"
-            )
-            if self.system.lumped:
-                sentence += ", by the tolerance of the linear solver."
-            elif self.system.num_nodes > len(self.system.problem.mesh.points_m):
-                sentence += ", which quadratic tetrahedra may do where they do not resolve the temperature."
-            else:
-                sentence += ", which convection that is not lumped may do."
-        return sentence
-
-
-def _limited_state(system: HeatSystem, time_s: float, relative_tolerance: float) -> _LimitedState:
-    """Find a steady state in the range of all given and surrounding temperatures; fluxes and sources open its sides."""
-
-    def solve(equations: HeatSystem, before: ImplicitSolution | None) -> ImplicitSolution:
-        # Radiation is found soonest from where the temperatures are already.
-        start_k = before.relative_k if before is not None and system.nonlinear else system.start_k
-        equation = ImplicitEquation(equations, time_s, np.inf, relative_tolerance=relative_tolerance)
-        return equation.solve(start_k, time_s)
-
-    solution, solved, left_out = solve(system, None), system, 0
-    if not solution.converged:
-        return _LimitedState(solution, system, 0, 0, 0.0)
+def _overshoot(system: HeatSystem, relative_k: Vector, time_s: float) -> tuple[float, str]:
+    """By how much temperatures are out of the range of the surroundings, [K], and a sentence on it, or nothing."""
     low, high = system.surroundings_k(time_s)  # a steady state does not know its start
-    slack_k = _slack_k(system, low, high, relative_tolerance)
-    least, most = low - slack_k, high + slack_k
-    if system.lumped and (solution.relative_k.min() < least or solution.relative_k.max() > most):
-        entries = PositiveOffDiagonals(system)
-        solution, limited = solve_in_range(entries, solution, least, most, solve)
-        solved, left_out = limited or system, entries.count
-    relative_k = solution.relative_k
-    outside = int(np.count_nonzero((relative_k < least) | (relative_k > most)))
-    outside_k = max(low - float(relative_k.min()), float(relative_k.max()) - high) if outside else 0.0
-    return _LimitedState(solution, solved, left_out, outside, outside_k)
+    beyond_k = np.maximum(low - relative_k, relative_k - high)
+    outside = int(np.count_nonzero(beyond_k > OVERSHOOT_K))
+    if not outside:
+        return 0.0, ""
+    most_k = float(beyond_k.max())
+    return most_k, (
+        f" The temperature of {outside} of {system.num_nodes} nodes is up to {most_k:.2g} K out of the range of the "
+        "surroundings: the mesh does not resolve a jump there."
+    )
 
 
-def _slack_k(system: HeatSystem, low: float, high: float, relative_tolerance: float) -> float:
-    """How far out of range round-off and the linear solver, whose error is a share of the change, may put it, [K]."""
-    start_k = system.start_k
-    ends = [end for end in (low, high, float(start_k.min()), float(start_k.max())) if np.isfinite(end)]
-    level_k = max(abs(end) for end in ends) + abs(system.reference_c + ZERO_CELSIUS_K)
-    share = min(max(_ERROR_OVER_TOLERANCE * relative_tolerance, RANGE_ROUND_OFF), MOST_SLACK)
-    return max(share * (max(ends) - min(ends)), LEVEL_ROUND_OFF * level_k)
-
-
-def heat_of_groups_w(system: HeatSystem, relative_k: np.ndarray, time_s: float) -> np.ndarray:
+def heat_of_groups_w(system: HeatSystem, relative_k: Vector, time_s: float) -> Vector:
     """Heat flow into the body of each group in a steady state, fixed nodes included, shape (g,), [W]."""
     kept_w = -system.net_heat_at_fixed(relative_k, time_s)
     return np.concatenate([system.group_heat_w(relative_k, time_s), system.fixed.shares @ kept_w])
 
 
-def too_cold(system: HeatSystem, relative_k: np.ndarray) -> str:
+def too_cold(system: HeatSystem, relative_k: Vector) -> str:
     """Say that temperatures are below absolute zero, or nothing."""
     coldest_k = float(relative_k.min()) + system.reference_c + ZERO_CELSIUS_K
     if coldest_k >= -1e-6:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
-
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
@@ -14,7 +12,7 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.forms import ConvectionForm, FixedNodes, RadiationForm, SourceForm, at_time, effect_forms
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.solution import Assembled
+from thermoxels_ns.fem.solution import Assembled, FacetHeat
 from thermoxels_ns.fem.space import Space
 
 Vector = npt.NDArray[np.float64]
@@ -135,12 +133,6 @@ class HeatSystem:
     def lumped(self) -> bool:
         """Whether masses, convection and radiation are all on the diagonal."""
         return self._space.lumped and self._space.lumped_boundary
-
-    def with_stiffness(self, stiffness: sparse.csr_matrix) -> HeatSystem:
-        """Copy the system with another K between the same nodes; all else is shared."""
-        other = copy(self)
-        other._stiffness, other._fixed_rows, other._kept_matrix = stiffness, None, None
-        return other
 
     @property
     def start_k(self) -> Vector:
@@ -272,6 +264,15 @@ class HeatSystem:
         """Heat flow into the body of each group but those of fixed nodes, [W]."""
         forms = (*self._convection, *self._loads, *self._radiation)
         return np.concatenate([np.zeros(0), *(form.group_heat_w(relative_k, time_s) for form in forms)])
+
+    def facet_heat(self, relative_k: Vector, time_s: float) -> tuple[FacetHeat, ...]:
+        """Heat flow of each effect but sources through boundary triangles, as if fixed nodes stored nothing."""
+        forms = [
+            form for form in (*self._convection, *self._loads, *self._radiation) if not isinstance(form, SourceForm)
+        ]
+        found = [FacetHeat(form.effect, form.facets, form.facet_heat_w(relative_k, time_s)) for form in forms]
+        kept_w = -self.net_heat_at_fixed(relative_k, time_s)
+        return (*found, *(FacetHeat(*part) for part in self.fixed.facet_heat_w(kept_w)))
 
     def exchanging_pieces(self, time_s: float) -> npt.NDArray[np.bool_]:
         """Mark the pieces whose temperature convection, radiation or fixed nodes hold, shape (p,)."""

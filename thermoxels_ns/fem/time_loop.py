@@ -10,12 +10,11 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin
-from thermoxels_ns.fem.limiter import AllowedRange, Limiter, is_in_range
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.runge_kutta import RungeKutta, Step
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
-from thermoxels_ns.fem.steady import too_cold
+from thermoxels_ns.fem.steady import OVERSHOOT_K, too_cold
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
@@ -26,8 +25,6 @@ MAX_STATE_BYTES = 4 * 2**30
 STEP_SHARE = 0.1
 """Share of the tolerance that one step may use. Conduction forgets errors, so that those of many steps do not add up
 to their sum."""
-RANGE_SHARE = 1e-3
-"""Share of the tolerance by which a temperature may leave its range before a step is repeated with backward Euler."""
 _SAFETY = 0.9  # Share of the longest step that meets the tolerance, by its estimate, that the next one is made
 _SHRINK, _GROW = 0.2, 5.0
 """Least and most that one step changes the length of the next."""
@@ -47,23 +44,26 @@ def solve_heat(
     lumped_boundary: bool = True,
     relative_tolerance: float = 1e-12,
     allow_unconverged: bool = False,
+    estimate_steps: bool = False,
     progress: Callable[[float, int], None] | None = None,
 ) -> HeatSolution:
     """Follow the temperatures of a body through time.
 
-    With the defaults no temperature leaves the range of the start and of the surroundings, unless a flux or source
-    drives it out, at any step length and on any mesh: where obtuse angles would let one leave, see `Limiter`. If other
-    choices let one leave, the status says so.
+    With backward Euler, lumped masses and tetrahedra without obtuse angles no temperature leaves the range of the start
+    and of the surroundings at any step length, unless a flux or source drives it out. Where one does leave it, the
+    status says by how much.
 
     Args:
         problem: Body, materials, initial temperatures and effects; without effects the boundary is insulated.
         time: Equal steps, steps as long as a tolerance allows, or steps of given lengths.
-        scheme: The scheme in time; None: backward Euler for equal steps, otherwise SDIRK2 (with backward Euler where it
-            would overshoot). Adaptive steps need a scheme with an estimate.
+        scheme: The scheme in time; None: backward Euler for equal steps, otherwise SDIRK2. Adaptive steps need a scheme
+            with an estimate.
         lumped: Lump the mass matrix, which keeps temperatures within their range at any step length.
         lumped_boundary: Evaluate convection and radiation at the nodes, for the same reason.
         relative_tolerance: Of the linear solver in each step.
         allow_unconverged: Return what was computed, with the reason in `status`, instead of raising.
+        estimate_steps: Tell the error of equal steps too (`time_error_k`), by steps of twice the length beside them,
+            which takes about half as long again. Adaptive steps tell it anyway.
         progress: Called after every step with the share of the duration that is done and the number of steps.
 
     Raises:
@@ -83,18 +83,23 @@ def solve_heat(
     if scheme is None:
         scheme = BACKWARD_EULER if isinstance(time, TimeSteps) else SDIRK2
     loop = _TimeLoop(system, scheme, time, relative_tolerance)
+    doubled = _DoubledSteps(loop.runge_kutta, states[0]) if estimate_steps and isinstance(time, TimeSteps) else None
     failure = ""
     for taken in loop.steps(states[0]):
         failure = taken.failure or too_cold(system, taken.step.relative_k)
         if failure:
             break
         balance.add(taken.step, taken.step_s, ends_interval=taken.ends_interval)
+        if doubled is not None:
+            doubled.follow(taken.step.relative_k, taken.step_s)
         if progress is not None:
             progress(balance.followed_s / time.duration_s, balance.steps)
     if failure and not allow_unconverged:
         raise HeatError(failure)
-    status = failure or balance.success(loop.describe()) + _skips(problem, time)
-    return balance.close(status, not failure, adaptive=adaptive)
+    said = "" if doubled is None else doubled.describe()
+    status = failure or balance.success(loop.describe()) + said + _skips(problem, time)
+    solution = balance.close(status, not failure, adaptive=adaptive)
+    return solution if doubled is None else replace(solution, time_error_k=doubled.most_k)
 
 
 @dataclass(frozen=True)
@@ -107,24 +112,50 @@ class _Taken:
     failure: str = ""  # Why the computation ends here; empty if the step was accepted
 
 
-class _TimeLoop:
-    """Takes one step after the other, each with `RungeKutta` or the limiter.
+class _DoubledSteps:
+    """Follows equal steps with steps of twice their length, to tell their error (Richardson 1911).
 
-    Equal steps of backward Euler are limited to the range that temperatures may have. An adaptive or given step that
-    leaves the range is taken with the limiter's backward Euler instead; the difference between both schemes is then the
-    error estimate. What the limiter changes is the mesh's error and no part of the step's. No adaptive step is longer
-    than effects can be followed by.
+    Steps of half the length leave 1 / 2^p of the error of a scheme of order p, so that both differ by 2^p - 1 of the
+    error of the shorter ones.
     """
+
+    def __init__(self, runge_kutta: RungeKutta, start_k: Vector) -> None:
+        self._runge_kutta, self._state_k = runge_kutta, start_k.copy()
+        self._steps, self._now_s, self._last_k = 0, 0.0, float("nan")
+        self.most_k = float("nan")
+        """Largest error of the shorter steps at any temperature so far, [K]; NaN before the second one."""
+
+    def follow(self, relative_k: Vector, step_s: float) -> None:
+        """Compare with the temperatures after the next of the equal steps, shape (n,), [K]; every second one counts."""
+        self._steps += 1
+        if self._steps % 2:
+            return
+        step = self._runge_kutta.step(self._state_k, self._now_s, 2.0 * step_s)
+        self._state_k, self._now_s = step.relative_k, self._now_s + 2.0 * step_s
+        if step.converged:
+            self._last_k = float(np.max(np.abs(relative_k - step.relative_k))) / (
+                2.0**self._runge_kutta.scheme.order - 1
+            )
+            self.most_k = float(np.fmax(self.most_k, self._last_k))
+
+    def describe(self) -> str:
+        """Say it in a sentence, or nothing."""
+        if not np.isfinite(self.most_k):
+            return " The error of the steps is not estimated: it takes two of them."
+        return (
+            f" The steps make an error of about {self.most_k:.2g} K at most and {self._last_k:.2g} K at the end (from "
+            "steps of twice the length)."
+        )
+
+
+class _TimeLoop:
+    """Takes one step after the other; no adaptive step is longer than effects can be followed by."""
 
     def __init__(self, system: HeatSystem, scheme: Scheme, time: Steps, relative_tolerance: float) -> None:
         self._system, self._scheme, self._time = system, scheme, time
-        self._runge_kutta = RungeKutta(system, scheme, relative_tolerance=relative_tolerance)
-        self._limiter = Limiter(system, relative_tolerance=relative_tolerance)
-        self._range = AllowedRange(system)
-        tolerance_k = 0.0 if isinstance(time, TimeSteps) else time.tolerance_k
-        self._slack_k = RANGE_SHARE * tolerance_k
-        self._allowed_k = STEP_SHARE * tolerance_k if isinstance(time, AdaptiveSteps) else np.inf
-        self._repeated = self._replaced = 0
+        self.runge_kutta = RungeKutta(system, scheme, relative_tolerance=relative_tolerance)
+        self._allowed_k = STEP_SHARE * time.tolerance_k if isinstance(time, AdaptiveSteps) else np.inf
+        self._repeated = 0
 
     def steps(self, start_k: Vector) -> Iterator[_Taken]:
         """Take all steps; the last one may be a failure."""
@@ -133,14 +164,8 @@ class _TimeLoop:
         return self._given(start_k, self._time)
 
     def describe(self) -> str:
-        """Count the steps that were repeated or replaced, in a sentence, or nothing."""
-        sentence = ""
-        if self._repeated:
-            sentence += f" {self._repeated} more were repeated with a shorter length."
-        if self._replaced:
-            why = f"because {self._scheme.name} would have overshot"
-            sentence += f" {self._replaced} were taken with backward Euler {why}."
-        return sentence
+        """Count the steps that were repeated, in a sentence, or nothing."""
+        return f" {self._repeated} more were repeated with a shorter length." if self._repeated else ""
 
     def _given(self, start_k: Vector, time: TimeSteps | GivenSteps) -> Iterator[_Taken]:
         """Take steps of known lengths."""
@@ -152,21 +177,13 @@ class _TimeLoop:
         for now_s, lengths_s in zip(time.times_s.tolist(), intervals):
             for number, step_s in enumerate(lengths_s, start=1):
                 count += 1
-                step = self._fixed_step(relative_k, now_s, step_s)
+                step = self.runge_kutta.step(relative_k, now_s, step_s)
                 failure = ""
                 if not step.converged:
                     remedy = "Use shorter steps or check the mesh's quality."
                     failure = f"Step {count} of {total} failed. {step.status} {remedy}"
                 yield _Taken(step, step_s, number == len(lengths_s), failure)
                 relative_k, now_s = step.relative_k, now_s + step_s
-
-    def _fixed_step(self, start_k: Vector, now_s: float, step_s: float) -> Step:
-        if isinstance(self._time, GivenSteps):
-            return self._safe_step(start_k, now_s, step_s)[0]
-        if self._scheme is BACKWARD_EULER:
-            return self._limiter.step(start_k, now_s, step_s)[0]
-        step = self._runge_kutta.step(start_k, now_s, step_s)
-        return replace(step, in_range=step.converged and self._in_range(step, start_k, now_s, step_s))
 
     def _adaptive(self, start_k: Vector, time: AdaptiveSteps) -> Iterator[_Taken]:
         """Take steps as long as their estimated errors allow."""
@@ -175,8 +192,8 @@ class _TimeLoop:
             while now_s < end_s:
                 left_s = float(end_s) - now_s
                 step_s = _fitted(min(wished_s, self._system.problem.resolution_s), left_s)
-                step, order = self._safe_step(relative_k, now_s, step_s)
-                factor = self._factor(step, order)
+                step = self.runge_kutta.step(relative_k, now_s, step_s, estimate=True)
+                factor = self._factor(step)
                 if not step.converged or step.error_k > self._allowed_k:
                     self._repeated += 1
                     wished_s = step_s * min(factor, _SAFETY)
@@ -200,33 +217,14 @@ class _TimeLoop:
             return interval_s
         return float(np.clip(time.tolerance_k / fastest, _SHORTEST * time.duration_s, interval_s))
 
-    def _safe_step(self, start_k: Vector, now_s: float, step_s: float) -> tuple[Step, int]:
-        """Take a step, with backward Euler if it leaves the range; the second value is the order of the scheme."""
-        plain = self._runge_kutta.step(start_k, now_s, step_s, estimate=isinstance(self._time, AdaptiveSteps))
-        order = self._scheme.order
-        if not plain.converged or plain.error_k > self._allowed_k or self._in_range(plain, start_k, now_s, step_s):
-            return plain, order
-        limited, unlimited_k = self._limiter.step(start_k, now_s, step_s, self._slack_k)
-        if not limited.in_range:
-            return replace(plain, in_range=False), order
-        error_k = float(np.max(np.abs(unlimited_k - plain.relative_k)))
-        self._replaced += error_k <= self._allowed_k
-        iterations = limited.iterations + plain.iterations
-        newton = limited.newton_iterations + plain.newton_iterations
-        limited = replace(limited, error_k=error_k, iterations=iterations, newton_iterations=newton)
-        return limited, BACKWARD_EULER.order
-
-    def _in_range(self, step: Step, start_k: Vector, now_s: float, step_s: float) -> bool:
-        times = (now_s, *(now_s + node * step_s for node in self._scheme.nodes))
-        return is_in_range(step, *self._range.at(start_k, times, self._slack_k))
-
-    def _factor(self, step: Step, order: int) -> float:
+    def _factor(self, step: Step) -> float:
         """How much longer the next step may be."""
         if not step.converged or not np.isfinite(step.error_k):
             return _SHRINK
         if step.error_k == 0.0:
             return _GROW
-        return float(np.clip(_SAFETY * (self._allowed_k / step.error_k) ** (1.0 / (order + 1)), _SHRINK, _GROW))
+        longest = (self._allowed_k / step.error_k) ** (1.0 / (self._scheme.order + 1))
+        return float(np.clip(_SAFETY * longest, _SHRINK, _GROW))
 
     def _failure(self, step: Step, now_s: float, time: AdaptiveSteps) -> str:
         if not step.converged:
@@ -251,7 +249,8 @@ class HeatBalance:
         self._iterations = np.zeros((len(times_s) - 1, 2), dtype=np.int64)
         self._error_k = 0.0
         self._lengths_s: list[list[float]] = [[] for _ in times_s[1:]]
-        self._limited = self._out_of_range = 0
+        self._range_k = float(states_k[0].min()), float(states_k[0].max())
+        self._overshoot_k, self._overshooting = 0.0, 0
         self._unbalanced_w = 0.0
 
     @property
@@ -262,7 +261,6 @@ class HeatBalance:
     def add(self, step: Step, step_s: float, *, ends_interval: bool) -> None:
         """Count a step of a length, [s]; at the end of an interval its temperatures are kept."""
         row = self._done
-        self.followed_s += step_s
         self._lengths_s[row].append(step_s)
         self._heat_j[row] += step_s * step.group_heat_w
         self._iterations[row] += step.iterations, step.newton_iterations
@@ -271,24 +269,27 @@ class HeatBalance:
         self._steps += 1
         self._exchanged_j[row] += step_s * float(np.abs(step.group_heat_w).sum())
         self._unbalanced_w = max(self._unbalanced_w, step.unbalanced_w)
-        self._limited += step.limited
-        self._out_of_range += not step.in_range
+        overshoot_k = self._overshoot_of(step.relative_k, step_s)
+        self._overshooting += overshoot_k > OVERSHOOT_K
+        self._overshoot_k = max(self._overshoot_k, overshoot_k)
+        self.followed_s += step_s
         if ends_interval:
             self._done += 1
             self._states[self._done] = step.relative_k
 
+    def _overshoot_of(self, relative_k: Vector, step_s: float) -> float:
+        """How far temperatures after a step are out of the range of the start and of all surroundings so far, [K]."""
+        times = self.followed_s, self.followed_s + step_s
+        self._range_k = low, high = self._system.allowed_range_k(self._range_k, times)
+        return max(low - float(relative_k.min()), float(relative_k.max()) - high)
+
     def success(self, of_steps: str) -> str:
         """Say that all went well, and how; `of_steps` is what is to be said about other steps."""
         sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most.{of_steps}"
-        if self._limited:
+        if self._overshooting:
             sentence += (
-                f" In {self._limited}, obtuse angles would have let a temperature leave its range; positive "
-                "off-diagonals were left out there."
-            )
-        if self._out_of_range:
-            sentence += (
-                f" In {self._out_of_range} a temperature left its range, which schemes other than backward Euler, "
-                "consistent masses and convection integrated over triangles may do."
+                f" In {self._overshooting} a temperature left the range of the start and of the surroundings, by up to "
+                f"{self._overshoot_k:.2g} K: the mesh or the steps do not resolve a jump."
             )
         return sentence
 
@@ -308,7 +309,7 @@ class HeatBalance:
         spread = float(np.sum(mass * np.abs(states_k[0] - mean)))
         scale = max(float(content[0]), exchanged)
         spread_scale = max(spread + exchanged, _NOTHING * float(content[0]))
-        lengths = np.diff(times_s)
+        lengths, last_facet_heat = np.diff(times_s), system.facet_heat(states_k[-1], float(times_s[-1]))
         states_k += system.reference_c
         kinds = [effect.kind for effect in system.problem.effects]
         return HeatSolution(
@@ -328,6 +329,8 @@ class HeatBalance:
             step_lengths_s=tuple(np.array(lengths) for lengths in self._lengths_s[:done]),
             time_error_k=self._error_k if adaptive else float("nan"),
             unbalanced_w=self._unbalanced_w,
+            last_facet_heat=last_facet_heat,
+            overshoot_k=self._overshoot_k if self._overshooting else 0.0,
             assembled=system.assembled,
         )
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import TypeAlias
 
 import numpy as np
 
@@ -128,7 +129,9 @@ def solve_to_tolerance(
     A steady state is solved with linear tetrahedra on the given mesh first, whose errors `p1_error` estimates from that
     solution alone. If they are too large, quadratic ones follow: the difference of both, and the ratio between the
     recovered errors of their fluxes, tell the errors of both. If these are too large still, quadratic tetrahedra on
-    meshes of half the size follow, again and again. What does not fit into the memory ends this with the best so far.
+    meshes of half the size follow, again and again. Where the solver fails on quadratic tetrahedra, as it may on very
+    flat ones, linear ones of half the size follow instead, each with its own estimate. What does not fit into memory
+    ends this with the best so far.
 
     In time tetrahedra stay linear, since the mass of quadratic ones cannot be lumped. Three solutions tell the errors
     of the mesh and of the steps: one on the given mesh, one with all steps halved, one on a mesh of half the size. From
@@ -167,7 +170,7 @@ class _Run:
     def __init__(
         self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable[[str], None]
     ) -> None:
-        self.given, self.tolerance, self._memory_bytes, self._log = problem, tolerance, memory_bytes, log
+        self.given, self.tolerance, self._memory_bytes, self.say = problem, tolerance, memory_bytes, log
         self._solved: list[tuple[Level, HeatProblem, SteadySolution | HeatSolution]] = []
         self._begin_s = time.perf_counter()
 
@@ -193,7 +196,7 @@ class _Run:
         num_nodes = solution.temperature_c.shape[-1] + edges
         level = Level(2 if edges else 1, refinements, steps_k, num_nodes, error, seconds)
         self._solved.append((level, problem, solution))
-        self._log(level.describe())
+        self.say(level.describe())
 
     def forget(self) -> None:
         """Take back what is estimated better by now."""
@@ -205,9 +208,9 @@ class _Run:
         where = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
         what = f"P{order} on {where} needs about {describe_bytes(needed)}"
         if needed <= self._memory_bytes:
-            self._log(f"{what} at most.")
+            self.say(f"{what} at most.")
             return ""
-        return f"{what}, more than the {describe_bytes(self._memory_bytes)} allowed"
+        return f"{what}, more than the {describe_bytes(self._memory_bytes)} allowed (--memory-gb)"
 
     def close(self, failure: str, allow_unmet: bool) -> ToleratedSolution:
         """Choose the smallest solution whose error is allowed, or else the best; `failure` says why none is.
@@ -230,15 +233,18 @@ class _Run:
         status = f"{'Not within' if failure else 'Within'} {allowed}: {last.describe()}, {seconds:.2f} s in all."
         if failure:
             status += (
-                f" {failure}. Allow more memory (--memory-gb) or a larger error, or take what there is (--allow-unmet "
-                "True); the worst temperature is often at a sharp edge."
+                f" {failure.rstrip('.')}. Allow a larger error, or take what there is (--allow-unmet True); the worst "
+                "temperature is often at a sharp edge."
             )
             if last.step_tolerance_k is None and self.tolerance.heat_flow is None:
                 status += " Heat flows are met far sooner: ask for them instead (--flow-tolerance 0.01)."
         if failure and not allow_unmet:
             raise HeatError(status)
-        self._log(status)
+        self.say(status)
         return ToleratedSolution(chosen[2], chosen[1], last, not failure, status, seconds, levels)
+
+
+SteadySolver: TypeAlias = Callable[[HeatProblem, int], tuple[SteadySolution, float]]  # Gives the seconds it took too
 
 
 def _solve_steady(run: _Run, time_s: float) -> str:
@@ -259,10 +265,14 @@ def _solve_steady(run: _Run, time_s: float) -> str:
     failure = "" if run.excess <= 1.0 else run.lacks_memory(2, 0)
     if run.excess <= 1.0 or failure:
         return failure
-    before_w_k = recovered_error_w_k(problem, before)
+    linear, before_w_k = before, recovered_error_w_k(problem, before)
     problem = replace(problem, initial_temperature_c=before.temperature_c)
     while True:
-        solution, seconds = solve(problem, 2)
+        try:
+            solution, seconds = solve(problem, 2)
+        except HeatError as refusal:
+            run.say(f"P2 failed: {refusal} Linear tetrahedra of half the size follow.")
+            return _halve_linear(run, solve, linear)
         after_w_k = recovered_error_w_k(problem, solution)
         apart = difference_between(before, solution, len(run.given.mesh.points_m))
         decrease = apart.temperature_k / apart_k if apart_k > 0.0 else None
@@ -285,6 +295,29 @@ def _solve_steady(run: _Run, time_s: float) -> str:
         start_c = np.concatenate([solution.temperature_c, solution.edge_temperature_c])
         problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
         before, before_w_k, apart_k = solution, after_w_k, apart.temperature_k
+
+
+def _halve_linear(run: _Run, solve: SteadySolver, solution: SteadySolution) -> str:
+    """Halve the mesh size of linear tetrahedra until their own estimate is allowed; returns what `_solve_steady` does.
+
+    `solution` is that on the given mesh.
+    """
+    problem, refinements = run.given, 0
+    while True:
+        refinements += 1
+        failure = run.lacks_memory(1, refinements)
+        if failure:
+            return failure
+        start_c = refined_values(problem.mesh, solution.temperature_c)
+        problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
+        try:
+            solution, seconds = solve(problem, 1)
+        except HeatError as refusal:
+            return str(refusal)
+        if solution.error is not None:
+            run.add(problem, solution, seconds, solution.error, refinements)
+        if run.excess <= 1.0:
+            return ""
 
 
 class _Refinable:

@@ -11,6 +11,8 @@ from thermoxels_ns.fem.terms import ConvectionTerm, Effect, FixedTerm, FluxTerm,
 
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8  # Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]
 
+HOTTEST_C = 10_000.0
+"""Highest temperature of surroundings, [degrees Celsius]: the surface of the sun has 5500. Above it a unit is wrong."""
 _ABSOLUTE_ZERO_C = -ZERO_CELSIUS_K
 
 
@@ -33,7 +35,7 @@ class FixedTemperature(SurfaceEffect):
     temperature_c: Quantity  # Temperature of the surface, [degrees Celsius], at least -273.15. Asked at the nodes
 
     kind = "fixed temperature"
-    bounds = {"temperature_c": Bounds("temperature_c", "degrees Celsius", _ABSOLUTE_ZERO_C)}
+    bounds = {"temperature_c": Bounds("temperature_c", "degrees Celsius", _ABSOLUTE_ZERO_C, HOTTEST_C)}
 
     def terms(self, selection: Selection) -> tuple[Term, ...]:
         """T = T_fixed at the nodes of the patches."""
@@ -64,7 +66,7 @@ class Convection(SurfaceEffect):
     kind = "convection"
     bounds = {
         "coefficient_w_m2k": Bounds("coefficient_w_m2k", "W/(m2 K)", 0.0),
-        "air_c": Bounds("air_c", "degrees Celsius", _ABSOLUTE_ZERO_C),
+        "air_c": Bounds("air_c", "degrees Celsius", _ABSOLUTE_ZERO_C, HOTTEST_C),
     }
 
     def terms(self, selection: Selection) -> tuple[Term, ...]:
@@ -86,7 +88,7 @@ class Radiation(SurfaceEffect):
     kind = "radiation"
     bounds = {
         "emissivity": Bounds("emissivity", "1", 0.0, 1.0),
-        "surroundings_c": Bounds("surroundings_c", "degrees Celsius", _ABSOLUTE_ZERO_C),
+        "surroundings_c": Bounds("surroundings_c", "degrees Celsius", _ABSOLUTE_ZERO_C, HOTTEST_C),
         "stefan_boltzmann_w_m2k4": Bounds(
             "stefan_boltzmann_w_m2k4", "W/(m2 K4)", 0.0, above_low=True, varies=False, remedy="Give 5.670374419e-8."
         ),
@@ -127,7 +129,7 @@ class GroundContact(SurfaceEffect):
     kind = "ground contact"
     bounds = {
         "resistance_m2k_w": Bounds("resistance_m2k_w", "m2 K/W", 0.0, above_low=True, varies=False),
-        "ground_c": Bounds("ground_c", "degrees Celsius", _ABSOLUTE_ZERO_C),
+        "ground_c": Bounds("ground_c", "degrees Celsius", _ABSOLUTE_ZERO_C, HOTTEST_C),
     }
 
     def terms(self, selection: Selection) -> tuple[Term, ...]:

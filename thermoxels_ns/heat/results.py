@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -10,9 +9,6 @@ from fnmatch import fnmatchcase
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import check_shape
-from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.forms import FixedNodes, SourceForm, effect_forms
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import (
@@ -20,11 +16,8 @@ from thermoxels_ns.fem.solution import (
     Solution,
     SolutionNodes,
     SteadySolution,
-    heat_by_effect,
     solution_nodes,
 )
-from thermoxels_ns.fem.space import Space
-from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.scene import HeatScene
@@ -112,6 +105,8 @@ class HeatResults:
     effects: tuple[EffectResult, ...]
     regions: tuple[RegionResult, ...]
     balance: EnergyBalance
+    overshoot_k: float
+    """How far any temperature left the range of what surrounds the body, and of its start, [K]; 0 up to 0.01 K."""
     coldest: Spot
     hottest: Spot
 
@@ -128,16 +123,10 @@ def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes 
         effects=_effects(problem, solution, selection, lengths),
         regions=_regions(problem, solution, selection, nodes),
         balance=_balance(solution, lengths),
+        overshoot_k=solution.overshoot_k,
         coldest=_first_spot(selection, nodes, int(states.argmin())),
         hottest=_first_spot(selection, nodes, int(states.argmax())),
     )
-
-
-def end_state_c(solution: Solution) -> Vector:
-    """Give the last temperatures of all unknowns of a solution, those of edges last, [degrees Celsius]."""
-    if isinstance(solution, SteadySolution):
-        return np.concatenate([solution.temperature_c, solution.edge_temperature_c])
-    return solution.temperature_c[-1]
 
 
 def region_behind_facets(mesh: TetMesh) -> npt.NDArray[np.int64]:
@@ -221,8 +210,7 @@ def _regions(
 ) -> tuple[RegionResult, ...]:
     mesh, names, last_c = selection.mesh, selection.mesh.region_names, nodes.states_c[-1]
     behind, made_of = region_behind_facets(problem.mesh), materials_by_region(problem)
-    by_region = heat_by_part(problem, end_state_c(solution), float(nodes.times_s[-1]), behind, names)
-    heat = heat_through_parts(by_region, names)[0]
+    heat = heat_by_part(solution, behind, len(names))
     area = np.bincount(nodes.of_facets(behind), selection.facet_area_m2, len(names))
     volume = _volumes_m3(mesh)
     total = np.bincount(mesh.region, volume, len(names))
@@ -343,15 +331,12 @@ def wall_result(
     """
     difference_k = inside_c - outside_c
     selection, mesh = Selection(problem.mesh, problem.up), problem.mesh
-    every_c = end_state_c(solution)
     inner = _faces_inside(problem, inside)
 
     def parts(numbers: npt.NDArray[np.int64], names: tuple[str, ...]) -> tuple[WallPart, ...]:
-        number = np.where(inner, numbers, len(names))
-        listed = (*names, "\0rest")
-        flows = heat_by_part(problem, every_c, 0.0, number, listed)
-        heat = heat_through_parts(flows, listed)[0]
-        area = np.bincount(number, selection.facet_area_m2, len(listed))
+        number, count = np.where(inner, numbers, len(names)), len(names) + 1
+        heat = heat_by_part(solution, number, count)
+        area = np.bincount(number, selection.facet_area_m2, count)
         return tuple(
             WallPart(names[n], float(area[n]), float(heat[n]), float(heat[n] / area[n] / difference_k))
             for n in np.unique(number[inner]).tolist()
@@ -360,7 +345,7 @@ def wall_result(
     patches = parts(selection.facet_patch, selection.patch_names)
     area, heat = sum(part.area_m2 for part in patches), sum(part.heat_w for part in patches)
     shown = solution_nodes(problem, solution) if nodes is None else nodes
-    inner_nodes = np.unique(shown.mesh.facets[shown.of_facets(inner)])
+    every_c, inner_nodes = shown.states_c[-1], np.unique(shown.mesh.facets[shown.of_facets(inner)])
     # At the rim of a hole both airs touch one node, which is no spot of the inner surface.
     others = [effect for effect in problem.effects if isinstance(effect, Convection) and effect.air_c != inside_c]
     outer = np.zeros(len(mesh.facets), dtype=bool)
@@ -392,44 +377,15 @@ def _faces_inside(problem: HeatProblem, inside: Sequence[str]) -> npt.NDArray[np
     return np.array(matching, dtype=bool)[selection.facet_patch]
 
 
-def heat_by_part(
-    problem: HeatProblem,
-    temperature_c: Vector,
-    time_s: float,
-    part: npt.NDArray[np.int64],
-    part_names: Sequence[str],
-) -> tuple[EffectHeat, ...]:
-    """Evaluate the heat flow into the body of each effect, but sources, through parts of the surface at one moment.
+def heat_by_part(solution: Solution, part: npt.NDArray[np.int64], count: int) -> Vector:
+    """Add up the heat flow into the body through parts of the surface at the end, shape (p,), [W].
 
-    Fixed temperatures are counted as if their nodes stored nothing at that moment, which holds for constant ones.
-    Convection and radiation are evaluated as the solvers do by default: at the nodes of linear tetrahedra, and
-    integrated over each triangle if they are quadratic. `temperature_c`, shape (n,), is that of the mesh's nodes and,
-    if tetrahedra are quadratic, of the middles of `mesh_edges` after them; `part` is the index into `part_names` of
-    each boundary triangle, shape (f,). Raises `HeatError` if one has another shape.
+    `part` is the number of the part, below `count`, of each boundary triangle of the mesh that was solved, shape (f,).
     """
-    remedy = "Give every boundary triangle of the mesh a part."
-    part = check_shape("part", np.asarray(part), (len(problem.mesh.facets),), remedy, HeatError)
-    selection = Selection(problem.mesh, problem.up)
-    parted = copy.copy(selection)
-    parted.facet_patch, parted.patch_names = part, tuple(part_names)
-    order = 1 if len(temperature_c) == len(problem.mesh.points_m) else 2
-    space = Space(parted, order=order, lumped=order == 1)
-    remedy = "Give the temperatures of the problem that was solved."
-    check_shape("temperature_c", temperature_c, (space.num_nodes,), remedy, HeatError)
-    reference_c = 0.5 * (float(temperature_c.min()) + float(temperature_c.max()))
-    relative_k = temperature_c - reference_c
-    acting = effect_forms(problem, space, reference_c, where=selection)
-    forms = [form for form in acting.exchanging if not isinstance(form, SourceForm)]
-    groups = [(form.effect, group) for form in forms for group in form.groups]
-    flows = [form.group_heat_w(relative_k, time_s) for form in forms]
-    if acting.fixed:
-        held, system = FixedNodes(acting.fixed, space.num_nodes), HeatSystem(problem, lumped=order == 1, order=order)
-        groups += held.groups
-        kept_w = -system.net_heat_at_fixed(temperature_c - system.reference_c, time_s)
-        flows.append(held.shares @ kept_w)
-    owners = {owner for owner, _ in groups}
-    named = [label for label in effect_labels(problem) if label in owners]
-    return heat_by_effect(named, groups, np.concatenate([np.zeros(0), *flows])[None])
+    total = np.zeros(count)
+    for heat in solution.last_facet_heat:
+        total += np.bincount(part[heat.facets], heat.heat_w, count)
+    return total
 
 
 def heat_through_parts(effects: Sequence[EffectHeat], part_names: Sequence[str]) -> Vector:

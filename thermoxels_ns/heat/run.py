@@ -11,16 +11,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.units import kelvin_to_celsius
 from thermoxels_ns.fem.probes import Probes, place_probes
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
 from thermoxels_ns.heat.results import HeatResults, WallResult, heat_results, volume_shares, wall_of_scene
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE
+from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_hours
 from thermoxels_ns.heat.screening import Screening
 from thermoxels_ns.heat.sky import Vector as Direction
 from thermoxels_ns.heat.solving import Accuracy, Goals, Say, solve_problem
+from thermoxels_ns.mesh.quality.checks import count_tets_in_other_bodies, count_twin_nodes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]
@@ -69,7 +71,8 @@ def run_scene(
     probes = place_probes(mesh, np.array(probes_m, dtype=np.float64).reshape(-1, 3))
     about_patches = patch_warnings(scene, mesh, problem.up)
     inner = () if about_patches else inner_surface_warnings(scene, mesh, problem.up)
-    warnings = (*about_patches, *inner, *unused_settings(scene), *shell_warnings(scene, export or {}))
+    about_scene = (*unused_settings(scene), *doubtful_temperatures(scene))
+    warnings = (*about_patches, *inner, *about_scene, *body_warnings(mesh), *shell_warnings(scene, export or {}))
     for warning in warnings:
         say(f"Warning: {warning}")
     found = solve_problem(problem, scene.time, goals, say)
@@ -115,6 +118,7 @@ def mesh_error_in_words(solution: Solution) -> str:
     return f"estimated {error.describe()}, usually right to a factor of three"
 
 
+_KELVIN_OF_AIR = (173.15, 373.15)  # Temperatures of air that are likely in kelvin and hardly so in degrees Celsius
 _COS_45 = float(np.sqrt(0.5))
 _LEAST_OF_A_ROOM = 0.1
 """Share of its surface that a room has on walls and floor at least: of a cube they are five sixths."""
@@ -183,14 +187,55 @@ def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tu
 
 
 def unused_settings(scene: HeatScene) -> tuple[str, ...]:
-    """Say what a scene gives and its question does not ask for."""
-    if not scene.steady or scene.initial_c is None:
-        return ()
-    return (
-        f"The scene gives an initial temperature of {scene.initial_c:g} degrees Celsius, but asks for the steady "
-        "state, which does not depend on the start: initial changes nothing. Remove it, or give time in place of "
-        "steady.",
+    """Say what a scene gives and its question does not ask for, or asks for and does not give."""
+    if scene.time is None:
+        if scene.initial_c is None:
+            return ()
+        return (
+            f"The scene gives an initial temperature of {scene.initial_c:g} degrees Celsius, but asks for the steady "
+            "state, which does not depend on the start: initial changes nothing. Remove it, or give time in place of "
+            "steady.",
+        )
+    hours, warnings = scene.time.duration_s / 3600.0, []
+    for name, air in (("inside_air", scene.inside_air), ("outside_air", scene.outside_air)):
+        if air is None or air.air_series is None:
+            continue
+        begin, end = air_series_hours(air.air_series)[[0, -1]].tolist()
+        if begin > 0.0 or end < hours * (1.0 - 1e-9):
+            warnings.append(
+                f"The air_series of {name} is from {begin:g} to {end:g} hours, but the body is followed from 0 to "
+                f"{hours:g} hours: before and after the series its first and last temperature are held. Give a longer "
+                "series, or a shorter time."
+            )
+    return tuple(warnings)
+
+
+def doubtful_temperatures(scene: HeatScene) -> tuple[str, ...]:
+    """Name airs that are so hot in degrees Celsius that they were probably given in kelvin."""
+    airs = [("inside_air", scene.inside_air), ("outside_air", scene.outside_air)]
+    airs += [(f"convection entry {number}", entry) for number, entry in enumerate(scene.convection, start=1)]
+    return tuple(
+        f"The air of {name} has {air.air_c:g} degrees Celsius. If that is meant in kelvin, give air_c: "
+        f"{kelvin_to_celsius(air.air_c):g}."
+        for name, air in airs
+        if air is not None and isinstance(air.air_c, float) and _KELVIN_OF_AIR[0] <= air.air_c <= _KELVIN_OF_AIR[1]
     )
+
+
+def body_warnings(mesh: TetMesh) -> tuple[str, ...]:
+    """Find nodes at one place, which no heat crosses, and bodies that lie in each other."""
+    twins, inside, warnings = count_twin_nodes(mesh.points_m), count_tets_in_other_bodies(mesh), []
+    if inside:
+        warnings.append(
+            f"Bodies of the mesh overlap: at least {inside} tetrahedra lie in another body. Heat flows of both count, "
+            "and no heat crosses from one to the other. Remove one of them."
+        )
+    elif twins:
+        warnings.append(
+            f"{twins} nodes of the mesh lie at the place of another one: parts that touch there without sharing nodes "
+            "exchange no heat. Merge the nodes where they should."
+        )
+    return tuple(warnings)
 
 
 def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ...]:

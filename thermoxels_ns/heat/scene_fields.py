@@ -17,7 +17,7 @@ import numpy.typing as npt
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
 from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying, tabulated
-from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4, Convection
+from thermoxels_ns.heat.effects import HOTTEST_C, STEFAN_BOLTZMANN_W_M2K4, Convection
 from thermoxels_ns.heat.sky import Vector
 
 HeatDirection: TypeAlias = Literal["up", "horizontal", "down"]  # Where heat flows to
@@ -104,12 +104,12 @@ _RANGES: dict[str, Bounds] = {
     "latitude_deg": Bounds("latitude_deg", "degrees", -90.0, 90.0),
     "longitude_deg": Bounds("longitude_deg", "degrees", -180.0, 180.0),
 }
-_UNITS: dict[str, tuple[str, float]] = {
-    "_w_m2k": ("W/(m2 K)", 0.0),
-    "_w_m2": ("W/m2", 0.0),
-    "_m_s": ("m/s", 0.0),
-    "_c": ("degrees Celsius", -ZERO_CELSIUS_K),
-    "_k": ("kelvin", 0.0),
+_UNITS: dict[str, tuple[str, float, float]] = {
+    "_w_m2k": ("W/(m2 K)", 0.0, math.inf),
+    "_w_m2": ("W/m2", 0.0, math.inf),
+    "_m_s": ("m/s", 0.0, math.inf),
+    "_c": ("degrees Celsius", -ZERO_CELSIUS_K, HOTTEST_C),
+    "_k": ("kelvin", 0.0, math.inf),
 }
 
 
@@ -122,8 +122,7 @@ def field_bounds(name: str) -> Bounds:
     if name in _RANGES:
         return _RANGES[name]
     ending = next(ending for ending in _UNITS if name.endswith(ending))
-    unit, low = _UNITS[ending]
-    return Bounds(name, unit, low)
+    return Bounds(name, *_UNITS[ending])
 
 
 class Section:
@@ -319,6 +318,18 @@ class Sun(Section):
 
 def read_air_series(path: str) -> Varying:
     """Read the temperature of air from a csv file with the columns hours and air_c; raises `HeatError`."""
+    table = _air_series(path)
+    field_bounds("air_c").check(table[:, 1])
+    return tabulated(3600.0 * table[:, 0], table[:, 1])
+
+
+def air_series_hours(path: str) -> npt.NDArray[np.float64]:
+    """Times of such a file, ascending, shape (k,), [h]; raises `HeatError`."""
+    return _air_series(path)[:, 0]
+
+
+def _air_series(path: str) -> npt.NDArray[np.float64]:
+    """Hours and temperatures of a csv file, shape (k, 2)."""
     try:
         rows = [row for row in csv.reader(Path(path).read_text(encoding="utf-8-sig").splitlines()) if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
@@ -328,12 +339,10 @@ def read_air_series(path: str) -> Varying:
         got = ",".join(rows[0]) if rows else "nothing"
         raise unclear(f"air_series: {path}", "the first line hours,air_c", got, "Write it so.")
     try:
-        table = np.array([[float(hours), float(air_c)] for hours, air_c in rows[1:]]).reshape(-1, 2)
+        return np.array([[float(hours), float(air_c)] for hours, air_c in rows[1:]]).reshape(-1, 2)
     except ValueError as problem:
         remedy = "Write 1.5,-3.2, for example."
         raise unclear(f"air_series: {path}", "two numbers in each line", str(problem), remedy) from problem
-    field_bounds("air_c").check(table[:, 1])
-    return tabulated(3600.0 * table[:, 0], table[:, 1])
 
 
 def check_direction(name: str, vector: Vector | None) -> None:

@@ -12,7 +12,6 @@ from scipy import sparse
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.limiter import holds_maximum_principle
 from thermoxels_ns.fem.linear_solver import LinearSolver
 from thermoxels_ns.fem.p1_kernels import lumped_mass
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
@@ -190,6 +189,7 @@ _WORTH_A_STEP = 1e4
 """Bound over tolerance above which the implicit step is not tried: it would not bring the bound below the tolerance."""
 _STEP_TOLERANCE = 1e-3
 """Relative tolerance of the linear solver in the implicit step; the bound of `screen` holds for an inexact v too."""
+_POSITIVE = 1e-9  # Share of the diagonal above which an entry off it counts as above 0
 _ROUND_OFF = 1e-12  # Share of the convection at a node below which nothing of it is kept
 
 
@@ -264,11 +264,9 @@ def screen(
     and the range that temperatures can reach, which follows from the start, all surroundings, and the bound of all
     fluxes and sources.
 
-    Where angles are obtuse there is no such principle, and the solver's limiter acts or not by the last digit of a
-    temperature. What is solved may then change by more than the heat equation's own bound (15 K instead of 0.15 K was
-    seen), so that only what brings no heat and names no temperature of its own, which the limiter would look at, is
-    left out. A tolerance of 0 leaves out only what brings no heat; without any effect nothing is computed. Raises
-    `HeatError` if the tolerance is negative, or an effect does not fit the mesh.
+    Where angles are obtuse there is no such principle, so that only what brings no heat is left out, and so it is for a
+    tolerance of 0. Without any effect nothing is computed. Raises `HeatError` if the tolerance is negative, or an
+    effect does not fit the mesh.
     """
     if not tolerance_k >= 0.0:
         remedy = "Give a tolerance in kelvin, or 0 to keep everything."
@@ -311,7 +309,6 @@ class _Screener:
         self._obtuse = False
         self._steps: dict[int, _Bound] = {}
         span = self._range()
-        self._one_temperature = bool(span.low == span.high)
         self.largest_w = [heat.largest_w(span) for heat in self.heats]
         self.brings_w = [float(heat_w.sum()) for heat_w in self.largest_w]
         self._alone_bounds = [self._alone(number) for number in range(len(self.heats))]
@@ -436,11 +433,22 @@ class _Screener:
         return _Bound(value_k, "its heat spreads into the depth in that time")
 
     def _may_go(self, number: int) -> bool:
-        """Whether a mesh with obtuse angles lets an effect go: the limiter then sees the same as before."""
-        named = any(span.low.size for span in self.heats[number].surroundings_c)
-        silent = not self.largest_w[number].any() and (self._one_temperature or not named)
-        return silent or not self._obtuse
+        """Whether the mesh lets an effect go: one with obtuse angles only lets go what brings no heat."""
+        return not (self._obtuse and self.largest_w[number].any())
 
     def _still_held(self, holding: npt.NDArray[np.bool_]) -> bool:
         """Whether every piece of a body whose steady state is asked for still has nodes that are held, shape (n,)."""
         return np.isfinite(self._duration_s) or bool(self._pieces.touched(np.flatnonzero(holding)).all())
+
+
+def holds_maximum_principle(stiffness: sparse.csr_matrix) -> bool:
+    """Whether a stiffness matrix has no entry above 0 off its diagonal, so that it is an M-matrix.
+
+    So it is on meshes without obtuse angles between faces; then no temperature leaves the range of its neighbours.
+
+    >>> holds_maximum_principle(sparse.csr_matrix([[1.0, -1.0], [-1.0, 1.0]]))
+    True
+    """
+    entries = stiffness.tocoo()
+    off = entries.row != entries.col
+    return not np.any(entries.data[off] > _POSITIVE * stiffness.diagonal()[entries.row[off]])

@@ -161,10 +161,12 @@ def _solve_screened(screening: Screening, time: Time, goals: Goals, say: Say) ->
         )
         return SolvedProblem(found.problem, found.solution, screening, _accuracy(goals, screening, found))
     times = 1 if time is None else time.num_times
-    needed = peak_bytes(kept, times=times, adaptive=isinstance(time, AdaptiveSteps))
+    needed = peak_bytes(kept, times=times, adaptive=time is not None)
     say(f"Memory: about {describe_bytes(needed)} at most.")
     check_memory(needed, memory_bytes, "Pass a larger --memory-gb, or export a coarser mesh.")
-    solution = solve_steady(kept) if time is None else solve_heat(kept, time, progress=_Progress(say))
+    solution = (
+        solve_steady(kept) if time is None else solve_heat(kept, time, estimate_steps=True, progress=_Progress(say))
+    )
     return SolvedProblem(kept, solution, screening, None)
 
 

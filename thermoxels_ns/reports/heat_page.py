@@ -290,7 +290,7 @@ def _made(run: HeatRun, command: str, files: Sequence[str]) -> Section:
     if isinstance(solution, HeatSolution):
         words.insert(0, f"{solution.steps} steps in time")
         if np.isfinite(solution.time_error_k):
-            words.append(f"errors of the steps estimated to add up to {solution.time_error_k:.2g} K")
+            words.append(f"error of the steps estimated at {solution.time_error_k:.2g} K")
     newton = int(np.sum(solution.newton_iterations))
     words.append(f"{newton} Newton steps" if newton else "no Newton steps")
     seconds = Table(("Part", "s"), tuple((name, f"{value:.2f}") for name, value in run.seconds.items()))

@@ -155,6 +155,33 @@ def test_a_tetrahedron_listed_again_is_refused(tmp_path, box_mesh) -> None:
         read_mesh(tmp_path / "mesh.vtu")
 
 
+def without_facets(mesh, kept):
+    tags = mesh.boundary
+    if tags is not None:
+        arrays = ("normal", "area_factor", "seen", "patch")
+        tags = dataclasses.replace(tags, photographs=None, **{name: getattr(tags, name)[kept] for name in arrays})
+    return dataclasses.replace(mesh, facets=mesh.facets[kept], facet_tags=mesh.facet_tags[kept], boundary=tags)
+
+
+@pytest.mark.parametrize("missing", [1, 7])
+def test_missing_triangles_of_the_boundary_are_refused(tmp_path, box_mesh, missing) -> None:
+    """Where they are missing no heat would flow."""
+    write_mesh(tmp_path / "mesh.vtu", without_facets(box_mesh, np.arange(missing, len(box_mesh.facets))))
+    with pytest.raises(MeshError, match=rf"mesh-boundary\.vtp: expected every face .* got {missing} missing"):
+        read_mesh(tmp_path / "mesh.vtu")
+
+
+def test_a_node_that_is_no_number_is_named(tmp_path, box_mesh) -> None:
+    import pyvista as pv
+
+    write_mesh(tmp_path / "mesh.vtu", box_mesh)
+    edited = pv.read(tmp_path / "mesh.vtu")
+    edited.points[3, 1] = np.nan
+    edited.save(tmp_path / "mesh.vtu")
+    with pytest.raises(MeshError, match=r"mesh\.vtu: points: expected finite numbers only, got 1 of"):
+        read_mesh(tmp_path / "mesh.vtu")
+
+
 def test_a_full_disk_is_one_line_and_the_old_file_stays(tmp_path, box_mesh, capfd) -> None:
     write_mesh(tmp_path / "box.vtu", box_mesh)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}

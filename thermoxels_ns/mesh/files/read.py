@@ -15,6 +15,8 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape, plain_os_errors
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.vtu import boundary_path, silent_vtk
+from thermoxels_ns.mesh.quality.checks import count_wrong_facets
+from thermoxels_ns.mesh.quality.face_count import group_faces
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
 
 _REMEDY = "Export the mesh again with ns-export thermoxels-mesh."
@@ -35,21 +37,18 @@ def read_mesh(path: Path | str) -> TetMesh:
     if path.suffix != ".vtu":
         raise _wrong("mesh file", "a name that ends in .vtu", path.name, "Pass the mesh.vtu of an export.")
     body, surface = _read(path), _read(boundary_path(path))
-    points = np.array(body.points, dtype=np.float64)
+    points = check_finite(f"{path.name}: points", np.array(body.points, dtype=np.float64), _REMEDY, MeshError)
     others = np.count_nonzero(body.celltypes != _TETRAHEDRON)
     if others:
         raise _wrong(path.name, "tetrahedra only", f"{others} cells of other kinds", _REMEDY)
     tets = np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4)
-    doubled = len(tets) - len(np.unique(np.sort(tets, axis=1), axis=0))
-    if doubled:
-        raise _wrong(path.name, "every tetrahedron once", f"{doubled} of {len(tets)} listed again", _REMEDY)
     names = _region_names(body, path.name)
     region = _cell_numbers(body, "region", path.name, len(names))
     colour = body.point_data.get("colour")
     facets, tags = _boundary(surface, points, boundary_path(path).name)
     on_box = _array(surface.cell_data, "on_box", boundary_path(path).name) != 0
-    return TetMesh(
-        points_m=check_finite("mesh points", points, _REMEDY, MeshError),
+    mesh = TetMesh(
+        points_m=points,
         tets=tets,
         temperature_c=_array(body.point_data, "temperature_c", path.name).astype(np.float64),
         observed=_array(body.point_data, "observed", path.name) != 0,
@@ -60,6 +59,24 @@ def read_mesh(path: Path | str) -> TetMesh:
         boundary=tags,
         colour=None if colour is None else (np.asarray(colour) / 255.0).astype(np.float32),
     )
+    _check_boundary(mesh, path)
+    return mesh
+
+
+def _check_boundary(mesh: TetMesh, path: Path) -> None:
+    """Refuse tetrahedra that are listed twice, and triangles that are not the faces of one tetrahedron each."""
+    faces = group_faces(mesh.tets)
+    wrong = count_wrong_facets(mesh, faces)
+    if not wrong and faces.sizes.max() <= 2:
+        return
+    doubled = len(mesh.tets) - len(np.unique(np.sort(mesh.tets, axis=1), axis=0))
+    if doubled:
+        raise _wrong(path.name, "every tetrahedron once", f"{doubled} of {len(mesh.tets)} listed again", _REMEDY)
+    if not wrong:
+        remedy = "Remove tetrahedra that lie in each other, or export the mesh again."
+        raise _wrong(path.name, "faces of one or two tetrahedra each", "faces of more", remedy)
+    expected, got = "every face of one tetrahedron alone, and no other", f"{wrong} missing, inside or turned over"
+    raise _wrong(boundary_path(path).name, expected, got, _REMEDY)
 
 
 def _read(path: Path) -> Any:

@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.mesh.quality.face_count import Groups, boundary_facets, group_pairs
 from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+_MOST_TRIED, _NEAREST = 2_000, 16
+"""Tetrahedra of a body that are looked for in another one, and those of the other, by their centres, that may hold
+each."""
+_WITHIN = 1e-6  # How far inside a tetrahedron, as a share of its heights, a point lies in it beyond doubt
 
 
 def facet_area_vectors(points: FloatArray, facets: IntArray) -> FloatArray:
@@ -61,6 +69,36 @@ def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
         cosine *= direction[pairs + gap] * direction[pairs]
         overlaps += int(np.count_nonzero(cosine > 1.0 - 1e-10))
     return overlaps
+
+
+def count_tets_in_other_bodies(mesh: TetMesh) -> int:
+    """Number of tetrahedra whose centre lies in a body that they share no node with; of many, some are tried."""
+    points, tets = mesh.points_m, mesh.tets
+    pairs = sparse.coo_matrix(
+        (np.ones(3 * len(tets), bool), (np.repeat(tets[:, 0], 3), tets[:, 1:].ravel())), shape=(len(points),) * 2
+    )
+    of_node = connected_components(pairs, directed=False)[1]
+    body, sizes = np.unique(of_node[tets[:, 0]], return_inverse=True, return_counts=True)[1:]
+    if len(sizes) == 1:
+        return 0
+    centres, found = points[tets].mean(axis=1), 0
+    by_body = np.split(np.argsort(body, kind="stable"), np.cumsum(sizes)[:-1])
+    low, high = (np.array([end(points[tets[own]], axis=(0, 1)) for own in by_body]) for end in (np.min, np.max))
+    for number, own in enumerate(by_body[:-1]):
+        close = np.all((low <= high[number]) & (high >= low[number]), axis=1)
+        close[: number + 1] = False
+        if not close.any():
+            continue
+        others = np.concatenate([by_body[other] for other in np.flatnonzero(close)])
+        for around, inside in ((own, others), (others, own)):
+            tried = inside[:: len(inside) // _MOST_TRIED + 1]
+            near = KDTree(centres[around]).query(centres[tried], k=range(1, min(len(around), _NEAREST) + 1))[1]
+            corner = points[tets[around[near]]]
+            sides = np.swapaxes(corner[:, :, 1:] - corner[:, :, :1], 2, 3)
+            shares = np.linalg.solve(sides, (centres[tried][:, None] - corner[:, :, 0])[..., None])[..., 0]
+            holds = (shares.min(axis=2) > _WITHIN) & (shares.sum(axis=2) < 1.0 - _WITHIN)
+            found += int(np.count_nonzero(holds.any(axis=1)))
+    return found
 
 
 def _smallest_first(facets: IntArray) -> IntArray:
