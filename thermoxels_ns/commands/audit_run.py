@@ -32,8 +32,8 @@ from thermoxels_ns.mesh.files.read import read_mesh
 from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtk
 from thermoxels_ns.reports.audit_page import audit_page
 from thermoxels_ns.reports.audit_pictures import draw_audit
-from thermoxels_ns.reports.interval_text import interval_text
-from thermoxels_ns.reports.page import Picture, build_page, write_page
+from thermoxels_ns.reports.numbers import interval_text
+from thermoxels_ns.reports.page import Picture, write_page
 
 ANSWERS, PAGE, SURFACE = "answers.json", "audit.html", "surface.vtp"
 """Files of an audit."""
@@ -151,8 +151,7 @@ def _write(folder: Path, options: AuditOptions, found: Audit, photographs: Mappi
     pictures = draw_audit(found) if options.pictures else None
     assert options.mesh is not None
     command, files = _command_line(options), (PAGE, ANSWERS, SURFACE)
-    page = audit_page(found, pictures, photographs, options.mesh.name, command, files)
-    write_page(folder / PAGE, build_page(page, "audit.html.j2"))
+    write_page(folder / PAGE, audit_page(found, pictures, photographs, options.mesh.name, command, files))
     write_summary(folder / ANSWERS, answers)
 
 

@@ -31,7 +31,7 @@ from thermoxels_ns.mesh.files.read import read_mesh
 from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtu
 from thermoxels_ns.reports.heat_page import heat_page
 from thermoxels_ns.reports.heat_pictures import PICTURES, draw_surface
-from thermoxels_ns.reports.page import build_page, write_page
+from thermoxels_ns.reports.page import write_page
 
 ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "report.html", "heat.pvd", "heat.vtu"
 """Files of a run; pictures come on top."""
@@ -160,8 +160,7 @@ def write_heat_files(folder: Path, options: HeatOptions, run: HeatRun, say: Say)
     drawn = {name: (folder / name).read_bytes() for name in pictures}
     shown_in = STEADY if isinstance(run.solution, SteadySolution) else THROUGH_TIME
     files = [PAGE, ANSWERS, SERIES, shown_in, *pictures]
-    page = build_page(heat_page(run, drawn, options.mesh.name, command_line(options), files))
-    write_page(folder / PAGE, page)
+    write_page(folder / PAGE, heat_page(run, drawn, options.mesh.name, command_line(options), files))
     write_summary(folder / ANSWERS, answers)
     say(f"Written to {folder}: {', '.join(files)}")
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 from thermoxels_ns.reports.charts import curves_over_time
+from thermoxels_ns.reports.numbers import duration_text, time_unit
 
 Vector = npt.NDArray[np.float64]
 
@@ -45,7 +46,7 @@ def draw_surface(
     low, high = (low, high) if beyond else (least, most)
     same: Any = {"clim": (low, high), "up": up}
     few = "; colours: middle 99 %" if beyond else ""
-    first, last = in_words(float(times_s[0])), in_words(float(times_s[-1]))
+    first, last = duration_text(float(times_s[0])), duration_text(float(times_s[-1]))
     when = ", steady" if steady else f" at {last}"
     picture_of_mesh(folder / end, mesh, states_c[-1], title=f"Surface temperature{when}{few}", **same)
     half, values, view = cut_open(mesh, states_c[-1], up)
@@ -123,26 +124,3 @@ def strongest(solution: HeatSolution) -> list[Any]:
     sizes = {id(heat): float(np.abs(heat.heat_w).max(initial=0.0)) for heat in solution.effects}
     acting = [heat for heat in solution.effects if sizes[id(heat)] > 0.0]
     return sorted(acting, key=lambda heat: -sizes[id(heat)])
-
-
-def time_unit(duration_s: float) -> tuple[str, float]:
-    """Choose a unit that suits a duration, and its length in seconds.
-
-    >>> time_unit(86400.0)
-    ('h', 3600.0)
-    """
-    if duration_s > 10 * 86400.0:
-        return "days", 86400.0
-    if duration_s > 2 * 3600.0:
-        return "h", 3600.0
-    return ("min", 60.0) if duration_s > 300.0 else ("s", 1.0)
-
-
-def in_words(seconds: float) -> str:
-    """Write a duration in the unit that suits it.
-
-    >>> in_words(5400.0)
-    '90 min'
-    """
-    unit, length = time_unit(seconds)
-    return f"{seconds / length:.4g} {unit}"
