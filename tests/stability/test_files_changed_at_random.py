@@ -20,8 +20,7 @@ from tests.support.audited_wall import STATED, audited_wall, photographed, solve
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.audit.conditions import load_conditions
 from thermoxels_ns.audit.run import audit
-from thermoxels_ns.commands.audit_options import AuditOptions
-from thermoxels_ns.commands.audit_run import answers_of
+from thermoxels_ns.commands.audit import Audit, answers_of
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
@@ -194,7 +193,7 @@ def test_audit_conditions(tmp_path) -> None:
     tree["leave_out"] = ["cut"]
     mesh = photographed(solve_wall(audited_wall(0.2), STATED, true_draws(STATED, None)), STATED, 1)
     path, solved = tmp_path / "conditions.yaml", [0, 0]
-    options = AuditOptions(tmp_path / "mesh.vtu", path)
+    options = Audit(tmp_path / "mesh.vtu", path)
 
     @EXAMPLES
     @example(to_yaml(tree).encode())

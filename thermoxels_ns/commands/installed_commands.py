@@ -12,9 +12,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from thermoxels_ns.core.errors import ThermoxelsError, explain
 
@@ -60,6 +62,20 @@ def command_line(arguments: Sequence[str | Path]) -> str:
     "ns-train thermoxels --data 'my scene'"
     """
     return shlex.join(str(argument) for argument in arguments)
+
+
+def command_of(name: str, options: Any) -> str:
+    """Write a command of ours as it is typed, from a dataclass of its options, the first of which has no name.
+
+    Options at their default are left out.
+    """
+    words = ["thermoxels", name, str(getattr(options, fields(options)[0].name))]
+    for field in fields(options)[1:]:
+        value = getattr(options, field.name)
+        if value != field.default:
+            parts = np.ravel(value).tolist() if isinstance(value, tuple) else [value]
+            words += [f"--{field.name.replace('_', '-')}", *map(str, parts)]
+    return shlex.join(words)
 
 
 def run_command(arguments: Sequence[str | Path], log: Path, console: Console) -> ProcessCost:

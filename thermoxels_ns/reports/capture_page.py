@@ -63,7 +63,7 @@ def capture_page(
     scene, rig, drift = result.scene, result.scene.rig, result.scene.drift
     errors, known_c = scene.model.sighting_error_px(), temperatures_c[np.isfinite(temperatures_c)]
     limit = max(float(np.percentile(errors, 99)), 0.1) if errors.size else 0.1
-    ends = (float(end) for end in np.percentile(known_c, (0.1, 99.9))) if known_c.size else (0.0, 1.0)
+    low, high = (float(end) for end in np.percentile(known_c, (0.1, 99.9))) if known_c.size else (0.0, 1.0)
     label = "temperature, °C; how many pixels of a sample, without the coldest and hottest 0.1 %"
     frames = []
     for index, (name, frame) in enumerate(zip(scene_names(len(scene.frames)), scene.model.frames)):
@@ -85,7 +85,7 @@ def capture_page(
         up_words=", ".join(f"{value:.3f}" for value in np.round(scene.up.direction, 3) + 0.0),
         temperatures_c=known_c,
         median_c=np.median(known_c) if known_c.size else math.nan,
-        temperature_chart=histogram(known_c, label, limits=tuple(ends)),
+        temperature_chart=histogram(known_c, label, limits=(low, high)),
         measurement=measurement_rows(scene.frames),
         masked_share=masked_share,
         min_frames=MIN_FRAMES,

@@ -15,7 +15,7 @@ from thermoxels_ns.heat.effects import Effect, FixedTemperature, InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.run import HeatRun, mesh_error_in_words
 from thermoxels_ns.heat.solving import Accuracy
-from thermoxels_ns.reports.heat_pictures import plot_over_time
+from thermoxels_ns.reports.charts import plot_over_time
 from thermoxels_ns.reports.numbers import duration_text, flow_text, least_flow, unit_signs
 from thermoxels_ns.reports.page import build_page
 
