@@ -13,8 +13,7 @@ from tests.support.audited_wall import INSIDE, STATED, audited_wall, photographe
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns import cli
 from thermoxels_ns.audit.run import audit
-from thermoxels_ns.commands.audit_options import AuditOptions
-from thermoxels_ns.commands.audit_run import run_audit
+from thermoxels_ns.commands.audit import Audit, run_audit
 from thermoxels_ns.core.errors import AuditError, HeatError, OutputError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.mesh.files.formats import write_mesh
@@ -28,7 +27,7 @@ def export(tmp_path_factory) -> Path:
     mesh = photographed(solve_wall(audited_wall(), STATED, true_draws(STATED, None)), STATED, 2)
     write_mesh(folder / "mesh.vtu", mesh)
     text = (configs_folder() / "conditions-example.yaml").read_text()
-    text = text.replace("title: Example house, north side", "title: A <b>house</b> & garden")
+    text = text.replace("title: Example house, north side", "title: A <script>house</script> & garden")
     (folder / "conditions.yaml").write_text(text.replace("offset: 0.0 +- 1.0 K", "offset: 0.0 +- 0.2 K"))
     return folder
 
@@ -82,7 +81,7 @@ calibrate:
 
 def test_the_page_is_complete_in_itself_and_escapes_what_users_write(done) -> None:
     page = (done / "audit.html").read_text()
-    assert "<h1>A &lt;b&gt;house&lt;/b&gt; &amp; garden</h1>" in page
+    assert "<h1>A &lt;script&gt;house&lt;/script&gt; &amp; garden</h1>" in page
     assert not re.search(r'(?:src|href)="(?!data:)', page) and "<script" not in page
     headings = re.findall(r"<h2>(.*?)</h2>", page)
     assert headings == [
@@ -145,13 +144,13 @@ def test_what_forbids_a_survey_stands_first(export, tmp_path) -> None:
 def test_an_example_of_conditions_is_written_and_read(export, tmp_path, capsys) -> None:
     assert cli.main(["audit", "--write-conditions", str(tmp_path / "c.yaml")]) == 0
     assert "pass it with --conditions" in capsys.readouterr().out
-    options = AuditOptions(export / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "out", pictures=False)
+    options = Audit(export / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "out", pictures=False)
     found = run_audit(options)
     assert found is not None and found.conditions.title == "Example house, north side"
 
 
 def test_the_same_input_gives_the_same_page(export, done, tmp_path) -> None:
-    run_audit(AuditOptions(export / "mesh.vtu", export / "conditions.yaml", tmp_path / "again", pictures=False))
+    run_audit(Audit(export / "mesh.vtu", export / "conditions.yaml", tmp_path / "again", pictures=False))
     again = json.loads((tmp_path / "again" / "answers.json").read_text())
     assert again == json.loads((done / "answers.json").read_text())
 
@@ -160,7 +159,7 @@ def test_the_up_of_the_export_counts(export, tmp_path) -> None:
     for name in ("mesh.vtu", "mesh-boundary.vtp"):
         (tmp_path / name).write_bytes((export / name).read_bytes())
     (tmp_path / "summary.json").write_text(json.dumps({"length_unit": "m", "up": [0.0, -3.0, 0.0]}))
-    options = AuditOptions(tmp_path / "mesh.vtu", export / "conditions.yaml", tmp_path / "out", pictures=False)
+    options = Audit(tmp_path / "mesh.vtu", export / "conditions.yaml", tmp_path / "out", pictures=False)
     found = run_audit(options)
     assert found is not None and found.surface.selection.up == (0.0, -1.0, 0.0)
     (tmp_path / "summary.json").write_text(json.dumps({"length_unit": "unit"}))
@@ -171,10 +170,10 @@ def test_the_up_of_the_export_counts(export, tmp_path) -> None:
 @pytest.mark.parametrize("given", [{}, {"mesh": Path("mesh.vtu")}])
 def test_what_is_missing_is_named(given) -> None:
     with pytest.raises(AuditError, match=r"expected a file, got none\. Pass the mesh\.vtu .*--write-conditions"):
-        run_audit(AuditOptions(**given))
+        run_audit(Audit(**given))
 
 
 def test_results_of_other_commands_are_not_replaced(export, tmp_path) -> None:
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(OutputError, match=r"no files but those of an earlier run"):
-        run_audit(AuditOptions(export / "mesh.vtu", export / "conditions.yaml", tmp_path))
+        run_audit(Audit(export / "mesh.vtu", export / "conditions.yaml", tmp_path))

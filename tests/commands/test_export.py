@@ -287,7 +287,7 @@ def test_failed_export_leaves_the_earlier_one_untouched(ball, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize(
-    "broken", ["mesh.files.formats.write_mesh", "heat.vtk_series.write_heat_series", "reports.mesh_pictures.draw_heat"]
+    "broken", ["commands.export_snapshot.write_mesh", "heat.vtk_series.write_vtu", "reports.mesh_pictures.draw_heat"]
 )
 def test_export_interrupted_while_writing_leaves_no_summary(ball, tmp_path, monkeypatch, broken) -> None:
     """So a folder with a summary is never a mixture."""

@@ -79,11 +79,12 @@ def test_memory_is_that_of_the_command(command, tmp_path):
     """
     command("x = b'1' * int(sys.argv[1]); del x")
     script = (
-        "import math, pathlib, sys\n"
+        "import io, math, pathlib, sys\n"
+        "from rich.console import Console\n"
         "from thermoxels_ns.commands.installed_commands import run_command\n"
         f"sys.executable = {str(tmp_path / 'bin' / 'python')!r}\n"
         f"log = pathlib.Path({str(tmp_path / 'log')!r})\n"
-        "peak = lambda size: run_command(['work', str(size)], log).peak_memory_gb\n"
+        "peak = lambda size: run_command(['work', str(size)], log, Console(file=io.StringIO())).peak_memory_gb\n"
         "print(peak(200_000_000), peak(600_000_000))\n"
         "large = b'1' * 500_000_000\n"
         "del large\n"
@@ -94,14 +95,6 @@ def test_memory_is_that_of_the_command(command, tmp_path):
     assert 0.2 < small < 0.3 and 0.6 < large < 0.7
     assert large - small == pytest.approx(0.4, abs=0.01)
     assert math.isnan(unknown)
-
-
-def test_output_is_kept_and_the_watcher_hears_how_far_it_is(command, tmp_path):
-    heard: list[float | None] = []
-    words = command("print('Step'); print('5 (12.50%)  1 ms'); time.sleep(0.8); print('9 (50.00%)'); time.sleep(0.8)")
-    run_command([*words, "a b"], tmp_path / "log", watch=heard.append)
-    assert heard[0] == 0.125 and heard[-1] == 0.5
-    assert (tmp_path / "log").read_text().splitlines()[1:] == ["5 (12.50%)  1 ms", "9 (50.00%)"]
 
 
 def test_a_failing_command_is_an_error_with_its_last_lines(fake_command, tmp_path, console):
@@ -115,34 +108,37 @@ def test_a_failing_command_is_an_error_with_its_last_lines(fake_command, tmp_pat
     assert str(tmp_path / "fail.log") in message
 
 
-def test_a_command_of_another_environment_is_not_used(fake_command, tmp_path, monkeypatch):
+def test_a_command_of_another_environment_is_not_used(fake_command, tmp_path, console, monkeypatch):
     other = tmp_path / "other"
     other.mkdir()
     (other / "ns-train").write_text("#!/bin/sh\n")
     (other / "ns-train").chmod(0o755)
     monkeypatch.setenv("PATH", str(other))
     with pytest.raises(ThermoxelsError, match=r"ns-train: expected a command in .*bin, got none"):
-        run_command(["ns-train"], tmp_path / "log")
+        run_command(["ns-train"], tmp_path / "log", console)
 
 
 def test_an_interrupt_ends_the_command(command, tmp_path):
     """The command would write its mark at the end; after the interrupt nothing is left to write it."""
     mark = tmp_path / "mark"
     words = command(
-        f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(5); open({str(mark)!r}, 'w')"
+        f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); print('started')\n"
+        f"time.sleep(5); open({str(mark)!r}, 'w')"
     )
 
-    def interrupt(_: float | None) -> None:
-        if (tmp_path / "pid").is_file() and (tmp_path / "pid").read_text():
-            raise KeyboardInterrupt
+    class Interrupter(io.StringIO):
+        def write(self, text: str) -> int:
+            if text.startswith("started"):
+                raise KeyboardInterrupt
+            return len(text)
 
     with pytest.raises(KeyboardInterrupt):
-        run_command(words, tmp_path / "log", watch=interrupt)
+        run_command(words, tmp_path / "log", Console(file=Interrupter()))
     assert not Path(f"/proc/{(tmp_path / 'pid').read_text()}").exists()
     assert not mark.exists()
 
 
-def test_systems_that_do_not_tell_memory_still_measure_time(command, tmp_path, monkeypatch):
+def test_systems_that_do_not_tell_memory_still_measure_time(command, tmp_path, console, monkeypatch):
     monkeypatch.delattr("os.wait4")
-    cost = run_command(command("sys.exit(0)"), tmp_path / "log")
+    cost = run_command(command("sys.exit(0)"), tmp_path / "log", console)
     assert cost.seconds > 0 and cost.peak_memory_gb != cost.peak_memory_gb

@@ -18,7 +18,7 @@ from thermoxels_ns.capture.sfm.metric_scale import MetricScale
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.radiometry.conditions import Conditions
-from thermoxels_ns.reports.capture_page import CapturePage, Overlay, build_page
+from thermoxels_ns.reports.capture_page import Overlay, capture_page
 from thermoxels_ns.reports.capture_pictures import colours, thermal_in_photograph
 
 THERMAL = Camera(80, 60, 70.0, 70.0, 41.0, 29.0)
@@ -51,10 +51,11 @@ def test_colours_go_from_dark_to_bright_and_nan_is_black():
 
 MODEL = ring_model(4)
 JPEG = b"\xff\xd8\xff"
+OVERLAY: Overlay = ("a", JPEG, JPEG, JPEG, "thermal image")
 
 
 @pytest.fixture
-def page() -> CapturePage:
+def result() -> CaptureResult:
     rig = RigEstimate(
         *(Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4), True, "Found.", ("rx",), np.eye(1), 0.1, 0.4, 0.33)
     )
@@ -72,7 +73,7 @@ def page() -> CapturePage:
         up=Up(np.array([-1e-9, -1e-12, 1.0]), "Assumed.", None),
         masks=PhotographMasks((640, 480)),
     )
-    result = CaptureResult(
+    return CaptureResult(
         source=Path("card"),
         output=Path("scene"),
         pairs=[Pair(name, Path(f"{name}.jpg"), Path(f"{name}.tiff"), "equal names") for name in MODEL.frames],
@@ -84,44 +85,46 @@ def page() -> CapturePage:
         poses_source="Given.",
         seconds=[("pairs", 1.0)],
     )
-    overlays = [Overlay("a", JPEG, JPEG, JPEG)]
-    return CapturePage(result, overlays, np.linspace(10, 20, 100, dtype=np.float32), 0.0)
 
 
-def with_scene(page: CapturePage, **changes: Any) -> CapturePage:
-    return replace(page, result=replace(page.result, scene=replace(page.scene, **changes)))
+def with_scene(result: CaptureResult, **changes: Any) -> CaptureResult:
+    return replace(result, scene=replace(result.scene, **changes))
 
 
-def words(page: CapturePage) -> str:
-    return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", build_page(page)))
+def page_of(result: CaptureResult, overlay: Overlay = OVERLAY) -> str:
+    return capture_page(result, [overlay], np.linspace(10, 20, 100, dtype=np.float32), 0.0)
 
 
-def test_numbers_of_the_rig_have_their_errors_and_an_unsure_turn_its_reason(page):
+def words(result: CaptureResult) -> str:
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", page_of(result)))
+
+
+def test_numbers_of_the_rig_have_their_errors_and_an_unsure_turn_its_reason(result):
     errors = {"rx": 0.003, "ry": 0.004, "rz": 0.012, "log_focal": 0.01, "cx": 0.42, "cy": 0.57}
     covariance = np.diag([errors.get(name, 0.0) ** 2 for name in PARAMETERS])
-    rig = replace(page.scene.rig, parameters=PARAMETERS, covariance=covariance)
-    said = words(with_scene(page, rig=rig))
+    rig = replace(result.scene.rig, parameters=PARAMETERS, covariance=covariance)
+    said = words(with_scene(result, rig=rig))
     assert "principal point, pixels 320.0, 240.0 41.0, 29.0 41.0 ± 0.4, 29.0 ± 0.6 " in said
     assert "focal length, pixels 500.0 70.0 70.0 ± 0.7 " in said
     assert "turned by 0.00 ± 0.74 degrees" in said
     assert "how sure the turn is The turn is sure to 0.74 degrees only" in said
-    given = words(with_scene(page, rig=replace(rig, parameters=(), covariance=np.zeros((0, 0)))))
+    given = words(with_scene(result, rig=replace(rig, parameters=(), covariance=np.zeros((0, 0)))))
     assert "41.0, 29.0 41.0, 29.0 " in given and "how sure the turn is" not in given
 
 
-def test_a_scale_that_is_missing_says_what_it_costs(page):
-    said = words(page)
+def test_a_scale_that_is_missing_says_what_it_costs(result):
+    said = words(result)
     assert "unknown (no photograph has a GPS position); give a length when you export the mesh" in said
-    known = words(with_scene(page, scale=MetricScale(0.5, 0.01, "GPS.")))
+    known = words(with_scene(result, scale=MetricScale(0.5, 0.01, "GPS.")))
     assert "0.5 ± 0.01 (2.0 %) m per unit" in known and "unknown" not in known
 
 
-def test_names_of_files_are_no_markup(page):
+def test_names_of_files_are_no_markup(result):
     evil = "<script>alert(1)</script>"
-    frames = [replace(frame, camera=evil) for frame in page.scene.frames]
+    frames = [replace(frame, camera=evil) for frame in result.scene.frames]
     pairs = [Pair("a", Path(f"{evil}.jpg"), Path("a.tiff"), evil)]
-    changed = with_scene(page, frames=frames)
-    result = replace(changed.result, source=Path(evil), dropped={evil: evil}, pairs=pairs, scale_missing=evil)
-    text = build_page(replace(changed, result=result))
+    changed = with_scene(result, frames=frames)
+    changed = replace(changed, source=Path(evil), dropped={evil: evil}, pairs=pairs, scale_missing=evil)
+    text = page_of(changed, (evil, JPEG, JPEG, JPEG, evil))
     assert "<script" not in text
-    assert text.count("&lt;script&gt;") >= 6
+    assert text.count("&lt;script&gt;") >= 8

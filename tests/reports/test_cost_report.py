@@ -11,7 +11,6 @@ from thermoxels_ns.reports.cost_report import (
     CostRow,
     CostRun,
     CostSetting,
-    Targets,
     cheapest,
     draw_plot,
     markdown_table,
@@ -19,6 +18,7 @@ from thermoxels_ns.reports.cost_report import (
     pareto_front,
     verdict,
     write_csv,
+    write_page,
 )
 
 NAN = math.nan
@@ -67,7 +67,7 @@ def test_the_cheapest_setting_keeps_all_targets():
     measured = rows(draft=(10, 25.0, 0.9), standard=(30, 31.0, 0.35), fine=(60, 33.0, 0.30), odd=(20, 20.0, 0.32))
 
     def name(**targets):
-        best = cheapest(measured, Targets(**targets))
+        best = cheapest(measured, targets)
         return best and best.setting.name
 
     assert name(thermal_mae_c=0.4) == "odd"
@@ -80,7 +80,7 @@ def test_the_cheapest_setting_keeps_all_targets():
 
 def test_the_verdict_says_plainly_that_none_will_do():
     measured = rows(draft=(10, 25.0, 0.9), standard=(30, 31.0, 0.35))
-    words = verdict(measured, Targets(psnr=40.0), "s")
+    words = verdict(measured, {"psnr": 40.0}, "s")
     assert words.startswith("No measured setting has an RGB PSNR of at least 40 dB.")
     assert "MAE 0.35 °C (standard)" in words and "PSNR 31.0 dB (standard)" in words
     assert "--settings" in words
@@ -113,10 +113,15 @@ def test_the_plot_has_a_panel_for_every_figure_there_is(tmp_path, known_truth):
         for n, s, p, m in [("draft", 10, 25.0, 0.9), ("standard", 30, 31.0, 0.35), ("odd", 20, NAN, 0.5)]
     ]
     measured = median_rows([setting(n) for n in ("draft", "standard", "odd")], runs, "standard")
-    draw_plot(tmp_path / "cost.png", measured, Targets(0.4, None), "a scene")
+    draw_plot(tmp_path / "cost.png", measured, {"thermal_mae_c": 0.4}, "a scene")
     with Image.open(tmp_path / "cost.png") as picture:
         assert picture.width > 1000 and picture.height > 1000
-        right_end = picture.width // 2 + picture.width // 10
-        corner = picture.convert("L").crop((right_end, picture.height // 2 + 60, picture.width, picture.height))
+        right_end, legend = picture.width // 2 + picture.width // 10, picture.height - 100
+        corner = picture.convert("L").crop((right_end, picture.height // 2 + 60, picture.width, legend))
         drawn = corner.getextrema()[0] < 128
     assert drawn == known_truth  # without an F-score there are three panels
+
+
+def test_names_in_the_page_are_no_markup(tmp_path):
+    write_page(tmp_path / "cost.md", ["| a | 1 |", "<script>alert(1)</script>: one run each"])
+    assert (tmp_path / "cost.md").read_text() == "| a | 1 |\n\n&lt;script&gt;alert(1)&lt;/script&gt;: one run each\n"

@@ -1,30 +1,208 @@
 """The command ``thermoxels audit``: heat loss, U-values and thermal bridges from measured temperatures."""
 
-# Only light imports at the top, so that --help answers at once.
-
 from __future__ import annotations
 
-from dataclasses import dataclass
+# Only light imports at the top, so that --help answers at once.
+import time as clock
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import tyro
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.commands.audit_options import AuditOptions
+from thermoxels_ns.commands.heat import read_export_summary
+from thermoxels_ns.commands.installed_commands import command_of
+from thermoxels_ns.core.checks import check_direction, check_positive, remove_file, result_folder
+from thermoxels_ns.core.errors import AuditError
+
+if TYPE_CHECKING:
+    from thermoxels_ns.audit.results import Audit as Found
+    from thermoxels_ns.reports.page import Picture
+
+ANSWERS, PAGE, SURFACE = "answers.json", "audit.html", "surface.vtp"
+"""Files of an audit."""
+
+Say = Callable[[str], None]
 
 
 @dataclass
-class Audit(AuditOptions):
+class Audit:
     """Say from the temperatures that thermal images measured: heat loss, U-values and thermal bridges, as intervals.
 
     Writes audit.html (open it first, or print it), answers.json, and surface.vtp for ParaView. What was known on site
     stands in a yaml file: ``thermoxels audit --write-conditions conditions.yaml`` writes one that explains itself."""
 
+    mesh: tyro.conf.Positional[Path | None] = None
+    """The mesh.vtu of an export with a known scale; mesh-boundary.vtp lies beside it."""
+    conditions: Path | None = None
+    """Conditions of the survey, a yaml file: air inside and outside, wind, sky, emissivities, camera, each with +-."""
+    output_dir: Path = Path("audit")
+    """Folder for the results; made if it does not exist. Those of an earlier audit in it are replaced."""
+    write_conditions: Path | None = None
+    """Write an example of conditions to this file, every key explained, and do nothing else."""
+    up: tuple[float, float, float] | None = None
+    """Direction that points up in the coordinates of the mesh. Default: that of the export's summary.json beside the
+    mesh, or else z."""
+    scene: Path | None = None
+    """Folder of the photographs that the mesh was made from, the --data of the training: the page then shows each
+    defect in the photograph and thermal image that show it best."""
+    pictures: bool = True
+    """Draw pictures for the page."""
+
     def main(self) -> None:
         """Run it; raises `ThermoxelsError` if the mesh, the conditions or an option cannot be used."""
         from rich.console import Console
-
-        from thermoxels_ns.commands.audit_run import run_audit
 
         console = Console(highlight=False)
         # The last bits of a product of long vectors depend on how many threads BLAS has.
         with threadpool_limits(1, "blas"):
             run_audit(self, lambda line: console.print(line, markup=False, soft_wrap=True))
+
+
+def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
+    """Audit, then write everything, answers.json last; or write an example of conditions, which gives None."""
+    from thermoxels_ns.audit.conditions import load_conditions, write_example
+    from thermoxels_ns.audit.run import audit
+    from thermoxels_ns.commands.audit_photographs import photographs_of_defects
+    from thermoxels_ns.mesh.files.read import read_mesh
+    from thermoxels_ns.reports.numbers import interval_text
+
+    if options.write_conditions is not None:
+        write_example(options.write_conditions)
+        say(f"Written to {options.write_conditions}: put in what you measured, and pass it with --conditions.")
+        return None
+    if options.mesh is None or options.conditions is None:
+        missing = "mesh" if options.mesh is None else "conditions"
+        remedy = "Pass the mesh.vtu of an export, and --conditions; --write-conditions writes an example of these."
+        raise AuditError(missing, expected="a file", got="none", remedy=remedy)
+    begin = clock.perf_counter()
+    others = ("summary.json", "quality.json", "series.csv")
+    folder = result_folder(options.output_dir, (ANSWERS, PAGE, SURFACE), (PAGE, ANSWERS), others)
+    conditions = load_conditions(options.conditions)
+    mesh = read_mesh(options.mesh)
+    export = read_export_summary(options.mesh, say)
+    up = export.get("up") if options.up is None else options.up
+    direction = check_direction("up", up or (0.0, 0.0, 1.0), "Pass --up 0 0 1.", AuditError)
+    x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
+    say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.facets):,} boundary triangles.")
+    found = audit(mesh, conditions, (x, y, z))
+    for words in (*found.check.forbidden, *found.check.doubts):
+        say(f"Warning: {words}")
+    if found.check.missing:
+        say(f"Missing for a report after EN 13187: {', '.join(found.check.missing)}.")
+    whole = found.whole
+    say(f"Heat loss: {interval_text(whole.loss_w, 'W')}; U-value: {interval_text(whole.u_w_m2k, 'W/(m2 K)')}.")
+    say(f"{sum(not one.not_counted for one in found.defects)} thermal bridges or defects.")
+    if found.calibration is not None:
+        told = [
+            f"{name} {interval_text(value, found.calibration.units[name])}"
+            for name, value in found.calibration.found.items()
+        ]
+        say(f"Calibration: {'; '.join(told) or f'refused. {found.calibration.refused}'}")
+    photographs = {}
+    if options.scene is not None:
+        photographs = photographs_of_defects(options.scene, _metres_per_unit(export), found)
+        say(f"Photographs show {sum(not found.defects[number].not_counted for number in photographs)} of them.")
+    _write(folder, options, found, photographs)
+    say(f"Written to {folder}: {PAGE}, {ANSWERS}, {SURFACE} ({clock.perf_counter() - begin:.1f} s)")
+    return found
+
+
+def answers_of(options: Audit, found: Found) -> dict[str, Any]:
+    """Everything that answers.json says."""
+    date = found.conditions.survey.date
+    conditions = asdict(replace(found.conditions, survey=replace(found.conditions.survey, date=None)))
+    conditions["survey"]["date"] = None if date is None else date.isoformat()
+    told = {
+        "mesh": options.mesh,
+        "conditions": conditions,
+        "whole": asdict(found.whole),
+        "patches": [asdict(one) for one in found.patches],
+        "storeys": [asdict(one) for one in found.storeys],
+        "defects": [asdict(one) for one in found.defects],
+        "limits": [asdict(one) for one in found.limits],
+        "f_rsi": [asdict(one) for one in found.f_rsi],
+        "year": None if found.year is None else asdict(found.year),
+        "calibration": _calibration(found),
+        "forbidden": list(found.check.forbidden),
+        "doubts": list(found.check.doubts),
+        "missing_for_en_13187": list(found.check.missing),
+        "loss_moved_by_w": dict(found.budget),
+        "not_counted_m2": dict(found.not_counted_m2),
+    }
+    return {name: _without_what_is_not_known(one) for name, one in told.items()}
+
+
+def _without_what_is_not_known(value: Any) -> Any:
+    """The same with null for numbers that are not known, or ends of intervals that are not there."""
+    if isinstance(value, Mapping):
+        return {name: _without_what_is_not_known(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_what_is_not_known(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _calibration(found: Found) -> dict[str, Any] | None:
+    """What a calibration found."""
+    one = found.calibration
+    if one is None:
+        return None
+    told = {"found": {name: asdict(value) for name, value in one.found.items()}, "units": one.units}
+    return {**told, "refused": one.refused, "moved_most_by": one.moved_most_by, "misfit_k": one.misfit_k}
+
+
+def _metres_per_unit(export: dict[str, Any]) -> float:
+    """Scale of the mesh over the poses of its scene, 1 where the export does not say."""
+    scale = export.get("scale") or {}
+    value = scale.get("metres_per_unit", 1.0) if isinstance(scale, dict) else 1.0
+    return check_positive("summary.json: metres_per_unit", value, "Export the mesh again.", AuditError)
+
+
+def _write(folder: Path, options: Audit, found: Found, photographs: Mapping[int, tuple[Picture, ...]]) -> None:
+    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
+    from thermoxels_ns.reports.audit_page import audit_page
+    from thermoxels_ns.reports.audit_pictures import draw_audit
+    from thermoxels_ns.reports.page import write_page
+
+    answers = answers_of(options, found)
+    summary_text(answers)  # raises if json cannot hold it
+    remove_file(folder / ANSWERS)
+    _write_surface(folder / SURFACE, found)
+    pictures = draw_audit(found) if options.pictures else None
+    assert options.mesh is not None
+    command, files = command_of("audit", options), (PAGE, ANSWERS, SURFACE)
+    write_page(folder / PAGE, audit_page(found, pictures, photographs, options.mesh.name, command, files))
+    write_summary(folder / ANSWERS, answers)
+
+
+def _write_surface(path: Path, found: Found) -> None:
+    """Write what was found of each boundary triangle, NaN where it does not count, and the number of its defect."""
+    import pyvista as pv
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    from thermoxels_ns.mesh.files.content import surface_of
+    from thermoxels_ns.mesh.files.vtu import write_vtk
+
+    mesh = found.surface.mesh
+    surface = surface_of(mesh.points_m, mesh.facets)
+    data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
+    numbers = np.zeros(len(mesh.facets), dtype=np.int32)
+    for number, one in enumerate(found.found, start=1):
+        numbers[one.core] = number
+    calibration = found.calibration
+    off = {} if calibration is None else {"measured_minus_computed_k": calibration.difference_k}
+    for name, values in {
+        "surface_temperature_c": found.triangle_surface_c,
+        "heat_flow_w_m2": found.triangle_flow_w_m2,
+        "u_w_m2k": found.triangle_u[:, 0],
+        "u_low_w_m2k": found.triangle_u[:, 1],
+        "u_high_w_m2k": found.triangle_u[:, 2],
+        "counted": found.surface.counted.astype(np.uint8),
+        "defect": numbers,
+        **off,
+    }.items():
+        data.cell_data[name] = values
+    write_vtk(vtkXMLPolyDataWriter(), path, data)

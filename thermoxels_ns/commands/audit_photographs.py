@@ -51,7 +51,7 @@ def photographs_of_defects(folder: Path, metres_per_unit: float, found: Audit) -
         if shown is not None:
             name = frame.image.name
             ends = f"{low:.1f} °C and less black, {high:.1f} °C and more bright"
-            pictures[number] = (Picture(shown[0], name), Picture(shown[1], f"Thermal image, as read: {ends}"))
+            pictures[number] = ((shown[0], name), (shown[1], f"Thermal image, as read: {ends}"))
     return pictures
 
 

@@ -47,7 +47,7 @@ def capture_folder(
 ) -> CaptureResult:
     """Turn a folder of camera files into a scene and write the page about it; raises what `run_capture` does."""
     from thermoxels_ns.capture.stages import run_capture
-    from thermoxels_ns.reports.capture_pictures import write_capture_page
+    from thermoxels_ns.reports.capture_page import write_capture_page
 
     return run_capture(source, output, settings, write_capture_page, say)
 

@@ -9,17 +9,16 @@ import os
 import re
 import shlex
 import shutil
-import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
 
 from thermoxels_ns import __version__
-from thermoxels_ns.commands.installed_commands import ProcessCost, Watch, run_command
+from thermoxels_ns.commands.installed_commands import PLAIN_TRAINING, run_command
 from thermoxels_ns.core.checks import check_positive, remedy_of, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
@@ -27,20 +26,21 @@ from thermoxels_ns.reports.cost_report import (
     FIGURES,
     CostRun,
     CostSetting,
-    Targets,
     draw_plot,
+    figure_text,
     markdown_table,
     median_rows,
+    shown_figures,
     verdict,
     write_csv,
+    write_page,
 )
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 _RUNS, _TABLE, _PLOT, _PAGE = "runs.csv", "cost.csv", "cost.png", "cost.md"
-_QUIET_S = 60.0
-_EVALUATED = tuple(FIGURES)[3:]
+_EVALUATED = tuple(name for name in FIGURES if name not in ("seconds", "training_seconds", "peak_memory_gb"))
 _KEYS = ("setting", "repeat", "scene", "version", "training")
 _GROUPS = ("density", "sh", "temperature", "background", "corrections")
 
@@ -81,7 +81,7 @@ class Cost:
     """Further options of every ns-train, as one quoted text after an equals sign, for instance
     --train-options="--pipeline.model.near-plane 0.05"."""
     warm_up: bool = True
-    """Train the quickest setting once before anything counts, so that no run pays for compiling kernels."""
+    """Train the first setting once before anything counts, so that no run pays for compiling kernels."""
     keep_models: bool = False
     """Keep the trained models in the folder models."""
     again: bool = False
@@ -96,42 +96,65 @@ class Cost:
 
 def run_cost(cost: Cost, console: Console) -> None:
     """Measure and report, see `Cost`."""
+
+    def say(line: str) -> None:
+        console.print(line, markup=False, soft_wrap=True)
+
     targets = _targets(cost)
     settings, baseline = planned_settings(cost)
     if cost.repeats < 1:
         raise ThermoxelsError("repeats", expected="1 or more", got=cost.repeats, remedy="Pass --repeats 3.")
-    folder = writable_folder(cost.output_dir)
-    bench = Bench(cost.scene, folder, cost.keep_models)
+    if not cost.scene.is_dir():
+        raise SceneError("scene", expected="a scene folder", got=f"none at {cost.scene}", remedy="Correct the path.")
+    folder, fingerprint = writable_folder(cost.output_dir), scene_fingerprint(cost.scene)
 
     # Repeats of a setting lie apart in time, so that a slow spell of the machine does not fall on one setting.
-    plan = [(setting, repeat) for repeat in range(1, cost.repeats + 1) for setting in settings]
-    keys = {bench.planned(*pair).key for pair in plan}
+    plan = [
+        (setting, CostRun(setting.name, repeat, fingerprint, __version__, setting.training, {}))
+        for repeat in range(1, cost.repeats + 1)
+        for setting in settings
+    ]
+    keys = {run.key for _, run in plan}
     runs = [run for run in read_runs(folder / _RUNS) if not (cost.again and run.key in keys)]
     known = {run.key for run in runs}
-    pending = [pair for pair in plan if bench.planned(*pair).key not in known]
+    pending = [(setting, run) for setting, run in plan if run.key not in known]
     if len(pending) < len(plan):
         kept = len(plan) - len(pending)
-        console.print(f"{kept} of {len(plan)} runs are in {folder / _RUNS} already; --again True measures them again.")
+        say(f"{kept} of {len(plan)} runs are in {folder / _RUNS} already; --again True measures them again.")
+    if pending and cost.warm_up:
+        first = pending[0][0]
+        say(f"Warm-up with {first.name}, not counted ...")
+        with suppress(ThermoxelsError):  # its counted run will say why it failed
+            measure(cost.scene, first, "warm-up", folder, False, console)
     failed: list[str] = []
-    if pending:
-        display = _Display(console, len(pending))
-        if cost.warm_up:
-            _warm_up(bench, [setting for setting, _ in pending], display)
-        for setting, repeat in pending:
-            title = setting.name if cost.repeats == 1 else f"{setting.name}, run {repeat}"
-            try:
-                with display.run(title) as watch:
-                    run = bench.measure(setting, repeat, watch)
-            except ThermoxelsError as problem:
-                failed.append(f"{title}: {problem}")
-                display.say(f"{title} failed: {problem}")
-                continue
-            runs.append(run)
-            write_runs(folder / _RUNS, runs)
-            display.say(f"{title}: {_in_words(run)}")
+    for number, (setting, run) in enumerate(pending, start=1):
+        title = setting.name if cost.repeats == 1 else f"{setting.name}, run {run.repeat}"
+        say(f"[{number}/{len(pending)}] {title} ...")
+        try:
+            name = f"{setting.file_name}-{run.repeat}"
+            figures = measure(cost.scene, setting, name, folder, cost.keep_models, console)
+        except ThermoxelsError as problem:
+            failed.append(f"{title}: {problem}")
+            say(f"{title} failed: {problem}")
+            continue
+        runs.append(replace(run, figures=figures))
+        write_runs(folder / _RUNS, runs)
+        shown = (f"{FIGURES[name].heading} {figure_text(name, figures[name])}" for name in shown_figures([figures]))
+        say(f"{title}: {', '.join(shown)}")
     counted = [run for run in runs if run.key in keys]
     if counted:
-        _report(cost, folder, settings, counted, baseline, targets, console)
+        rows = median_rows(settings, counted, baseline)
+        counts = sorted({row.repeats for row in rows})
+        medians = "one run each" if counts == [1] else f"medians of {' or '.join(map(str, counts))} runs"
+        scene, machine = cost.scene.resolve().name, f"a machine with {os.cpu_count()} processors"
+        words = [markdown_table(rows, baseline)]
+        words.append(f"{scene}: {medians} on {machine}; memory is that of the ns-train process.")
+        words += [verdict(rows, targets, cost.scene)] if targets else []
+        write_csv(folder / _TABLE, rows, baseline)
+        draw_plot(folder / _PLOT, rows, targets, f"What accuracy costs: {scene}")
+        write_page(folder / _PAGE, words)
+        for text in ("", *words, f"Written to {folder}: {', '.join((_TABLE, _PLOT, _PAGE, _RUNS))}"):
+            say(text)
     if failed:
         remedy = "Start the command again to repeat them. " + "\n".join(failed)
         raise ThermoxelsError("cost", expected="every run to finish", got=f"{len(failed)} that did not", remedy=remedy)
@@ -149,12 +172,7 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
         expected, remedy = "words as in a shell", "Close the quotes."
         raise ThermoxelsError("train_options", expected=expected, got=str(problem), remedy=remedy) from problem
 
-    words: dict[str, tuple[str, ...]] = {}
-    work: dict[str, float] = {}
-    for text in cost.settings:
-        resolution, steps = parse_setting(text)
-        words[text] = tuple(training_options(resolution, steps))
-        work[text] = float(resolution**2 * steps)
+    words = {text: tuple(training_options(*parse_setting(text))) for text in cost.settings}
     words |= {quality: ("--quality", quality) for quality in cost.qualities}
     if not words:
         remedy = "Pass --settings 64:800."
@@ -167,8 +185,7 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     def row(of: str, method: str, recipe: str, kind: str = "") -> CostSetting:
         # The default is the method's own recipe, which needs no option.
         recipe_words = () if recipe == "default" else ("--pipeline.model.recipe", recipe)
-        options = (*words[of], *recipe_words, *further)
-        return CostSetting(f"{of}{kind}", method, options, work.get(of, math.inf), beside=bool(kind))
+        return CostSetting(f"{of}{kind}", method, (*words[of], *recipe_words, *further))
 
     (method, *methods), (recipe, *recipes) = dict.fromkeys(cost.methods), dict.fromkeys(cost.recipes)
     rows = [row(name, method, recipe) for name in words]
@@ -177,95 +194,14 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     return rows, baseline
 
 
-def _targets(cost: Cost) -> Targets:
+def _targets(cost: Cost) -> dict[str, float]:
+    """The bounds that were given, by the names of figures."""
     for name in ("target_mae", "target_psnr"):
         value = getattr(cost, name)
         if value is not None:
             check_positive(name, value, f"Correct --{name.replace('_', '-')}, or leave it out.")
-    return Targets(cost.target_mae, cost.target_psnr)
-
-
-def _warm_up(bench: Bench, settings: Sequence[CostSetting], display: _Display) -> None:
-    """Train the quickest setting once and forget it; if it fails, its counted run will say why."""
-    setting = min(settings, key=lambda setting: setting.work)
-    name = "warm-up"
-    with display.run(f"warm-up with {setting.name}, not counted", counts=False) as watch:
-        try:
-            bench.train(setting, name, watch)
-        except ThermoxelsError:
-            display.say("The warm-up failed.")
-        finally:
-            bench.discard(name)
-
-
-def _in_words(run: CostRun) -> str:
-    figures = run.figures
-    parts = (
-        ("{:.1f} s", figures["seconds"]),
-        ("training {:.1f} s", figures["training_seconds"]),
-        ("{:.2f} GB", figures["peak_memory_gb"]),
-        ("{:.2f} dB", figures["psnr"]),
-        ("{:.3f} °C", figures["thermal_mae_c"]),
-        ("F-score {:.3f}", figures["fscore_128"]),
-    )
-    return ", ".join(form.format(value) for form, value in parts if value == value)
-
-
-def _report(
-    cost: Cost,
-    folder: Path,
-    settings: Sequence[CostSetting],
-    runs: Sequence[CostRun],
-    baseline: str,
-    targets: Targets,
-    console: Console,
-) -> None:
-    """Write and print the table, the plot and which setting will do."""
-    rows = median_rows(settings, runs, baseline)
-    counts = sorted({row.repeats for row in rows})
-    medians = "one run each" if counts == [1] else f"medians of {' or '.join(map(str, counts))} runs"
-    scene = cost.scene.resolve().name
-    note = f"{scene}: {medians} on a machine with {os.cpu_count()} processors; memory is that of the ns-train process."
-    words = [markdown_table(rows, baseline), note]
-    if targets.words:
-        words.append(verdict(rows, targets, cost.scene))
-    write_csv(folder / _TABLE, rows, baseline)
-    draw_plot(folder / _PLOT, rows, targets, f"What accuracy costs: {scene}")
-    with replace_when_done(folder / _PAGE) as temporary:
-        temporary.write_text("\n\n".join(words) + "\n", encoding="utf-8")
-    for text in ("", *words):
-        console.print(text, markup=False, soft_wrap=True)
-    console.print(f"Written to {folder}: {', '.join((_TABLE, _PLOT, _PAGE, _RUNS))}", markup=False, soft_wrap=True)
-
-
-class _Display:
-    """Says which run is at work: in the last line of a terminal, in a line a minute elsewhere."""
-
-    def __init__(self, console: Console, total: int) -> None:
-        self._console, self._total, self._done = console, total, 0
-
-    def say(self, line: str) -> None:
-        self._console.print(line, markup=False, soft_wrap=True)
-
-    @contextmanager
-    def run(self, title: str, counts: bool = True) -> Iterator[Watch]:
-        """Show a run; gives what is to be called with the share that is done."""
-        start = told = time.monotonic()
-        name = f"[{self._done + 1}/{self._total}] {title}" if counts else title
-        self.say(f"{name} ...")
-        with self._console.status("at work") as status:
-
-            def watch(share: float | None) -> None:
-                nonlocal told
-                done = "" if share is None else f", {share:.0%} of the training done"
-                line = f"... at work for {time.monotonic() - start:.0f} s{done}"
-                status.update(line)
-                if not self._console.is_terminal and time.monotonic() - told > _QUIET_S:
-                    told = time.monotonic()
-                    self.say(line)
-
-            self._done += counts
-            yield watch
+    bounds = {"thermal_mae_c": cost.target_mae, "psnr": cost.target_psnr}
+    return {name: bound for name, bound in bounds.items() if bound is not None}
 
 
 def parse_setting(text: str) -> tuple[int, int]:
@@ -340,59 +276,23 @@ def write_runs(path: Path, runs: Iterable[CostRun]) -> None:
             writer.writerow([getattr(run, key) for key in _KEYS] + ["" if math.isnan(v) else repr(v) for v in figures])
 
 
-class Bench:
-    """Runs settings on one scene, each in a folder of its own that goes when it is done."""
-
-    def __init__(self, scene: Path, folder: Path, keep_models: bool = False) -> None:
-        """Remember where things go; refuse a scene folder that is not there."""
-        if not scene.is_dir():
-            raise SceneError("scene", expected="a scene folder", got=f"none at {scene}", remedy="Correct the path.")
-        self.scene, self.fingerprint = scene, scene_fingerprint(scene)
-        self._folder, self._keep = folder, keep_models
-
-    def planned(self, setting: CostSetting, repeat: int) -> CostRun:
-        """The run as it will be remembered, still without figures."""
-        return CostRun(setting.name, repeat, self.fingerprint, __version__, setting.training, {})
-
-    def train(self, setting: CostSetting, name: str, watch: Watch) -> tuple[Path, ProcessCost]:
-        """Train a setting anew; returns the run's folder, as nerfstudio makes it, and what the command took."""
-        models = writable_folder(self._folder / "models")
-        shutil.rmtree(models / name, ignore_errors=True)
-        words = [
-            *("ns-train", setting.method, "--data", str(self.scene), "--output-dir", str(models)),
-            *("--experiment-name", name, "--timestamp", "run", "--vis", "tensorboard"),
-            # One line every fifty steps instead of a block that is drawn over and over.
-            *("--logging.steps-per-log", "50", "--logging.local-writer.max-log-size", "0"),
-            *("--logging.profiler", "none", *setting.options),
-        ]
-        cost = run_command(words, self._log(name, "train"), watch=watch)
-        return models / name / setting.method / "run", cost
-
-    def measure(self, setting: CostSetting, repeat: int, watch: Watch) -> CostRun:
-        """Train and evaluate a setting."""
-        name = f"{setting.file_name}-{repeat}"
-        try:
-            run_folder, cost = self.train(setting, name, watch)
-            figures = {
-                "seconds": cost.seconds,
-                "training_seconds": training_seconds(run_folder),
-                "peak_memory_gb": cost.peak_memory_gb,
-            }
-            output = writable_folder(self._folder / "eval") / f"{name}.json"
-            words = ["ns-eval", "--load-config", str(run_folder / "config.yml"), "--output-path", str(output)]
-            run_command(words, self._log(name, "eval"), watch=lambda _: watch(None))
-            figures |= read_evaluation(output)
-        finally:
-            if not self._keep:
-                self.discard(name)
-        return CostRun(*self.planned(setting, repeat).key, figures=figures)
-
-    def discard(self, name: str) -> None:
-        """Remove a run's model."""
-        shutil.rmtree(self._folder / "models" / name, ignore_errors=True)
-
-    def _log(self, name: str, what: str) -> Path:
-        return writable_folder(self._folder / "logs") / f"{name}-{what}.log"
+def measure(
+    scene: Path, setting: CostSetting, name: str, folder: Path, keep_model: bool, console: Console
+) -> dict[str, float]:
+    """Train a setting anew and evaluate it, under a name of its own; returns figures by the names in `FIGURES`."""
+    models, logs, evaluations = (writable_folder(folder / part) for part in ("models", "logs", "eval"))
+    shutil.rmtree(models / name, ignore_errors=True)
+    run_folder, output = models / name / setting.method / "run", evaluations / f"{name}.json"
+    train = ["ns-train", setting.method, "--data", scene, "--output-dir", models, "--experiment-name", name]
+    evaluate = ["ns-eval", "--load-config", run_folder / "config.yml", "--output-path", output]
+    try:
+        cost = run_command([*train, *PLAIN_TRAINING, *setting.options], logs / f"{name}-train.log", console)
+        run_command(evaluate, logs / f"{name}-eval.log", console)
+        figures = {"seconds": cost.seconds, "peak_memory_gb": cost.peak_memory_gb}
+        return figures | {"training_seconds": training_seconds(run_folder), **read_evaluation(output)}
+    finally:
+        if not keep_model:
+            shutil.rmtree(models / name, ignore_errors=True)
 
 
 def training_seconds(run_folder: Path) -> float:

@@ -6,21 +6,20 @@ from __future__ import annotations
 import shutil
 import time
 import webbrowser
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from thermoxels_ns.commands.installed_commands import PLAIN_TRAINING, command_line, run_command
 from thermoxels_ns.core.checks import writable_folder
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
-from thermoxels_ns.core.json_values import read_json
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from thermoxels_ns.commands.demo_results import DemoResults
-    from thermoxels_ns.reports.demo_page import ColourBar, DemoPage
+    from thermoxels_ns.commands.demo_results import Target
 
 SceneName = Literal["hot-object", "house-corner", "sphere", "courtyard", "pipes"]
 """The synthetic scenes."""
@@ -28,15 +27,8 @@ SceneName = Literal["hot-object", "house-corner", "sphere", "courtyard", "pipes"
 _MARKER = ".thermoxels-demo"
 _WRITTEN = ("index.html", "scene", "outputs", "eval.json", "eval", "renders", "export", "survey", "audit", "logs")
 _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT = 42, 6, 320, 240
-_INPUTS_SHOWN = 6
 _BUILDINGS: tuple[SceneName, ...] = ("house-corner", "courtyard")
 _AUDITED: SceneName = "house-corner"  # The scene whose U-values are known
-_AUDIT_FILES = (
-    ("audit/audit.html", "heat loss, U-values and thermal bridges, as a page to hand over"),
-    ("survey/", "which part of the surface is which element, and the conditions of the survey"),
-)
-_COLOUR_MAP = "inferno"
-_COLOUR_STOPS = 17
 
 
 @dataclass
@@ -59,29 +51,10 @@ class Demo:
         run_demo(self, Console(highlight=False))
 
 
-@dataclass
-class _Steps:
-    """Announces steps and remembers how long each took."""
-
-    console: Console
-    count: int
-    seconds: list[tuple[str, float]] = field(default_factory=list)
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[None]:
-        """Announce a step and time what happens in it."""
-        self.console.rule(f"[bold]{len(self.seconds) + 1}/{self.count}  {name}")
-        start = time.monotonic()
-        yield
-        self.seconds.append((name, time.monotonic() - start))
-
-
 def run_demo(demo: Demo, console: Console) -> None:
     """Run all steps; see `Demo`."""
-    from thermoxels_ns.commands.demo_audit import audit_section, audit_target, compare, write_survey
-    from thermoxels_ns.commands.demo_results import read_results
-    from thermoxels_ns.commands.installed_commands import command_line, run_command
-    from thermoxels_ns.reports.demo_page import build_page
+    from thermoxels_ns.commands.demo_results import audit_target, compare, demo_page, read_results
+    from thermoxels_ns.core.yaml_records import configs_folder
     from thermoxels_ns.reports.page import write_page
     from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
@@ -91,35 +64,39 @@ def run_demo(demo: Demo, console: Console) -> None:
     folder = prepare_folder(demo.output_dir)
     logs = writable_folder(folder / "logs")
     commands = demo_commands(folder, demo.scene, demo.iterations)
-    steps = _Steps(console, len(commands) + 1)
-    audited = demo.scene == _AUDITED
+    patches = folder / "survey" / "patches.yaml"
+    seconds: list[tuple[str, float]] = []
 
-    with steps.step("Photograph the synthetic scene"):
+    @contextmanager
+    def step(name: str) -> Iterator[None]:
+        """Announce a step and time what happens in it."""
+        console.rule(f"[bold]{len(seconds) + 1}/{len(commands) + 1}  {name}")
+        start = time.monotonic()
+        yield
+        seconds.append((name, time.monotonic() - start))
+
+    with step("Photograph the synthetic scene"):
         console.print(f"$ {command_line(commands[0])}", style="bold", markup=False, soft_wrap=True)
         write_scene(make_scene(demo.scene), folder / "scene", _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT)
-        if audited:
-            write_survey(folder)
+        for name in ("patches.yaml", "conditions.yaml") if demo.scene == _AUDITED else ():
+            shutil.copyfile(configs_folder() / f"{_AUDITED}-{name}", writable_folder(patches.parent) / name)
     names = ("Train", "Evaluate", "Render", "Export the mesh and let heat flow", "Audit the house")
     for name, command in zip(names, commands[1:]):
-        with steps.step(name):
+        with step(name):
             run_command(command, logs / f"{command[0].replace('thermoxels', 'audit')}.log", console)
-    with steps.step("Compare with the truth"):
-        results = read_results(folder / "eval.json", folder / "export" / "summary.json")
-        compared = compare(folder / "audit" / "answers.json") if audited else ()
-        if audited:
-            results = replace(results, targets=(*results.targets, audit_target(compared)))
-        print_results(results, console)
+    with step("Compare with the truth"):
+        targets, others = read_results(folder / "eval.json", folder / "export" / "summary.json")
+        compared = compare(folder / "audit" / "answers.json", patches) if demo.scene == _AUDITED else ()
+        targets += (audit_target(compared),) if compared else ()
+        print_targets(targets, console)
 
-    shown = [command_line(command) for command in commands]
-    page = assemble_page(folder, demo.scene, results, steps.seconds, shown)
-    if audited:
-        page = replace(page, sections=(audit_section(compared),), files=(*page.files, *_AUDIT_FILES))
-    index = folder / "index.html"
-    write_page(index, build_page(page))
+    index, shown = folder / "index.html", [command_line(command) for command in commands]
+    page = demo_page(folder, demo.scene, targets, others, compared, seconds, shown, next_steps(folder, demo.scene))
+    write_page(index, page)
     console.print(f"All pictures and figures: {index}", markup=False, soft_wrap=True)
     if demo.open_browser:
         webbrowser.open(index.resolve().as_uri())
-    missed = [f"{t.name} {t.measured_text} (target {t.bound_text})" for t in results.targets if not t.met]
+    missed = [f"{t.name} {t.measured_text} (target {t.bound_text})" for t in targets if not t.met]
     if missed:
         remedy = f"See {index} for pictures."
         raise ThermoxelsError("demo", expected="every target met", got="; ".join(missed), remedy=remedy)
@@ -160,11 +137,8 @@ def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> li
     return [
         ["thermoxels", "synthetic", scene, "--output-dir", str(folder / "scene")],
         [
-            *("ns-train", "thermoxels", "--output-dir", str(folder / "outputs")),
-            *("--experiment-name", "demo", "--timestamp", "run", "--vis", "tensorboard", *steps),
-            # One line every hundred steps instead of a block that is drawn over and over.
-            *("--logging.steps-per-log", "100", "--logging.local-writer.max-log-size", "0"),
-            *("--logging.profiler", "none", "thermal-data", "--data", str(folder / "scene")),
+            *("ns-train", "thermoxels", "--output-dir", str(folder / "outputs"), "--experiment-name", "demo"),
+            *(*PLAIN_TRAINING, *steps, "thermal-data", "--data", str(folder / "scene")),
         ],
         [
             *("ns-eval", "--load-config", config, "--output-path", str(folder / "eval.json")),
@@ -173,7 +147,7 @@ def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> li
         [
             *("ns-render", "dataset", "--load-config", config, "--split", "test"),
             *("--rendered-output-names", "gt-rgb", "rgb", "gt-thermal", "thermal"),
-            *("--image-format", "png", "--colormap-options.colormap", _COLOUR_MAP),
+            *("--image-format", "png", "--colormap-options.colormap", "inferno"),
             *("--output-path", str(folder / "renders")),
         ],
         [
@@ -184,172 +158,35 @@ def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> li
     ]
 
 
-def print_results(results: DemoResults, console: Console) -> None:
+def print_targets(targets: Iterable[Target], console: Console) -> None:
     """Print the figures with a target as a table."""
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    table = Table()
-    table.add_column("")
-    table.add_column("measured", justify="right")
-    table.add_column("target", justify="right")
-    table.add_column("met")
-    for target in results.targets:
+    table = Table("", Column("measured", justify="right"), Column("target", justify="right"), "met")
+    for target in targets:
         met = "[green]yes[/green]" if target.met else "[bold red]no[/bold red]"
         table.add_row(target.name, target.measured_text, target.bound_text, met)
     console.print(table)
 
 
-def assemble_page(
-    folder: Path, scene: str, results: DemoResults, seconds: Sequence[tuple[str, float]], commands: Sequence[str]
-) -> DemoPage:
-    """Gather the pictures of a demo run for its page; raises `ThermoxelsError` if one is missing."""
-    from thermoxels_ns.commands.installed_commands import command_line
-    from thermoxels_ns.reports.demo_page import Check, DemoPage, HeldOutView
-    from thermoxels_ns.reports.page import Picture, Table
-
-    bar = _colour_bar(folder / "scene")
-    renders = folder / "renders" / "test"
-    names = sorted(f"{path.stem}.png" for path in (folder / "scene" / "images").glob("frame_eval_*"))
-    export = folder / "export"
-    before, after, change = _panels(export / "heat.png", 3)
-    pairs = tuple(_training_pairs(folder / "scene"))
-    return DemoPage(
-        title=f"Thermoxels demo: {scene}",
-        summary=(
-            f"{_TRAIN_VIEWS} photographs and their thermal images became a model, a tetrahedral mesh with temperatures "
-            "and a heat computation. The scene is synthetic: its shape and temperature are known exactly, so the "
-            "result can be measured."
-        ),
-        at_a_glance=(
-            Picture(pairs[0][0], f"In: {_TRAIN_VIEWS} photographs"),
-            Picture(pairs[0][1], "In: their thermal images"),
-            Picture(_picture(export / "mesh.png"), "Out: a solid in which heat can flow"),
-        ),
-        checks=tuple(Check(t.name, t.measured_text, t.bound_text, t.met, t.meaning) for t in results.targets),
-        more_figures=Table(("", ""), results.others, summary="More figures"),
-        training_pairs=pairs,
-        views=tuple(
-            HeldOutView(
-                Path(name).stem, *(_picture(renders / o / name) for o in ("gt-rgb", "rgb", "gt-thermal", "thermal"))
-            )
-            for name in names
-        ),
-        colour_bar=bar,
-        mesh_pictures=(
-            Picture(before, "Before: the temperatures that the photographs gave."),
-            Picture(after, "After: heat has flowed through the solid. Both in one range of colours."),
-            Picture(change, "The change, on a scale of its own."),
-            Picture(
-                _picture(export / "mesh-measured.png"), "Grey: no thermal ray saw the surface; it is interpolated."
-            ),
-        ),
-        next_steps=(
-            (
-                command_line(["ns-viewer", "--load-config", folder / "outputs/demo/thermoxels/run/config.yml"]),
-                "Walk around the trained model in a browser:",
-            ),
-            *heat_steps(folder, scene),
-            (
-                command_line(["thermoxels", "capture", "PHOTOGRAPHS", "--output", "SCENE"]),
-                "Make a scene of your own from a folder of photographs and thermal images:",
-            ),
-            ("ns-train thermoxels --data SCENE", "Train on it, and then go on with ns-export as above:"),
-        ),
-        seconds=tuple(seconds),
-        commands=tuple(commands),
-        files=(
-            ("scene/", "the synthetic photographs, thermal images and camera poses"),
-            ("outputs/demo/thermoxels/run/config.yml", "the training run; ns-viewer --load-config shows it"),
-            ("eval.json", "figures of the held-out views"),
-            ("renders/test/", "rendered and measured held-out views"),
-            ("export/mesh.vtu", "the mesh with temperatures, for ParaView or a solver"),
-            ("export/mesh.glb", "its surface, for a browser or a phone"),
-            ("export/quality.png", "how good its tetrahedra are"),
-            ("export/heat.pvd", "temperatures over time, for ParaView"),
-            ("export/summary.json", "figures of mesh, heat and truth, and all options"),
-            ("logs/", "what every command said"),
-        ),
-    )
-
-
-def heat_steps(folder: Path, scene: str) -> Iterator[tuple[str, str]]:
-    """Commands that lead to a heat report: of a building with walls, of anything else as it was exported."""
-    from thermoxels_ns.commands.installed_commands import command_line
-
+def next_steps(folder: Path, scene: str) -> list[tuple[str, str]]:
+    """Commands to try next, and what each does: look at the model, a heat report, a scene of one's own."""
     config = folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml"
+    steps: list[tuple[list[str | Path], str]] = [
+        (["ns-viewer", "--load-config", config], "Walk around the trained model in a browser:")
+    ]
     mesh, weather, said = folder / "export" / "mesh.vtu", "original", "ten windy, sunny minutes"
     if scene in _BUILDINGS:
         mesh, weather, said = folder / "walls" / "mesh.vtu", "winter-night", "a winter night"
-        yield (
-            command_line(
-                [
-                    *("ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", mesh.parent),
-                    *("--metres-per-unit", "1", "--interior", "hollow", "--wall-thickness", "0.3"),
-                ]
-            ),
-            "Export the building with rooms; photographs do not show how thick its walls are, so say it:",
-        )
-    yield (
-        command_line(["thermoxels", "heat", mesh, "--scene", weather, "--output-dir", folder / "heat"]),
-        f"Let {said} act on it; report.html says how much heat goes where:",
-    )
-
-
-def _picture(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as problem:
-        expected, remedy = "a picture that the demo's commands write", "Run the demo again."
-        got = problem.strerror or str(problem)
-        raise ThermoxelsError(str(path), expected=expected, got=got, remedy=remedy) from problem
-
-
-def _panels(path: Path, count: int) -> list[bytes]:
-    """Cut a picture of panels side by side, so that a narrow screen can show one below the other."""
-    from io import BytesIO
-
-    from PIL import Image
-
-    panels = []
-    with Image.open(BytesIO(_picture(path))) as whole:
-        for number in range(count):
-            file = BytesIO()
-            left, right = number * whole.width // count, (number + 1) * whole.width // count
-            whole.crop((left, 0, right, whole.height)).save(file, format="PNG")
-            panels.append(file.getvalue())
-    return panels
-
-
-def _colour_bar(scene: Path) -> ColourBar:
-    """The colours in which ns-render draws normalised temperatures 0 to 1, the scene's bounds."""
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
-
-    from thermoxels_ns.reports.demo_page import ColourBar
-
-    bounds = read_json(scene / "temperature_bounds.json")
-    stops = (n / (_COLOUR_STOPS - 1) for n in range(_COLOUR_STOPS))
-    return ColourBar(
-        tuple(to_hex(colormaps[_COLOUR_MAP](stop)) for stop in stops),
-        float(bounds["absolute_min_temperature"]),
-        float(bounds["absolute_max_temperature"]),
-    )
-
-
-def _training_pairs(scene: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Some training photographs from all around, each with its thermal image in the page's colours."""
-    import numpy as np
-    from matplotlib import colormaps
-    from PIL import Image
-
-    from thermoxels_ns.reports.capture_pictures import jpeg_of
-
-    photographs = sorted((scene / "images").glob("frame_train_*"))
-    for number in range(_INPUTS_SHOWN):
-        path = photographs[number * len(photographs) // _INPUTS_SHOWN]
-        with Image.open(path) as photograph:
-            rgb = np.asarray(photograph.convert("RGB"))
-        with Image.open(scene / "thermal" / f"{path.stem}.png") as counts:  # 16 bits that span the bounds
-            normalised = np.asarray(counts, dtype=np.float64) / 65535.0
-        colours = np.round(255.0 * colormaps[_COLOUR_MAP](normalised)[..., :3]).astype(np.uint8)
-        yield jpeg_of(rgb, 88), jpeg_of(colours, 88)
+        walls = ["--metres-per-unit", "1", "--interior", "hollow", "--wall-thickness", "0.3"]
+        what = "Export the building with rooms; photographs do not show how thick its walls are, so say it:"
+        export = ["ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", mesh.parent, *walls]
+        steps.append((export, what))
+    heat = ["thermoxels", "heat", mesh, "--scene", weather, "--output-dir", folder / "heat"]
+    capture = ["thermoxels", "capture", "PHOTOGRAPHS", "--output", "SCENE"]
+    steps += [
+        (heat, f"Let {said} act on it; report.html says how much heat goes where:"),
+        (capture, "Make a scene of your own from a folder of photographs and thermal images:"),
+        (["ns-train", "thermoxels", "--data", "SCENE"], "Train on it, and then go on with ns-export as above:"),
+    ]
+    return [(command_line(words), what) for words, what in steps]

@@ -1,16 +1,33 @@
-"""The figures of a demo run, read from files and held against targets."""
+"""What a demo run achieved: its figures beside targets and beside the drawing, and the page that shows them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any
 
+import numpy as np
+from PIL import Image
+
+from thermoxels_ns.audit.draws import Interval
+from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.checks import plain_os_errors
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.json_values import read_json_object
+from thermoxels_ns.core.json_values import read_json, read_json_object
+from thermoxels_ns.mesh.boundary.patch_rules import load_patch_rules
+from thermoxels_ns.mesh.boundary.patches import apply_patches
+from thermoxels_ns.reports.capture_pictures import colours, jpeg_of
+from thermoxels_ns.reports.page import build_page
+from thermoxels_ns.synthetic.catalogue import make_scene
+from thermoxels_ns.synthetic.house_corner import BRIDGE_PSI_W_MK, HOUSE, true_u_w_m2k
 
+_AGAIN = "Run the demo again."
 _ENERGY_UNITS = ("J", "kJ", "MJ", "GJ", "TJ", "PJ")  # Each a thousand of the one before
+_BRIDGE_PATCH = "side-wall"  # Where nothing stands before the band, and its psi is that of the drawing
+_POINTS = 200_000  # On the true surface, from which the mean U-value of each element is told
+_INPUTS_SHOWN = 6
 
 
 @dataclass(frozen=True)
@@ -40,67 +57,62 @@ class Target:
         return ("≥ " if self.at_least else "≤ ") + self.form.format(self.bound)
 
 
-@dataclass(frozen=True)
-class DemoResults:
-    """What a demo run achieved: the figures with a target, and others."""
+def read_results(eval_json: Path, summary_json: Path) -> tuple[tuple[Target, ...], tuple[tuple[str, str], ...]]:
+    """Read what ``ns-eval`` (on held-out views) and ``ns-export thermoxels-mesh`` wrote, or raise `ThermoxelsError`.
 
-    targets: tuple[Target, ...]
-    others: tuple[tuple[str, str], ...]  # Further figures: name and value with unit
-
-
-def read_results(eval_json: Path, summary_json: Path) -> DemoResults:
-    """Read what ``ns-eval`` (on held-out views) and ``ns-export thermoxels-mesh`` wrote, or raise `ThermoxelsError`."""
-    images = _Section(eval_json, "results")
-    truth, heat, mesh = (_Section(summary_json, name) for name in ("truth", "heat", "mesh"))
-    tolerance = truth.number("tolerance_voxels")
+    Returns the figures with a target, and further ones: name, and value with unit.
+    """
+    image = numbers_of(eval_json, "results")
+    truth, heat, mesh = (numbers_of(summary_json, name) for name in ("truth", "heat", "mesh"))
+    tolerance = truth("tolerance_voxels")
     targets = (
         Target(
-            *("RGB PSNR, held-out views", images.number("psnr"), 26.0, True, "{:.2f} dB"),
+            *("RGB PSNR, held-out views", image("psnr"), 26.0, True, "{:.2f} dB"),
             "How like the photographs the model's pictures are, at places where it was never shown one.",
         ),
         Target(
-            *("Temperature error, all pixels, mean", images.number("thermal_mae_c"), 1.0, False, "{:.2f} °C"),
+            *("Temperature error, all pixels, mean", image("thermal_mae_c"), 1.0, False, "{:.2f} °C"),
             "The same for the thermal images.",
         ),
         Target(
-            *(f"Surface F-score at {tolerance:g} voxels", truth.number("fscore"), 0.6, True, "{:.3f}"),
+            *(f"Surface F-score at {tolerance:g} voxels", truth("fscore"), 0.6, True, "{:.3f}"),
             f"1: the surface is nowhere further than {tolerance:g} voxels from the true one, and none is missing.",
         ),
         Target(
-            *("Heat conserved, relative error", heat.number("energy_residual"), 1e-9, False, "{:.0e}"),
+            *("Heat conserved, relative error", heat("energy_residual"), 1e-9, False, "{:.0e}"),
             "Change of the heat in the insulated solid while heat flows inside it.",
         ),
     )
+    seen_error, seen = truth("temperature_seen_mae_c"), 100.0 * truth("share_of_seen_reached")
+    chamfer, chamfer_mm = truth("chamfer_voxels"), 1e3 * truth("chamfer_m")
+    volume, true_volume = truth("mesh_volume_m3"), truth("true_volume_m3")
+    area, true_area = truth("mesh_area_m2"), truth("true_area_m2")
     others = (
-        ("RGB SSIM", f"{images.number('ssim'):.3f}"),
-        ("Thermal PSNR", f"{images.number('thermal_psnr'):.2f} dB"),
-        ("Thermal SSIM", f"{images.number('thermal_ssim'):.3f}"),
-        ("Temperature error, pixels that hit the object, mean", f"{images.number('thermal_mae_hit_c'):.2f} °C"),
-        ("Temperature error, hot region, mean", f"{images.number('thermal_mae_roi_c'):.2f} °C"),
-        ("Voxel size", f"{1e3 * truth.number('voxel_size_m'):.1f} mm"),
-        ("Surface precision", f"{truth.number('precision'):.3f}"),
-        ("Surface recall", f"{truth.number('recall'):.3f}"),
+        ("RGB SSIM", f"{image('ssim'):.3f}"),
+        ("Thermal PSNR", f"{image('thermal_psnr'):.2f} dB"),
+        ("Thermal SSIM", f"{image('thermal_ssim'):.3f}"),
+        ("Temperature error, pixels that hit the object, mean", f"{image('thermal_mae_hit_c'):.2f} °C"),
+        ("Temperature error, hot region, mean", f"{image('thermal_mae_roi_c'):.2f} °C"),
+        ("Voxel size", f"{1e3 * truth('voxel_size_m'):.1f} mm"),
+        ("Surface precision", f"{truth('precision'):.3f}"),
+        ("Surface recall", f"{truth('recall'):.3f}"),
         (
             "Distance between the mesh's and the true surface, mean of both ways (Chamfer)",
-            f"{truth.number('chamfer_voxels'):.2f} voxels, {1e3 * truth.number('chamfer_m'):.1f} mm",
+            f"{chamfer:.2f} voxels, {chamfer_mm:.1f} mm",
         ),
         (
             "Temperature error of the mesh on the seen surface, mean",
-            f"{truth.number('temperature_seen_mae_c'):.2f} °C "
-            f"({100.0 * truth.number('share_of_seen_reached'):.0f} % of the surface)",
+            f"{seen_error:.2f} °C ({seen:.0f} % of the surface)",
         ),
-        (
-            "Volume of the mesh",
-            f"{truth.number('mesh_volume_m3'):.4g} m³ (true: {truth.number('true_volume_m3'):.4g} m³)",
-        ),
-        ("Surface of the mesh", f"{truth.number('mesh_area_m2'):.4g} m² (true: {truth.number('true_area_m2'):.4g} m²)"),
-        ("Tetrahedra", f"{mesh.number('tets'):,.0f}"),
-        ("Nodes", f"{mesh.number('nodes'):,.0f}"),
-        ("Nodes with a measured temperature", f"{100.0 * mesh.number('share_of_nodes_observed'):.0f} %"),
-        ("Heat content before", energy_text(heat.number("energy_before_j"))),
-        ("Heat content after", energy_text(heat.number("energy_after_j"))),
+        ("Volume of the mesh", f"{volume:.4g} m³ (true: {true_volume:.4g} m³)"),
+        ("Surface of the mesh", f"{area:.4g} m² (true: {true_area:.4g} m²)"),
+        ("Tetrahedra", f"{mesh('tets'):,.0f}"),
+        ("Nodes", f"{mesh('nodes'):,.0f}"),
+        ("Nodes with a measured temperature", f"{100.0 * mesh('share_of_nodes_observed'):.0f} %"),
+        ("Heat content before", energy_text(heat("energy_before_j"))),
+        ("Heat content after", energy_text(heat("energy_after_j"))),
     )
-    return DemoResults(targets, others)
+    return targets, others
 
 
 def energy_text(energy_j: float) -> str:
@@ -116,24 +128,140 @@ def energy_text(energy_j: float) -> str:
     return f"{value / 1e3**power:.4g} {_ENERGY_UNITS[power]}"
 
 
-class _Section:
-    """One object of a json file; asks for its numbers by name."""
+def numbers_of(path: Path, name: str) -> Callable[[str], float]:
+    """Read an object of a json file; returns a function that gives its numbers by key, NaN for null.
 
-    def __init__(self, path: Path, name: str) -> None:
-        self._path, self._name = path, name
-        self._content: Any = read_json_object(path, "Run the demo again.").get(name)
-        if not isinstance(self._content, dict):
-            raise self._error("an object", self._content)
+    Both raise `ThermoxelsError` for what is missing or of another kind. Null is a figure that does not exist, for
+    instance without a surface.
+    """
 
-    def number(self, key: str) -> float:
-        """The number under `key`; NaN for null (a figure that does not exist, for instance without a surface)."""
-        value = self._content.get(key, "nothing")
+    def refuse(expected: str, got: object) -> ThermoxelsError:
+        return ThermoxelsError(f"{path}: {name}", expected=expected, got=repr(got), remedy=_AGAIN)
+
+    content = read_json_object(path, _AGAIN).get(name)
+    if not isinstance(content, dict):
+        raise refuse("an object", content)
+
+    def number(key: str) -> float:
+        value = content.get(key, "nothing")
         if value is None:
             return math.nan
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise self._error(f"a number under {key}", value)
+            raise refuse(f"a number under {key}", value)
         return float(value)
 
-    def _error(self, expected: str, got: object) -> ThermoxelsError:
-        what = f"{self._path}: {self._name}"
-        return ThermoxelsError(what, expected=expected, got=repr(got), remedy="Run the demo again.")
+    return number
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A figure of the audit beside the true one."""
+
+    name: str
+    unit: str
+    true: float
+    found: Interval | None  # None: not found
+
+    @property
+    def held(self) -> bool:
+        """Whether the interval holds the truth."""
+        return self.found is not None and self.found.low <= self.true <= self.found.high
+
+
+def compare(answers: Path, rules: Path) -> tuple[Compared, ...]:
+    """Hold answers.json of an audit with a file of patches against the drawing, or raise `ThermoxelsError`."""
+    content, true = read_json_object(answers, _AGAIN), true_u_of_patches(rules)
+    found = [
+        Compared(one["name"], "W/(m2 K)", true[one["name"]], Interval(**one["u_w_m2k"])) for one in content["patches"]
+    ]
+    wanted = ("line", _BRIDGE_PATCH, "")
+    bridges = [one for one in content["defects"] if (one["kind"], one["patch"], one["not_counted"]) == wanted]
+    longest = max(bridges, key=lambda one: one["length_m"], default=None)
+    psi = None if longest is None else Interval(**longest["coefficient"])
+    return (*found, Compared(f"thermal bridge in {_BRIDGE_PATCH}, psi", "W/(m K)", BRIDGE_PSI_W_MK, psi))
+
+
+def true_u_of_patches(rules: Path) -> dict[str, float]:
+    """Mean true U-value of each element that a file of patches cuts out of the house, [W/(m2 K)]."""
+    points, normals = make_scene(HOUSE).surface_points(_POINTS)
+    every, none = np.ones(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
+    applied = apply_patches(
+        load_patch_rules(rules), centroids_m=points, normals=normals, up=(0.0, 0.0, 1.0), seen=every, on_box=none
+    )
+    u: FloatArray = true_u_w_m2k(points)
+    return {applied.names[n]: float(u[applied.number == n].mean()) for n in np.unique(applied.number)}
+
+
+def audit_target(compared: Sequence[Compared]) -> Target:
+    """How many of the figures lie in their intervals: all of them should."""
+    share = sum(one.held for one in compared) / len(compared) if compared else math.nan
+    return Target(
+        *("Audit: true U-values and psi in their intervals", 100.0 * share, 100.0, True, "{:.0f} %"),
+        "The audit's answers beside what the house was drawn with; its intervals are to hold 90 % in the long run.",
+    )
+
+
+def demo_page(
+    folder: Path,
+    scene: str,
+    targets: Iterable[Target],
+    others: Sequence[tuple[str, str]],
+    compared: Sequence[Compared],
+    seconds: Sequence[tuple[str, float]],
+    commands: Sequence[str],
+    next_steps: Sequence[tuple[str, str]],
+) -> str:
+    """Build the page of a demo from the pictures in its folder; raises `ThermoxelsError` if one is missing.
+
+    `seconds` are what each step took, in order; `next_steps` are commands, and what each does.
+    """
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    export, renders, drawn = folder / "export", folder / "renders" / "test", folder / "scene"
+    photographs = sorted((drawn / "images").glob("frame_train_*"))
+    held_out = sorted(path.stem for path in (drawn / "images").glob("frame_eval_*"))
+    bounds = read_json(drawn / "temperature_bounds.json")
+    with plain_os_errors(folder, "a picture that the demo's commands write", _AGAIN, ThermoxelsError):
+        inputs = []
+        for number in range(_INPUTS_SHOWN):
+            path = photographs[number * len(photographs) // _INPUTS_SHOWN]
+            with Image.open(drawn / "thermal" / f"{path.stem}.png") as counts:  # 16 bits that span the bounds
+                thermal = colours(np.asarray(counts, dtype=np.float64) / 65535.0, (0.0, 1.0)).astype(np.uint8)
+            inputs.append((path.read_bytes(), jpeg_of(thermal, 88)))
+        return build_page(
+            "demo.html.j2",
+            scene=scene,
+            photographs=len(photographs),
+            targets=targets,
+            others=others,
+            compared=compared,
+            inputs=inputs,
+            views=[
+                (
+                    name,
+                    [(renders / of / f"{name}.png").read_bytes() for of in ("gt-rgb", "rgb", "gt-thermal", "thermal")],
+                )
+                for name in held_out
+            ],
+            gradient=[to_hex(colour) for colour in colormaps["inferno"](np.linspace(0.0, 1.0, 17))],
+            ends_c=[float(bounds[f"absolute_{end}_temperature"]) for end in ("min", "max")],
+            heat=_panels(export / "heat.png", 3),
+            mesh=(export / "mesh.png").read_bytes(),
+            measured=(export / "mesh-measured.png").read_bytes(),
+            seconds=seconds,
+            commands=commands,
+            next_steps=next_steps,
+        )
+
+
+def _panels(path: Path, count: int) -> list[bytes]:
+    """Cut a picture of panels side by side, so that a narrow screen can show one below the other."""
+    panels = []
+    with Image.open(path) as whole:
+        for number in range(count):
+            file = BytesIO()
+            left, right = number * whole.width // count, (number + 1) * whole.width // count
+            whole.crop((left, 0, right, whole.height)).save(file, format="PNG")
+            panels.append(file.getvalue())
+    return panels

@@ -14,7 +14,6 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of, up_of
-from thermoxels_ns.commands.export_snapshot import export_snapshot, prepare_folder
 from thermoxels_ns.core.errors import CheckpointError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.core.lattice import input_from_world
@@ -70,9 +69,10 @@ class ExportThermoxelsMesh(ExportOptions):
 
     def run(self, say: Any = print) -> dict[str, Any]:
         """Run the export and return the summary that summary.json holds, or raise `ThermoxelsError`."""
+        from thermoxels_ns.commands.export_snapshot import export_snapshot, prepare_folder
+
         checked = check_options(self)
-        scaled = checked.distance is not None or self.metres_per_unit is not None
-        prepare_folder(self.output_dir, heat=scaled)
+        prepare_folder(self.output_dir)
         say(f"Loading {self.load_config}")
 
         def check_scale(scene_folder: Path) -> None:

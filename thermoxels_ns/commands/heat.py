@@ -1,30 +1,231 @@
 """The command ``thermoxels heat``: heat flow through an exported mesh in a scene."""
 
-# Only light imports at the top, so that --help answers at once.
-
 from __future__ import annotations
 
-from dataclasses import dataclass
+# Only light imports at the top, so that --help answers at once.
+import csv
+import math
+import time as clock
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import tyro
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.commands.heat_options import HeatOptions
+from thermoxels_ns.commands.installed_commands import command_of
+from thermoxels_ns.core.checks import remove_file, replace_when_done, result_folder
+from thermoxels_ns.core.errors import HeatError, MeshError
+from thermoxels_ns.core.json_values import read_json_object
+
+if TYPE_CHECKING:
+    from thermoxels_ns.heat.run import HeatRun
+
+ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "report.html", "heat.pvd", "heat.vtu"
+"""Files of a run; pictures come on top."""
+
+Say = Callable[[str], None]
 
 
 @dataclass
-class Heat(HeatOptions):
+class Heat:
     """Let heat flow through an exported mesh: heat losses, U-values, cold spots, temperatures over time, a report.
 
     Writes report.html (open it first), answers.json, series.csv, temperatures for ParaView (heat.pvd through time,
     heat.vtu of a steady state) and pictures."""
 
+    mesh: tyro.conf.Positional[Path]
+    """The mesh.vtu of an export with a known scale; mesh-boundary.vtp lies beside it."""
+    scene: str
+    """Heat scene: the path of a yaml file, or the name of one of configs/scene-NAME.yaml, such as winter-night."""
+    output_dir: Path = Path("heat")
+    """Folder for the results; made if it does not exist. Those of an earlier run in it are replaced."""
+    probes: tuple[tuple[float, float, float], ...] = ()
+    """Points whose temperature is followed, x y z in the coordinates of the mesh, one after the other, [m]."""
+    tolerance: float | None = None
+    """Largest error that any temperature may have, [K], such as 0.05. Linear or quadratic tetrahedra, the mesh size and
+    the time steps are then chosen so that the estimated error meets it; of the scene's time settings only
+    the duration and the times at which temperatures are kept remain. The error is that of the heat equation in the
+    body as the mesh describes it. Left out: the mesh as it is, with the scene's own steps; of a steady state the error
+    is estimated all the same."""
+    flow_tolerance: float | None = None
+    """Largest error that the mean heat flow of any effect may have, as a share of all heat that flows through the body,
+    such as 0.01; alone or beside --tolerance, without which a scene with a duration cannot do."""
+    memory_gb: float = 4.0
+    """Most memory that solving may take, [GiB]. What needs more is refused before any of it is taken."""
+    allow_unmet: bool = False
+    """If a tolerance cannot be met within the memory, write the best that fits and say so, instead of an error.
+    Through time the first estimate needs room for a mesh of half the size."""
+    leave_out_below_k: float | None = None
+    """Effects that together can change no temperature by more than this are left out, [K]; the report lists each with
+    its bound. 0 builds all that brings heat; so do meshes with obtuse angles, as exports are, and --flow-tolerance.
+    Left out: a fifth of --tolerance, which counts against it, or 0.01 without one (a fifth of the default tolerance of
+    the time steps), and what may change a mean heat flow by more than 1 % of all heat that flows is built, too."""
+    up: tuple[float, float, float] | None = None
+    """Direction that points up in the coordinates of the mesh, if the scene does not say. Default: that of the
+    export's summary.json beside the mesh, or else z."""
+    pictures: bool = True
+    """Draw pictures of the surface."""
+
     def main(self) -> None:
         """Run it; raises `ThermoxelsError` if the mesh, the scene or an option cannot be used, or the solver fails."""
         from rich.console import Console
-
-        from thermoxels_ns.commands.heat_run import run_heat
 
         console = Console(highlight=False)
         # The last bits of a product of long vectors depend on how many threads BLAS has.
         with threadpool_limits(1, "blas"):
             run_heat(self, lambda line: console.print(line, markup=False, soft_wrap=True))
+
+
+def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
+    """Compute everything, then write it; answers.json comes last, so that files beside one belong together."""
+    from thermoxels_ns.heat.vtk_series import STEP_PATTERN
+    from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES
+
+    names, series = (
+        (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *HEAT_PICTURES),
+        f"{Path(THROUGH_TIME).stem}/{STEP_PATTERN}",
+    )
+    others = ("summary.json", "quality.json")
+    folder = result_folder(options.output_dir, names, (ANSWERS, SERIES), others, series)
+    run = compute_heat(options, say)
+    write_heat_files(folder, options, run, say)
+    return run
+
+
+def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
+    """Do what `run_heat` does without writing anything."""
+    from thermoxels_ns.heat.run import run_scene
+    from thermoxels_ns.heat.scene_file import load_heat_scene
+    from thermoxels_ns.heat.solving import Goals
+    from thermoxels_ns.mesh.files.read import read_mesh
+
+    begin = clock.perf_counter()
+    scene = load_heat_scene(options.scene)
+    goals = Goals(
+        tolerance_k=options.tolerance,
+        flow_tolerance=options.flow_tolerance,
+        leave_out_below_k=options.leave_out_below_k,
+        memory_gb=options.memory_gb,
+        allow_unmet=options.allow_unmet,
+    )
+    goals.check_fits(scene.time)
+    mesh = read_mesh(options.mesh)
+    export = read_export_summary(options.mesh, say)
+    up = export.get("up") if options.up is None else options.up
+    say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes.")
+    say(f"Scene: {scene.description or options.scene}.")
+    read_s = clock.perf_counter() - begin
+    run = run_scene(scene, mesh, goals, up=up, probes_m=options.probes, export=export, say=say)
+    return replace(run, seconds={"read": read_s, **run.seconds})
+
+
+def read_export_summary(mesh: Path, say: Say) -> dict[str, Any]:
+    """Read what the export says about a mesh (empty without summary.json); `HeatError` for one without a scale."""
+    path = mesh.with_name("summary.json")
+    if not path.is_file():
+        say(f"Warning: {path} is missing; the mesh is taken to be in metres.")
+        return {}
+    summary = read_json_object(path, "Export the mesh again, or move the file away.", MeshError)
+    if summary.get("length_unit", "m") != "m":
+        remedy = "Export again with --metres-per-unit or --known-distance."
+        got = f"one in {summary['length_unit']}s"
+        raise HeatError("scale of the mesh", expected="an export in metres", got=got, remedy=remedy)
+    try:
+        if summary.get("up") is not None:
+            x, y, z = map(float, summary["up"])
+            summary["up"] = (x, y, z)
+    except (TypeError, ValueError) as problem:
+        name, remedy = f"{path}: up", "Pass --up 0 0 1, or export the mesh again."
+        raise MeshError(name, expected="three numbers", got=repr(summary["up"]), remedy=remedy) from problem
+    return summary
+
+
+def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
+    """Everything that answers.json says."""
+    screening, solution = run.screening, run.solution
+    error, time_error_k = getattr(solution, "error", None), getattr(solution, "time_error_k", math.nan)
+    return {
+        "mesh": options.mesh,
+        "scene": options.scene,
+        "description": run.scene.description,
+        "steady": run.scene.steady,
+        "warnings": list(run.warnings),
+        "leave_out_below_k": screening.tolerance_k,
+        "accuracy": None if run.accuracy is None else asdict(run.accuracy),
+        "mesh_error": None if error is None else asdict(error),
+        "solved": {
+            "tets": len(run.solved.mesh.tets),
+            "nodes": len(run.solved.mesh.points_m),
+            "unknowns": run.nodes.states_c.shape[1],
+        },
+        **asdict(run.results),
+        "wall": None if run.wall is None else asdict(run.wall),
+        "no_wall": run.no_wall,
+        "probes": [
+            {"point_m": point, "temperature_c": run.probes_c[:, number]}
+            for number, point in enumerate(run.probes.points_m)
+        ],
+        "built": [asdict(entry) for entry in screening.kept],
+        "left_out": [asdict(entry) for entry in screening.left_out],
+        "left_out_bound_k": screening.bound_k,
+        "left_out_bound_w": screening.bound_w,
+        "left_out_note": screening.note,
+        "assembled": dict(solution.assembled.counts),
+        "newton_iterations": int(np.sum(solution.newton_iterations)),
+        "linear_iterations": int(np.sum(solution.iterations)),
+        "steps": getattr(solution, "steps", 0),
+        "time_error_k": time_error_k if math.isfinite(time_error_k) else None,
+        "seconds": dict(run.seconds),
+    }
+
+
+def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> None:
+    """Write everything into a folder that is ready for it, answers.json last, or raise `OutputError`."""
+    from thermoxels_ns.fem.solution import SteadySolution
+    from thermoxels_ns.heat.vtk_series import remove_heat_series, write_heat_series
+    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtu
+    from thermoxels_ns.reports.heat_page import heat_page
+    from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES, draw_surface
+    from thermoxels_ns.reports.page import write_page
+
+    answers = answers_of(options, run)
+    summary_text(answers)  # raises if json cannot hold it
+    shown, pictures = run.nodes, list[str]()
+    remove_file(folder / ANSWERS)
+    _write_series(folder / SERIES, run)  # first: it tells the next run that the rest is a heat run's, too
+    for name in (PAGE, STEADY, *HEAT_PICTURES):
+        remove_file(folder / name)
+    if isinstance(run.solution, SteadySolution):
+        remove_heat_series(folder / THROUGH_TIME)
+        write_vtu(folder / STEADY, shown.mesh, temperature_c=shown.states_c[-1])
+    else:
+        write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution)
+    if options.pictures:
+        pictures = draw_surface(folder, shown.mesh, shown.states_c, shown.times_s, run.problem.up)
+    drawn = {name: (folder / name).read_bytes() for name in pictures}
+    shown_in = STEADY if isinstance(run.solution, SteadySolution) else THROUGH_TIME
+    files = [PAGE, ANSWERS, SERIES, shown_in, *pictures]
+    write_page(folder / PAGE, heat_page(run, drawn, options.mesh.name, command_of("heat", options), files))
+    write_summary(folder / ANSWERS, answers)
+    say(f"Written to {folder}: {', '.join(files)}")
+
+
+def _write_series(path: Path, run: HeatRun) -> None:
+    """Temperatures at each time, and mean heat flows during the interval that ends there."""
+    times, states = run.nodes.times_s, run.nodes.states_c
+    effects = run.solution.effects
+    head = ["time_s", "min_c", "mean_c", "max_c"]
+    head += [f"probe {number + 1} [C]" for number in range(run.probes_c.shape[1])]
+    head += [f"{heat.effect} [W]" for heat in effects]
+    heat_w = np.stack([heat.heat_w for heat in effects], axis=1) if effects else np.zeros((max(len(times) - 1, 1), 0))
+    with replace_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(head)
+        for number, time_s in enumerate(times):
+            temperatures = [states[number].min(), run.mean_c[number], states[number].max(), *run.probes_c[number]]
+            interval = number if len(times) == 1 else number - 1
+            flows = ["" for _ in effects] if interval < 0 else [repr(float(flow)) for flow in heat_w[interval]]
+            writer.writerow([repr(float(time_s)), *(repr(float(value)) for value in temperatures), *flows])

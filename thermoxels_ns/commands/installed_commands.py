@@ -11,10 +11,12 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from thermoxels_ns.core.errors import ThermoxelsError, explain
 
@@ -22,11 +24,16 @@ if TYPE_CHECKING:
     # The peak that Linux reports for a process is at least that of the process which started it, so this stays small.
     from rich.console import Console
 
+PLAIN_TRAINING = (
+    *("--timestamp", "run", "--vis", "tensorboard"),
+    # One line every hundred steps instead of a block that is drawn over and over.
+    *("--logging.steps-per-log", "100", "--logging.local-writer.max-log-size", "0", "--logging.profiler", "none"),
+)
+"""Options of an ns-train whose output somebody reads, or a file keeps."""
+
 _POLL_S = 0.05
 _QUIET_S = 20.0
-_TAIL_BYTES = 4096
 _LAST_LINES = 12
-_DONE = re.compile(rb"^\d+ \((\d+(?:\.\d+)?)%\)", re.MULTILINE)
 # What nerfstudio 1.1 and torch tell their programmers, not their users.
 _SILENCED = ",".join(
     (
@@ -36,9 +43,6 @@ _SILENCED = ",".join(
         "ignore:Converting a tensor with requires_grad:UserWarning",
     )
 )
-
-Watch = Callable[[float | None], None]
-"""Called while a command runs with the share of the training that is done, None if it does not say."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +64,21 @@ def command_line(arguments: Sequence[str | Path]) -> str:
     return shlex.join(str(argument) for argument in arguments)
 
 
-def run_command(
-    arguments: Sequence[str | Path], log: Path, console: Console | None = None, watch: Watch = lambda _: None
-) -> ProcessCost:
+def command_of(name: str, options: Any) -> str:
+    """Write a command of ours as it is typed, from a dataclass of its options, the first of which has no name.
+
+    Options at their default are left out.
+    """
+    words = ["thermoxels", name, str(getattr(options, fields(options)[0].name))]
+    for field in fields(options)[1:]:
+        value = getattr(options, field.name)
+        if value != field.default:
+            parts = np.ravel(value).tolist() if isinstance(value, tuple) else [value]
+            words += [f"--{field.name.replace('_', '-')}", *map(str, parts)]
+    return shlex.join(words)
+
+
+def run_command(arguments: Sequence[str | Path], log: Path, console: Console) -> ProcessCost:
     """Run a command of this installation with its output in a file, whose folder exists, and measure it.
 
     `console` shows the output as it comes, progress bars included; elsewhere than on a terminal a line says now and
@@ -70,8 +86,7 @@ def run_command(
     """
     words = [str(argument) for argument in arguments]
     program = _installed_command(words[0])
-    if console is not None:
-        console.print(f"$ {command_line(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"$ {command_line(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)
     start = time.monotonic()
     with log.open("wb") as file:
         process = subprocess.Popen(
@@ -82,7 +97,7 @@ def run_command(
             env=_environment(console),
         )
     try:
-        peak_memory_gb = _wait(process, log, console, watch, f"... {words[0]} is at work")
+        peak_memory_gb = _wait(process, log, console, f"... {words[0]} is at work")
     finally:
         if process.poll() is None:
             process.terminate()
@@ -105,36 +120,32 @@ def _installed_command(name: str) -> str:
     return program
 
 
-def _environment(console: Console | None) -> dict[str, str]:
+def _environment(console: Console) -> dict[str, str]:
     """The environment of a command: output at once, without warnings that concern programmers, colours if wanted."""
     environment = dict(os.environ, PYTHONUNBUFFERED="1", PYTHONIOENCODING="utf-8")
     environment.setdefault("PYTHONWARNINGS", _SILENCED)
-    if console is not None and console.is_terminal:
+    if console.is_terminal:
         environment |= {"FORCE_COLOR": "1", "COLUMNS": str(console.width)}
     return environment
 
 
-def _wait(process: subprocess.Popen[bytes], log: Path, console: Console | None, watch: Watch, quiet: str) -> float:
-    """Show the output and tell the watcher until a process ends; return its peak memory [1e9 bytes]."""
-    start = looked = heard = time.monotonic()
+def _wait(process: subprocess.Popen[bytes], log: Path, console: Console, quiet: str) -> float:
+    """Show the output until a process ends; return its peak memory [1e9 bytes]."""
+    start = heard = time.monotonic()
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")  # what has arrived may end within a character
     with log.open("rb") as output:
         while True:
             ended, peak_memory_gb = _ended(process)
             now = time.monotonic()
-            if console is not None:
-                if arrived := output.read():
-                    heard = now
-                    console.file.write(decoder.decode(arrived))
-                    console.file.flush()
-                elif now - heard > _QUIET_S and not console.is_terminal:
-                    heard = now
-                    console.print(f"{quiet}, {now - start:.0f} s", highlight=False)
+            if arrived := output.read():
+                heard = now
+                console.file.write(decoder.decode(arrived))
+                console.file.flush()
+            elif now - heard > _QUIET_S and not console.is_terminal:
+                heard = now
+                console.print(f"{quiet}, {now - start:.0f} s", highlight=False)
             if ended:
                 return peak_memory_gb
-            if now - looked > 10 * _POLL_S:
-                looked = now
-                watch(_share_done(log))
             time.sleep(_POLL_S)
 
 
@@ -157,11 +168,3 @@ def _own_peak_kib() -> int:
     status = Path("/proc/self/status")
     found = re.search(r"^VmHWM:\s*(\d+) kB", status.read_text(), re.MULTILINE) if status.is_file() else None
     return int(found[1]) if found else 0
-
-
-def _share_done(log: Path) -> float | None:
-    """How much of the training is done according to the last line of steps in its log, 0 to 1."""
-    with log.open("rb") as file:
-        file.seek(max(0, log.stat().st_size - _TAIL_BYTES))
-        found = _DONE.findall(file.read())
-    return min(1.0, float(found[-1]) / 100.0) if found else None

@@ -203,19 +203,35 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
         raise OutputError("output folder", expected=expected, got=", ".join(blocked), remedy=remedy)
 
 
-def refuse_files_of_others(folder: Path, files: Iterable[str], own: Sequence[str], others: Sequence[str]) -> None:
-    """Raise `OutputError` where a command that writes or removes `files` would take what it did not write.
+def result_folder(
+    path: Path | str, files: Sequence[str], own: Sequence[str], others: Sequence[str], series: str | None = None
+) -> Path:
+    """Make the folder of a command's results, without what killed runs of it left half-written.
 
-    A star in a name stands for anything. `own` are names that it writes first and last, without any of which the others
-    are not the command's; `others` tell the results of another command.
+    Raises `OutputError`, before anything is computed, for what is in the way of results, and where a command that
+    writes or removes `files` would take what it did not write.
+
+    Args:
+        path: The folder.
+        files: Names of all files that the command may write.
+        own: Names that it writes first and last, without any of which the others are not the command's.
+        others: Names that tell the results of another command.
+        series: Files of a folder in it, with a star that stands for anything, as in ``heat/step-*.vtu``.
     """
+    folder, steps = writable_folder(path), [] if series is None else [series]
+    refuse_what_is_in_the_way(folder, files, [Path(name).parent.name for name in steps])
     found = [name for name in others if (folder / name).exists()]
     if not any((folder / name).exists() for name in own):
-        found += [next(folder.glob(name)).relative_to(folder).as_posix() for name in files if any(folder.glob(name))]
+        there = [next(folder.glob(name), None) for name in (*files, *steps)]
+        found += [one.relative_to(folder).as_posix() for one in there if one is not None]
     if found:
         expected = f"no files but those of an earlier run of this command in {folder}"
         remedy = "Choose another folder with --output-dir, or move them away."
         raise OutputError("output folder", expected=expected, got=", ".join(dict.fromkeys(found)), remedy=remedy)
+    remove_stale_temporaries(folder, files)
+    for name in steps:
+        remove_stale_temporaries((folder / name).parent, [Path(name).name])
+    return folder
 
 
 def _output_error(path: Path, expected: str, problem: OSError) -> OutputError:

@@ -1,4 +1,4 @@
-"""Pictures and samples for the page of a capture: thermal images laid over photographs."""
+"""Thermal images in colours, alone and laid over photographs."""
 
 from __future__ import annotations
 
@@ -10,47 +10,14 @@ import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.rig.start import rig_frames
 from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame
-from thermoxels_ns.capture.scene_writer import scene_names
 from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
-from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.reports.capture_page import CapturePage, Overlay, build_page
-from thermoxels_ns.reports.page import write_page
 
 _WIDTH = 640
 _DEPTH_STEP = 4  # Depth is looked up at every so many pixels of the reduced photograph, and linear between
 _COLOUR_SHARE = 0.55  # How much of the thermal colours covers the photograph
 _PERCENTILES = (2.0, 98.0)  # Of a thermal image's temperatures, for its darkest and brightest colours
-_SHOWN = 6
-_SAMPLED_PIXELS = 4000  # Of every thermal image, for the histogram
-
-
-def write_capture_page(result: CaptureResult) -> None:
-    """Draw the overlays and write the page of a capture, whole or not at all."""
-    scene, names = result.scene, scene_names(len(result.scene.frames))
-    paired = rig_frames(scene.model, scene.frames)
-    overlays = []
-    shown = np.linspace(0, len(paired) - 1, min(_SHOWN, len(paired))).round().astype(int)
-    for index in np.unique(shown).tolist():
-        temperature_c = scene.drift.corrected(index, np.load(scene.frames[index].thermal))
-        start, found = (
-            jpeg_of(overlay(paired[index], temperature_c, scene.model.camera, rig)) for rig in (result.start, scene.rig)
-        )
-        known = temperature_c[np.isfinite(temperature_c)]
-        low, high = (float(each) for each in np.percentile(known, _PERCENTILES)) if known.size else (0.0, 1.0)
-        alone = jpeg_of(colours(temperature_c, (low, high)).astype(np.uint8))
-        title = f"{names[index]}: {scene.frames[index].photograph_source}"
-        ends = f": {low:.1f} °C and less are black, {high:.1f} °C and more are bright yellow" if known.size else ""
-        overlays.append(Overlay(title, start, found, alone, f"thermal image{ends}"))
-    samples, masked, pixels = [], 0, 0
-    for index, frame in enumerate(scene.frames):
-        temperature_c = scene.drift.corrected(index, np.load(frame.thermal)).ravel()
-        samples.append(temperature_c[:: max(1, len(temperature_c) // _SAMPLED_PIXELS)])
-        masked, pixels = masked + frame.masked, pixels + len(temperature_c)
-    page = CapturePage(result, overlays, np.concatenate(samples), masked / max(pixels, 1))
-    write_page(result.page, build_page(page))
 
 
 def thermal_in_photograph(

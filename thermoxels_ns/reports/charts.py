@@ -10,12 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.reports.numbers import time_unit
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 INK, SOFT, LINE, ACCENT = "#1d2430", "#9aa3ae", "#e1e5ea", "#b3431e"
 """Colours of the pages' style sheet."""
+
+_MOST_CURVES = 8  # Probes or effects in one plot; more cannot be told apart
 
 
 @contextmanager
@@ -67,32 +73,28 @@ def bars(values: Sequence[float], label: str) -> str:
         return svg_text(figure)
 
 
-def curves_over_time(
-    times: npt.NDArray,
-    unit: str,
-    curves: Sequence[tuple[str, npt.NDArray]],
-    band: tuple[str, npt.NDArray, npt.NDArray],
-    steps: Sequence[tuple[str, npt.NDArray]],
-    labels: tuple[str, str],
-) -> str:
-    """Draw curves, and below them means over the intervals between the times, as an svg element.
+def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatArray, probe_names: Sequence[str]) -> str:
+    """Draw temperatures over time, and below them each effect's heat flow, as an svg element.
 
-    Times and `curves`, the most important one first, have shape (s + 1,), as lowest and highest values of `band`;
-    means, the most important one last, have shape (s,). `labels` are those of the upper and the lower vertical axis.
+    `mean_c` is that of the volume, shape (s + 1,), `probes_c` has shape (s + 1, p), [degrees Celsius]. Heat flows are
+    means over the intervals between the times.
     """
+    unit, length_s = time_unit(float(solution.times_s[-1]))
+    times, states = solution.times_s / length_s, solution.temperature_c
+    strongest = sorted(solution.effects, key=lambda heat: -np.abs(heat.heat_w).max(initial=0.0))
+    acting = [heat for heat in strongest if np.any(heat.heat_w)][:_MOST_CURVES]
     with chart(10.5, 7.0, rows=2) as (figure, (above, below)):
-        name, low, high = band
-        above.fill_between(times, low, high, color="#e9dcd6", label=name)
-        for number, (name, values) in enumerate(curves):
-            above.plot(times, values, label=name, **({"color": INK, "linewidth": 2} if number == 0 else {}))
+        above.fill_between(times, states.min(axis=1), states.max(axis=1), color="#e9dcd6", label="coldest to hottest")
+        above.plot(times, mean_c, label="mean of the volume", color=INK, linewidth=2)
+        for name, values in list(zip(probe_names, probes_c.T))[:_MOST_CURVES]:
+            above.plot(times, values, label=name)
         below.axhline(0.0, color=SOFT, linewidth=0.8)
-        for number, (name, values) in enumerate(steps):
-            last = number == len(steps) - 1
-            colour, width = (INK, 2.0) if last else (None, 1.4)
-            below.stairs(values, times, baseline=None, label=name, color=colour, linewidth=width)
+        for heat in acting:
+            below.stairs(heat.heat_w, times, baseline=None, label=heat.effect, linewidth=1.4)
+        below.stairs(solution.heat_w, times, baseline=None, label="all together: stored", color=INK, linewidth=2)
         below.set_xlabel(f"time [{unit}]")
         below.set_xlim(times[0], times[-1])
-        for axis, label in zip((above, below), labels):
+        for axis, label in ((above, "temperature [°C]"), (below, "heat flow into the body [W]")):
             axis.set_ylabel(label)
             axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8.5)
         return svg_text(figure)

@@ -18,7 +18,8 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.boundary.tags import SUPPORT, support_of_facets
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+from thermoxels_ns.reports.numbers import duration_text
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -33,6 +34,9 @@ _SUPPORT_COLOURS: tuple[str, ...] = ("green", "gold", "red", "grey")
 BAR_TITLE = "temperature [°C]"  # What a colour bar says unless told otherwise
 _LEAST_CHANGE_K = 1e-3  # Half the span of the smallest scale of changes, [K]
 _SHARE_OF_CHANGES = 0.95
+HEAT_PICTURES = ("surface-start.png", "surface-end.png", "surface-change.png", "cut.png")
+"""Pictures of a heat computation; of a steady state there are the second and the last only."""
+_MATTER = {"ambient": 0.5, "diffuse": 0.65, "smooth_shading": False}  # Colours stay readable in the shade
 _DARKEST = 0.1  # Share of inferno left out at its dark end, where shading could not be told from cold
 
 
@@ -91,59 +95,89 @@ def picture_of_mesh(
     if path.suffix != ".png":
         raise OutputError("picture", expected="a name that ends in .png", got=path.name, remedy="Rename the file.")
     values = np.asarray(mesh.temperature_c if temperature_c is None else temperature_c, dtype=np.float64)
-    right, true_up, towards_camera = _view_axes(up, view_direction)
+    axes = _view_axes(up, view_direction)
     shown = values[np.unique(mesh.facets)]
     ends = _without_outliers(shown) if clim is None else np.asarray(clim, dtype=np.float64)
     low, high = float(ends.min()), float(ends.max())
     if not high - low > 1e-3:  # a constant temperature gets 1 K around it
         low, high = low - 0.5, high + 0.5
-    beyond = clim is None and (float(shown.min()) < low or float(shown.max()) > high)
-    extremes = (float(shown.min()), float(shown.max())) if beyond else None
-
     plain = np.any([which for *_, which in painted], axis=0) if painted else np.zeros(len(mesh.facets), dtype=bool)
-    folder = writable_folder(path.parent)
+    words = [_size_of(mesh, length_unit)] if size else []
+    words += [textwrap.fill("; ".join(f"{colour}: {what}" for what, colour, which in painted if which.any()), 58)]
+    if clim is None and not plain.all() and (float(shown.min()) < low or float(shown.max()) > high):
+        words.append(f"colours: middle 99 %; all: {float(shown.min()):.1f} to {float(shown.max()):.1f}")
+    words.append(note)
+
+    folder, height = writable_folder(path.parent), window_size[1]
+    # DejaVu Sans, which comes with matplotlib, is the easiest to read in small pictures.
+    font = str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
     with _quiet_vtk(), replace_when_done(folder / path.name) as temporary:
-        plotter = pv.Plotter(off_screen=True, window_size=list(window_size), lighting="none")
+        plotter = pv.Plotter(off_screen=True, window_size=list(window_size))
         try:
             plotter.renderer.set_background("white")
-            _add_lights(plotter, right, true_up, towards_camera)
-            # DejaVu Sans, which comes with matplotlib and has every sign the pictures need.
-            font = str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
-            matter = {"ambient": 0.62, "diffuse": 0.45, "specular": 0.0, "smooth_shading": False}
             if not plain.all():
-                start = _DARKEST if colour_map == "inferno" else 0.0
                 surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[~plain])
                 surface.point_data["temperature_c"] = values
-                plotter.add_mesh(
-                    surface,
-                    scalars="temperature_c",
-                    cmap=ListedColormap(matplotlib.colormaps[colour_map](np.linspace(start, 1.0, 256))),
-                    clim=(low, high),
-                    show_scalar_bar=False,
-                    **matter,
-                )
-                _add_colour_bar(plotter, font, bar_title, high - low)
+                start = _DARKEST if colour_map == "inferno" else 0.0
+                colours = ListedColormap(matplotlib.colormaps[colour_map](np.linspace(start, 1.0, 256)))
+                bar_look: Any = _colour_bar(bar_title, high - low, height)
+                plotter.add_mesh(surface, cmap=colours, clim=(low, high), scalar_bar_args=bar_look, **_MATTER)
             for _, colour, which in painted:
                 if which.any():
                     surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[which])
-                    plotter.add_mesh(surface, color=colour, **matter)
-            words = "; ".join(f"{colour}: {what}" for what, colour, which in painted if which.any())
-            about = _size_of(mesh, length_unit) if size else ""
+                    plotter.add_mesh(surface, color=colour, **_MATTER)
             in_sight = mesh.points_m[np.unique(mesh.facets)]
             if ghost is not None and len(ghost[1]):
-                plotter.add_mesh(pv.PolyData.from_regular_faces(*ghost), color="grey", opacity=0.35, **matter)
+                plotter.add_mesh(pv.PolyData.from_regular_faces(*ghost), color="grey", opacity=0.35, **_MATTER)
                 in_sight = np.concatenate((in_sight, ghost[0]))
-            _add_words(plotter, title, font, about, note, words, None if plain.all() else extremes)
             if labels:
-                _add_labels(plotter, font, labels)
-            _frame(plotter, in_sight, right, true_up, towards_camera)
+                points, texts = np.array([point for _, point in labels], dtype=np.float64), [text for text, _ in labels]
+                look: Any = {
+                    "font_size": round(height / 45),
+                    "font_file": font,
+                    "text_color": _INK,
+                    "shape_color": "white",
+                }
+                plotter.add_point_labels(points, texts, show_points=False, always_visible=True, **look)
+            for bar in plotter.scalar_bars.values():
+                for text in (bar.GetTitleTextProperty(), bar.GetLabelTextProperty()):
+                    text.SetFontFamily(4)  # VTK_FONT_FILE
+                    text.SetFontFile(font)
+            written: Any = {"viewport": True, "color": _INK, "font_file": font}
+            plotter.add_text(title, position=(0.04, 0.925), font_size=round(height / 60), **written)
+            below = "\n".join(line for line in words if line)
+            plotter.add_text(below, position=(0.17, 0.04), font_size=round(height / 78), **written)
+            plotter.renderer.add_axes(viewport=(0.0, 0.0, 0.15, 0.155), color=_INK)
+            _frame(plotter, in_sight, *axes)
             plotter.screenshot(str(temporary), return_img=False)
         finally:
             plotter.close()
 
 
-def change_colours(change: npt.NDArray[np.floating]) -> tuple[dict[str, Any], str]:
-    """Colours for changes to both sides of 0, [K], as arguments of `picture_of_mesh`, and a note to write below it.
+def before_after_change(
+    states_c: FloatArray, times_s: FloatArray, shown: IntArray
+) -> list[tuple[FloatArray, dict[str, Any]]]:
+    """Choose how to show the first and the last of some states in one range of colours, and the change in its own.
+
+    Colours span the values at the nodes `shown`. Returns nodal values and arguments of `picture_of_mesh` for each of
+    the three pictures.
+    """
+    before, after = states_c[0], states_c[-1]
+    first, last = duration_text(float(times_s[0])), duration_text(float(times_s[-1]))
+    every = np.concatenate([before[shown], after[shown]])
+    ends = _without_outliers(every)
+    note = "colours: middle 99 %" if len(ends) < len(every) else ""
+    same: dict[str, Any] = {"clim": (float(ends.min()), float(ends.max())), "note": note}
+    change = {"title": f"Change from {first} to {last}", **change_colours((after - before)[shown])}
+    return [
+        (before, {"title": f"Surface temperature at {first}", **same}),
+        (after, {"title": f"Surface temperature at {last}", **same}),
+        (after - before, change),
+    ]
+
+
+def change_colours(change: npt.NDArray[np.floating]) -> dict[str, Any]:
+    """Colours for changes to both sides of 0, [K], and a note to write below, as arguments of `picture_of_mesh`.
 
     Where a few nodes changed far more than the rest, all others would be as grey as no change: the scale then ends
     where 95 % of the sizes do, and the note says so; else it is empty.
@@ -154,7 +188,7 @@ def change_colours(change: npt.NDArray[np.floating]) -> tuple[dict[str, Any], st
     end = max(end if beyond else most, _LEAST_CHANGE_K)
     extremes = f"{float(change.min()):.2g} to {float(change.max()):.2g} K"
     note = f"colours: {100 * _SHARE_OF_CHANGES:.0f} % of the nodes; all: {extremes}" if beyond else ""
-    return {"clim": (-end, end), "colour_map": "coolwarm", "bar_title": "change [K]"}, note
+    return {"clim": (-end, end), "colour_map": "coolwarm", "bar_title": "change [K]", "note": note}
 
 
 def _view_axes(
@@ -187,86 +221,22 @@ def _without_outliers(values: FloatArray) -> FloatArray:
     return values[(values >= low) & (values <= high)] if few else values
 
 
-def _add_colour_bar(plotter: pv.Plotter, font: str, title: str, span: float) -> None:
+def _colour_bar(title: str, span: float, height: int) -> dict[str, Any]:
+    """How the colour bar of values over so wide a span looks, in a picture of so many rows of pixels."""
     import pyvista as pv
 
-    height = plotter.window_size[1]
     decimals = 1 if span > 2.0 else 2 + max(0, math.ceil(-math.log10(span)))
-    bar = plotter.add_scalar_bar(  # pyright: ignore[reportCallIssue]  (pyvista wraps it without self)
-        title=title,
-        vertical=True,
-        position_x=0.86,
-        position_y=0.2,
-        width=0.06,
-        height=0.6,
-        title_font_size=round(height / 38),
-        label_font_size=round(height / 38),
-        n_labels=5,
-        # VTK 9.6 went from printf's to Python's way of writing formats.
-        fmt=f"{{:.{decimals}f}}" if pv.vtk_version_info >= (9, 6) else f"%.{decimals}f",
-        color=_INK,
-        unconstrained_font_size=True,
-        render=False,
-    )
-    bar.SetVerticalTitleSeparation(round(height / 40))
-    for words in (bar.GetTitleTextProperty(), bar.GetLabelTextProperty()):
-        words.SetFontFamily(4)  # VTK_FONT_FILE
-        words.SetFontFile(font)
-
-
-def _add_lights(plotter: pv.Plotter, right: npt.NDArray, up: npt.NDArray, towards_camera: npt.NDArray) -> None:
-    """Three soft parallel lights, so that faces of different direction differ while colours stay readable."""
-    import pyvista as pv
-
-    for direction, strength in (
-        (towards_camera + 0.6 * up - 0.5 * right, 0.75),
-        (towards_camera + 0.2 * up + 1.2 * right, 0.35),
-        (up, 0.25),
-    ):
-        light = pv.Light(position=tuple(direction), focal_point=(0, 0, 0), intensity=strength, light_type="scene light")
-        light.positional = False
-        plotter.add_light(light)
-
-
-def _add_words(
-    plotter: pv.Plotter,
-    title: str,
-    font: str,
-    about: str,
-    note: str,
-    painted: str,
-    extremes: tuple[float, float] | None,
-) -> None:
-    """Title, size of the mesh, axes, what plain colours mean, and extremes that the others do not reach."""
-    height = plotter.window_size[1]
-    how: Any = {"viewport": True, "color": _INK, "font_file": font}
-    if title:
-        plotter.add_text(title, position=(0.04, 0.925), font_size=round(height / 60), **how)
-    beyond = "" if extremes is None else f"colours: middle 99 %; all: {extremes[0]:.1f} to {extremes[1]:.1f}"
-    words = "\n".join(line for line in (about, textwrap.fill(painted, 58), beyond, note) if line)
-    plotter.add_text(words, position=(0.17, 0.04), font_size=round(height / 78), **how)
-    plotter.renderer.add_axes(viewport=(0.0, 0.0, 0.15, 0.155), line_width=3, color=_INK)
+    place = {"vertical": True, "position_x": 0.86, "position_y": 0.2, "width": 0.06, "height": 0.6}
+    points = round(height / 38)
+    size = {"title_font_size": points, "label_font_size": points, "unconstrained_font_size": True}
+    # VTK 9.6 went from printf's to Python's way of writing formats.
+    form = f"{{:.{decimals}f}}" if pv.vtk_version_info >= (9, 6) else f"%.{decimals}f"
+    return {"title": f"{title}\n", "fmt": form, "color": _INK, "n_labels": 5, **place, **size}
 
 
 def _size_of(mesh: TetMesh, length_unit: str) -> str:
     size = mesh.points_m.max(axis=0) - mesh.points_m.min(axis=0)
     return f"{size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {length_unit}, {len(mesh.tets):,} tetrahedra"
-
-
-def _add_labels(plotter: pv.Plotter, font: str, labels: Sequence[tuple[str, Sequence[float]]]) -> None:
-    plotter.add_point_labels(
-        np.array([point for _, point in labels], dtype=np.float64),
-        [words for words, _ in labels],
-        font_size=round(plotter.window_size[1] / 45),
-        font_file=font,
-        text_color=_INK,
-        shape_color="white",
-        shape_opacity=0.85,
-        margin=4,
-        show_points=False,
-        always_visible=True,
-        reset_camera=False,
-    )
 
 
 def _frame(
@@ -275,24 +245,17 @@ def _frame(
     """Point a parallel camera so that `points` just fill the mesh's area."""
     width, height = plotter.window_size
     left, bottom, area_right, top = _MESH_AREA
-    across, along = points @ right, points @ up
-    depth = points @ towards_camera
-    view_height = max(np.ptp(along) / (top - bottom), np.ptp(across) / (area_right - left) * height / width, 1e-12)
-    # The area's centre is off the picture's centre; shift the focal point the other way.
-    shift_x = (0.5 * (left + area_right) - 0.5) * view_height * width / height
-    shift_y = (0.5 * (bottom + top) - 0.5) * view_height
-    focus = (
-        (0.5 * (across.min() + across.max()) - shift_x) * right
-        + (0.5 * (along.min() + along.max()) - shift_y) * up
-        + 0.5 * (depth.min() + depth.max()) * towards_camera
-    )
-    distance = 2.0 * view_height + float(np.ptp(depth))
+    in_view = points @ np.stack((right, up, towards_camera), axis=1)
+    low, high = in_view.min(axis=0), in_view.max(axis=0)
+    across, along, depth = high - low
     camera = plotter.camera
-    camera.focal_point = tuple(focus)
-    camera.position = tuple(focus + distance * towards_camera)
-    camera.up = tuple(up)
     camera.enable_parallel_projection()
-    camera.parallel_scale = 0.5 * view_height
+    camera.parallel_scale = 0.5 * max(along / (top - bottom), across / (area_right - left) * height / width, 1e-12)
+    middle = 0.5 * (low + high) @ np.stack((right, up, towards_camera))
+    camera.focal_point = tuple(middle)
+    camera.position = tuple(middle + (4.0 * camera.parallel_scale + depth) * towards_camera)
+    camera.up = tuple(up)
+    camera.SetWindowCenter(1.0 - left - area_right, 1.0 - bottom - top)  # the area's is off the picture's
     plotter.camera_set = True
     plotter.reset_camera_clipping_range()
 
@@ -332,23 +295,78 @@ def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[s
     """
     from PIL import Image
 
-    shown = np.unique(mesh.facets)
-    before, after = solution.temperature_c[0], solution.temperature_c[-1]
-    change = after - before
-    ends = np.concatenate([before[shown], after[shown]])
-    diverging, note = change_colours(change[shown])
-    first, last = f"{solution.times_s[0]:g} s", f"{solution.times_s[-1]:g} s"
-    same: Any = {"clim": (float(ends.min()), float(ends.max()))}
-    panels = [
-        _panel(mesh, values, title=title, **colours, **look)
-        for title, values, colours in (
-            (f"Surface temperature at {first}", before, same),
-            (f"Surface temperature at {last}", after, same),
-            (f"Change from {first} to {last}", change, {**diverging, "note": note}),
-        )
-    ]
+    shown = before_after_change(solution.temperature_c, solution.times_s, np.unique(mesh.facets))
+    panels = [_panel(mesh, values, **how, **look) for values, how in shown]
     with replace_when_done(path) as temporary:
         Image.fromarray(np.concatenate(panels, axis=1)).save(temporary)
+
+
+def draw_surface(
+    folder: Path, mesh: TetMesh, states_c: FloatArray, times_s: FloatArray, up: tuple[float, float, float]
+) -> list[str]:
+    """Draw the surface at the start, at the end, and the change (of a steady state once), and a cut through the body.
+
+    Colours of the surface span what photographs show of it: inside a heated building it is far warmer. States are nodal
+    temperatures, shape (s, n), [degrees Celsius], at times of shape (s,), [s]. Returns the names of the files.
+    """
+    seen = mesh.facet_tags != FACET_BOX
+    if mesh.boundary is not None:
+        seen = seen & mesh.boundary.seen
+    shown = np.unique(mesh.facets[seen] if seen.any() else mesh.facets)
+    drawn: dict[str, tuple[FloatArray, dict[str, Any]]] = dict(
+        zip(HEAT_PICTURES, before_after_change(states_c, times_s, shown))
+    )
+    half, values, view = cut_open(mesh, states_c[-1], up)
+    when = f" at {duration_text(float(times_s[-1]))}"
+    if len(times_s) == 1:
+        when = ", steady"
+        drawn = {
+            HEAT_PICTURES[1]: (states_c[-1], {**drawn[HEAT_PICTURES[1]][1], "title": f"Surface temperature{when}"})
+        }
+    for name, (nodal, how) in drawn.items():
+        picture_of_mesh(folder / name, mesh, nodal, up=up, **how)
+    title = f"Cut through the middle{when}"
+    picture_of_mesh(folder / HEAT_PICTURES[3], half, values, title=title, up=up, view_direction=view.tolist())
+    return [*drawn, HEAT_PICTURES[3]]
+
+
+def cut_open(
+    mesh: TetMesh, nodal_c: FloatArray, up: tuple[float, float, float]
+) -> tuple[TetMesh, FloatArray, FloatArray]:
+    """Take away the half of a body in front of an upright plane through its middle.
+
+    Returns what is left, as a mesh to draw (its nodes and boundary triangles are real, its tetrahedra only a number),
+    the values at its nodes, and the direction to look in, shape (3,).
+    """
+    import pyvista as pv
+    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
+
+    upwards = np.array(up) / np.linalg.norm(up)
+    # Across the shorter of the two sides, so that the cut is the larger one.
+    sides = [axis - (axis @ upwards) * upwards for axis in np.eye(3)]
+    sides = [side / np.linalg.norm(side) for side in sides if np.linalg.norm(side) > 0.5]
+    towards = min(sides, key=lambda side: float(np.ptp(mesh.points_m @ side)))
+    across = mesh.points_m @ towards
+    origin = towards * 0.5 * float(across.min() + across.max())
+    grid = pv.UnstructuredGrid({pv.CellType.TETRA: mesh.tets}, mesh.points_m)
+    grid.point_data["value"] = nodal_c
+    outside = vtkDataSetSurfaceFilter()
+    outside.SetInputData(grid.clip(normal=tuple(towards), origin=tuple(origin)))
+    outside.Update()
+    surface: Any = pv.wrap(outside.GetOutput()).triangulate()
+    points = np.array(surface.points, dtype=np.float64)
+    facets = np.array(surface.regular_faces, dtype=np.int64)
+    half = TetMesh(
+        points_m=points,
+        tets=np.zeros_like(mesh.tets),
+        temperature_c=np.array(surface.point_data["value"], dtype=np.float64),
+        observed=np.ones(len(points), dtype=bool),
+        facets=facets,
+        facet_tags=np.zeros(len(facets), np.int64),
+        region=mesh.region,
+        region_names=mesh.region_names,
+    )
+    return half, half.temperature_c, -(towards + 0.25 * np.cross(upwards, towards) + 0.3 * upwards)
 
 
 def add_support(path: Path, mesh: TetMesh, look: Mapping[str, Any]) -> None:

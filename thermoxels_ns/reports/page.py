@@ -3,80 +3,29 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass
+import math
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.reports import numbers
+
+Picture: TypeAlias = tuple[bytes, str]
+"""Content of a PNG or JPEG file, and its caption."""
 
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows of text; figures are aligned to the right."""
-
-    columns: tuple[str, ...]  # Headings of the columns; all empty: the table has no head
-    rows: tuple[tuple[str, ...], ...]
-    """As many entries each as there are columns; further lines of an entry are written small below its first."""
-    figures_from: int = 1  # First column of figures
-    note: str = ""  # A sentence below
-    summary: str = ""  # Words to click on where the table is folded away at first; empty: it is shown
-    look: str = ""  # Class of the style sheet: ``rows`` for names with their values, ``cameras`` for few wide columns
-
-
-@dataclass(frozen=True)
-class Picture:
-    """One picture with its caption."""
-
-    image: bytes  # Content of a PNG or JPEG file
-    caption: str
-
-
-@dataclass(frozen=True)
-class Gallery:
-    """Pictures side by side."""
-
-    pictures: tuple[Picture, ...]  # From left to right
-    columns: int = 2  # How many stand in a row on a wide screen, 2 to 4
-    heading: str = ""  # Words above
-
-
-@dataclass(frozen=True)
-class Section:
-    """A heading and what stands below it, in this order."""
-
-    heading: str
-    words: tuple[str, ...] = ()
-    galleries: tuple[Gallery, ...] = ()
-    svg: str = ""  # A chart as an svg element
-    tables: tuple[Table, ...] = ()  # Tables; one without rows is left out
-    lines: tuple[str, ...] = ()  # Lines as they are typed or written, in a box
-
-
-@dataclass(frozen=True)
-class Page:
-    """Everything a page says."""
-
-    title: str
-    summary: str  # One or two sentences below it
-    sections: tuple[Section, ...]
-    figures: tuple[tuple[str, str], ...] = ()  # The figures that matter most: value with unit, and what it is
-    warnings: tuple[str, ...] = ()  # What to know before any figure is believed; stands above the figures
-    in_short: tuple[str, ...] = ()  # What the reader wants to know first, sentences
-
-
-def build_page(page: Any, template: str = "page.html.j2") -> str:
-    """Build the html text of a page, or of what a template in the folder ``templates`` asks for under this name.
+def build_page(template: str, **shown: Any) -> str:
+    """Build the html text of a page from a template in the folder ``templates`` and what it shows, by name.
 
     It depends on the arguments alone; raises `ThermoxelsError` for a picture that is neither PNG nor JPEG.
     """
-    return _environment().get_template(template).render(page=page)
+    return _environment().get_template(template).render(**shown)
 
 
 def write_page(path: Path, text: str) -> None:
@@ -98,12 +47,23 @@ def image_address(image: bytes, words: str) -> str:
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("thermoxels_ns.reports"),
-        autoescape=True,
+        autoescape=True,  # charts, which are ours, are marked as safe where they stand
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["address"] = image_address
-    # The style sheet and charts are ours; every other text is escaped.
-    environment.filters["markup"] = Markup
+    environment.filters |= {
+        "address": image_address,
+        "area": numbers.area_text,
+        "count": "{:,}".format,
+        "degrees": numbers.degrees,
+        "duration": numbers.duration_text,
+        "figure": numbers.figure,
+        "finite": math.isfinite,
+        "interval": numbers.interval_text,
+        "lines": numbers.interval_lines,
+        "point": numbers.point_text,
+        "stated": numbers.stated_text,
+        "unit": numbers.unit_signs,
+    }
     return environment

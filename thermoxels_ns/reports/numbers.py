@@ -1,0 +1,177 @@
+"""Numbers as pages write them: figures, temperatures, coordinates, units, durations, and intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from datetime import datetime
+
+from thermoxels_ns.audit.draws import Interval
+from thermoxels_ns.core.measured import Measured
+
+_LARGE = 1000.0
+
+
+def figure(value: float) -> str:
+    """Write four digits, without powers of ten where figures are of everyday size.
+
+    >>> figure(1234.56), figure(0.0123456), figure(0.0)
+    ('1,235', '0.01235', '0')
+    """
+    if value == 0.0:
+        return "0"
+    if 1e-3 <= abs(value) < 1e6:
+        digits = max(0, 3 - math.floor(math.log10(abs(value))))
+        return f"{value:,.{digits}f}"
+    return f"{value:.3e}"
+
+
+def flow_text(heat_w: float, least_w: float, per_area: float | None = None) -> str:
+    """Write a heat flow, [W], or what it is per area, [W/m^2]; flows below `least_w` are round-off and written as 0.
+
+    >>> flow_text(6e-10, 1e-6), flow_text(-12.5, 1e-6), flow_text(-12.5, 1e-6, -0.5)
+    ('0', '-12.50', '-0.5000')
+    """
+    return "0" if abs(heat_w) < least_w else figure(heat_w if per_area is None else per_area)
+
+
+def least_flow(flows_w: Sequence[float], area_m2: float) -> float:
+    """Say from what size on heat flows are more than round-off in a body of so much surface, [W].
+
+    Of a steady body, what flows in and out of it again rounds to a billionth of the largest of all flows, which a
+    balance need not close to, or to a billionth of a watt per square metre, where a surface is as warm as the air.
+
+    >>> f"{least_flow((1e3, -1e3), 200.0):g} {least_flow((), 200.0):g}"
+    '1e-06 2e-07'
+    """
+    return 1e-9 * max(*map(abs, flows_w), area_m2, 0.0)
+
+
+def degrees(value_c: float) -> str:
+    """Write a temperature to a hundredth of a degree; what rounds to 0 has no sign.
+
+    >>> degrees(-0.001), degrees(-0.006)
+    ('0.00', '-0.01')
+    """
+    return f"{round(float(value_c), 2) + 0.0:.2f}"
+
+
+def point_text(point_m: Sequence[float]) -> str:
+    """Write coordinates to three digits, but not below the millimetre.
+
+    >>> point_text((0.00625, 3.14159, -12.04)), point_text((51234.5, -0.0002, 1.0))
+    ('(0.006, 3.14, -12)', '(51234, 0, 1)')
+    """
+    texts = []
+    for value_m in point_m:
+        decimals = 3 if abs(value_m) < 1.0 else max(0, 2 - math.floor(math.log10(abs(value_m))))
+        text = f"{round(float(value_m), decimals) + 0.0:.{decimals}f}"
+        texts.append(text.rstrip("0").rstrip(".") if decimals else text)
+    return f"({', '.join(texts)})"
+
+
+def unit_signs(unit: str) -> str:
+    """Write the powers of a unit as signs, and keep it on one line.
+
+    >>> unit_signs("W/(m2 K4)") == "W/(m²\\N{NO-BREAK SPACE}K⁴)"
+    True
+    """
+    for plain, sign in (("m2", "m²"), ("m3", "m³"), ("K4", "K⁴"), (" ", "\N{NO-BREAK SPACE}")):
+        unit = unit.replace(plain, sign)
+    return unit
+
+
+def time_unit(duration_s: float) -> tuple[str, float]:
+    """Choose a unit that suits a duration, and its length in seconds.
+
+    >>> time_unit(86400.0)
+    ('h', 3600.0)
+    """
+    if duration_s > 10 * 86400.0:
+        return "days", 86400.0
+    if duration_s > 2 * 3600.0:
+        return "h", 3600.0
+    return ("min", 60.0) if duration_s > 300.0 else ("s", 1.0)
+
+
+def duration_text(seconds: float) -> str:
+    """Write a duration in the unit that suits it.
+
+    >>> duration_text(5400.0)
+    '90 min'
+    """
+    unit, length = time_unit(seconds)
+    return f"{seconds / length:.4g} {unit}"
+
+
+def stated_text(value: Measured | datetime | str, unit: str = "") -> str:
+    """Write what somebody stated: a number with how far it may be off, a date, or words.
+
+    >>> stated_text(Measured(20.0, 0.5), "°C"), stated_text("dry")
+    ('20 ± 0.5 °C', 'dry')
+    """
+    if isinstance(value, datetime):
+        return f"{value:%Y-%m-%d %H:%M %Z}".strip()
+    if isinstance(value, str):
+        return value
+    off = f" ± {value.off_by:g}" if value.off_by else ""
+    return f"{value.value:g}{off} {unit}".strip()
+
+
+def interval_text(interval: Interval, unit: str, bounds: bool = True) -> str:
+    """Write a number with the range that holds it, to two digits of half its width.
+
+    What is only known from above is called "at most", from below "at least"; of what may be nothing at all, no number
+    is given. `bounds`:
+    the quantity is one that cannot be below 0; else any sign is a result.
+
+    >>> interval_text(Interval(0.8851, 0.211, 1.552), "W/(m2 K)").replace("\\N{NO-BREAK SPACE}", " ")
+    '0.89 (0.21 to 1.55) W/(m² K)'
+    >>> interval_text(Interval(0.3, -0.2, 0.8), "W"), interval_text(Interval(-3.0, -9.0, -1.0), "W")
+    ('at most 0.80\\xa0W', 'not measurable')
+    >>> interval_text(Interval(0.3, 0.2, math.inf), "m"), interval_text(Interval(0.3, 0.0, math.inf), "m")
+    ('at least 0.20\\xa0m', 'not measurable')
+    """
+    unit = f"\N{NO-BREAK SPACE}{unit_signs(unit)}" if unit else ""
+    if math.isnan(interval.value):
+        return "not known"
+    if bounds and (interval.unknown or (interval.at_most and math.isinf(interval.high))):
+        return "not measurable"
+    if math.isinf(interval.high):
+        return f"at least {number_text(interval.low, 0.5 * interval.low)}{unit}"
+    if bounds and interval.at_most:
+        return f"at most {number_text(interval.high, 0.5 * interval.high)}{unit}"
+    half = 0.5 * (interval.high - interval.low)
+    value, low, high = (number_text(one, half) for one in (interval.value, interval.low, interval.high))
+    return f"{value} ({low} to {high}){unit}"
+
+
+def interval_lines(interval: Interval, bounds: bool = True) -> str:
+    """Write an interval without a unit for a cell of a table, its range on a second line.
+
+    >>> interval_lines(Interval(0.8851, 0.211, 1.552)), interval_lines(Interval(0.3, -0.2, 0.8))
+    ('0.89\\n0.21 to 1.55', 'at most 0.80')
+    """
+    return interval_text(interval, "", bounds).replace(" (", "\n").rstrip(")")
+
+
+def area_text(area_m2: float) -> str:
+    """Write an area to a tenth of a square metre, small ones to a square decimetre.
+
+    >>> area_text(12.04), area_text(0.4812)
+    ('12.0', '0.48')
+    """
+    return f"{area_m2:,.1f}" if area_m2 >= 10.0 else f"{area_m2:.2f}"
+
+
+def number_text(value: float, half_width: float) -> str:
+    """Write a number to two digits of the half width of its range, at most four behind the point.
+
+    >>> number_text(1234.56, 30.0), number_text(0.123456, 0.01), number_text(-0.001, 0.5), number_text(17732.0, 3800.0)
+    ('1,235', '0.123', '0.00', '17,700')
+    """
+    size = abs(half_width) or abs(value) * 1e-3
+    decimals = 2 if size == 0.0 else min(1 - math.floor(math.log10(size)), 4)
+    if abs(value) >= _LARGE:
+        decimals = min(decimals, 1)
+    return f"{round(float(value), decimals) + 0.0:,.{max(decimals, 0)}f}"
