@@ -8,6 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -230,42 +231,33 @@ def _shot(stem: str) -> tuple[str, ...]:
 
 def _by_time(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], options: PairOptions) -> _Found:
     explained = {file.path: "no partner of this name, and no time in the file" for file in (*photographs, *thermal)}
-    photos = [file for file in photographs if file.taken_at is not None]
-    hot = [file for file in thermal if file.taken_at is not None]
+    photos, hot = ([file for file in side if file.taken_at is not None] for side in (photographs, thermal))
     if not photos or not hot:
-        for file in (*photos, *hot):
-            explained[file.path] = "no partner of this name, and none with a time in its file"
-        return [], explained
+        why = "no partner of this name, and none with a time in its file"
+        return [], explained | {file.path: why for file in (*photos, *hot)}
     epoch = min(file.taken_at for file in (*photos, *hot) if file.taken_at is not None)
     at = [np.array([(f.taken_at - epoch).total_seconds() for f in side if f.taken_at]) for side in (photos, hot)]
     apart = np.abs(at[0][:, None] - (at[1][None, :] - options.clock_offset_s))
-    pairs = []
-    for side, files, other_files, table in (("rows", photos, hot, apart), ("columns", hot, photos, apart.T)):
-        for index, file in enumerate(files):
-            order = np.argsort(table[index], kind="stable")
-            nearest = float(table[index, order[0]])
-            second = float(table[index, order[1]]) if len(order) > 1 else np.inf
-            partner = other_files[order[0]]
-            if nearest > options.time_limit_s:
-                late = f"{partner.path.name}, is {nearest:.1f} s away"
-                explained[file.path] = f"no partner of this name; the nearest in time, {late}"
-            elif second <= _CLEARLY_NEARER * nearest + _CLOCK_STEP_S and second <= options.time_limit_s:
-                other = other_files[order[1]]
-                two = f"{partner.path.name} ({nearest:.1f} s) and {other.path.name} ({second:.1f} s)"
-                explained[file.path] = f"ambiguous: {two} are about as near in time"
-            elif table[:, order[0]].argmin() != index:
-                explained[file.path] = f"{partner.path.name}, the nearest in time, is nearer to another"
-            elif side == "rows":
-                pairs.append((file, partner, f"taken {nearest:.1f} s apart"))
+    partner = dict[Path, Path]()  # of every file whose nearest in time is clear
+    for files, others, table in ((photos, hot, apart), (hot, photos, apart.T)):
+        for file, row in zip(files, table):
+            order = np.argsort(row, kind="stable")[:2]
+            names, gaps = [others[number].path.name for number in order], row[order].tolist()
+            if gaps[0] > options.time_limit_s:
+                why = f"no partner of this name; the nearest in time, {names[0]}, is {gaps[0]:.1f} s away"
+            elif len(gaps) > 1 and gaps[1] <= min(_CLEARLY_NEARER * gaps[0] + _CLOCK_STEP_S, options.time_limit_s):
+                two = f"{names[0]} ({gaps[0]:.1f} s) and {names[1]} ({gaps[1]:.1f} s)"
+                why = f"ambiguous: {two} are about as near in time"
             else:
-                explained[file.path] = f"{partner.path.name}, the nearest in time, has no clear partner"
-    # A pair counts only if neither side is ambiguous.
-    clear = [pair for pair in pairs if not explained[pair[1].path].startswith("ambiguous")]
-    for photo, partner, _ in pairs:
-        if explained[partner.path].startswith("ambiguous"):
-            explained[photo.path] = f"{partner.path.name}, the nearest in time, is ambiguous itself"
-    done = {file.path for pair in clear for file in pair[:2]}
-    return clear, {path: why for path, why in explained.items() if path not in done}
+                partner[file.path] = others[order[0]].path
+                why = f"{names[0]}, the nearest in time, is nearer to another, or two are about as near to it"
+            explained[file.path] = why
+    pairs = []
+    for (row, photo), (column, other) in product(enumerate(photos), enumerate(hot)):
+        if partner.get(photo.path) == other.path and partner.get(other.path) == photo.path:
+            pairs.append((photo, other, f"taken {apart[row, column]:.1f} s apart"))
+            del explained[photo.path], explained[other.path]
+    return pairs, explained
 
 
 def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
