@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.capture.folder_scan import shown_name
 from thermoxels_ns.capture.frames import measurement_rows
-from thermoxels_ns.capture.rig.explanation import turn_deg, turn_error_deg, why_turn_is_unsure, with_error
-from thermoxels_ns.capture.rig_types import DriftEstimate
+from thermoxels_ns.capture.rig_types import DriftEstimate, with_error
 from thermoxels_ns.capture.scene_writer import Scene, scene_names
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
@@ -158,7 +157,7 @@ def _cameras(page: CapturePage) -> Section:
         ("distortion k1, k2", *(f"{camera.k1:.4f}, {camera.k2:.4f}" for _, camera, _ in columns)),
     )
     cameras = Table(("", *(name for name, _, _ in columns)), rows, look="cameras")
-    turn = with_error(turn_deg(rig), turn_error_deg(rig), 2)
+    turn = with_error(rig.turn_deg, rig.turn_error_deg, 2)
     shift = float(np.linalg.norm(rig.visible_to_thermal[:3, 3]))
     metres = f" = {100 * shift * scale.metres_per_unit:.1f} cm" if scale is not None else ""
     names = sorted({frame.camera for frame in page.scene.frames if frame.camera})
@@ -167,9 +166,6 @@ def _cameras(page: CapturePage) -> Section:
         ("between the two lenses", f"turned by {turn} degrees, {shift:.4g} units{metres} apart"),
         ("how the rig was found", rig.explanation),
     ]
-    unsure = why_turn_is_unsure(rig)
-    if unsure:
-        extra.append(("how sure the turn is", unsure))
     if np.isfinite(rig.score_after):
         extra.append(("agreement of edges", f"{rig.score_before:.3f} before, {rig.score_after:.3f} after"))
     if np.isfinite(rig.projection_sigma_px):
