@@ -18,7 +18,7 @@ from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
 from thermoxels_ns.core.units import kelvin_to_celsius
 from thermoxels_ns.radiometry.conditions import Conditions
 from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
-from thermoxels_ns.radiometry.jpeg_segments import APP1, JPEG_START, DamagedJpegError, jpeg_segments
+from thermoxels_ns.radiometry.jpeg_segments import APP1, JPEG_START, jpeg_segments
 from thermoxels_ns.radiometry.measurement_model import AirConstants, PlanckConstants, RadiometricModel
 
 RAW_DATA, EMBEDDED_PICTURE, CAMERA_INFO, PICTURE_IN_PICTURE = 0x01, 0x0E, 0x20, 0x2A
@@ -37,30 +37,20 @@ _MOST_PIXELS = 2**24
 """Counts of an R-JPEG: several times its largest images. A PNG of zeros, which is small, can claim far more."""
 
 
-class DamagedRecordError(ValueError):
-    """A record is missing, cut off or contradicts another; the message says which."""
-
-
 class Record:
     """The bytes of one record; numbers are read in its own byte order."""
 
     def __init__(self, content: bytes, name: str, order_mark: int | None = 2) -> None:
-        self.content = content
-        self.name = name
-        self.order = "<"
+        self.content, self.order = content, "<"
         if order_mark is not None:
             marks = [order for order in "<>" if content[:2] == struct.pack(f"{order}H", order_mark)]
             if not marks:
-                raise DamagedRecordError(f"a {name} record that starts with {content[:2]!r}")
+                raise ValueError(f"a {name} record that starts with {content[:2]!r}")
             self.order = marks[0]
 
     def numbers(self, offset: int, codes: str) -> tuple[float, ...]:
         """Numbers at a byte offset; `codes` are those of `struct`."""
-        try:
-            return struct.unpack_from(self.order + codes, self.content, offset)
-        except struct.error as problem:
-            length = len(self.content)
-            raise DamagedRecordError(f"a {self.name} record of {length} bytes without byte {offset}") from problem
+        return struct.unpack_from(self.order + codes, self.content, offset)
 
     def text(self, offset: int, length: int) -> str | None:
         """Text up to the first zero byte; None where there is none."""
@@ -102,25 +92,23 @@ def fff_records(fff: bytes) -> Iterator[tuple[int, memoryview]]:
     ExifTool (FLIR tags); every record says its own byte order.
 
     Raises:
-        DamagedRecordError: The block or a record of it is cut off.
+        ValueError, struct.error: The block or a record of it is cut off.
     """
     if fff[:4] not in (b"FFF\0", b"AFF\0"):
-        raise DamagedRecordError(f"a FLIR block that starts with {fff[:4]!r}")
-    for order in "><":
-        if len(fff) >= 64 and 100 <= struct.unpack_from(f"{order}I", fff, 20)[0] < 200:  # version of the format
-            break
-    else:
-        raise DamagedRecordError("a FLIR block without a version from 100 to 199")
+        raise ValueError(f"a FLIR block that starts with {fff[:4]!r}")
+    order = next((each for each in "><" if 100 <= struct.unpack_from(f"{each}I", fff, 20)[0] < 200), None)
+    if order is None:
+        raise ValueError("a FLIR block without a version from 100 to 199")
     start, count = struct.unpack_from(f"{order}II", fff, 24)
     if count > _MOST_RECORDS or start + 32 * count > len(fff):
-        raise DamagedRecordError(f"a list of {count} records at byte {start} of a FLIR block of {len(fff)} bytes")
+        raise ValueError(f"a list of {count} records at byte {start} of a FLIR block of {len(fff)} bytes")
     for number in range(count):
         kind, _, _, _, offset, length = struct.unpack_from(f"{order}HHIIII", fff, start + 32 * number)
         if kind == 0:
             continue
         if offset + length > len(fff):
             beyond = f"up to byte {offset + length} of {len(fff)}: the file is cut off"
-            raise DamagedRecordError(f"record {number} (type {kind:#04x}) {beyond}")
+            raise ValueError(f"record {number} (type {kind:#04x}) {beyond}")
         yield kind, memoryview(fff)[offset : offset + length]
 
 
@@ -132,26 +120,21 @@ def read_counts(path: Path, content: bytes) -> npt.NDArray[np.uint16]:
 
     Raises:
         ThermalFileError: The header claims an absurd size.
-        DamagedRecordError: There are fewer bytes than pixels, or the PNG is another image.
+        ValueError: There are fewer bytes than pixels, or the PNG is another image.
     """
     record = Record(content, "raw data")
     width, height = (int(number) for number in record.numbers(2, "HH"))
     check_thermal_size(path, width, height)
     if width * height > _MOST_PIXELS:
-        raise DamagedRecordError(f"{width} x {height} counts, more than {_MOST_PIXELS}")
+        raise ValueError(f"{width} x {height} counts, more than {_MOST_PIXELS}")
     data = content[_IMAGE_HEADER_BYTES:]
     if not data.startswith(_PNG_START):
-        if len(data) < 2 * width * height:
-            raise DamagedRecordError(f"{len(data)} bytes of counts for {width} x {height} pixels")
         counts = np.frombuffer(data, dtype=f"{record.order}u2", count=width * height)
         return counts.reshape(height, width).astype(np.uint16)
-    try:
-        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-            if image.size != (width, height) or not image.mode.startswith("I"):
-                raise DamagedRecordError(f"a PNG of {image.size} and mode {image.mode} for {width} x {height} counts")
-            counts = np.asarray(image).astype(np.uint16)
-    except (OSError, SyntaxError, struct.error, Image.DecompressionBombError) as problem:
-        raise DamagedRecordError(f"counts in a PNG that cannot be decoded ({problem})") from problem
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        if image.size != (width, height) or not image.mode.startswith("I"):
+            raise ValueError(f"a PNG of {image.size} and mode {image.mode} for {width} x {height} counts")
+        counts = np.asarray(image).astype(np.uint16)
     return min((counts.byteswap(), counts), key=_roughness)
 
 
@@ -161,7 +144,7 @@ def _roughness(counts: npt.NDArray[np.uint16]) -> float:
 
 
 def read_camera_info(content: bytes) -> CameraInfo:
-    """Read calibration and settings; a `DamagedRecordError` where a value is missing or cannot be."""
+    """Read calibration and settings; a `ValueError` or `struct.error` where a value is missing or cannot be."""
     record = Record(content, "camera info")
     emissivity, distance, reflected, air, window, window_transmission = record.numbers(0x20, "6f")
     (humidity,) = record.numbers(0x3C, "f")
@@ -191,7 +174,7 @@ def read_camera_info(content: bytes) -> CameraInfo:
             taken_at=_taken_at(record),
         )
     except ThermoxelsError as problem:
-        raise DamagedRecordError(f"a camera info record with a wrong value: {problem}") from problem
+        raise ValueError(f"a camera info record with a wrong value: {problem}") from problem
 
 
 def _celsius(kelvin: float) -> float | None:
@@ -205,7 +188,7 @@ def _taken_at(record: Record) -> datetime | None:
         seconds, milliseconds, zone = record.numbers(0x384, "IIh")
         east = timezone(timedelta(minutes=-int(zone)))
         return datetime.fromtimestamp(int(seconds) + (int(milliseconds) & 0xFFFF) / 1000.0, east) if seconds else None
-    except (DamagedRecordError, ValueError, OverflowError, OSError):
+    except (struct.error, ValueError, OverflowError, OSError):
         return None
 
 
@@ -271,7 +254,7 @@ def read_flir_jpeg(path: Path) -> FlirImage:
                 records[kind] = bytes(content)
         for kind, name in ((RAW_DATA, "raw counts"), (CAMERA_INFO, "calibration")):
             if kind not in records:
-                raise DamagedRecordError(f"no record with {name}")
+                raise ValueError(f"no record with {name}")
         pip = records.get(PICTURE_IN_PICTURE)
         picture = records.get(EMBEDDED_PICTURE)
         return FlirImage(
@@ -292,5 +275,5 @@ def _flir_block(content: bytes) -> bytes:
             last = max(last, payload[7])
     missing = sorted(set(range(last + 1)) - set(parts))
     if not parts or missing:
-        raise DamagedJpegError(f"{len(parts)} of {last + 1} FLIR segments (missing: {missing})")
+        raise ValueError(f"{len(parts)} of {last + 1} FLIR segments (missing: {missing})")
     return b"".join(parts[number] for number in range(last + 1))
