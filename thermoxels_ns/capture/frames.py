@@ -184,14 +184,10 @@ def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:
         if f.format
     ]
     conditions = [conditions_text(frame.conditions) for frame in frames if frame.conditions]
-    listed = {"thermal files": formats, "computed with": conditions}
-    return [(name, _counted(texts)) for name, texts in listed.items() if texts]
-
-
-def _counted(texts: Sequence[str]) -> str:
-    counted = Counter(texts).most_common()
-    if len(counted) == 1:
-        return counted[0][0]
-    listed = [f"{text} ({count} frames)" for text, count in counted[:_MOST_LISTED]]
-    more = len(counted) - len(listed)
-    return "; ".join(listed) + (f"; {more} more kinds" if more else "")
+    rows = []
+    for name, texts in (("thermal files", formats), ("computed with", conditions)):
+        counted = Counter(texts).most_common()
+        listed = [f"{text} ({count} frames)" if len(counted) > 1 else text for text, count in counted[:_MOST_LISTED]]
+        more = [f"{len(counted) - _MOST_LISTED} more kinds"] if len(counted) > _MOST_LISTED else []
+        rows += [(name, "; ".join(listed + more))] if texts else []
+    return rows

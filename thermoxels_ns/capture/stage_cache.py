@@ -22,7 +22,7 @@ import numpy as np
 
 from thermoxels_ns import __version__
 from thermoxels_ns.capture.settings import StageName
-from thermoxels_ns.core.checks import hold_folder, remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import hold_folder, plain_os_errors, remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
 
@@ -81,7 +81,8 @@ class StageCache:
         if stale:
             # The key goes before the files: whoever is killed between them leaves nothing that is taken for whole.
             remove_file(folder / _KEY_FILE)
-            _remove_folder(folder)
+            with plain_os_errors(folder, "an earlier result of the capture, which can be removed"):
+                shutil.rmtree(folder, ignore_errors=not folder.exists())
         writable_folder(folder)
         with replace_when_done(folder / _KEY_FILE) as temporary:
             temporary.write_text(key, encoding="utf-8")
@@ -241,15 +242,3 @@ def _sizes(output: Path, writes: Sequence[Path]) -> dict[str, int]:
     """Bytes of every file that a stage wrote, by its name in the output folder."""
     files = [each for path in writes for each in ([path] if path.is_file() else path.rglob("*")) if each.is_file()]
     return {path.relative_to(output).as_posix(): path.stat().st_size for path in sorted(files)}
-
-
-def _remove_folder(folder: Path) -> None:
-    try:
-        shutil.rmtree(folder)
-    except FileNotFoundError:
-        pass
-    except OSError as problem:
-        expected = "an earlier result of the capture, which can be removed"
-        got = problem.strerror or str(problem)
-        remedy = "Remove the folder by hand, or choose another one with --output."
-        raise OutputError(str(folder), expected=expected, got=got, remedy=remedy) from problem

@@ -132,14 +132,6 @@ def check_free_space(folder: Path, needed_bytes: float, purpose: str, remedy: st
         raise _too_little(folder, f"up to {needed_bytes / 1e6:.0f} MB free for {purpose}", free, remedy)
 
 
-def disk_of(path: Path) -> Path:
-    """Folder at which the disk (the file system) of a path is mounted."""
-    disk = path.resolve()
-    while not os.path.ismount(disk) and disk != disk.parent:
-        disk = disk.parent
-    return disk
-
-
 def _too_little(folder: Path, expected: str, free: int, remedy: str) -> OutputError:
-    remedy += f"; finished stages are kept. It was to be written to {folder}."
-    return OutputError(f"disk at {disk_of(folder)}", expected=expected, got=f"{free / 1e6:.0f} MB", remedy=remedy)
+    got, remedy = f"{free / 1e6:.0f} MB", f"{remedy}; finished stages are kept."
+    return OutputError(f"disk of {folder}", expected=expected, got=got, remedy=remedy)
