@@ -13,7 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoxels_ns.capture.folder_scan import ROLE_WORDS, CameraFile, CameraFolder, natural_key, shown_name, words_of
+from thermoxels_ns.capture.folder_scan import (
+    ROLE_WORDS,
+    CameraFile,
+    CameraFolder,
+    natural_key,
+    scan_folder,
+    shown_name,
+    words_of,
+)
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.transforms_json import path_inside
@@ -95,6 +103,31 @@ def find_pairs(found: CameraFolder, options: PairOptions | None = None) -> PairS
         tuple(Pair(name, photo.path, hot.path, how) for name, (photo, hot, how) in zip(names, ordered)),
         dict(sorted(unpaired.items(), key=lambda item: natural_key(item[0]))),
     )
+
+
+def search_pairs(
+    folder: Path,
+    without: Sequence[Path],
+    options: PairOptions,
+    skip_bad: bool,
+    has_dji_library: bool,
+    say: Callable[[str], None] = lambda _: None,
+) -> tuple[PairSearch, dict[Path, str]]:
+    """Find the pairs of a folder, not in the folders `without`, and why some files cannot be read.
+
+    Raises:
+        SceneError: A file cannot be read and `skip_bad` is off, or there is no pair.
+    """
+    found = scan_folder(folder, without, say)
+    search = find_pairs(found, options)
+    if found.unreadable and not skip_bad:
+        first = next(iter(found.unreadable.values()))
+        more = f" {len(found.unreadable) - 1} more cannot be read." if len(found.unreadable) > 1 else ""
+        remedy = "" if "--skip-bad" in first else " To go on without such files, pass --skip-bad True."
+        raise SceneError(f"{first}{more}{remedy}")
+    if not search.pairs:
+        raise _no_pairs(found, search.unpaired, has_dji_library)
+    return search, found.unreadable
 
 
 def read_pair_list(file: Path, folder: Path) -> PairSearch:
@@ -291,12 +324,15 @@ def _without_role(stem: str) -> str:
     return "".join(cut)
 
 
-def no_pairs(found: CameraFolder, unpaired: Mapping[Path, str], has_dji_library: bool) -> SceneError:
+def _no_pairs(found: CameraFolder, unpaired: Mapping[Path, str], has_dji_library: bool) -> SceneError:
     """Error for a folder without a pair: what there is, one file with its reason, and a remedy for what is missing."""
-    photographs = [file for file in found.files if file.role == "photograph"]
-    thermal = [file for file in found.files if file.role == "thermal"]
-    pictures = [file for file in found.files if file.role == "thermal picture"]
-    got = _contents(found, len(photographs), len(thermal), len(pictures))
+    roles = ("photograph", "thermal", "thermal picture")
+    photographs, thermal, pictures = ([file for file in found.files if file.role == role] for role in roles)
+    counted = [(len(photographs), "photograph", ""), (len(thermal), "thermal image", "")]
+    counted += [(len(pictures), "picture", " for the eye, named thermal, without temperatures")] if pictures else []
+    counted += [(len(found.unreadable), "file", " that cannot be read")] if found.unreadable else []
+    counted += [(found.others, "file", " of other kinds")] if found.others else []
+    got = ", ".join(f"{count or 'no'} {what}{'s' * (count != 1)}{more}" for count, what, more in counted)
     example = next((item for item in unpaired.items() if item[0] not in found.passed_over), None)
     if example is not None:
         got += f" ({example[0].name}: {example[1]})"
@@ -307,21 +343,6 @@ def no_pairs(found: CameraFolder, unpaired: Mapping[Path, str], has_dji_library:
     if any(file.dji for file in thermal) and not has_dji_library:
         remedies.append(_DJI_LIBRARY)
     return SceneError(str(found.folder), expected="photographs with thermal images", got=got, remedy=" ".join(remedies))
-
-
-def _contents(found: CameraFolder, photographs: int, thermal: int, pictures: int) -> str:
-    parts = [_plural(photographs, "photograph"), _plural(thermal, "thermal image")]
-    if pictures:
-        parts.append(_plural(pictures, "picture") + " for the eye, named thermal, without temperatures")
-    if found.unreadable:
-        parts.append(_plural(len(found.unreadable), "file") + " that cannot be read")
-    if found.others:
-        parts.append(_plural(found.others, "file") + " of other kinds")
-    return ", ".join(parts)
-
-
-def _plural(count: int, what: str) -> str:
-    return f"{count or 'no'} {what}{'' if count == 1 else 's'}"
 
 
 def _remedy(photographs: list[CameraFile], thermal: list[CameraFile], pictures: list[CameraFile]) -> str:

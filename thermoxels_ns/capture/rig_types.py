@@ -61,6 +61,11 @@ class RigStart:
     source: str = "a guess: same place and direction as the visible camera"
     """Where the start comes from, for the report."""
 
+    def kept(self, why: str) -> RigEstimate:
+        """The start value as an estimate, where nothing better can be found."""
+        text = f"Not determined, the start value is kept ({self.source}): {why}."
+        return RigEstimate(self.thermal_camera, np.asarray(self.visible_to_thermal, np.float64), False, text)
+
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:

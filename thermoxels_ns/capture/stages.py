@@ -14,11 +14,11 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder, shown_name
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
 from thermoxels_ns.capture.masks import PhotographMasks, find_masks, mask_files, user_masks
-from thermoxels_ns.capture.pairs import Pair, PairOptions, PairSearch, find_pairs, no_pairs, read_pair_list
+from thermoxels_ns.capture.pairs import Pair, PairOptions, read_pair_list, search_pairs
 from thermoxels_ns.capture.rig.board import CheckerBoard, board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.rig.drift import estimate_drift
 from thermoxels_ns.capture.rig.search import estimate_rig
-from thermoxels_ns.capture.rig.start import kept_start, read_rig, rig_frames, rig_start
+from thermoxels_ns.capture.rig.start import read_rig, rig_frames, rig_start
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate, with_error
 from thermoxels_ns.capture.scene_writer import SCENE_CONTENT, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
@@ -42,8 +42,8 @@ from thermoxels_ns.capture.stage_cache import (
     locked,
     prepare_output,
 )
-from thermoxels_ns.core.checks import remove_stale_temporaries
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.checks import plain_os_errors, remove_stale_temporaries
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 PAGE_NAME = "capture.html"  # of the page, in the output folder
@@ -99,18 +99,16 @@ def run_capture(
     if settings.board_photos is not None and not settings.board_photos.is_dir():
         scan_folder(settings.board_photos)
     folder = prepare_output(output)
-    try:
-        # Inverses and sums of BLAS depend on the number of its threads; one thread is no slower here.
-        with locked(folder, say), threadpool_limits(1, "blas"):
-            remove_stale_temporaries(folder, [PAGE_NAME])
-            cache = StageCache(folder, settings.from_stage, say, source)
-            return _Capture(source, folder, settings, cache, say, board).run(write_page)
-    except ThermoxelsError:
-        raise
-    except OSError as problem:
-        what, got = str(problem.filename2 or problem.filename or folder), problem.strerror or str(problem)
-        remedy = "Check free space and permissions, and run the command again: finished stages are kept."
-        raise OutputError(what, expected="a file that can be read or written", got=got, remedy=remedy) from problem
+    remedy = "Check free space and permissions, and run the command again: finished stages are kept."
+    # Inverses and sums of BLAS depend on the number of its threads; one thread is no slower here.
+    with (
+        plain_os_errors(folder, "a file that can be read or written", remedy),
+        locked(folder, say),
+        threadpool_limits(1, "blas"),
+    ):
+        remove_stale_temporaries(folder, [PAGE_NAME])
+        cache = StageCache(folder, settings.from_stage, say, source)
+        return _Capture(source, folder, settings, cache, say, board).run(write_page)
 
 
 @dataclass(frozen=True)
@@ -214,7 +212,12 @@ class _Capture:
         }
 
         def work(_: Path) -> _Paired:
-            search, unreadable = self._searched_pairs(options)
+            if settings.pairs is not None:
+                search, unreadable = read_pair_list(settings.pairs, self.source), dict[Path, str]()
+            else:
+                has_library = settings.dji_library is not None
+                found = self.source, [self.output], options, settings.skip_bad, has_library
+                search, unreadable = search_pairs(*found, self.say)
             self.say(f"pairs: {len(search.pairs)}, files without a partner: {len(search.unpaired)}")
             left_out = {shown_name(path, self.source): why for path, why in (unreadable | search.unpaired).items()}
             for name, why in list(left_out.items())[:_MOST_NAMED]:
@@ -224,22 +227,6 @@ class _Capture:
             return _Paired(search.pairs, left_out)
 
         return self.cache.result("pairs", depends, _Paired, work)
-
-    def _searched_pairs(self, options: PairOptions) -> tuple[PairSearch, dict[Path, str]]:
-        """The pairs as listed or found, and why some files cannot be read."""
-        settings = self.settings
-        if settings.pairs is not None:
-            return read_pair_list(settings.pairs, self.source), {}
-        found = scan_folder(self.source, [self.output], self.say)
-        search = find_pairs(found, options)
-        if found.unreadable and not settings.skip_bad:
-            first = next(iter(found.unreadable.values()))
-            more = f" {len(found.unreadable) - 1} more cannot be read." if len(found.unreadable) > 1 else ""
-            remedy = "" if "--skip-bad" in first else " To go on without such files, pass --skip-bad True."
-            raise SceneError(f"{first}{more}{remedy}")
-        if not search.pairs:
-            raise no_pairs(found, search.unpaired, settings.dji_library is not None)
-        return search, found.unreadable
 
     def temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
         """Read the pairs: degrees from thermal files, photographs out of files that hold both."""
@@ -354,7 +341,7 @@ class _Capture:
             elif board is not None:
                 rig = in_scene_units(board, scale, scaled.missing)
             elif len(model.sighting_frame) < _LEAST_SIGHTINGS:
-                rig = kept_start(begin, "There are no scene points to compare the images at.")
+                rig = begin.kept("there are no scene points to compare the images at")
             else:
 
                 def tell(message: str, share: float) -> None:
@@ -362,7 +349,7 @@ class _Capture:
 
                 rig = estimate_rig(rig_frames(model, frames), model.camera, begin, tell)
             self.say(f"rig: {rig_line(rig, metres)}")
-            return _Rig(rig, kept_start(begin, "Where the search begins."))
+            return _Rig(rig, begin.kept("where the search begins"))
 
         return self.cache.result("rig", depends, _Rig, work)
 

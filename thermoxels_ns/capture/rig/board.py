@@ -12,11 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from thermoxels_ns.capture.folder_scan import scan_folder
 from thermoxels_ns.capture.frames import read_frames
-from thermoxels_ns.capture.pairs import PairOptions, find_pairs
+from thermoxels_ns.capture.pairs import PairOptions, search_pairs
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas, standard_errors
+from thermoxels_ns.capture.rig.parameters import RigModel, prior_sigmas, standard_errors
 from thermoxels_ns.capture.rig.start import BASELINE_SIGMA_M, rig_start
 from thermoxels_ns.capture.rig_types import FloatArray, RigEstimate, RigStart
 from thermoxels_ns.capture.settings import CaptureSettings
@@ -102,9 +101,9 @@ def rig_from_boards(
     rig = RigModel(start.thermal_camera, np.asarray(start.visible_to_thermal, dtype=np.float64))
     sigmas = prior_sigmas(start, depth)
     if len(points) < _FEWEST_BOARDS:
-        reason = f"the board is seen by both cameras in {len(points)} of {len(pairs)} pairs ({_FEWEST_BOARDS} needed)"
-        text = f"Not determined, the start value is kept ({start.source}): {reason}."
-        return RigEstimate(rig.camera, rig.transform, False, text, dict(zip(PARAMETERS, sigmas.tolist())))
+        return start.kept(
+            f"the board is seen by both cameras in {len(points)} of {len(pairs)} pairs ({_FEWEST_BOARDS} needed)"
+        )
     every, target = np.concatenate(points), np.concatenate(seen)
 
     def misfit(z: FloatArray) -> FloatArray:
@@ -162,15 +161,8 @@ def rig_from_board_photos(
     Its files are paired and read like those of the capture, into `folder`. A `SceneError` is raised where there are no
     pairs, they come from another camera, or fewer than three show the board to both cameras.
     """
-    found = scan_folder(source)
-    if found.unreadable and not settings.skip_bad:
-        raise SceneError(next(iter(found.unreadable.values())))
-    search = find_pairs(found, PairOptions(settings.time_limit_s, settings.clock_offset_s))
-    if not search.pairs:
-        example = next((f"{path.name}: {why}" for path, why in search.unpaired.items()), "no camera files")
-        expected = "photographs with thermal images"
-        got, remedy = f"none; {example}", "Give both of a shot the same name or time."
-        raise SceneError(f"board pictures in {source}", expected=expected, got=got, remedy=remedy)
+    options = PairOptions(settings.time_limit_s, settings.clock_offset_s)
+    search, _ = search_pairs(source, [], options, settings.skip_bad, settings.dji_library is not None)
     read = read_frames(search.pairs, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
     if read.thermal_size != thermal_size:
         raise _another_camera("thermal images", thermal_size, read.thermal_size)

@@ -14,7 +14,6 @@ from scipy.sparse.csgraph import connected_components
 from thermoxels_ns.capture.rig.images import read_temperatures
 from thermoxels_ns.capture.rig.score import sampled
 from thermoxels_ns.capture.rig_types import DriftEstimate, FloatArray, RigFrame, radius_squared
-from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
 from thermoxels_ns.core.camera import Camera
 
 _RADIAL_TERMS = 2
@@ -27,15 +26,10 @@ _MOST_LAG = 6
 _FEWEST_POINTS = 50
 _GAIN_OF_OFFSETS, _GAIN_OF_RADIAL = 0.05, 0.01
 _RIDGE = 1e-9
-IntArray = npt.NDArray[np.int64]
-
-_FEWEST_PER_FRAME, _SHARE_PER_FRAME = 1000, 0.5
-"""Points of each frame that are read, those that most frames share first. These lie together and can all be wrong: of
-36 frames with 15,000 points each, offsets from 1000 were wrong by up to 0.35 K, from the half by up to 0.08 K."""
 _BLUR_PX = 1.0
 _SMOOTH_SHARE = 0.4
-_DEPTH_TOLERANCE = 0.03
 _BORDER_PX = 2.0
+IntArray = npt.NDArray[np.int64]
 
 
 def estimate_drift(
@@ -164,53 +158,26 @@ class DriftSamples:
 
 
 def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_thermal: FloatArray) -> DriftSamples:
-    """Read the temperature of scene points in all thermal images that see them.
+    """Read the temperature of scene points in the thermal images of the frames in which they were found.
 
-    A frame sees a point if structure from motion found it there, or if the point lies in its image at the depth
-    that the frame's own points have around it. Points on steep temperature edges are left out, because there a
-    pixel's error in place is a large error in degrees.
+    Points on steep temperature edges are left out, because there a pixel's error in place is a large error in degrees.
     """
-    world, tracked = _chosen_points(frames)
     columns: list[tuple[IntArray, IntArray, FloatArray, FloatArray]] = []
     for number, frame in enumerate(frames):
-        pose = np.asarray(frame.camera_to_world, dtype=np.float64)
-        visible = ((world - pose[:3, 3]) @ pose[:3, :3]) * (1.0, -1.0, -1.0)
-        pixels = camera.project(visible @ visible_to_thermal[:3, :3].T + visible_to_thermal[:3, 3])
-        near = np.flatnonzero(camera.contains(pixels, _BORDER_PX) & (visible[:, 2] > 0.0))
-        ahead = visible[near]
-        around, distance = SparseDepth(frame.points_visible()).at(ahead / ahead[:, 2:])
-        unhidden = (np.abs(ahead[:, 2] - around) < _DEPTH_TOLERANCE * around) & (distance < _DEPTH_TOLERANCE)
-        near = near[tracked[number][near] | unhidden]
-        reading, steepness = _read(read_temperatures(frame, camera), pixels[near])
+        pixels = camera.project(frame.points_visible() @ visible_to_thermal[:3, :3].T + visible_to_thermal[:3, 3])
+        inside = camera.contains(pixels, _BORDER_PX)
+        pixels, point = pixels[inside], frame.point_ids[inside]
+        reading, steepness = _read(read_temperatures(frame, camera), pixels)
         known = np.isfinite(reading) & np.isfinite(steepness)
-        near, reading, steepness = near[known], reading[known], steepness[known]
-        if len(near):
-            smooth = steepness <= np.quantile(steepness, _SMOOTH_SHARE)
-            near, reading = near[smooth], reading[smooth]
-        radius2 = radius_squared(pixels[near], camera.width, camera.height)
-        columns.append((near, np.full(len(near), number), reading, radius2))
+        limit = np.quantile(steepness[known], _SMOOTH_SHARE) if known.any() else 0.0
+        smooth = known & (steepness <= limit)
+        radius2 = radius_squared(pixels[smooth], camera.width, camera.height)
+        columns.append((point[smooth], np.full(len(radius2), number), reading[smooth], radius2))
     point, frame_number, reading, radius2 = (np.concatenate(parts) for parts in zip(*columns))
+    _, point = np.unique(point, return_inverse=True)
     order = np.lexsort((frame_number, point))
     samples = DriftSamples(point[order], frame_number[order], reading[order], radius2[order], len(frames))
-    return samples.of_points(np.bincount(samples.point, minlength=len(world)) >= 2)
-
-
-def _chosen_points(frames: Sequence[RigFrame]) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """World positions (n, 3) of the points that most frames share, some from every frame, and who tracks them."""
-    every = np.concatenate([frame.point_ids for frame in frames])
-    ids, first, inverse = np.unique(every, return_index=True, return_inverse=True)
-    world = np.concatenate([np.asarray(frame.points_world, dtype=np.float64).reshape(-1, 3) for frame in frames])[first]
-    views = np.bincount(inverse.ravel(), minlength=len(ids))
-    seen = np.split(inverse.ravel(), np.cumsum([len(frame.point_ids) for frame in frames])[:-1])
-    chosen = np.zeros(len(ids), dtype=bool)
-    for members in seen:
-        shared = members[views[members] >= 2]
-        most = max(_FEWEST_PER_FRAME, round(_SHARE_PER_FRAME * len(members)))
-        chosen[shared[np.argsort(-views[shared], kind="stable")[:most]]] = True
-    tracked = np.zeros((len(frames), len(ids)), dtype=bool)
-    for number, members in enumerate(seen):
-        tracked[number, members] = True
-    return world[chosen], tracked[:, chosen]
+    return samples.of_points(np.bincount(samples.point) >= 2)
 
 
 def _read(image: npt.NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -113,9 +113,3 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
     else:
         lengths = "its lengths taken for those of this scene, because not both have a scale"
     return RigEstimate(camera, transform, True, f"Given in {file.name}, {lengths}.")
-
-
-def kept_start(start: RigStart, why: str) -> RigEstimate:
-    """The start value as an estimate, where nothing can be compared."""
-    text = f"{why} The start value is kept: {start.source}."
-    return RigEstimate(start.thermal_camera, start.visible_to_thermal, False, text)
