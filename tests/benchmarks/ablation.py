@@ -61,7 +61,7 @@ def _nothing(*_: Any, **__: Any) -> None:
     """Do nothing, find nothing."""
 
 
-def _no_planes(depths: Any, backdrop: Any, depth: np.ndarray, *_: Any) -> np.ndarray:
+def _no_planes(photographs: Any, backdrop: Any, depth: np.ndarray, tolerance: float) -> np.ndarray:
     return np.full(len(depth), np.nan, np.float32)
 
 

@@ -4,7 +4,7 @@ import pytest
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.multiview.votes import FEWEST_POINTS, MARGIN_VOXELS, air_voxels, around_cameras, votes, voxels_hold
+from thermoxels_ns.multiview.votes import FEWEST_POINTS, MARGIN_VOXELS, air_voxels, around_cameras, votes
 from thermoxels_ns.synthetic.camera_rings import look_at
 
 
@@ -15,14 +15,6 @@ def empty_voxels(lattice: Lattice, rays: FeatureRays) -> np.ndarray:
 
 
 BOX = Lattice.covering((-1, -1, -1), (1, 1, 1), 20)
-
-
-def test_a_point_lies_in_one_voxel_or_in_none():
-    chosen = np.zeros(BOX.cell_shape, dtype=bool)
-    chosen[3, 0, 19] = True
-    inside = BOX.index_to_world(np.array([[3.5, 0.5, 19.5], [3.01, 0.99, 19.01], [2.99, 0.5, 19.5], [3.5, 1.01, 19.5]]))
-    outside = np.array([[-0.65, -1.05, 0.95], [-0.65, -0.95, 1.05]])
-    assert voxels_hold(BOX, chosen, np.concatenate((inside, outside))).tolist() == [True, True] + [False] * 4
 
 
 def lines(origins, points, uncertainty=0.0) -> FeatureRays:

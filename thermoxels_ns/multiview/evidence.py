@@ -33,20 +33,13 @@ LEAST_OFFSET_K = 0.1  # The same of offsets of thermal images, [K]
 class PhotographEvidence:
     """What training photographs say before there is a model."""
 
-    depths: Depths
-    """What several photographs agree about, of photographs that are small and without differences of gain and offset
-    that matter."""
+    photographs: Photographs  # The photographs, small, without differences of gain and offset that matter
     backdrop: npt.NDArray[np.bool_]  # Which of their pixels show a plain backdrop, shape (pixels,)
     feature_rays: FeatureRays | None
     """Rays to each depth that several photographs agree about; None where these are too few to tell anything."""
     log_gain: FloatArray | None
     """Logarithm of the gain of each photograph and channel, (photographs, 3); None: none that matters was found."""
     offset: FloatArray | None  # Offset of each thermal image, of the temperature range, (photographs,), or None
-
-    @property
-    def photographs(self) -> Photographs:
-        """The photographs."""
-        return self.depths.photographs
 
 
 def depths_of_dataset(dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike) -> Depths | None:
@@ -95,7 +88,7 @@ def evidence_of_photographs(
         f"a plain backdrop fills {backdrop.mean():.1%}; {time.perf_counter() - began:.1f} s"
     )
     rays = None if few else feature_rays_to_depths(depths)
-    return PhotographEvidence(depths, backdrop, rays, log_gain, offset)
+    return PhotographEvidence(photographs, backdrop, rays, log_gain, offset)
 
 
 def rays_through_backdrop(

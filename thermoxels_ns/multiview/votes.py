@@ -44,14 +44,6 @@ def air_voxels(lattice: Lattice, rays: FeatureRays) -> BoolArray:
     return np.asarray(ndimage.binary_erosion(free, border_value=1), dtype=np.bool_)
 
 
-def voxels_hold(lattice: Lattice, chosen: BoolArray, points: FloatArray) -> BoolArray:
-    """Which points (n, 3) lie in voxels that are `chosen`, of the shape of the lattice's voxels; outside none does."""
-    place = np.floor(lattice.world_to_index(points)).astype(np.int64)
-    inside = ((place >= 0) & (place < lattice.cell_shape)).all(axis=1)
-    place[~inside] = 0
-    return chosen[tuple(place.T)] & inside
-
-
 def around_cameras(points: FloatArray, rays: FeatureRays, views: Sequence[View]) -> BoolArray:
     """Which points (n, 3) are much nearer to a camera than what it shows, and in view of fewer than two photographs.
 

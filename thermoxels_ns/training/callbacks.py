@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from threadpoolctl import threadpool_limits
 from torch.nn import Parameter
 
 from thermoxels_ns.core.errors import PruningError
-from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.field.refine import RowChange, prune, refine
@@ -26,7 +24,7 @@ from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_pho
 from thermoxels_ns.multiview.photographs import camera_at
 from thermoxels_ns.multiview.planes import depths_on_planes
 from thermoxels_ns.multiview.stereo import rays_through
-from thermoxels_ns.multiview.votes import View, air_voxels, around_cameras, voxels_hold
+from thermoxels_ns.multiview.votes import View, air_voxels, around_cameras
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
 from thermoxels_ns.training.ray_statistics import (
@@ -64,14 +62,13 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     # Where the lattice never changes within the run, a third of it is time enough to know what stands behind.
     decisions = {step for step in steps if end is None or step < end} or {(end or 0) // 3}
 
-    found = [rays for rays in (model.feature_rays, evidence and evidence.feature_rays) if rays is not None]
-    rays = found[0].joined_with(found[1]) if len(found) == 2 else found[0] if found else None
-
     def carve(step: int) -> None:
         """Drop what is air; at the first step of a training, not of a resumed one, and after every refinement."""
-        if model.config.carve == "off" or rays is None:
+        found = [rays for rays in (model.feature_rays, evidence and evidence.feature_rays) if rays is not None]
+        if model.config.carve == "off" or not found:
             return
         voxels, lattice = model.grid.voxels, model.grid.voxels.lattice
+        rays = found[0] if len(found) == 1 else found[0].joined_with(found[1])
         air = air_voxels(lattice, rays).reshape(-1)[voxels.cells]
         if (views := views_of(attributes)) is not None:
             centres = np.stack(np.unravel_index(voxels.cells, lattice.cell_shape), axis=1) + 0.5
@@ -119,7 +116,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     def look_at_walls(step: int) -> None:
         """Before the lattice is refined, and a third of the way to its first change: backdrops shall not eat walls."""
         if evidence is not None:
-            follow_walls(model, evidence, rays, step)
+            follow_walls(model, evidence, step)
 
     def change_lattice(step: int) -> None:
         assert attributes.pipeline is not None and attributes.optimizers is not None
@@ -213,15 +210,12 @@ def views_of(attributes: TrainingCallbackAttributes) -> list[View] | None:
     return [(camera_at(cameras, number), pose) for number, pose in enumerate(poses)]
 
 
-def follow_walls(model: ThermoxelsModel, evidence: PhotographEvidence, rays: FeatureRays | None, step: int) -> None:
+def follow_walls(model: ThermoxelsModel, evidence: PhotographEvidence, step: int) -> None:
     """Give the model feature rays to the planes of plain walls, as it has them now, and to the backdrop without walls.
 
-    They take the place of earlier ones. What `rays` to what photographs see cross is air, and no wall.
+    They take the place of earlier ones.
     """
-    photographs, lattice = evidence.photographs, model.grid.lattice
-    size, air = lattice.voxel_size, np.zeros(lattice.cell_shape, dtype=np.bool_)
-    if rays is not None:
-        air = air_voxels(lattice, rays)
+    photographs, size = evidence.photographs, model.grid.lattice.voxel_size
     backdrop = evidence.backdrop.copy()
     if len(model.wall_depth):
         backdrop &= np.isnan(model.wall_depth.cpu().numpy())  # a wall stays one
@@ -229,13 +223,12 @@ def follow_walls(model: ThermoxelsModel, evidence: PhotographEvidence, rays: Fea
     for pixels in np.array_split(np.arange(len(depth)), -(-len(depth) // RAYS_AT_ONCE)):
         origins, along = photographs.of_pixels(pixels)
         lengths = np.linalg.norm(along, axis=1)
-        given = (torch.from_numpy(v).float().to(model.device) for v in (origins, along / lengths[:, None]))
-        points = half_way_points(model, *given).cpu().numpy()
+        rays = (torch.from_numpy(v).float().to(model.device) for v in (origins, along / lengths[:, None]))
+        points = half_way_points(model, *rays).cpu().numpy()
         depth[pixels] = np.linalg.norm(points - origins, axis=1) / lengths
     with threadpool_limits(1, "blas"):  # same bits for any number of threads
         backdrop = backdrop_without_walls(photographs, backdrop, depth, size)
-        is_air = partial(voxels_hold, lattice, air)
-        planes = depths_on_planes(evidence.depths, backdrop, depth, PLANE_VOXELS * size, is_air)
+        planes = depths_on_planes(photographs, backdrop, depth, PLANE_VOXELS * size)
     CONSOLE.log(
         f"step {step}: {np.isfinite(planes).mean():.1%} of the photographs' pixels show plain walls that are planes, "
         f"{backdrop.mean():.1%} a plain backdrop"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
@@ -92,7 +94,8 @@ def count_tets_in_other_bodies(mesh: TetMesh) -> int:
         others = np.concatenate([by_body[other] for other in np.flatnonzero(close)])
         for around, inside in ((own, others), (others, own)):
             tried = inside[:: len(inside) // _MOST_TRIED + 1]
-            near = KDTree(centres[around]).query(centres[tried], k=list(range(1, min(len(around), _NEAREST) + 1)))[1]
+            tree: Any = KDTree(centres[around])
+            near = tree.query(centres[tried], k=list(range(1, min(len(around), _NEAREST) + 1)))[1]
             corner = points[tets[around[near]]]
             sides = np.swapaxes(corner[:, :, 1:] - corner[:, :, :1], 2, 3)
             shares = np.linalg.solve(sides, (centres[tried][:, None] - corner[:, :, 0])[..., None])[..., 0]
