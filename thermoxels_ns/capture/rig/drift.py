@@ -106,8 +106,8 @@ def _fit(samples: DriftSamples, radial_terms: int) -> FloatArray:
     solution, weight = np.zeros(design.shape[1]), np.ones(len(difference_k))
     for _ in range(_ITERATIONS):
         before = solution.copy()
-        weighted: Any = design.multiply(weight[:, None]).T
-        weighted = weighted.tocsr()[:columns]
+        product: Any = design.multiply(weight[:, None])
+        weighted = product.T.tocsr()[:columns]
         # Minimum norm: every group of frames that shares points gets mean offset 0.
         normal, right = (weighted @ design[:, :columns]).toarray(), weighted @ difference_k
         solution[:columns] = np.linalg.lstsq(normal, right, rcond=_RIDGE)[0]
