@@ -101,12 +101,13 @@ def _differences(samples: DriftSamples) -> tuple[csr_matrix, FloatArray]:
 
 def _fit(samples: DriftSamples, radial_terms: int) -> FloatArray:
     """Offsets and radial coefficients by iteratively reweighted least squares, the latter 0 beyond `radial_terms`."""
+    design: Any
     design, difference_k = _differences(samples)
     columns = samples.num_frames + radial_terms
     solution, weight = np.zeros(design.shape[1]), np.ones(len(difference_k))
     for _ in range(_ITERATIONS):
         before = solution.copy()
-        product: Any = design.multiply(weight[:, None])
+        product = design.multiply(weight[:, None])
         weighted = product.T.tocsr()[:columns]
         # Minimum norm: every group of frames that shares points gets mean offset 0.
         normal, right = (weighted @ design[:, :columns]).toarray(), weighted @ difference_k
