@@ -8,7 +8,6 @@ from tests.support.camera_card import counts, jpeg_bytes, photograph
 from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.frames import CaptureFrames, read_frames
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.capture.stage_cache import load, save
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 RADIOMETRY = RadiometryOptions()
@@ -46,10 +45,9 @@ def test_the_list_survives_a_move_of_both_folders(tmp_path):
     first = pair(card, "a", gps=(48.0, 11.0, 500.0))
     (card / "F.jpg").write_bytes(flir.jpeg())
     frames = read([first, Pair("F", card / "F.jpg", card / "F.jpg", "both in one file")], tmp_path)
-    save(tmp_path / "frames.npz", frames, [tmp_path / "work", card])
     (tmp_path / "work").rename(tmp_path / "work2")
     card.rename(tmp_path / "card2")
-    loaded = load(tmp_path / "frames.npz", CaptureFrames, [tmp_path / "work2", tmp_path / "card2"])
+    loaded = CaptureFrames.load(tmp_path / "work2", tmp_path / "card2")
     assert [frame.name for frame in loaded.frames] == ["a", "F"]
     assert loaded.frames[0].gps == frames.frames[0].gps
     for frame in loaded.frames:

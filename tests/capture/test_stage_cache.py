@@ -13,7 +13,8 @@ from tests.support.unreadable import files_end_after
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
-from thermoxels_ns.capture.stage_cache import StageCache, load, locked, prepare_output, save
+from thermoxels_ns.capture.stage_cache import StageCache, locked, prepare_output
+from thermoxels_ns.capture.stage_results import load, save
 from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.errors import OutputError, SceneError
 

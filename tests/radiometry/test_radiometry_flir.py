@@ -157,7 +157,7 @@ def test_a_missing_segment_is_named(tmp_path):
         ({"size": (30000, 30)}, "30000 x 30"),
         ({"size": (0, 30)}, "0 x 30"),
         ({"size": (8000, 8000), "storage": "png"}, "8000 x 8000 counts, more than"),
-        ({"size": (41, 30)}, "buffer is smaller than requested size"),
+        ({"size": (41, 30)}, "bytes of counts for 41 x 30"),
         ({"size": (30, 40), "storage": "png"}, "PNG of"),
         ({"planck": {"r1": 0.0, "b": 1400.0, "f": 1.0, "r2": 0.01, "o": -6000}}, "Planck constant R1"),
         ({"settings": {"e": 0.0, "d": 1.0, "r": 293.0, "a": 293.0, "w": 293.0, "p": 1.0}}, "emissivity"),

@@ -11,6 +11,7 @@ from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
 from thermoxels_ns.radiometry.measurement_model import (
     LONG_WAVE,
     AirConstants,
+    PlanckBand,
     PlanckConstants,
     RadiometricModel,
     corrected_temperature_c,
@@ -65,9 +66,13 @@ def test_the_band_is_the_integral_of_planck():
         metres = wavelength_um * 1e-6
         return 2 * h * c**2 / metres**5 / math.expm1(h * c / (metres * k * kelvin)) * 1e-6
 
-    for kelvin in (243.15, 288.0, 300.0, 373.15):
-        exact = quad(spectral, 7.5, 13.0, args=(kelvin,), epsrel=1e-11)[0]
-        assert LONG_WAVE.signal(kelvin) == pytest.approx(exact, rel=0.01)
+    for kelvin in (200.0, 288.0, 300.0, 373.0, 900.0):
+        exact = quad(spectral, 8.0, 14.0, args=(kelvin,), epsrel=1e-11)[0]
+        assert PlanckBand(8.0, 14.0).signal(kelvin) == pytest.approx(exact, rel=1e-6)
+
+
+def test_a_band_signal_of_nothing_has_no_temperature():
+    assert np.isnan(LONG_WAVE.temperature_k([0.0, -1.0, 1e-30])).all()
 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=["E60", "i7", "band"])

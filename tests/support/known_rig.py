@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV, RigEstimate, RigFrame, RigStart, radius_squared
 from thermoxels_ns.core.camera import Camera
@@ -44,7 +43,8 @@ class KnownCapture:
 
 def changes_between(start: RigStart, camera: Camera, transform: FloatArray) -> FloatArray:
     """The ten changes (`rig_parameters.PARAMETERS`) that make a rig of a start that is not turned, shape (10,)."""
-    before, angles = start.thermal_camera, Rotation.from_matrix(transform[:3, :3]).as_rotvec()
+    turn, before = transform[:3, :3], start.thermal_camera
+    angles = np.arctan2(turn[2, 1], turn[2, 2]), -np.arcsin(turn[2, 0]), np.arctan2(turn[1, 0], turn[0, 0])
     shift = transform[:3, 3] - start.visible_to_thermal[:3, 3]
     growth = np.log(camera.fl_x / before.fl_x)
     lens = growth, camera.cx - before.cx, camera.cy - before.cy, camera.k1 - before.k1

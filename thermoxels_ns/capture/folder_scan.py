@@ -133,10 +133,9 @@ def files_below(folder: Path, without: Sequence[Path] = ()) -> tuple[list[Path],
     return files, passed_over
 
 
-def shown_name(path: Path, folder: Path | None = None) -> str:
-    """Name of a file, with that of its folder in `folder`, as it can be printed and written."""
-    inside = folder is not None and path.is_relative_to(folder)
-    return "/".join(map(printable, path.relative_to(folder).parts if folder and inside else (path.name,)))
+def shown_name(path: Path) -> str:
+    """Name of a file as it can be printed and written."""
+    return printable(path.name)
 
 
 def _check_name(name: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,16 @@ import numpy.typing as npt
 
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_mask, read_photograph_facts
+from thermoxels_ns.capture.stage_results import load_json
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.radiometry.conditions import Conditions, conditions_text
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
-from thermoxels_ns.radiometry.flir_rjpeg import PictureInPicture, read_flir_jpeg
+from thermoxels_ns.radiometry.flir_records import PictureInPicture
+from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions, read_thermogram
 
+_LIST = "frames.json"
 _MOST_LISTED = 4  # kinds of measurements that are described
 _MOST_FOR_DEAD_PIXELS = 60  # frames that stuck pixels are looked for in: more need memory and say nothing new
 
@@ -55,6 +59,29 @@ class CaptureFrames:
     thermal_size: tuple[int, int]  # width and height of all thermal images
     dead_pixels: int  # thermal pixels that are stuck at one value in all frames; they are NaN in every frame
     dropped: dict[str, str] = field(default_factory=dict)  # why, by the frame's name
+
+    def save(self, folder: Path, root: Path) -> None:
+        """Write the list of frames beside their images; both folders may be moved later."""
+        content = asdict(self)
+        for row in content["frames"]:
+            for name in ("photograph", "thermal"):
+                inside = row[name].is_relative_to(folder.resolve())
+                row[name] = [inside, row[name].relative_to(folder.resolve() if inside else root.resolve()).as_posix()]
+        write_json(folder / _LIST, content)
+
+    @classmethod
+    def load(cls, folder: Path, root: Path) -> CaptureFrames:
+        """Read the list of frames from a folder, for a capture in `root`."""
+        content = load_json(folder / _LIST)
+        for row in content["frames"]:
+            for name in ("photograph", "thermal"):
+                inside, relative = row[name]
+                row[name] = (folder if inside else root) / relative
+            for name, kind in (("gps", GpsFix), ("picture_in_picture", PictureInPicture), ("conditions", Conditions)):
+                row[name] = None if row[name] is None else kind(**row[name])
+            row["gimbal_deg"] = None if row["gimbal_deg"] is None else tuple(row["gimbal_deg"])
+        frames, size = tuple(CaptureFrame(**row) for row in content["frames"]), content["thermal_size"]
+        return cls(frames, (size[0], size[1]), content["dead_pixels"], content["dropped"])
 
 
 def read_frames(
@@ -100,7 +127,9 @@ def read_frames(
             dropped[frame.name] = f"{frame.thermal_source} has {got}, most have {most}: another thermal camera"
     kept = [frame for frame in frames if frame.name not in dropped]
     dead, kept = _without_stuck_pixels(kept, (height, width), thermal_mask)
-    return CaptureFrames(tuple(kept), (width, height), dead, dropped)
+    result = CaptureFrames(tuple(kept), (width, height), dead, dropped)
+    result.save(folder, root)
+    return result
 
 
 def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -> tuple[CaptureFrame, tuple[int, int]]:
@@ -184,10 +213,14 @@ def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:
         if f.format
     ]
     conditions = [conditions_text(frame.conditions) for frame in frames if frame.conditions]
-    rows = []
-    for name, texts in (("thermal files", formats), ("computed with", conditions)):
-        counted = Counter(texts).most_common()
-        listed = [f"{text} ({count} frames)" if len(counted) > 1 else text for text, count in counted[:_MOST_LISTED]]
-        more = [f"{len(counted) - _MOST_LISTED} more kinds"] if len(counted) > _MOST_LISTED else []
-        rows += [(name, "; ".join(listed + more))] if texts else []
-    return rows
+    listed = {"thermal files": formats, "computed with": conditions}
+    return [(name, _counted(texts)) for name, texts in listed.items() if texts]
+
+
+def _counted(texts: Sequence[str]) -> str:
+    counted = Counter(texts).most_common()
+    if len(counted) == 1:
+        return counted[0][0]
+    listed = [f"{text} ({count} frames)" for text, count in counted[:_MOST_LISTED]]
+    more = len(counted) - len(listed)
+    return "; ".join(listed) + (f"; {more} more kinds" if more else "")

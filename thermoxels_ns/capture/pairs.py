@@ -8,20 +8,11 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from thermoxels_ns.capture.folder_scan import (
-    ROLE_WORDS,
-    CameraFile,
-    CameraFolder,
-    natural_key,
-    scan_folder,
-    shown_name,
-    words_of,
-)
+from thermoxels_ns.capture.folder_scan import ROLE_WORDS, CameraFile, CameraFolder, natural_key, shown_name, words_of
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.transforms_json import path_inside
@@ -103,31 +94,6 @@ def find_pairs(found: CameraFolder, options: PairOptions | None = None) -> PairS
         tuple(Pair(name, photo.path, hot.path, how) for name, (photo, hot, how) in zip(names, ordered)),
         dict(sorted(unpaired.items(), key=lambda item: natural_key(item[0]))),
     )
-
-
-def search_pairs(
-    folder: Path,
-    without: Sequence[Path],
-    options: PairOptions,
-    skip_bad: bool,
-    has_dji_library: bool,
-    say: Callable[[str], None] = lambda _: None,
-) -> tuple[PairSearch, dict[Path, str]]:
-    """Find the pairs of a folder, not in the folders `without`, and why some files cannot be read.
-
-    Raises:
-        SceneError: A file cannot be read and `skip_bad` is off, or there is no pair.
-    """
-    found = scan_folder(folder, without, say)
-    search = find_pairs(found, options)
-    if found.unreadable and not skip_bad:
-        first = next(iter(found.unreadable.values()))
-        more = f" {len(found.unreadable) - 1} more cannot be read." if len(found.unreadable) > 1 else ""
-        remedy = "" if "--skip-bad" in first else " To go on without such files, pass --skip-bad True."
-        raise SceneError(f"{first}{more}{remedy}")
-    if not search.pairs:
-        raise _no_pairs(found, search.unpaired, has_dji_library)
-    return search, found.unreadable
 
 
 def read_pair_list(file: Path, folder: Path) -> PairSearch:
@@ -264,33 +230,42 @@ def _shot(stem: str) -> tuple[str, ...]:
 
 def _by_time(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], options: PairOptions) -> _Found:
     explained = {file.path: "no partner of this name, and no time in the file" for file in (*photographs, *thermal)}
-    photos, hot = ([file for file in side if file.taken_at is not None] for side in (photographs, thermal))
+    photos = [file for file in photographs if file.taken_at is not None]
+    hot = [file for file in thermal if file.taken_at is not None]
     if not photos or not hot:
-        why = "no partner of this name, and none with a time in its file"
-        return [], explained | {file.path: why for file in (*photos, *hot)}
+        for file in (*photos, *hot):
+            explained[file.path] = "no partner of this name, and none with a time in its file"
+        return [], explained
     epoch = min(file.taken_at for file in (*photos, *hot) if file.taken_at is not None)
     at = [np.array([(f.taken_at - epoch).total_seconds() for f in side if f.taken_at]) for side in (photos, hot)]
     apart = np.abs(at[0][:, None] - (at[1][None, :] - options.clock_offset_s))
-    partner = dict[Path, Path]()  # of every file whose nearest in time is clear
-    for files, others, table in ((photos, hot, apart), (hot, photos, apart.T)):
-        for file, row in zip(files, table):
-            order = np.argsort(row, kind="stable")[:2]
-            names, gaps = [others[number].path.name for number in order], row[order].tolist()
-            if gaps[0] > options.time_limit_s:
-                why = f"no partner of this name; the nearest in time, {names[0]}, is {gaps[0]:.1f} s away"
-            elif len(gaps) > 1 and gaps[1] <= min(_CLEARLY_NEARER * gaps[0] + _CLOCK_STEP_S, options.time_limit_s):
-                two = f"{names[0]} ({gaps[0]:.1f} s) and {names[1]} ({gaps[1]:.1f} s)"
-                why = f"ambiguous: {two} are about as near in time"
-            else:
-                partner[file.path] = others[order[0]].path
-                why = f"{names[0]}, the nearest in time, is nearer to another, or two are about as near to it"
-            explained[file.path] = why
     pairs = []
-    for (row, photo), (column, other) in product(enumerate(photos), enumerate(hot)):
-        if partner.get(photo.path) == other.path and partner.get(other.path) == photo.path:
-            pairs.append((photo, other, f"taken {apart[row, column]:.1f} s apart"))
-            del explained[photo.path], explained[other.path]
-    return pairs, explained
+    for side, files, other_files, table in (("rows", photos, hot, apart), ("columns", hot, photos, apart.T)):
+        for index, file in enumerate(files):
+            order = np.argsort(table[index], kind="stable")
+            nearest = float(table[index, order[0]])
+            second = float(table[index, order[1]]) if len(order) > 1 else np.inf
+            partner = other_files[order[0]]
+            if nearest > options.time_limit_s:
+                late = f"{partner.path.name}, is {nearest:.1f} s away"
+                explained[file.path] = f"no partner of this name; the nearest in time, {late}"
+            elif second <= _CLEARLY_NEARER * nearest + _CLOCK_STEP_S and second <= options.time_limit_s:
+                other = other_files[order[1]]
+                two = f"{partner.path.name} ({nearest:.1f} s) and {other.path.name} ({second:.1f} s)"
+                explained[file.path] = f"ambiguous: {two} are about as near in time"
+            elif table[:, order[0]].argmin() != index:
+                explained[file.path] = f"{partner.path.name}, the nearest in time, is nearer to another"
+            elif side == "rows":
+                pairs.append((file, partner, f"taken {nearest:.1f} s apart"))
+            else:
+                explained[file.path] = f"{partner.path.name}, the nearest in time, has no clear partner"
+    # A pair counts only if neither side is ambiguous.
+    clear = [pair for pair in pairs if not explained[pair[1].path].startswith("ambiguous")]
+    for photo, partner, _ in pairs:
+        if explained[partner.path].startswith("ambiguous"):
+            explained[photo.path] = f"{partner.path.name}, the nearest in time, is ambiguous itself"
+    done = {file.path for pair in clear for file in pair[:2]}
+    return clear, {path: why for path, why in explained.items() if path not in done}
 
 
 def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
@@ -324,15 +299,12 @@ def _without_role(stem: str) -> str:
     return "".join(cut)
 
 
-def _no_pairs(found: CameraFolder, unpaired: Mapping[Path, str], has_dji_library: bool) -> SceneError:
+def no_pairs(found: CameraFolder, unpaired: Mapping[Path, str], has_dji_library: bool) -> SceneError:
     """Error for a folder without a pair: what there is, one file with its reason, and a remedy for what is missing."""
-    roles = ("photograph", "thermal", "thermal picture")
-    photographs, thermal, pictures = ([file for file in found.files if file.role == role] for role in roles)
-    counted = [(len(photographs), "photograph", ""), (len(thermal), "thermal image", "")]
-    counted += [(len(pictures), "picture", " for the eye, named thermal, without temperatures")] if pictures else []
-    counted += [(len(found.unreadable), "file", " that cannot be read")] if found.unreadable else []
-    counted += [(found.others, "file", " of other kinds")] if found.others else []
-    got = ", ".join(f"{count or 'no'} {what}{'s' * (count != 1)}{more}" for count, what, more in counted)
+    photographs = [file for file in found.files if file.role == "photograph"]
+    thermal = [file for file in found.files if file.role == "thermal"]
+    pictures = [file for file in found.files if file.role == "thermal picture"]
+    got = _contents(found, len(photographs), len(thermal), len(pictures))
     example = next((item for item in unpaired.items() if item[0] not in found.passed_over), None)
     if example is not None:
         got += f" ({example[0].name}: {example[1]})"
@@ -343,6 +315,21 @@ def _no_pairs(found: CameraFolder, unpaired: Mapping[Path, str], has_dji_library
     if any(file.dji for file in thermal) and not has_dji_library:
         remedies.append(_DJI_LIBRARY)
     return SceneError(str(found.folder), expected="photographs with thermal images", got=got, remedy=" ".join(remedies))
+
+
+def _contents(found: CameraFolder, photographs: int, thermal: int, pictures: int) -> str:
+    parts = [_plural(photographs, "photograph"), _plural(thermal, "thermal image")]
+    if pictures:
+        parts.append(_plural(pictures, "picture") + " for the eye, named thermal, without temperatures")
+    if found.unreadable:
+        parts.append(_plural(len(found.unreadable), "file") + " that cannot be read")
+    if found.others:
+        parts.append(_plural(found.others, "file") + " of other kinds")
+    return ", ".join(parts)
+
+
+def _plural(count: int, what: str) -> str:
+    return f"{count or 'no'} {what}{'' if count == 1 else 's'}"
 
 
 def _remedy(photographs: list[CameraFile], thermal: list[CameraFile], pictures: list[CameraFile]) -> str:

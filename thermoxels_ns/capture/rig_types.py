@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.core.camera import Camera
 
@@ -61,11 +60,6 @@ class RigStart:
     source: str = "a guess: same place and direction as the visible camera"
     """Where the start comes from, for the report."""
 
-    def kept(self, why: str) -> RigEstimate:
-        """The start value as an estimate, where nothing better can be found."""
-        text = f"Not determined, the start value is kept ({self.source}): {why}."
-        return RigEstimate(self.thermal_camera, np.asarray(self.visible_to_thermal, np.float64), False, text)
-
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:
@@ -77,9 +71,11 @@ class RigEstimate:
     determined: bool
     """Whether it is known where the thermal camera is. False: camera and transform are those of the start."""
     explanation: str  # one sentence for the report: what was found, or why nothing could be
-    standard_errors: dict[str, float] = field(default_factory=dict)
-    """Standard error of each parameter: rx, ry, rz [rad], tx, ty, tz [world units], log_focal, cx, cy [thermal
-    pixels], k1. Empty: nothing was estimated."""
+    parameters: tuple[str, ...] = ()
+    """Names of the parameters that the covariance is of: rx, ry, rz [rad], tx, ty, tz [world units], log_focal, cx, cy
+    [thermal pixels], k1. Empty: nothing was estimated."""
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    """Covariance of the parameters, shape (n, n)."""
     score_before: float = math.nan
     """Agreement of thermal and visible edges with the start value, -1 to 1; NaN: not compared."""
     score_after: float = math.nan  # the same with the values returned
@@ -87,16 +83,9 @@ class RigEstimate:
     """Standard error of where a scene point falls in the thermal image, median over the points [thermal pixels]."""
 
     @property
-    def turn_deg(self) -> float:
-        """Angle between the directions of the two cameras, about any axis [degrees]."""
-        return float(np.degrees(Rotation.from_matrix(self.visible_to_thermal[:3, :3]).magnitude()))
-
-    @property
-    def turn_error_deg(self) -> float:
-        """Standard error of the turn about all axes together [degrees]; NaN where it is not known."""
-        return float(
-            np.degrees(np.linalg.norm([self.standard_errors.get(name, np.nan) for name in ("rx", "ry", "rz")]))
-        )
+    def standard_errors(self) -> dict[str, float]:
+        """Square roots of the covariance's diagonal by parameter."""
+        return dict(zip(self.parameters, np.sqrt(np.diag(self.covariance)).tolist()))
 
     def thermal_pose(self, camera_to_world: npt.ArrayLike) -> FloatArray:
         """Pose of the thermal camera (4, 4) from that of the visible one, both OpenGL."""
@@ -137,13 +126,3 @@ def radius_squared(pixels: npt.ArrayLike, width: int, height: int) -> FloatArray
     """
     offset = np.asarray(pixels, dtype=np.float64) - (0.5 * width, 0.5 * height)
     return np.sum(offset * offset, axis=-1) / (0.25 * (width * width + height * height))
-
-
-def with_error(value: float, error: float, decimals: int) -> str:
-    """Write a number with its standard error, where it has one.
-
-    >>> with_error(70.04, 0.26, 1), with_error(1.0, float("nan"), 2), with_error(1.0, 0.0, 2)
-    ('70.0 ± 0.3', '1.00', '1.00')
-    """
-    plus = f" ± {error:.{decimals}f}" if np.isfinite(error) and error > 0.0 else ""
-    return f"{value:.{decimals}f}{plus}"

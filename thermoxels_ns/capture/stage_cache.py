@@ -1,39 +1,28 @@
-"""Keeps the results of stages and runs again only what has changed.
-
-A result is a dataclass, kept as one .npz file of its arrays and a json text of the rest.
-"""
+"""Keeps the results of stages and runs again only what has changed."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import shutil
 import time
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import NoneType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
-
-import numpy as np
+from typing import Any, get_args
 
 from thermoxels_ns import __version__
 from thermoxels_ns.capture.settings import StageName
-from thermoxels_ns.core.checks import hold_folder, plain_os_errors, remove_file, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.checks import hold_folder, remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.errors import OutputError, SceneError
 from thermoxels_ns.core.json_values import write_json
 
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
 LOCK_FILE = "lock"
-_FORMAT = 3  # of the results; raised when they are kept in another way, so that earlier ones are made again
-_KEY_FILE, _DONE_FILE, _RESULT_FILE = "key.txt", "done.json", "result.npz"
-_REST = "rest"  # name of the json text beside the arrays of a result, whose names are numbers
-
-_Record = TypeVar("_Record")
+_FORMAT = 2  # of the results; raised when they are kept in another way, so that earlier ones are made again
+_KEY_FILE, _DONE_FILE = "key.txt", "done.json"
 
 
 @dataclass
@@ -47,7 +36,6 @@ class StageCache:
     folder: Path  # the capture's output folder
     from_stage: StageName | None = None  # run this stage and all later ones, also where nothing has changed
     say: Callable[[str], None] = lambda _: None  # told one line per stage
-    source: Path | None = None  # the camera's files; they and `folder` may be moved between two captures
     seconds: list[tuple[str, float]] = field(default_factory=list)
     """Stages in order and the time each took, also where it was taken from the cache, [s]."""
     _previous: str = ""
@@ -81,8 +69,7 @@ class StageCache:
         if stale:
             # The key goes before the files: whoever is killed between them leaves nothing that is taken for whole.
             remove_file(folder / _KEY_FILE)
-            with plain_os_errors(folder, "an earlier result of the capture, which can be removed"):
-                shutil.rmtree(folder, ignore_errors=not folder.exists())
+            _remove_folder(folder)
         writable_folder(folder)
         with replace_when_done(folder / _KEY_FILE) as temporary:
             temporary.write_text(key, encoding="utf-8")
@@ -94,81 +81,9 @@ class StageCache:
         self.seconds.append((name, took))
         return folder
 
-    def result(
-        self, name: StageName, depends_on: Mapping[str, Any], kind: type[_Record], work: Callable[[Path], _Record]
-    ) -> _Record:
-        """Run a stage as `run` does; its result is the dataclass that `work` returns, now or in an earlier capture."""
-        roots = [self.folder] if self.source is None else [self.folder, self.source]
-        folder = self.run(name, depends_on, lambda folder: save(folder / _RESULT_FILE, work(folder), roots))
-        return load(folder / _RESULT_FILE, kind, roots)
-
     def leave_out(self, name: StageName, why: str) -> None:
         """Say that a stage has nothing to do, so that the numbers of the others have no gap."""
         self.say(f"{_title(name)}: left out, {why}")
-
-
-def save(path: Path, record: Any, roots: Sequence[Path] = ()) -> None:
-    """Write a dataclass as .npz, whole or not at all.
-
-    Its fields are arrays, numbers, texts, paths, None, and tuples, mappings by text and dataclasses of these. Paths in
-    one of the `roots` are kept relative to it, so that both may be moved.
-    """
-    arrays: dict[str, np.ndarray] = {}
-    real_roots = [root.resolve() for root in roots]
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            name = str(len(arrays))
-            arrays[name] = value
-            return name
-        if isinstance(value, Path):
-            real = value.resolve()
-            number = next((n for n, root in enumerate(real_roots) if real.is_relative_to(root)), None)
-            return [number, (real if number is None else real.relative_to(real_roots[number])).as_posix()]
-        if is_dataclass(value):
-            return {each.name: plain(getattr(value, each.name)) for each in fields(value)}
-        if isinstance(value, Mapping):
-            return {key: plain(entry) for key, entry in value.items()}
-        return [plain(entry) for entry in value] if isinstance(value, (tuple, list)) else value
-
-    arrays[_REST] = np.asarray(json.dumps(plain(record)))
-    packed = io.BytesIO()  # in memory, because numpy's half-made files complain later
-    np.savez(packed, **arrays)  # type: ignore[arg-type]
-    with replace_when_done(path) as temporary:
-        temporary.write_bytes(packed.getbuffer())
-
-
-def load(path: Path, kind: type[_Record], roots: Sequence[Path] = ()) -> _Record:
-    """Read a dataclass that `save` wrote; a `ThermoxelsError` where the file is missing or damaged."""
-
-    def restored(value: Any, hint: Any) -> Any:
-        """What was kept, in the type of its field."""
-        origin, parts = get_origin(hint), get_args(hint)
-        if value is None:
-            return None
-        if NoneType in parts:
-            return restored(value, next(part for part in parts if part is not NoneType))
-        if origin is np.ndarray:
-            return arrays[value]
-        if hint is Path:
-            number, name = value
-            return Path(name) if number is None else roots[number] / name
-        if is_dataclass(hint):
-            return hint(**{name: restored(value[name], own) for name, own in get_type_hints(hint).items()})  # type: ignore[operator]
-        if origin is tuple:
-            each = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
-            return tuple(restored(entry, own) for entry, own in zip(value, each))
-        if isinstance(value, dict):
-            return {key: restored(entry, parts[1]) for key, entry in value.items()}
-        return value
-
-    try:
-        with np.load(path, allow_pickle=False) as opened:
-            arrays = {name: opened[name] for name in opened.files}
-        return restored(json.loads(arrays[_REST].item()), kind)
-    except (OSError, EOFError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as problem:
-        expected, remedy = "what an earlier stage of the capture wrote", "Run it again with --from-stage pairs."
-        raise ThermoxelsError(str(path), expected=expected, got=repr(problem), remedy=remedy) from problem
 
 
 def _title(name: StageName) -> str:
@@ -242,3 +157,15 @@ def _sizes(output: Path, writes: Sequence[Path]) -> dict[str, int]:
     """Bytes of every file that a stage wrote, by its name in the output folder."""
     files = [each for path in writes for each in ([path] if path.is_file() else path.rglob("*")) if each.is_file()]
     return {path.relative_to(output).as_posix(): path.stat().st_size for path in sorted(files)}
+
+
+def _remove_folder(folder: Path) -> None:
+    try:
+        shutil.rmtree(folder)
+    except FileNotFoundError:
+        pass
+    except OSError as problem:
+        expected = "an earlier result of the capture, which can be removed"
+        got = problem.strerror or str(problem)
+        remedy = "Remove the folder by hand, or choose another one with --output."
+        raise OutputError(str(folder), expected=expected, got=got, remedy=remedy) from problem

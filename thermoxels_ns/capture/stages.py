@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
+from thermoxels_ns.capture import stage_results
 from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder, shown_name
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
 from thermoxels_ns.capture.masks import PhotographMasks, find_masks, mask_files, user_masks
-from thermoxels_ns.capture.pairs import Pair, PairOptions, read_pair_list, search_pairs
+from thermoxels_ns.capture.pairs import Pair, PairOptions, PairSearch, find_pairs, no_pairs, read_pair_list
 from thermoxels_ns.capture.rig.board import CheckerBoard, board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.rig.drift import estimate_drift
+from thermoxels_ns.capture.rig.explanation import rig_lines
 from thermoxels_ns.capture.rig.search import estimate_rig
-from thermoxels_ns.capture.rig.start import read_rig, rig_frames, rig_start
-from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate, with_error
+from thermoxels_ns.capture.rig.start import kept_start, read_rig, rig_frames, rig_start
+from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.scene_writer import SCENE_CONTENT, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions
-from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, read_given_poses
+from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, read_given_poses, reordered
 from thermoxels_ns.capture.sfm.gravity import Up, find_up, level_rotation
 from thermoxels_ns.capture.sfm.metric_scale import (
     MeasuredDistance,
@@ -35,6 +36,7 @@ from thermoxels_ns.capture.sfm.metric_scale import (
 from thermoxels_ns.capture.sfm.poses import add_points, find_poses
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import (
+    CACHE_FOLDER,
     StageCache,
     files_of,
     fingerprint,
@@ -42,13 +44,15 @@ from thermoxels_ns.capture.stage_cache import (
     locked,
     prepare_output,
 )
-from thermoxels_ns.core.checks import plain_os_errors, remove_stale_temporaries
-from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.checks import remove_stale_temporaries
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 PAGE_NAME = "capture.html"  # of the page, in the output folder
 _MOST_NAMED = 10  # files left out that are named while the command runs
 _LEAST_SIGHTINGS = 50  # sightings of scene points below which thermal images and photographs cannot be compared
+_OVERLAY_FILE = "overlay.npy"
 
 _Options = TypeVar("_Options")
 
@@ -99,51 +103,18 @@ def run_capture(
     if settings.board_photos is not None and not settings.board_photos.is_dir():
         scan_folder(settings.board_photos)
     folder = prepare_output(output)
-    remedy = "Check free space and permissions, and run the command again: finished stages are kept."
-    # Inverses and sums of BLAS depend on the number of its threads; one thread is no slower here.
-    with (
-        plain_os_errors(folder, "a file that can be read or written", remedy),
-        locked(folder, say),
-        threadpool_limits(1, "blas"),
-    ):
-        remove_stale_temporaries(folder, [PAGE_NAME])
-        cache = StageCache(folder, settings.from_stage, say, source)
-        return _Capture(source, folder, settings, cache, say, board).run(write_page)
-
-
-@dataclass(frozen=True)
-class _Paired:
-    """Result of the stage that finds pairs."""
-
-    pairs: tuple[Pair, ...]
-    dropped: dict[str, str]  # why, by the file's name
-
-
-@dataclass(frozen=True)
-class _Posed:
-    """Result of the stage that finds poses."""
-
-    model: SfmModel
-    dropped: dict[str, str]  # why, by the frame's name
-    overlay: npt.NDArray[np.bool_] | None  # as in `PhotographMasks`
-
-
-@dataclass(frozen=True)
-class _Scaled:
-    """Result of the stage that finds metres per unit and up."""
-
-    model: SfmModel  # upright, if it was found here
-    scale: MetricScale | None
-    missing: str  # why there is no scale
-    up: Up
-
-
-@dataclass(frozen=True)
-class _Rig:
-    """Result of the stage that finds the rig."""
-
-    found: RigEstimate
-    start: RigEstimate
+    try:
+        # Inverses and sums of BLAS depend on the number of its threads; one thread is no slower here.
+        with locked(folder, say), threadpool_limits(1, "blas"):
+            remove_stale_temporaries(folder, [PAGE_NAME])
+            cache = StageCache(folder, settings.from_stage, say)
+            return _Capture(source, folder, settings, cache, say, board).run(write_page)
+    except ThermoxelsError:
+        raise
+    except OSError as problem:
+        what, got = str(problem.filename2 or problem.filename or folder), problem.strerror or str(problem)
+        remedy = "Check free space and permissions, and run the command again: finished stages are kept."
+        raise OutputError(what, expected="a file that can be read or written", got=got, remedy=remedy) from problem
 
 
 @dataclass
@@ -156,38 +127,34 @@ class _Capture:
     cache: StageCache
     say: Callable[[str], None]
     board: CheckerBoard | None = None  # what the user's pictures of a checker board show
+    dropped: dict[str, str] = field(default_factory=dict)
+    """Files and frames that are left out, and why; stages add to it."""
 
     def run(self, write_page: Callable[[CaptureResult], None]) -> CaptureResult:
         """Run all stages."""
-        paired = self.pairs()
-        read = self.temperatures(paired.pairs)
-        posed = self.poses(read)
+        pairs = self.pairs()
+        read = self.temperatures(pairs)
+        found = self.poses(read)
+        model, scale, scale_missing, up = self.scale(found, read)
         by_name = {frame.name: frame for frame in read.frames}
-        frames = [by_name[name] for name in posed.model.frames]
-        scaled = self.scale(posed.model, frames)
-        model = scaled.model
-        rig = self.rig(scaled, frames, read, self.board_rig(model, read))
-        drift = self.drift(model, frames, rig.found)
+        frames = [by_name[name] for name in model.frames]
+        board = self.board_rig(model, read)
+        rig, start = self.rig(model, frames, read, scale, scale_missing, board)
+        drift = self.drift(model, frames, rig)
         # What the stage of the poses found drawn over the photographs, and the user's masks.
-        size, drawn = (model.camera.width, model.camera.height), posed.overlay
+        size, file = (model.camera.width, model.camera.height), self.output / CACHE_FOLDER / "poses" / _OVERLAY_FILE
+        drawn = np.load(file) if file.is_file() else None
         if drawn is not None and drawn.shape != size[::-1]:
             drawn = None
         masks = PhotographMasks(size, drawn, user_masks(frames, self.settings.masks))
-        scene = Scene(frames, model, rig.found, drift, scaled.scale, scaled.up, masks)
+        scene = Scene(frames, model, rig, drift, scale, up, masks)
         written = [self.output / name for name in SCENE_CONTENT]
         self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
         given = self.settings.poses
+        source = f"Given in {given.name}." if given else "Structure from motion on the photographs (COLMAP)."
+        left_out, seconds = self.dropped, self.cache.seconds
         result = CaptureResult(
-            source=self.source,
-            output=self.output,
-            pairs=paired.pairs,
-            dropped=paired.dropped | read.dropped | posed.dropped,
-            read=read,
-            scene=scene,
-            start=rig.start,
-            scale_missing=scaled.missing,
-            poses_source=f"Given in {given.name}." if given else "Structure from motion on the photographs (COLMAP).",
-            seconds=self.cache.seconds,
+            self.source, self.output, pairs, left_out, read, scene, start, scale_missing, source, seconds
         )
         self.cache.run("page", {}, lambda _: write_page(result), [result.page])
         return result
@@ -197,7 +164,7 @@ class _Capture:
         settings = vars(self.settings)
         return kind(**{each.name: settings[each.name] for each in fields(kind) if each.name in settings})  # type: ignore[arg-type]
 
-    def pairs(self) -> _Paired:
+    def pairs(self) -> tuple[Pair, ...]:
         """Find which photograph belongs to which thermal image."""
         settings, options = self.settings, self.options(PairOptions)
         inside, passed_over = files_below(self.source, [self.output])
@@ -211,22 +178,37 @@ class _Capture:
             "skip_bad": settings.skip_bad,
         }
 
-        def work(_: Path) -> _Paired:
-            if settings.pairs is not None:
-                search, unreadable = read_pair_list(settings.pairs, self.source), dict[Path, str]()
-            else:
-                has_library = settings.dji_library is not None
-                found = self.source, [self.output], options, settings.skip_bad, has_library
-                search, unreadable = search_pairs(*found, self.say)
+        def work(folder: Path) -> None:
+            search, unreadable = self._searched_pairs(options)
+            stage_results.save_pairs(folder, search, self.source)
+            write_json(folder / "unreadable.json", {shown_name(path): why for path, why in unreadable.items()})
             self.say(f"pairs: {len(search.pairs)}, files without a partner: {len(search.unpaired)}")
-            left_out = {shown_name(path, self.source): why for path, why in (unreadable | search.unpaired).items()}
-            for name, why in list(left_out.items())[:_MOST_NAMED]:
+            left_out = [(shown_name(path), why) for path, why in (unreadable | search.unpaired).items()]
+            for name, why in left_out[:_MOST_NAMED]:
                 self.say(f"left out: {name}: {why}")
             if len(left_out) > _MOST_NAMED:
                 self.say(f"left out: {len(left_out) - _MOST_NAMED} more; {PAGE_NAME} names all")
-            return _Paired(search.pairs, left_out)
 
-        return self.cache.result("pairs", depends, _Paired, work)
+        folder = self.cache.run("pairs", depends, work)
+        pairs, unpaired = stage_results.load_pairs(folder, self.source)
+        self.dropped |= stage_results.load_json(folder / "unreadable.json") | unpaired
+        return pairs
+
+    def _searched_pairs(self, options: PairOptions) -> tuple[PairSearch, dict[Path, str]]:
+        """The pairs as listed or found, and why some files cannot be read."""
+        settings = self.settings
+        if settings.pairs is not None:
+            return read_pair_list(settings.pairs, self.source), {}
+        found = scan_folder(self.source, [self.output], self.say)
+        search = find_pairs(found, options)
+        if found.unreadable and not settings.skip_bad:
+            first = next(iter(found.unreadable.values()))
+            more = f" {len(found.unreadable) - 1} more cannot be read." if len(found.unreadable) > 1 else ""
+            remedy = "" if "--skip-bad" in first else " To go on without such files, pass --skip-bad True."
+            raise SceneError(f"{first}{more}{remedy}")
+        if not search.pairs:
+            raise no_pairs(found, search.unpaired, settings.dji_library is not None)
+        return search, found.unreadable
 
     def temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
         """Read the pairs: degrees from thermal files, photographs out of files that hold both."""
@@ -239,15 +221,16 @@ class _Capture:
             "mask": given_fingerprints([settings.thermal_mask]),
         }
 
-        def work(folder: Path) -> CaptureFrames:
+        def work(folder: Path) -> None:
             read = read_frames(pairs, self.source, folder, options, settings.skip_bad, settings.thermal_mask, self.say)
             width, height = read.thermal_size
             self.say(f"temperatures: {len(read.frames)} thermal images of {width} x {height} pixels")
-            return read
 
-        return self.cache.result("temperatures", depends, CaptureFrames, work)
+        read = CaptureFrames.load(self.cache.run("temperatures", depends, work), self.source)
+        self.dropped |= read.dropped
+        return read
 
-    def poses(self, read: CaptureFrames) -> _Posed:
+    def poses(self, read: CaptureFrames) -> SfmModel:
         """Find camera, poses and scene points, or take those that the user gives."""
         settings, options = self.settings, self.options(PoseOptions)
         depends = {
@@ -257,36 +240,43 @@ class _Capture:
             "overlays": settings.find_overlays,
         }
 
-        def work(folder: Path) -> _Posed:
+        def work(folder: Path) -> None:
             photographs = {frame.name: frame.photograph for frame in read.frames}
             masks = find_masks(read.frames, settings.masks, settings.find_overlays)
             if masks.overlay is not None:
+                np.save(folder / _OVERLAY_FILE, masks.overlay)
                 self.say(f"masks: {100 * (1 - masks.overlay.mean()):.1f} % of every photograph is drawn over")
             if settings.poses is None:
                 focal = [frame.focal_px for frame in read.frames if frame.focal_px]
                 middle = float(np.median(focal)) if focal else None
                 poses = find_poses(photographs, folder, middle, masks, options, self.say)
+                order = {name: number for number, name in enumerate(photographs)}
+                model = reordered(poses.model, lambda name: order[name])
             else:
                 given = read_given_poses(settings.poses, {f.name: f.photograph_source for f in read.frames})
                 poses = fitted_to_photographs(given, photographs)
-                if not len(poses.model.points):
-                    model = add_points(poses.model, photographs, folder, masks, options, self.say)
-                    poses = replace(poses, model=model)
-            model = poses.model
+                model = poses.model
+                if not len(model.points):
+                    model = add_points(model, photographs, folder, masks, options, self.say)
+            stage_results.save(folder / "model.npz", model)
+            write_json(folder / "dropped.json", dict(poses.dropped))
             self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
-            return _Posed(model, dict(poses.dropped), masks.overlay)
 
-        return self.cache.result("poses", depends, _Posed, work)
+        folder = self.cache.run("poses", depends, work)
+        self.dropped |= stage_results.load_json(folder / "dropped.json")
+        return stage_results.load(folder / "model.npz", SfmModel)
 
-    def scale(self, found: SfmModel, frames: list[CaptureFrame]) -> _Scaled:
+    def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, MetricScale | None, str, Up]:
         """Find metres per unit and up; turn a model that was found here upright, keep one that was given."""
         settings = self.settings
         depends = {
             "known": [settings.known_distance, settings.known_distance_error_m],
             "markers": [settings.marker_side_m, settings.marker_error_m],
         }
+        by_name = {frame.name: frame for frame in read.frames}
+        frames = [by_name[name] for name in found.frames]
 
-        def work(_: Path) -> _Scaled:
+        def work(folder: Path) -> None:
             scale, missing = self._metric_scale(found, frames)
             gimbal, orientation = [frame.gimbal_deg for frame in frames], [frame.orientation for frame in frames]
             up = find_up(found.camera_to_world, gimbal, orientation)
@@ -295,11 +285,13 @@ class _Capture:
                 rotation = level_rotation(up.direction, -found.camera_to_world[:, :3, 2].mean(axis=0))
                 origin = np.median(found.points, axis=0) if len(found.points) else found.centres.mean(axis=0)
                 model = found.moved(rotation, origin)
-                up = replace(up, direction=rotation @ up.direction)
+                up = Up(rotation @ up.direction, up.source, up.spread_deg)
+            stage_results.save(folder / "model.npz", model)
+            write_json(folder / "scale.json", {"scale": scale, "missing": missing, "up": up})
             self.say(f"scale: {missing}" if scale is None else f"scale: {scale.metres_per_unit:.5g} m per unit")
-            return _Scaled(model, scale, missing, up)
 
-        return self.cache.result("scale", depends, _Scaled, work)
+        folder = self.cache.run("scale", depends, work)
+        return stage_results.load(folder / "model.npz", SfmModel), *stage_results.load_scale(folder / "scale.json")
 
     def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[MetricScale | None, str]:
         """Metres per unit from the surest source that there is; where there is none, why."""
@@ -322,60 +314,61 @@ class _Capture:
         angle = settings.thermal_field_of_view_deg
         depends = {"board": board, "files": fingerprint(files_of(pictures), pictures), "angle": angle}
 
-        def work(folder: Path) -> RigEstimate:
+        def work(folder: Path) -> None:
             radiometry, size = self.options(RadiometryOptions), read.thermal_size
-            return rig_from_board_photos(pictures, board, model.camera, size, folder, settings, radiometry, self.say)
+            rig = rig_from_board_photos(pictures, board, model.camera, size, folder, settings, radiometry, self.say)
+            stage_results.save(folder / "rig.npz", rig)
 
-        return self.cache.result("board", depends, RigEstimate, work)
+        return stage_results.load(self.cache.run("board", depends, work) / "rig.npz", RigEstimate)
 
-    def rig(self, scaled: _Scaled, frames: list[CaptureFrame], read: CaptureFrames, board: RigEstimate | None) -> _Rig:
+    def rig(
+        self,
+        model: SfmModel,
+        frames: list[CaptureFrame],
+        read: CaptureFrames,
+        scale: MetricScale | None,
+        scale_missing: str,
+        board: RigEstimate | None,
+    ) -> tuple[RigEstimate, RigEstimate]:
         """Find the rig, or take the one that the user or a checker board gives."""
-        settings, model, scale = self.settings, scaled.model, scaled.scale
+        settings = self.settings
         depends = {"angle": settings.thermal_field_of_view_deg, "rig": given_fingerprints([settings.rig])}
 
-        def work(_: Path) -> _Rig:
+        def work(folder: Path) -> None:
             metres = None if scale is None else scale.metres_per_unit
             begin = rig_start(frames, model.camera, read.thermal_size, settings.thermal_field_of_view_deg, metres)
+            stage_results.save(folder / "start.npz", kept_start(begin, "Where the search begins."))
             if settings.rig is not None:
                 rig = read_rig(settings.rig, read.thermal_size, metres)
             elif board is not None:
-                rig = in_scene_units(board, scale, scaled.missing)
+                rig = in_scene_units(board, scale, scale_missing)
             elif len(model.sighting_frame) < _LEAST_SIGHTINGS:
-                rig = begin.kept("there are no scene points to compare the images at")
+                rig = kept_start(begin, "There are no scene points to compare the images at.")
             else:
 
                 def tell(message: str, share: float) -> None:
                     self.say(f"rig: {message} ({100 * share:.0f} %)")
 
                 rig = estimate_rig(rig_frames(model, frames), model.camera, begin, tell)
-            self.say(f"rig: {rig_line(rig, metres)}")
-            return _Rig(rig, begin.kept("where the search begins"))
+            stage_results.save(folder / "rig.npz", rig)
+            for line in rig_lines(rig, metres):
+                self.say(f"rig: {line}")
 
-        return self.cache.result("rig", depends, _Rig, work)
+        folder = self.cache.run("rig", depends, work)
+        rig, start = (stage_results.load(folder / f"{name}.npz", RigEstimate) for name in ("rig", "start"))
+        return rig, start
 
     def drift(self, model: SfmModel, frames: list[CaptureFrame], rig: RigEstimate) -> DriftEstimate:
         """Find how far each thermal image reads too high, unless the user switched that off."""
 
-        def work(_: Path) -> DriftEstimate:
+        def work(folder: Path) -> None:
             if self.settings.drift == "off" or len(model.sighting_frame) < _LEAST_SIGHTINGS:
                 why = "Switched off." if self.settings.drift == "off" else "There are no scene points to compare at."
                 drift = DriftEstimate(np.zeros(len(frames)), (), np.nan, np.nan, False, why)
             else:
                 drift = estimate_drift(rig_frames(model, frames), rig.thermal_camera, rig.visible_to_thermal)
+            stage_results.save(folder / "drift.npz", drift)
             self.say(f"drift: {drift.explanation}")
-            return drift
 
-        return self.cache.result("drift", {"drift": self.settings.drift}, DriftEstimate, work)
-
-
-def rig_line(rig: RigEstimate, metres_per_unit: float | None) -> str:
-    """Say shortly what was found; of a rig that is given or not determined its explanation."""
-    if not rig.determined or not np.isfinite(rig.projection_sigma_px):
-        return rig.explanation
-    focal_px = rig.thermal_camera.fl_x
-    focal = with_error(focal_px, rig.standard_errors.get("log_focal", np.nan) * focal_px, 1)
-    distance = float(np.linalg.norm(rig.visible_to_thermal[:3, 3]))
-    apart = f"{distance:.3g} units" if metres_per_unit is None else f"{100.0 * distance * metres_per_unit:.1f} cm"
-    turn = with_error(rig.turn_deg, rig.turn_error_deg, 2)
-    points = f"points fall within {rig.projection_sigma_px:.2f} thermal pixels (standard error)"
-    return f"turned by {turn} degrees, {apart} apart, focal length {focal} pixels; {points}"
+        folder = self.cache.run("drift", {"drift": self.settings.drift}, work)
+        return stage_results.load(folder / "drift.npz", DriftEstimate)

@@ -46,6 +46,12 @@ COUNT_SCALES: dict[CameraName, CountScale] = {
 }
 """From the makers' manuals. FLIR's two gains cannot be told apart by the file, so the user says which."""
 
+_RECOGNISED: tuple[tuple[str, str, CameraName], ...] = (
+    ("workswell", "wiris pro", "workswell"),
+    ("sensefly", "", "sensefly"),
+)
+"""Maker, start of the model and preset of the cameras that a file names without doubt, in small letters."""
+
 
 def recognised_camera(make: str | None, model: str | None) -> CameraName | None:
     """Find the preset of a camera by what its file says of it; None where the file leaves a choice.
@@ -55,10 +61,11 @@ def recognised_camera(make: str | None, model: str | None) -> CameraName | None:
     >>> recognised_camera("FLIR", "Duo Pro R") is None
     True
     """
-    named = f"{(make or '').strip()} {(model or '').strip()}".lower()
-    if named.startswith("workswell wiris pro"):
-        return "workswell"
-    return "sensefly" if named.startswith("sensefly") else None
+    make, model = (make or "").strip().lower(), (model or "").strip().lower()
+    for maker, start, name in _RECOGNISED:
+        if make.startswith(maker) and model.startswith(start):
+            return name
+    return None
 
 
 def read_count_image(

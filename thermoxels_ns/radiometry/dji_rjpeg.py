@@ -17,7 +17,7 @@ from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
 from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
 from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
 from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
-from thermoxels_ns.radiometry.jpeg_segments import APP1, APP3, JPEG_START, check_jpeg, jpeg_segments
+from thermoxels_ns.radiometry.jpeg_segments import APP1, APP3, JPEG_START, DamagedJpegError, check_jpeg, jpeg_segments
 
 _SDK = "the DJI Thermal SDK (www.dji.com/downloads/softwares/dji-thermal-sdk)"
 _STATUS = {
@@ -79,7 +79,7 @@ def is_dji_rjpeg(content: bytes) -> bool:
         for marker, payload in jpeg_segments(content):
             made_by_dji |= marker == APP1 and b"DJI" in payload
             counts |= marker == APP3
-    except ValueError:
+    except DamagedJpegError:
         pass  # what comes before the damage tells what the file was to be
     return content.startswith(JPEG_START) and made_by_dji and counts
 

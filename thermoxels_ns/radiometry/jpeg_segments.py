@@ -11,16 +11,20 @@ _START_OF_SCAN, _END_OF_IMAGE, _FILL = 0xDA, 0xD9, 0xFF
 _FILL_BYTES = re.compile(rb"\xff+")
 
 
+class DamagedJpegError(ValueError):
+    """The bytes are no whole JPEG; the message says where they break off."""
+
+
 def jpeg_segments(content: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield marker and payload of every segment of a file before the picture's data (ITU-T T.81, annex B).
 
     Raises:
-        ValueError: A segment reaches beyond the end of the file, or there is no picture after the segments.
+        DamagedJpegError: A segment reaches beyond the end of the file, or there is no picture after the segments.
     """
     at = 2
     while at + 4 <= len(content):
         if content[at] != 0xFF:
-            raise ValueError(f"no marker at byte {at}")
+            raise DamagedJpegError(f"no marker at byte {at}")
         marker = content[at + 1]
         if marker == _FILL:
             # Any number of fill bytes may stand before a marker; the last of them begins it.
@@ -29,17 +33,17 @@ def jpeg_segments(content: bytes) -> Iterator[tuple[int, bytes]]:
         if marker == _START_OF_SCAN:
             # The last one ends the picture; those of thumbnails lie in segments before it.
             if content.rfind(bytes((0xFF, _END_OF_IMAGE)), at) < 0:
-                raise ValueError(f"the picture that starts at byte {at} has no end: the file is cut off")
+                raise DamagedJpegError(f"the picture that starts at byte {at} has no end: the file is cut off")
             return
         end = at + 2 + int.from_bytes(content[at + 2 : at + 4], "big")
         if end > len(content):
-            raise ValueError(f"a segment of {end - at} bytes at byte {at} of {len(content)}: the file is cut off")
+            raise DamagedJpegError(f"a segment of {end - at} bytes at byte {at} of {len(content)}: the file is cut off")
         yield marker, content[at + 4 : end]
         at = end
-    raise ValueError(f"no picture in {len(content)} bytes: the file is cut off")
+    raise DamagedJpegError(f"no picture in {len(content)} bytes: the file is cut off")
 
 
 def check_jpeg(content: bytes) -> None:
-    """Raise a `ValueError` if a JPEG's segments are not whole or no picture comes after them."""
+    """Raise a `DamagedJpegError` if a JPEG's segments are not whole or no picture comes after them."""
     for _ in jpeg_segments(content):
         pass

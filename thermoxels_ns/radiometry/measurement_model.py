@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,10 @@ from thermoxels_ns.radiometry.conditions import Conditions, check_between
 
 _LARGEST_ATTENUATION, _LARGEST_WEIGHT = 1.0, 10.0
 _LARGEST_EXPONENT = 700.0
+FIRST_RADIATION_W_UM4_M2_SR = 1.191042972e8  # 2 h c^2 (exact constants of the SI, rounded), [W um^4 / (m2 sr)]
+SECOND_RADIATION_UM_K = 14387.76877  # h c / k (exact constants of the SI, rounded), [um K]
+_COLDEST_K, _HOTTEST_K = 50.0, 6000.0
+_STEPS = 8192
 _PLANCK_REMEDY = "Use the constants of the camera file."
 
 Floats = npt.NDArray[np.floating]
@@ -55,10 +60,50 @@ class PlanckConstants:
         return self.b / np.log(self.r1 / (self.r2 * radiance) + self.f)
 
 
-LONG_WAVE = PlanckConstants(r1=6288.753, r2=1.0, b=1442.826, f=1.0, o=0.0)
-"""For cameras that say degrees but not how they got them, [W / (m2 sr)]: fitted to Planck's law integrated from 7.5 to
-13 micrometres, the band of microbolometers, from -30 to 100 degrees C, where it is right to 1 %. Corrections of some
-kelvin differ by less than 0.1 K from those by the integral, which differ twice as much from a FLIR E60's."""
+@dataclass(frozen=True)
+class PlanckBand:
+    """Planck's law integrated over a band, for cameras that say degrees but not how they got them.
+
+    The curve is tabled: the logarithm of the radiance is nearly a straight line over 1 / T, and the table's straight
+    pieces can be read both ways, so there and back again is exact.
+    """
+
+    shortest_um: float = 7.5  # lower end of the band, [micrometres]
+    longest_um: float = 13.0  # upper end of the band, [micrometres]
+
+    @cached_property
+    def _table(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """1 / T rising, and the logarithm of the radiance, [W / (m2 sr)]."""
+        inverse_k = np.linspace(1.0 / _HOTTEST_K, 1.0 / _COLDEST_K, _STEPS)
+        nodes, weights = np.polynomial.legendre.leggauss(48)
+        half = 0.5 * (self.longest_um - self.shortest_um)
+        wavelengths = self.shortest_um + half * (nodes + 1.0)
+        spectral = FIRST_RADIATION_W_UM4_M2_SR / wavelengths**5
+        radiance = np.zeros(_STEPS)
+        for wavelength, strength in zip(wavelengths, half * weights * spectral):
+            radiance += strength / np.expm1(SECOND_RADIATION_UM_K / wavelength * inverse_k)
+        return inverse_k, np.log(radiance)
+
+    def signal(self, temperature_k: npt.ArrayLike) -> Floats:
+        """Radiance of a black body in the band, [W / (m2 sr)], from 50 to 6000 K, any shape, float64.
+
+        >>> round(float(PlanckBand().signal(300.0)), 2)
+        51.48
+        """
+        inverse_k, logarithm = self._table
+        return np.exp(np.interp(1.0 / np.asarray(temperature_k, dtype=np.float64), inverse_k, logarithm))
+
+    def temperature_k(self, signal: npt.ArrayLike) -> Floats:
+        """Temperature of a black body with this radiance, [K]; NaN where it is below that of 50 K or not above 0."""
+        inverse_k, logarithm = self._table
+        radiance = np.asarray(signal, dtype=np.float64)
+        known = radiance >= np.exp(logarithm[-1])
+        falling = np.log(np.where(known, radiance, 1.0))
+        return np.where(known, 1.0 / np.interp(falling, logarithm[::-1], inverse_k[::-1]), np.nan)
+
+
+SensorCurve = PlanckConstants | PlanckBand  # a sensor's signal for black bodies, and its inverse
+LONG_WAVE = PlanckBand()  # 7.5 to 13 micrometres, the band of microbolometer cameras
 
 
 @dataclass(frozen=True)
@@ -110,7 +155,7 @@ class RadiometricModel:
     """
 
     conditions: Conditions
-    sensor: PlanckConstants = LONG_WAVE
+    sensor: SensorCurve = LONG_WAVE
     air: AirConstants = AirConstants()
 
     def signal(self, temperature_c: npt.ArrayLike) -> Floats:
@@ -154,7 +199,7 @@ def corrected_temperature_c(
     temperature_c: npt.ArrayLike,
     before: Conditions,
     after: Conditions,
-    sensor: PlanckConstants = LONG_WAVE,
+    sensor: SensorCurve = LONG_WAVE,
     air: AirConstants = AirConstants(),
 ) -> Floats:
     """Temperatures [degrees C] as the camera would have shown them with other settings, any shape, float64.

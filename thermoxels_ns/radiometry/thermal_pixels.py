@@ -15,7 +15,7 @@ from PIL import Image, TiffImagePlugin
 
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.radiometry.decoders import check_file_size, check_thermal_size, errors_name
+from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
@@ -23,6 +23,8 @@ THERMAL_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".csv")  # file types that `read_th
 
 _WIDTH, _HEIGHT, _SAMPLE_BITS, _SAMPLE_FORMAT = 256, 257, 258, 339  # tags of TIFF
 _SIGNED, _FLOATING = 2, 3  # sample formats
+_LONGEST_LINE = 2**20
+"""More characters in a line are no row of a thermal image: 8192 numbers of 30 characters are a quarter of it."""
 _EXPECTED = "a readable thermal file"
 _REMEDY = "The file is damaged or not what its suffix says; copy it again or remove its frame."
 _TIFF_SUFFIXES = (".tif", ".tiff")
@@ -184,7 +186,8 @@ def _read_raw(path: Path, suffix: str) -> _RawPixels:
     if not path.is_file():
         remedy = "Restore the file, or remove the frame or pass --missing-thermal skip."
         raise ThermalFileError("thermal file", expected=f"a file at {path}", got="nothing there", remedy=remedy)
-    check_file_size(path)
+    if path.stat().st_size == 0:
+        raise _damaged(path, "a file of zero bytes")
     if suffix == ".npy":
         try:
             values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: its size is checked before it is read
@@ -209,12 +212,19 @@ def _read_raw(path: Path, suffix: str) -> _RawPixels:
 
 def _read_csv(path: Path) -> npt.NDArray[np.float64]:
     """Read rows of numbers split by commas or semicolons; empty cells and nan, NA, null, - are NaN."""
+    width = height = 0
+    with path.open(encoding="latin-1") as stream:  # counts alone, whatever the file's own encoding
+        while line := stream.readline(_LONGEST_LINE):
+            width, height = max(width, 1 + max(line.count(","), line.count(";"))), height + 1
+            if len(line) == _LONGEST_LINE:
+                expected = f"a table with lines below {_LONGEST_LINE} characters"
+                remedy = "The file is damaged or no table; write one row of the image per line."
+                raise ThermalFileError(str(path), expected=expected, got=f"a longer one, line {height}", remedy=remedy)
+            check_thermal_size(path, width, height)
     text = path.read_text(encoding="utf-8-sig")
-    lines = text.splitlines()
-    check_thermal_size(path, 1 + max((max(line.count(","), line.count(";")) for line in lines), default=0), len(lines))
     semicolons = ";" in text
     rows = []
-    for row in csv.reader(lines, delimiter=";" if semicolons else ","):
+    for row in csv.reader(text.splitlines(), delimiter=";" if semicolons else ","):
         cells = [cell.strip() for cell in row]
         if cells and cells[-1] == "":
             cells.pop()  # many cameras end each line with a separator

@@ -22,7 +22,8 @@ from thermoxels_ns.radiometry.count_scales import (
 )
 from thermoxels_ns.radiometry.decoders import check_file_size, errors_name
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg, read_dji_rjpeg
-from thermoxels_ns.radiometry.flir_rjpeg import PictureInPicture, is_flir_jpeg, read_flir_jpeg
+from thermoxels_ns.radiometry.flir_records import PictureInPicture
+from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 from thermoxels_ns.radiometry.jpeg_segments import JPEG_START, check_jpeg
 from thermoxels_ns.radiometry.measurement_model import corrected_temperature_c
 from thermoxels_ns.radiometry.thermal_pixels import (

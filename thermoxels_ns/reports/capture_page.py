@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from thermoxels_ns.capture.folder_scan import shown_name
 from thermoxels_ns.capture.frames import measurement_rows
+from thermoxels_ns.capture.rig.explanation import turn_deg, turn_error_deg, why_turn_is_unsure, with_error
 from thermoxels_ns.capture.rig.start import rig_frames
-from thermoxels_ns.capture.rig_types import with_error
 from thermoxels_ns.capture.scene_writer import scene_names
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
@@ -75,8 +75,9 @@ def capture_page(
         result=result,
         overlays=overlays,
         cameras=_cameras(result),
-        turn=with_error(rig.turn_deg, rig.turn_error_deg, 2),
+        turn=with_error(turn_deg(rig), turn_error_deg(rig), 2),
         shift=float(np.linalg.norm(rig.visible_to_thermal[:3, 3])),
+        unsure=why_turn_is_unsure(rig),
         errors=errors,
         median_error=np.median(errors) if errors.size else math.nan,
         error_chart=histogram(errors, "reprojection error, pixels of the photographs", limits=(0.0, limit)),

@@ -106,7 +106,7 @@ def test_pictures_that_do_not_serve_are_refused(
         found(folder, tmp_path / "a", size=(80, 64))
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(SceneError, match="expected photographs with thermal images, got no photograph"):
+    with pytest.raises(SceneError, match="got none; no camera files"):
         found(empty, tmp_path / "c")
     two = write_board_folder(tmp_path / "two", pairs[:2])
     with pytest.raises(SceneError, match=r"in 2 of 2 pairs.*Pairs: board0, board1"):

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from tests.support.known_rig import KnownCapture, painted_sky
+from thermoxels_ns.capture.rig.explanation import turn_errors_deg
 from thermoxels_ns.capture.rig.images import prepare_frames
 from thermoxels_ns.capture.rig.parameters import RigModel, prior_sigmas
-from thermoxels_ns.capture.rig.refinement import RefinedRig, refine
+from thermoxels_ns.capture.rig.refinement import RefinedRig, inflate_centre_covariance, refine
 from thermoxels_ns.capture.rig.windows import THERMAL_BLUR_PX, SmoothThermal, WindowScore, window_design
 from thermoxels_ns.capture.rig_types import RigStart
 
@@ -81,3 +82,24 @@ def test_slopes_are_the_derivatives_of_the_likelihood(sky: KnownCapture) -> None
         assert slopes[number] == pytest.approx(
             (ahead - behind) / (2 * step), rel=0.03, abs=0.02 * np.abs(slopes[number]) + 1e-3
         )
+
+
+def covariance_with_centre(variance_px: float) -> np.ndarray:
+    """A covariance whose principal point is known to that variance, the tilt standing for its row."""
+    errors = np.linspace(0.01, 0.1, 10)
+    result = np.diag(errors**2)
+    result[[7, 8], [7, 8]] = variance_px
+    result[0, 8] = result[8, 0] = 0.9 * errors[0] * np.sqrt(variance_px)
+    return result
+
+
+def test_a_quarter_of_what_windows_say_of_the_principal_point_counts() -> None:
+    covariance, sigmas = covariance_with_centre(1.0 / 9.0), np.ones(10)
+    doubted = inflate_centre_covariance(covariance, sigmas)
+    # Information 9, of it 1 from the start and 8 from the windows.
+    assert doubted[7, 7] == pytest.approx(1.0 / 3.0)
+    assert doubted[8, 8] == pytest.approx(1.0 / 3.0)
+    assert doubted[0, 0] == pytest.approx(covariance[0, 0] * (1.0 + 0.81 * 2.0))
+    assert turn_errors_deg(doubted)[1] == pytest.approx(turn_errors_deg(covariance)[1])
+    rest = [1, 2, 3, 4, 5, 6, 9]
+    assert np.allclose(doubted[np.ix_(rest, rest)], covariance[np.ix_(rest, rest)], rtol=0.0, atol=1e-15)

@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.camera_card import write_pairs
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.colmap_process import run_in_process
+from thermoxels_ns.capture.sfm.colmap_process import disk_of, run_in_process
 from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 
@@ -94,7 +94,7 @@ def test_a_full_disk_is_named_whatever_colmap_says(tmp_path, work, monkeypatch, 
         monkeypatch.setattr(shutil, "disk_usage", lambda _: FULL)
     with pytest.raises(OutputError, match=r"free space for features, matches and poses.*finished stages are kept") as e:
         run_in_process(work.abort_as_colmap, (words,), tmp_path)
-    assert str(e.value).startswith(f"disk of {tmp_path}: ")
+    assert str(e.value).startswith(f"disk at {disk_of(tmp_path)}: ")
 
 
 def test_a_mapping_that_aborts_is_an_error_and_the_capture_goes_on_behind_its_features(tmp_path, monkeypatch):

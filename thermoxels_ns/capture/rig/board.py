@@ -12,10 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from thermoxels_ns.capture.folder_scan import scan_folder
 from thermoxels_ns.capture.frames import read_frames
-from thermoxels_ns.capture.pairs import PairOptions, search_pairs
+from thermoxels_ns.capture.pairs import PairOptions, find_pairs
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.rig.parameters import RigModel, prior_sigmas, standard_errors
+from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas
 from thermoxels_ns.capture.rig.start import BASELINE_SIGMA_M, rig_start
 from thermoxels_ns.capture.rig_types import FloatArray, RigEstimate, RigStart
 from thermoxels_ns.capture.settings import CaptureSettings
@@ -25,6 +26,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 _SIZE = re.compile(r"(\d{1,3})\s*[xX]\s*(\d{1,3})")
+_SHIFTS = slice(3, 6)  # of a rig's ten parameters, those that are lengths
 
 _FEWEST_BOARDS = 3
 _CORNER_SIGMA_PX = 0.3
@@ -101,28 +103,37 @@ def rig_from_boards(
     rig = RigModel(start.thermal_camera, np.asarray(start.visible_to_thermal, dtype=np.float64))
     sigmas = prior_sigmas(start, depth)
     if len(points) < _FEWEST_BOARDS:
-        return start.kept(
-            f"the board is seen by both cameras in {len(points)} of {len(pairs)} pairs ({_FEWEST_BOARDS} needed)"
-        )
+        reason = f"the board is seen by both cameras in {len(points)} of {len(pairs)} pairs ({_FEWEST_BOARDS} needed)"
+        text = f"Not determined, the start value is kept ({start.source}): {reason}."
+        return RigEstimate(rig.camera, rig.transform, False, text, PARAMETERS, np.diag(sigmas**2))
+    free = np.flatnonzero(sigmas > 0.0)
     every, target = np.concatenate(points), np.concatenate(seen)
 
+    def change(z: FloatArray) -> FloatArray:
+        full = np.zeros(len(sigmas))
+        full[free] = z * sigmas[free]
+        return full
+
     def misfit(z: FloatArray) -> FloatArray:
-        errors = np.nan_to_num(rig.project(z * sigmas, every) - target, nan=1e3).ravel()
+        errors = np.nan_to_num(rig.project(change(z), every) - target, nan=1e3).ravel()
         return np.concatenate([errors / _CORNER_SIGMA_PX, z])
 
-    best = least_squares(misfit, np.zeros(len(sigmas)), loss="huber", x_scale="jac")
-    camera, transform = rig.changed(best.x * sigmas)
-    slopes = best.jac[: target.size]
-    covariance = np.linalg.inv(best.jac.T @ best.jac) * max(float(np.mean(best.fun[: target.size] ** 2)), 1.0)
-    sigma_px = _CORNER_SIGMA_PX * float(np.sqrt(np.trace(slopes @ covariance @ slopes.T) / len(every)))
-    errors_px = np.linalg.norm(rig.project(best.x * sigmas, every) - target, axis=1)
+    best = least_squares(misfit, np.zeros(len(free)), loss="huber", x_scale="jac")
+    covariance = np.zeros((len(sigmas),) * 2)
+    scatter = max(float(np.mean(best.fun[: target.size] ** 2)), 1e-6)
+    inverse = np.linalg.inv(best.jac.T @ best.jac) * max(scatter, 1.0)
+    covariance[np.ix_(free, free)] = inverse * np.outer(sigmas[free], sigmas[free])
+    errors_px = np.linalg.norm(best.fun[: target.size].reshape(-1, 2), axis=1) * _CORNER_SIGMA_PX
+    camera, transform = rig.changed(change(best.x))
+    error_px = float(np.median(errors_px))
     text = (
         f"Found from {len(points)} pictures of a checker board: focal length {camera.fl_x:.1f} pixels, "
-        f"{np.linalg.norm(transform[:3, 3]):.3f} m from the visible camera; corners fall {np.median(errors_px):.2f} "
-        f"thermal pixels from where they are seen (median)."
+        f"{np.linalg.norm(transform[:3, 3]):.3f} m from the visible camera; corners fall {error_px:.2f} thermal pixels "
+        f"from where they are seen (median)."
     )
-    errors = standard_errors(covariance * np.outer(sigmas, sigmas))
-    return RigEstimate(camera, transform, True, text, errors, projection_sigma_px=sigma_px)
+    uncertain_px = float(np.sqrt(np.trace(best.jac[: target.size] @ inverse @ best.jac[: target.size].T) / len(every)))
+    sigma_px = uncertain_px * _CORNER_SIGMA_PX
+    return RigEstimate(camera, transform, True, text, PARAMETERS, covariance, projection_sigma_px=sigma_px)
 
 
 def board_of(settings: CaptureSettings) -> CheckerBoard | None:
@@ -161,8 +172,15 @@ def rig_from_board_photos(
     Its files are paired and read like those of the capture, into `folder`. A `SceneError` is raised where there are no
     pairs, they come from another camera, or fewer than three show the board to both cameras.
     """
-    options = PairOptions(settings.time_limit_s, settings.clock_offset_s)
-    search, _ = search_pairs(source, [], options, settings.skip_bad, settings.dji_library is not None)
+    found = scan_folder(source)
+    if found.unreadable and not settings.skip_bad:
+        raise SceneError(next(iter(found.unreadable.values())))
+    search = find_pairs(found, PairOptions(settings.time_limit_s, settings.clock_offset_s))
+    if not search.pairs:
+        example = next((f"{path.name}: {why}" for path, why in search.unpaired.items()), "no camera files")
+        expected = "photographs with thermal images"
+        got, remedy = f"none; {example}", "Give both of a shot the same name or time."
+        raise SceneError(f"board pictures in {source}", expected=expected, got=got, remedy=remedy)
     read = read_frames(search.pairs, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
     if read.thermal_size != thermal_size:
         raise _another_camera("thermal images", thermal_size, read.thermal_size)
@@ -190,10 +208,11 @@ def in_scene_units(rig: RigEstimate, scale: MetricScale | None, missing: str) ->
         expected = "a known scale, because a board gives the distance of the lenses in metres"
         remedy = "Pass --known-distance or --marker-side-m; poses that were found are kept."
         raise SceneError("scale", expected=expected, got=f"none: {missing}", remedy=remedy)
-    transform, errors = rig.visible_to_thermal.copy(), dict(rig.standard_errors)
+    transform, covariance = rig.visible_to_thermal.copy(), rig.covariance.copy()
     transform[:3, 3] /= scale.metres_per_unit
-    errors |= {name: errors[name] / scale.metres_per_unit for name in ("tx", "ty", "tz")}
-    return replace(rig, visible_to_thermal=transform, standard_errors=errors)
+    covariance[_SHIFTS] /= scale.metres_per_unit
+    covariance[:, _SHIFTS] /= scale.metres_per_unit
+    return replace(rig, visible_to_thermal=transform, covariance=covariance)
 
 
 def _another_camera(name: str, wanted: Sequence[int], got: Sequence[int]) -> SceneError:

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig.parameters import RigModel
 from thermoxels_ns.capture.rig.score import EdgePoints, RigScore, ThermalEdges
 from thermoxels_ns.capture.rig_types import RigFrame
 from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.radiometry.decoders import errors_name
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -144,8 +144,17 @@ def read_temperatures(frame: RigFrame, camera: Camera) -> FloatImage:
 def read_photograph(frame: RigFrame, camera: Camera) -> FloatImage:
     """Photograph of a frame as grey values; EXIF's orientation is not applied, as in structure from motion."""
     source = frame.photograph
-    image = np.asarray(open_photograph(source).convert("L") if isinstance(source, Path) else source)
-    image = image[..., :3].mean(axis=2) if image.ndim == 3 else image
+    if isinstance(source, Path):
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        with errors_name(f"{frame.name}: {source.name}", "a readable photograph"):
+            encoded = np.frombuffer(source.read_bytes(), np.uint8)
+        image = cv2.imdecode(encoded, flags) if len(encoded) else None
+        if image is None:
+            remedy, got = "Copy it from the camera again or leave the frame out.", "a file that is damaged or no image"
+            raise SceneError(f"{frame.name}: {source.name}", expected="a readable photograph", got=got, remedy=remedy)
+    else:
+        image = np.asarray(source)
+        image = image[..., :3].mean(axis=2) if image.ndim == 3 else image
     height, width = image.shape
     if abs(width * camera.height / (height * camera.width) - 1.0) > _ASPECT_TOLERANCE:
         expected = f"the aspect of the visible camera, {camera.width} x {camera.height}"

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
-import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.capture.rig_types import FloatArray, RigStart
 from thermoxels_ns.core.camera import Camera
@@ -15,6 +14,11 @@ PARAMETERS = ("rx", "ry", "rz", "tx", "ty", "tz", "log_focal", "cx", "cy", "k1")
 """Radians, world units, natural logarithm, thermal pixels at full size, and OpenCV's k1."""
 
 _TRANSLATION_SHARE = 0.03
+_SMALLEST_DEPTH_SHARE = 1e-3
+_GENERATORS = np.array(
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]],
+    dtype=np.float64,
+)
 
 
 def prior_sigmas(start: RigStart, median_depth: float) -> FloatArray:
@@ -24,18 +28,12 @@ def prior_sigmas(start: RigStart, median_depth: float) -> FloatArray:
     return np.array([turn] * 3 + [shift] * 3 + [start.focal_sigma, centre, centre, start.k1_sigma])
 
 
-def standard_errors(covariance: FloatArray) -> dict[str, float]:
-    """Standard errors of the parameters by name, from the covariance (10, 10) of their changes."""
-    return dict(zip(PARAMETERS, np.sqrt(np.diag(covariance)).tolist()))
-
-
 @dataclass(frozen=True, eq=False)
 class RigModel:
     """The start value that the changes are counted from, at some size of the thermal image.
 
     A rig is a start value and ten small changes p = (rx, ry, rz, tx, ty, tz, log focal, cx, cy, k1):
-    x_thermal = R R_start x_visible + t_start + t with R the rotation by the vector (rx, ry, rz), then the pinhole
-    camera with distortion.
+    x_thermal = Rz Ry Rx R_start x_visible + t_start + t, then the pinhole camera with radial distortion.
     """
 
     camera: Camera  # thermal camera of the start, resized to the level's pixels
@@ -50,8 +48,9 @@ class RigModel:
 
     def changed(self, change: FloatArray) -> tuple[Camera, FloatArray]:
         """Thermal camera and transform with the ten changes applied."""
+        rotation, _ = _rotation(*change[:3].tolist())
         transform = self.transform.copy()
-        transform[:3, :3] = Rotation.from_rotvec(change[:3]).as_matrix() @ self.transform[:3, :3]
+        transform[:3, :3] = rotation @ self.transform[:3, :3]
         transform[:3, 3] += change[3:6]
         growth = float(np.exp(change[6]))
         camera = replace(
@@ -69,15 +68,44 @@ class RigModel:
         camera, transform = self.changed(change)
         return camera.project(points @ transform[:3, :3].T + transform[:3, 3])
 
-    def slopes(self, change: FloatArray, points: FloatArray) -> FloatArray:
-        """Derivatives of `project` with respect to the ten changes, shape (n, 2, 10); 0 behind the camera."""
+    def pull_back(self, change: FloatArray, points: FloatArray, slope: FloatArray) -> FloatArray:
+        """Derivative of a sum over points with respect to the ten changes, shape (10,), by the chain rule.
+
+        `slope` (n, 2) is the derivative of the sum with respect to the pixels of `points` (n, 3) of the visible camera;
+        0 where a point does not count. Tangential distortion is taken as constant: it is far below a pixel's worth.
+        """
         camera, transform = self.changed(change)
-        turned, shift = points @ self.transform[:3, :3].T, transform[:3, 3]
-        matrix = np.array([[camera.fl_x, 0.0, camera.cx], [0.0, camera.fl_y, camera.cy], [0.0, 0.0, 1.0]])
-        distortion = np.array([camera.k1, camera.k2, camera.p1, camera.p2])
-        # Columns: rotation vector, shift, both focal lengths, principal point, distortion.
-        table = cv2.projectPoints(turned, change[:3], shift, matrix, distortion)[1].reshape(len(points), 2, -1)
-        by_focal = camera.fl_x * table[..., 6:7] + camera.fl_y * table[..., 7:8]
-        centre, k1 = self.pixel_share * table[..., 8:10], table[..., 10:11]
-        ahead = points @ transform[2, :3] + shift[2] > 0.0
-        return np.concatenate([table[..., :6], by_focal, centre, k1], axis=2) * ahead[:, None, None]
+        _, turned = _rotation(*change[:3].tolist())
+        local = points @ transform[:3, :3].T + transform[:3, 3]
+        depth = local[:, 2]
+        safe = np.where(depth > _SMALLEST_DEPTH_SHARE * np.median(points[:, 2]), depth, np.inf)
+        x, y = local[:, 0] / safe, local[:, 1] / safe
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (camera.k1 + r2 * camera.k2)
+        growth = 2.0 * (camera.k1 + 2.0 * r2 * camera.k2)
+        along = camera.fl_x * slope[:, 0], camera.fl_y * slope[:, 1]
+        outward = along[0] * x + along[1] * y
+        to_x = (along[0] * radial + growth * x * outward) / safe
+        to_y = (along[1] * radial + growth * y * outward) / safe
+        to_local = np.column_stack([to_x, to_y, -(x * to_x + y * to_y)])
+        to_rotation = to_local.T @ (points @ self.transform[:3, :3].T)
+        result = np.empty(len(PARAMETERS))
+        result[:3] = np.einsum("kij,ij->k", turned, to_rotation)
+        result[3:6] = to_local.sum(axis=0)
+        result[6] = float(np.sum(radial * outward))
+        result[7:9] = self.pixel_share * slope.sum(axis=0)
+        result[9] = float(np.sum(r2 * outward))
+        return result
+
+
+@lru_cache(maxsize=4)  # all frames ask for the same one
+def _rotation(rx: float, ry: float, rz: float) -> tuple[FloatArray, FloatArray]:
+    """Rotation Rz Ry Rx (3, 3) and its derivatives by the three angles (3, 3, 3)."""
+    single, slope = [], []
+    for angle, generator in zip((rx, ry, rz), _GENERATORS):
+        cosine, sine = np.cos(angle), np.sin(angle)
+        square = generator @ generator
+        single.append(np.eye(3) + sine * generator + (1.0 - cosine) * square)
+        slope.append(cosine * generator + sine * square)
+    x, y, z = single
+    return z @ y @ x, np.array([z @ y @ slope[0], z @ slope[1] @ x, slope[2] @ y @ x])

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.capture.rig.fit import RigMaximizer
 from thermoxels_ns.capture.rig.images import FARTHEST_FROM_POINT, SURE_DISTANCE, PreparedFrame, PreparedFrames
-from thermoxels_ns.capture.rig.parameters import RigModel
+from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel
 from thermoxels_ns.capture.rig.windows import THERMAL_BLUR_PX, SmoothThermal, WindowDesign, WindowScore, window_design
 from thermoxels_ns.capture.rig_types import FloatArray
 
@@ -31,9 +31,10 @@ _MOST_SHIFT_PX = 2.0
 _CORRELATED_FRAMES = 6
 """Frames that count as one. In five drawn captures of 36 frames the turn was wrong by 0.09 degrees (median) with 6, by
 0.22 where all counted as one; where none did, no better in the four that were tried."""
-_MORE_UNSURE = 2.0
-"""How much larger the standard errors are than the scatter of the windows says: errors that all windows share do not
-show in it. In drawn captures with known rigs those of turn and principal point were one to two times as large."""
+_CENTRE = [PARAMETERS.index(name) for name in ("cx", "cy")]
+_CENTRE_INFLATION = 4.0
+"""By how much the windows' information on the principal point is divided. In drawn captures with known rigs its errors
+were one to two times what the scatter of the windows says, up to six times in one; those of the rest were not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +55,8 @@ def refine(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: 
 
     Frames show the same things, so their errors are correlated: up to six together count as one frame in the standard
     errors and against the prior. More frames look from other places, where the errors of the same windows differ, so
-    that thirty tell more than six.
+    that thirty tell more than six. What the windows say of the principal point counts less still
+    (`inflate_centre_covariance`).
 
     None where too few windows agree, or hardly more than by chance.
     """
@@ -93,7 +95,33 @@ def refine(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: 
     moved = np.linalg.norm(rig.project(change, points) - rig.project(start, points), axis=1)
     if not np.nanmedian(moved) < _MOST_SHIFT_PX:
         return None
-    return RefinedRig(change, _MORE_UNSURE**2 * maximizer.covariance(change), chosen.windows)
+    return RefinedRig(change, inflate_centre_covariance(maximizer.covariance(change), sigmas), chosen.windows)
+
+
+def inflate_centre_covariance(covariance: FloatArray, sigmas: FloatArray) -> FloatArray:
+    """State the principal point, and what stands for it, as less sure than the windows' scatter says.
+
+    Turn and principal point differ in the image only by terms of second order, some tenths of a pixel in its corners,
+    which errors that all windows share reach. With C_cc the covariance of the principal point and D that of the start,
+    the information gained is C_cc^-1 - D^-1; a quarter of it counts. The other numbers follow by their regression on
+    the principal point, so what they would be with it known stays as it is. Where the principal point is kept fixed
+    (0 in `sigmas`), the covariance is unchanged.
+    """
+    if np.any(sigmas[_CENTRE] <= 0.0):
+        return covariance
+    before = np.diag(1.0 / sigmas[_CENTRE] ** 2)
+    inner = covariance[np.ix_(_CENTRE, _CENTRE)]
+    known = np.linalg.inv(inner)
+    gained = _positive_part(known - before)
+    added = _positive_part(np.linalg.inv(before + gained / _CENTRE_INFLATION) - inner)
+    follow = covariance[:, _CENTRE] @ known
+    return covariance + follow @ added @ follow.T
+
+
+def _positive_part(symmetric: FloatArray) -> FloatArray:
+    """A symmetric matrix with its negative eigenvalues set to 0."""
+    values, vectors = np.linalg.eigh(0.5 * (symmetric + symmetric.T))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, dtype=np.float64)
 
 
 def _agrees(score: WindowScore, change: FloatArray, fewest: float) -> bool:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import map_coordinates
 
 from thermoxels_ns.capture.rig.parameters import RigModel
 from thermoxels_ns.capture.rig_types import FloatArray
@@ -26,14 +25,27 @@ class EdgePoints:
 
 
 class ThermalEdges:
-    """Edge values of one thermal image, and how much they count."""
+    """Edge values of one thermal image and all that is needed to sample them smoothly."""
 
     def __init__(self, field: npt.NDArray[np.complex64]) -> None:
         """Take edge values, shape (height, width)."""
         height, width = field.shape
         self.field = field
         self.weight: npt.NDArray[np.float32] = np.minimum.outer(_ramp(height), _ramp(width)).astype(np.float32)
-        self.slopes = np.gradient(field)[::-1]  # along x and y
+        # Zeros around, so that everything outside reads 0.
+        values = np.pad(np.dstack([field.real, field.imag]).astype(np.float32), ((2, 2), (2, 2), (0, 0)))
+        self._planes = np.zeros((height + 4, width + 4, 6), np.float32)
+        self._planes[..., :2] = values
+        self._planes[:, 1:-1, 2:4] = 0.5 * (values[:, 2:] - values[:, :-2])
+        self._planes[1:-1, :, 4:] = 0.5 * (values[2:] - values[:-2])
+
+    def sample(self, pixels: FloatArray) -> npt.NDArray[np.float32]:
+        """Edge values at pixels (n, 2), and their derivatives along x and y: complex as pairs (n, 6); 0 outside."""
+        return _bilinear(self._planes, pixels + 2.0)
+
+    def weight_at(self, pixels: FloatArray) -> FloatArray:
+        """How much points at pixel positions (n, 2) count, shape (n,); 0 outside the image."""
+        return _bilinear(np.pad(self.weight, 2)[..., None], pixels + 2.0)[:, 0].astype(np.float64)
 
 
 class RigScore:
@@ -54,7 +66,7 @@ class RigScore:
     ) -> None:
         """Take edges of photographs and thermal images, what changes count from, and where the weights are taken."""
         self.edges, self.thermal, self.rig = edges, thermal, rig
-        self._weights = [sampled(t.weight, rig.project(around, e.points)) for e, t in zip(edges, thermal)]
+        self._weights = [t.weight_at(rig.project(around, e.points)) for e, t in zip(edges, thermal)]
         self._own = sum(float(w @ np.abs(e.value) ** 2) for e, w in zip(edges, self._weights))
         self._scale = 1.0 / np.sqrt(max(self._own * self._sums(around)[1], _TINY))
 
@@ -71,30 +83,34 @@ class RigScore:
         """Weighted sums of Re a* b and |b|^2."""
         product, other = 0.0, 0.0
         for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
-            found = sampled(thermal.field, self.rig.project(change, one.points))
-            product += float(weight @ (one.value.conj() * found).real)
-            other += float(weight @ np.abs(found) ** 2)
+            sampled = thermal.sample(self.rig.project(change, one.points))
+            product += float(weight @ (one.value.real * sampled[:, 0] + one.value.imag * sampled[:, 1]))
+            other += float(weight @ (sampled[:, 0] ** 2 + sampled[:, 1] ** 2))
         return product, other
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
         """What is maximised, and its derivative split by the frames that it comes from, shape (frames, 10)."""
         total, rows = 0.0, []
         for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
-            pixels = self.rig.project(change, one.points)
-            by_value = self._scale * weight * one.value.conj()
-            total += float((by_value @ sampled(thermal.field, pixels)).real)
-            by_pixel = np.column_stack([(by_value * sampled(slope, pixels)).real for slope in thermal.slopes])
-            rows.append(np.einsum("nx,nxk->k", by_pixel, self.rig.slopes(change, one.points)))
+            values = thermal.sample(self.rig.project(change, one.points))
+            by_real, by_imaginary = (self._scale * weight * part for part in (one.value.real, one.value.imag))
+            total += float(by_real @ values[:, 0] + by_imaginary @ values[:, 1])
+            slope = np.column_stack([by_real * values[:, k] + by_imaginary * values[:, k + 1] for k in (2, 4)])
+            rows.append(self.rig.pull_back(change, one.points, slope))
         return total, np.array(rows)
 
 
-def sampled(image: npt.NDArray, pixels: FloatArray, order: int = 1, outside: str = "constant") -> npt.NDArray:
-    """Values of an image (of the coefficients of its spline, for an order above 1) at pixels (n, 2).
-
-    Outside they are 0, or with `outside` "nearest" those of the border; NaN lies outside.
-    """
-    place = np.nan_to_num(pixels, nan=-9.0)[:, ::-1].T - 0.5
-    return np.asarray(map_coordinates(image, place, order=order, prefilter=False, mode=outside))
+def _bilinear(planes: npt.NDArray[np.float32], pixels: FloatArray) -> npt.NDArray[np.float32]:
+    """Sample planes (height, width, k) at pixel positions (n, 2); NaN and what is far off reads the corner."""
+    rows, columns, depth = planes.shape
+    place = np.nan_to_num(pixels, nan=-9.0, posinf=-9.0, neginf=-9.0) - 0.5
+    x, y = np.clip(place[:, 0], 0.0, columns - 1.001), np.clip(place[:, 1], 0.0, rows - 1.001)
+    left, top = x.astype(np.int64), y.astype(np.int64)
+    u, v = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
+    flat, first = planes.reshape(rows * columns, depth), top * columns + left
+    above = flat[first] * (1 - u) + flat[first + 1] * u
+    below = flat[first + columns] * (1 - u) + flat[first + columns + 1] * u
+    return above * (1 - v) + below * v
 
 
 def _ramp(length: int) -> npt.NDArray[np.float64]:

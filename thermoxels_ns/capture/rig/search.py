@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.capture.rig.coarse_search import CoarseSearch
+from thermoxels_ns.capture.rig.explanation import uncertainty_text
 from thermoxels_ns.capture.rig.fit import RigFit, RigMaximizer
 from thermoxels_ns.capture.rig.images import PreparedFrames, prepare_frames
-from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas, standard_errors
+from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas
 from thermoxels_ns.capture.rig.refinement import refine
 from thermoxels_ns.capture.rig_types import FloatArray, RigEstimate, RigFrame, RigStart
 from thermoxels_ns.core.camera import Camera
@@ -25,6 +25,7 @@ _SEARCHED_SIZES = 2
 _FARTHEST_SIGMAS = 5.0
 _WORTH_TRYING = 0.8
 _SMALLEST_ERROR_PX, _LARGEST_ERROR_SHARE = 1.5, 0.005
+_PROBE_STEP = 1e-4
 
 
 def estimate_rig(
@@ -119,14 +120,14 @@ class _RigSearch:
             error_px = self._projection_sigma(rig, change, covariance)
         self.progress("Rig found", 1.0)
         camera, transform = rig.changed(change)
-        turn_deg = np.degrees(Rotation.from_matrix(transform[:3, :3]).magnitude())
+        turn_deg = np.degrees(np.arccos(np.clip(0.5 * (np.trace(transform[:3, :3]) - 1.0), -1.0, 1.0)))
         explanation = (
             f"Found from {len(self.prepared.frames)} frames{windows}: focal length {camera.fl_x:.1f} pixels, "
             f"{turn_deg:.2f} degrees and {np.linalg.norm(transform[:3, 3]):.3g} world units from the visible camera; "
-            f"scene points fall within {error_px:.2f} thermal pixels (standard error). Start: {self.start.source}."
-        )
-        errors = standard_errors(covariance)
-        return RigEstimate(camera, transform, True, explanation, errors, before, after, error_px)
+            f"scene points fall within {error_px:.2f} thermal pixels (standard error). Start: {self.start.source}. "
+            f"{uncertainty_text(covariance, sigmas)}"
+        ).rstrip()
+        return RigEstimate(camera, transform, True, explanation, PARAMETERS, covariance, before, after, error_px)
 
     def _rejection(
         self, change: FloatArray, sigmas: FloatArray, before: float, after: float, error_px: float
@@ -149,14 +150,19 @@ class _RigSearch:
         covariance = np.diag(sigmas**2)
         error_px = self._projection_sigma(rig, np.zeros(len(sigmas)), covariance)
         text = f"Not determined, the start value is kept ({self.start.source}): {reason}."
-        errors = standard_errors(covariance)
-        return RigEstimate(rig.camera, rig.transform, False, text, errors, score, score, error_px)
+        return RigEstimate(rig.camera, rig.transform, False, text, PARAMETERS, covariance, score, score, error_px)
 
     def _projection_sigma(self, rig: RigModel, change: FloatArray, covariance: FloatArray) -> float:
         """Median standard error of where scene points fall [thermal pixels], both axes together."""
         camera = self.prepared.thermal
         across, down = np.meshgrid(np.linspace(0.05, 0.95, 12), np.linspace(0.05, 0.95, 12))
         rays = camera.rays(np.column_stack([across.ravel() * camera.width, down.ravel() * camera.height]))
-        slopes = rig.slopes(change, rays * self.prepared.median_depth)
-        variance = np.einsum("nxi,ij,nxj->n", slopes, covariance, slopes)
-        return float(np.sqrt(np.median(variance)))
+        points = rays * self.prepared.median_depth
+        here = rig.project(change, points)
+        slopes = np.empty((len(PARAMETERS), *here.shape))
+        for number in range(len(PARAMETERS)):
+            moved = change.copy()
+            moved[number] += _PROBE_STEP
+            slopes[number] = (rig.project(moved, points) - here) / _PROBE_STEP
+        variance = np.einsum("inx,ij,jnx->n", slopes, covariance, slopes)
+        return float(np.sqrt(np.nanmedian(variance)))

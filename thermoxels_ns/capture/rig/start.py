@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +15,8 @@ from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame, RigStart
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.json_values import read_json_object
-from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
+from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.data.transforms_json import read_intrinsics
 
 _MOST_ERROR_PX = 4.0
 """Points that project farther than this from where they were seen are not used, [pixels of the photographs]."""
@@ -93,15 +94,29 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
     Where the json has a scale and this capture too, lengths are converted. A `SceneError` is raised where one is
     missing or no camera of this size, or no rotation and shift.
     """
+    content: Any = read_json(file)
     remedy = "Pass the transforms.json of an earlier capture with the same camera."
-    content = read_json_object(file, remedy, SceneError)
     try:
-        camera = read_intrinsics(content["thermal_camera"], {}, None, "thermal_camera")
-        transform = read_pose(content["rig"], "rig")
-    except (SceneError, KeyError, TypeError) as problem:
-        expected = "'thermal_camera', its intrinsics, and 'rig', 4 x 4 numbers, a rotation and a shift"
-        got = f"no {problem}" if isinstance(problem, KeyError) else problem
-        raise SceneError(str(file), expected=expected, got=got, remedy=remedy) from problem
+        entries = content["thermal_camera"]
+        for name in ("w", "h"):
+            if not float(entries[name]).is_integer():  # neither infinity nor NaN is one
+                where = f"{file.name}: thermal_camera.{name}"
+                raise SceneError(where, expected="a whole number of pixels", got=entries[name], remedy=remedy)
+        camera = read_intrinsics(entries, {}, None, f"{file.name}: thermal_camera")
+        transform = np.array(content["rig"], dtype=np.float64)
+    except (KeyError, TypeError, ValueError, AttributeError) as problem:
+        if isinstance(problem, SceneError):
+            raise
+        got = f"no {problem}" if isinstance(problem, KeyError) else str(problem)
+        raise SceneError(str(file), expected="'thermal_camera' and 'rig'", got=got, remedy=remedy) from problem
+    rigid = transform.shape == (4, 4) and bool(np.isfinite(transform).all())
+    if rigid:  # a rotation, which keeps left and right, and a shift
+        rotation = transform[:3, :3]
+        rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-2 and np.linalg.det(rotation) > 0.0
+        rigid &= np.array_equal(transform[3], [0.0, 0.0, 0.0, 1.0])
+    if not rigid:
+        expected, got = "4 x 4 numbers, a rotation and a shift", transform.tolist()
+        raise SceneError(f"{file}: rig", expected=expected, got=got, remedy=remedy)
     if (camera.width, camera.height) != thermal_size:
         expected = f"{thermal_size[0]} x {thermal_size[1]} pixels, as the images have"
         got, remedy = f"{camera.width} x {camera.height}", "Pass the rig of the same camera and mode."
@@ -113,3 +128,9 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
     else:
         lengths = "its lengths taken for those of this scene, because not both have a scale"
     return RigEstimate(camera, transform, True, f"Given in {file.name}, {lengths}.")
+
+
+def kept_start(start: RigStart, why: str) -> RigEstimate:
+    """The start value as an estimate, where nothing can be compared."""
+    text = f"{why} The start value is kept: {start.source}."
+    return RigEstimate(start.thermal_camera, start.visible_to_thermal, False, text)

@@ -9,10 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
-from scipy.sparse import coo_matrix
 
 from thermoxels_ns.capture.rig.parameters import RigModel
-from thermoxels_ns.capture.rig.score import sampled
 from thermoxels_ns.capture.rig_types import FloatArray
 
 FloatImage = npt.NDArray[np.float32]
@@ -90,14 +88,13 @@ class SmoothThermal:
 
     def value(self, pixels: FloatArray) -> FloatArray:
         """Local contrast at pixel positions (n, 2), shape (n,) [K]."""
-        return sampled(self._spline, pixels, 3, "nearest")
+        return _sampled(self._spline, pixels)
 
     def slope(self, pixels: FloatArray) -> FloatArray:
         """Its derivatives along x and y, shape (n, 2) [K/pixel]."""
         steps = (_STEP_PX, 0.0), (0.0, _STEP_PX)
-        return np.column_stack([self.value(pixels + step) - self.value(pixels - step) for step in steps]) / (
-            2.0 * _STEP_PX
-        )
+        rises = [_sampled(self._spline, pixels + step) - _sampled(self._spline, pixels - step) for step in steps]
+        return np.column_stack(rises) / (2.0 * _STEP_PX)
 
 
 class WindowScore:
@@ -152,15 +149,16 @@ class WindowScore:
             left = value - gain[:, None] * design.bright
             by_value = value / spread[:, None] - left / (spread - gain**2)[:, None]
             by_value *= 2.0 * share * design.trust[:, None] * design.weight
+            slope = thermal.slope(pixels)
             centre = pixels[design.index[:, design.index.shape[1] // 2]]
             share_of_image = np.nan_to_num(centre, nan=0.0) / thermal.shape[::-1]
             column, row = np.clip((share_of_image * _BLOCKS).astype(int), 0, _BLOCKS - 1).T
-            parts, part = np.unique(row * _BLOCKS + column, return_inverse=True)
-            ends = np.repeat(part, design.index.shape[1]), design.index.ravel()
-            by_value = coo_matrix((by_value.ravel(), ends), shape=(len(parts), len(design.points)))
-            by_pixel = thermal.slope(pixels)
-            rows.append(by_value @ np.einsum("nx,nxk->nk", by_pixel, self.rig.slopes(change, design.points)))
-        return total, np.concatenate(rows) if rows else np.zeros((0, 10))
+            label = row * _BLOCKS + column
+            for part in (np.flatnonzero(label == number) for number in np.unique(label)):
+                summed = np.bincount(design.index[part].ravel(), by_value[part].ravel(), len(design.points))
+                touched = np.flatnonzero(summed)
+                rows.append(self.rig.pull_back(change, design.points[touched], summed[touched, None] * slope[touched]))
+        return total, np.array(rows).reshape(-1, 10)
 
     def _fit(self, design: WindowDesign, temperature: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Temperatures in each window without their plane (weighted), how much of the photograph is in them, and their
@@ -197,8 +195,7 @@ def window_design(
     step = max(round(window_px * pitch), 1)
     picked = np.zeros_like(whole)
     picked[reach : height - reach : step, reach : width - reach : step] = True
-    uneven = photograph - cv2.GaussianBlur(photograph, (0, 0), window_px * pitch)
-    contrast = cv2.GaussianBlur(uneven * uneven, (0, 0), window_px * pitch)
+    contrast = _contrast(photograph, near, plain, weight)
     strong = np.flatnonzero(whole & picked & (contrast > _SMALLEST_VARIANCE))
     strong = np.sort(strong[np.argsort(-contrast.ravel()[strong], kind="stable")[:most]])
     index = strong[:, None] + down * width + across
@@ -209,3 +206,25 @@ def window_design(
     used, number = np.unique(index, return_inverse=True)
     number, bright = number.reshape(-1, len(down)), bright / length[:, None]
     return WindowDesign(rays[used], number, plain, bright, weight, np.ones(len(index)))
+
+
+def _contrast(photograph: FloatImage, near: npt.NDArray[np.bool_], plain: FloatArray, weight: FloatArray) -> FloatArray:
+    """Length of what the window around each pixel has beside planes, shape (height, width)."""
+    # |w p|^2 less the squares of (w p)'s parts along the planes, all of them correlations with small images.
+
+    def correlated(image: FloatArray, entries: FloatArray) -> FloatArray:
+        side = round(np.sqrt(near.size))
+        kernel = np.zeros(near.size)
+        kernel[near] = entries
+        return np.asarray(cv2.filter2D(image, cv2.CV_64F, kernel.reshape(side, side)), dtype=np.float64)
+
+    level: FloatArray = photograph.astype(np.float64) - float(np.mean(photograph))
+    left = correlated(level * level, weight * weight)
+    for along in plain.T:
+        left -= correlated(level, weight * along) ** 2
+    return np.sqrt(np.maximum(left, 0.0))
+
+
+def _sampled(spline: FloatArray, pixels: FloatArray) -> FloatArray:
+    place = np.nan_to_num(pixels, nan=-9.0)[:, ::-1].T - 0.5
+    return np.asarray(ndimage.map_coordinates(spline, place, order=3, prefilter=False, mode="nearest"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -34,8 +34,9 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
     else:
         expected, got = "a COLMAP model's folder or a transforms.json", f"nothing at {path}"
         raise SceneError("poses", expected=expected, got=got, remedy="Check the path.")
+    order = {name: number for number, name in enumerate(photographs)}
     missing = {name: f"{path.name} has no pose of it" for name in photographs if name not in model.frames}
-    return Poses(model.in_order_of(list(photographs)), missing)
+    return Poses(reordered(model, lambda name: order[name]), missing)
 
 
 def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Poses:
@@ -56,6 +57,21 @@ def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Pose
         raise SceneError("given poses", expected=expected, got=f"{size[0]} x {size[1]}", remedy=remedy)
     error_px, pixel = model.point_error_px * float(factors.mean()), model.sighting_pixel * factors
     return Poses(replace(model, camera=camera.resized(*size), point_error_px=error_px, sighting_pixel=pixel), dropped)
+
+
+def reordered(model: SfmModel, key: Callable[[str], Any]) -> SfmModel:
+    """Same model with its frames sorted by a key of their names."""
+    order = sorted(range(len(model.frames)), key=lambda index: key(model.frames[index]))
+    number = np.argsort(order)[model.sighting_frame] if len(model.sighting_frame) else model.sighting_frame
+    rows = np.argsort(number, kind="stable")
+    return replace(
+        model,
+        frames=tuple(model.frames[index] for index in order),
+        camera_to_world=model.camera_to_world[order],
+        sighting_frame=number[rows],
+        sighting_point=model.sighting_point[rows],
+        sighting_pixel=model.sighting_pixel[rows],
+    )
 
 
 def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.capture.rig_types import FloatArray
 
@@ -69,8 +68,15 @@ def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
     >>> level_rotation([0, 1, 0], [0, 0, -1]).round(9).tolist()
     [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
     """
-    axes = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
-    return Rotation.align_vectors(axes, np.array([up, ahead], dtype=np.float64), weights=[np.inf, 1.0])[0].as_matrix()
+    z = np.asarray(up, dtype=np.float64)
+    z = z / np.linalg.norm(z)
+    y = np.asarray(ahead, dtype=np.float64)
+    y = y - (y @ z) * z
+    if not np.linalg.norm(y) > 1e-6:
+        y = np.eye(3)[np.argmin(np.abs(z))]
+        y = y - (y @ z) * z
+    y = y / np.linalg.norm(y)
+    return np.stack([np.cross(y, z), y, z]) + 0.0
 
 
 def _robust_mean(directions: FloatArray) -> FloatArray:

@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph
 from thermoxels_ns.capture.rig_types import FloatArray
@@ -175,13 +174,16 @@ def scale_from_markers(
 
 def _similarity(model: FloatArray, metres: FloatArray, weight: FloatArray) -> tuple[float, FloatArray]:
     """Scale of the best similarity from model to metres, and each point's distance from it, [m]."""
-    a, b = model - np.average(model, 0, weight), metres - np.average(metres, 0, weight)
-    variance = float(weight @ (a * a).sum(axis=1))
+    share = weight / weight.sum()
+    a, b = model - share @ model, metres - share @ metres
+    left, size, right = np.linalg.svd((b * share[:, None]).T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    variance = float(share @ (a * a).sum(axis=1))
     if not variance > 0:
         return 0.0, np.zeros(len(model))
-    turned = Rotation.align_vectors(b, a, weight)[0].apply(a)
-    scale = float(weight @ (b * turned).sum(axis=1)) / variance
-    return scale, np.linalg.norm(b - scale * turned, axis=1)
+    scale = float(size @ sign) / variance
+    rotated = a @ (left * sign @ right).T
+    return scale, np.linalg.norm(b - scale * rotated, axis=1)
 
 
 def _frame_named(model: SfmModel, name: str, photograph_of: Mapping[str, str]) -> int:

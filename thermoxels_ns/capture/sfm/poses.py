@@ -74,7 +74,7 @@ def find_poses(
             dropped[name] = f"fits only to {elsewhere[name]} others, in a part of its own"
         elif name not in model.frames:
             dropped[name] = "too few matches with the other photographs"
-    return Poses(model.in_order_of(names), dropped)
+    return Poses(model, dropped)
 
 
 def add_points(

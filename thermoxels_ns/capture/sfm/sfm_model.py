@@ -61,20 +61,6 @@ class SfmModel:
         poses[:, :3, 3] = (poses[:, :3, 3] - origin) @ rotation.T
         return replace(self, camera_to_world=poses, points=(self.points - origin) @ rotation.T)
 
-    def in_order_of(self, names: Sequence[str]) -> SfmModel:
-        """Same model with its frames, all of which are among `names`, in the order of these."""
-        order = sorted(range(len(self.frames)), key=lambda index: names.index(self.frames[index]))
-        number = np.argsort(order)[self.sighting_frame] if len(self.sighting_frame) else self.sighting_frame
-        rows = np.argsort(number, kind="stable")
-        return replace(
-            self,
-            frames=tuple(self.frames[index] for index in order),
-            camera_to_world=self.camera_to_world[order],
-            sighting_frame=number[rows],
-            sighting_point=self.sighting_point[rows],
-            sighting_pixel=self.sighting_pixel[rows],
-        )
-
     def without(self, names: Sequence[str]) -> SfmModel:
         """Same model without some frames; its points stay, also those that only they saw."""
         keep = np.array([name not in set(names) for name in self.frames], dtype=bool)
