@@ -145,7 +145,7 @@ def test_the_report_is_one_page_that_fetches_nothing(hour) -> None:
 
 @pytest.mark.parametrize(
     ("size_bytes", "broken"),
-    [(450, "series.csv"), (1000, "step-0000.vtu"), (15_000, "surface-end.png"), (200_000, "report.html")],
+    [(450, "series.csv"), (1000, "step-0000.vtu"), (15_000, "surface-start.png"), (200_000, "report.html")],
 )
 def test_a_full_disk_is_one_line_and_leaves_no_half_of_a_file(folder, hour, tmp_path, capsys, size_bytes, broken):
     shutil.copytree(hour, tmp_path / "out")
