@@ -588,6 +588,17 @@ def test_a_sky_far_below_the_bounds_is_no_other_unit(scene_folder):
     assert parse(scene.path).metadata["temperature_range"].min_c == pytest.approx(-80.0)
 
 
+def test_bounds_in_kelvins_beside_files_in_degrees_are_refused(scene_folder):
+    scene = scene_folder()
+    all_in(".npy", np.eye(18, 24) + 20.0)(scene)
+    (scene.path / "temperature_bounds.json").write_text(
+        json.dumps({"absolute_min_temperature": 283.0, "absolute_max_temperature": 303.0})
+    )
+    scene.rewrite()
+    with pytest.raises(SceneError, match=r"20\.00 C in the middle"):
+        parse(scene.path)
+
+
 def test_bad_options(scene_folder):
     scene = scene_folder()
     for option in ({"downscale_factor": 0}, {"scale_factor": 0.0}, {"eval_mode": "interval", "eval_interval": 1}):

@@ -34,6 +34,7 @@ _FAR_SIDES = 16.0
 """Farther from the origin than this many times its longest side, as in national coordinates, a box is far: shifts in
 single precision are then off by more than a millionth of it."""
 _LEAST_THAT_MEETS = 0.01  # share of the rays that must meet the scene box
+_COLDEST_SKY_K = 150.0  # How far a clear sky may be below the lowest temperature that somebody declares, [K]
 _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
 """Median from which on a file may hold kelvins, and how far it may then be from the other files."""
 _MOST_FRAMES = 64  # frames per resolution that the search for dead pixels keeps in memory
@@ -340,13 +341,14 @@ def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int
 
 
 def _refuse_beyond_bounds(middles_c: dict[Path, float], bounds_c: tuple[float, float]) -> None:
-    """Refuse files whose median is above the declared bounds by more than their width: they hold kelvins.
+    """Refuse files whose median is further from the declared bounds than these are wide: they have another unit.
 
-    Below the bounds nothing is refused: a clear sky may be colder than anybody declares.
+    Below the bounds that is at least `_COLDEST_SKY_K`: a clear sky may be colder than anybody declares.
     """
-    most = bounds_c[1] + max(bounds_c[1] - bounds_c[0], _SAME_PLACE_K)
+    width = bounds_c[1] - bounds_c[0]
+    least, most = bounds_c[0] - max(width, _COLDEST_SKY_K), bounds_c[1] + max(width, _SAME_PLACE_K)
     for path, middle in middles_c.items():
-        if middle > most:
+        if not least <= middle <= most:
             expected = f"temperatures near {bounds_c[0]:g} to {bounds_c[1]:g} C, as {BOUNDS_NAME} says"
             got = f"{middle:.2f} C in the middle"
             remedy = f"Subtract 273.15 if the file holds kelvins; else correct {BOUNDS_NAME}, or remove it."
