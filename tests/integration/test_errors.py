@@ -1,5 +1,6 @@
 """Bad input through the real commands: one clear sentence and a non-zero exit, no traceback of ours."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -73,6 +74,22 @@ def test_checkpoint_of_another_method(trained: Trained, tmp_path):
         "ns-eval", "--load-config", str(folder / "config.yml"), "--output-path", str(tmp_path / "e.json")
     )
     assert result.returncode == 1 and "Error: checkpoint:" in result.stdout and "Traceback" not in result.stdout
+
+
+def test_poses_that_changed_since_the_training(trained: Trained, tmp_path):
+    """The box is the one that the run keeps: it does not tell that a camera was moved."""
+    scene = trained.scene / "transforms.json"
+    known = scene.read_text()
+    content = json.loads(known)
+    moved = next(frame for frame in content["frames"] if "train" in frame["file_path"])
+    moved["transform_matrix"][0][3] += 0.05
+    try:
+        scene.write_text(json.dumps(content))
+        result = export(trained.config, tmp_path / "export")
+    finally:
+        scene.write_text(known)
+    assert result.returncode == 1
+    assert "poses and scene box: expected those the checkpoint was trained with" in " ".join(result.stdout.split())
 
 
 def test_config_of_a_stock_method(tmp_path):

@@ -32,7 +32,7 @@ def plain_backdrop(
     those that most such pixels have, as a function of direction (harmonics of degree 2, fitted to the pixels that agree
     with it); and so are plain pixels that look the same and touch it, those below an object among them.
     `depth`, (pixels,), is NaN where unknown. What looks like the backdrop beside it has no depth of its own either: it
-    took that of an outline (drawn courtyard: 2.6 % of all depths lie on the sky, 0.6 % without those).
+    took that of an outline (drawn courtyard: 2.6 % of all depths lie on the sky, 0.5 % without those).
     """
     open_above, plain = (np.zeros(len(photographs.colours), dtype=bool) for _ in range(2))
     directions, up = np.empty((len(open_above), 3)), upwards(photographs)
