@@ -7,8 +7,9 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.boundary.tags import voxel_surface as surface_of_voxels
-from thermoxels_ns.mesh.boundary.visibility import _EmptySpace, _is_free, facet_views, seen_facets
+from thermoxels_ns.mesh.boundary.visibility import facet_views, seen_facets
 from thermoxels_ns.mesh.quality.checks import facet_normals
+from thermoxels_ns.mesh.solid.free_space import first_solid
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
 
 LATTICE = Lattice((2.0, -1.0, 0.5), 0.25, (33, 33, 33))
@@ -194,33 +195,33 @@ def test_more_cameras_see_more_and_their_order_does_not_matter() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_lines_meet_the_voxels_that_they_cross(seed: int) -> None:
-    """Against the length of each line in each solid voxel, voxel by voxel."""
+def test_rays_meet_the_first_voxel_that_they_cross(seed: int) -> None:
+    """Against the way of each ray through each solid voxel, voxel by voxel."""
     random = np.random.default_rng(seed)
     shape = tuple(random.integers(1, 40, size=3))
     cells = random.random(shape) < random.choice([0.002, 0.02, 0.3])
     cells[tuple(random.integers(0, shape))] = True
-    size = np.array(shape)
-    start = random.uniform(-0.3, 1.3, (200, 3)) * size
-    end = random.uniform(-1.0, 2.0, 3) * size
-    start[:60, seed % 3] = end[seed % 3]  # lines within a plane of voxels,
-    start[:20, (seed + 1) % 3] = end[(seed + 1) % 3]  # along an axis,
-    start[20:30] = np.round(start[20:30])  # and from lattice corners
+    eye = random.uniform(-1.0, 2.0, 3) * shape
+    ends = random.uniform(-0.3, 1.3, (200, 3)) * shape
+    ends[:60, seed % 3] = eye[seed % 3]  # rays within a plane of voxels,
+    ends[:20, (seed + 1) % 3] = eye[(seed + 1) % 3]  # along an axis,
+    ends[20:30] = np.round(ends[20:30])  # and to lattice corners
+    along = ends - eye
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
 
     solid = np.argwhere(cells)
-    direction = end - start
-    length = np.linalg.norm(direction, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        near = (solid[None] - start[:, None]) / (direction / length[:, None])[:, None]
-        far = (solid[None] + 1 - start[:, None]) / (direction / length[:, None])[:, None]
-    near, far = np.fmin(near, far).max(axis=2), np.fmax(near, far).min(axis=2)
-    inside = np.minimum(far, (length - 1.5)[:, None]) - np.maximum(near, 0.0)
-    crossed, missed = inside.max(axis=1) > 1e-3, inside.max(axis=1) < -1e-3
-    space = _EmptySpace(cells)
-    free = np.array([_is_free(space.block, point - space.lowest, *(end - space.lowest)) for point in start])
-    assert not free[crossed].any()
-    assert free[missed].all()
-    assert (crossed | missed).mean() > 0.9
+        faces = [(solid[None] + side - eye) / along[:, None] for side in (0, 1)]
+    near, far = np.fmin(*faces).max(axis=2), np.fmax(*faces).min(axis=2)
+    clear = np.maximum(near, 1.5)
+    crossed = far - clear > 1e-6
+    nearest = np.where(crossed, clear, np.inf).min(axis=1)
+    grazed = np.abs(far - clear).min(axis=1) < 1e-6
+    met = first_solid(cells, eye, along)
+    np.testing.assert_allclose(met[~grazed], nearest[~grazed], rtol=1e-9)
+    assert grazed.mean() < 0.2
+    reach = np.where(np.isfinite(nearest), 0.99 * nearest, 1e3)
+    assert np.isinf(first_solid(cells, eye, along, reach)[~grazed]).all()
 
 
 def test_without_cameras_nothing_is_seen() -> None:

@@ -1,4 +1,4 @@
-"""How many training cameras see each voxel."""
+"""Lines of sight through solid voxels: how far a ray gets, and how many training cameras see each voxel."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 
@@ -156,3 +157,56 @@ def _runs(number: IntArray, count: int) -> list[tuple[slice, IntArray]]:
     """In each row of ascending numbers, the run of those that lie in 0..count - 1."""
     starts, stops = ((number < end).sum(axis=1).tolist() for end in (0, count))
     return [(slice(a, b), row[a:b]) for row, a, b in zip(number, starts, stops)]
+
+
+def first_solid(
+    cells: BoolArray, eye: FloatArray, directions: FloatArray, reach: FloatArray | float = np.inf
+) -> FloatArray:
+    """How far from a point, in corner indices, rays along unit vectors (n, 3) enter the first solid voxel, [voxels].
+
+    Infinite where they meet none up to `reach`. What begins nearer than `CLEAR_OF_CAMERA` blocks no ray.
+    """
+    found = np.empty(len(directions))
+    reach = np.broadcast_to(np.asarray(reach, dtype=np.float64), len(directions))
+    _march(np.ascontiguousarray(cells), eye, directions, reach, CLEAR_OF_CAMERA, found)
+    return found
+
+
+@kernel
+def _march(cells, eye, directions, reach, clear, found):
+    """Walk rays from voxel to voxel (Amanatides and Woo 1987) to the first solid one, see `first_solid`."""
+    shape = np.array(cells.shape)
+    voxel, step = np.empty(3, np.int64), np.empty(3, np.int64)
+    leaves, across = np.empty(3), np.empty(3)
+    for n in range(len(directions)):
+        found[n] = np.inf
+        first, last = 0.0, reach[n]
+        for axis in range(3):
+            speed = directions[n, axis]
+            if speed != 0.0:
+                low, high = -eye[axis] / speed, (shape[axis] - eye[axis]) / speed
+                first, last = max(first, min(low, high)), min(last, max(low, high))
+            elif not 0.0 <= eye[axis] < shape[axis]:
+                last = -1.0
+        if first >= last:
+            continue
+        for axis in range(3):
+            speed = directions[n, axis]
+            voxel[axis] = min(max(int(np.floor(eye[axis] + first * speed)), 0), shape[axis] - 1)
+            step[axis] = 1 if speed > 0.0 else -1
+            across[axis] = abs(1.0 / speed) if speed != 0.0 else np.inf
+            face = voxel[axis] + (1 if speed > 0.0 else 0)
+            leaves[axis] = (face - eye[axis]) / speed if speed != 0.0 else np.inf
+        entered = first
+        while entered < last:
+            axis = 0 if leaves[0] <= leaves[1] else 1
+            if leaves[2] < leaves[axis]:
+                axis = 2
+            if cells[voxel[0], voxel[1], voxel[2]] and leaves[axis] > clear:
+                found[n] = max(entered, clear)
+                break
+            entered = leaves[axis]
+            voxel[axis] += step[axis]
+            if not 0 <= voxel[axis] < shape[axis]:
+                break
+            leaves[axis] += across[axis]

@@ -13,7 +13,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.mesh.solid.free_space import CLEAR_OF_CAMERA, MOST_CAMERAS
+from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, first_solid
 
 RegionKind = Literal["auto", "all"]
 Box = tuple[float, float, float, float, float, float]
@@ -42,11 +42,16 @@ def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> Bool
     The region is where the sum is `LEAST_SHARE` or more of what it is where nearly all cameras look, or better. A
     ground that runs on then ends about where the cameras stood.
     """
+    eyes, far = lattice.world_to_index(views.camera_to_world[:, :, 3]), {}
     count = len(views.focal)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_CAMERAS)).round().astype(np.int64))
-    eyes = lattice.world_to_index(views.camera_to_world[:, :, 3])
-    far = {camera: _distance_looked_at(cells, views, camera, eyes[camera]) for camera in chosen.tolist()}
-    far = {camera: distance for camera, distance in far.items() if math.isfinite(distance)}
+    part = CENTRAL_PART * ((np.arange(CENTRAL_RAYS) + 0.5) / CENTRAL_RAYS - 0.5)
+    for camera in np.unique(np.linspace(0, count - 1, min(count, MOST_CAMERAS)).round().astype(np.int64)).tolist():
+        across, along = np.meshgrid(*np.outer(views.size[camera] / views.focal[camera], part))
+        local = np.stack((across.ravel(), along.ravel(), np.full(CENTRAL_RAYS**2, -1.0)), axis=1)
+        direction = local / np.linalg.norm(local, axis=1, keepdims=True) @ views.camera_to_world[camera, :, :3].T
+        met = first_solid(cells, eyes[camera], direction)
+        if np.isfinite(met).any():
+            far[camera] = float(np.quantile(met[np.isfinite(met)], NEAREST_SHARE))
     if not far:
         return np.ones_like(cells)
     matrices = views.matrices()
@@ -74,22 +79,6 @@ def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> Bool
     if block > 1:
         well = np.asarray(ndimage.zoom(well, block, order=1, mode="nearest", grid_mode=True))
     return well[tuple(slice(n) for n in cells.shape)] >= least
-
-
-def _distance_looked_at(cells: BoolArray, views: Views, camera: int, eye: FloatArray) -> float:
-    """How far away rays through the middle of an image end, [voxels]; infinite if none does."""
-    part = CENTRAL_PART * ((np.arange(CENTRAL_RAYS) + 0.5) / CENTRAL_RAYS - 0.5)
-    across, along = np.meshgrid(*(part * views.size[camera, axis] / views.focal[camera, axis] for axis in (0, 1)))
-    local = np.stack((across.ravel(), along.ravel(), np.full(CENTRAL_RAYS**2, -1.0)), axis=1)
-    direction = local / np.linalg.norm(local, axis=1, keepdims=True) @ views.camera_to_world[camera, :, :3].T
-    shape = np.array(cells.shape)
-    distance = np.arange(CLEAR_OF_CAMERA, np.linalg.norm(eye - 0.5 * shape) + np.linalg.norm(shape), 0.5)
-    voxel = np.floor(eye + distance[:, None, None] * direction).astype(np.int64)
-    inside = np.all((voxel >= 0) & (voxel < shape), axis=2)
-    solid = np.zeros(inside.shape, dtype=bool)
-    solid[inside] = cells[tuple(voxel[inside].T)]
-    ends = solid.any(axis=0)
-    return float(np.quantile(distance[solid.argmax(axis=0)[ends]], NEAREST_SHARE)) if ends.any() else math.inf
 
 
 def check_region(region: str, box: Box | None, near: Ball | None) -> None:
