@@ -213,7 +213,7 @@ def test_boundary_is_tagged_with_normal_and_true_area(snapshot_of, mode):
     assert np.einsum("ij,ij->i", outwards, boundary.normal).min() > 0.9
     true_area = (facet_areas(mesh.points_m, mesh.facets) * boundary.area_factor).sum()
     radius = 5.3 + np.log(2.0) / 3.0  # where density is one half, [voxels]; a voxel is 0.5 * 2 wide
-    assert true_area == pytest.approx(4 * np.pi * radius**2, rel=0.03 if mode == "conforming" else 0.04)
+    assert true_area == pytest.approx(4 * np.pi * radius**2, rel=0.03 if mode == "conforming" else 0.05)
 
 
 def test_colour_is_that_of_corners_with_density(snapshot_of):

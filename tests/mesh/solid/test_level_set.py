@@ -3,7 +3,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.stuffed_shapes import volumes_and_angles
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.level_set import DEEP_RATIOS, level_of
+from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
+from thermoxels_ns.mesh.stuffing.sharp_edges import sharpen
 
 
 def crossings(level: np.ndarray) -> np.ndarray:
@@ -101,3 +105,43 @@ def test_sign_range_and_type_hold_for_any_density(seed, decades, share):
     assert level.dtype == np.float32 and level.shape == shape
     assert np.array_equal(level > 0, cells) and np.array_equal(level < 0, ~cells)
     assert np.abs(level).max() <= 1.0 and np.abs(level).min() >= 0.004
+
+
+def meshed(cells: np.ndarray) -> StuffedSolid:
+    """Opaque voxels beside empty ones, as training leaves them."""
+    return sharpen(stuff(level_of(np.where(cells, 40.0, 0.0), 0.5, cells, cells)), cells.shape)
+
+
+def share_kept(cells: np.ndarray) -> float:
+    solid = meshed(cells)
+    _, low, high = volumes_and_angles(solid.points, solid.tets)
+    assert low >= 10.7 and high <= 164.8
+    return float(signed_volumes(solid.points, solid.tets).sum() / np.count_nonzero(cells))
+
+
+def turned_bar(degrees: float, width: float) -> np.ndarray:
+    x, y, z = np.indices((30, 30, 11)) + 0.5 - np.array([15.1, 14.9, 5.6])[:, None, None, None]
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return (np.abs(x * c + y * s) < 10) & (np.abs(y * c - x * s) < width / 2) & (np.abs(z) < width / 2)
+
+
+SMALL = [(1, 1, 1), (2, 2, 2), (3, 3, 3), (8, 8, 8), (1, 3, 20), (12, 12, 1), (12, 12, 2)]
+BARS = [(20, width, width) for width in (1, 2, 3, 4)]
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [np.pad(np.ones(size, dtype=bool), 4) for size in (*SMALL, *BARS)]
+    + [turned_bar(degrees, width) for degrees in (30.0, 45.0) for width in (1.5, 3.0)],
+)
+def test_small_and_thin_bodies_keep_their_volume(cells):
+    """A third of a bar one voxel thick was left, three quarters of one of three."""
+    low, high = (0.8, 1.1) if np.count_nonzero(cells) == 1 else (0.84, 1.05)
+    assert low < share_kept(cells) < high
+
+
+def test_channels_stay_open_as_bars_stay_solid():
+    cells = np.ones((20, 14, 14), dtype=bool)
+    cells[:, 6:8, 6:8] = False
+    lost = cells.size - share_kept(cells) * np.count_nonzero(cells)
+    assert 0.84 < lost / (20 * 4) < 1.02
