@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.quality.checks import facet_areas
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
+from thermoxels_ns.mesh.quality.checks import boundary_facets, facet_areas
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE

@@ -12,10 +12,10 @@ from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
-from thermoxels_ns.mesh.boundary.patches import apply_regions
-from thermoxels_ns.mesh.boundary.tags import BoundaryMode, tag_boundary
-from thermoxels_ns.mesh.quality.topology import component_of
+from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_regions
+from thermoxels_ns.mesh.boundary.tags import tag_boundary
+from thermoxels_ns.mesh.quality.checks import component_of
+from thermoxels_ns.mesh.quality.report import BoundaryMode
 from thermoxels_ns.mesh.solid.morphology import bounding_box, connected, face_connected
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing.isosurface import check_coarsest, stuff

@@ -12,7 +12,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
-from thermoxels_ns.mesh.quality.face_count import TET_EDGES
+from thermoxels_ns.mesh.quality.checks import TET_EDGES
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 
 MIN_OBSERVED_WEIGHT = 0.5

@@ -72,7 +72,7 @@ def voxel_facets(cells: BoolArray) -> IntArray:
     """Boundary triangles of `kuhn_tets` (f, 3), normals outwards, taken from the voxel faces between solid and empty.
 
     Kuhn's tetrahedra cut every voxel face along the diagonal from its lowest to its highest corner. The triangles of a
-    face follow each other; `face_count.boundary_facets` finds the same ones among all tetrahedra, in another order.
+    face follow each other; `checks.boundary_facets` finds the same ones among all tetrahedra, in another order.
 
     >>> voxel_facets(np.ones((1, 1, 1), dtype=bool)).shape
     (12, 3)

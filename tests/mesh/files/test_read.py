@@ -9,8 +9,7 @@ from tests.support.unreadable import files_end_after, forbid
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.files.content import colour_bytes
 from thermoxels_ns.mesh.files.formats import write_mesh
-from thermoxels_ns.mesh.files.read import read_mesh
-from thermoxels_ns.mesh.files.vtu import write_vtu
+from thermoxels_ns.mesh.files.vtu import read_mesh, write_vtu
 from thermoxels_ns.mesh.tetrahedra import Boundary
 
 

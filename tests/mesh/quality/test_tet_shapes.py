@@ -3,7 +3,7 @@ import pytest
 import skfem
 from skfem.models.poisson import laplace
 
-from thermoxels_ns.mesh.quality.face_count import TET_EDGES
+from thermoxels_ns.mesh.quality.checks import TET_EDGES
 from thermoxels_ns.mesh.quality.tet_shapes import TetShapes, shapes_in_chunks, signed_volumes
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 

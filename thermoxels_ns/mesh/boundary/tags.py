@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
@@ -11,15 +9,12 @@ from scipy import ndimage
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
-from thermoxels_ns.mesh.boundary.patches import apply_patches
+from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_patches
 from thermoxels_ns.mesh.boundary.visibility import seen_facets
 from thermoxels_ns.mesh.quality.checks import facet_normals
+from thermoxels_ns.mesh.quality.report import BoundaryMode
 from thermoxels_ns.mesh.solid.voxels import SolidCells
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh
-
-BoundaryMode = Literal["conforming", "voxel"]
-"""How the boundary of a mesh runs: along the level set of the density, or along voxel faces."""
 
 SUPPORT = {
     "supported": "three photographs or more",

@@ -17,8 +17,7 @@ from thermoxels_ns.core.checks import check_positive, replace_when_done, writabl
 from thermoxels_ns.core.errors import HeatError, MeshError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content
-from thermoxels_ns.mesh.quality.checks import facet_area_vectors
-from thermoxels_ns.mesh.quality.face_count import facet_owners
+from thermoxels_ns.mesh.quality.checks import facet_area_vectors, facet_owners
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8

@@ -11,7 +11,7 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content
-from thermoxels_ns.mesh.quality.face_count import facet_owners
+from thermoxels_ns.mesh.quality.checks import facet_owners
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 TEMPERATURE_VIEW = "temperature_c"  # name of the view of nodal temperatures, [degrees Celsius]

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.mesh.quality.checks import component_of
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
-from thermoxels_ns.mesh.quality.topology import component_of
 from thermoxels_ns.mesh.stuffing.edge_planes import Planes, Surface, edge_planes, is_near
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 

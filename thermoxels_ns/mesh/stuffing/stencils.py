@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.mesh.quality.face_count import OUTWARD_FACES
+from thermoxels_ns.mesh.quality.checks import OUTWARD_FACES
 
 BUNDLE_EDGES: tuple[tuple[int, int], ...] = (
     (0, 1),
