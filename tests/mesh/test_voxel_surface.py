@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from tests.support.stuffed_shapes import SHAPES, centres
-from thermoxels_ns.mesh.boundary.tags import LEAST_AREA_FACTOR, voxel_surface
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX
-from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, voxel_facets
+from thermoxels_ns.mesh.voxel_tets import LEAST_AREA_FACTOR, boundary_tags, kuhn_tets, voxel_facets, voxel_surface
 
 CELLS = 80
 MIDDLE = 0.5 * CELLS * (1.0 + np.array([0.0137, -0.0071, 0.0043]))
