@@ -80,8 +80,6 @@ def test_corners_with_less_than_the_least_weight_are_extended(snapshot_of):
     snapshot = snapshot_of(np.ones((3, 3, 3)), values, weight)
     mesh = build_mesh(snapshot, DENSE, np.eye(4), VOXEL).mesh
     assert (mesh.observed.sum(), mesh.temperature_c.max()) == (26, 20.0)
-    mesh = build_mesh(snapshot, DENSE, np.eye(4), MeshOptions("voxel", min_observed_weight=0.0)).mesh
-    assert (mesh.observed.sum(), mesh.temperature_c.max()) == (27, 900.0)
 
 
 def test_extension_conducts_like_the_voxels_do(snapshot_of):
@@ -161,11 +159,6 @@ def test_part_of_a_conforming_mesh_no_thermal_ray_saw_is_counted(snapshot_of):
 def test_what_is_no_similarity_is_refused(bad):
     with pytest.raises(MeshError, match="world_to_metres"):
         check_similarity("world_to_metres", bad)
-
-
-def test_negative_least_weight_is_refused():
-    with pytest.raises(MeshError, match="min_observed_weight"):
-        MeshOptions(min_observed_weight=-1.0)
 
 
 def ball(snapshot_of, seen_side: bool = False):

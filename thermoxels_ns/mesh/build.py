@@ -33,22 +33,13 @@ from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edge
 class MeshOptions:
     """How solid voxels become a mesh."""
 
-    boundary: BoundaryMode = "conforming"
-    """conforming: the boundary follows the level set of the density (isosurface stuffing); voxel: it follows voxel
-    faces, and every boundary triangle says how much true surface it stands for."""
+    boundary: BoundaryMode = "conforming"  # along the level set of the density, or along voxel faces
     coarsest_cell: int = 4
     """Edge of the largest cells deep inside a conforming mesh, a power of two, [voxels]; 1: as fine as the surface."""
-    min_observed_weight: float = MIN_OBSERVED_WEIGHT
-    """Nodes with less thermal ray weight than this are not measurements, [rays], at least 0; 0 keeps every node that
-    any ray touched."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Direction that points up, in the coordinates of the mesh
     rules: PatchRules = field(default_factory=PatchRules)  # Patches and regions of the user
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.min_observed_weight) and self.min_observed_weight >= 0.0):
-            remedy = f"Leave it out to use {MIN_OBSERVED_WEIGHT}."
-            got = self.min_observed_weight
-            raise MeshError("min_observed_weight", expected="a finite number of at least 0", got=got, remedy=remedy)
         check_coarsest("coarsest_cell", self.coarsest_cell, "Pass --coarsest-cell 4.")
         if self.boundary not in ("conforming", "voxel"):
             raise MeshError("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")
@@ -95,14 +86,13 @@ def build_mesh(
         world_to_metres: Similarity (rotation or reflection, one scale, shift), shape (4, 4), that maps homogeneous
             column vectors of the trained scene to metres. A reflection turns the tetrahedra over, so that their
             volumes stay positive.
-        options: Kind of boundary, tags, and what counts as measured.
+        options: Kind of boundary, and tags.
         metres_per_unit: Length of a unit of the input poses, [m], in which a region is given.
 
     Raises:
         MeshError: Nothing is solid, the 4x4 is no similarity, or no node of the mesh was measured.
     """
     transform = check_similarity("world_to_metres", world_to_metres)
-    least = max(options.min_observed_weight, float(np.finfo(np.float32).tiny))
     scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
     of_scene = scale, transform[:3] / metres_per_unit
     solid = select_solid(snapshot, selection, *of_scene, makes_up_volume=not voxel)
@@ -115,9 +105,9 @@ def build_mesh(
         tags = np.where(stuffed.on_box, FACET_BOX, FACET_SURFACE).astype(np.int64)
         shape = _Shape(stuffed.points, stuffed.tets, stuffed.facets, tags)
     # From measured corners alone.
-    measured = np.where(snapshot.observed_weight >= least, snapshot.observed_weight, 0.0)
+    measured = np.where(snapshot.observed_weight >= MIN_OBSERVED_WEIGHT, snapshot.observed_weight, 0.0)
     temperature_c, weight = interpolate_corners(shape.points, snapshot.temperature_c, measured)
-    stays, num_parts = _with_a_measurement(shape, weight >= least)
+    stays, num_parts = _with_a_measurement(shape, weight >= MIN_OBSERVED_WEIGHT)
     num_voxels = 0
     if num_parts:
         goes = _voxels_of(solid, shape, ~stays, voxel)
@@ -125,7 +115,7 @@ def build_mesh(
         solid = replace(solid, cells=solid.cells & ~goes, level=np.where(goes, -np.abs(solid.level), solid.level))
         shape, temperature_c, weight = _kept(shape, stays), temperature_c[stays], weight[stays]
     edges, conductance = lattice_edges(solid.cells) if voxel else tet_conductances(shape.points, shape.tets)
-    observed = weight >= least
+    observed = weight >= MIN_OBSERVED_WEIGHT
     temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
 
     tets, facets = shape.tets, shape.facets
@@ -150,7 +140,7 @@ def build_mesh(
         colour=colour,
     )
     boundary, idle_patches = _tagged(mesh, shape.points, solid, snapshot, transform[:3, :3] / scale, options)
-    measured_c = snapshot.temperature_c[snapshot.observed_weight >= least]
+    measured_c = snapshot.temperature_c[snapshot.observed_weight >= MIN_OBSERVED_WEIGHT]
     observed_range_c = float(measured_c.min()), float(measured_c.max())
     return BuiltMesh(
         replace(mesh, boundary=boundary), solid, num_parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)

@@ -11,7 +11,7 @@ from nerfstudio.cameras.rays import RayBundle
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.mesh.solid.threshold import automatic_threshold
+from thermoxels_ns.mesh.solid.voxels import automatic_threshold
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import GridSamples, sample_rays
 from thermoxels_ns.training.ray_statistics import field_evidence

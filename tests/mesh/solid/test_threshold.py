@@ -5,17 +5,18 @@ import pytest
 
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
-from thermoxels_ns.mesh.solid.threshold import (
+from thermoxels_ns.mesh.solid.voxels import (
     FEWEST_RAYS,
     LEAST_WEIGHT,
     OPAQUE_OPTICAL_DEPTH,
     OPTICAL_DEPTH_BOUNDS,
     SHARE_OF_RAYS,
     SHARE_THAT_ENDS,
+    SolidSelection,
     automatic_threshold,
     optical_depth_threshold,
+    select_solid,
 )
-from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 
 VOXEL = 0.25
 MET = np.repeat(np.arange(1.0, 11.0), [30, 130, *[105] * 8])

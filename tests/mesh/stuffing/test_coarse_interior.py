@@ -18,9 +18,9 @@ from tests.support.stuffed_shapes import (
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.stuffing.bcc_lattice import bcc_lattice
 from thermoxels_ns.mesh.stuffing.coarse_interior import balanced_octree, coarse_interior, split_in_eight
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
+from thermoxels_ns.mesh.stuffing.lattice import bcc_lattice
 
 
 def ball(cells: int, radius: float, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:

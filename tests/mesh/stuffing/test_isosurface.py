@@ -7,10 +7,8 @@ from scipy.spatial import KDTree
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres, tet_mesh, volumes_and_angles
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.report import check_mesh
-from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, bcc_lattice
-from thermoxels_ns.mesh.stuffing.isosurface import stuff
-from thermoxels_ns.mesh.stuffing.stencils import BUNDLE_EDGES, BUNDLE_POINTS, CODE_WEIGHTS, stencil_table
-from thermoxels_ns.mesh.stuffing.warp import ALPHA_INSIDE, ALPHA_OUTSIDE, warp
+from thermoxels_ns.mesh.stuffing.isosurface import BUNDLE_EDGES, BUNDLE_POINTS, CODE_WEIGHTS, stencil_table, stuff
+from thermoxels_ns.mesh.stuffing.lattice import ALPHA_INSIDE, ALPHA_OUTSIDE, DIRECTIONS, bcc_lattice, warp
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (3, 2, 1), (1, 4, 5), (4, 3, 5)])

@@ -15,9 +15,8 @@ from tests.support.stuffed_shapes import (
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.stuffing.edge_planes import Surface
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
-from thermoxels_ns.mesh.stuffing.sharp_edges import ANGLES_DEG, LONGEST_MOVE, sharpen
+from thermoxels_ns.mesh.stuffing.sharp_edges import ANGLES_DEG, LONGEST_MOVE, Surface, sharpen
 
 CELLS = 48
 VOXEL = 2.0 / CELLS

@@ -9,7 +9,7 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, IntArray
 from thermoxels_ns.mesh.solid.morphology import bounding_box, grow, halved, repeated
-from thermoxels_ns.mesh.stuffing.bcc_lattice import BccLattice
+from thermoxels_ns.mesh.stuffing.lattice import BccLattice
 
 # The sides of a face lie between its corners 0-1, 1-2, 2-3 and 3-0, counter-clockwise seen from where its axis points.
 _CORNERS = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])
