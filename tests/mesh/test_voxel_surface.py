@@ -60,18 +60,6 @@ def test_flat_sides_of_a_box_are_exact(kind: str) -> None:
     assert normals[inner] == pytest.approx(own[inner], abs=1e-3)
 
 
-@pytest.mark.parametrize(("kind", "mean", "most"), [("ramp", 1.5, 9.0), ("jump", 4.0, 20.0)])
-def test_normals_of_a_sphere(kind: str, mean: float, most: float) -> None:
-    level = exported("sphere", kind)
-    points, facets = surface(level)
-    normals, _ = voxel_surface(level, points, facets)
-    exact = points[facets].mean(axis=1) - MIDDLE
-    exact /= np.linalg.norm(exact, axis=1, keepdims=True)
-    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-12)
-    degrees = np.degrees(np.arccos(np.clip(np.einsum("ij,ij->i", normals, exact), -1.0, 1.0)))
-    assert degrees.mean() < mean and degrees.max() < most
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_a_plane_has_its_normal_and_its_area(seed: int) -> None:
     """The factor is the cosine between the face and the plane, up to where the plane leaves the lattice."""
@@ -86,16 +74,6 @@ def test_a_plane_has_its_normal_and_its_area(seed: int) -> None:
     assert normals[steps] == pytest.approx(np.broadcast_to(normal, normals[steps].shape), abs=1e-9)
     own = np.abs(facet_normals(points.astype(float), facets)[steps] @ normal)
     assert factors[steps] == pytest.approx(np.maximum(own, LEAST_AREA_FACTOR), abs=1e-9)
-
-
-def test_where_the_scene_box_cuts_the_normal_is_that_of_the_box() -> None:
-    level = np.clip(-(centres(12, 12, 12) @ [0.6, 0.0, 0.8]), -1.0, 1.0)
-    points, facets = surface(level)
-    cut = boundary_tags(facets, points, (13, 13, 13)) == FACET_BOX
-    assert np.count_nonzero(cut) > 100
-    normals, factors = voxel_surface(level, points, facets)
-    assert np.array_equal(normals[cut], facet_normals(points.astype(float), facets)[cut])
-    assert np.all(factors[cut] == 1.0)
 
 
 @pytest.mark.parametrize("least", [1e-6, 0.02, 1.0])

@@ -5,7 +5,6 @@ import pytest
 
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.boundary.patches import (
-    DEFAULT_PATCHES,
     Box,
     Colour,
     PatchRule,
@@ -13,7 +12,6 @@ from thermoxels_ns.mesh.boundary.patches import (
     RegionRule,
     apply_patches,
     apply_regions,
-    default_patches,
     facing,
     load_patch_rules,
 )
@@ -40,30 +38,6 @@ def rules_of(tmp_path: Path, text: str) -> PatchRules:
 @pytest.mark.parametrize("length", [0.1, 1.0, 9.81])
 def test_facing_changes_at_45_and_135_degrees(degrees: float, expected: str, length: float) -> None:
     assert facing(tilted(degrees)[None], np.array(UP) * length).tolist() == [["up", "side", "down"].index(expected)]
-
-
-def test_facing_follows_the_up_direction() -> None:
-    normals = np.concatenate([np.eye(3), -np.eye(3)])
-    assert facing(normals, (0, 1, 0)).tolist() == [1, 0, 1, 1, 2, 1]
-    assert facing(normals, (0, 0, -1)).tolist() == [1, 1, 2, 1, 1, 0]
-
-
-def test_default_patches_are_named_by_side_and_direction() -> None:
-    normals = np.array([tilted(d) for d in (0, 90, 180, 0, 90, 180, 0)])
-    seen = np.array([True, True, True, False, False, False, True])
-    on_box = np.array([False] * 6 + [True])
-    patch, names = default_patches(normals, UP, seen, on_box)
-    assert [names[p] for p in patch] == [
-        "exterior-up",
-        "exterior-side",
-        "exterior-down",
-        "interior-up",
-        "interior-side",
-        "interior-down",
-        "cut",
-    ]
-    assert names == DEFAULT_PATCHES
-    assert patch.tolist() == list(range(7))
 
 
 FACETS = {
@@ -110,21 +84,6 @@ def test_all_conditions_of_a_rule_hold(tmp_path: Path, rule: str, changed: list[
     assert [n for n, name in enumerate(names) if name == BEFORE[n]] == [n for n in range(6) if n not in changed]
 
 
-def test_later_rules_win_and_equal_names_add_up(tmp_path: Path) -> None:
-    rules = rules_of(
-        tmp_path,
-        """
-patches:
-  - {name: wall, facing: side}
-  - {name: window, box: {lower: [0, 0, 0.9], upper: [0.5, 0.5, 1.1]}}
-  - {name: window, box: {lower: [1.5, 0, 0.9], upper: [2.5, 1.0, 1.1]}}
-  - {name: nowhere, box: {lower: [8, 8, 8], upper: [9, 9, 9]}}
-""",
-    )
-    assert named(rules) == ["exterior-up", "interior-down", "window", "window", "wall", "cut"]
-    assert apply_patches(rules, **FACETS)[1] == (*DEFAULT_PATCHES, "wall", "window", "nowhere")
-
-
 COLOURS = np.array([[1.0, 0, 0], [0.9, 0, 0], [0.5, 0, 0], [0.1, 0, 0], [0.0, 0, 0], [0.4, 0.3, 0.0]])
 
 
@@ -145,20 +104,6 @@ def test_the_nearest_colour_wins_whatever_the_order(tmp_path: Path) -> None:
 def test_a_colour_that_is_too_far_is_nobodys(tmp_path: Path, distance: str) -> None:
     names = named(rules_of(tmp_path, f"patches: [{{name: red, nearest_colour: {{{distance}}}}}]"), COLOURS)
     assert names == ["red", "red", *BEFORE[2:]]
-
-
-def test_a_colour_that_its_other_conditions_exclude_does_not_compete(tmp_path: Path) -> None:
-    rules = rules_of(
-        tmp_path,
-        """
-patches:
-  - {name: near, nearest_colour: {rgb: [230, 0, 0]}, facing: up}
-  - {name: far, nearest_colour: {rgb: [0, 0, 255]}, only: all}
-  - {name: roof, box: {lower: [0, 0, 1.9], upper: [1, 1, 2.1]}}
-""",
-    )
-    # The first would be nearest to the floor too, but does not face down. A later rule without colour wins as ever.
-    assert named(rules, COLOURS) == ["roof", "far", "far", "far", "far", "near"]
 
 
 def test_regions_go_by_box_plane_and_colour(tmp_path: Path) -> None:

@@ -78,16 +78,6 @@ def test_twin_nodes_and_third_owner_are_not_conforming():
     assert "conforming" in quality_report(mesh_from(points, third), "voxel").unmet
 
 
-def test_missing_boundary_triangle_breaks_closedness(box_mesh):
-    fewer = replace(box_mesh, facets=box_mesh.facets[1:], facet_tags=box_mesh.facet_tags[1:])
-    report = quality_report(fewer, "voxel")
-    assert report.unmet == ("boundary_closed",)
-    assert figure_of(report, "boundary_closed") == 3 + 1  # open edges, wrong triangles
-    assert report.genus is None
-    none = replace(box_mesh, facets=box_mesh.facets[:0], facet_tags=box_mesh.facet_tags[:0])
-    assert quality_report(none, "voxel").unmet == ("boundary_closed",)
-
-
 @pytest.mark.parametrize(("degrees", "broken"), [(10.8, False), (10.6, True)])
 def test_dihedral_bounds_depend_on_the_mode(degrees, broken):
     # A right prism's corner with this angle at one edge and no obtuse one.
@@ -146,16 +136,6 @@ def test_a_voxel_mesh_meets_its_criteria_in_national_coordinates(box_mesh, size)
     # A node that is off by a tenth of a voxel is no rounding.
     points[len(points) // 2] += 0.1 * size * 0.05
     assert "non_obtuse" in quality_report(replace(box_mesh, points_m=points), "voxel").unmet
-
-
-def test_bodies_that_touch_are_counted_both_ways(mesh_of_cells):
-    cells = np.zeros((4, 2, 2), dtype=bool)
-    cells[0, 0, 0] = cells[1, 1, 1] = cells[3, 0, 0] = True
-    report = quality_report(mesh_of_cells(cells), "voxel")
-    assert (report.bodies_by_node, report.bodies_by_face) == (2, 3)
-    assert (report.num_non_manifold_edges, report.num_non_manifold_vertices) == (0, 1)
-    assert report.unmet == ()
-    assert (report.genus, len(report.components)) == (0, 3)
 
 
 def test_mapping_is_json_and_complete(mesh_of_cells):

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from tests.support.stuffed_shapes import volumes_and_angles
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.solid.level_set import DEEP_RATIOS, level_of
+from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
 from thermoxels_ns.mesh.stuffing.sharp_edges import sharpen
 
@@ -41,31 +41,6 @@ def test_the_surface_of_a_smooth_ramp_lies_within_a_tenth_of_a_voxel(ramp, offse
     assert np.abs(found - (9.0 + offset)).max() <= 0.1
 
 
-def test_the_surface_of_a_smooth_sphere_lies_within_a_tenth_of_a_voxel():
-    index = np.indices((25, 25, 25)) - np.array([12.2, 11.9, 12.4])[:, None, None, None]
-    radius = np.sqrt((index**2).sum(axis=0))
-    level = of(3.0 * 4.0 ** (8.0 - radius), 3.0)
-    found = []
-    for axis in range(3):
-        turned, r = np.moveaxis(level, axis, 0), np.moveaxis(radius, axis, 0)
-        change = (turned[:-1] > 0) != (turned[1:] > 0)
-        share = (turned[:-1] / np.where(change, turned[:-1] - turned[1:], 1.0))[change]
-        # The radius is close to linear between neighbours.
-        found.append(r[:-1][change] * (1 - share) + r[1:][change] * share)
-    error = np.concatenate(found) - 8.0
-    assert len(error) > 600 and np.abs(error).max() <= 0.1
-
-
-def test_pruned_fields_put_the_surface_half_way_or_closer_to_thin_voxels():
-    """Outside a trained surface density is exactly 0; a dense voxel next to it is all inside, a thin one partly."""
-    density = np.zeros((12, 5, 5))
-    density[6:] = 50.0 * DEEP_RATIOS[1]
-    assert crossings(of(density, 50.0)) == pytest.approx(5.5)
-    density[6] = 50.0 * 3.0
-    thin = crossings(of(density, 50.0))
-    assert (thin > 5.55).all() and (thin < 6.0).all()
-
-
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_walls_and_gaps_one_voxel_thick_keep_their_thickness(axis):
     wall = np.zeros((9, 9, 9))
@@ -84,13 +59,6 @@ def test_steps_override_density_deep_on_their_side():
     level = level_of(density, 1.0, dense, cells)
     assert np.array_equal(level > 0, cells) and level[7, 3, 3] == 1.0 and level[0, 3, 3] == -1.0
     assert np.unique(crossings(level).round(6)).tolist() == [1.5, 8.5]
-
-
-def test_a_threshold_of_zero_takes_any_density_as_deep_inside():
-    density = np.zeros((5, 5, 5))
-    density[2:] = 1e-6
-    level = level_of(density, 0.0, density > 0, density > 0)
-    assert np.isfinite(level).all() and crossings(level) == pytest.approx(1.5)
 
 
 @settings(max_examples=40, deadline=None)

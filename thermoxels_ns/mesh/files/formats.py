@@ -50,8 +50,6 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
             patches = file.read_meshtags(mesh, name="facets")
 
     The .h5 comes first and the .xdmf, which points at it, last; in between there is no .xdmf.
-
-    Arguments and errors are those of `write_mesh`.
     """
     import h5py
 

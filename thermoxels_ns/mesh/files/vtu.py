@@ -16,16 +16,17 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import (
-    check_finite,
-    check_shape,
-    plain_os_errors,
-    replace_when_done,
-    writable_folder,
-)
+from thermoxels_ns.core.checks import check_finite, check_shape, plain_os_errors, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values
-from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content, node_arrays, surface_of
+from thermoxels_ns.mesh.files.content import (
+    check_suffix,
+    colour_bytes,
+    file_content,
+    node_arrays,
+    surface_of,
+    write_bytes,
+)
 from thermoxels_ns.mesh.quality.checks import count_wrong_facets, facet_areas, group_faces
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
 
@@ -102,11 +103,8 @@ def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
     Raises:
         MeshError: A number is NaN or infinite (json has neither), or a value has no place in json.
     """
-    text = summary_text(summary)
     path = Path(path)
-    writable_folder(path.parent)
-    with replace_when_done(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_bytes(path, [summary_text(summary).encode()])
 
 
 def summary_text(summary: Mapping[str, Any]) -> str:
@@ -135,8 +133,6 @@ def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
 
     A mesh without boundary tags is written with the triangles' own normals and areas, one patch "boundary", and
     without `seen`, which nobody knows.
-
-    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkStringArray
@@ -189,7 +185,7 @@ def read_mesh(path: Path | str) -> TetMesh:
     points = check_finite(f"{path.name}: points", np.array(body.points, dtype=np.float64), _REMEDY, MeshError)
     others = np.count_nonzero(body.celltypes != _TETRAHEDRON)
     if others:
-        raise _wrong(path.name, "tetrahedra only", f"{others} cells of other kinds", _REMEDY)
+        raise _wrong(path.name, "tetrahedra only", f"{others} cells of other kinds")
     tets = np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4)
     names = _region_names(body, path.name)
     region = _cell_numbers(body, "region", path.name, len(names))
@@ -220,12 +216,12 @@ def _check_boundary(mesh: TetMesh, path: Path) -> None:
         return
     doubled = len(mesh.tets) - len(np.unique(np.sort(mesh.tets, axis=1), axis=0))
     if doubled:
-        raise _wrong(path.name, "every tetrahedron once", f"{doubled} of {len(mesh.tets)} listed again", _REMEDY)
+        raise _wrong(path.name, "every tetrahedron once", f"{doubled} of {len(mesh.tets)} listed again")
     if not wrong:
         remedy = "Remove tetrahedra that lie in each other, or export the mesh again."
         raise _wrong(path.name, "faces of one or two tetrahedra each", "faces of more", remedy)
     expected, got = "every face of one tetrahedron alone, and no other", f"{wrong} missing, inside or turned over"
-    raise _wrong(boundary_path(path).name, expected, got, _REMEDY)
+    raise _wrong(boundary_path(path).name, expected, got)
 
 
 def _read(path: Path) -> Any:
@@ -234,20 +230,18 @@ def _read(path: Path) -> Any:
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
 
     if not path.is_file():
-        raise _wrong(path.name, f"a file at {path}", "none", _REMEDY)
+        raise _wrong(path.name, f"a file at {path}", "none")
     reader: Any = vtkXMLPolyDataReader() if path.suffix == ".vtp" else vtkXMLUnstructuredGridReader()
     reader.SetFileName(str(path))
     data = None
-    with plain_os_errors(path, "a VTK file that can be read", "Check its permissions.", MeshError), path.open("rb"):
-        pass
-    if not _sizes_fit(path.read_bytes()):
-        raise _wrong(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one", _REMEDY)
+    with plain_os_errors(path, "a VTK file that can be read", "Check its permissions.", MeshError):
+        sound = _sizes_fit(path.read_bytes())
     with silent_vtk() as complaints:
-        if reader.CanReadFile(str(path)):
+        if sound and reader.CanReadFile(str(path)):
             reader.Update()
             data = pv.wrap(reader.GetOutput())
     if data is None or complaints.events or reader.GetErrorCode() or not data.n_cells:
-        raise _wrong(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one", _REMEDY)
+        raise _wrong(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one")
     return data
 
 
@@ -294,54 +288,49 @@ def _region_names(body: Any, name: str) -> tuple[str, ...]:
         if (array.GetName() or "").startswith(_REGION) and array.GetNumberOfValues() == 1:
             numbers[int(array.GetVariantValue(0).ToInt())] = array.GetName().removeprefix(_REGION)
     if sorted(numbers) != list(range(len(numbers))) or not numbers:
-        raise _wrong(name, f"field arrays {_REGION}NAME numbered from 0", sorted(numbers) or "none", _REMEDY)
+        raise _wrong(name, f"field arrays {_REGION}NAME numbered from 0", sorted(numbers) or "none")
     return tuple(numbers[number] for number in range(len(numbers)))
 
 
 def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Boundary | None]:
     node = _array(surface.point_data, "node", name).astype(np.int64)
     if node.min() < 0 or node.max() >= len(points) or not np.array_equal(points[node], surface.points):
-        raise _wrong(name, "the boundary of the mesh beside it", "that of another one", _REMEDY)
+        raise _wrong(name, "the boundary of the mesh beside it", "that of another one")
     if not surface.is_all_triangles:
-        raise _wrong(name, "triangles only", "other polygons", _REMEDY)
+        raise _wrong(name, "triangles only", "other polygons")
     facets = node[np.asarray(surface.regular_faces, dtype=np.int64)]
     if "seen" not in surface.cell_data:
         return facets, None
     array = surface.GetFieldData().GetAbstractArray("patch_names")
     if array is None:
-        raise _wrong(name, "the field array patch_names", "none", _REMEDY)
+        raise _wrong(name, "the field array patch_names", "none")
     names = tuple(str(array.GetValue(number)) for number in range(array.GetNumberOfValues()))
     normal = np.array(_array(surface.cell_data, "normal", name), dtype=np.float64)
+    counts, photographs = [f"photographs_{what}" for what in ("seen", "supporting")], None
+    if any(count in surface.cell_data for count in counts):
+        photographs = np.stack([_array(surface.cell_data, n, name).astype(np.int64) for n in counts], axis=1)
     return facets, Boundary(
         normal=check_shape("normal", normal, (len(facets), 3), _REMEDY, MeshError),
         area_factor=np.array(_array(surface.cell_data, "area_factor", name), dtype=np.float64),
         seen=_array(surface.cell_data, "seen", name) != 0,
         patch=_cell_numbers(surface, "patch", name, len(names)),
         patch_names=names,
-        photographs=_photographs(surface, name),
+        photographs=photographs,
     )
-
-
-def _photographs(surface: Any, name: str) -> IntArray | None:
-    """Photographs that see and support each triangle, (f, 2); None in files of meshes that do not know."""
-    counts = [f"photographs_{what}" for what in ("seen", "supporting")]
-    if not any(count in surface.cell_data for count in counts):
-        return None
-    return np.stack([_array(surface.cell_data, count, name).astype(np.int64) for count in counts], axis=1)
 
 
 def _cell_numbers(data: Any, array: str, name: str, count: int) -> IntArray:
     numbers = _array(data.cell_data, array, name).astype(np.int64)
     if numbers.min() < 0 or numbers.max() >= count:
-        raise _wrong(f"{name}: {array}", f"0 to {count - 1}", f"{numbers.min()} to {numbers.max()}", _REMEDY)
+        raise _wrong(f"{name}: {array}", f"0 to {count - 1}", f"{numbers.min()} to {numbers.max()}")
     return numbers
 
 
 def _array(data: Any, array: str, name: str) -> npt.NDArray:
     if array not in data:
-        raise _wrong(name, f"an array {array}", f"{', '.join(sorted(data.keys())) or 'none'}", _REMEDY)
+        raise _wrong(name, f"an array {array}", f"{', '.join(sorted(data.keys())) or 'none'}")
     return check_finite(f"{name}: {array}", np.array(data[array]), _REMEDY, MeshError)
 
 
-def _wrong(name: str, expected: str, got: object, remedy: str) -> MeshError:
+def _wrong(name: str, expected: str, got: object, remedy: str = _REMEDY) -> MeshError:
     return MeshError(name, expected=expected, got=got, remedy=remedy)

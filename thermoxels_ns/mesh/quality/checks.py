@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -236,23 +237,11 @@ class SurfaceComponent:
     """True where it bounds a hole inside a body: it is closed and the volume that it encloses is negative."""
 
 
-@dataclass(frozen=True)
-class SurfaceTopology:
-    """How a boundary hangs together."""
-
-    num_open_edges: int
-    """Edges whose triangles do not pass them equally often in both directions; 0: the surface is closed."""
-    num_non_manifold_edges: int  # edges with more than two triangles: bodies that touch along an edge
-    num_non_manifold_vertices: int
-    """Vertices whose triangles are not one fan: bodies that touch at a point, and the ends of non-manifold edges."""
-    euler_characteristic: int  # vertices - edges + triangles of the whole surface
-    components: tuple[SurfaceComponent, ...]  # largest first
-
-
-def surface_topology(points: FloatArray, facets: IntArray, sides: Groups) -> SurfaceTopology:
+def surface_topology(points: FloatArray, facets: IntArray, sides: Groups) -> dict[str, Any]:
     """Count the components of a triangulated surface, their handles, and where it is no manifold.
 
-    Nodes (n, 3), [m]; triangles (f, 3), right-hand normal out of the body; `sides` is `group_sides(facets)`.
+    Nodes (n, 3), [m]; triangles (f, 3), right-hand normal out of the body; `sides` is `group_sides(facets)`. The
+    figures have the names that they have in `report.QualityReport`.
     """
     uses, (left, right) = sides.sizes, sides.pairs()
     start, rows = facets.ravel(), np.arange(facets.size)
@@ -285,18 +274,20 @@ def surface_topology(points: FloatArray, facets: IntArray, sides: Groups) -> Sur
     corner = (points - points.mean(axis=0))[facets]
     cones = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6.0
     cavity = ~is_open & (per_component(rows[::3] // 3, cones) < 0.0)
-    return SurfaceTopology(
-        num_open_edges=int(np.count_nonzero(sides.sums(np.where(upwards, 1, -1)))),
-        num_non_manifold_edges=int(np.count_nonzero(uses > 2)),
-        num_non_manifold_vertices=int(np.count_nonzero(fans_at_node > 1)),
-        euler_characteristic=int(np.count_nonzero(fans_at_node)) - len(uses) + len(facets),
-        components=tuple(
-            SurfaceComponent(
-                num_triangles=int(triangles[n]),
-                euler_characteristic=int(euler[n]),
-                genus=(2 - int(euler[n])) // 2 if closed[n] else None,
-                is_cavity=bool(cavity[n]),
-            )
-            for n in np.argsort(-triangles, kind="stable")
-        ),
-    )
+    components = []
+    for n in np.argsort(-triangles, kind="stable"):
+        genus = (2 - int(euler[n])) // 2 if closed[n] else None
+        components.append(SurfaceComponent(int(triangles[n]), int(euler[n]), genus, bool(cavity[n])))
+    return {
+        "num_non_manifold_edges": int(np.count_nonzero(uses > 2)),
+        "num_non_manifold_vertices": int(np.count_nonzero(fans_at_node > 1)),
+        "euler_characteristic": int(np.count_nonzero(fans_at_node)) - len(uses) + len(facets),
+        "genus": sum(one.genus or 0 for one in components) if closed.all() else None,
+        "components": tuple(components),
+    }
+
+
+def count_open_edges(facets: IntArray, sides: Groups) -> int:
+    """Number of edges whose triangles do not pass them equally often in both directions; 0: the surface is closed."""
+    upwards = facets < np.roll(facets, -1, axis=1)
+    return int(np.count_nonzero(sides.sums(np.where(upwards.ravel(), 1, -1))))

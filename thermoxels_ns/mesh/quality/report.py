@@ -16,6 +16,7 @@ from thermoxels_ns.mesh.quality.checks import (
     TET_EDGES,
     SurfaceComponent,
     component_of,
+    count_open_edges,
     count_overlaps,
     count_twin_nodes,
     count_wrong_facets,
@@ -201,7 +202,6 @@ def quality_report(
     faces, sides = group_faces(tets), group_sides(mesh.facets)
     first, second = faces.pairs()
     surface = surface_topology(points, mesh.facets, sides)
-    genera = [component.genus for component in surface.components]
     areas = facet_areas(points, mesh.facets)
     unused = len(points) - np.count_nonzero(np.bincount(tets.ravel()))
     mismatches = int(np.count_nonzero(faces.sizes > 2)) + count_overlaps(points, mesh.facets, sides)
@@ -212,7 +212,7 @@ def quality_report(
         volumes,
         length_unit,
         mismatches=mismatches + count_twin_nodes(points) + unused,
-        open_edges=surface.num_open_edges,
+        open_edges=count_open_edges(mesh.facets, sides),
         wrong_facets=count_wrong_facets(mesh, faces),
         excess=float(max(low_c - temperature.min(), temperature.max() - high_c, 0.0)),
         rounding_deg=float(np.degrees(angle_rounding(node_rounding(points), float(lengths.min()) or 1.0))),
@@ -233,11 +233,7 @@ def quality_report(
         # Nodes without a tetrahedron are no bodies.
         bodies_by_node=int(connected_components(links, directed=False)[0]) - unused,
         bodies_by_face=int(component_of(len(tets), first >> 2, second >> 2).max()) + 1,
-        euler_characteristic=surface.euler_characteristic,
-        genus=None if None in genera else sum(genus for genus in genera if genus is not None),
-        components=surface.components,
-        num_non_manifold_edges=surface.num_non_manifold_edges,
-        num_non_manifold_vertices=surface.num_non_manifold_vertices,
+        **surface,
         criteria=criteria if boundary_mode == "voxel" else criteria[:5],
     )
 

@@ -37,7 +37,9 @@ NUM_BUNDLE_NODES = 19
 CODE_WEIGHTS: npt.NDArray[np.int16] = (3 ** np.arange(6)).astype(np.int16)
 """A bundle's code is the sum of (sign + 1) times these."""
 
-_CUT = {ends: 6 + e for e, edge in enumerate(BUNDLE_EDGES) for ends in (edge, edge[::-1])}  # number of an edge's cut
+_CUT: dict[tuple[int, int], int] = {
+    ends: 6 + e for e, edge in enumerate(BUNDLE_EDGES) for ends in (edge, edge[::-1])
+}  # number of an edge's cut
 _Tet = tuple[int, int, int, int]
 _CHUNK = 1 << 16
 
