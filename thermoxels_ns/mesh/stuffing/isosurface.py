@@ -37,9 +37,7 @@ NUM_BUNDLE_NODES = 19
 CODE_WEIGHTS: npt.NDArray[np.int16] = (3 ** np.arange(6)).astype(np.int16)
 """A bundle's code is the sum of (sign + 1) times these."""
 
-_CUT: dict[tuple[int, int], int] = {
-    ends: 6 + e for e, edge in enumerate(BUNDLE_EDGES) for ends in (edge, edge[::-1])
-}  # number of an edge's cut
+_CUT = {(a, b): 6 + e for e, (c, d) in enumerate(BUNDLE_EDGES) for a, b in ((c, d), (d, c))}  # edge to its cut
 _Tet = tuple[int, int, int, int]
 _CHUNK = 1 << 16
 
