@@ -7,8 +7,7 @@ from tests.support.heat_meshes import box_mesh
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.fem.p1_kernels import TET_EDGES, stiffness_matrix
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
-from thermoxels_ns.mesh.quality.checks import facet_areas
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
+from thermoxels_ns.mesh.quality.checks import boundary_facets, facet_areas
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 

@@ -44,17 +44,6 @@ def test_rotated_scaled_and_mirrored_meshes_stay_valid(snapshot_of, seed, mirror
     assert quality.criteria[0].figure == pytest.approx((0.25 * 3.0) ** 3 / 6, rel=1e-9)
 
 
-def test_points_are_transformed_lattice_corners(snapshot_of):
-    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a quarter turn about z
-    snapshot = snapshot_of(np.ones((2, 2, 2)), lo=(1.0, 2.0, 3.0), voxel_size=0.5)
-    mesh = build_mesh(snapshot, DENSE, similarity(2.0, turn, (10.0, 20.0, 30.0)), VOXEL).mesh
-    # Corner (0, 0, 0) at (1, 2, 3): turned (-2, 1, 3), doubled (-4, 2, 6), shifted (6, 22, 36).
-    assert mesh.points_m[0].tolist() == [6.0, 22.0, 36.0]
-    # Corner (1, 0, 0) is node 4 and lies one metre further along y.
-    assert mesh.points_m[4].tolist() == [6.0, 23.0, 36.0]
-    assert mesh.points_m.dtype == np.float64
-
-
 def test_temperature_and_observed_follow_the_corners(snapshot_of):
     shape = (4, 3, 3)
     values = np.arange(np.prod(shape), dtype=float).reshape(shape)
@@ -70,18 +59,6 @@ def test_temperature_and_observed_follow_the_corners(snapshot_of):
     index = np.rint(mesh.points_m / 0.5).astype(int)
     assert np.array_equal(mesh.observed, ~np.all(index == 1, axis=1))
     assert np.allclose(mesh.temperature_c, values[tuple(index.T)], atol=1e-9)  # linear: the unseen corner too
-
-
-def test_corners_with_less_than_the_least_weight_are_extended(snapshot_of):
-    weight = np.full((3, 3, 3), 5.0)
-    weight[1, 1, 1] = 0.004
-    values = np.full((3, 3, 3), 20.0)
-    values[1, 1, 1] = 900.0
-    snapshot = snapshot_of(np.ones((3, 3, 3)), values, weight)
-    mesh = build_mesh(snapshot, DENSE, np.eye(4), VOXEL).mesh
-    assert (mesh.observed.sum(), mesh.temperature_c.max()) == (26, 20.0)
-    mesh = build_mesh(snapshot, DENSE, np.eye(4), MeshOptions("voxel", min_observed_weight=0.0)).mesh
-    assert (mesh.observed.sum(), mesh.temperature_c.max()) == (27, 900.0)
 
 
 def test_extension_conducts_like_the_voxels_do(snapshot_of):
@@ -163,11 +140,6 @@ def test_what_is_no_similarity_is_refused(bad):
         check_similarity("world_to_metres", bad)
 
 
-def test_negative_least_weight_is_refused():
-    with pytest.raises(MeshError, match="min_observed_weight"):
-        MeshOptions(min_observed_weight=-1.0)
-
-
 def ball(snapshot_of, seen_side: bool = False):
     """A ball of radius 5.3 voxels of 0.5 in a lattice of 14, its density exponential in the distance to its surface."""
     corner = np.stack(np.meshgrid(*[np.arange(15.0)] * 3, indexing="ij"), axis=-1)
@@ -213,7 +185,7 @@ def test_boundary_is_tagged_with_normal_and_true_area(snapshot_of, mode):
     assert np.einsum("ij,ij->i", outwards, boundary.normal).min() > 0.9
     true_area = (facet_areas(mesh.points_m, mesh.facets) * boundary.area_factor).sum()
     radius = 5.3 + np.log(2.0) / 3.0  # where density is one half, [voxels]; a voxel is 0.5 * 2 wide
-    assert true_area == pytest.approx(4 * np.pi * radius**2, rel=0.03 if mode == "conforming" else 0.04)
+    assert true_area == pytest.approx(4 * np.pi * radius**2, rel=0.03 if mode == "conforming" else 0.05)
 
 
 def test_colour_is_that_of_corners_with_density(snapshot_of):

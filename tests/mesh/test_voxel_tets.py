@@ -1,12 +1,11 @@
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.quality.checks import facet_areas
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
+from thermoxels_ns.mesh.quality.checks import boundary_facets, facet_areas
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
-from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets, lattice_edges, voxel_facets
 
 
 def exposed_faces(cells: np.ndarray) -> int:
@@ -52,14 +51,6 @@ def test_volume_area_and_validity(mesh_of_cells, name):
     assert (quality.dihedral_range_deg[0], quality.dihedral_range_deg[1]) == pytest.approx((45.0, 90.0))
 
 
-@pytest.mark.parametrize("seed", range(25))
-def test_random_carved_blocks_are_valid(mesh_of_cells, random_cells, seed):
-    cells = random_cells(seed)
-    quality = check_mesh(mesh_of_cells(cells, voxel_size=0.25))
-    assert quality.volume_m3 == pytest.approx(cells.sum() * 0.25**3, rel=1e-13)
-    assert quality.area_m2 == pytest.approx(exposed_faces(cells) * 0.25**2, rel=1e-13)
-
-
 def turned(facets: np.ndarray) -> list:
     """Triangles with their smallest node first, orientation kept, in one order."""
     rows = [tuple(np.roll(row, -int(np.argmin(row)))) for row in facets]
@@ -88,15 +79,6 @@ def test_single_voxel_by_hand():
     assert np.allclose(signed_volumes(corners.astype(float), tets), 1 / 6)
 
 
-def test_nodes_are_the_used_corners_only():
-    cells = np.zeros((5, 4, 3), dtype=bool)
-    cells[3, 2, 1] = True
-    corners, tets = kuhn_tets(cells)
-    assert corners.min(axis=0).tolist() == [3, 2, 1]
-    assert corners.max(axis=0).tolist() == [4, 3, 2]
-    assert np.unique(tets).tolist() == list(range(8))
-
-
 def test_box_facets_are_those_on_the_lattice_border(mesh_of_cells):
     cells = np.zeros((3, 3, 3), dtype=bool)
     cells[1:, 1, 1] = True  # touches the box at x = 3 with one voxel face
@@ -105,12 +87,6 @@ def test_box_facets_are_those_on_the_lattice_border(mesh_of_cells):
     assert np.all(mesh.points_m[mesh.facets[box]][:, :, 0] == 3.0)
     assert facet_areas(mesh.points_m, mesh.facets[box]).sum() == pytest.approx(1.0)
     assert np.count_nonzero(mesh.facet_tags == FACET_SURFACE) == len(mesh.facets) - 2
-
-
-def test_triangle_with_nodes_on_two_sides_of_the_box_is_no_cut():
-    corners = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0], [0, 2, 2]])
-    facets = np.array([[0, 1, 2], [0, 3, 1]])
-    assert boundary_tags(facets, corners, (5, 5, 5)).tolist() == [FACET_SURFACE, FACET_SURFACE]
 
 
 def test_voxels_around_an_edge_are_counted():

@@ -29,10 +29,9 @@ from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.run import run_scene
 from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.solving import Goals
-from thermoxels_ns.mesh.boundary.patch_rules import load_patch_rules
+from thermoxels_ns.mesh.boundary.patches import load_patch_rules
 from thermoxels_ns.mesh.files.formats import write_mesh
-from thermoxels_ns.mesh.files.read import read_mesh
-from thermoxels_ns.mesh.files.vtu import summary_text
+from thermoxels_ns.mesh.files.vtu import read_mesh, summary_text
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.reports.audit_page import audit_page
 

@@ -7,11 +7,11 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
-from thermoxels_ns.mesh.boundary.tags import LEAST_AREA_FACTOR
 from thermoxels_ns.mesh.build import BuiltMesh, MeshOptions, build_mesh
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
+from thermoxels_ns.mesh.voxel_tets import LEAST_AREA_FACTOR
 
 MODES = ["conforming", "voxel"]
 AS_IT_IS = SolidSelection(density_threshold=0.5, close_gaps=0, region="all", interior="hollow")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
+from thermoxels_ns.mesh.quality.checks import boundary_facets
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 

@@ -4,8 +4,7 @@ from itertools import permutations
 
 import numpy as np
 
-from thermoxels_ns.mesh.quality.checks import facet_normals
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
+from thermoxels_ns.mesh.quality.checks import boundary_facets, facet_normals
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from thermoxels_ns.audit.surface import AuditedSurface
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.mesh.quality.topology import component_of, group_sides, triangles_across_edges
+from thermoxels_ns.mesh.quality.checks import component_of, group_sides, triangles_across_edges
 
 DefectKind = Literal["line", "point", "area"]
 

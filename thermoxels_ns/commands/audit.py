@@ -67,7 +67,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     from thermoxels_ns.audit.conditions import load_conditions, write_example
     from thermoxels_ns.audit.run import audit
     from thermoxels_ns.commands.audit_photographs import photographs_of_defects
-    from thermoxels_ns.mesh.files.read import read_mesh
+    from thermoxels_ns.mesh.files.vtu import read_mesh
     from thermoxels_ns.reports.numbers import interval_text
 
     if options.write_conditions is not None:

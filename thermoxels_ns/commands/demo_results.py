@@ -16,8 +16,7 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import plain_os_errors
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json, read_json_object
-from thermoxels_ns.mesh.boundary.patch_rules import load_patch_rules
-from thermoxels_ns.mesh.boundary.patches import apply_patches
+from thermoxels_ns.mesh.boundary.patches import apply_patches, load_patch_rules
 from thermoxels_ns.reports.capture_pictures import colours, jpeg_of
 from thermoxels_ns.reports.page import build_page
 from thermoxels_ns.synthetic.catalogue import make_scene

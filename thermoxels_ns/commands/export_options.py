@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from thermoxels_ns.fem.problem import TimeSteps
     from thermoxels_ns.heat.materials import Material
     from thermoxels_ns.heat.scene import HeatScene
-    from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
+    from thermoxels_ns.mesh.boundary.patches import PatchRules
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
 Settings = TypeVar("Settings", "Material", "TimeSteps")
@@ -135,7 +135,7 @@ class CheckedOptions:
 
 def check_options(options: ExportOptions) -> CheckedOptions:
     """Check every option, so that a wrong one is refused (`ThermoxelsError`) before anything slow runs."""
-    from thermoxels_ns.mesh.boundary.patch_rules import PatchRules, load_patch_rules
+    from thermoxels_ns.mesh.boundary.patches import PatchRules, load_patch_rules
     from thermoxels_ns.mesh.build import MeshOptions
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
 

@@ -26,7 +26,6 @@ from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.solving import Goals, solve_problem
 from thermoxels_ns.heat.vtk_series import STEP_PATTERN, heat_series_paths, remove_heat_series, write_heat_series
-from thermoxels_ns.mesh.boundary.tags import SUPPORT, support_of_facets
 from thermoxels_ns.mesh.boundary.visibility import facet_views
 from thermoxels_ns.mesh.build import BuiltMesh, MeshOptions, apply_transform, build_mesh
 from thermoxels_ns.mesh.files.abaqus import HeatStep
@@ -37,7 +36,7 @@ from thermoxels_ns.mesh.quality.picture import picture_of_quality
 from thermoxels_ns.mesh.quality.report import QualityReport, check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, support_of_facets
 from thermoxels_ns.mesh.voxel_tets import used_corners, voxel_facets
 from thermoxels_ns.multiview.stereo import Depths
 from thermoxels_ns.multiview.votes import supporting_photographs

@@ -100,7 +100,7 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     from thermoxels_ns.heat.run import run_scene
     from thermoxels_ns.heat.scene_file import load_heat_scene
     from thermoxels_ns.heat.solving import Goals
-    from thermoxels_ns.mesh.files.read import read_mesh
+    from thermoxels_ns.mesh.files.vtu import read_mesh
 
     begin = clock.perf_counter()
     scene = load_heat_scene(options.scene)

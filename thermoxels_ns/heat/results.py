@@ -21,7 +21,7 @@ from thermoxels_ns.fem.solution import (
 from thermoxels_ns.heat.effects import Convection, InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.mesh.quality.face_count import facet_owners
+from thermoxels_ns.mesh.quality.checks import facet_owners
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]

@@ -10,13 +10,12 @@ import numpy.typing as npt
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
-from thermoxels_ns.mesh.boundary.patches import apply_regions
-from thermoxels_ns.mesh.boundary.tags import BoundaryMode, tag_boundary
-from thermoxels_ns.mesh.quality.topology import component_of
-from thermoxels_ns.mesh.solid.morphology import bounding_box, connected, face_connected
+from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_patches, apply_regions
+from thermoxels_ns.mesh.boundary.visibility import seen_facets
+from thermoxels_ns.mesh.quality.checks import component_of, facet_normals
+from thermoxels_ns.mesh.quality.report import BoundaryMode
+from thermoxels_ns.mesh.solid.morphology import face_connected
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing.isosurface import check_coarsest, stuff
 from thermoxels_ns.mesh.stuffing.sharp_edges import sharpen
@@ -26,30 +25,21 @@ from thermoxels_ns.mesh.temperature import (
     interpolate_corners,
     tet_conductances,
 )
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
+from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets, voxel_surface
 
 
 @dataclass(frozen=True)
 class MeshOptions:
     """How solid voxels become a mesh."""
 
-    boundary: BoundaryMode = "conforming"
-    """conforming: the boundary follows the level set of the density (isosurface stuffing); voxel: it follows voxel
-    faces, and every boundary triangle says how much true surface it stands for."""
+    boundary: BoundaryMode = "conforming"  # along the level set of the density, or along voxel faces
     coarsest_cell: int = 4
     """Edge of the largest cells deep inside a conforming mesh, a power of two, [voxels]; 1: as fine as the surface."""
-    min_observed_weight: float = MIN_OBSERVED_WEIGHT
-    """Nodes with less thermal ray weight than this are not measurements, [rays], at least 0; 0 keeps every node that
-    any ray touched."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Direction that points up, in the coordinates of the mesh
     rules: PatchRules = field(default_factory=PatchRules)  # Patches and regions of the user
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.min_observed_weight) and self.min_observed_weight >= 0.0):
-            remedy = f"Leave it out to use {MIN_OBSERVED_WEIGHT}."
-            got = self.min_observed_weight
-            raise MeshError("min_observed_weight", expected="a finite number of at least 0", got=got, remedy=remedy)
         check_coarsest("coarsest_cell", self.coarsest_cell, "Pass --coarsest-cell 4.")
         if self.boundary not in ("conforming", "voxel"):
             raise MeshError("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")
@@ -96,40 +86,38 @@ def build_mesh(
         world_to_metres: Similarity (rotation or reflection, one scale, shift), shape (4, 4), that maps homogeneous
             column vectors of the trained scene to metres. A reflection turns the tetrahedra over, so that their
             volumes stay positive.
-        options: Kind of boundary, tags, and what counts as measured.
+        options: Kind of boundary, and tags.
         metres_per_unit: Length of a unit of the input poses, [m], in which a region is given.
 
     Raises:
         MeshError: Nothing is solid, the 4x4 is no similarity, or no node of the mesh was measured.
     """
     transform = check_similarity("world_to_metres", world_to_metres)
-    least = max(options.min_observed_weight, float(np.finfo(np.float32).tiny))
-    scale = float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
+    scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
     of_scene = scale, transform[:3] / metres_per_unit
-    solid = select_solid(snapshot, selection, *of_scene, makes_up_volume=options.boundary == "conforming")
-    solid, num_parts, num_voxels = _without_unobserved(solid, snapshot.observed_weight >= least)
-
-    if options.boundary == "voxel":
+    solid = select_solid(snapshot, selection, *of_scene, makes_up_volume=not voxel)
+    if voxel:
         (corners, tets), facets = kuhn_tets(solid.cells), voxel_facets(solid.cells)
         tags = boundary_tags(facets, corners, tuple(n + 1 for n in solid.cells.shape))
         shape = _Shape(corners.astype(np.float64), tets, facets, tags)
-        temperature_c, weight = _measured(snapshot, shape.points, least)
-        edges, conductance = lattice_edges(solid.cells)
     else:
         stuffed = sharpen(stuff(solid.level, options.coarsest_cell), solid.level.shape)
         tags = np.where(stuffed.on_box, FACET_BOX, FACET_SURFACE).astype(np.int64)
         shape = _Shape(stuffed.points, stuffed.tets, stuffed.facets, tags)
-        temperature_c, weight = _measured(snapshot, shape.points, least)
-        stays, dropped = _with_a_measurement(shape, weight >= least)
-        if dropped:
-            solid, dropped_voxels = _without_voxels_of(solid, shape.points[~stays])
-            num_parts, num_voxels = num_parts + dropped, num_voxels + dropped_voxels
-            shape, temperature_c, weight = _kept(shape, stays), temperature_c[stays], weight[stays]
-        edges, conductance = tet_conductances(shape.points, shape.tets)
-    observed = weight >= least
+    # From measured corners alone.
+    measured = np.where(snapshot.observed_weight >= MIN_OBSERVED_WEIGHT, snapshot.observed_weight, 0.0)
+    temperature_c, weight = interpolate_corners(shape.points, snapshot.temperature_c, measured)
+    stays, num_parts = _with_a_measurement(shape, weight >= MIN_OBSERVED_WEIGHT)
+    num_voxels = 0
+    if num_parts:
+        goes = _voxels_of(solid, shape, ~stays, voxel)
+        num_voxels = int(np.count_nonzero(goes))
+        solid = replace(solid, cells=solid.cells & ~goes, level=np.where(goes, -np.abs(solid.level), solid.level))
+        shape, temperature_c, weight = _kept(shape, stays), temperature_c[stays], weight[stays]
+    edges, conductance = lattice_edges(solid.cells) if voxel else tet_conductances(shape.points, shape.tets)
+    observed = weight >= MIN_OBSERVED_WEIGHT
     temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
 
-    shape = replace(shape, facet_tags=np.where(_cut(shape, solid.within), FACET_BOX, shape.facet_tags))
     tets, facets = shape.tets, shape.facets
     if np.linalg.det(transform[:3, :3]) < 0.0:
         tets, facets = tets[:, [0, 2, 1, 3]], facets[:, ::-1]
@@ -146,18 +134,51 @@ def build_mesh(
         temperature_c=temperature_c,
         observed=observed,
         facets=np.ascontiguousarray(facets),
-        facet_tags=shape.facet_tags,
+        facet_tags=np.where(_cut(shape, solid.within), FACET_BOX, shape.facet_tags),
         region=region,
         region_names=region_names,
         colour=colour,
     )
-    place = shape.points, solid, snapshot.lattice, snapshot.views, transform
-    boundary, idle_patches = tag_boundary(mesh, *place, options.boundary, options.up, options.rules)
-    measured_c = snapshot.temperature_c[snapshot.observed_weight >= least]
+    boundary, idle_patches = _tagged(mesh, shape.points, solid, snapshot, transform[:3, :3] / scale, options)
+    measured_c = snapshot.temperature_c[snapshot.observed_weight >= MIN_OBSERVED_WEIGHT]
     observed_range_c = float(measured_c.min()), float(measured_c.max())
     return BuiltMesh(
         replace(mesh, boundary=boundary), solid, num_parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
     )
+
+
+def _tagged(
+    mesh: TetMesh,
+    points_index: FloatArray,
+    solid: SolidCells,
+    snapshot: GridSnapshot,
+    rotation: FloatArray,
+    options: MeshOptions,
+) -> tuple[Boundary, tuple[str, ...]]:
+    """Normal, area factor, visibility and patch of every boundary triangle, and the rules that no triangle follows.
+
+    Without cameras every triangle counts as seen.
+    """
+    if options.boundary == "voxel":
+        in_world, factor = voxel_surface(solid.level, points_index, mesh.facets)
+        normal = in_world @ rotation.T
+    else:
+        normal = facet_normals(mesh.points_m, mesh.facets)
+        in_world, factor = normal @ rotation, np.ones(len(mesh.facets))
+    seen = np.ones(len(mesh.facets), dtype=bool)
+    if snapshot.views is not None:
+        centroids = snapshot.lattice.index_to_world(points_index[mesh.facets].mean(axis=1))
+        seen = seen_facets(solid.cells, snapshot.views, snapshot.lattice, centroids, in_world)
+    patch, names, idle = apply_patches(
+        options.rules,
+        centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
+        normals=normal,
+        up=options.up,
+        seen=seen,
+        on_box=mesh.facet_tags == FACET_BOX,
+        colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),
+    )
+    return Boundary(normal=normal, area_factor=factor, seen=seen, patch=patch, patch_names=names), idle
 
 
 def _cut(shape: _Shape, within: BoolArray) -> BoolArray:
@@ -171,12 +192,6 @@ def _cut(shape: _Shape, within: BoolArray) -> BoolArray:
     cut = np.zeros(len(beside), dtype=bool)
     cut[inside] = ~within[tuple(beside[inside].T)]
     return cut
-
-
-def _measured(snapshot: GridSnapshot, points: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
-    """Temperature at fractional corner indices from measured corners alone, and their ray weight there, shape (n,)."""
-    weight = np.where(snapshot.observed_weight >= least, snapshot.observed_weight, 0.0)
-    return interpolate_corners(points, snapshot.temperature_c, weight)
 
 
 def _with_a_measurement(shape: _Shape, observed: BoolArray) -> tuple[BoolArray, int]:
@@ -200,41 +215,17 @@ def _kept(shape: _Shape, stays: BoolArray) -> _Shape:
     )
 
 
-def _without_voxels_of(solid: SolidCells, points: FloatArray) -> tuple[SolidCells, int]:
-    """Leave out the voxels that components of a mesh with these nodes were made from; also their number."""
-    # Centres of solid voxels near the surface are nodes, and voxels that share a face are in one component.
+def _voxels_of(solid: SolidCells, shape: _Shape, nodes: BoolArray, voxel: bool) -> BoolArray:
+    """The solid voxels that the components of a mesh with these nodes were made from."""
+    if voxel:
+        inside = shape.points[shape.tets[nodes[shape.tets[:, 0]]]].mean(axis=1)
+    else:  # centres of solid voxels near the surface are nodes, and voxels that share a face are in one component
+        inside = shape.points[nodes][np.all(shape.points[nodes] % 1.0 == 0.5, axis=1)]
     component = face_connected(solid.cells)
-    voxel = np.floor(points).astype(np.int64)
-    centres = voxel[np.all(points == voxel + 0.5, axis=1)]
     goes = np.zeros(int(component.max()) + 1, dtype=bool)
-    goes[component[tuple(centres.T)]] = True
+    goes[component[tuple(np.floor(inside).astype(np.int64).T)]] = True
     goes[0] = False
-    return _without(solid, goes[component])
-
-
-def _without(solid: SolidCells, goes: BoolArray) -> tuple[SolidCells, int]:
-    """Leave out some solid voxels; also their number."""
-    level = np.where(goes, -np.abs(solid.level), solid.level)
-    return replace(solid, cells=solid.cells & ~goes, level=level), int(np.count_nonzero(goes))
-
-
-def _without_unobserved(solid: SolidCells, observed_corners: BoolArray) -> tuple[SolidCells, int, int]:
-    """Leave out components without an observed corner, unless all are; also their number and that of their voxels."""
-    # Voxels share a node if they touch by a face, an edge or a corner.
-    box = bounding_box(solid.cells)
-    cells = solid.cells[box]
-    component = connected(cells)
-    touched = np.zeros(cells.shape, dtype=bool)
-    for offset in CORNER_OFFSETS:
-        shifted = tuple(slice(s.start + int(d), s.stop + int(d)) for s, d in zip(box, offset))
-        touched |= observed_corners[shifted]
-    seen = np.bincount(component[cells & touched], minlength=int(component.max()) + 1) > 0
-    if seen[1:].all() or not seen.any():
-        return solid, 0, 0
-    goes = np.zeros_like(solid.cells)
-    goes[box] = cells & ~seen[component]
-    kept, num_voxels = _without(solid, goes)
-    return kept, int(np.count_nonzero(~seen[1:])), num_voxels
+    return goes[component]
 
 
 def check_similarity(name: str, matrix: npt.ArrayLike) -> FloatArray:

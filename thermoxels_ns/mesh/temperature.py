@@ -12,12 +12,12 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
-from thermoxels_ns.mesh.quality.face_count import TET_EDGES
+from thermoxels_ns.mesh.quality.checks import TET_EDGES
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 
 MIN_OBSERVED_WEIGHT = 0.5
-"""A node counts as measured if thermal rays, all together, gave it at least half of one fully absorbed ray.
-Less is leakage through a surface or the tail of an interpolation, and its temperature is mostly the starting value."""
+"""A node counts as measured if thermal rays, all together, gave it at least half of one fully absorbed ray; less is
+leakage through a surface or the tail of an interpolation."""
 _DIRECT_SOLVE_UNKNOWNS = 4000
 _RELATIVE_RESIDUAL = 1e-7
 _MOST_ROUNDS = 100_000
@@ -79,17 +79,15 @@ def extend_harmonically(
     """Fill in the temperature of unobserved nodes by the graph Laplace equation, shape (n,), [degrees Celsius].
 
     Observed nodes keep their value. Every other node i solves sum_j w_ij (T_i - T_j) = 0 over its edges: steady heat
-    conduction in an insulated body. The matrix is an M-matrix, so the maximum principle holds: no filled-in value
-    leaves the observed range of its connected component. What rounding adds beyond it is clipped. An edge whose weights
-    add up to 0 or less gets next to none, so that this holds for any mesh.
+    conduction in an insulated body. No filled-in value leaves the observed range of its connected component: an edge
+    whose weights add up to 0 or less gets next to none, and what rounding adds beyond the range is clipped.
 
     Args:
         edges: Node pairs, shape (e, 2); the weights of a pair that comes more than once add up.
         temperature_c: Nodal temperatures, shape (n,), [degrees Celsius]; read at observed nodes only.
         observed: True where a node's temperature is a measurement, shape (n,).
-        edge_weights: Conductance of each edge, shape (e,); equal if left out. The number of solid voxels around an
-            edge (`voxel_tets.lattice_edges`) gives uniform conductivity in the voxels, `tet_conductances` that in any
-            tetrahedra.
+        edge_weights: Conductance of each edge, shape (e,), as from `voxel_tets.lattice_edges` or `tet_conductances`;
+            equal if left out.
 
     Raises:
         MeshError: A connected component has no observed node, or the solver did not converge.
@@ -132,9 +130,8 @@ def extend_harmonically(
 def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, FloatArray]:
     """Edges of tetrahedra, shape (6 t, 2), and what each adds to their conductance: minus its linear stiffness entries.
 
-    With them the extension is steady heat conduction in the mesh: a temperature that is linear in space is extended
-    exactly, but for edges between angles so obtuse that their entries add up to less than 0 (next to the surface of a
-    conforming mesh; 0.6 % of the range in a ball). An edge comes once for each tetrahedron around it.
+    With them a temperature that is linear in space is extended exactly, but for edges between angles so obtuse that
+    their entries add up to less than 0. An edge comes once for each tetrahedron around it.
     """
     conductances = np.empty((len(tets), 6))
     for which, shapes in shapes_in_chunks(points, tets):

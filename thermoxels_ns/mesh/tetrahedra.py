@@ -12,6 +12,16 @@ from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntAr
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 
+FACET_SURFACE = 0  # boundary between solid and empty space
+FACET_BOX = 1  # boundary where the scene box or the region of an export cuts the solid
+SUPPORT = {
+    "supported": "three photographs or more",
+    "weak": "one or two photographs",
+    "smooth": "seen, but placed by smoothness alone",
+    "filled": "seen by no photograph",
+}
+"""Classes of boundary triangles by the photographs that support them, see `Boundary.photographs`."""
+
 _REMEDY = "Build the mesh with thermoxels_ns.mesh.build."
 
 
@@ -102,5 +112,13 @@ def _check_names(name: str, names: Sequence[str]) -> None:
         raise MeshError(f"mesh {name}", expected=expected, got=list(names), remedy="Rename them.")
 
 
-FACET_SURFACE = 0  # boundary between solid and empty space
-FACET_BOX = 1  # boundary where the scene box or the region of an export cuts the solid
+def support_of_facets(mesh: TetMesh) -> IntArray | None:
+    """Place in `SUPPORT` of each boundary triangle, -1 where the scene box cuts the solid, shape (f,).
+
+    None if photographs were not compared.
+    """
+    if mesh.boundary is None or mesh.boundary.photographs is None:
+        return None
+    seen, supporting = mesh.boundary.photographs.T
+    on_box = mesh.facet_tags == FACET_BOX
+    return np.select([on_box, supporting >= 3, supporting > 0, seen > 0], [-1, 0, 1, 2], default=3)

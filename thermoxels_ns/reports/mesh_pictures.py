@@ -17,8 +17,7 @@ import numpy.typing as npt
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
-from thermoxels_ns.mesh.boundary.tags import SUPPORT, support_of_facets
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, SUPPORT, TetMesh, support_of_facets
 from thermoxels_ns.reports.numbers import duration_text
 
 if TYPE_CHECKING:

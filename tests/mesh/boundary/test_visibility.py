@@ -6,11 +6,11 @@ import pytest
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.mesh.boundary.tags import voxel_surface as surface_of_voxels
 from thermoxels_ns.mesh.boundary.visibility import facet_views, seen_facets
 from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.solid.free_space import first_solid
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
+from thermoxels_ns.mesh.voxel_tets import voxel_surface as surface_of_voxels
 
 LATTICE = Lattice((2.0, -1.0, 0.5), 0.25, (33, 33, 33))
 H = LATTICE.voxel_size

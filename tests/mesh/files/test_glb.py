@@ -71,17 +71,6 @@ def test_arrays_are_the_surface_with_its_temperatures(tmp_path, tagged_mesh):
     assert extras == {"colours": "temperature", "lowest_c": temperature.min(), "highest_c": temperature.max()}
 
 
-def test_colours_are_stored_as_light(tmp_path, tagged_mesh, monkeypatch):
-    """Half of the screen's range is 21.4 % of the light (sRGB)."""
-    colours = "thermoxels_ns.mesh.files.surface.temperature_colours"
-    monkeypatch.setattr(colours, lambda surface, _: np.tile([0.5, 1.0, 0.02], (len(surface.nodes), 1)))
-    write_glb(tmp_path / "house.glb", tagged_mesh)
-    _, arrays = read_glb(tmp_path / "house.glb")
-    assert np.unique(arrays["COLOR_0"], axis=0) / 65535.0 == pytest.approx(
-        np.array([[0.21404, 1.0, 0.02 / 12.92, 1.0]]), abs=2e-5
-    )
-
-
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (0, -1, 0), (1, 0, 0), (0.3, -0.9, 0.4), (0, -3, 1e-3)])
 def test_any_direction_can_be_up(tmp_path, tagged_mesh, up):
     write_glb(tmp_path / "house.glb", tagged_mesh, up=up)

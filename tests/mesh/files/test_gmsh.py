@@ -42,17 +42,6 @@ def test_temperatures_are_at_their_nodes(tmp_path, tagged_mesh):
     assert np.array_equal(read.point_data[TEMPERATURE_VIEW].ravel(), shown[number])
 
 
-def test_nodes_lie_on_the_boundary_or_inside(tmp_path, box_mesh):
-    write_msh(tmp_path / "box.msh", box_mesh)
-    read = meshio.read(tmp_path / "box.msh")
-    dimension = read.point_data["gmsh:dim_tags"][:, 0]
-    low, high = box_mesh.points_m.min(axis=0), box_mesh.points_m.max(axis=0)
-    on_boundary = np.any((read.points == low) | (read.points == high), axis=1)
-    assert np.array_equal(dimension == 2, on_boundary)
-    assert np.array_equal(dimension == 3, ~on_boundary)
-    assert 0 < np.count_nonzero(dimension == 3) < len(dimension)
-
-
 def test_a_name_that_gmsh_would_cut_is_refused(tmp_path, tagged_mesh):
     names = ("walls", "floor", "é" * 64)
     with pytest.raises(MeshError, match=r"at most 127 bytes.*got 128 bytes"):
@@ -73,9 +62,3 @@ def test_triangles_carry_true_areas_and_normals(tmp_path, tagged_mesh):
         assert np.array_equal(table["tag"], len(tagged_mesh.tets) + 1 + np.arange(count))
         assert np.all(table["nodes"] == 3)
         assert np.array_equal(table["value"], np.repeat(values[:, None], 3, axis=1))
-
-
-def test_a_mesh_that_follows_the_surface_has_no_factors(tmp_path, tagged_mesh):
-    plain = dataclasses.replace(tagged_mesh.boundary, area_factor=np.ones(len(tagged_mesh.facets)))
-    write_msh(tmp_path / "house.msh", dataclasses.replace(tagged_mesh, boundary=plain))
-    assert b"ElementNodeData" not in (tmp_path / "house.msh").read_bytes()

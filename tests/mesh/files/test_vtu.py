@@ -1,12 +1,10 @@
 import json
 from pathlib import Path
 
-import meshio
 import numpy as np
 import pytest
 import pyvista as pv
 
-from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.vtu import write_boundary_vtp, write_summary, write_vtu
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX
@@ -28,24 +26,6 @@ def test_mesh_round_trips_through_pyvista(tmp_path, box_mesh):
     assert np.array_equal(grid.cell_data["region"], box_mesh.region)
     assert grid.volume == pytest.approx(3.0)
     assert [p.name for p in path.parent.iterdir()] == ["mesh.vtu"]
-
-
-def test_colours_and_regions_are_written(tmp_path, tagged_mesh):
-    write_vtu(tmp_path / "mesh.vtu", tagged_mesh)
-    grid = pv.read(tmp_path / "mesh.vtu")
-    assert grid.point_data["colour"].dtype == np.uint8
-    assert np.abs(grid.point_data["colour"] / 255.0 - tagged_mesh.colour).max() <= 0.5 / 255.0 + 1e-6
-    assert np.array_equal(grid.cell_data["region"], tagged_mesh.region)
-    names = {name: int(grid.field_data[name][0]) for name in grid.field_data.keys()}  # noqa: SIM118
-    assert names == {"region:walls": 0, "region:floor slab": 1, "region:roof": 2}
-
-
-def test_meshio_reads_the_mesh(tmp_path, tagged_mesh):
-    write_vtu(tmp_path / "mesh.vtu", tagged_mesh)
-    read = meshio.read(tmp_path / "mesh.vtu")
-    assert np.array_equal(read.points, tagged_mesh.points_m)
-    assert np.array_equal(read.cells_dict["tetra"], tagged_mesh.tets)
-    assert np.array_equal(read.point_data["temperature_c"], tagged_mesh.temperature_c)
 
 
 def test_temperature_of_a_later_step_replaces_the_meshs_own(tmp_path, box_mesh):
@@ -78,20 +58,6 @@ def test_summary_keeps_order_and_converts_numpy(tmp_path):
     assert read["source"] == "run/config.yml"
     assert '\n  "volume_m3": 0.5' in text
     assert "°C" in text
-
-
-@pytest.mark.parametrize(
-    ("summary", "message"),
-    [
-        ({"a": {"b": [1.0, float("nan")]}}, r"summary\.a\.b\[1\]: expected a finite number, got nan"),
-        ({"a": np.array([np.inf])}, r"summary\.a\[0\]: expected a finite number"),
-        ({"a": {1, 2}}, r"summary\.a: expected text.*got set"),
-    ],
-)
-def test_summary_refuses_what_json_lacks(tmp_path, summary, message):
-    with pytest.raises(MeshError, match=message):
-        write_summary(tmp_path / "summary.json", summary)
-    assert not list(tmp_path.iterdir())
 
 
 def names_in(data: pv.DataSet) -> list[str]:

@@ -11,7 +11,7 @@ from nerfstudio.cameras.rays import RayBundle
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.mesh.solid.threshold import automatic_threshold
+from thermoxels_ns.mesh.solid.voxels import automatic_threshold
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import GridSamples, sample_rays
 from thermoxels_ns.training.ray_statistics import field_evidence
@@ -97,15 +97,3 @@ def test_what_a_surface_lets_through_makes_nothing_solid_behind_it():
     cells = automatic_threshold(snapshot, snapshot.centre_density()).cells
     assert cells.any(axis=(1, 2)).nonzero()[0].tolist() == [9] and cells[9].all()
     assert snapshot.evidence is not None and snapshot.evidence.voxel_weight[4].sum() > 40.0  # of 1,600 rays
-
-
-def test_fog_without_a_surface_is_said_to_be_the_least_that_counts():
-    """Rays end in such fog only because the box is deep; the threshold stays at its lower bound and nothing breaks."""
-    snapshot = Layers(np.full(17, np.log(0.4))).snapshot()
-    fainter = Layers(np.full(17, np.log(0.1))).snapshot()
-    assert snapshot.evidence is not None and fainter.evidence is not None
-    assert len(snapshot.evidence.half_depth_density) == 1600 and len(fainter.evidence.half_depth_density) == 0
-    chosen = automatic_threshold(snapshot, snapshot.centre_density())
-    assert chosen.density == pytest.approx(0.4, rel=1e-5) and "100% of the 1600 training rays" in chosen.explanation
-    assert chosen.cells.any()
-    assert not automatic_threshold(fainter, fainter.centre_density()).cells.any()

@@ -5,17 +5,16 @@ import pytest
 
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
-from thermoxels_ns.mesh.solid.threshold import (
+from thermoxels_ns.mesh.solid.voxels import (
     FEWEST_RAYS,
-    LEAST_WEIGHT,
     OPAQUE_OPTICAL_DEPTH,
     OPTICAL_DEPTH_BOUNDS,
     SHARE_OF_RAYS,
-    SHARE_THAT_ENDS,
+    SolidSelection,
     automatic_threshold,
     optical_depth_threshold,
+    select_solid,
 )
-from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 
 VOXEL = 0.25
 MET = np.repeat(np.arange(1.0, 11.0), [30, 130, *[105] * 8])
@@ -60,14 +59,6 @@ def test_the_threshold_leaves_the_asked_share_of_rays_a_solid_voxel_to_end_on():
     assert chosen.cells[:, :, 5].all(axis=1).tolist() == [False] + [True] * 9 and chosen.cells.sum() == 90
 
 
-def test_fog_that_rays_pass_through_goes_however_much_light_it_takes():
-    density = wall_in_fog(fog=0.15)
-    # Nine tenths of all weight is spent in the fog.
-    chosen = automatic(field(density, MET, np.full_like(density, 10.0)))
-    assert chosen.density == 2.0 and chosen.cells.sum() == 90
-    assert "hold 9% of the weight" in chosen.explanation
-
-
 @pytest.mark.parametrize(("scale", "bound"), [(1e-6, 0), (1e6, 1)])
 def test_the_threshold_stays_within_bounds(scale, bound):
     density = wall_in_fog() * scale
@@ -75,14 +66,6 @@ def test_the_threshold_stays_within_bounds(scale, bound):
     chosen = automatic(field(density, MET * scale))
     assert chosen.density == pytest.approx(OPTICAL_DEPTH_BOUNDS[bound] / VOXEL)
     assert ("the least that is not half-transparent", "the most that is asked")[bound] in chosen.explanation
-
-
-def test_the_voxel_whose_density_is_the_threshold_is_solid():
-    """Densities of rays are float32 numbers that float64 arithmetic must not miss."""
-    met = np.full(1000, np.float32(1.0) / np.float32(3.0))
-    density = np.zeros((3, 3, 3))
-    density[1, 1, 1] = met[0]
-    assert np.argwhere(automatic(field(density, met)).cells).tolist() == [[1, 1, 1]]
 
 
 def leak() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -102,22 +85,6 @@ def test_voxels_in_which_no_ray_ends_are_solid_only_if_they_are_opaque():
     assert chosen.density == 2.0
     assert chosen.cells[:, :, 5].all() and chosen.cells[:4, :, 3].all() and chosen.cells.sum() == 140
     assert "60 voxels that dense are left out" in chosen.explanation
-
-
-def test_a_voxel_belongs_to_the_surface_if_rays_rather_end_in_it_than_pass():
-    density, weight, ends = leak()
-    weight[:, :, 5] = 100.0
-    ends[:5, :, 5], ends[5:, :, 5] = 1.01 * SHARE_THAT_ENDS * 100.0, 0.99 * SHARE_THAT_ENDS * 100.0
-    chosen = automatic(field(density, MET, weight, ends))
-    assert np.array_equal(np.argwhere(chosen.cells), np.argwhere(density[:5] * (np.arange(10) == 5)))
-
-
-def test_where_rays_are_few_density_alone_decides():
-    """Half a ray's weight in a voxel does not tell whether any ends there; with more it does."""
-    density, weight, ends = leak()
-    weight[:5, :, 3], weight[5:, :, 3] = 0.99 * LEAST_WEIGHT, 1.01 * LEAST_WEIGHT
-    chosen = automatic(field(density, MET, weight, ends))
-    assert chosen.cells[:5, :, 3].all() and not chosen.cells[5:, :, 3].any()
 
 
 def test_a_few_dense_voxels_behind_a_surface_do_not_widen_the_body():

@@ -24,14 +24,6 @@ def cells_along_x(values: list[float]) -> np.ndarray:
     return np.broadcast_to(np.array(layers, dtype=np.float32)[:, None, None], (len(layers), 2, 2))
 
 
-def test_density_of_a_voxel_is_the_mean_of_its_corners(snapshot_of):
-    density = np.zeros((2, 2, 2))
-    density[0, 0, 0] = 8.0
-    assert select_solid(snapshot_of(density), SolidSelection(close_gaps=0, density_threshold=1.0)).cells.all()
-    with pytest.raises(MeshError, match=r"1\.001.*highest density at a voxel centre is 1\."):
-        select_solid(snapshot_of(density), SolidSelection(close_gaps=0, density_threshold=1.001))
-
-
 @pytest.mark.parametrize("percentile", [50.0, 75.0, 90.0, 99.0])
 def test_percentile_keeps_the_densest_share_of_all_voxels(snapshot_of, percentile):
     density = np.random.default_rng(0).random((11, 11, 11))
@@ -129,17 +121,6 @@ def test_a_wall_thickness_needs_a_scale_and_cameras(facade):
         select_solid(replace(facade, views=None), selection, 1.0)
 
 
-def test_a_room_that_photographs_were_taken_in_stays_empty(snapshot_of):
-    density = np.full((21, 21, 21), 9.0)
-    density[4:17, 4:17, 4:17] = 0.0
-    inside = looking_at((5.0, 5.0, 5.0), [(4.0, 4.0, 5.5), (6.0, 4.5, 5.0)])
-    field = snapshot_of(density)
-    room = select_solid(replace(field, views=inside), SolidSelection(density_threshold=5.0))
-    assert not room.cells[5:15, 5:15, 5:15].any()
-    assert "1 cavities with a camera in them stay empty" in step_of(room, "interior").remark
-    assert select_solid(field, SolidSelection(density_threshold=5.0)).cells.all()
-
-
 def test_what_the_cameras_cannot_look_into_is_filled(snapshot_of):
     """A box without a floor, photographed from above and all around."""
     density = np.zeros((21, 21, 21), dtype=np.float32)
@@ -156,33 +137,6 @@ def test_what_the_cameras_cannot_look_into_is_filled(snapshot_of):
     step = step_of(solid, "interior")
     assert step.added == 8 * 8 * 10 and "640 voxels that cameras cannot look into" in step.remark
     assert (select_solid(field, SolidSelection(close_gaps=0, interior="hollow")).cells == (shell > 0)).all()
-
-
-def test_the_steps_lead_from_nothing_to_the_result(snapshot_of):
-    random = np.random.default_rng(3)
-    field = snapshot_of(random.random((14, 13, 12)) ** 3)
-    solid = select_solid(field, SolidSelection(density_percentile=85.0))
-    assert [step.name for step in solid.steps] == ["threshold", "close gaps", "region", "interior"]
-    assert sum(step.added - step.removed for step in solid.steps) == solid.cells.sum()
-    assert step_of(solid, "threshold").remark == solid.explanation and solid.explanation.startswith("The densest 15 %")
-    assert all(step.remark.endswith(".") and step.added >= 0 <= step.removed for step in solid.steps)
-
-
-@pytest.mark.parametrize("case", ["one voxel", "full", "checkerboard", "noise", "one voxel wide"])
-def test_the_level_has_the_sign_of_the_choice_in_hard_cases(snapshot_of, corner_density, case):
-    shape = (7, 6, 1) if case == "one voxel wide" else (7, 6, 5)
-    cells = {
-        "one voxel": np.arange(210).reshape(7, 6, 5) == 100,
-        "full": np.ones(shape, dtype=bool),
-        "checkerboard": np.indices(shape).sum(axis=0) % 2 == 0,
-        "noise": np.random.default_rng(0).random(shape) < 0.3,
-        "one voxel wide": np.random.default_rng(1).random(shape) < 0.5,
-    }[case]
-    field = replace(snapshot_of(corner_density(cells)), voxel_density=50.0 * cells.astype(np.float32))
-    for options in ({}, {"close_gaps": 0, "interior": "hollow", "region": "all"}):
-        solid = select_solid(field, SolidSelection(density_threshold=1.0, **options))
-        assert np.array_equal(solid.level > 0, solid.cells) and np.array_equal(solid.level < 0, ~solid.cells)
-    assert np.array_equal(solid.cells, cells)
 
 
 @pytest.mark.parametrize(

@@ -49,20 +49,6 @@ def test_space_that_cameras_look_through_stays_empty():
     assert wall_behind(cells, LATTICE, views, 5.0)[8:12, 8:16, 8:16].all()
 
 
-def test_a_corner_grows_on_its_inner_side_only():
-    cells = np.zeros((N, N, N), dtype=bool)
-    cells[18, 3:19, 2:22] = cells[3:19, 18, 2:22] = True
-    views = looking_at((9.0, 9.0, 6.0), [(40.0, 25.0, 6.0), (25.0, 40.0, 6.0), (40.0, 40.0, 8.0)])
-    added = wall_behind(cells, LATTICE, views, 4.0)
-    assert added[15:18, 8, 10].all() and added[8, 15:18, 10].all() and added[16, 16, 10]
-    assert not added[:14, :14].any() and not added[19:].any() and not added[:, 19:].any()
-
-
-def test_what_nobody_sees_does_not_grow():
-    away = looking_at((80.0, 6.0, 6.0), [(40.0, 6.0, 6.0)])
-    assert not wall_behind(plate(), LATTICE, away, 5.0).any()
-
-
 def test_it_does_not_reach_a_shadow_beyond_seen_space():
     """A camera looks along the back of the plate through a slot three voxels wide; nobody looks behind that slot."""
     front = looking_at((6.0, 6.0, 6.0), FRONT[:1])

@@ -1,6 +1,3 @@
-from dataclasses import fields
-from itertools import product
-
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -18,9 +15,9 @@ from tests.support.stuffed_shapes import (
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.stuffing.bcc_lattice import bcc_lattice
-from thermoxels_ns.mesh.stuffing.coarse_interior import balanced_octree, coarse_interior, split_in_eight
+from thermoxels_ns.mesh.stuffing.coarse_interior import coarse_interior
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
+from thermoxels_ns.mesh.stuffing.lattice import bcc_lattice
 
 
 def ball(cells: int, radius: float, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
@@ -87,17 +84,6 @@ def test_the_inside_changes_and_the_surface_does_not(kind, seed):
     assert count < 0.9 * len(uniform.tets)
 
 
-@pytest.mark.parametrize("radius", [6.2, 7.9, 9.5, 11.3, 12.8])
-def test_balls_anywhere(radius):
-    random = np.random.default_rng(int(10 * radius))
-    level = ball(31, radius, tuple(random.uniform(-1, 1, size=3)))
-    graded, uniform = stuff(level), stuff(level, coarsest=1)
-    quality = check_mesh(tet_mesh(graded))
-    assert same_surface(graded, uniform)
-    assert quality.volume_m3 == pytest.approx(signed_volumes(uniform.points, uniform.tets).sum(), rel=1e-13)
-    assert quality.num_tets < len(uniform.tets)
-
-
 @pytest.mark.parametrize("coarsest", [2, 4, 8, 16])
 def test_angles_of_the_coarse_part(coarsest):
     lattice = bcc_lattice(ball(64, 31.0))
@@ -122,22 +108,6 @@ def test_full_box_by_hand():
     assert len(uniform.points) - len(solid.points) == 4**3 + 12 + 6
     assert quality.volume_m3 == pytest.approx(512.0, rel=1e-14)
     assert solid.on_box.all() and same_surface(solid, uniform)
-
-
-@pytest.mark.parametrize("name", ["wall", "rod", "small box", "noise"])
-def test_nothing_deep_leaves_the_mesh_as_it_is(name):
-    level = np.full((16, 17, 18), -1.0)
-    if name == "wall":
-        level[5:10, 1:-1, 1:-1] = 1.0
-    elif name == "rod":
-        level[6:11, 6:11] = 1.0
-    elif name == "small box":
-        level[5:10, 5:10, 5:10] = 1.0
-    else:
-        level = np.random.default_rng(1).normal(size=level.shape)
-    graded, uniform = stuff(level), stuff(level, coarsest=1)
-    for item in fields(StuffedSolid):
-        assert np.array_equal(getattr(graded, item.name), getattr(uniform, item.name)), item.name
 
 
 def test_place_in_the_lattice_does_not_matter():
@@ -167,61 +137,3 @@ def test_edges_that_are_no_power_of_two(bad):
         MeshError, match=r"coarsest: expected 1, 2, 4, 8 or another power of two, \[voxels\], got .* Pass 4, or 1"
     ):
         stuff(np.ones((3, 3, 3)), coarsest=bad)
-
-
-def test_no_edge_is_too_large():
-    level = ball(30, 13.0)
-    assert np.array_equal(stuff(level, coarsest=2**40).tets, stuff(level, coarsest=64).tets)
-    assert np.array_equal(stuff(level, coarsest=np.int64(4)).tets, stuff(level).tets)
-
-
-def edges_of_cubes(cells: np.ndarray, largest: int) -> np.ndarray:
-    """Edge of the cube that each voxel is in, [voxels]."""
-    edges = np.ones(cells.shape, dtype=np.int64)
-    for number, level in enumerate(balanced_octree(cells, largest)):
-        whole = level
-        for below in range(number, -1, -1):
-            half = tuple(-(-n // 2**below) for n in cells.shape)
-            whole = split_in_eight(whole, half)
-        edges[whole] = 2 ** (number + 1)
-    return edges
-
-
-def edges_from_above(cells: np.ndarray, largest: int) -> np.ndarray:
-    """The same by splitting: the largest cubes that hold nothing else, halved until all neighbours fit."""
-    edges = np.ones(cells.shape, dtype=np.int64)
-    size = 2
-    while size <= largest:
-        for corner in product(*(range(0, n - size + 1, size) for n in cells.shape)):
-            cube = tuple(slice(c, c + size) for c in corner)
-            if cells[cube].all():
-                edges[cube] = size
-        size *= 2
-    while True:
-        smallest = ndimage.minimum_filter(edges, size=3, mode="constant", cval=1)
-        wrong = edges > 2 * smallest
-        if not wrong.any():
-            return edges
-        for size in np.unique(edges[wrong]):
-            lowest = np.argwhere(wrong & (edges == size)) // size * size
-            for corner in np.unique(lowest, axis=0):
-                edges[tuple(slice(c, c + size) for c in corner)] = size // 2
-
-
-@pytest.mark.parametrize("largest", [1, 2, 4, 16, 2**40])
-@pytest.mark.parametrize("seed", range(4))
-def test_every_cube_is_as_large_as_balance_allows(seed, largest):
-    random = np.random.default_rng(seed)
-    shape = tuple(random.integers(20, 40, size=3))
-    cells = random.random(shape) > 10.0 ** -random.uniform(2, 4.5)
-    found = edges_of_cubes(cells, largest)
-    assert np.array_equal(found, edges_from_above(cells, min(largest, 64)))
-    assert found.max() <= largest and np.all(found[~cells] == 1)
-
-
-def test_sizes_in_a_large_cube():
-    edges = edges_of_cubes(np.ones((62, 62, 62), dtype=bool), 64)
-    middle = edges[31, 31]
-    # One layer of every size, as far as where the sizes begin allows: 2, 4, 8 and so on from either side.
-    assert middle[:32].tolist() == [2] * 4 + [4] * 4 + [8] * 8 + [16] * 16
-    assert middle[32:].tolist() == [16] * 16 + [8] * 8 + [4] * 4 + [2] * 2

@@ -2,15 +2,12 @@ from itertools import combinations, product
 
 import numpy as np
 import pytest
-from scipy.spatial import KDTree
 
-from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres, tet_mesh, volumes_and_angles
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, centres, tet_mesh, volumes_and_angles
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.report import check_mesh
-from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, bcc_lattice
-from thermoxels_ns.mesh.stuffing.isosurface import stuff
-from thermoxels_ns.mesh.stuffing.stencils import BUNDLE_EDGES, BUNDLE_POINTS, CODE_WEIGHTS, stencil_table
-from thermoxels_ns.mesh.stuffing.warp import ALPHA_INSIDE, ALPHA_OUTSIDE, warp
+from thermoxels_ns.mesh.stuffing.isosurface import BUNDLE_EDGES, BUNDLE_POINTS, CODE_WEIGHTS, stencil_table, stuff
+from thermoxels_ns.mesh.stuffing.lattice import ALPHA_INSIDE, ALPHA_OUTSIDE, DIRECTIONS
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (3, 2, 1), (1, 4, 5), (4, 3, 5)])
@@ -38,32 +35,6 @@ def test_linear_level_gives_its_plane_exactly(seed):
     distance = (nodes - [6.0, 5.5, 5.0]) @ normal
     assert np.count_nonzero(far) > 50
     assert np.ptp(distance[far]) < 1e-12
-
-
-def test_binary_half_space_ends_on_the_voxel_faces():
-    level = np.full((6, 5, 4), -1.0)
-    level[:3] = 1.0
-    solid = stuff(level)
-    quality = check_mesh(tet_mesh(solid))
-    assert quality.volume_m3 == pytest.approx(3 * 5 * 4, rel=1e-14)
-    surface = solid.points[solid.facets[~solid.on_box]]
-    assert np.all(surface[..., 0] == 3.0)
-
-
-def test_only_ratios_of_levels_matter():
-    level = SHAPES["torus"].level(16)
-    first, second = stuff(level), stuff(level * 2.0**900)
-    assert np.array_equal(first.points, second.points) and np.array_equal(first.tets, second.tets)
-    single = stuff(level.astype(np.float32))
-    assert np.array_equal(single.tets, stuff(level.astype(np.float32).astype(np.float64)).tets)
-
-
-def test_axes_are_alike():
-    level = SHAPES["torus"].level(16)
-    here, turned, mirrored = stuff(level), stuff(level.transpose(1, 2, 0)), stuff(level[::-1])
-    for points, other in ((here.points[:, [1, 2, 0]], turned), (np.abs([16, 0, 0] - here.points), mirrored)):
-        assert len(points) == len(other.points) and len(here.tets) == len(other.tets)
-        assert KDTree(points).query(other.points)[0].max() < 1e-12
 
 
 def test_tags_of_nodes_and_triangles():
@@ -155,18 +126,6 @@ def test_angles_of_every_stencil_at_the_ends_of_all_ranges(signs):
         assert _tet_volumes(corners).min() > 0.0
         _, low, high = volumes_and_angles(corners.reshape(-1, 3), np.arange(4 * len(corners)).reshape(-1, 4))
         assert low > 10.94 and high < 163.75
-
-
-def test_smooth_surface_moves_every_near_point():
-    """Holding cuts back costs accuracy: it must not happen where the solid is thick."""
-    for name in ("sphere", "torus"):
-        lattice = bcc_lattice(SHAPES[name].level(48))
-        warped = warp(lattice)
-        neighbour = lattice.level[lattice.neighbours(warped.cut_points)]
-        own = lattice.level[warped.cut_points][:, None]
-        cut = np.isfinite(warped.cuts)
-        assert len(warped.moved) > 1000
-        assert np.allclose(warped.cuts[cut], (own / (own - neighbour))[cut], rtol=1e-12), name
 
 
 @pytest.mark.parametrize("level", [np.full((3, 3, 3), -1.0), np.zeros((2, 2, 2)), np.ones((0, 4, 4))])

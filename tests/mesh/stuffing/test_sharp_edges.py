@@ -3,7 +3,6 @@ import pytest
 from scipy.spatial import KDTree
 
 from tests.support.stuffed_shapes import (
-    ANGLE_BOUNDS_DEG,
     SHAPES,
     Shape,
     box_distance,
@@ -15,9 +14,8 @@ from tests.support.stuffed_shapes import (
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.stuffing.edge_planes import Surface
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
-from thermoxels_ns.mesh.stuffing.sharp_edges import ANGLES_DEG, LONGEST_MOVE, sharpen
+from thermoxels_ns.mesh.stuffing.sharp_edges import ANGLES_DEG, LONGEST_MOVE, Surface, sharpen
 
 CELLS = 48
 VOXEL = 2.0 / CELLS
@@ -153,25 +151,6 @@ def test_smooth_and_noisy_surfaces_stay(name, noise):
     solid, sharp = sharpened(level)
     assert len(moved(solid, sharp)) <= 2e-4 * np.count_nonzero(solid.on_surface)
     assert relative_errors(SHAPES[name], sharp)[1] == pytest.approx(relative_errors(SHAPES[name], solid)[1], abs=1e-3)
-
-
-def test_steps_of_a_staircase_are_no_edges():
-    level = np.sign(SHAPES["sphere"].level(CELLS))
-    solid, sharp = sharpened(level)
-    assert len(moved(solid, sharp)) == 0
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_any_levels_keep_the_angles(seed):
-    random = np.random.default_rng(seed)
-    waves = sum(np.cos(centres(20, 18, 16) @ random.normal(size=3) * 0.4 + random.uniform(0, 6)) for _ in range(3))
-    for level in (random.normal(size=(10, 9, 11)), np.clip(waves, -0.3, 0.3), np.sign(waves)):
-        sharp = sharpened(level)[1]
-        quality = check_mesh(tet_mesh(sharp))
-        assert (
-            ANGLE_BOUNDS_DEG[0] <= quality.dihedral_range_deg[0] <= quality.dihedral_range_deg[1] <= ANGLE_BOUNDS_DEG[1]
-        )
-        assert np.all((sharp.points >= 0.0) & (sharp.points <= level.shape))
 
 
 def test_what_lies_on_the_border_stays_there():

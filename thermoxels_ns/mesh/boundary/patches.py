@@ -1,10 +1,17 @@
-"""Patches of boundary triangles and regions of tetrahedra, default ones and a user's."""
+"""Patches of boundary triangles and regions of tetrahedra, default ones and a user's.
+
+``configs/patches-example.yaml`` explains every key of a user's file.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from numbers import Real
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,10 +19,132 @@ import numpy.typing as npt
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.boundary.patch_rules import DEFAULT_PATCHES, DEFAULT_REGION, FACINGS, PatchRules, Rule
+from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, wrong
 
+FACINGS = ("up", "side", "down")  # Where a surface may face
+DEFAULT_PATCHES = (*(f"{where}-{facing}" for where in ("exterior", "interior") for facing in FACINGS), "cut")
+"""Names of the patches that every mesh has, in this order."""
+DEFAULT_REGION = "solid"  # Name of region 0
+
+Vector = tuple[float, float, float]
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")
 _COS_45 = math.sqrt(0.5) + 1e-9
 """A little above the cosine of 45 degrees, so that a roof of exactly 45 degrees is a side whatever its rounding."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box that holds the centroid, its border included, [m]."""
+
+    lower: Vector
+    upper: Vector
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.lower, self.upper)):
+            got = f"{[*self.lower]} and {[*self.upper]}"
+            raise wrong("corners", "each number of lower below that of upper", got, "Correct them.")
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane, [m]; the centroid lies on it or on the side that its normal points to."""
+
+    point: Vector
+    normal: Vector
+
+    def __post_init__(self) -> None:
+        if not (all(map(math.isfinite, self.point)) and 0.0 < math.hypot(*self.normal) < math.inf):
+            got = f"{[*self.point]} and {[*self.normal]}"
+            raise wrong("point and normal", "finite numbers, and a normal that is not 0", got, "Correct them.")
+
+
+@dataclass(frozen=True)
+class Colour:
+    """A colour in whole numbers to 255 or in decimals to 1.0, and the longest distance to it on the same scale."""
+
+    rgb: tuple[Real, Real, Real]
+    max_distance: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not all(0.0 <= float(part) <= 255.0 for part in self.rgb):
+            raise wrong("rgb", "three numbers from 0 to 255, or from 0.0 to 1.0", [*self.rgb])
+        if all(isinstance(part, int) for part in self.rgb) and max(map(float, self.rgb)) == 1.0:
+            bright, dark = [float(part) for part in self.rgb], [round(float(part) / 255.0, 4) for part in self.rgb]
+            raise wrong(
+                "rgb",
+                "whole numbers up to 255 or decimals up to 1.0",
+                f"{[*self.rgb]}, which may be either",
+                f"Write {bright} for a bright colour or {dark} for a dark one.",
+            )
+        if not self.max_distance > 0.0:
+            raise wrong("max_distance", "a number above 0, on the scale of rgb", self.max_distance)
+
+    def distance(self, colours: npt.NDArray) -> FloatArray:
+        """Root of the summed squared differences to colours in [0, 1], infinite beyond the longest; (n, 3) to (n,)."""
+        whole = all(isinstance(part, int) for part in self.rgb) or max(map(float, self.rgb)) > 1.0
+        scale = 255.0 if whole else 1.0
+        distance = np.linalg.norm(colours - np.array(self.rgb, dtype=np.float64) / scale, axis=1)
+        return np.where(distance <= self.max_distance / scale, distance, np.inf)
+
+
+@dataclass(frozen=True)
+class RegionRule:
+    """What belongs to a region: everything that meets all conditions that are given."""
+
+    name: str  # Name of the patch or region; rules of the same name add up
+    box: Box | None = None
+    plane: Plane | None = None
+    nearest_colour: Colour | None = None
+    """Of all rules that have one and whose other conditions hold, the closest wins."""
+
+    def __post_init__(self) -> None:
+        if not _NAME.fullmatch(self.name):
+            expected = "up to 40 letters, digits, - and _ that start with a letter"
+            raise wrong("name", expected, repr(self.name), "Rename it.")
+        conditions = [*vars(self)][1:]
+        if all(getattr(self, key) is None for key in conditions):
+            raise wrong(self.name, f"at least one of {', '.join(conditions)}", "only a name")
+
+
+@dataclass(frozen=True)
+class PatchRule(RegionRule):
+    """What belongs to a patch."""
+
+    only: Literal["exterior", "interior", "cut", "all"] | None = None  # Part of the boundary
+    facing: Literal["up", "side", "down", "any"] | None = None  # Where the normal points
+
+
+@dataclass(frozen=True)
+class PatchRules:
+    """A user's patches and regions, in the order of the file: later rules win."""
+
+    patches: tuple[PatchRule, ...] = ()  # Rules for boundary triangles
+    regions: tuple[RegionRule, ...] = ()  # Rules for tetrahedra
+
+
+@raising(MeshError)
+def load_patch_rules(path: Path | str) -> PatchRules:
+    """Read a user's patches and regions from a yaml file.
+
+    Raises:
+        MeshError: No such file, no yaml, or an entry that cannot be understood; the message says which.
+    """
+    path = Path(path)
+    rules = as_record(path.name, read_yaml(path), PatchRules)
+    for kind, entries, taken in (
+        ("patches", rules.patches, DEFAULT_PATCHES),
+        ("regions", rules.regions, (DEFAULT_REGION,)),
+    ):
+        known = {name.lower(): name for name in taken}
+        for number, entry in enumerate(entries, start=1):
+            before = known.setdefault(entry.name.lower(), entry.name)
+            if before in taken or before != entry.name:
+                others = f"a name other than {', '.join(taken)}"
+                expected = others if before in taken else f"{before}, as above, or another"
+                remedy = "Choose another name; solvers do not tell capitals from small letters."
+                raise wrong(f"{path.name}: {kind} entry {number}: name", expected, entry.name, remedy)
+    return rules
 
 
 class Applied(NamedTuple):
@@ -81,18 +210,13 @@ def apply_patches(
     """
     patch, names = default_patches(normals, up, seen, on_box)
     direction = facing(normals, up)
-    surfaces = {
-        "exterior": ~on_box & seen,
-        "interior": ~on_box & ~seen,
-        "cut": on_box,
-        "all": np.ones(len(patch), dtype=bool),
-    }
+    parts = {"exterior": ~on_box & seen, "interior": ~on_box & ~seen, "cut": on_box}
     allowed = [
-        surfaces[rule.only] & (True if rule.facing == "any" else direction == FACINGS.index(rule.facing))
+        parts.get(rule.only or "all", True)
+        & (True if rule.facing in (None, "any") else direction == FACINGS.index(rule.facing))
         for rule in rules.patches
     ]
-    owner = _rule_of_each(rules.patches, "patch", allowed, len(patch), centroids_m, colours)
-    return _applied(rules.patches, "patch", owner, patch, names)
+    return _applied(rules.patches, "patch", allowed, patch, names, centroids_m, colours)
 
 
 def apply_regions(rules: PatchRules, tet_centroids: FloatArray, tet_colours: npt.NDArray | None = None) -> Applied:
@@ -103,71 +227,46 @@ def apply_regions(rules: PatchRules, tet_centroids: FloatArray, tet_colours: npt
     Raises:
         MeshError: A rule asks for colours and there are none, or shapes do not fit.
     """
-    count = len(tet_centroids)
-    allowed = [np.ones(count, dtype=bool)] * len(rules.regions)
-    owner = _rule_of_each(rules.regions, "region", allowed, count, tet_centroids, tet_colours)
-    return _applied(rules.regions, "region", owner, np.zeros(count, dtype=np.int64), (DEFAULT_REGION,))
+    start, everywhere = np.zeros(len(tet_centroids), dtype=np.int64), [True] * len(rules.regions)
+    return _applied(rules.regions, "region", everywhere, start, (DEFAULT_REGION,), tet_centroids, tet_colours)
 
 
-def _applied(rules: Sequence[Rule], kind: str, owner: IntArray, start: IntArray, names: tuple[str, ...]) -> Applied:
-    """Overwrite `start` where a rule owns the element, and append the rules' names."""
-    all_names = tuple(dict.fromkeys((*names, *(rule.name for rule in rules))))
-    number = np.array([all_names.index(rule.name) for rule in rules], dtype=np.int64)
-    index = start.copy()
-    owned = owner >= 0
-    index[owned] = number[owner[owned]]
-    followed = np.bincount(owner[owned], minlength=len(rules)) > 0
-    idle = (f"{kind} {rule.name} (entry {n})" for n, rule in enumerate(rules, start=1) if not followed[n - 1])
-    return Applied(index, all_names, tuple(idle))
-
-
-def _rule_of_each(
-    rules: Sequence[Rule],
+def _applied(
+    rules: Sequence[RegionRule],
     kind: str,
-    allowed: Sequence[BoolArray],
-    count: int,
+    allowed: Sequence[BoolArray | bool],
+    start: IntArray,
+    names: tuple[str, ...],
     centroids: FloatArray,
     colours: npt.NDArray | None,
-) -> IntArray:
-    """Number of the rule that each of `count` elements follows, -1 for none, shape (count,).
-
-    `allowed` says for each rule where `only` and `facing` hold.
-    """
-    remedy = f"Pass one centroid and one colour per element that gets a {kind}."
+) -> Applied:
+    """Overwrite `start` where a rule holds, and append the rules' names; `allowed` says where other conditions do."""
+    count, remedy = len(start), f"Pass one centroid and one colour per element that gets a {kind}."
     check_shape("centroids", centroids, (count, 3), remedy, MeshError)
     check_finite("centroids", centroids, remedy, MeshError)
-    matches = []
-    for rule, mask in zip(rules, allowed):  # the borders of boxes and planes belong to them
-        inside = mask.copy()
+    closest, winner, matches = np.full(count, np.inf), np.full(count, -1), []
+    for number, (rule, mask) in enumerate(zip(rules, allowed)):
+        inside = np.full(count, True) & mask
         if rule.box is not None:
-            lower, upper = rule.box
-            inside &= np.all((centroids >= lower) & (centroids <= upper), axis=1)
+            inside &= np.all((centroids >= rule.box.lower) & (centroids <= rule.box.upper), axis=1)
         if rule.plane is not None:
-            point, normal = rule.plane
-            inside &= (centroids - point) @ np.array(normal) >= 0.0
+            inside &= (centroids - rule.plane.point) @ np.array(rule.plane.normal) >= 0.0
+        if rule.nearest_colour is not None:
+            if colours is None:
+                expected = "a mesh with colours, because its rule is by nearest_colour"
+                other = "Use box or plane, or a model that was trained on colour photographs."
+                raise MeshError(f"{kind} {rule.name}", expected=expected, got="a mesh without", remedy=other)
+            check_shape("colours", colours, (count, 3), remedy, MeshError)
+            distance = np.where(inside, rule.nearest_colour.distance(colours), np.inf)
+            wins = np.isfinite(distance) & (distance <= closest)
+            closest[wins], winner[wins] = distance[wins], number
         matches.append(inside)
 
-    coloured = [number for number, rule in enumerate(rules) if rule.colour is not None]
-    if coloured:
-        if colours is None:
-            raise MeshError(
-                f"{kind} {rules[coloured[0]].name}",
-                expected="a mesh with colours, because its rule is by nearest_colour",
-                got="a mesh without",
-                remedy="Use box or plane, or a model that was trained on colour photographs.",
-            )
-        check_shape("colours", colours, (count, 3), remedy, MeshError)
-        closest = np.full(count, np.inf)
-        winner = np.full(count, -1)
-        for number in coloured:
-            rule = rules[number]
-            distance = np.linalg.norm(colours - rule.colour, axis=1)
-            wins = matches[number] & (distance <= rule.max_colour_distance) & (distance <= closest)
-            closest[wins], winner[wins] = distance[wins], number
-        for number in coloured:
-            matches[number] = winner == number
-
     owner = np.full(count, -1, dtype=np.int64)
-    for number, match in enumerate(matches):
-        owner[match] = number
-    return owner
+    for number, (rule, match) in enumerate(zip(rules, matches)):
+        owner[match if rule.nearest_colour is None else winner == number] = number
+    all_names = tuple(dict.fromkeys((*names, *(rule.name for rule in rules))))
+    index = np.append([all_names.index(rule.name) for rule in rules], 0).astype(np.int64)[owner]
+    followed = np.bincount(owner[owner >= 0], minlength=len(rules)) > 0
+    idle = (f"{kind} {rule.name} (entry {n})" for n, rule in enumerate(rules, start=1) if not followed[n - 1])
+    return Applied(np.where(owner >= 0, index, start), all_names, tuple(idle))

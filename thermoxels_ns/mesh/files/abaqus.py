@@ -17,8 +17,7 @@ from thermoxels_ns.core.checks import check_positive, replace_when_done, writabl
 from thermoxels_ns.core.errors import HeatError, MeshError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content
-from thermoxels_ns.mesh.quality.checks import facet_area_vectors
-from thermoxels_ns.mesh.quality.face_count import facet_owners
+from thermoxels_ns.mesh.quality.checks import facet_area_vectors, facet_owners
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
@@ -57,23 +56,17 @@ class HeatStep:
 def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> None:
     """Write a mesh as an input file of CalculiX and Abaqus that runs as it is: ``ccx NAME`` for ``NAME.inp``.
 
-    Metres, kilograms, seconds and degrees Celsius; absolute zero and the Stefan-Boltzmann constant are in the file,
-    so that radiation can be added. Node and tetrahedron k of the mesh have the number k + 1. In the file:
+    Metres, kilograms, seconds, degrees Celsius. Node and tetrahedron k have the number k + 1. In the file:
 
-    - ``NALL`` and ``EALL``: all nodes and all elements. The elements are called DC3D4, which Abaqus asks for in heat
-      transfer and CalculiX takes for C3D4.
+    - ``NALL`` and ``EALL``: all nodes and all elements, of type DC3D4, which CalculiX takes for C3D4.
     - ``REGION-<name>``: elements of a region; ``MATERIAL-<name>``: its material, the same for all regions.
-    - ``PATCH-<name>``: nodes of a boundary patch, and under the same name its element faces as a surface.
-      Before it, a comment says how large the true surface is and how large its triangles are together. In voxel
-      meshes the latter is larger: multiply the film coefficient and the emissivity of a load on the surface (``*FILM``,
-      ``*RADIATE``, a flux of ``*DFLUX``) by the ratio.
+    - ``PATCH-<name>``: nodes of a boundary patch, and under the same name its element faces as a surface. Before it, a
+      comment says by what ratio to multiply film coefficients, emissivities and fluxes in voxel meshes.
     - ``OBSERVED``: the nodes whose temperature was measured, if there are any.
     - Initial temperatures, and a heat transfer step without boundary conditions that prints temperatures (``NT``).
 
     Names are in capitals; what is neither letter, digit nor underscore becomes an underscore. Empty regions and
     patches are left out, because an empty set stops a solver.
-
-    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     path = check_suffix(path, ".inp")
     if heat_step is None:

@@ -131,10 +131,9 @@ def surface_of(points_m: FloatArray, facets: IntArray) -> Surface:
 
 
 def far_origin(points_m: FloatArray) -> FloatArray | None:
-    """Where to count positions from so that single precision can hold them: the middle of the nodes in whole units.
+    """Where to count positions from so that single precision holds them: the middle of the nodes in whole units.
 
-    None where the origin of the coordinates will do. Five million metres from it, as in national coordinates, single
-    precision has steps of half a metre.
+    None where the origin will do. Five million metres from it single precision has steps of half a metre.
 
     >>> far_origin(np.array([[4.0e6, 0.2, 0.0], [4.0e6 + 9.0, 2.6, 1.0]]))
     array([4.000004e+06, 1.000000e+00, 0.000000e+00])
@@ -145,10 +144,7 @@ def far_origin(points_m: FloatArray) -> FloatArray | None:
 
 
 def temperature_colours(surface: Surface, temperature_c: FloatArray) -> FloatArray:
-    """Colours of a surface's nodes, red, green, blue in [0, 1] as screens show them (sRGB), shape (m, 3).
-
-    The colour map spans the surface's own temperatures; a surface of one temperature gets the map's middle.
-    """
+    """Colours of a surface's nodes in [0, 1] (sRGB), shape (m, 3), from a map that spans the surface's temperatures."""
     import matplotlib
 
     low, high = surface_range_c(surface, temperature_c)

@@ -11,13 +11,10 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content
-from thermoxels_ns.mesh.quality.face_count import facet_owners
+from thermoxels_ns.mesh.quality.checks import facet_owners
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 TEMPERATURE_VIEW = "temperature_c"  # name of the view of nodal temperatures, [degrees Celsius]
-
-FACTOR_VIEW = "area_factor"  # name of the view of true area over the triangle's own, for voxel meshes
-NORMAL_VIEW = "normal"  # name of the view of the true surface's outward normals, for voxel meshes
 
 _LONGEST_NAME = 127
 _TRIANGLE, _TETRAHEDRON = 2, 4
@@ -30,14 +27,11 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
     Regions are physical volumes and patches are physical surfaces, both numbered from 1 in the order of their names;
     one that is empty is left out. Nodal temperatures are a view, "temperature_c". A mesh whose triangles stand for
     another area than their own, as in voxel meshes, has two more: "area_factor" and "normal" of the true surface at
-    each triangle, the same at its three nodes; multiply a flux through a triangle by the first. meshio passes them by.
-    Tetrahedron k of the mesh has the tag k + 1, and the boundary triangles follow. Nodes are numbered anew: Gmsh wants
-    them sorted by the patch or region they lie on, and meshio takes a node's place in the file for its number.
+    each triangle, the same at its three nodes. Tetrahedron k of the mesh has the tag k + 1, and the boundary triangles
+    follow; nodes are numbered anew, by the patch or region they lie on, as Gmsh wants them.
 
-    Layout: "MSH file format", Gmsh reference manual, version 4.1 of the format. meshio's own writer is no help: it has
-    one group to a name, and a patch may have a region's; it writes boxes of zeros around entities and tags of its own.
-
-    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
+    Layout: "MSH file format", Gmsh reference manual, version 4.1. meshio's writer has one group to a name, and a patch
+    may have a region's.
     """
     path = check_suffix(path, ".msh")
     content = file_content(mesh)
@@ -72,7 +66,7 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
         table["value"] = content.temperature_c[order]
         file.writelines([_header("NodeData", TEMPERATURE_VIEW, 1, count), table.tobytes(), b"\n$EndNodeData\n"])
         if np.any(content.area_factor != 1.0):
-            for name, values in ((FACTOR_VIEW, content.area_factor[:, None]), (NORMAL_VIEW, content.normal)):
+            for name, values in (("area_factor", content.area_factor[:, None]), ("normal", content.normal)):
                 file.writelines(_triangle_view(name, len(content.tets) + 1, values))
 
 

@@ -31,10 +31,7 @@ _UNLIT = "KHR_materials_unlit"
 
 
 def write_stl(path: Path | str, mesh: TetMesh) -> None:
-    """Write the boundary triangles as binary STL, which knows nothing but shapes; lengths are metres.
-
-    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
-    """
+    """Write the boundary triangles as binary STL, which knows nothing but shapes; lengths are metres."""
     from trimesh import Trimesh
     from trimesh.exchange.stl import export_stl
 
@@ -65,11 +62,9 @@ def check_stl(mesh: TetMesh) -> None:
 def write_ply(path: Path | str, mesh: TetMesh) -> None:
     """Write the boundary as binary PLY with colours and temperatures (read by MeshLab, CloudCompare, Blender).
 
-    Vertex properties: x, y, z [m], red, green, blue, `temperature_c` [degrees Celsius] and `observed` (1: measured,
-    0: extended). Colours are those of the photographs, of temperatures where the mesh has none; a comment says which.
-    trimesh and VTK write positions in single precision, and meshio the time of day, so the few lines are our own.
-
-    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
+    Vertex properties: x, y, z [m], red, green, blue, `temperature_c` [degrees Celsius] and `observed`. Colours are
+    those of the photographs, of temperatures where the mesh has none; a comment says which. trimesh and VTK write
+    positions in single precision, meshio the time of day.
     """
     path = check_suffix(path, ".ply")
     content = file_content(mesh)
@@ -81,12 +76,8 @@ def write_ply(path: Path | str, mesh: TetMesh) -> None:
     else:
         shown, colours = "photographs", colour_bytes(np.asarray(mesh.colour, dtype=np.float64)[surface.nodes])
     columns = {
-        "x": ("double", "<f8", surface.points_m[:, 0]),
-        "y": ("double", "<f8", surface.points_m[:, 1]),
-        "z": ("double", "<f8", surface.points_m[:, 2]),
-        "red": ("uchar", "u1", colours[:, 0]),
-        "green": ("uchar", "u1", colours[:, 1]),
-        "blue": ("uchar", "u1", colours[:, 2]),
+        **{name: ("double", "<f8", values) for name, values in zip("xyz", surface.points_m.T)},
+        **{name: ("uchar", "u1", values) for name, values in zip(("red", "green", "blue"), colours.T)},
         "temperature_c": ("float", "<f4", content.temperature_c[surface.nodes]),
         "observed": ("uchar", "u1", mesh.observed[surface.nodes]),
     }
@@ -115,12 +106,9 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
     """Write the boundary as binary glTF 2.0 with a colour per node; lengths are metres.
 
     glTF's up is +y: the file holds mesh coordinates and a matrix that turns `up` to it. Colours are stored as light
-    intensities (linear), as glTF asks for, and shown as they are, without lamps (``KHR_materials_unlit``), so that a
-    colour stands for one temperature. Positions are in single precision; those of a mesh far from the origin count from
-    its middle, and the matrix brings it back. The vertex attribute ``_TEMPERATURE_C`` holds the temperatures
-    themselves, and the ends of the colour map are in the mesh's ``extras``.
-
-    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
+    intensities and shown without lamps (``KHR_materials_unlit``), so that a colour stands for one temperature.
+    Positions are in single precision; far from the origin they count from the middle, and the matrix brings them back.
+    The vertex attribute ``_TEMPERATURE_C`` holds the temperatures, the mesh's ``extras`` the ends of the colour map.
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb

@@ -1,9 +1,12 @@
-"""Meshes as VTK files: the body (.vtu) and its tagged boundary (.vtp)."""
+"""Meshes as VTK files, written and read back: the body (.vtu) and its tagged boundary (.vtp)."""
 
 from __future__ import annotations
 
+import base64
+import binascii
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,14 +15,26 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.checks import check_finite, check_shape, plain_os_errors, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values
-from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content, node_arrays, surface_of
-from thermoxels_ns.mesh.quality.checks import facet_areas
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+from thermoxels_ns.mesh.files.content import (
+    check_suffix,
+    colour_bytes,
+    file_content,
+    node_arrays,
+    surface_of,
+    write_bytes,
+)
+from thermoxels_ns.mesh.quality.checks import count_wrong_facets, facet_areas, group_faces
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
 
 _DISK_IS_FULL = 20007  # VTK's own number
+_REMEDY = "Export the mesh again with ns-export thermoxels-mesh."
+_REGION = "region:"
+_TETRAHEDRON = 10  # VTK's number for the kind of cell
+_MOST_COMPRESSION = 1040  # Bytes that zlib can make of one: 1032, and a little
 
 
 def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None) -> None:
@@ -88,11 +103,8 @@ def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
     Raises:
         MeshError: A number is NaN or infinite (json has neither), or a value has no place in json.
     """
-    text = summary_text(summary)
     path = Path(path)
-    writable_folder(path.parent)
-    with replace_when_done(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_bytes(path, [summary_text(summary).encode()])
 
 
 def summary_text(summary: Mapping[str, Any]) -> str:
@@ -121,8 +133,6 @@ def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
 
     A mesh without boundary tags is written with the triangles' own normals and areas, one patch "boundary", and
     without `seen`, which nobody knows.
-
-    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkStringArray
@@ -158,3 +168,169 @@ def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
     data.GetFieldData().AddArray(names)
     data.set_active_scalars("temperature_c")
     write_vtk(vtkXMLPolyDataWriter(), path, data)
+
+
+def read_mesh(path: Path | str) -> TetMesh:
+    """Read ``NAME.vtu`` and the ``NAME-boundary.vtp`` beside it.
+
+    All comes back as it was written, bit for bit, but colours, which files hold as bytes.
+
+    Raises:
+        MeshError: A file is missing, cannot be read, lacks an array, or the two do not belong together.
+    """
+    path = Path(path)
+    if path.suffix != ".vtu":
+        raise _wrong("mesh file", "a name that ends in .vtu", path.name, "Pass the mesh.vtu of an export.")
+    body, surface = _read(path), _read(boundary_path(path))
+    points = check_finite(f"{path.name}: points", np.array(body.points, dtype=np.float64), _REMEDY, MeshError)
+    others = np.count_nonzero(body.celltypes != _TETRAHEDRON)
+    if others:
+        raise _wrong(path.name, "tetrahedra only", f"{others} cells of other kinds")
+    tets = np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4)
+    names = _region_names(body, path.name)
+    region = _cell_numbers(body, "region", path.name, len(names))
+    colour = body.point_data.get("colour")
+    facets, tags = _boundary(surface, points, boundary_path(path).name)
+    on_box = _array(surface.cell_data, "on_box", boundary_path(path).name) != 0
+    mesh = TetMesh(
+        points_m=points,
+        tets=tets,
+        temperature_c=_array(body.point_data, "temperature_c", path.name).astype(np.float64),
+        observed=_array(body.point_data, "observed", path.name) != 0,
+        facets=facets,
+        facet_tags=np.where(on_box, FACET_BOX, FACET_SURFACE).astype(np.int64),
+        region=region,
+        region_names=names,
+        boundary=tags,
+        colour=None if colour is None else (np.asarray(colour) / 255.0).astype(np.float32),
+    )
+    _check_boundary(mesh, path)
+    return mesh
+
+
+def _check_boundary(mesh: TetMesh, path: Path) -> None:
+    """Refuse tetrahedra that are listed twice, and triangles that are not the faces of one tetrahedron each."""
+    faces = group_faces(mesh.tets)
+    wrong = count_wrong_facets(mesh, faces)
+    if not wrong and faces.sizes.max() <= 2:
+        return
+    doubled = len(mesh.tets) - len(np.unique(np.sort(mesh.tets, axis=1), axis=0))
+    if doubled:
+        raise _wrong(path.name, "every tetrahedron once", f"{doubled} of {len(mesh.tets)} listed again")
+    if not wrong:
+        remedy = "Remove tetrahedra that lie in each other, or export the mesh again."
+        raise _wrong(path.name, "faces of one or two tetrahedra each", "faces of more", remedy)
+    expected, got = "every face of one tetrahedron alone, and no other", f"{wrong} missing, inside or turned over"
+    raise _wrong(boundary_path(path).name, expected, got)
+
+
+def _read(path: Path) -> Any:
+    """Read a VTK file; a damaged one is an error, not an empty mesh."""
+    import pyvista as pv
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
+
+    if not path.is_file():
+        raise _wrong(path.name, f"a file at {path}", "none")
+    reader: Any = vtkXMLPolyDataReader() if path.suffix == ".vtp" else vtkXMLUnstructuredGridReader()
+    reader.SetFileName(str(path))
+    data = None
+    with plain_os_errors(path, "a VTK file that can be read", "Check its permissions.", MeshError):
+        sound = _sizes_fit(path.read_bytes())
+    with silent_vtk() as complaints:
+        if sound and reader.CanReadFile(str(path)):
+            reader.Update()
+            data = pv.wrap(reader.GetOutput())
+    if data is None or complaints.events or reader.GetErrorCode() or not data.n_cells:
+        raise _wrong(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one")
+    return data
+
+
+def _sizes_fit(content: bytes) -> bool:
+    """Whether the arrays of a VTK file, as `write_mesh` writes them, claim no more than its bytes can hold.
+
+    VTK ends the process where a damaged size is too large for the memory. Files written otherwise are not checked.
+    """
+    header = re.search(rb'header_type="UInt(32|64)"[^>]*compressor="vtkZLibDataCompressor"', content)
+    begin = re.search(rb'<AppendedData encoding="base64">\s*_', content)
+    if header is None or begin is None:
+        return True
+    width = int(header[1]) // 8
+    most = _MOST_COMPRESSION * len(content)
+    for offset in re.findall(rb'offset="(\d+)', content[: begin.start()]):
+        start = begin.end() + int(offset)
+        # An array begins with the number of its blocks, the size of a block, that of the last one, those compressed.
+        blocks, size, last = _numbers(content[start : start + 4 * width], width, 3)
+        if blocks * width > len(content) or max(blocks * size, last) > most:
+            return False
+        letters = -(-(3 + blocks) * width // 3) * 4
+        packed = _numbers(content[start : start + letters], width, 3 + blocks)[3:]
+        if sum(packed) > len(content):
+            return False
+    return True
+
+
+def _numbers(letters: bytes, width: int, count: int) -> list[int]:
+    """Little-endian numbers of `width` bytes in base64; what is not there or no base64 is as large as can be."""
+    try:
+        found = base64.b64decode(letters + b"=" * (-len(letters) % 4), validate=True)
+    except binascii.Error:
+        found = b""
+    whole = found + b"\xff" * max(0, width * count - len(found))
+    return [int.from_bytes(whole[width * k : width * (k + 1)], "little") for k in range(count)]
+
+
+def _region_names(body: Any, name: str) -> tuple[str, ...]:
+    """Names by their numbers, which the file holds one by one."""
+    arrays = body.GetFieldData()
+    numbers = {}
+    for place in range(arrays.GetNumberOfArrays()):
+        array = arrays.GetAbstractArray(place)
+        if (array.GetName() or "").startswith(_REGION) and array.GetNumberOfValues() == 1:
+            numbers[int(array.GetVariantValue(0).ToInt())] = array.GetName().removeprefix(_REGION)
+    if sorted(numbers) != list(range(len(numbers))) or not numbers:
+        raise _wrong(name, f"field arrays {_REGION}NAME numbered from 0", sorted(numbers) or "none")
+    return tuple(numbers[number] for number in range(len(numbers)))
+
+
+def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Boundary | None]:
+    node = _array(surface.point_data, "node", name).astype(np.int64)
+    if node.min() < 0 or node.max() >= len(points) or not np.array_equal(points[node], surface.points):
+        raise _wrong(name, "the boundary of the mesh beside it", "that of another one")
+    if not surface.is_all_triangles:
+        raise _wrong(name, "triangles only", "other polygons")
+    facets = node[np.asarray(surface.regular_faces, dtype=np.int64)]
+    if "seen" not in surface.cell_data:
+        return facets, None
+    array = surface.GetFieldData().GetAbstractArray("patch_names")
+    if array is None:
+        raise _wrong(name, "the field array patch_names", "none")
+    names = tuple(str(array.GetValue(number)) for number in range(array.GetNumberOfValues()))
+    normal = np.array(_array(surface.cell_data, "normal", name), dtype=np.float64)
+    counts, photographs = [f"photographs_{what}" for what in ("seen", "supporting")], None
+    if any(count in surface.cell_data for count in counts):
+        photographs = np.stack([_array(surface.cell_data, n, name).astype(np.int64) for n in counts], axis=1)
+    return facets, Boundary(
+        normal=check_shape("normal", normal, (len(facets), 3), _REMEDY, MeshError),
+        area_factor=np.array(_array(surface.cell_data, "area_factor", name), dtype=np.float64),
+        seen=_array(surface.cell_data, "seen", name) != 0,
+        patch=_cell_numbers(surface, "patch", name, len(names)),
+        patch_names=names,
+        photographs=photographs,
+    )
+
+
+def _cell_numbers(data: Any, array: str, name: str, count: int) -> IntArray:
+    numbers = _array(data.cell_data, array, name).astype(np.int64)
+    if numbers.min() < 0 or numbers.max() >= count:
+        raise _wrong(f"{name}: {array}", f"0 to {count - 1}", f"{numbers.min()} to {numbers.max()}")
+    return numbers
+
+
+def _array(data: Any, array: str, name: str) -> npt.NDArray:
+    if array not in data:
+        raise _wrong(name, f"an array {array}", f"{', '.join(sorted(data.keys())) or 'none'}")
+    return check_finite(f"{name}: {array}", np.array(data[array]), _REMEDY, MeshError)
+
+
+def _wrong(name: str, expected: str, got: object, remedy: str = _REMEDY) -> MeshError:
+    return MeshError(name, expected=expected, got=got, remedy=remedy)

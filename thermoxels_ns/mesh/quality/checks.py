@@ -1,22 +1,23 @@
-"""Areas and normals of triangles; nodes at one place, triangles that are missing, cracks."""
+"""Areas of triangles; faces, edges and components of a mesh: which are shared, missing or doubled."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.mesh.quality.face_count import Groups, boundary_facets, group_pairs
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-_MOST_TRIED, _NEAREST = 2_000, 16
-"""Tetrahedra of a body that are looked for in another one, and those of the other, by their centres, that may hold
-each."""
-_WITHIN = 1e-6  # How far inside a tetrahedron, as a share of its heights, a point lies in it beyond doubt
+OUTWARD_FACES: IntArray = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
+"""Faces of a positively oriented tetrahedron; face f lies opposite node f, its right-hand normal points outwards."""
+TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int64)
+"""Positions of a tetrahedron's nodes at the ends of its six edges, shape (6, 2)."""
 
 
 def facet_area_vectors(points: FloatArray, facets: IntArray) -> FloatArray:
@@ -37,6 +38,138 @@ def facet_normals(points: FloatArray, facets: IntArray) -> FloatArray:
     return vectors / np.where(length > 0.0, length, 1.0)
 
 
+@dataclass(frozen=True)
+class Groups:
+    """Rows put together by equality; group g is `order[start[g]:start[g + 1]]`, the last one ends with `order`."""
+
+    order: IntArray  # row numbers, those of a group in a row; within a group in no particular order. Shape (rows,).
+    start: IntArray
+    """Where each group starts in `order`, shape (groups,); groups go by their first and then their second number."""
+
+    @property
+    def sizes(self) -> IntArray:
+        """Number of rows in each group, shape (groups,)."""
+        return np.diff(np.append(self.start, len(self.order)))
+
+    @property
+    def first(self) -> IntArray:
+        """Smallest row number of each group, shape (groups,)."""
+        return np.minimum.reduceat(self.order, self.start) if len(self.start) else self.start
+
+    def sums(self, values: npt.NDArray) -> npt.NDArray:
+        """Sum of a value per row over each group, shape (groups,)."""
+        return np.add.reduceat(values[self.order], self.start) if len(self.start) else values[:0]
+
+    def pairs(self) -> tuple[IntArray, IntArray]:
+        """Rows that follow each other inside a group."""
+        follows = np.ones(len(self.order), dtype=bool)
+        follows[self.start] = False
+        at = np.flatnonzero(follows)
+        return self.order[at - 1], self.order[at]
+
+
+def group_pairs(first: IntArray, second: IntArray) -> Groups:
+    """Find the rows in which a pair of whole numbers of at least 0 is the same.
+
+    Two stages, both linear in memory: a counting sort by the first number (a sparse row turned into columns), then a
+    sort of the few rows that share it. On a million tetrahedra this is several times faster than one sort of all rows.
+
+    >>> groups = group_pairs(np.array([5, 2, 5, 2]), np.array([1, 9, 1, 0]))
+    >>> groups.sizes, groups.first
+    (array([1, 1, 2]), array([3, 1, 0]))
+    """
+    rows = len(first)
+    if rows == 0:
+        return Groups(*np.zeros((2, 0), dtype=np.int64))
+    shape = (int(first.max()) + 1, int(second.max()) + 1)
+    by_first = sparse.csr_array((np.arange(rows), first, np.array([0, rows])), shape=(1, shape[0])).tocsc()
+    rows_by_first, starts = (np.asarray(array, dtype=np.int64) for array in (by_first.data, by_first.indptr))
+    by_both = sparse.csr_array((rows_by_first, second[rows_by_first], starts), shape=shape)
+    by_both.sort_indices()
+    new = np.append(True, by_both.indices[1:] != by_both.indices[:-1])
+    new[starts[:-1][np.diff(starts) > 0]] = True
+    return Groups(np.asarray(by_both.data, dtype=np.int64), np.flatnonzero(new))
+
+
+def group_faces(tets: IntArray) -> Groups:
+    """Find the faces that tetrahedra share; row 4 t + f is the face of tetrahedron t opposite its node f."""
+    node = [np.ascontiguousarray(tets[:, n]) for n in range(4)]
+    # Sorted element by element with five comparisons.
+    a, b = np.minimum(node[0], node[1]), np.maximum(node[0], node[1])
+    c, d = np.minimum(node[2], node[3]), np.maximum(node[2], node[3])
+    s0, low, high, s3 = np.minimum(a, c), np.maximum(a, c), np.minimum(b, d), np.maximum(b, d)
+    s1, s2 = np.minimum(low, high), np.maximum(low, high)
+    size = int(s3.max()) + 1 if len(tets) else 1
+    lowest, others = np.empty((len(tets), 4), dtype=np.int64), np.empty((len(tets), 4), dtype=np.int64)
+    for n, left_out in enumerate(node):
+        lowest[:, n] = np.where(left_out == s0, s1, s0)
+        others[:, n] = np.where(left_out <= s1, s2, s1) * size + np.where(left_out == s3, s2, s3)
+    return group_pairs(lowest.ravel(), others.ravel())
+
+
+def group_sides(facets: IntArray) -> Groups:
+    """Find the edges that triangles share; row 3 f + s is the side of triangle f from its node s to the next."""
+    ends = np.roll(facets, -1, axis=1)
+    return group_pairs(np.minimum(facets, ends).ravel(), np.maximum(facets, ends).ravel())
+
+
+def triangles_across_edges(sides: Groups) -> IntArray:
+    """Pairs of triangles that share an edge, shape (p, 2), from `group_sides`."""
+    return np.stack(sides.pairs(), axis=1) // 3
+
+
+def component_of(num: int, first: IntArray, second: IntArray) -> IntArray:
+    """Number of the connected component that each of `num` things is in, shape (num,)."""
+    links = sparse.coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
+    return connected_components(links, directed=False)[1].astype(np.int64) if num else np.zeros(0, dtype=np.int64)
+
+
+def boundary_facets(tets: IntArray, faces: Groups | None = None) -> IntArray:
+    """Triangles that belong to exactly one tetrahedron, outwards, shape (f, 3), ordered by their sorted node numbers.
+
+    `faces` is `group_faces(tets)` where that is already known.
+
+    >>> boundary_facets(np.array([[0, 1, 2, 3], [1, 3, 2, 4]])).shape
+    (6, 3)
+    """
+    faces = group_faces(tets) if faces is None else faces
+    rows = faces.first[faces.sizes == 1]
+    return tets.ravel().take((rows & ~3)[:, None] + OUTWARD_FACES[rows & 3])
+
+
+def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
+    """Tetrahedron of every boundary triangle, and which of its four nodes lies opposite to it, each shape (f,).
+
+    Only faces whose nodes all lie on the boundary are looked at, so the sort follows the surface, not the volume.
+
+    Raises:
+        MeshError: A triangle is listed twice, is no face of a tetrahedron, or lies between two.
+
+    >>> facet_owners(np.array([[0, 1, 2, 3]]), np.array([[0, 2, 1], [1, 2, 3]]))
+    (array([0, 0]), array([3, 0]))
+    """
+    if not len(facets):
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    size, count = max(int(tets.max()), int(facets.max())) + 1, len(facets)
+    on_boundary = np.zeros(size, dtype=bool)
+    on_boundary[facets.ravel()] = True
+    flags = on_boundary[tets]
+    # A face is on the boundary's nodes if the only node that is not is the one opposite, or none is not.
+    tet, face = np.nonzero((flags.sum(axis=1)[:, None] - flags) == 3)
+    faces = np.concatenate([facets, tets[tet[:, None], OUTWARD_FACES[face]]]).astype(np.int64)
+    low, middle, high = np.sort(faces, axis=1).T
+    groups = group_pairs(low, middle * size + high)
+    first, last = groups.first, np.maximum.reduceat(groups.order, groups.start)
+    good = (groups.sizes == 2) & (first < count) & (last >= count)
+    if np.count_nonzero(good) != count:
+        expected = "different triangles, each a face of exactly one tetrahedron"
+        remedy, got = "Build the mesh with thermoxels_ns.mesh.build.", f"{count - np.count_nonzero(good)} others"
+        raise MeshError("facets", expected=expected, got=got, remedy=remedy)
+    of_facet = np.empty(count, dtype=np.int64)
+    of_facet[first[good]] = last[good] - count
+    return tet[of_facet], face[of_facet]
+
+
 def count_twin_nodes(points: FloatArray) -> int:
     """Number of nodes at the place of an earlier one."""
     ordered = points[np.lexsort(points.T)]
@@ -45,9 +178,11 @@ def count_twin_nodes(points: FloatArray) -> int:
 
 def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
     """Number of triangles to take from and add to `mesh.facets` (one turned over counts twice) to get the faces of one
-    owner, normals outwards. `faces` is `face_count.group_faces(mesh.tets)`."""
+    owner, normals outwards. `faces` is `group_faces(mesh.tets)`."""
     wanted = boundary_facets(mesh.tets, faces)
-    both = np.concatenate([_smallest_first(wanted), _smallest_first(mesh.facets)])
+    both = np.concatenate([wanted, mesh.facets]).astype(np.int64)
+    turn = (np.argmin(both, axis=1)[:, None] + np.arange(3)) % 3  # the smallest node first, so orientation stays
+    both = np.take_along_axis(both, turn, axis=1)
     same = group_pairs(both[:, 0], both[:, 1] * len(mesh.points_m) + both[:, 2])
     return int(np.abs(same.sums(np.repeat([1, -1], [len(wanted), len(mesh.facets)]))).sum())
 
@@ -56,7 +191,7 @@ def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
     """Number of pairs of triangles that share an edge and lie on the same side of it in the same plane.
 
     This is how a crack looks: the faces of neighbours that do not match are boundary triangles, one upon the other.
-    `sides` is `topology.group_sides(facets)`.
+    `sides` is `group_sides(facets)`.
     """
     normals = facet_normals(points, facets)
     facet, side = np.divmod(sides.order, 3)
@@ -74,37 +209,85 @@ def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
 
 
 def count_tets_in_other_bodies(mesh: TetMesh) -> int:
-    """Number of tetrahedra whose centre lies in a body that they share no node with; of many, some are tried."""
+    """Number of tetrahedra whose centre lies in a body that they share no node with."""
+    import pyvista as pv
+
     points, tets = mesh.points_m, mesh.tets
-    pairs = sparse.coo_matrix(
-        (np.ones(3 * len(tets), bool), (np.repeat(tets[:, 0], 3), tets[:, 1:].ravel())), shape=(len(points),) * 2
-    )
-    of_node = connected_components(pairs, directed=False)[1]
-    body, sizes = np.unique(of_node[tets[:, 0]], return_inverse=True, return_counts=True)[1:]
-    if len(sizes) == 1:
-        return 0
+    body = component_of(len(points), tets[:, :3].ravel(), tets[:, 1:].ravel())[tets[:, 0]]
     centres, found = points[tets].mean(axis=1), 0
-    by_body = np.split(np.argsort(body, kind="stable"), np.cumsum(sizes)[:-1])
-    low, high = (np.array([end(points[tets[own]], axis=(0, 1)) for own in by_body]) for end in (np.min, np.max))
-    for number, own in enumerate(by_body[:-1]):
-        close = np.all((low <= high[number]) & (high >= low[number]), axis=1)
-        close[: number + 1] = False
-        if not close.any():
-            continue
-        others = np.concatenate([by_body[other] for other in np.flatnonzero(close)])
-        for around, inside in ((own, others), (others, own)):
-            tried = inside[:: len(inside) // _MOST_TRIED + 1]
-            tree: Any = KDTree(centres[around])
-            near = tree.query(centres[tried], k=list(range(1, min(len(around), _NEAREST) + 1)))[1]
-            corner = points[tets[around[near]]]
-            sides = np.swapaxes(corner[:, :, 1:] - corner[:, :, :1], 2, 3)
-            shares = np.linalg.solve(sides, (centres[tried][:, None] - corner[:, :, 0])[..., None])[..., 0]
-            holds = (shares.min(axis=2) > _WITHIN) & (shares.sum(axis=2) < 1.0 - _WITHIN)
-            found += int(np.count_nonzero(holds.any(axis=1)))
+    for number in np.unique(body) if body.any() else ():
+        corners = points[tets[body == number]]
+        low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        near = (body != number) & np.all((centres > low) & (centres < high), axis=1)
+        if near.any():
+            own = pv.UnstructuredGrid({pv.CellType.TETRA: tets[body == number]}, points)
+            found += int(np.count_nonzero(np.atleast_1d(own.find_containing_cell(centres[near])) >= 0))
     return found
 
 
-def _smallest_first(facets: IntArray) -> IntArray:
-    """Turn each triangle so that its smallest node comes first; its orientation stays."""
-    turn = (np.argmin(facets, axis=1)[:, None] + np.arange(3)) % 3
-    return np.take_along_axis(facets, turn, axis=1)
+@dataclass(frozen=True)
+class SurfaceComponent:
+    """Triangles of the boundary that hang together by edges."""
+
+    num_triangles: int
+    euler_characteristic: int  # vertices - edges + triangles
+    genus: int | None
+    """Number of handles, (2 - Euler characteristic) / 2; None where the component is not a closed manifold."""
+    is_cavity: bool
+    """True where it bounds a hole inside a body: it is closed and the volume that it encloses is negative."""
+
+
+def surface_topology(points: FloatArray, facets: IntArray, sides: Groups) -> dict[str, Any]:
+    """Count the components of a triangulated surface, their handles, and where it is no manifold.
+
+    Nodes (n, 3), [m]; triangles (f, 3), right-hand normal out of the body; `sides` is `group_sides(facets)`. The
+    figures have the names that they have in `report.QualityReport`.
+    """
+    uses, (left, right) = sides.sizes, sides.pairs()
+    start, rows = facets.ravel(), np.arange(facets.size)
+    next_corner = rows - rows % 3 + (rows + 1) % 3
+    upwards = start < start[next_corner]
+    component = component_of(len(facets), left // 3, right // 3)
+    # Corner 3 f + s of triangle f lies at its node s. Two corners at one node are in one fan if an edge with just two
+    # triangles lies between them.
+    two_only = np.zeros(len(rows), dtype=bool)
+    two_only[sides.order] = np.repeat(uses == 2, uses)
+    left, right = left[two_only[left]], right[two_only[left]]
+    low, high = np.where(upwards, rows, next_corner), np.where(upwards, next_corner, rows)
+    fan = component_of(len(rows), np.concatenate([low[left], high[left]]), np.concatenate([low[right], high[right]]))
+    a_corner = np.zeros(int(fan.max(initial=-1)) + 1, dtype=np.int64)
+    a_corner[fan] = rows
+    fans_at_node = np.bincount(start[a_corner], minlength=1)
+
+    count = int(component.max(initial=-1)) + 1
+
+    def per_component(triangle: IntArray, weights: npt.NDArray | None = None) -> npt.NDArray:
+        return np.bincount(component[triangle], weights, minlength=count)
+
+    edge_triangle = sides.first // 3
+    triangles = per_component(rows[::3] // 3)
+    vertices = per_component(group_pairs(component[rows // 3], start).first // 3)
+    euler = vertices - per_component(edge_triangle) + triangles
+    closed = (per_component(edge_triangle, uses != 2) == 0) & (per_component(a_corner // 3) == vertices)
+    is_open = per_component(edge_triangle, uses % 2) > 0
+    # Signed volumes between triangles and the middle of the nodes.
+    corner = (points - points.mean(axis=0))[facets]
+    cones = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6.0
+    cavity = ~is_open & (per_component(rows[::3] // 3, cones) < 0.0)
+    components = []
+    for n in np.argsort(-triangles, kind="stable"):
+        genus = (2 - int(euler[n])) // 2 if closed[n] else None
+        components.append(SurfaceComponent(int(triangles[n]), int(euler[n]), genus, bool(cavity[n])))
+    return {
+        "num_non_manifold_edges": int(np.count_nonzero(uses > 2)),
+        "num_non_manifold_vertices": int(np.count_nonzero(fans_at_node > 1)),
+        "euler_characteristic": int(np.count_nonzero(fans_at_node)) - len(uses) + len(facets),
+        "genus": sum(one.genus or 0 for one in components) if closed.all() else None,
+        "components": tuple(components),
+    }
+
+
+def count_open_edges(facets: IntArray, sides: Groups) -> int:
+    """Number of edges whose triangles do not pass them equally often in both directions; 0: the surface is closed."""
+    upwards = facets < np.roll(facets, -1, axis=1)
+    return int(np.count_nonzero(sides.sums(np.where(upwards.ravel(), 1, -1))))

@@ -7,10 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import OutputError
-from thermoxels_ns.mesh.quality.criteria import DIHEDRAL_BOUNDS_DEG, angle_bins, in_percent
-from thermoxels_ns.mesh.quality.report import RATIO_BIN, QualityReport
+from thermoxels_ns.mesh.quality.report import (
+    DIHEDRAL_BOUNDS_DEG,
+    RATIO_EDGES,
+    QualityReport,
+    angle_edges,
+    in_percent,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,8 +55,7 @@ def picture_of_quality(path: Path | str, report: QualityReport) -> None:
 
 def _draw_angles(axis: Axes, report: QualityReport) -> None:
     low, high = DIHEDRAL_BOUNDS_DEG[report.boundary_mode]
-    bins = angle_bins(report.boundary_mode)
-    _draw_bars(axis, report.dihedral_counts, bins.first_centre_deg, bins.width_deg)
+    _draw_bars(axis, report.dihedral_counts, angle_edges(report.boundary_mode))
     across = axis.get_xaxis_transform()
     for bound, side, shift in ((low, "left", 4), (high, "right", -4)):
         axis.axvline(bound, color=_BOUND, linestyle="--", linewidth=1.3)
@@ -65,7 +70,7 @@ def _draw_angles(axis: Axes, report: QualityReport) -> None:
 
 
 def _draw_ratios(axis: Axes, report: QualityReport) -> None:
-    _draw_bars(axis, report.radius_ratio_counts, 0.5 * RATIO_BIN, RATIO_BIN)
+    _draw_bars(axis, report.radius_ratio_counts, RATIO_EDGES)
     axis.axvline(report.radius_ratio_mean, color=_PALE, linestyle=":", linewidth=1.3)
     worst, _ = report.radius_ratio_range
     axis.set_xlim(0.0, 1.0)
@@ -74,9 +79,8 @@ def _draw_ratios(axis: Axes, report: QualityReport) -> None:
     axis.set_title("Inscribed over circumscribed radius", fontsize=11)
 
 
-def _draw_bars(axis: Axes, counts: tuple[int, ...], first: float, width: float) -> None:
-    centres = first + width * np.arange(len(counts))
-    axis.bar(centres, counts, width, color=_BARS, edgecolor="white", linewidth=0.6)
+def _draw_bars(axis: Axes, counts: tuple[int, ...], edges: FloatArray) -> None:
+    axis.bar(edges[:-1], counts, np.diff(edges), align="edge", color=_BARS, edgecolor="white", linewidth=0.6)
     axis.set_yscale("log")
     axis.set_ylim(0.7, 4.0 * max(counts))
     axis.grid(axis="y", alpha=0.3)

@@ -11,7 +11,7 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 
 _CHUNK = 1 << 14  # tetrahedra at a time: what is worked on stays in the processor's cache
 _FACE_PAIRS = ((2, 3), (1, 3), (1, 2), (0, 3), (0, 2), (0, 1))
-"""Faces (by the node opposite) that meet in edge e of `face_count.TET_EDGES`."""
+"""Faces (by the node opposite) that meet in edge e of `checks.TET_EDGES`."""
 _RIGHT_ANGLE = 1e-9  # cosines below this are those of a right angle, up to rounding
 _FAR_SIZES = 16.0  # farther from the origin than this many times its own size, a mesh has nodes whose rounding counts
 _ANGLE_PER_ROUNDING = 4.0
@@ -35,7 +35,7 @@ class TetShapes:
         return self.six_volumes / 6.0
 
     def dihedral_cosines(self) -> FloatArray:
-        """Cosines of the inner angles between two faces, shape (6, t), at the edges of `face_count.TET_EDGES`.
+        """Cosines of the inner angles between two faces, shape (6, t), at the edges of `checks.TET_EDGES`.
 
         The angle at a face without area counts as 0 degrees; those of right angles, as far as rounding of the nodes
         lets one tell, are exactly 0.

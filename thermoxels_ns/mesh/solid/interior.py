@@ -21,11 +21,9 @@ LARGEST_PASS = 4_000_000  # lattices with more voxels than this are looked at in
 SHADOW_SURROUNDED = 0.1
 """Space that the shell itself hides is inside only if seen surfaces surround it at least this far, as a winding number:
 behind a surface seen from one side only it is up to one half; in the shadow before a wall it is 0 or less."""
-CREVICE_SURROUNDED = 0.3
-"""The same for space that only the filled inside hides: holes of the shell let cameras see it, so it needs more."""
+CREVICE_SURROUNDED = 0.3  # the same for space that only the filled inside hides
 STRAY_SHARE = 0.005
-"""Share of a body's solid voxels that may lie beyond each side of the box that bounds its hull: a few strays below a
-slab would make the underside that no camera sees as deep as the deepest of them."""
+"""Share of a body's solid voxels, strays, that may lie beyond each side of the box that bounds its hull."""
 _fast_length = cast(Callable[[int], int], fft.next_fast_len)
 MARGIN = 0.25  # the potential is zero this share of the lattice's size beyond it, on each side
 THINNEST_GROWN = 1.5
@@ -51,12 +49,11 @@ def interior(
 
     A body is what touches once openings of up to twice `seal` voxels are closed. Its inside are cavities of the sealed
     shell and, if the cameras are known, the space within its convex hull that they should see but do not, because the
-    shell stands in front of it (`free_space`), and that the backs of seen surfaces surround (`winding_number`). The
-    hull bounds the shadow behind bodies seen from one side; the winding number tells a body's shadow from its inside.
+    shell stands in front of it (`free_space`), and that the backs of seen surfaces surround (`winding_number`).
 
     Through holes of the shell a few cameras look past it onto what others know to be inside. Such lines of sight end
-    where that begins, and the cameras are asked again: crevices between shell and inside are hidden now. They are
-    filled where surfaces surround them well.
+    where that begins, and the cameras are asked again; crevices that are hidden now are filled where surfaces surround
+    them well.
     """
     sealed, within = close_gaps(cells, seal), np.ones_like(cells) if within is None else within
     enclosed, room = _enclosed(cells, sealed, lattice, views, seal)
@@ -167,13 +164,11 @@ def _without_strays(body: BoolArray) -> BoolArray:
 def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
     """Find how far the voxel faces between solid and air surround each voxel, those faces taken from their back.
 
-    It is 1 within a closed surface and 0 outside of it. Where the surface has a hole, it goes from one to the other
-    smoothly, and one half is a film across the hole; before a surface that is open it may be below 0. Faces with solid
-    on both sides, or next to voxels that are neither, are no surface; the two sides of a leaf cancel from afar. For
-    surfaces given as triangles: Jacobson, Kavan and Sorkine-Hornung 2013, Robust inside-outside segmentation using
-    generalized winding numbers, equation 5. Here it is the function that jumps by one across the surface and is
-    harmonic elsewhere, solved for with sine transforms in blocks of 2^3 voxels: Lap w = div J, where J holds the jumps.
-    All voxels of a block have the same.
+    It is 1 within a closed surface and 0 outside of it; where the surface has a hole, one half is a film across it.
+    Faces with solid on both sides, or next to voxels that are neither, are no surface. For triangles: Jacobson, Kavan
+    and Sorkine-Hornung 2013, Robust inside-outside segmentation using generalized winding numbers, equation 5. Here it
+    is the function that jumps by one across the surface and is harmonic elsewhere, solved for with sine transforms in
+    blocks of 2^3 voxels: Lap w = div J, where J holds the jumps.
     """
     shape = solid.shape
     # Lengths for which the transforms are fast, with the lattice about in the middle.
@@ -211,10 +206,9 @@ def _jumps(side: npt.NDArray[np.int8], axis: int) -> Float32Array:
 def wall_behind(cells: BoolArray, lattice: Lattice, views: Views, thickness: float) -> BoolArray:
     """Find the empty voxels that make the seen surface as thick as a wall, the seen voxel included, [voxels].
 
-    Seen surface are the solid voxels that enough cameras have a free line to (see `free_space`). An
-    empty voxel joins if it lies within the thickness of them, counted from their outer faces, on the straight way
-    through space that is solid or not seen. Voxels that cameras look through never join, so a plate that is seen from
-    both sides does not grow.
+    An empty voxel joins if it lies within the thickness of solid voxels that enough cameras see, counted from their
+    outer faces, on the straight way through space that is solid or not seen. A plate that is seen from both sides does
+    not grow.
     """
     added = np.zeros_like(cells)
     # The middle of a surface voxel lies half a voxel below its face, that of the last one half a voxel before the end.

@@ -1,4 +1,4 @@
-"""The level function whose zero is the surface, on voxel centres."""
+"""The level function on voxel centres whose zero is the surface; thin and small bodies keep their volume."""
 
 from __future__ import annotations
 
@@ -8,19 +8,28 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from thermoxels_ns.core.arrays import BoolArray, Float32Array
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, IntArray
 from thermoxels_ns.mesh.solid.morphology import bounding_box
-from thermoxels_ns.mesh.solid.surface_ramp import surface_ramp
-from thermoxels_ns.mesh.solid.volume_keeping import keep_volume
 
 DEEP_QUANTILE = 0.95  # before smoothing, a voxel as dense as this quantile of the dense ones has level 1 ..
 DEEP_RATIOS = (2.0, 100.0)  # ... but that density is kept within these multiples of the threshold.
 LEAST_LEVEL = 0.02
 """No voxel is nearer to 0 than this before smoothing: a surface never passes through a voxel's centre."""
-LEAST_SMOOTH_LEVEL = 0.005  # the same where density is a smooth ramp
 LEAST_SHARE = 0.25  # smoothing leaves at least this share of a voxel's level, with its sign
-MARGIN = 4  # voxels farther from the solid than this, along an axis, have level -1 without a look at their density
 LEAST_SHARE_THIN = 0.5  # the same in walls and gaps one voxel thick; they keep their thickness
+MARGIN = 4  # voxels farther from the solid than this, along an axis, have level -1 without a look at their density
+UNNOTICED = 0.12
+"""Up to this share of the solid (for gaps: of the empty space) within a voxel may be lost to smoothing. To that much,
+edges of large bodies and single bumps of noise are rounded off, which is what smoothing is for."""
+
+_ROUNDS = 5  # how often what is missing is looked for and made up
+_RATE = 1.5  # share of what is missing that each round makes up, if all of the surface moves alike
+_LEAST_SLOPE = 0.6
+"""Levels change by at least this much per voxel of shift, [1 / voxel]; else a speck that smoothing left nearly nothing
+of would never grow."""
+_CHUNK = 1 << 14  # voxels at a time: what is worked on stays in the processor's cache
+_AROUND = np.indices((3, 3, 3)).reshape(3, 27).T - 1
+_WINDOW = np.array([0.25, 0.5, 0.25], dtype=np.float32)[_AROUND + 1].prod(axis=1)
 
 
 def level_of(
@@ -33,15 +42,11 @@ def level_of(
 ) -> Float32Array:
     """Give every voxel a level in [-1, 1]: above 0 in solid voxels, below 0 in empty ones, 0 on the surface between.
 
-    Where density falls smoothly across the surface (`surface_ramp`), the level is a function of density that is linear
-    in the distance there; area and volume of a body are then of second order in the voxel size.
-
-    Trained density jumps by orders of magnitude between neighbours, mostly from exactly 0. There the level is
+    Trained density jumps by orders of magnitude between neighbours, mostly from exactly 0. So the level is
     s = log(density / threshold) / log(deep / threshold), at most 1, where that is above 0, and exp(s) - 1 below; deep
-    is the density of the densest part of the body. So it is 0 at the threshold and -1 where there is no density: the
+    is the density of the densest part of the body. It is 0 at the threshold and -1 where there is no density: the
     logarithm keeps what density says about the place of the surface. The weights 1 2 1 along each axis, over three
-    voxels, take the noise out, and the level shifts where thin or small bodies would lose volume by that
-    (`keep_volume`).
+    voxels, take the noise out, and the level shifts where thin or small bodies would lose volume by that.
 
     Args:
         density: At voxel centres, at least 0, [1 / world unit].
@@ -52,36 +57,11 @@ def level_of(
         makes_up_volume: Whether the level shifts in thin and small bodies so that its trilinear zero holds their
             volume. Not for voxels, which hold it as they are.
     """
-    level = np.full(cells.shape, -1.0, dtype=np.float32)
-    near = bounding_box(cells, MARGIN)
-    deep_ratio = _deep_ratio(density[dense], threshold)
-    around = density[near], threshold, deep_ratio, dense[near], cells[near]
-    ramp = surface_ramp(*around) if threshold > 0.0 else None
-    if ramp is None:
-        level[near] = _smoothed(*around, makes_up_volume)
-        return level
-    found = ramp.level
-    if ramp.belief.min() < 1.0:
-        smoothed = _smoothed(*around, makes_up_volume)
-        found = smoothed + ramp.belief * (found - smoothed)
-    level[near] = _signed(found, np.float32(LEAST_SMOOTH_LEVEL), cells[near])
-    return level
-
-
-def _smoothed(
-    density: npt.NDArray[np.floating],
-    threshold: float,
-    deep_ratio: float,
-    dense: BoolArray,
-    cells: BoolArray,
-    makes_up_volume: bool,
-) -> Float32Array:
-    """The level where density jumps."""
-    level = np.full(cells.shape, -1.0, dtype=np.float32)
-    positive = density > 0.0
-    # A threshold of 0 asks for any density at all; what has some is then deep inside.
-    smallest = max(threshold, float(np.finfo(np.float64).tiny))
-    share = (np.log(density[positive]) - math.log(smallest)) / math.log(deep_ratio)
+    result = np.full(cells.shape, -1.0, dtype=np.float32)
+    near, logarithm = bounding_box(cells, MARGIN), _logarithm_of_deep(density[dense], threshold)
+    density, dense, cells = density[near], dense[near], cells[near]
+    level, positive = np.full(cells.shape, -1.0, dtype=np.float32), density > 0.0
+    share = (np.log(density[positive]) - _safe_log(threshold)) / logarithm
     level[positive] = np.where(share < 0.0, np.expm1(share), share)
     np.clip(level, -1.0, 1.0, out=level)
     level[cells & ~dense] = 1.0
@@ -94,18 +74,22 @@ def _smoothed(
     least = np.abs(level)
     least *= np.where(_thin(cells) | _thin(~cells), np.float32(LEAST_SHARE_THIN), np.float32(LEAST_SHARE))
     smooth = np.clip(_signed(smooth, least, cells), np.float32(-1.0), np.float32(1.0))
-    return keep_volume(smooth, level, least, cells) if makes_up_volume else smooth
+    result[near] = _keep_volume(smooth, level, least, cells) if makes_up_volume else smooth
+    return result
 
 
-def _deep_ratio(dense: npt.NDArray[np.floating], threshold: float) -> float:
-    """How many times denser than the threshold the densest part of the body is, within `DEEP_RATIOS`."""
-    if len(dense) == 0:
-        return DEEP_RATIOS[1]
-    # In a logarithm the ratio of the largest to the smallest number does not overflow.
-    smallest = max(threshold, float(np.finfo(np.float64).tiny))
-    logarithm = math.log(float(np.quantile(dense, DEEP_QUANTILE, method="higher"))) - math.log(smallest)
+def _safe_log(threshold: float) -> float:
+    """Logarithm of the threshold; one of 0 asks for any density at all, and what has some is then deep inside."""
+    return math.log(max(threshold, float(np.finfo(np.float64).tiny)))
+
+
+def _logarithm_of_deep(dense: npt.NDArray[np.floating], threshold: float) -> float:
+    """Logarithm of how many times denser than the threshold the densest part of the body is, within `DEEP_RATIOS`."""
     low, high = map(math.log, DEEP_RATIOS)
-    return math.exp(min(max(logarithm, low), high))
+    if len(dense) == 0:
+        return high
+    deep = math.log(float(np.quantile(dense, DEEP_QUANTILE, method="higher")))
+    return min(max(deep - _safe_log(threshold), low), high)
 
 
 def _signed(level: Float32Array, least: Float32Array | np.float32, cells: BoolArray) -> Float32Array:
@@ -118,11 +102,8 @@ def _thin(cells: BoolArray) -> BoolArray:
     thin = np.zeros_like(cells)
     for axis in range(3):
         alone = cells & ~_beside(cells, axis, 1) & ~_beside(cells, axis, -1)
-        beside = np.zeros(cells.shape, dtype=np.uint8)
-        for across in {0, 1, 2} - {axis}:
-            beside += _beside(alone, across, 1)
-            beside += _beside(alone, across, -1)
-        thin |= alone & (beside >= 2)
+        beside = [_beside(alone, across, step) for across in {0, 1, 2} - {axis} for step in (1, -1)]
+        thin |= alone & (np.sum(beside, axis=0, dtype=np.uint8) >= 2)
     return thin
 
 
@@ -130,3 +111,107 @@ def _beside(cells: BoolArray, axis: int, step: int) -> BoolArray:
     """The neighbour of every voxel along an axis; on the border of the lattice, where there is none, the voxel."""
     row = np.moveaxis(cells, axis, 0)
     return np.moveaxis(np.concatenate((row[1:], row[-1:]) if step > 0 else (row[:1], row[:-1])), 0, axis)
+
+
+def _keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, cells: BoolArray) -> Float32Array:
+    """Shift a smoothed level until around every voxel about as much is solid as the level before smoothing has it.
+
+    A level of -1 and 1 smoothed over three voxels has its zero where it should be on flat walls, but inside it at
+    convex edges; of a bar one voxel thick a third would be left.
+
+    Of each voxel near the surface, the solid share is taken from the trilinear level, and from where the sharp level
+    changes its sign along the axes. Their differences, averaged with weights 1 4 6 4 1 along each axis and divided by
+    the surface around, say how far the surface should move. Differences below `UNNOTICED` of what is there are left
+    alone, so that this acts on bars, corners, specks and pits, not on the faces and long edges of a body of many
+    voxels. Signs stay, and no level comes nearer to 0 than `least`.
+    """
+    some, every = (look(cells, 3, mode="nearest") for look in (ndimage.maximum_filter, ndimage.minimum_filter))
+    near = np.pad(np.not_equal(some, every), 1)
+    index = np.flatnonzero(near)
+    if len(index) == 0:
+        return level
+    strides = np.array([near.shape[1] * near.shape[2], near.shape[2], 1])
+    steps = _AROUND @ strides
+    wanted, sides = _wanted(np.pad(sharp, 1, mode="edge").reshape(-1), index, strides)
+    solid, lowest = np.pad(cells, 1, mode="edge").reshape(-1)[index], np.pad(least, 1).reshape(-1)[index]
+    volume = _windowed(np.pad(cells, 1, mode="edge").astype(np.float32).reshape(-1), wanted, index, steps)
+    buffer = np.zeros(near.size, dtype=np.float32)
+    area = np.maximum(_windowed(buffer, 0.5 * sides, index, steps), np.finfo(np.float32).tiny)
+
+    padded = np.pad(level, 1, mode="edge")
+    levels = padded.reshape(-1)
+    share, slope = _found(levels, index, steps)
+    changed = np.zeros(len(levels), dtype=bool)
+    for _ in range(_ROUNDS):
+        missing = _windowed(buffer, wanted - share, index, steps)
+        noticed = np.abs(missing) - UNNOTICED * np.where(missing > 0.0, volume, 1.0 - volume)
+        moves = np.flatnonzero(noticed > 0.0)
+        if len(moves) == 0:
+            break
+        shift = _RATE * np.sign(missing[moves]) * noticed[moves] / area[moves]
+        moved = levels[index[moves]] + shift * np.maximum(slope[moves], np.float32(_LEAST_SLOPE))
+        low = lowest[moves]
+        moved = np.where(solid[moves], np.maximum(moved, low), np.minimum(moved, -low))
+        levels[index[moves]] = np.clip(moved, -1.0, 1.0)
+        changed[:] = False
+        for step in steps:
+            changed[index[moves] + step] = True
+        again = np.flatnonzero(changed[index])
+        share[again], slope[again] = _found(levels, index[again], steps)
+    return np.ascontiguousarray(padded[1:-1, 1:-1, 1:-1])
+
+
+def _wanted(sharp: Float32Array, index: IntArray, strides: IntArray) -> tuple[Float32Array, Float32Array]:
+    """Share of some voxels that is solid, and how many of their six neighbours are on the other side of the surface."""
+    # A voxel is as wide along an axis as the surface leaves of it, from its centre at most half a voxel to either side.
+    own = sharp[index]
+    share, sides = np.ones(len(index), dtype=np.float32), np.zeros(len(index), dtype=np.float32)
+    for stride in strides:
+        width = np.zeros(len(index), dtype=np.float32)
+        for step in (stride, -stride):
+            other = sharp[index + step]
+            across = (other > 0.0) != (own > 0.0)
+            # Both are never 0.
+            width += np.where(across, np.minimum(np.abs(own) / (np.abs(own) + np.abs(other)), 0.5), 0.5)
+            sides += across
+        share *= width
+    return np.where(own > 0.0, share, 1.0 - share), sides
+
+
+def _octant_weights() -> tuple[Float32Array, Float32Array]:
+    """Weights of the 27 levels around a voxel in value (8, 27) and gradient (3, 8, 27) in the middle of its octants."""
+    side = np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1
+    towards = _AROUND[None] == side[:, None]
+    share = np.where(_AROUND[None] == 0, 0.75, np.where(towards, 0.25, 0.0))
+    change = np.where(_AROUND[None] == 0, -side[:, None], np.where(towards, side[:, None], 0.0))
+    slopes = [np.where(np.arange(3) == axis, change, share).prod(axis=2) for axis in range(3)]
+    return share.prod(axis=2).astype(np.float32), np.array(slopes, dtype=np.float32)
+
+
+_VALUES, _SLOPES = _octant_weights()
+
+
+def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> tuple[Float32Array, Float32Array]:
+    """Solid share and mean slope [1 / voxel] of some voxels. The level is taken for linear in each octant of a voxel:
+    of a cube of half a voxel, cut by a plane at distance d from its middle, 1/2 + 2 d is inside (on average).
+    """
+    share, slope = np.empty(len(index), dtype=np.float32), np.empty(len(index), dtype=np.float32)
+    for start in range(0, len(index), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        around = levels[index[part] + steps[:, None]]
+        slopes = np.sqrt(sum((weights @ around) ** 2 for weights in _SLOPES))
+        distance = (_VALUES @ around) / np.maximum(slopes, np.float32(1e-6))
+        share[part] = np.clip(0.5 + 2.0 * distance, 0.0, 1.0).mean(axis=0)
+        slope[part] = slopes.mean(axis=0)
+    return share, slope
+
+
+def _windowed(values: Float32Array, at_index: Float32Array, index: IntArray, steps: IntArray) -> Float32Array:
+    """Mean around voxels at flat indices, with weights 1 4 6 4 1 along each axis; `at_index` overwrites `values`."""
+    for _ in range(2):
+        values[index] = at_index
+        at_index = np.empty(len(index), dtype=np.float32)
+        for start in range(0, len(index), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            at_index[part] = _WINDOW @ values[index[part] + steps[:, None]]
+    return at_index

@@ -105,8 +105,6 @@ def fill_enclosed(cells: BoolArray) -> BoolArray:
 def convex_hull(cells: BoolArray, of_centres: bool = False) -> BoolArray:
     """Find the voxels whose centres lie in the convex hull of the solid voxels: of the cubes, or of their centres.
 
-    The hull of cubes lies half a voxel beyond the centres, so it takes in voxels beside a curved surface.
-
     The hull meets every column of voxels in one interval, so it costs one comparison per column and plane.
     """
     columns = np.argwhere(cells.any(axis=2))

@@ -21,15 +21,11 @@ Ball = tuple[float, float, float, float]
 
 LEAST_SHARE = 0.15
 """Space belongs to the region if photographs show it at least this well, as a share of how well they show what they
-were taken of. Chosen on nine drawn scenes with a street or a room around, in a lattice three times as large: all of the
-scene stays and half of what is around goes; of drawn rooms seen from inside 99.7 % of what two photographs see stays.
-At 0.2 it is 99.2 % (and 98.7 % of a front five times as high as the cameras see it best), at 0.3 98 %."""
+were taken of. Chosen on nine drawn scenes with a street or a room around: all of the scene stays and half of what is
+around goes; of drawn rooms seen from inside 99.7 % of what two photographs see stays."""
 CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # the middle of an image, as a share of its sides, and rays along each of them
-NEAREST_SHARE = 0.25
-"""A camera was pointed at what this share of these rays end on first; the others may pass by an object."""
-FEWEST_CAMERAS = 0.1
-"""Share of the cameras that may look at places which are seen less well than what the others look at: not eight
-overviews of a house beside forty close-ups of its door, but the few photographs that missed."""
+NEAREST_SHARE = 0.25  # a camera was pointed at what this share of these rays end on first
+FEWEST_CAMERAS = 0.1  # share of the cameras that may look at places which are seen less well
 MOST_BLOCKS = 500_000  # how well places are seen changes slowly: in larger lattices it is found in blocks of voxels
 
 
@@ -37,10 +33,9 @@ def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> Bool
     """Find the voxels, solid or not, that photographs show about as well as what they were taken of.
 
     A camera was pointed at what the rays through the middle of its image end on, d away. It counts as one for all that
-    its image holds up to there, and as (d / distance)^2 behind: so many pixels does an equal area get. Summed over the
-    cameras this is how well a place is seen, whatever stands in front of it: a recess of a house stays with the house.
-    The region is where the sum is `LEAST_SHARE` or more of what it is where nearly all cameras look, or better. A
-    ground that runs on then ends about where the cameras stood.
+    its image holds up to there, and as (d / distance)^2 behind: so many pixels does an equal area get. The region is
+    where the sum over the cameras, whatever stands in front, is `LEAST_SHARE` or more of what it is where nearly all
+    cameras look. A ground that runs on then ends about where the cameras stood.
     """
     eyes, far = lattice.world_to_index(views.camera_to_world[:, :, 3]), {}
     count = len(views.focal)

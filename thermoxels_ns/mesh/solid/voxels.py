@@ -16,90 +16,65 @@ from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_beh
 from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
 from thermoxels_ns.mesh.solid.region import Ball, Box, RegionKind, asked_region, check_region, where_cameras_look
-from thermoxels_ns.mesh.solid.threshold import (
-    Threshold,
-    automatic_threshold,
-    density_threshold,
-    optical_depth_threshold,
-    percentile_threshold,
-)
 
 InteriorKind = Literal["solid", "hollow"]
 
 SMALLEST_BODY = 0.01
 """Bodies (voxels that touch, if only by corners) of less than this share of the largest are mostly floaters."""
-
-_WIDEST = 100
+FALLBACK_OPTICAL_DEPTH = 0.5  # density times voxel edge from which on a voxel is solid where rays say nothing
+SHARE_OF_RAYS = 0.95  # share of the rays that end on something that are to meet a solid voxel where they end
+OPTICAL_DEPTH_BOUNDS = (0.02, math.log(2.0))
+"""The automatic threshold times the voxel edge stays within these. Below the first a ray needs 35 voxels to lose half
+of its light: half-transparent space. From the second on a single voxel stops half of it: a surface."""
+OPAQUE_OPTICAL_DEPTH = 2.0  # density times voxel edge from which on a voxel is solid even though no ray ends in it
+SHARE_THAT_ENDS = 0.5
+"""Rays that end in a voxel, per weight that rays spent in it, above which it is part of what they end on: 1 in a voxel
+that ends all rays that come, 0 where light leaked past a surface."""
+LEAST_WEIGHT = 0.5  # weight that rays spent in a voxel, [rays], below which density alone decides about it
+FEWEST_RAYS = 100  # with fewer rays than this that end on something, there is no evidence to choose by
 
 
 @dataclass(frozen=True)
 class SolidSelection:
-    """How solid voxels are told from empty ones. Without a threshold of your own it is found from the training rays."""
+    """How solid voxels are told from empty ones, as the options of an export of the same names say."""
 
-    voxel_optical_depth: float | None = None
-    """Voxels in which density times edge length is at least this are solid: at 0.5, light that crosses one loses 39 %.
-    Lower it if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: the
-    highest that 95 % of the training rays that end on something meet within half a voxel of where they end."""
+    voxel_optical_depth: float | None = None  # density times edge length; without any threshold it is automatic
     density_percentile: float | None = None
-    """Percentile p of the density over all voxels of the box, 0 to 100: the (100 - p) % densest voxels are solid, as in
-    the Thermoxels paper. Overrides the optical depth. Raise it if empty space turns solid, lower it if walls have
-    holes."""
-    density_threshold: float | None = None
-    """Voxels at least this dense are solid, [1 / world unit of the trained scene]. Overrides both."""
-    close_gaps: int = 1
-    """Fill gaps and pinholes up to twice this many voxels wide (a morphological closing); thin walls are not
-    continuous without it. 0: none."""
+    """Over all voxels of the box, 0 to 100, as in the Thermoxels paper. Overrides the optical depth."""
+    density_threshold: float | None = None  # [1 / world unit of the trained scene]; overrides both
+    close_gaps: int = 1  # gaps up to twice this many voxels wide are filled (a morphological closing)
     region: RegionKind = "auto"
-    """Which part is taken. auto: what photographs show about as well as what they were taken of, without bodies below
-    1 % of the largest (floaters). all: everything."""
-    region_box: Box | None = None
-    """In place of auto, what lies in a box: xmin ymin zmin xmax ymax zmax in the coordinates of the input poses."""
-    region_near: Ball | None = None
-    """In place of auto, what lies near a point: x y z radius in the coordinates of the input poses."""
+    region_box: Box | None = None  # in place of auto; in the coordinates of the input poses
+    region_near: Ball | None = None  # the same
     interior: InteriorKind = "solid"
-    """What becomes of the inside of a body of which photographs only show the shell. solid: it is filled, namely
-    cavities that the shell encloses, and space within the body's convex hull that the training cameras would see if
-    the shell did not stand in front of it (fewer than one in ten look into it), with the crevices that holes of the
-    shell leave between the two. hollow: the shell alone is meshed, as thick as the photographs happened to make it. A
-    cavity with a camera in it is a room and is never filled."""
-    seal_openings: int = 2
-    """While looking for the inside, openings in the shell up to twice this many voxels wide count as closed. It leaves
-    the shell itself as it is."""
-    wall_thickness: float | None = None
-    """For facades seen from one side: make the seen surface this thick, [m], growing away from the cameras, never into
-    space that they look through. Takes the place of filling the interior. Needs metres per unit."""
+    seal_openings: int = 2  # openings up to twice this many voxels wide count as closed while looking for the inside
+    wall_thickness: float | None = None  # [m]; takes the place of filling the interior
 
     def __post_init__(self) -> None:
-        for name, (kind, low, high, usual) in _BOUNDS.items():
-            value = getattr(self, name)
-            if not (_is_within(value, kind, low, high) or (value is None and usual is None)):
+        for name, (kind, high, usual) in _BOUNDS.items():
+            value, option = getattr(self, name), f"--{name.replace('_', '-')}"
+            number = isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)
+            if not ((number and 0 <= value <= high) or (value is None and usual is None)):
                 what = "a whole number" if kind is int else "a finite number"
-                most = "" if high == math.inf else f" to {high:g}"
-                option = f"--{name.replace('_', '-')}"
-                expected = f"{what} from {low:g}{most}" if most else f"{what} of at least {low:g}"
+                expected = f"{what} of at least 0" if high == math.inf else f"{what} from 0 to {high:g}"
                 remedy = f"Leave {option} out." if usual is None else f"Pass {option} {usual}, or leave it out."
                 raise MeshError(name, expected=expected, got=repr(value), remedy=remedy)
         for name in ("voxel_optical_depth", "wall_thickness"):
-            value = getattr(self, name)
-            if value is not None:
-                check_positive(name, value, f"Leave --{name.replace('_', '-')} out.", MeshError)
+            if getattr(self, name) is not None:
+                check_positive(name, getattr(self, name), f"Leave --{name.replace('_', '-')} out.", MeshError)
         check_region(self.region, self.region_box, self.region_near)
         if self.interior not in get_args(InteriorKind):
             kinds = " or ".join(get_args(InteriorKind))
             raise MeshError("interior", expected=kinds, got=repr(self.interior), remedy="Pass --interior solid.")
 
 
-def _is_within(value: Any, kind: Any, low: float, high: float) -> bool:
-    return isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value) and low <= value <= high
-
-
-_BOUNDS: dict[str, tuple[Any, float, float, float | None]] = {
-    "density_percentile": ((int, float), 0.0, 100.0, None),
-    "density_threshold": ((int, float), 0.0, math.inf, None),
-    "close_gaps": (int, 0, _WIDEST, 1),
-    "seal_openings": (int, 0, _WIDEST, 2),
+_BOUNDS: dict[str, tuple[Any, float, int | None]] = {
+    "density_percentile": ((int, float), 100.0, None),
+    "density_threshold": ((int, float), math.inf, None),
+    "close_gaps": (int, 100, 1),
+    "seal_openings": (int, 100, 2),
 }
-"""Type, least and most of options; what to pass instead, None for those that may be None."""
+"""Type and most of options from 0 on; what to pass instead, None for those that may be None."""
 
 
 @dataclass(frozen=True)
@@ -196,6 +171,7 @@ def select_solid(
 
 
 def _threshold(snapshot: GridSnapshot, density: FloatArray, selection: SolidSelection) -> Threshold:
+    """The voxels that are dense enough, by the rule that is asked for."""
     if selection.density_threshold is not None:
         return density_threshold(density, selection.density_threshold)
     if selection.density_percentile is not None:
@@ -270,3 +246,90 @@ def _wall_voxels(
         got, remedy = f"{selection.wall_thickness:g} m", "Pass it in metres, and check --metres-per-unit."
         raise MeshError("wall_thickness", expected=f"at most the scene box, {longest:.3g} m", got=got, remedy=remedy)
     return voxels
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """The voxels that are dense enough."""
+
+    cells: BoolArray
+    """True where a voxel is dense enough, not empty and not ruled out by rays, shape `lattice.cell_shape`."""
+    density: float  # density at the voxel centre from which on it is dense enough, [1 / world unit]
+    explanation: str  # which rule chose it, and why, in one or two sentences
+
+
+def automatic_threshold(snapshot: GridSnapshot, density: FloatArray) -> Threshold:
+    """Choose the threshold, and the voxels that reach it, by where training rays end.
+
+    A ray ends where half of its weight is spent. What it meets there is the densest voxel within half a voxel of that
+    point (`RayEvidence.half_depth_density`). The threshold is the highest density that `SHARE_OF_RAYS` of the rays
+    meet, within `OPTICAL_DEPTH_BOUNDS`: what nearly all rays end on is solid, what they merely pass through goes.
+
+    Where rays spend weight but hardly any ends, density is what light left that leaked past a surface. Such a voxel
+    must be opaque by itself (`OPAQUE_OPTICAL_DEPTH`): a few behind a surface would widen the body by a layer.
+
+    Without evidence the rule is that of `optical_depth_threshold`; without `RayEvidence.voxel_ends` all voxels that
+    reach the threshold are solid. `density` is that at the voxel centres.
+    """
+    evidence, voxel = snapshot.evidence, snapshot.lattice.voxel_size
+    if evidence is None or len(evidence.half_depth_density) < FEWEST_RAYS:
+        found = optical_depth_threshold(snapshot, density, FALLBACK_OPTICAL_DEPTH)
+        known = "nothing is known of" if evidence is None else f"only {len(evidence.half_depth_density)} rays end among"
+        reason = f"Automatic: {known} the training rays, so the rule is a fixed optical depth. {found.explanation}"
+        return Threshold(found.cells, found.density, reason)
+    met, weight = evidence.half_depth_density, evidence.voxel_weight
+    low, high = (depth / voxel for depth in OPTICAL_DEPTH_BOUNDS)
+    threshold = min(max(float(np.quantile(met, 1.0 - SHARE_OF_RAYS, method="lower")), low), high)
+    # The densities of rays are float32; the threshold is one of them, and its own voxel must reach it.
+    cells = dense = density >= np.float32(threshold)
+    if evidence.voxel_ends is not None:
+        passed = (evidence.voxel_ends <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
+        cells = dense & ~(passed & (density * voxel < OPAQUE_OPTICAL_DEPTH))
+    held = float(weight[cells].sum(dtype=np.float64) / max(weight.sum(dtype=np.float64), 1e-300))
+    share = float(np.mean(met >= np.float32(threshold)))
+    bound = {low: ", the least that is not half-transparent", high: ", the most that is asked"}.get(threshold, "")
+    count, left_out = np.count_nonzero(dense) - np.count_nonzero(cells), ""
+    if count:
+        left_out = f"{count} voxels that dense are left out: hardly any ray ends in them and they are not opaque. "
+    return Threshold(
+        cells,
+        threshold,
+        f"Automatic: {share:.0%} of the {len(met)} training rays that end on something meet, within half a voxel of "
+        f"there, a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel{bound}). "
+        f"{left_out}Those that are solid hold {held:.0%} of the weight that rays spent.",
+    )
+
+
+def optical_depth_threshold(snapshot: GridSnapshot, density: FloatArray, optical_depth: float) -> Threshold:
+    """Choose voxels in which density times edge length is at least `optical_depth`."""
+    threshold, lost = optical_depth / snapshot.lattice.voxel_size, 1.0 - np.exp(-optical_depth)
+    said = f"Voxels of optical depth {optical_depth:g} or more are solid (density {threshold:.4g}): light that crosses "
+    return Threshold(density >= threshold, threshold, f"{said}one loses at least {lost:.0%}.")
+
+
+def density_threshold(density: FloatArray, threshold: float) -> Threshold:
+    """Choose voxels of at least the given density, [1 / world unit]; a voxel without density is never solid."""
+    cells = (density >= threshold) & (density > 0.0)
+    return Threshold(cells, float(threshold), f"Voxels of density {threshold:g} or more are solid, as asked.")
+
+
+def percentile_threshold(density: FloatArray, percentile: float) -> Threshold:
+    """Choose the densest (100 - percentile) % of all voxels of the box, as in the Thermoxels paper.
+
+    Where more voxels tie at the threshold than were asked for (space that training never touched keeps its starting
+    value), only the denser ones are taken, if there are any.
+
+    Raises:
+        MeshError: All voxels have the same density.
+    """
+    threshold = float(np.percentile(density, percentile))
+    if percentile > 0.0 and 0.0 < density.min() == density.max():
+        remedy = "Train longer, or pass --density-threshold to say from which density on a voxel is solid."
+        got = f"the same density {threshold:.6g} in all {density.size} voxels"
+        raise MeshError("density", expected="some voxels denser than others", got=got, remedy=remedy)
+    reached, denser = ((density > 0.0) & (over(density, threshold)) for over in (np.greater_equal, np.greater))
+    asked = np.ceil((1.0 - percentile / 100.0) * density.size) + 1
+    tied = np.count_nonzero(reached) > asked and bool(denser.any())
+    said = f"{'more than' if tied else 'at least'} density {threshold:.4g}."
+    explanation = f"The densest {100.0 - percentile:g} % of all voxels are solid, as asked: {said}"
+    return Threshold(denser if tied else reached, threshold, explanation)

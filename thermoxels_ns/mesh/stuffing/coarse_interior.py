@@ -9,7 +9,7 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, IntArray
 from thermoxels_ns.mesh.solid.morphology import bounding_box, grow, halved, repeated
-from thermoxels_ns.mesh.stuffing.bcc_lattice import BccLattice
+from thermoxels_ns.mesh.stuffing.lattice import BccLattice
 
 # The sides of a face lie between its corners 0-1, 1-2, 2-3 and 3-0, counter-clockwise seen from where its axis points.
 _CORNERS = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])
@@ -32,13 +32,8 @@ def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
     """Join voxels into cubes of 2, 4, 8, ... `largest` voxels along an edge that only hold voxels of the set.
 
     Cube (i, j, k) of edge s begins at voxel (i s, j s, k s). Cubes that touch, if only at a corner, differ at most by
-    a factor 2 in size; voxels outside the set, beyond the array too, count as cubes of one voxel. Under these rules
-    every cube is as large as it can be, which no choice elsewhere can change.
-
-    Returns:
-        Entry n is for cubes of 2^(n + 1) voxels along an edge: True where the cube is one cube or part of a larger one,
-        so that nothing in it is smaller. Its shape is half that before, rounded up. Sizes without any cube are left
-        out at the end.
+    a factor 2 in size; voxels outside the set count as cubes of one voxel. Under these rules every cube is as large as
+    it can be. Entry n of the result is for cubes of 2^(n + 1) voxels along an edge: True where nothing is smaller.
 
     >>> [np.count_nonzero(level) for level in balanced_octree(np.ones((12, 12, 12), dtype=bool), 8)]
     [216, 1]
@@ -84,14 +79,12 @@ class CoarseInterior:
 def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior | None:
     """Build the inside of a solid from cubes of two to `largest` voxels; None if there are no such cubes.
 
-    Every cube of the octree has a node at its centre and, as the voxels outside the octree have, nodes at its corners;
-    all of them are points of the body-centred cubic lattice. Between two neighbours of the same size lie four
-    tetrahedra, one for each side of their common face, around the edge that joins the centres; where smaller cubes
-    touch a side it has a node in the middle, and its tetrahedron is cut in two there. Between two of different sizes
-    lies the face of the smaller: the diagonal through the middle of the larger face cuts it into two triangles, and
-    each of them makes a tetrahedron with either centre. (The same pieces as in Labelle and Shewchuk 2007.)
-    The angles are 45, 60, 90 and, in the smaller cube of the second case, 120 degrees.
-    The octree begins at the lowest voxel that may be joined, so the solid's place in the lattice does not matter.
+    Every cube has nodes at its centre and its corners, points of the body-centred cubic lattice. Between two neighbours
+    of the same size lie four tetrahedra, one for each side of their common face, around the edge that joins the
+    centres; where smaller cubes touch a side it has a node in the middle, and its tetrahedron is cut in two there.
+    Between two of different sizes lies the face of the smaller: the diagonal through the middle of the larger face cuts
+    it into two triangles, and each makes a tetrahedron with either centre (Labelle and Shewchuk 2007). The octree
+    begins at the lowest voxel that may be joined, so the solid's place in the lattice does not matter.
     """
     if largest == 1:
         return None

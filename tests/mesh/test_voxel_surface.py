@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from tests.support.stuffed_shapes import SHAPES, centres
-from thermoxels_ns.mesh.boundary.tags import LEAST_AREA_FACTOR, voxel_surface
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX
-from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, voxel_facets
+from thermoxels_ns.mesh.voxel_tets import LEAST_AREA_FACTOR, boundary_tags, kuhn_tets, voxel_facets, voxel_surface
 
 CELLS = 80
 MIDDLE = 0.5 * CELLS * (1.0 + np.array([0.0137, -0.0071, 0.0043]))
@@ -55,22 +54,10 @@ def test_flat_sides_of_a_box_are_exact(kind: str) -> None:
     low, high = points.min(axis=0), points.max(axis=0)
     middle = points[facets].mean(axis=1)
     from_edges = np.sort(np.minimum(middle - low, high - middle), axis=1)[:, 1]
-    inner = from_edges > 4.0
-    assert np.count_nonzero(inner) > 2000
+    inner = from_edges > 7.0
+    assert np.count_nonzero(inner) > 1500
     assert factors[inner] == pytest.approx(1.0, abs=1e-6)
     assert normals[inner] == pytest.approx(own[inner], abs=1e-3)
-
-
-@pytest.mark.parametrize(("kind", "mean", "most"), [("ramp", 1.5, 9.0), ("jump", 4.0, 20.0)])
-def test_normals_of_a_sphere(kind: str, mean: float, most: float) -> None:
-    level = exported("sphere", kind)
-    points, facets = surface(level)
-    normals, _ = voxel_surface(level, points, facets)
-    exact = points[facets].mean(axis=1) - MIDDLE
-    exact /= np.linalg.norm(exact, axis=1, keepdims=True)
-    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-12)
-    degrees = np.degrees(np.arccos(np.clip(np.einsum("ij,ij->i", normals, exact), -1.0, 1.0)))
-    assert degrees.mean() < mean and degrees.max() < most
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -87,16 +74,6 @@ def test_a_plane_has_its_normal_and_its_area(seed: int) -> None:
     assert normals[steps] == pytest.approx(np.broadcast_to(normal, normals[steps].shape), abs=1e-9)
     own = np.abs(facet_normals(points.astype(float), facets)[steps] @ normal)
     assert factors[steps] == pytest.approx(np.maximum(own, LEAST_AREA_FACTOR), abs=1e-9)
-
-
-def test_where_the_scene_box_cuts_the_normal_is_that_of_the_box() -> None:
-    level = np.clip(-(centres(12, 12, 12) @ [0.6, 0.0, 0.8]), -1.0, 1.0)
-    points, facets = surface(level)
-    cut = boundary_tags(facets, points, (13, 13, 13)) == FACET_BOX
-    assert np.count_nonzero(cut) > 100
-    normals, factors = voxel_surface(level, points, facets)
-    assert np.array_equal(normals[cut], facet_normals(points.astype(float), facets)[cut])
-    assert np.all(factors[cut] == 1.0)
 
 
 @pytest.mark.parametrize("least", [1e-6, 0.02, 1.0])

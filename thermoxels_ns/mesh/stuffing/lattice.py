@@ -1,0 +1,261 @@
+"""The body-centred cubic lattice of isosurface stuffing, and which of its points move onto the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.mesh.solid.morphology import bounding_box
+
+_AXES = np.eye(3)[[0, 0, 1, 1, 2, 2]] * np.array([1.0, -1.0] * 3)[:, None]
+_DIAGONALS = (np.arange(8)[:, None] >> np.array([2, 1, 0]) & 1) - 0.5
+
+DIRECTIONS: FloatArray = np.concatenate([_AXES, _DIAGONALS])
+"""Steps to the 14 neighbours, shape (14, 3), [voxels]: +x, -x, +y, -y, +z, -z, then the diagonals (---) to (+++)."""
+LENGTHS: FloatArray = np.linalg.norm(DIRECTIONS, axis=1)  # lengths of the 14 edges, [voxels]
+OPPOSITE: IntArray = np.array([1, 0, 3, 2, 5, 4, 13, 12, 11, 10, 9, 8, 7, 6])
+"""Number of the direction that points the other way, shape (14,)."""
+NUM_DIRECTIONS = 14
+
+_OUTSIDE = -1.0
+
+
+@dataclass(frozen=True)
+class BccLattice:
+    """Levels on the points of the lattice around the solid part of a voxel lattice.
+
+    It is two cubic lattices: the voxel centres and the voxel corners. A point has 14 neighbours: six of its own lattice
+    along the axes (long edges, 1 voxel) and eight of the other one along the space diagonals (short edges, sqrt(3)/2
+    voxels). All points lie in one flat array, first the centres, then the corners, both padded to the same shape, so
+    that a step along an edge is a constant offset of the flat index.
+    """
+
+    level: npt.NDArray[np.floating]
+    """Level of every point: the padded centres, then the padded corners; above 0 is solid. Points above 0 have all
+    their neighbours in the array and lie strictly inside the box."""
+    shape: tuple[int, int, int]  # shape of each of the two padded blocks
+    first_cell: IntArray  # index of the voxel whose centre has index (1, 1, 1) in its block
+
+    @property
+    def num_centres(self) -> int:
+        """Points in the block of centres; flat indices from here on are corners."""
+        return self.shape[0] * self.shape[1] * self.shape[2]
+
+    @property
+    def strides(self) -> tuple[int, int, int]:
+        """Flat steps along x, y, z within a block."""
+        return (self.shape[1] * self.shape[2], self.shape[2], 1)
+
+    @cached_property
+    def offsets(self) -> IntArray:
+        """Flat steps to the 14 neighbours, of a centre and of a corner, shape (2, 14)."""
+        strides = np.array(self.strides)
+        along = DIRECTIONS[:6].astype(np.int64) @ strides
+        # Centre i lies half a voxel below corner i of its block.
+        to_corner = np.where(_DIAGONALS > 0.0, 0, -1) @ strides + self.num_centres
+        to_centre = np.where(_DIAGONALS > 0.0, 1, 0) @ strides - self.num_centres
+        return np.stack([np.concatenate([along, to_corner]), np.concatenate([along, to_centre])])
+
+    def is_corner(self, points: IntArray) -> IntArray:
+        """1 for voxel corners, 0 for voxel centres; same shape as `points`."""
+        return (points >= self.num_centres).astype(np.int64)
+
+    def neighbours(self, points: IntArray) -> IntArray:
+        """Flat indices of the 14 neighbours, shape (n, 14)."""
+        return points[:, None] + self.offsets[self.is_corner(points)]
+
+    def each_neighbour(self, points: IntArray) -> Iterator[IntArray]:
+        """Flat indices of one neighbour of every point, shape (n,), for each of the 14 directions in turn."""
+        corner = self.is_corner(points)
+        for step in self.offsets.T:
+            yield points + step[corner]
+
+    def block_index(self, points: IntArray) -> IntArray:
+        """Index along x, y, z within the point's block, shape (n, 3)."""
+        within = points - self.is_corner(points) * self.num_centres
+        return np.stack(np.unravel_index(within, self.shape), axis=-1)
+
+    def positions(self, points: IntArray) -> FloatArray:
+        """Fractional corner indices of the points in the whole voxel lattice, shape (n, 3)."""
+        shift = self.first_cell + 0.5 * self.is_corner(points)[:, None] - 0.5
+        return self.block_index(points) + shift
+
+
+def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
+    """Put levels of voxel centres, above 0 somewhere, on the lattice and close it where the solid touches the border.
+
+    A corner gets the mean of the eight centres around it, which is the trilinear value, or 0 where that would break a
+    layer of one voxel. Beyond the border every centre has the level -|level| of the centre inside, and corners on the
+    border are at most 0: linear interpolation is then 0 exactly on the border where solid touches it, and nothing above
+    0 lies on the border or beyond. What is farther than two voxels from all solid voxels is left out.
+    """
+    box = bounding_box(level > 0.0, margin=2)
+    first, inner = np.array([part.start for part in box]), level[box]
+
+    nx, ny, nz = (n + 2 for n in inner.shape)
+    blocks = np.full((2, nx, ny, nz), _OUTSIDE, dtype=level.dtype)
+    centres, corners = blocks
+    centres[1:-1, 1:-1, 1:-1] = inner
+    for axis in range(3):
+        padded, within = np.moveaxis(centres, axis, 0), np.moveaxis(inner, axis, 0)
+        padded[0, 1:-1, 1:-1] = -np.abs(within[0])
+        padded[-1, 1:-1, 1:-1] = -np.abs(within[-1])
+
+    # Halved before each sum: the sum of two levels may be too large for the number type, their mean is not.
+    mean = 0.5 * np.pad(inner, 1, mode="edge")
+    for axis in range(3):
+        mean = np.moveaxis(mean, axis, 0)
+        mean = np.moveaxis(mean[1:] + mean[:-1], 0, axis)
+        if axis < 2:
+            mean *= 0.5
+    for axis in range(3):
+        border = np.moveaxis(mean, axis, 0)[[0, -1]]
+        np.moveaxis(mean, axis, 0)[[0, -1]] = np.minimum(border, 0.0)
+    corners[:-1, :-1, :-1] = mean
+    _keep_sheets(centres, corners)
+    return BccLattice(blocks.reshape(-1), (nx, ny, nz), first)
+
+
+def _keep_sheets(centres: npt.NDArray[np.floating], corners: npt.NDArray[np.floating]) -> None:
+    """Raise corners to 0 where a solid layer of one voxel would have holes, and lower them where a gap of one would.
+
+    The middle of a square of four solid centres is solid too, but no point of the lattice: it is on the long edge
+    between the corners above and below. If neither of them is above 0, the square is a hole, unless both are 0.
+    """
+    solid = centres > 0.0
+    for layer, side in ((~solid, -1.0), (solid, 1.0)):
+        for axis in range(3):
+            flat = np.moveaxis(layer, axis, 0)[1:-1]
+            square = flat[:, 1:, 1:] & flat[:, :-1, 1:]
+            square &= flat[:, 1:, :-1]
+            square &= flat[:, :-1, :-1]
+            facing = np.moveaxis(corners, axis, 0)[:-1, :-1, :-1]
+            below, above = facing[:-1], facing[1:]
+            square &= side * below <= 0.0
+            square &= side * above <= 0.0
+            for corner in (below, above):
+                corner[square] = 0.0
+
+
+ALPHA_INSIDE = np.where(LENGTHS == 1.0, 0.272, 0.397)
+"""Share of each of the 14 edges within which a cut pulls a point inside the solid onto the surface."""
+ALPHA_OUTSIDE = np.where(LENGTHS == 1.0, 0.282, 0.369)
+"""The same for a point outside.
+
+With these four numbers all dihedral angles are between 10.94 and 163.74 degrees: the extremes over all stencils, with
+every cut and every moved point at every end of its range. Labelle and Shewchuk (2007) give one pair for both sides.
+"""
+
+
+def _contractible_links() -> BoolArray:
+    """For every set of neighbours, as 14 bits: is what the lattice spans between them one piece without holes?"""
+    # The neighbours of a point span a sphere of 24 triangles. A part of a sphere can be shrunk to a point if neither it
+    # nor the rest of the sphere is empty or in several pieces.
+    steps = DIRECTIONS[:, None, :] - DIRECTIONS[None, :, :]
+    joined = (np.abs(steps[:, :, None, :] - DIRECTIONS).max(axis=-1) < 0.25).any(axis=-1)
+    around = joined @ (1 << np.arange(NUM_DIRECTIONS))
+    sets = np.arange(1 << NUM_DIRECTIONS)
+
+    def in_one_piece(members: IntArray) -> BoolArray:
+        reached = members & -members
+        for _ in range(NUM_DIRECTIONS):
+            for d in range(NUM_DIRECTIONS):
+                reached |= np.where(reached >> d & 1, around[d], 0) & members
+        return (reached == members) & (members != 0)
+
+    return in_one_piece(sets) & in_one_piece(sets ^ sets[-1])
+
+
+_CONTRACTIBLE = _contractible_links()
+
+
+@dataclass(frozen=True)
+class WarpedLattice:
+    """The lattice with its near points moved onto the surface, and the cuts that are left."""
+
+    sign: npt.NDArray[np.int8]  # +1 inside the solid, 0 on its surface, -1 outside, one per point of the lattice
+    moved: IntArray  # points that moved, shape (m,)
+    moved_to: FloatArray  # where they are now, fractional corner indices, shape (m, 3)
+    inner: IntArray  # points with sign +1 that are not buried, ascending; shape (p,)
+    cut_points: IntArray  # those of them that have a cut edge, ascending; shape (s,)
+    cuts: FloatArray
+    """How far along each of their edges the surface is, as a share of the edge, NaN where no cut is; shape (s, 14)."""
+
+
+def warp(lattice: BccLattice, buried: BoolArray | None = None) -> WarpedLattice:
+    """Find the cuts and move points that are too close to one onto the surface.
+
+    A cut is where linear interpolation along an edge between two opposite signs is 0. A point with cuts within alpha
+    times the edge length moves to the nearest of them and has sign 0 from then on; its edges are cut no more (Labelle
+    and Shewchuk 2007, section 3). `buried` points are not looked at: they and all their neighbours are inside.
+
+    Beyond the paper, nothing thin is lost: a point stays if the solid is not on its other side, seen from the cut, or
+    if the solid (for a point outside: the empty space) would fall apart, close up or vanish with it. Its cuts are then
+    held at alpha times the edge length, which the bounds on the angles allow.
+    """
+    level = lattice.level
+    sign = (level > 0.0).astype(np.int8)
+    sign -= level < 0.0
+    inner = np.flatnonzero(sign > 0 if buried is None else (sign > 0) & ~buried)
+    touches, touched = np.zeros(len(inner), dtype=bool), np.zeros(len(sign), dtype=bool)
+    for neighbour in lattice.each_neighbour(inner):
+        crosses = sign[neighbour] < 0
+        touches |= crosses
+        touched[neighbour[crosses]] = True
+    # Points inside with a neighbour outside, and points outside with one inside.
+    inside, outside = inner[touches], np.flatnonzero(touched)
+
+    moved, moved_to = [], []
+    for points, own, alpha in ((inside, 1, ALPHA_INSIDE), (outside, -1, ALPHA_OUTSIDE)):
+        share = _cut_shares(lattice, sign, points)
+        reach = np.where(share < alpha, share * LENGTHS, np.inf)
+        nearest = np.argmin(reach, axis=1)
+        near = np.flatnonzero(np.isfinite(reach[np.arange(len(points)), nearest]))
+        points, nearest, share = points[near], nearest[near], share[near, nearest[near]]
+        behind = points + lattice.offsets[lattice.is_corner(points), OPPOSITE[nearest]]
+        thick = sign[behind] == own
+        points, nearest, share = points[thick], nearest[thick], share[thick]
+        # Taking a point away leaves the topology as it is if its neighbours of the same sign can be shrunk to a point.
+        # No two points of one of the four classes (centre or corner, even or odd sum of indices) are neighbours, so
+        # each class may be decided at once.
+        free = np.zeros(len(points), dtype=bool)
+        group = 2 * lattice.is_corner(points) + lattice.block_index(points).sum(axis=1) % 2
+        for number in range(4):
+            members = np.flatnonzero(group == number)
+            alike = sign[lattice.neighbours(points[members])] == own
+            free[members] = _CONTRACTIBLE[alike @ (1 << np.arange(NUM_DIRECTIONS))]
+            sign[points[members[free[members]]]] = 0
+        moved.append(points[free])
+        moved_to.append(lattice.positions(points[free]) + share[free, None] * DIRECTIONS[nearest[free]])
+
+    inner = inner[sign[inner] > 0]
+    inside = inside[sign[inside] > 0]
+    share = _cut_shares(lattice, sign, inside)
+    is_cut = np.isfinite(share)
+    has_cut = is_cut.any(axis=1)
+    held = np.clip(share, ALPHA_INSIDE, 1.0 - ALPHA_OUTSIDE)
+    return WarpedLattice(
+        sign=sign,
+        moved=np.concatenate(moved),
+        moved_to=np.concatenate(moved_to),
+        inner=inner,
+        cut_points=inside[has_cut],
+        cuts=np.where(is_cut, held, np.nan)[has_cut],
+    )
+
+
+def _cut_shares(lattice: BccLattice, sign: npt.NDArray[np.int8], points: IntArray) -> FloatArray:
+    """Share of each edge from the point to its cut, infinite where none is; shape (n, 14)."""
+    neighbours = lattice.neighbours(points)
+    own = lattice.level[points].astype(np.float64)
+    other = lattice.level[neighbours].astype(np.float64)
+    # Where levels differ by more than the number type holds, the ratio is infinite and the cut at the point: right.
+    with np.errstate(over="ignore", divide="ignore"):
+        share = 1.0 / (1.0 - other / own[:, None])
+    share[sign[neighbours] != -sign[points][:, None]] = np.inf
+    return share
