@@ -9,10 +9,14 @@ from PIL import Image
 
 from tests.support.flir_file import FlirFile, picture_bytes, smooth_counts
 from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsError
-from thermoxels_ns.radiometry.conditions import Conditions
-from thermoxels_ns.radiometry.count_scales import COUNT_SCALES, recognised_camera
-from thermoxels_ns.radiometry.measurement_model import corrected_temperature_c
-from thermoxels_ns.radiometry.thermogram import RadiometryOptions, detect_format, read_thermogram
+from thermoxels_ns.radiometry.measurement_model import Conditions, corrected_temperature_c
+from thermoxels_ns.radiometry.thermogram import (
+    COUNT_SCALES,
+    RadiometryOptions,
+    detect_format,
+    read_thermogram,
+    recognised_camera,
+)
 
 WALL_C = np.array([[18.25, 19.5, 20.75], [21.0, 22.25, 23.5]])
 
@@ -191,9 +195,9 @@ def tiff_bytes(pixels: np.ndarray, folder: Path) -> bytes:
 HARD: dict[str, tuple[str, str]] = {
     "palette.jpg": ("false-colour", "as the camera wrote it"),
     "palette.png": ("a picture for the eye", "Export"),
-    "palette.tiff": ("3 channels of 8 bits", "Export"),
-    "grey8.tiff": ("1 channel of 8 bits", "Export"),
-    "truncated.jpg": ("cut off", "Copy"),
+    "palette.tiff": ("image mode RGB", "Export"),
+    "grey8.tiff": ("image mode L", "Export"),
+    "truncated.jpg": ("expected a whole", "Copy"),
     "truncated.tiff": ("readable", "copy"),
     "truncated.npy": ("readable", "copy"),
     "truncated.png": ("readable", "copy"),

@@ -17,7 +17,7 @@ from thermoxels_ns.capture.sfm.gravity import Up
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.radiometry.conditions import Conditions
+from thermoxels_ns.radiometry.measurement_model import Conditions
 from thermoxels_ns.reports.capture_page import Overlay, capture_page
 from thermoxels_ns.reports.capture_pictures import colours, thermal_in_photograph
 

@@ -15,9 +15,8 @@ from PIL import Image
 
 from thermoxels_ns.capture.photograph import read_photograph_facts
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError, printable
-from thermoxels_ns.radiometry.decoders import check_file_size, check_thermal_size, errors_name
+from thermoxels_ns.radiometry.decoders import check_file_size, check_thermal_size, errors_name, read_exif_facts
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
-from thermoxels_ns.radiometry.exif import read_exif_facts
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 from thermoxels_ns.radiometry.thermal_pixels import size_of_double_tiff
 
@@ -161,9 +160,7 @@ def _identify(path: Path, folder: Path) -> CameraFile:
             taken_at = flir.camera.taken_at
             role: Role = "thermal" if flir.visible is None else "both"
             return CameraFile(path, role, None if taken_at is None else taken_at.replace(tzinfo=None))
-        with path.open("rb") as stream:
-            head = stream.read(2**18)
-        if is_dji_rjpeg(head) or is_dji_rjpeg(path.read_bytes()):
+        if is_dji_rjpeg(path):
             return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
     elif size_of_double_tiff(path) is not None:
         return CameraFile(path, "thermal", None)

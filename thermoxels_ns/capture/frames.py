@@ -15,10 +15,9 @@ from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_mask,
 from thermoxels_ns.capture.stage_results import load_json
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
-from thermoxels_ns.radiometry.conditions import Conditions, conditions_text
-from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
-from thermoxels_ns.radiometry.flir_records import PictureInPicture
-from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
+from thermoxels_ns.radiometry.flir_rjpeg import PictureInPicture, read_flir_jpeg
+from thermoxels_ns.radiometry.measurement_model import Conditions, conditions_text
+from thermoxels_ns.radiometry.thermal_pixels import find_dead_pixels
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions, read_thermogram
 
 _LIST = "frames.json"

@@ -15,8 +15,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.radiometry.decoders import errors_name
-from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
+from thermoxels_ns.radiometry.decoders import ExifFacts, errors_name, read_exif_facts
 
 LARGEST_SIDE = 30000  # pixels along a side of a photograph that is believed; a header that claims more is damaged
 _LARGEST_PIXELS = 178_956_970  # in all; Pillow opens no more

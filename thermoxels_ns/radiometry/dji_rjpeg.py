@@ -14,10 +14,14 @@ import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
-from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
-from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
-from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
-from thermoxels_ns.radiometry.jpeg_segments import APP1, APP3, JPEG_START, DamagedJpegError, check_jpeg, jpeg_segments
+from thermoxels_ns.radiometry.decoders import (
+    ExifFacts,
+    app_segments,
+    check_thermal_size,
+    errors_name,
+    read_exif_facts,
+)
+from thermoxels_ns.radiometry.measurement_model import ConditionOverrides, Conditions
 
 _SDK = "the DJI Thermal SDK (www.dji.com/downloads/softwares/dji-thermal-sdk)"
 _STATUS = {
@@ -72,16 +76,11 @@ class DjiImage:
     exif: ExifFacts
 
 
-def is_dji_rjpeg(content: bytes) -> bool:
+def is_dji_rjpeg(path: Path) -> bool:
     """Whether a JPEG is DJI's and holds counts: its photographs have the maker's name, but no APP3 segments."""
-    counts = made_by_dji = False
-    try:
-        for marker, payload in jpeg_segments(content):
-            made_by_dji |= marker == APP1 and b"DJI" in payload
-            counts |= marker == APP3
-    except DamagedJpegError:
-        pass  # what comes before the damage tells what the file was to be
-    return content.startswith(JPEG_START) and made_by_dji and counts
+    segments = app_segments(path)
+    made_by_dji = any(name == "APP1" and b"DJI" in content for name, content in segments)
+    return made_by_dji and any(name == "APP3" for name, _ in segments)
 
 
 def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrides) -> DjiImage:
@@ -91,10 +90,10 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
     programs, and is free to download. So the user names the library. A `ThermalFileError` is raised where there is
     none, it is another one, it refuses the file or the parameters, or the file is cut off.
     """
-    content = path.read_bytes()
     whole = "a whole DJI R-JPEG, as the drone wrote it"
     with errors_name(path, whole, "Copy the file from the drone again.", ThermalFileError):
-        check_jpeg(content)  # before a library in another language takes it
+        app_segments(path, whole=True)  # before a library in another language takes it
+        content = path.read_bytes()
     if library is None:
         expected = "DJI's library libdirp, the only one that turns the counts of a DJI R-JPEG into degrees"
         remedy = f"Download {_SDK} and pass --dji-library with the path of libdirp.so (libdirp.dll on Windows)."

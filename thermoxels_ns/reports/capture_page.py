@@ -15,7 +15,7 @@ from thermoxels_ns.capture.rig.start import rig_frames
 from thermoxels_ns.capture.scene_writer import scene_names
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.radiometry.dead_pixels import MIN_FRAMES
+from thermoxels_ns.radiometry.thermal_pixels import MIN_FRAMES
 from thermoxels_ns.reports.capture_pictures import colours, jpeg_of, overlay
 from thermoxels_ns.reports.charts import bars, histogram
 from thermoxels_ns.reports.page import build_page, write_page
