@@ -13,8 +13,7 @@ from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.rig.parameters import PARAMETERS
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate, RigFrame
 from thermoxels_ns.capture.scene_writer import Scene
-from thermoxels_ns.capture.sfm.gravity import Up
-from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.sfm.scale_and_up import MetricScale, Up
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.radiometry.measurement_model import Conditions

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_mask, read_photograph_facts
-from thermoxels_ns.capture.stage_results import load_json
+from thermoxels_ns.capture.stage_cache import load_json
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.radiometry.flir_rjpeg import PictureInPicture, read_flir_jpeg
@@ -59,28 +60,20 @@ class CaptureFrames:
     dead_pixels: int  # thermal pixels that are stuck at one value in all frames; they are NaN in every frame
     dropped: dict[str, str] = field(default_factory=dict)  # why, by the frame's name
 
-    def save(self, folder: Path, root: Path) -> None:
-        """Write the list of frames beside their images; both folders may be moved later."""
-        content = asdict(self)
-        for row in content["frames"]:
-            for name in ("photograph", "thermal"):
-                inside = row[name].is_relative_to(folder.resolve())
-                row[name] = [inside, row[name].relative_to(folder.resolve() if inside else root.resolve()).as_posix()]
-        write_json(folder / _LIST, content)
-
     @classmethod
     def load(cls, folder: Path, root: Path) -> CaptureFrames:
-        """Read the list of frames from a folder, for a capture in `root`."""
+        """Read the list of frames from their folder, for a capture in `root`; both may have been moved."""
         content = load_json(folder / _LIST)
         for row in content["frames"]:
-            for name in ("photograph", "thermal"):
-                inside, relative = row[name]
-                row[name] = (folder if inside else root) / relative
             for name, kind in (("gps", GpsFix), ("picture_in_picture", PictureInPicture), ("conditions", Conditions)):
                 row[name] = None if row[name] is None else kind(**row[name])
             row["gimbal_deg"] = None if row["gimbal_deg"] is None else tuple(row["gimbal_deg"])
-        frames, size = tuple(CaptureFrame(**row) for row in content["frames"]), content["thermal_size"]
-        return cls(frames, (size[0], size[1]), content["dead_pixels"], content["dropped"])
+            row["thermal"] = folder / "thermal" / f"{row['name']}.npy"
+            taken_out = row["photograph_source"] == row["thermal_source"]
+            inside = folder / "photographs" / Path(row["photograph"]).name
+            row["photograph"] = inside if taken_out else root / row["photograph_source"]
+        frames = tuple(CaptureFrame(**row) for row in content["frames"])
+        return cls(**{**content, "frames": frames, "thermal_size": tuple(content["thermal_size"])})
 
 
 def read_frames(
@@ -127,7 +120,7 @@ def read_frames(
     kept = [frame for frame in frames if frame.name not in dropped]
     dead, kept = _without_stuck_pixels(kept, (height, width), thermal_mask)
     result = CaptureFrames(tuple(kept), (width, height), dead, dropped)
-    result.save(folder, root)
+    write_json(folder / _LIST, result)
     return result
 
 
@@ -155,8 +148,8 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
         name=pair.name,
         photograph=photograph.resolve(),
         thermal=thermal.resolve(),
-        photograph_source=_relative(pair.photograph, root),
-        thermal_source=_relative(pair.thermal, root),
+        photograph_source=Path(os.path.relpath(pair.photograph, root)).as_posix(),
+        thermal_source=Path(os.path.relpath(pair.thermal, root)).as_posix(),
         camera=metadata.camera or facts.exif.camera,
         lens=metadata.lens,
         taken_at=None if taken_at is None else taken_at.isoformat(),
@@ -174,11 +167,6 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
     )
     height, width = thermogram.temperature_c.shape
     return frame, (height, width)
-
-
-def _relative(path: Path, root: Path) -> str:
-    real, root = path.resolve(), root.resolve()
-    return real.relative_to(root).as_posix() if real.is_relative_to(root) else path.name
 
 
 def _without_stuck_pixels(

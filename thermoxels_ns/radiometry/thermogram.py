@@ -199,7 +199,7 @@ def detect_format(path: Path) -> ThermogramFormat:
     check_file_size(path)
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
-    found = next((name for start, name in _STARTS.items() if head.startswith(start)), None)
+    found: ThermogramFormat | None = next((name for start, name in _STARTS.items() if head.startswith(start)), None)
     if found is not None:
         return found
     if _TEXT.fullmatch(head) and _NUMBERS.match(head) and re.search(rb"[0-9]", head):  # as tables of numbers start

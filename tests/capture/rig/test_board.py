@@ -9,7 +9,7 @@ from tests.support.known_rig import turned
 from thermoxels_ns.capture.rig.board import board_of, find_board, in_scene_units, rig_from_board_photos, rig_from_boards
 from thermoxels_ns.capture.rig_types import RigEstimate, RigStart
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.sfm.scale_and_up import MetricScale
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions

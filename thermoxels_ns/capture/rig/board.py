@@ -20,7 +20,7 @@ from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sig
 from thermoxels_ns.capture.rig.start import BASELINE_SIGMA_M, rig_start
 from thermoxels_ns.capture.rig_types import FloatArray, RigEstimate, RigStart
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.sfm.scale_and_up import MetricScale
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions

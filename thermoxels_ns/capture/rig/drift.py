@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.capture.rig.images import read_temperatures
 from thermoxels_ns.capture.rig_types import DriftEstimate, FloatArray, RigFrame, radius_squared
-from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
+from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.core.camera import Camera
 
 _RADIAL_TERMS = 2

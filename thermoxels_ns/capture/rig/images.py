@@ -13,7 +13,7 @@ import numpy.typing as npt
 from thermoxels_ns.capture.rig.parameters import RigModel
 from thermoxels_ns.capture.rig.score import EdgePoints, RigScore, ThermalEdges
 from thermoxels_ns.capture.rig_types import RigFrame
-from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
+from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.decoders import errors_name

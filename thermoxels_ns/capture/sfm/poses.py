@@ -14,8 +14,7 @@ from PIL import Image
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
-from thermoxels_ns.capture.sfm.colmap_conversion import model_of_colmap
-from thermoxels_ns.capture.sfm.colmap_process import quiet_colmap, run_in_process
+from thermoxels_ns.capture.sfm.colmap import model_of_colmap, quiet_colmap, run_in_process
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, as_colmap, fill_database
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
@@ -224,15 +223,14 @@ def _triangulate(matched: ReducedPhotographs, posed: SfmModel, seed: int, say: C
         found = pycolmap.triangulate_points(*given, clear_points=True, options=options, refine_intrinsics=False)
     model = model_of_colmap(found, matched.frame_of_image, matched.size)
     sighting_frame = np.array([number[frame] for frame in model.frames], dtype=np.int64)[model.sighting_frame]
-    order = np.lexsort((model.sighting_point, sighting_frame))
     return replace(
         posed,
         points=model.points,
         colours=model.colours,
         point_error_px=model.point_error_px,
-        sighting_frame=sighting_frame[order],
-        sighting_point=model.sighting_point[order],
-        sighting_pixel=model.sighting_pixel[order],
+        sighting_frame=sighting_frame,
+        sighting_point=model.sighting_point,
+        sighting_pixel=model.sighting_pixel,
     )
 
 
