@@ -53,8 +53,7 @@ def test_a_camera_that_the_file_names_needs_no_preset(tmp_path):
     counts = counts_of(WALL_C, 0.025, -100.0)
     got = read_thermogram(save_tiff(tmp_path / "a.tiff", counts, "Workswell", "WIRIS Pro"))
     np.testing.assert_allclose(got.temperature_c, WALL_C, atol=1e-5)
-    assert (got.metadata.camera, got.metadata.serial) == ("Workswell WIRIS Pro", "77")
-    assert got.metadata.taken_at.isoformat() == "2024-10-30T10:50:42"
+    assert got.metadata.camera == "Workswell WIRIS Pro"
 
 
 def test_the_users_word_comes_before_the_files(tmp_path):
@@ -118,7 +117,7 @@ def test_stored_temperatures_are_corrected_by_the_model(tmp_path):
     after = Conditions(emissivity=0.9, reflected_c=10.0, distance_m=5.0, air_c=12.0)
     np.testing.assert_allclose(got.temperature_c, corrected_temperature_c(WALL_C, Conditions(), after), atol=1e-5)
     assert (got.temperature_c > WALL_C).all()  # warmer than the surroundings it mirrors
-    assert got.metadata.conditions == after and got.metadata.camera_conditions == Conditions()
+    assert got.metadata.conditions == after
 
 
 def test_a_correction_that_the_camera_made_is_not_made_again(tmp_path):

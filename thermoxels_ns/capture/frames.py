@@ -22,7 +22,6 @@ from thermoxels_ns.radiometry.thermal_pixels import find_dead_pixels
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions, read_thermogram
 
 _LIST = "frames.json"
-_MOST_LISTED = 4  # kinds of measurements that are described
 _MOST_FOR_DEAD_PIXELS = 60  # frames that stuck pixels are looked for in: more need memory and say nothing new
 
 
@@ -36,8 +35,6 @@ class CaptureFrame:
     photograph_source: str  # the camera's file, relative to the capture
     thermal_source: str
     camera: str | None = None  # maker and model of the thermal camera
-    lens: str | None = None
-    taken_at: str | None = None  # when the photograph was taken, as ISO 8601
     focal_px: float | None = None  # focal length that the photograph states, [pixels]
     orientation: int = 1  # EXIF's orientation of the photograph
     gps: GpsFix | None = None
@@ -70,7 +67,7 @@ class CaptureFrames:
             row["gimbal_deg"] = None if row["gimbal_deg"] is None else tuple(row["gimbal_deg"])
             row["thermal"] = folder / "thermal" / f"{row['name']}.npy"
             taken_out = row["photograph_source"] == row["thermal_source"]
-            inside = folder / "photographs" / Path(row["photograph"]).name
+            inside = folder / "photographs" / row["photograph"]
             row["photograph"] = inside if taken_out else root / row["photograph_source"]
         frames = tuple(CaptureFrame(**row) for row in content["frames"])
         return cls(**{**content, "frames": frames, "thermal_size": tuple(content["thermal_size"])})
@@ -120,7 +117,8 @@ def read_frames(
     kept = [frame for frame in frames if frame.name not in dropped]
     dead, kept = _without_stuck_pixels(kept, (height, width), thermal_mask)
     result = CaptureFrames(tuple(kept), (width, height), dead, dropped)
-    write_json(folder / _LIST, result)
+    bare = [replace(frame, photograph=frame.photograph.name, thermal=frame.thermal.name) for frame in kept]
+    write_json(folder / _LIST, replace(result, frames=bare))
     return result
 
 
@@ -143,7 +141,6 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
     thermal = folder / "thermal" / f"{pair.name}.npy"
     np.save(thermal, thermogram.temperature_c)
     metadata = thermogram.metadata
-    taken_at = facts.taken_at or holder.taken_at or metadata.taken_at
     frame = CaptureFrame(
         name=pair.name,
         photograph=photograph.resolve(),
@@ -151,8 +148,6 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
         photograph_source=Path(os.path.relpath(pair.photograph, root)).as_posix(),
         thermal_source=Path(os.path.relpath(pair.thermal, root)).as_posix(),
         camera=metadata.camera or facts.exif.camera,
-        lens=metadata.lens,
-        taken_at=None if taken_at is None else taken_at.isoformat(),
         focal_px=facts.focal_px,
         orientation=facts.orientation,
         gps=facts.gps or holder.gps,
@@ -194,20 +189,14 @@ def _without_stuck_pixels(
 
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:
     """File formats and the settings behind degrees, as names and texts; the most frequent kind first."""
-    formats = [
+    formats = Counter(
         f.format + ("" if f.celsius_per_count is None else f" with {f.celsius_per_count:.4g} K per count")
         for f in frames
         if f.format
-    ]
-    conditions = [conditions_text(frame.conditions) for frame in frames if frame.conditions]
-    listed = {"thermal files": formats, "computed with": conditions}
-    return [(name, _counted(texts)) for name, texts in listed.items() if texts]
-
-
-def _counted(texts: Sequence[str]) -> str:
-    counted = Counter(texts).most_common()
-    if len(counted) == 1:
-        return counted[0][0]
-    listed = [f"{text} ({count} frames)" for text, count in counted[:_MOST_LISTED]]
-    more = len(counted) - len(listed)
-    return "; ".join(listed) + (f"; {more} more kinds" if more else "")
+    )
+    conditions = Counter(conditions_text(frame.conditions) for frame in frames if frame.conditions)
+    rows = []
+    for name, counted in (("thermal files", formats), ("computed with", conditions)):
+        listed = [f"{text} ({number} frames)" if len(counted) > 1 else text for text, number in counted.most_common()]
+        rows.append((name, "; ".join(listed)))
+    return [row for row in rows if row[1]]

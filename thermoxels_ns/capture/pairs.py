@@ -61,24 +61,13 @@ class PairSearch:
     unpaired: dict[Path, str] = field(default_factory=dict)  # why, by file
 
 
-@dataclass(frozen=True)
-class PairOptions:
-    """How partners are recognised."""
-
-    time_limit_s: float = 1.5
-    """Longest time between the exposures of a pair that is found by time alone, [s]."""
-    clock_offset_s: float = 0.0
-    """How far the thermal camera's clock is ahead of the photographs', [s]."""
-
-
-def find_pairs(found: CameraFolder, options: PairOptions | None = None) -> PairSearch:
+def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: float = 0.0) -> PairSearch:
     """Pair photographs and thermal images: inside one file, by DJI's names, by equal names, by time.
 
     Equal names are equal after words for the kind of image are dropped: ``10-58-15-636-visible.jpg`` and
     ``10-58-15-636-radiometric.tiff``, or ``visible/a7.jpg`` and ``thermal/a7.npy``. By time: each the other's nearest,
-    within the limit, and no second candidate about as near.
+    within the limit [s], and no second candidate about as near; the thermal camera's clock is ahead by an offset [s].
     """
-    options = options or PairOptions()
     pairs: list[tuple[CameraFile, CameraFile, str]] = []
     unpaired = dict[Path, str]()
     both = [file for file in found.files if file.role == "both"]
@@ -92,7 +81,7 @@ def find_pairs(found: CameraFolder, options: PairOptions | None = None) -> PairS
         used = {file.path for pair in matched for file in pair[:2]} | set(explained)
         photographs = [file for file in photographs if file.path not in used]
         thermal = [file for file in thermal if file.path not in used]
-    matched, explained = _by_time(photographs, thermal, options)
+    matched, explained = _by_time(photographs, thermal, time_limit_s, clock_offset_s)
     pairs += matched
     unpaired |= explained
     ordered = sorted(pairs, key=lambda pair: natural_key(pair[0].path.relative_to(found.folder)))
@@ -228,22 +217,24 @@ def _shot(stem: str) -> tuple[str, ...]:
     return kept or words
 
 
-def _by_time(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], options: PairOptions) -> _Found:
+def _by_time(
+    photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], limit_s: float, offset_s: float
+) -> _Found:
     explained = {file.path: "no partner of this name, and no time in the file" for file in (*photographs, *thermal)}
     photos, hot = ([file for file in side if file.taken_at is not None] for side in (photographs, thermal))
     if not photos or not hot:
         return [], explained
     at = [np.array([(f.taken_at - datetime.min).total_seconds() for f in side if f.taken_at]) for side in (photos, hot)]
-    apart = np.abs(at[0][:, None] - (at[1][None, :] - options.clock_offset_s))
+    apart = np.abs(at[0][:, None] - (at[1][None, :] - offset_s))
     chosen: dict[Path, tuple[CameraFile, float]] = {}
     for files, others, table in ((photos, hot, apart), (hot, photos, apart.T)):
         for file, row in zip(files, table):
             order = np.argsort(row, kind="stable")[:2]
             (partner, *more), (nearest, *seconds) = [others[number] for number in order], row[order].tolist()
             name = partner.path.name
-            if nearest > options.time_limit_s:
+            if nearest > limit_s:
                 why = f"no partner of this name; the nearest in time, {name}, is {nearest:.1f} s away"
-            elif more and seconds[0] <= min(_CLEARLY_NEARER * nearest + _CLOCK_STEP_S, options.time_limit_s):
+            elif more and seconds[0] <= min(_CLEARLY_NEARER * nearest + _CLOCK_STEP_S, limit_s):
                 two = f"{name} ({nearest:.1f} s) and {more[0].path.name} ({seconds[0]:.1f} s)"
                 why = f"ambiguous: {two} are about as near in time"
             else:

@@ -19,13 +19,13 @@ from thermoxels_ns.capture.settings import StageName
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
-from thermoxels_ns.core.json_values import read_json, write_json
+from thermoxels_ns.core.json_values import read_json
 
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
 LOCK_FILE = "lock"
 _FORMAT = 2  # of the results; raised when they are kept in another way, so that earlier ones are made again
-_KEY_FILE, _DONE_FILE = "key.txt", "done.json"
+_KEY_FILE, _DONE_FILE = "key.txt", "seconds.txt"
 _Record = TypeVar("_Record")
 _EXPECTED, _REMEDY = "what an earlier stage of the capture wrote", "Run it again with --from-stage pairs."
 
@@ -53,7 +53,7 @@ class StageCache:
         Stages come once each, in order. `depends_on` is everything but the earlier stages that the result depends on,
         as json can hold it. `work` writes the result into the folder that it is given; that may hold what an
         interrupted run with the same key left. `writes` are files and folders that the stage writes elsewhere; where
-        one of them, or a file in one, is gone or has another size than the stage gave it, the stage runs again.
+        one of them is gone, the stage runs again.
 
         Raises:
             OutputError: The result cannot be written.
@@ -65,10 +65,10 @@ class StageCache:
         forced = self.from_stage is not None and STAGES.index(name) >= STAGES.index(self.from_stage)
         title = _title(name)
         stale = forced or _read(folder / _KEY_FILE) != key
-        done = None if stale else _read_done(folder, self.folder, writes)
-        if done is not None:
+        done = None if stale else _read(folder / _DONE_FILE)
+        if done is not None and all(path.exists() for path in writes):
             self.say(f"{title}: as before")
-            self.seconds.append((name, done))
+            self.seconds.append((name, float(done)))
             return folder
         remove_file(folder / _DONE_FILE)
         if stale:
@@ -83,7 +83,8 @@ class StageCache:
         start = time.monotonic()
         work(folder)
         took = time.monotonic() - start
-        write_json(folder / _DONE_FILE, {"seconds": took, "written": _sizes(self.folder, writes)})
+        with replace_when_done(folder / _DONE_FILE) as temporary:
+            temporary.write_text(f"{took}", encoding="utf-8")
         self.seconds.append((name, took))
         return folder
 
@@ -136,22 +137,6 @@ def _read(file: Path) -> str | None:
         return file.read_text(encoding="utf-8")
     except OSError:
         return None
-
-
-def _read_done(folder: Path, output: Path, writes: Sequence[Path]) -> float | None:
-    """Seconds that a stage took; None where it did not end, or where what it wrote elsewhere is no longer whole."""
-    try:
-        done = json.loads((folder / _DONE_FILE).read_text(encoding="utf-8"))
-        seconds = float(done["seconds"])
-        return seconds if done["written"] == _sizes(output, writes) else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def _sizes(output: Path, writes: Sequence[Path]) -> dict[str, int]:
-    """Bytes of every file that a stage wrote, by its name in the output folder."""
-    files = [each for path in writes for each in ([path] if path.is_file() else path.rglob("*")) if each.is_file()]
-    return {path.relative_to(output).as_posix(): path.stat().st_size for path in sorted(files)}
 
 
 def save(path: Path, record: Any) -> None:

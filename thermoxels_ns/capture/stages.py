@@ -14,10 +14,9 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
 from thermoxels_ns.capture.masks import PhotographMasks, find_masks, mask_files, user_masks
-from thermoxels_ns.capture.pairs import Pair, PairOptions, PairSearch, find_pairs, no_pairs, read_pair_list
+from thermoxels_ns.capture.pairs import Pair, PairSearch, find_pairs, no_pairs, read_pair_list
 from thermoxels_ns.capture.rig.board import CheckerBoard, board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.rig.drift import estimate_drift
-from thermoxels_ns.capture.rig.explanation import rig_lines
 from thermoxels_ns.capture.rig.search import estimate_rig
 from thermoxels_ns.capture.rig.start import kept_start, read_rig, rig_frames, rig_start
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
@@ -156,7 +155,7 @@ class _Capture:
             drawn = None
         masks = PhotographMasks(size, drawn, user_masks(frames, self.settings.masks))
         scene = Scene(frames, model, rig, drift, scale, up, masks)
-        written = [self.output / name for name in SCENE_CONTENT]
+        written = [self.output / name for name in SCENE_CONTENT if name != "masks" or masks.any]
         self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
         given = self.settings.poses
         source = f"Given in {given.name}." if given else "Structure from motion on the photographs (COLMAP)."
@@ -174,19 +173,19 @@ class _Capture:
 
     def pairs(self) -> tuple[Pair, ...]:
         """Find which photograph belongs to which thermal image."""
-        settings, options = self.settings, self.options(PairOptions)
+        settings = self.settings
         inside = files_below(self.source, [self.output])
         if settings.pairs is None:
             inside = [path for path in inside if path.suffix.lower() in SUFFIXES]
         depends = {
-            "options": options,
+            "times": [settings.time_limit_s, settings.clock_offset_s],
             "files": fingerprint(inside, self.source),
             "list": given_fingerprints([settings.pairs]),
             "skip_bad": settings.skip_bad,
         }
 
         def work(folder: Path) -> None:
-            search, unreadable = self._searched_pairs(options)
+            search, unreadable = self._searched_pairs()
             rows = [
                 (pair.name, self.name_of(pair.photograph), self.name_of(pair.thermal), pair.how)
                 for pair in search.pairs
@@ -207,13 +206,13 @@ class _Capture:
         """A camera file's name from the capture's folder on."""
         return Path(os.path.relpath(path, self.source)).as_posix()
 
-    def _searched_pairs(self, options: PairOptions) -> tuple[PairSearch, dict[Path, str]]:
+    def _searched_pairs(self) -> tuple[PairSearch, dict[Path, str]]:
         """The pairs as listed or found, and why some files cannot be read."""
         settings = self.settings
         if settings.pairs is not None:
             return read_pair_list(settings.pairs, self.source), {}
         found = scan_folder(self.source, [self.output], self.say)
-        search = find_pairs(found, options)
+        search = find_pairs(found, settings.time_limit_s, settings.clock_offset_s)
         if found.unreadable and not settings.skip_bad:
             first = next(iter(found.unreadable.values()))
             more = f" {len(found.unreadable) - 1} more cannot be read." if len(found.unreadable) > 1 else ""
@@ -347,12 +346,11 @@ class _Capture:
     ) -> tuple[RigEstimate, RigEstimate]:
         """Find the rig, or take the one that the user or a checker board gives."""
         settings = self.settings
-        depends = {"angle": settings.thermal_field_of_view_deg, "rig": given_fingerprints([settings.rig])}
+        angle, metres = settings.thermal_field_of_view_deg, None if scale is None else scale.metres_per_unit
+        begin = rig_start(frames, model.camera, read.thermal_size, angle, metres)
+        depends = {"angle": angle, "rig": given_fingerprints([settings.rig])}
 
         def work(folder: Path) -> None:
-            metres = None if scale is None else scale.metres_per_unit
-            begin = rig_start(frames, model.camera, read.thermal_size, settings.thermal_field_of_view_deg, metres)
-            save(folder / "start.npz", kept_start(begin, "Where the search begins."))
             if settings.rig is not None:
                 rig = read_rig(settings.rig, read.thermal_size, metres)
             elif board is not None:
@@ -360,18 +358,14 @@ class _Capture:
             elif len(model.sighting_frame) < _LEAST_SIGHTINGS:
                 rig = kept_start(begin, "There are no scene points to compare the images at.")
             else:
-
-                def tell(message: str, share: float) -> None:
-                    self.say(f"rig: {message} ({100 * share:.0f} %)")
-
-                rig = estimate_rig(rig_frames(model, frames), model.camera, begin, tell)
+                rig = estimate_rig(
+                    rig_frames(model, frames), model.camera, begin, lambda line: self.say(f"rig: {line}")
+                )
             save(folder / "rig.npz", rig)
-            for line in rig_lines(rig, metres):
-                self.say(f"rig: {line}")
+            self.say(f"rig: {rig.explanation}")
 
-        folder = self.cache.run("rig", depends, work)
-        rig, start = (load(folder / f"{name}.npz", RigEstimate) for name in ("rig", "start"))
-        return rig, start
+        rig = load(self.cache.run("rig", depends, work) / "rig.npz", RigEstimate)
+        return rig, kept_start(begin, "Where the search begins.")
 
     def drift(self, model: SfmModel, frames: list[CaptureFrame], rig: RigEstimate) -> DriftEstimate:
         """Find how far each thermal image reads too high, unless the user switched that off."""

@@ -18,7 +18,6 @@ LARGEST_SIDE = 8192
 """Pixels along a side: four times the largest thermal sensors and super-resolution modes (about 2048)."""
 JPEG_START, PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _MAKE, _MODEL, _CHANGED_AT, _TAKEN_AT, _EXIF = 271, 272, 306, 36867, 34665
-_BODY_SERIAL, _DNG_SERIAL = 42033, 50735
 LARGEST_FILE_BYTES = 2**29  # a table of 4096 x 4096 numbers of 30 characters; camera files are far smaller
 
 
@@ -91,7 +90,6 @@ class ExifFacts:
 
     make: str | None = None
     model: str | None = None
-    serial: str | None = None
     taken_at: datetime | None = None  # without a time zone, as the camera's clock showed it
 
     @property
@@ -107,7 +105,6 @@ def read_exif_facts(image: Image.Image) -> ExifFacts:
     return ExifFacts(
         _text(tags.get(_MAKE)),
         _text(tags.get(_MODEL)),
-        _text(tags.get(_BODY_SERIAL)) or _text(tags.get(_DNG_SERIAL)),
         _time(tags.get(_TAKEN_AT)) or _time(tags.get(_CHANGED_AT)),
     )
 

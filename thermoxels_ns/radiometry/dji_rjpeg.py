@@ -24,19 +24,6 @@ from thermoxels_ns.radiometry.decoders import (
 from thermoxels_ns.radiometry.measurement_model import ConditionOverrides, Conditions
 
 _SDK = "the DJI Thermal SDK (www.dji.com/downloads/softwares/dji-thermal-sdk)"
-_STATUS = {
-    -1: "out of memory",
-    -2: "a null pointer",
-    -3: "parameters out of range",
-    -4: "no valid counts in the R-JPEG",
-    -5: "no valid header in the R-JPEG",
-    -6: "no valid calibration curve in the R-JPEG",
-    -7: "an R-JPEG that cannot be parsed",
-    -8: "a wrong size",
-    -9: "an invalid handle",
-    -10: "a wrong input format",
-    -11: "a wrong output format",
-}
 _FUNCTIONS = (
     "dirp_create_from_rjpeg",
     "dirp_get_rjpeg_resolution",
@@ -71,7 +58,6 @@ class DjiImage:
     """One R-JPEG of a DJI camera after reading."""
 
     temperature_c: npt.NDArray[np.float32]  # shape (height, width), [degrees C]
-    camera_conditions: Conditions
     conditions: Conditions
     exif: ExifFacts
 
@@ -106,7 +92,7 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
         status = getattr(dirp, function)(*arguments)
         if status != 0:
             expected = f"{function} of {library.name} to take the file"
-            got = f"status {status} ({_STATUS.get(status, 'unknown')})"
+            got = f"status {status}"
             remedy = f"Copy the file from the drone again, unedited; use a newer library. {_LIMITS}"
             raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
@@ -156,7 +142,7 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
         errors_name(path, "a JPEG with readable tags", error=ThermalFileError),
         Image.open(path, formats=("JPEG", "MPO")) as image,
     ):
-        return DjiImage(temperature_c, before, after, read_exif_facts(image))
+        return DjiImage(temperature_c, after, read_exif_facts(image))
 
 
 def _load(library: Path) -> ctypes.CDLL:

@@ -71,8 +71,6 @@ class CameraInfo:
     raw_range: tuple[int, int]  # counts from and to which the calibration holds
     field_of_view_deg: float | None  # horizontal, as the camera states it; some state nonsense such as 180
     model: str | None
-    serial: str | None
-    lens: str | None
     taken_at: datetime | None
 
 
@@ -206,8 +204,6 @@ def _camera_info(record: _Record) -> CameraInfo:
             raw_range=(int(low), int(high)) if low < high else (0, 0xFFFF),
             field_of_view_deg=field_of_view if field_of_view > 0 else None,
             model=model if model is None or model.lower().startswith("flir") else f"FLIR {model}",
-            serial=record.text(0x104, 16),
-            lens=record.text(0x170, 32),
             taken_at=_taken_at(record),
         )
     except ThermoxelsError as problem:

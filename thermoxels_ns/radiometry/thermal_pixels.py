@@ -25,8 +25,6 @@ _WIDTH, _HEIGHT, _SAMPLE_BITS, _SAMPLE_FORMAT = 256, 257, 258, 339  # tags of TI
 _FLOATING = 3  # a sample format
 MIN_FRAMES = 5  # fewer frames than this cannot tell a stuck pixel from a quiet one
 _WINDOW = 2  # half width of the neighbourhood: 5 x 5, so that a dead column or row is still a minority of it
-_LONGEST_LINE = 2**20
-"""More characters in a line are no row of a thermal image: 8192 numbers of 30 characters are a quarter of it."""
 _EXPECTED = "a readable thermal file"
 _REMEDY = "The file is damaged or not what its suffix says; copy it again or remove its frame."
 _TIFF_SUFFIXES = (".tif", ".tiff")
@@ -214,15 +212,6 @@ def _read_raw(path: Path, suffix: str) -> _RawPixels:
 
 def _read_csv(path: Path) -> npt.NDArray[np.float64]:
     """Read rows of numbers split by commas or semicolons; empty cells and nan, NA, null, - are NaN."""
-    width = height = 0
-    with path.open(encoding="latin-1") as stream:  # counts alone, whatever the file's own encoding
-        while line := stream.readline(_LONGEST_LINE):
-            width, height = max(width, 1 + max(line.count(","), line.count(";"))), height + 1
-            if len(line) == _LONGEST_LINE:
-                expected = f"a table with lines below {_LONGEST_LINE} characters"
-                remedy = "The file is damaged or no table; write one row of the image per line."
-                raise ThermalFileError(str(path), expected=expected, got=f"a longer one, line {height}", remedy=remedy)
-            check_thermal_size(path, width, height)
     text = path.read_text(encoding="utf-8-sig")
     semicolons = ";" in text
     rows = []
@@ -235,6 +224,7 @@ def _read_csv(path: Path) -> npt.NDArray[np.float64]:
             rows.append([_number(cell.replace(",", ".") if semicolons else cell) for cell in cells])
     if not rows or len({len(row) for row in rows}) != 1:
         raise _damaged(path, f"rows of lengths {sorted({len(row) for row in rows})}")
+    check_thermal_size(path, len(rows[0]), len(rows))
     return np.array(rows, dtype=np.float64)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
@@ -74,26 +73,17 @@ COUNT_SCALES: dict[CameraName, CountScale] = {
 }
 """From the makers' manuals. FLIR's two gains cannot be told apart by the file, so the user says which."""
 
-_RECOGNISED: tuple[tuple[str, str, CameraName], ...] = (
-    ("workswell", "wiris pro", "workswell"),
-    ("sensefly", "", "sensefly"),
-)
-"""Maker, start of the model and preset of the cameras that a file names without doubt, in small letters."""
-
 
 def recognised_camera(make: str | None, model: str | None) -> CameraName | None:
     """Find the preset of a camera by what its file says of it; None where the file leaves a choice.
 
-    >>> recognised_camera("Workswell", "WIRIS Pro")
-    'workswell'
-    >>> recognised_camera("FLIR", "Duo Pro R") is None
-    True
+    >>> recognised_camera("Workswell", "WIRIS Pro"), recognised_camera("FLIR", "Duo Pro R")
+    ('workswell', None)
     """
     make, model = (make or "").strip().lower(), (model or "").strip().lower()
-    for maker, start, name in _RECOGNISED:
-        if make.startswith(maker) and model.startswith(start):
-            return name
-    return None
+    if make.startswith("workswell") and model.startswith("wiris pro"):
+        return "workswell"
+    return "sensefly" if make.startswith("sensefly") else None
 
 
 @dataclass(frozen=True)
@@ -102,12 +92,8 @@ class ThermogramMetadata:
 
     format: ThermogramFormat  # by content, not by name
     camera: str | None = None  # maker and model
-    serial: str | None = None  # of the camera
-    lens: str | None = None
-    taken_at: datetime | None = None  # when; with a time zone where the file has one
     field_of_view_deg: float | None = None
     """Horizontal, of the thermal lens, as the camera states it; some state nonsense such as 180."""
-    camera_conditions: Conditions | None = None  # emissivity and the rest that the camera was set to
     conditions: Conditions | None = None
     """Those that the temperatures were computed with: the camera's, with the user's in their place."""
     picture_in_picture: PictureInPicture | None = None  # factory alignment of photograph and thermal image
@@ -226,11 +212,7 @@ def _read_flir(path: Path, options: RadiometryOptions) -> tuple[ThermalImage, Th
     metadata = ThermogramMetadata(
         format="FLIR R-JPEG",
         camera=camera.model,
-        serial=camera.serial,
-        lens=camera.lens,
-        taken_at=camera.taken_at,
         field_of_view_deg=camera.field_of_view_deg,
-        camera_conditions=camera.conditions,
         conditions=conditions,
         picture_in_picture=flir.picture_in_picture,
     )
@@ -243,9 +225,6 @@ def _read_dji(path: Path, options: RadiometryOptions) -> tuple[ThermalImage, The
     metadata = ThermogramMetadata(
         format="DJI R-JPEG",
         camera=dji.exif.camera,
-        serial=dji.exif.serial,
-        taken_at=dji.exif.taken_at,
-        camera_conditions=dji.camera_conditions,
         conditions=dji.conditions,
     )
     return image, metadata
@@ -271,9 +250,6 @@ def _read_stored(
     metadata = ThermogramMetadata(
         format=found,
         camera=exif.camera,
-        serial=exif.serial,
-        taken_at=exif.taken_at,
-        camera_conditions=before,
         conditions=after,
         celsius_per_count=unit.scale if found in ("TIFF", "PNG") and unit.kind == "linear" else None,
     )

@@ -7,8 +7,8 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
@@ -75,7 +75,12 @@ def run_in_process(
         words = log.read_text("utf-8", "replace") if log.is_file() else ""
         log.unlink(missing_ok=True)
     if ended is None:
-        raise colmap_stopped(_reason(child.exitcode, words), folder)
+        reason, free = _reason(child.exitcode, words), shutil.disk_usage(folder).free
+        if free < _FULL_BYTES or "disk is full" in reason:  # whatever COLMAP says
+            expected, got = f"free space for features, matches and poses in {folder}", f"{free / 1e6:.0f} MB"
+            raise OutputError("disk", expected=expected, got=got, remedy="Make space; finished stages are kept.")
+        remedy = "Check free space and memory and run the command again; if that does not help, begin anew with "
+        raise ThermoxelsError("COLMAP", expected="to end", got=reason, remedy=remedy + "--from-stage poses.")
     if ended[1] is not None:
         raise ended[1]
     return ended[0]
@@ -87,8 +92,10 @@ def _serve(pipe: Connection, log: Path, work: Callable[..., Any], arguments: tup
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    import pycolmap  # noqa: F401 (brings a BLAS of its own, whose sums depend on the number of its threads)
+    import pycolmap  # brings a BLAS of its own, whose sums depend on the number of its threads
 
+    log_of_colmap: Any = pycolmap.logging
+    log_of_colmap.minloglevel = _FATAL_ONLY
     ended: tuple[Any, Exception | None]
     with threadpool_limits(1, "blas"):
         try:
@@ -106,40 +113,12 @@ def _exit_with_parent() -> None:
 
 
 def _reason(status: int | None, words: str) -> str:
-    """Say why the process ended: the line that names an error, else its last one, else its status."""
+    """Say why the process ended: the last line that names an error, else its last one, else its status."""
     if status == _KILLED:
         return "it was killed, as systems do where memory runs out (lower --threads, --image-size or --max-features)"
     said = [line for line in words.splitlines() if line.strip()]
     telling = [line for line in said if "error" in line.lower()] or said[-1:]
-    return f"exit status {status}" + (f" ({telling[0]})" if telling else "")
-
-
-@contextmanager
-def quiet_colmap(folder: Path) -> Iterator[None]:
-    """Silence COLMAP in the block; where it stops, the error of `colmap_stopped` is raised."""
-    import pycolmap
-
-    log: Any = pycolmap.logging
-    before = log.minloglevel
-    log.minloglevel = _FATAL_ONLY
-    try:
-        yield
-    except (RuntimeError, ValueError) as problem:  # what COLMAP raises, such as for a database on a full disk
-        lines = str(problem).strip().splitlines()
-        raise colmap_stopped(lines[0] if lines else type(problem).__name__, folder) from problem
-    finally:
-        log.minloglevel = before
-
-
-def colmap_stopped(reason: str, folder: Path) -> ThermoxelsError:
-    """Build the error for a COLMAP that stopped; a full disk is named as the reason, whatever COLMAP says."""
-    free = shutil.disk_usage(folder).free
-    if free < _FULL_BYTES or "disk is full" in reason:
-        expected, got = f"free space for features, matches and poses in {folder}", f"{free / 1e6:.0f} MB"
-        remedy = "Make space; finished stages are kept."
-        return OutputError("disk", expected=expected, got=got, remedy=remedy)
-    remedy = "Check free space and memory and run the command again; if that does not help, begin anew with "
-    return ThermoxelsError("COLMAP", expected="to end", got=reason, remedy=remedy + "--from-stage poses.")
+    return f"exit status {status}" + (f" ({telling[-1]})" if telling else "")
 
 
 def model_of_colmap(

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.capture.settings import LensModel, Matching
-from thermoxels_ns.capture.sfm.colmap import quiet_colmap, run_in_process
+from thermoxels_ns.capture.sfm.colmap import run_in_process
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import replace_when_done
 
@@ -90,10 +90,9 @@ def fill_database(
 def _find_and_match(
     photographs: ReducedPhotographs, camera: Camera, known_focal: bool, options: PoseOptions, say: Callable[[str], None]
 ) -> None:
-    with quiet_colmap(photographs.database.parent):
-        _add_images(photographs, camera, options.lens, known_focal)
-        _find_features(photographs, options, say)
-        _match(photographs, image_pairs(len(photographs.frame_of_image), options.matching), options, say)
+    _add_images(photographs, camera, options.lens, known_focal)
+    _find_features(photographs, options, say)
+    _match(photographs, image_pairs(len(photographs.frame_of_image), options.matching), options, say)
 
 
 def _find_features(photographs: ReducedPhotographs, options: PoseOptions, say: Callable[[str], None]) -> None:

@@ -216,17 +216,14 @@ def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> t
         raise SceneError("known distance", expected=f"scene points around pixel {pixel}", got=len(near), remedy=remedy)
     depth = model.in_camera(index, model.points[points[near]])[:, 2]
     weight = 1.0 / (1.0 + apart[near] / (np.median(apart[near]) + 1e-9))
-    table = np.column_stack([np.ones(len(near)), pixels[near] - pixel])
-    scale = np.array([1.0, 1.0 / camera.width, 1.0 / camera.width])
-    inverse, keep = 1.0 / depth, np.ones(len(near), dtype=bool)
-    solution = np.zeros(3)
+    table = np.column_stack([np.ones(len(near)), (pixels[near] - pixel) / camera.width])
+    inverse, keep, plane = 1.0 / depth, np.ones(len(near), dtype=bool), np.zeros(3)
     for _ in range(3):
-        w = weight * keep
-        left = (table * w[:, None]) / scale
-        solution = np.linalg.lstsq(left, inverse * w, rcond=1e-6)[0] / scale
-        off = np.abs(table @ solution - inverse)
+        w = (weight * keep)[:, None]
+        plane = np.linalg.lstsq(table * w, inverse * w[:, 0], rcond=1e-6)[0]
+        off = np.abs(table @ plane - inverse)
         keep = off <= 3.0 * 1.4826 * float(np.median(off)) + 1e-12
-    at, scatter = float(solution[0]), float(np.sqrt(np.mean((table @ solution - inverse)[keep] ** 2)))
+    at, scatter = float(plane[0]), float(np.sqrt(np.mean((table @ plane - inverse)[keep] ** 2)))
     if not at > 0.25 * float(np.median(inverse)):
         at = float(np.median(inverse))
     pose = model.camera_to_world[index]
