@@ -7,20 +7,20 @@ import pytest
 from tests.support.camera_card import counts, jpeg_bytes, photograph
 from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.folder_scan import CameraFile, CameraFolder, scan_folder
-from thermoxels_ns.capture.pairs import PairOptions, PairSearch, find_pairs, read_pair_list
+from thermoxels_ns.capture.pairs import PairSearch, find_pairs, read_pair_list
 from thermoxels_ns.core.errors import SceneError
 
 ROOT = Path("/card")
 NOON = datetime(2024, 5, 1, 12)
 
 
-def of(*files: tuple[str, str] | tuple[str, str, float], options: PairOptions | None = None) -> PairSearch:
+def of(*files: tuple[str, str] | tuple[str, str, float], clock_offset_s: float = 0.0) -> PairSearch:
     """Pair files given as name, role and (optional) seconds after noon."""
     listed = tuple(
         CameraFile(ROOT / f[0], f[1], None if len(f) == 2 else NOON + timedelta(seconds=f[2]))  # type: ignore[arg-type]
         for f in files
     )
-    return find_pairs(CameraFolder(ROOT, listed), options)
+    return find_pairs(CameraFolder(ROOT, listed), clock_offset_s=clock_offset_s)
 
 
 def names(search: PairSearch) -> list[tuple[str, str]]:
@@ -88,7 +88,7 @@ def test_times_pair_what_names_do_not():
 def test_a_clock_that_is_ahead_is_set_back():
     files = (("a.jpg", "photograph", 0.0), ("b.npy", "thermal", 3600.2))
     assert of(*files).pairs == ()
-    assert names(of(*files, options=PairOptions(clock_offset_s=3600.0))) == [("a.jpg", "b.npy")]
+    assert names(of(*files, clock_offset_s=3600.0)) == [("a.jpg", "b.npy")]
 
 
 def test_two_candidates_about_as_near_in_time_are_not_guessed_between():

@@ -10,8 +10,7 @@ from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.scene_writer import TRACKS_NAME, Scene, scene_names, write_scene_folder
-from thermoxels_ns.capture.sfm.gravity import Up
-from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.sfm.scale_and_up import MetricScale, Up
 from thermoxels_ns.capture.stage_cache import prepare_output
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig

@@ -12,7 +12,7 @@ from thermoxels_ns.capture.pairs import read_pair_list
 from thermoxels_ns.capture.photograph import open_photograph, read_mask
 from thermoxels_ns.capture.rig.images import read_photograph
 from thermoxels_ns.capture.rig_types import RigFrame
-from thermoxels_ns.capture.sfm.colmap_conversion import read_colmap
+from thermoxels_ns.capture.sfm.colmap import read_colmap
 from thermoxels_ns.commands.cost import read_runs
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import ThermoxelsError

@@ -15,7 +15,7 @@ from tests.support.textured_room import write_card
 
 COUNT = 5
 OPTIONS = "--max-features 300 --image-size 320 --thermal-field-of-view-deg 56"
-OF_THE_RUN = {"capture.html", "lock", "done.json", "key.txt", "features.db"}
+OF_THE_RUN = {"capture.html", "lock", "seconds.txt", "key.txt", "features.db"}
 """They hold times, a process number, the options, and rows in the order in which threads ended."""
 
 

@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
 from thermoxels_ns.radiometry.measurement_model import (
     LONG_WAVE,
     AirConstants,
+    ConditionOverrides,
+    Conditions,
     PlanckBand,
     PlanckConstants,
     RadiometricModel,

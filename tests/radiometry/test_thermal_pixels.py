@@ -9,8 +9,7 @@ from PIL import Image
 from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.data.dataparser import survey_thermal_files
-from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
-from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, read_thermal_file
+from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixels, read_thermal_file
 from thermoxels_ns.radiometry.thermogram import read_thermogram
 
 BOUNDS = ThermalUnit.bounds(-10.0, 40.0)

@@ -42,9 +42,9 @@ class KnownCapture:
 
 
 def changes_between(start: RigStart, camera: Camera, transform: FloatArray) -> FloatArray:
-    """The ten changes (`rig_parameters.PARAMETERS`) that make a rig of a start that is not turned, shape (10,)."""
+    """The ten changes (`PARAMETERS`) that make a rig of a start that is not turned, shape (10,)."""
     turn, before = transform[:3, :3], start.thermal_camera
-    angles = np.arctan2(turn[2, 1], turn[2, 2]), -np.arcsin(turn[2, 0]), np.arctan2(turn[1, 0], turn[0, 0])
+    angles = cv2.Rodrigues(turn)[0].ravel()
     shift = transform[:3, 3] - start.visible_to_thermal[:3, 3]
     growth = np.log(camera.fl_x / before.fl_x)
     lens = growth, camera.cx - before.cx, camera.cy - before.cy, camera.k1 - before.k1

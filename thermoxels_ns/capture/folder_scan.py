@@ -15,9 +15,8 @@ from PIL import Image
 
 from thermoxels_ns.capture.photograph import read_photograph_facts
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError, printable
-from thermoxels_ns.radiometry.decoders import check_file_size, check_thermal_size, errors_name
+from thermoxels_ns.radiometry.decoders import check_file_size, check_thermal_size, errors_name, read_exif_facts
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
-from thermoxels_ns.radiometry.exif import read_exif_facts
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 from thermoxels_ns.radiometry.thermal_pixels import size_of_double_tiff
 
@@ -52,8 +51,6 @@ class CameraFolder:
     files: tuple[CameraFile, ...]
     unreadable: dict[Path, str] = field(default_factory=dict)  # why, by file
     others: int = 0  # files of other kinds, which were not looked at
-    passed_over: dict[Path, str] = field(default_factory=dict)
-    """What is not followed or not opened (links that lead out, folders that are shut), and why."""
 
 
 def words_of(name: str) -> tuple[str, ...]:
@@ -81,15 +78,14 @@ def scan_folder(
 ) -> CameraFolder:
     """Look at every picture and table in a folder (a `SceneError` if it is none) and the folders in it but `without`.
 
-    Hidden files and folders are passed over. Links that lead out of the folder, linked folders, folders that are shut
-    and what is no file are passed over and named.
+    Hidden files and folders, linked folders and what is no file are passed over; `say` is told of shut folders.
     """
     if not folder.is_dir():
         remedy = "Pass the folder that the memory card was copied to."
         got = f"{'a file' if folder.exists() else 'nothing'} at {folder}"
         raise SceneError("input", expected="a folder with camera files", got=got, remedy=remedy)
     files, unreadable, others = [], dict[Path, str](), 0
-    found, passed_over = files_below(folder, without)
+    found = files_below(folder, without, say)
     for number, path in enumerate(found):
         if path.suffix.lower() not in SUFFIXES:
             others += 1
@@ -101,36 +97,23 @@ def scan_folder(
             unreadable[path] = str(problem)
         if (number + 1) % 100 == 0:
             say(f"files: {number + 1} of {len(found)}")
-    return CameraFolder(folder, tuple(files), unreadable, others, passed_over)
+    return CameraFolder(folder, tuple(files), unreadable, others)
 
 
-def files_below(folder: Path, without: Sequence[Path] = ()) -> tuple[list[Path], dict[Path, str]]:
-    """Files of a folder and its folders but `without`, sorted as people do, and why others are not among them."""
-    root, skipped = folder.resolve(), [path.resolve() for path in without]
-    files, passed_over = [], dict[Path, str]()
-
-    def shut(problem: OSError) -> None:
-        passed_over[Path(problem.filename)] = f"a folder that cannot be opened ({problem.strerror})"
-
+def files_below(folder: Path, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None) -> list[Path]:
+    """Files of a folder and the folders in it but `without`, sorted as people do."""
+    skipped, files = [path.resolve() for path in without], []
+    shut = lambda problem: say(f"passed over: {problem.filename} ({problem.strerror})")  # noqa: E731
     for place, folders, names in os.walk(folder, onerror=shut):
         here = Path(place)
-        for name in [name for name in folders if (here / name).is_symlink() and not name.startswith(".")]:
-            passed_over[here / name] = "a link to a folder, which is not followed; copy the folder itself"
         folders[:] = [
             name
             for name in folders
             if not name.startswith(".") and not any((here / name).resolve().is_relative_to(each) for each in skipped)
         ]
-        for path in (here / name for name in names if not name.startswith(".")):
-            if not path.is_file():
-                passed_over[path] = "no file" if path.exists() else "a link to nothing"
-            elif path.is_symlink() and not path.resolve().is_relative_to(root):
-                passed_over[path] = "a link that leads out of the folder; copy the file itself"
-            else:
-                files.append(path)
+        files += [here / name for name in names if not name.startswith(".") and (here / name).is_file()]
     # Names that differ in capitals alone come in one order on every disk.
-    files.sort(key=lambda path: (natural_key(path.relative_to(folder)), path.as_posix()))
-    return files, passed_over
+    return sorted(files, key=lambda path: (natural_key(path.relative_to(folder)), path.as_posix()))
 
 
 def shown_name(path: Path) -> str:
@@ -161,9 +144,7 @@ def _identify(path: Path, folder: Path) -> CameraFile:
             taken_at = flir.camera.taken_at
             role: Role = "thermal" if flir.visible is None else "both"
             return CameraFile(path, role, None if taken_at is None else taken_at.replace(tzinfo=None))
-        with path.open("rb") as stream:
-            head = stream.read(2**18)
-        if is_dji_rjpeg(head) or is_dji_rjpeg(path.read_bytes()):
+        if is_dji_rjpeg(path):
             return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
     elif size_of_double_tiff(path) is not None:
         return CameraFile(path, "thermal", None)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +13,15 @@ import numpy.typing as npt
 
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_mask, read_photograph_facts
-from thermoxels_ns.capture.stage_results import load_json
+from thermoxels_ns.capture.stage_cache import load_json
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
-from thermoxels_ns.radiometry.conditions import Conditions, conditions_text
-from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
-from thermoxels_ns.radiometry.flir_records import PictureInPicture
-from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
+from thermoxels_ns.radiometry.flir_rjpeg import PictureInPicture, read_flir_jpeg
+from thermoxels_ns.radiometry.measurement_model import Conditions, conditions_text
+from thermoxels_ns.radiometry.thermal_pixels import find_dead_pixels
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions, read_thermogram
 
 _LIST = "frames.json"
-_MOST_LISTED = 4  # kinds of measurements that are described
 _MOST_FOR_DEAD_PIXELS = 60  # frames that stuck pixels are looked for in: more need memory and say nothing new
 
 
@@ -36,8 +35,6 @@ class CaptureFrame:
     photograph_source: str  # the camera's file, relative to the capture
     thermal_source: str
     camera: str | None = None  # maker and model of the thermal camera
-    lens: str | None = None
-    taken_at: str | None = None  # when the photograph was taken, as ISO 8601
     focal_px: float | None = None  # focal length that the photograph states, [pixels]
     orientation: int = 1  # EXIF's orientation of the photograph
     gps: GpsFix | None = None
@@ -60,28 +57,20 @@ class CaptureFrames:
     dead_pixels: int  # thermal pixels that are stuck at one value in all frames; they are NaN in every frame
     dropped: dict[str, str] = field(default_factory=dict)  # why, by the frame's name
 
-    def save(self, folder: Path, root: Path) -> None:
-        """Write the list of frames beside their images; both folders may be moved later."""
-        content = asdict(self)
-        for row in content["frames"]:
-            for name in ("photograph", "thermal"):
-                inside = row[name].is_relative_to(folder.resolve())
-                row[name] = [inside, row[name].relative_to(folder.resolve() if inside else root.resolve()).as_posix()]
-        write_json(folder / _LIST, content)
-
     @classmethod
     def load(cls, folder: Path, root: Path) -> CaptureFrames:
-        """Read the list of frames from a folder, for a capture in `root`."""
+        """Read the list of frames from their folder, for a capture in `root`; both may have been moved."""
         content = load_json(folder / _LIST)
         for row in content["frames"]:
-            for name in ("photograph", "thermal"):
-                inside, relative = row[name]
-                row[name] = (folder if inside else root) / relative
             for name, kind in (("gps", GpsFix), ("picture_in_picture", PictureInPicture), ("conditions", Conditions)):
                 row[name] = None if row[name] is None else kind(**row[name])
             row["gimbal_deg"] = None if row["gimbal_deg"] is None else tuple(row["gimbal_deg"])
-        frames, size = tuple(CaptureFrame(**row) for row in content["frames"]), content["thermal_size"]
-        return cls(frames, (size[0], size[1]), content["dead_pixels"], content["dropped"])
+            row["thermal"] = folder / "thermal" / f"{row['name']}.npy"
+            taken_out = row["photograph_source"] == row["thermal_source"]
+            inside = folder / "photographs" / row["photograph"]
+            row["photograph"] = inside if taken_out else root / row["photograph_source"]
+        frames = tuple(CaptureFrame(**row) for row in content["frames"])
+        return cls(**{**content, "frames": frames, "thermal_size": tuple(content["thermal_size"])})
 
 
 def read_frames(
@@ -128,7 +117,8 @@ def read_frames(
     kept = [frame for frame in frames if frame.name not in dropped]
     dead, kept = _without_stuck_pixels(kept, (height, width), thermal_mask)
     result = CaptureFrames(tuple(kept), (width, height), dead, dropped)
-    result.save(folder, root)
+    bare = [replace(frame, photograph=frame.photograph.name, thermal=frame.thermal.name) for frame in kept]
+    write_json(folder / _LIST, replace(result, frames=bare))
     return result
 
 
@@ -151,16 +141,13 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
     thermal = folder / "thermal" / f"{pair.name}.npy"
     np.save(thermal, thermogram.temperature_c)
     metadata = thermogram.metadata
-    taken_at = facts.taken_at or holder.taken_at or metadata.taken_at
     frame = CaptureFrame(
         name=pair.name,
         photograph=photograph.resolve(),
         thermal=thermal.resolve(),
-        photograph_source=_relative(pair.photograph, root),
-        thermal_source=_relative(pair.thermal, root),
+        photograph_source=Path(os.path.relpath(pair.photograph, root)).as_posix(),
+        thermal_source=Path(os.path.relpath(pair.thermal, root)).as_posix(),
         camera=metadata.camera or facts.exif.camera,
-        lens=metadata.lens,
-        taken_at=None if taken_at is None else taken_at.isoformat(),
         focal_px=facts.focal_px,
         orientation=facts.orientation,
         gps=facts.gps or holder.gps,
@@ -175,11 +162,6 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
     )
     height, width = thermogram.temperature_c.shape
     return frame, (height, width)
-
-
-def _relative(path: Path, root: Path) -> str:
-    real, root = path.resolve(), root.resolve()
-    return real.relative_to(root).as_posix() if real.is_relative_to(root) else path.name
 
 
 def _without_stuck_pixels(
@@ -207,20 +189,14 @@ def _without_stuck_pixels(
 
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:
     """File formats and the settings behind degrees, as names and texts; the most frequent kind first."""
-    formats = [
+    formats = Counter(
         f.format + ("" if f.celsius_per_count is None else f" with {f.celsius_per_count:.4g} K per count")
         for f in frames
         if f.format
-    ]
-    conditions = [conditions_text(frame.conditions) for frame in frames if frame.conditions]
-    listed = {"thermal files": formats, "computed with": conditions}
-    return [(name, _counted(texts)) for name, texts in listed.items() if texts]
-
-
-def _counted(texts: Sequence[str]) -> str:
-    counted = Counter(texts).most_common()
-    if len(counted) == 1:
-        return counted[0][0]
-    listed = [f"{text} ({count} frames)" for text, count in counted[:_MOST_LISTED]]
-    more = len(counted) - len(listed)
-    return "; ".join(listed) + (f"; {more} more kinds" if more else "")
+    )
+    conditions = Counter(conditions_text(frame.conditions) for frame in frames if frame.conditions)
+    rows = []
+    for name, counted in (("thermal files", formats), ("computed with", conditions)):
+        listed = [f"{text} ({number} frames)" if len(counted) > 1 else text for text, number in counted.most_common()]
+        rows.append((name, "; ".join(listed)))
+    return [row for row in rows if row[1]]

@@ -49,10 +49,7 @@ class PhotographMasks:
 
 def find_masks(frames: Sequence[CaptureFrame], folder: Path | None, look_for_overlays: bool) -> PhotographMasks:
     """Masks for photographs of the size that most of the frames have; a `SceneError` where one cannot be read."""
-    sizes = []
-    for frame in frames:
-        facts = read_photograph_facts(frame.photograph)
-        sizes.append((facts.width, facts.height))
+    sizes = [read_photograph_facts(frame.photograph).size for frame in frames]
     size = max(dict.fromkeys(sizes), key=sizes.count)
     same = [frame for frame, own in zip(frames, sizes) if own == size]
     drawn = None

@@ -7,7 +7,9 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from functools import partial
+from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,11 @@ _LAST_LETTERS = frozenset({"t", "v", "w", "r"})
 _CLEARLY_NEARER = 2.0
 _CLOCK_STEP_S = 0.5
 """A second candidate must be farther than twice the first one's distance plus half a step of a camera's clock."""
+_REMEDY = (
+    "Copy photographs and thermal files (FLIR or DJI R-JPEG, radiometric TIFF, .npy, .csv) of the same shots into the "
+    "folder, as the camera wrote them; give both of a shot the same name (DJI: _T and _V or _W), or the right time "
+    "(--clock-offset-s, --time-limit-s), or list them in a file with --pairs."
+)
 _DJI_LIBRARY = (
     "DJI's thermal images also need DJI's own library: download the DJI Thermal SDK and pass --dji-library with the "
     "path of libdirp.so (libdirp.dll on Windows)."
@@ -54,26 +61,15 @@ class PairSearch:
     unpaired: dict[Path, str] = field(default_factory=dict)  # why, by file
 
 
-@dataclass(frozen=True)
-class PairOptions:
-    """How partners are recognised."""
-
-    time_limit_s: float = 1.5
-    """Longest time between the exposures of a pair that is found by time alone, [s]."""
-    clock_offset_s: float = 0.0
-    """How far the thermal camera's clock is ahead of the photographs', [s]."""
-
-
-def find_pairs(found: CameraFolder, options: PairOptions | None = None) -> PairSearch:
+def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: float = 0.0) -> PairSearch:
     """Pair photographs and thermal images: inside one file, by DJI's names, by equal names, by time.
 
     Equal names are equal after words for the kind of image are dropped: ``10-58-15-636-visible.jpg`` and
     ``10-58-15-636-radiometric.tiff``, or ``visible/a7.jpg`` and ``thermal/a7.npy``. By time: each the other's nearest,
-    within the limit, and no second candidate about as near.
+    within the limit [s], and no second candidate about as near; the thermal camera's clock is ahead by an offset [s].
     """
-    options = options or PairOptions()
     pairs: list[tuple[CameraFile, CameraFile, str]] = []
-    unpaired = dict(found.passed_over)
+    unpaired = dict[Path, str]()
     both = [file for file in found.files if file.role == "both"]
     pairs += [(file, file, "both in one file") for file in both]
     photographs = [file for file in found.files if file.role == "photograph"]
@@ -85,7 +81,7 @@ def find_pairs(found: CameraFolder, options: PairOptions | None = None) -> PairS
         used = {file.path for pair in matched for file in pair[:2]} | set(explained)
         photographs = [file for file in photographs if file.path not in used]
         thermal = [file for file in thermal if file.path not in used]
-    matched, explained = _by_time(photographs, thermal, options)
+    matched, explained = _by_time(photographs, thermal, time_limit_s, clock_offset_s)
     pairs += matched
     unpaired |= explained
     ordered = sorted(pairs, key=lambda pair: natural_key(pair[0].path.relative_to(found.folder)))
@@ -197,7 +193,7 @@ def _groups(files: Iterable[CameraFile], key: Callable[[CameraFile], tuple]) -> 
 
 
 def _parted(group: list[CameraFile], folder: Path) -> list[list[CameraFile]]:
-    """Files of one name, by the folder they lie in and by capital letters where one name occurs more than once."""
+    """Files of one name, by the folder they lie in where one name occurs more than once."""
     if _one_of_each(group):
         return [group]
 
@@ -205,14 +201,7 @@ def _parted(group: list[CameraFile], folder: Path) -> list[list[CameraFile]]:
         parents = file.path.relative_to(folder).parts[:-1]
         return tuple(word for part in parents for word in words_of(part) if word not in ROLE_WORDS)
 
-    def exact(file: CameraFile) -> tuple[str, ...]:
-        return tuple(word for word in re.split(r"[\W_]+", file.path.stem) if word.lower() not in ROLE_WORDS)
-
-    return [
-        part
-        for placed in _groups(group, place)
-        for part in ([placed] if _one_of_each(placed) else _groups(placed, exact))
-    ]
+    return _groups(group, place)
 
 
 def _one_of_each(group: list[CameraFile]) -> bool:
@@ -228,44 +217,37 @@ def _shot(stem: str) -> tuple[str, ...]:
     return kept or words
 
 
-def _by_time(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], options: PairOptions) -> _Found:
+def _by_time(
+    photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], limit_s: float, offset_s: float
+) -> _Found:
     explained = {file.path: "no partner of this name, and no time in the file" for file in (*photographs, *thermal)}
-    photos = [file for file in photographs if file.taken_at is not None]
-    hot = [file for file in thermal if file.taken_at is not None]
+    photos, hot = ([file for file in side if file.taken_at is not None] for side in (photographs, thermal))
     if not photos or not hot:
-        for file in (*photos, *hot):
-            explained[file.path] = "no partner of this name, and none with a time in its file"
         return [], explained
-    epoch = min(file.taken_at for file in (*photos, *hot) if file.taken_at is not None)
-    at = [np.array([(f.taken_at - epoch).total_seconds() for f in side if f.taken_at]) for side in (photos, hot)]
-    apart = np.abs(at[0][:, None] - (at[1][None, :] - options.clock_offset_s))
-    pairs = []
-    for side, files, other_files, table in (("rows", photos, hot, apart), ("columns", hot, photos, apart.T)):
-        for index, file in enumerate(files):
-            order = np.argsort(table[index], kind="stable")
-            nearest = float(table[index, order[0]])
-            second = float(table[index, order[1]]) if len(order) > 1 else np.inf
-            partner = other_files[order[0]]
-            if nearest > options.time_limit_s:
-                late = f"{partner.path.name}, is {nearest:.1f} s away"
-                explained[file.path] = f"no partner of this name; the nearest in time, {late}"
-            elif second <= _CLEARLY_NEARER * nearest + _CLOCK_STEP_S and second <= options.time_limit_s:
-                other = other_files[order[1]]
-                two = f"{partner.path.name} ({nearest:.1f} s) and {other.path.name} ({second:.1f} s)"
-                explained[file.path] = f"ambiguous: {two} are about as near in time"
-            elif table[:, order[0]].argmin() != index:
-                explained[file.path] = f"{partner.path.name}, the nearest in time, is nearer to another"
-            elif side == "rows":
-                pairs.append((file, partner, f"taken {nearest:.1f} s apart"))
+    at = [np.array([(f.taken_at - datetime.min).total_seconds() for f in side if f.taken_at]) for side in (photos, hot)]
+    apart = np.abs(at[0][:, None] - (at[1][None, :] - offset_s))
+    chosen: dict[Path, tuple[CameraFile, float]] = {}
+    for files, others, table in ((photos, hot, apart), (hot, photos, apart.T)):
+        for file, row in zip(files, table):
+            order = np.argsort(row, kind="stable")[:2]
+            (partner, *more), (nearest, *seconds) = [others[number] for number in order], row[order].tolist()
+            name = partner.path.name
+            if nearest > limit_s:
+                why = f"no partner of this name; the nearest in time, {name}, is {nearest:.1f} s away"
+            elif more and seconds[0] <= min(_CLEARLY_NEARER * nearest + _CLOCK_STEP_S, limit_s):
+                two = f"{name} ({nearest:.1f} s) and {more[0].path.name} ({seconds[0]:.1f} s)"
+                why = f"ambiguous: {two} are about as near in time"
             else:
-                explained[file.path] = f"{partner.path.name}, the nearest in time, has no clear partner"
-    # A pair counts only if neither side is ambiguous.
-    clear = [pair for pair in pairs if not explained[pair[1].path].startswith("ambiguous")]
-    for photo, partner, _ in pairs:
-        if explained[partner.path].startswith("ambiguous"):
-            explained[photo.path] = f"{partner.path.name}, the nearest in time, is ambiguous itself"
-    done = {file.path for pair in clear for file in pair[:2]}
-    return clear, {path: why for path, why in explained.items() if path not in done}
+                chosen[file.path] = partner, nearest
+                why = f"{name}, the nearest in time, is nearer to another or ambiguous"
+            explained[file.path] = why
+    pairs = []
+    for photo in photos:  # a pair counts only if each is the other's clear choice
+        partner, nearest = chosen.get(photo.path, (None, 0.0))
+        if partner is not None and chosen.get(partner.path, (None,))[0] is photo:
+            pairs.append((photo, partner, f"taken {nearest:.1f} s apart"))
+            del explained[photo.path], explained[partner.path]
+    return pairs, explained
 
 
 def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
@@ -279,14 +261,11 @@ def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
     places = ["-".join((*path.relative_to(folder).parts[:-1], _without_role(path.stem))) for path in photographs]
     longer = [stem if counted[stem.lower()] == 1 else slug(place) for stem, place in zip(stems, places)]
     # Files are named by them, and some disks take A and a for one.
-    names, taken, used = [], set[str](), Counter[str]()
+    names, taken = [], set[str]()
     for name in longer:
-        unique = name
-        while unique.lower() in taken:
-            used[name.lower()] += 1
-            unique = f"{name}-{used[name.lower()] + 1}"
-        taken.add(unique.lower())
-        names.append(unique)
+        numbered = chain([name], (f"{name}-{number}" for number in count(2)))
+        names.append(next(each for each in numbered if each.lower() not in taken))
+        taken.add(names[-1].lower())
     return names
 
 
@@ -300,52 +279,17 @@ def _without_role(stem: str) -> str:
 
 
 def no_pairs(found: CameraFolder, unpaired: Mapping[Path, str], has_dji_library: bool) -> SceneError:
-    """Error for a folder without a pair: what there is, one file with its reason, and a remedy for what is missing."""
-    photographs = [file for file in found.files if file.role == "photograph"]
-    thermal = [file for file in found.files if file.role == "thermal"]
-    pictures = [file for file in found.files if file.role == "thermal picture"]
-    got = _contents(found, len(photographs), len(thermal), len(pictures))
-    example = next((item for item in unpaired.items() if item[0] not in found.passed_over), None)
-    if example is not None:
-        got += f" ({example[0].name}: {example[1]})"
-    remedies = [_remedy(photographs, thermal, pictures)]
-    if found.passed_over:
-        path, why = next(iter(found.passed_over.items()))
-        remedies.append(f"Not looked at: {shown_name(path)}: {why}.")
-    if any(file.dji for file in thermal) and not has_dji_library:
-        remedies.append(_DJI_LIBRARY)
-    return SceneError(str(found.folder), expected="photographs with thermal images", got=got, remedy=" ".join(remedies))
-
-
-def _contents(found: CameraFolder, photographs: int, thermal: int, pictures: int) -> str:
-    parts = [_plural(photographs, "photograph"), _plural(thermal, "thermal image")]
-    if pictures:
-        parts.append(_plural(pictures, "picture") + " for the eye, named thermal, without temperatures")
-    if found.unreadable:
-        parts.append(_plural(len(found.unreadable), "file") + " that cannot be read")
-    if found.others:
-        parts.append(_plural(found.others, "file") + " of other kinds")
-    return ", ".join(parts)
-
-
-def _plural(count: int, what: str) -> str:
-    return f"{count or 'no'} {what}{'' if count == 1 else 's'}"
-
-
-def _remedy(photographs: list[CameraFile], thermal: list[CameraFile], pictures: list[CameraFile]) -> str:
-    if photographs and thermal:
-        return (
-            "Give both of a shot the same name, or the right time (--clock-offset-s, --time-limit-s), or list them in "
-            "a file with --pairs."
-        )
-    if thermal:
-        words = "Copy the photographs of the same shots into the folder too."
-        if any(file.dji for file in thermal):
-            words += " DJI names them as the thermal image, with _V or _W in place of _T."
-        return words
-    if photographs or pictures:
-        return (
-            "Copy the thermal files as the camera wrote them (FLIR or DJI R-JPEG, radiometric TIFF, .npy, .csv) into "
-            "the folder too; pictures that were edited, sent or exported have lost their temperatures."
-        )
-    return "Pass the folder that the memory card was copied to."
+    """Error for a folder without a pair: what there is, one file with its reason, and what helps."""
+    roles = Counter(file.role for file in found.files)
+    parts = [
+        *((roles["photograph"], "photographs"), (roles["thermal"], "thermal images")),
+        (roles["thermal picture"], "pictures named thermal, without temperatures"),
+        *((len(found.unreadable), "unreadable files"), (found.others, "files of other kinds")),
+    ]
+    got = ", ".join(f"{number} {what}" for number, what in parts if number) or "no files"
+    for path, why in list(unpaired.items())[:1]:
+        got += f" ({shown_name(path)}: {why})"
+    remedy = _REMEDY
+    if any(file.dji for file in found.files) and not has_dji_library:
+        remedy += f" {_DJI_LIBRARY}"
+    return SceneError(str(found.folder), expected="photographs with thermal images", got=got, remedy=remedy)

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,8 @@ import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.radiometry.decoders import errors_name
-from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
+from thermoxels_ns.radiometry.decoders import ExifFacts, errors_name, read_exif_facts
 
-LARGEST_SIDE = 30000  # pixels along a side of a photograph that is believed; a header that claims more is damaged
-_LARGEST_PIXELS = 178_956_970  # in all; Pillow opens no more
 _EXPECTED = "a photograph that can be decoded"
 _REMEDY = "The file is damaged; copy it from the camera again, or go on without it with --skip-bad True."
 _EXIF, _GPS = 34665, 34853
@@ -58,6 +56,11 @@ class PhotographFacts:
     gimbal_deg: tuple[float, float] | None
     """Pitch (0 level, -90 straight down) and roll of the camera against gravity, [degrees]."""
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, [pixels]."""
+        return self.width, self.height
+
 
 def read_photograph_facts(path: Path) -> PhotographFacts:
     """Read a photograph's header; a `SceneError` where it is no picture or claims an absurd size."""
@@ -68,7 +71,6 @@ def read_photograph_facts(path: Path) -> PhotographFacts:
         tags, gps = {**exif, **exif.get_ifd(_EXIF)}, exif.get_ifd(_GPS)
         with path.open("rb") as stream:
             head = stream.read(2**18)
-    check_photograph_size(path, width, height)
     orientation = tags.get(_ORIENTATION, 1)
     return PhotographFacts(
         width=width,
@@ -82,18 +84,9 @@ def read_photograph_facts(path: Path) -> PhotographFacts:
     )
 
 
-def check_photograph_size(path: Path, width: int, height: int) -> None:
-    """Raise a `SceneError` if a photograph's header claims more pixels than cameras have."""
-    if not (0 < width < LARGEST_SIDE and 0 < height < LARGEST_SIDE and width * height <= _LARGEST_PIXELS):
-        expected = f"a photograph below {LARGEST_SIDE} pixels a side and {_LARGEST_PIXELS} in all"
-        remedy = "The header is damaged; copy the file from the camera again."
-        raise SceneError(str(path), expected=expected, got=f"a header that says {width} x {height}", remedy=remedy)
-
-
 def open_photograph(path: Path) -> Image.Image:
     """Decode a photograph as its RGB pixels are stored, without EXIF's orientation; a `SceneError` where it is none."""
     with errors_name(path, _EXPECTED, _REMEDY), Image.open(path) as image:
-        check_photograph_size(path, *image.size)
         return image.convert("RGB")
 
 
@@ -123,11 +116,10 @@ def _with_fraction(taken_at: datetime | None, tags: Mapping[int, Any]) -> dateti
     for tag in _SUBSECOND:
         text = str(tags.get(tag, "")).split("\0")[0].strip()
         try:
-            top, slash, bottom = text.partition("/")
-            share = float(top) / float(bottom) if slash else float(f"0.{text}") if text.isdigit() else None
+            share = float(Fraction(text if "/" in text else f"0.{text}"))
         except (ValueError, ZeroDivisionError):
-            share = None
-        if share is not None and 0.0 <= share < 1.0:
+            continue
+        if 0.0 <= share < 1.0:
             return taken_at + timedelta(seconds=share)
     return taken_at
 

@@ -1,4 +1,4 @@
-"""Types shared by poses, rig, drift and the scene writer."""
+"""Types shared by poses, rig, drift and the scene writer, and the ten numbers of a rig."""
 
 # Poses are camera to world with x right, y up, z back (OpenGL), as in transforms.json. Transforms between two cameras
 # and points in front of a camera have x right, y down, z ahead (OpenCV). Pixel centres lie at +0.5. Lengths are those
@@ -7,9 +7,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -19,6 +20,11 @@ FloatArray = npt.NDArray[np.float64]
 
 OPENGL_FROM_OPENCV: FloatArray = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns camera axes; it is its own inverse. ``pose @ OPENGL_FROM_OPENCV`` is camera to world in OpenCV's axes."""
+
+PARAMETERS = ("rx", "ry", "rz", "tx", "ty", "tz", "log_focal", "cx", "cy", "k1")
+"""Rotation vector [radians], world units, natural logarithm, thermal pixels at full size, and OpenCV's k1."""
+_TRANSLATION_SHARE = 0.03
+_SMALLEST_DEPTH_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +78,7 @@ class RigEstimate:
     """Whether it is known where the thermal camera is. False: camera and transform are those of the start."""
     explanation: str  # one sentence for the report: what was found, or why nothing could be
     parameters: tuple[str, ...] = ()
-    """Names of the parameters that the covariance is of: rx, ry, rz [rad], tx, ty, tz [world units], log_focal, cx, cy
-    [thermal pixels], k1. Empty: nothing was estimated."""
+    """Names of the parameters (`PARAMETERS`) that the covariance is of. Empty: nothing was estimated."""
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """Covariance of the parameters, shape (n, n)."""
     score_before: float = math.nan
@@ -87,10 +92,86 @@ class RigEstimate:
         """Square roots of the covariance's diagonal by parameter."""
         return dict(zip(self.parameters, np.sqrt(np.diag(self.covariance)).tolist()))
 
+    @property
+    def turn_deg(self) -> float:
+        """Angle between the directions of the two cameras, about any axis [degrees]."""
+        return float(np.degrees(np.linalg.norm(cv2.Rodrigues(self.visible_to_thermal[:3, :3])[0])))
+
+    @property
+    def turn_error_deg(self) -> float:
+        """Standard error of the turn about all axes together [degrees]; NaN where it is not known."""
+        errors = self.standard_errors
+        return float(np.degrees(np.linalg.norm([errors.get(name, math.nan) for name in ("rx", "ry", "rz")])))
+
     def thermal_pose(self, camera_to_world: npt.ArrayLike) -> FloatArray:
         """Pose of the thermal camera (4, 4) from that of the visible one, both OpenGL."""
         pose = np.asarray(camera_to_world, dtype=np.float64)
         return pose @ OPENGL_FROM_OPENCV @ np.linalg.inv(self.visible_to_thermal) @ OPENGL_FROM_OPENCV
+
+
+def prior_sigmas(start: RigStart, median_depth: float) -> FloatArray:
+    """Standard deviations of the ten changes before the images are looked at, shape (10,)."""
+    shift = _TRANSLATION_SHARE * median_depth if start.translation_sigma is None else start.translation_sigma
+    turn, centre = np.radians(start.rotation_sigma_deg), start.centre_sigma * start.thermal_camera.width
+    return np.array([turn] * 3 + [shift] * 3 + [start.focal_sigma, centre, centre, start.k1_sigma])
+
+
+@dataclass(frozen=True, eq=False)
+class RigModel:
+    """The start value that the changes are counted from, at some size of the thermal image.
+
+    A rig is a start value and ten small changes (`PARAMETERS`): x_thermal = R(rx, ry, rz) R_start x_visible + t_start +
+    t, then the pinhole camera with radial distortion.
+    """
+
+    camera: Camera  # thermal camera of the start, resized to the level's pixels
+    transform: FloatArray  # visible to thermal, shape (4, 4), OpenCV axes
+    pixel_share: float = 1.0
+    """Pixels of the level per pixel of the full thermal image; the changes of cx and cy are in the latter."""
+
+    def at_size(self, width: int, height: int) -> RigModel:
+        """Same rig for a thermal image of another size."""
+        share = width / self.camera.width * self.pixel_share
+        return RigModel(self.camera.resized(width, height), self.transform, share)
+
+    def changed(self, change: FloatArray) -> tuple[Camera, FloatArray]:
+        """Thermal camera and transform with the ten changes applied."""
+        transform = self.transform.copy()
+        transform[:3, :3] = cv2.Rodrigues(change[:3])[0] @ self.transform[:3, :3]
+        transform[:3, 3] += change[3:6]
+        growth = float(np.exp(change[6]))
+        camera = replace(
+            self.camera,
+            fl_x=self.camera.fl_x * growth,
+            fl_y=self.camera.fl_y * growth,
+            cx=self.camera.cx + float(change[7]) * self.pixel_share,
+            cy=self.camera.cy + float(change[8]) * self.pixel_share,
+            k1=self.camera.k1 + float(change[9]),
+        )
+        return camera, transform
+
+    def project(self, change: FloatArray, points: FloatArray) -> FloatArray:
+        """Where points (n, 3) of the visible camera fall in the thermal image (n, 2); NaN behind it."""
+        camera, transform = self.changed(change)
+        return camera.project(points @ transform[:3, :3].T + transform[:3, 3])
+
+    def pull_back(self, change: FloatArray, points: FloatArray, slope: FloatArray) -> FloatArray:
+        """Derivative of a sum over points with respect to the ten changes, shape (10,), by the chain rule.
+
+        `slope` (n, 2) is the derivative of the sum with respect to the pixels of `points` (n, 3) of the visible camera;
+        points behind the thermal camera do not count.
+        """
+        camera, transform = self.changed(change)
+        ahead = points @ transform[2, :3] + transform[2, 3] > _SMALLEST_DEPTH_SHARE * np.median(points[:, 2])
+        if not ahead.any():
+            return np.zeros(len(PARAMETERS))
+        turned = points[ahead] @ self.transform[:3, :3].T
+        matrix = np.array([[camera.fl_x, 0.0, camera.cx], [0.0, camera.fl_y, camera.cy], [0.0, 0.0, 1.0]])
+        lens = np.array([camera.k1, camera.k2, camera.p1, camera.p2])
+        _, by_number = cv2.projectPoints(turned, change[:3], transform[:3, 3], matrix, lens)
+        by = slope[ahead].ravel() @ by_number  # turn, shift, fl_x, fl_y, cx, cy, k1, ...
+        by_focal = camera.fl_x * by[6] + camera.fl_y * by[7]
+        return np.array([*by[:6], by_focal, *(self.pixel_share * by[8:10]), by[10]])
 
 
 @dataclass(frozen=True, eq=False)

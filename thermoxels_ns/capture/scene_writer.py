@@ -16,8 +16,7 @@ from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig_types import DriftEstimate, FloatArray, RigEstimate
-from thermoxels_ns.capture.sfm.gravity import Up
-from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.sfm.scale_and_up import MetricScale, Up
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import CACHE_FOLDER
 from thermoxels_ns.core.camera import Camera

@@ -1,28 +1,33 @@
-"""Keeps the results of stages and runs again only what has changed."""
+"""Keeps the results of stages, arrays in .npz files and the rest in json, and runs again only what has changed."""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args, get_type_hints
+
+import numpy as np
 
 from thermoxels_ns import __version__
 from thermoxels_ns.capture.settings import StageName
-from thermoxels_ns.core.checks import hold_folder, remove_file, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import OutputError, SceneError
-from thermoxels_ns.core.json_values import write_json
+from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.json_values import read_json
 
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
 LOCK_FILE = "lock"
 _FORMAT = 2  # of the results; raised when they are kept in another way, so that earlier ones are made again
-_KEY_FILE, _DONE_FILE = "key.txt", "done.json"
+_KEY_FILE, _DONE_FILE = "key.txt", "seconds.txt"
+_Record = TypeVar("_Record")
+_EXPECTED, _REMEDY = "what an earlier stage of the capture wrote", "Run it again with --from-stage pairs."
 
 
 @dataclass
@@ -48,10 +53,10 @@ class StageCache:
         Stages come once each, in order. `depends_on` is everything but the earlier stages that the result depends on,
         as json can hold it. `work` writes the result into the folder that it is given; that may hold what an
         interrupted run with the same key left. `writes` are files and folders that the stage writes elsewhere; where
-        one of them, or a file in one, is gone or has another size than the stage gave it, the stage runs again.
+        one of them is gone, the stage runs again.
 
         Raises:
-            OutputError: An earlier result cannot be removed, or the new one cannot be written.
+            OutputError: The result cannot be written.
         """
         content = json.dumps([__version__, _FORMAT, name, self._previous, depends_on], sort_keys=True, default=str)
         key = hashlib.sha256(content.encode()).hexdigest()
@@ -60,16 +65,17 @@ class StageCache:
         forced = self.from_stage is not None and STAGES.index(name) >= STAGES.index(self.from_stage)
         title = _title(name)
         stale = forced or _read(folder / _KEY_FILE) != key
-        done = None if stale else _read_done(folder, self.folder, writes)
-        if done is not None:
+        done = None if stale else _read(folder / _DONE_FILE)
+        if done is not None and all(path.exists() for path in writes):
             self.say(f"{title}: as before")
-            self.seconds.append((name, done))
+            self.seconds.append((name, float(done)))
             return folder
         remove_file(folder / _DONE_FILE)
         if stale:
             # The key goes before the files: whoever is killed between them leaves nothing that is taken for whole.
             remove_file(folder / _KEY_FILE)
-            _remove_folder(folder)
+            if folder.is_dir():
+                shutil.rmtree(folder)
         writable_folder(folder)
         with replace_when_done(folder / _KEY_FILE) as temporary:
             temporary.write_text(key, encoding="utf-8")
@@ -77,7 +83,8 @@ class StageCache:
         start = time.monotonic()
         work(folder)
         took = time.monotonic() - start
-        write_json(folder / _DONE_FILE, {"seconds": took, "written": _sizes(self.folder, writes)})
+        with replace_when_done(folder / _DONE_FILE) as temporary:
+            temporary.write_text(f"{took}", encoding="utf-8")
         self.seconds.append((name, took))
         return folder
 
@@ -125,17 +132,6 @@ def prepare_output(folder: Path) -> Path:
     return folder
 
 
-@contextmanager
-def locked(output: Path, say: Callable[[str], None] = lambda _: None) -> Iterator[None]:
-    """Hold the output folder of a capture for the block; an `OutputError` where another capture holds it."""
-    remedy = "Wait until it ends, or pass another folder with --output."
-    lock = hold_folder(output / CACHE_FOLDER / LOCK_FILE, remedy, say)
-    try:
-        yield
-    finally:
-        lock.release()
-
-
 def _read(file: Path) -> str | None:
     try:
         return file.read_text(encoding="utf-8")
@@ -143,29 +139,39 @@ def _read(file: Path) -> str | None:
         return None
 
 
-def _read_done(folder: Path, output: Path, writes: Sequence[Path]) -> float | None:
-    """Seconds that a stage took; None where it did not end, or where what it wrote elsewhere is no longer whole."""
+def save(path: Path, record: Any) -> None:
+    """Write a dataclass of arrays, numbers, texts, tuples and perspective cameras as .npz, whole or not at all."""
+    values = {each.name: getattr(record, each.name) for each in fields(record)}
+    for name, value in values.items():
+        if isinstance(value, Camera):  # all but the lens, which comes last
+            values[name] = tuple(getattr(value, each.name) for each in fields(value)[:-1])
+    packed = io.BytesIO()  # in memory, because numpy's half-made files complain later
+    np.savez(packed, **{name: np.asarray(value) for name, value in values.items()})  # type: ignore[arg-type]
+    with replace_when_done(path) as temporary:
+        temporary.write_bytes(packed.getbuffer())
+
+
+def load(path: Path, kind: type[_Record]) -> _Record:
+    """Read a dataclass that `save` wrote; a `ThermoxelsError` where the file is missing or damaged."""
     try:
-        done = json.loads((folder / _DONE_FILE).read_text(encoding="utf-8"))
-        seconds = float(done["seconds"])
-        return seconds if done["written"] == _sizes(output, writes) else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+        with np.load(path, allow_pickle=False) as opened:
+            arrays = {name: opened[name] for name in opened.files}
+    except (OSError, ValueError, KeyError) as problem:
+        got = str(problem) or type(problem).__name__
+        raise ThermoxelsError(str(path), expected=_EXPECTED, got=got, remedy=_REMEDY) from problem
+    return kind(**{name: _value(arrays[name], hint) for name, hint in get_type_hints(kind).items()})
 
 
-def _sizes(output: Path, writes: Sequence[Path]) -> dict[str, int]:
-    """Bytes of every file that a stage wrote, by its name in the output folder."""
-    files = [each for path in writes for each in ([path] if path.is_file() else path.rglob("*")) if each.is_file()]
-    return {path.relative_to(output).as_posix(): path.stat().st_size for path in sorted(files)}
+def load_json(path: Path) -> Any:
+    """Read json that a stage wrote; a `ThermoxelsError` where it is missing or damaged."""
+    return read_json(path, _EXPECTED, _REMEDY)
 
 
-def _remove_folder(folder: Path) -> None:
-    try:
-        shutil.rmtree(folder)
-    except FileNotFoundError:
-        pass
-    except OSError as problem:
-        expected = "an earlier result of the capture, which can be removed"
-        got = problem.strerror or str(problem)
-        remedy = "Remove the folder by hand, or choose another one with --output."
-        raise OutputError(str(folder), expected=expected, got=got, remedy=remedy) from problem
+def _value(array: np.ndarray, hint: Any) -> Any:
+    """What was kept as an array, in the type of its field."""
+    if hint is Camera:
+        width, height, *numbers = array.tolist()
+        return Camera(int(width), int(height), *numbers)
+    if hint in (str, bool, float, int):
+        return hint(array.item())
+    return tuple(array.tolist()) if getattr(hint, "__origin__", None) is tuple else array

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -10,30 +11,30 @@ from typing import TypeVar
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.capture import stage_results
-from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder, shown_name
+from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
 from thermoxels_ns.capture.masks import PhotographMasks, find_masks, mask_files, user_masks
-from thermoxels_ns.capture.pairs import Pair, PairOptions, PairSearch, find_pairs, no_pairs, read_pair_list
+from thermoxels_ns.capture.pairs import Pair, PairSearch, find_pairs, no_pairs, read_pair_list
 from thermoxels_ns.capture.rig.board import CheckerBoard, board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.rig.drift import estimate_drift
-from thermoxels_ns.capture.rig.explanation import rig_lines
 from thermoxels_ns.capture.rig.search import estimate_rig
 from thermoxels_ns.capture.rig.start import kept_start, read_rig, rig_frames, rig_start
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.scene_writer import SCENE_CONTENT, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions
-from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, read_given_poses, reordered
-from thermoxels_ns.capture.sfm.gravity import Up, find_up, level_rotation
-from thermoxels_ns.capture.sfm.metric_scale import (
+from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, read_given_poses
+from thermoxels_ns.capture.sfm.poses import add_points, find_poses
+from thermoxels_ns.capture.sfm.scale_and_up import (
     MeasuredDistance,
     MetricScale,
+    Up,
+    find_up,
+    level_rotation,
     scale_from_distance,
     scale_from_gps,
     scale_from_markers,
 )
-from thermoxels_ns.capture.sfm.poses import add_points, find_poses
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import (
     CACHE_FOLDER,
@@ -41,11 +42,13 @@ from thermoxels_ns.capture.stage_cache import (
     files_of,
     fingerprint,
     given_fingerprints,
-    locked,
+    load,
+    load_json,
     prepare_output,
+    save,
 )
-from thermoxels_ns.core.checks import remove_stale_temporaries
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.checks import hold_folder, remove_stale_temporaries
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError, printable
 from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
@@ -103,10 +106,12 @@ def run_capture(
     if settings.board_photos is not None and not settings.board_photos.is_dir():
         scan_folder(settings.board_photos)
     folder = prepare_output(output)
+    remedy = "Wait until it ends, or pass another folder with --output."
+    lock = hold_folder(folder / CACHE_FOLDER / "lock", remedy, say)
     try:
+        remove_stale_temporaries(folder, [PAGE_NAME])
         # Inverses and sums of BLAS depend on the number of its threads; one thread is no slower here.
-        with locked(folder, say), threadpool_limits(1, "blas"):
-            remove_stale_temporaries(folder, [PAGE_NAME])
+        with threadpool_limits(1, "blas"):
             cache = StageCache(folder, settings.from_stage, say)
             return _Capture(source, folder, settings, cache, say, board).run(write_page)
     except ThermoxelsError:
@@ -115,6 +120,8 @@ def run_capture(
         what, got = str(problem.filename2 or problem.filename or folder), problem.strerror or str(problem)
         remedy = "Check free space and permissions, and run the command again: finished stages are kept."
         raise OutputError(what, expected="a file that can be read or written", got=got, remedy=remedy) from problem
+    finally:
+        lock.release()
 
 
 @dataclass
@@ -148,7 +155,7 @@ class _Capture:
             drawn = None
         masks = PhotographMasks(size, drawn, user_masks(frames, self.settings.masks))
         scene = Scene(frames, model, rig, drift, scale, up, masks)
-        written = [self.output / name for name in SCENE_CONTENT]
+        written = [self.output / name for name in SCENE_CONTENT if name != "masks" or masks.any]
         self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
         given = self.settings.poses
         source = f"Given in {given.name}." if given else "Structure from motion on the photographs (COLMAP)."
@@ -166,41 +173,46 @@ class _Capture:
 
     def pairs(self) -> tuple[Pair, ...]:
         """Find which photograph belongs to which thermal image."""
-        settings, options = self.settings, self.options(PairOptions)
-        inside, passed_over = files_below(self.source, [self.output])
+        settings = self.settings
+        inside = files_below(self.source, [self.output])
         if settings.pairs is None:
             inside = [path for path in inside if path.suffix.lower() in SUFFIXES]
         depends = {
-            "options": options,
+            "times": [settings.time_limit_s, settings.clock_offset_s],
             "files": fingerprint(inside, self.source),
-            "passed_over": sorted(map(str, passed_over)),
             "list": given_fingerprints([settings.pairs]),
             "skip_bad": settings.skip_bad,
         }
 
         def work(folder: Path) -> None:
-            search, unreadable = self._searched_pairs(options)
-            stage_results.save_pairs(folder, search, self.source)
-            write_json(folder / "unreadable.json", {shown_name(path): why for path, why in unreadable.items()})
+            search, unreadable = self._searched_pairs()
+            rows = [
+                (pair.name, self.name_of(pair.photograph), self.name_of(pair.thermal), pair.how)
+                for pair in search.pairs
+            ]
+            left_out = {printable(self.name_of(path)): why for path, why in (unreadable | search.unpaired).items()}
+            write_json(folder / "pairs.json", {"pairs": rows, "left_out": left_out})
             self.say(f"pairs: {len(search.pairs)}, files without a partner: {len(search.unpaired)}")
-            left_out = [(shown_name(path), why) for path, why in (unreadable | search.unpaired).items()]
-            for name, why in left_out[:_MOST_NAMED]:
+            for name, why in list(left_out.items())[:_MOST_NAMED]:
                 self.say(f"left out: {name}: {why}")
             if len(left_out) > _MOST_NAMED:
                 self.say(f"left out: {len(left_out) - _MOST_NAMED} more; {PAGE_NAME} names all")
 
-        folder = self.cache.run("pairs", depends, work)
-        pairs, unpaired = stage_results.load_pairs(folder, self.source)
-        self.dropped |= stage_results.load_json(folder / "unreadable.json") | unpaired
-        return pairs
+        content = load_json(self.cache.run("pairs", depends, work) / "pairs.json")
+        self.dropped |= content["left_out"]
+        return tuple(Pair(name, self.source / a, self.source / b, how) for name, a, b, how in content["pairs"])
 
-    def _searched_pairs(self, options: PairOptions) -> tuple[PairSearch, dict[Path, str]]:
+    def name_of(self, path: Path) -> str:
+        """A camera file's name from the capture's folder on."""
+        return Path(os.path.relpath(path, self.source)).as_posix()
+
+    def _searched_pairs(self) -> tuple[PairSearch, dict[Path, str]]:
         """The pairs as listed or found, and why some files cannot be read."""
         settings = self.settings
         if settings.pairs is not None:
             return read_pair_list(settings.pairs, self.source), {}
         found = scan_folder(self.source, [self.output], self.say)
-        search = find_pairs(found, options)
+        search = find_pairs(found, settings.time_limit_s, settings.clock_offset_s)
         if found.unreadable and not settings.skip_bad:
             first = next(iter(found.unreadable.values()))
             more = f" {len(found.unreadable) - 1} more cannot be read." if len(found.unreadable) > 1 else ""
@@ -250,21 +262,19 @@ class _Capture:
                 focal = [frame.focal_px for frame in read.frames if frame.focal_px]
                 middle = float(np.median(focal)) if focal else None
                 poses = find_poses(photographs, folder, middle, masks, options, self.say)
-                order = {name: number for number, name in enumerate(photographs)}
-                model = reordered(poses.model, lambda name: order[name])
             else:
                 given = read_given_poses(settings.poses, {f.name: f.photograph_source for f in read.frames})
                 poses = fitted_to_photographs(given, photographs)
-                model = poses.model
-                if not len(model.points):
-                    model = add_points(model, photographs, folder, masks, options, self.say)
-            stage_results.save(folder / "model.npz", model)
+            model = poses.model
+            if not len(model.points):
+                model = add_points(model, photographs, folder, masks, options, self.say)
+            save(folder / "model.npz", model)
             write_json(folder / "dropped.json", dict(poses.dropped))
             self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
 
         folder = self.cache.run("poses", depends, work)
-        self.dropped |= stage_results.load_json(folder / "dropped.json")
-        return stage_results.load(folder / "model.npz", SfmModel)
+        self.dropped |= load_json(folder / "dropped.json")
+        return load(folder / "model.npz", SfmModel)
 
     def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, MetricScale | None, str, Up]:
         """Find metres per unit and up; turn a model that was found here upright, keep one that was given."""
@@ -286,12 +296,16 @@ class _Capture:
                 origin = np.median(found.points, axis=0) if len(found.points) else found.centres.mean(axis=0)
                 model = found.moved(rotation, origin)
                 up = Up(rotation @ up.direction, up.source, up.spread_deg)
-            stage_results.save(folder / "model.npz", model)
+            save(folder / "model.npz", model)
             write_json(folder / "scale.json", {"scale": scale, "missing": missing, "up": up})
             self.say(f"scale: {missing}" if scale is None else f"scale: {scale.metres_per_unit:.5g} m per unit")
 
         folder = self.cache.run("scale", depends, work)
-        return stage_results.load(folder / "model.npz", SfmModel), *stage_results.load_scale(folder / "scale.json")
+        content = load_json(folder / "scale.json")
+        scale, up = content["scale"], content["up"]
+        up["direction"] = np.array(up["direction"], dtype=np.float64)
+        scale = None if scale is None else MetricScale(**scale)
+        return load(folder / "model.npz", SfmModel), scale, content["missing"], Up(**up)
 
     def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[MetricScale | None, str]:
         """Metres per unit from the surest source that there is; where there is none, why."""
@@ -317,9 +331,9 @@ class _Capture:
         def work(folder: Path) -> None:
             radiometry, size = self.options(RadiometryOptions), read.thermal_size
             rig = rig_from_board_photos(pictures, board, model.camera, size, folder, settings, radiometry, self.say)
-            stage_results.save(folder / "rig.npz", rig)
+            save(folder / "rig.npz", rig)
 
-        return stage_results.load(self.cache.run("board", depends, work) / "rig.npz", RigEstimate)
+        return load(self.cache.run("board", depends, work) / "rig.npz", RigEstimate)
 
     def rig(
         self,
@@ -332,12 +346,11 @@ class _Capture:
     ) -> tuple[RigEstimate, RigEstimate]:
         """Find the rig, or take the one that the user or a checker board gives."""
         settings = self.settings
-        depends = {"angle": settings.thermal_field_of_view_deg, "rig": given_fingerprints([settings.rig])}
+        angle, metres = settings.thermal_field_of_view_deg, None if scale is None else scale.metres_per_unit
+        begin = rig_start(frames, model.camera, read.thermal_size, angle, metres)
+        depends = {"angle": angle, "rig": given_fingerprints([settings.rig])}
 
         def work(folder: Path) -> None:
-            metres = None if scale is None else scale.metres_per_unit
-            begin = rig_start(frames, model.camera, read.thermal_size, settings.thermal_field_of_view_deg, metres)
-            stage_results.save(folder / "start.npz", kept_start(begin, "Where the search begins."))
             if settings.rig is not None:
                 rig = read_rig(settings.rig, read.thermal_size, metres)
             elif board is not None:
@@ -345,18 +358,14 @@ class _Capture:
             elif len(model.sighting_frame) < _LEAST_SIGHTINGS:
                 rig = kept_start(begin, "There are no scene points to compare the images at.")
             else:
+                rig = estimate_rig(
+                    rig_frames(model, frames), model.camera, begin, lambda line: self.say(f"rig: {line}")
+                )
+            save(folder / "rig.npz", rig)
+            self.say(f"rig: {rig.explanation}")
 
-                def tell(message: str, share: float) -> None:
-                    self.say(f"rig: {message} ({100 * share:.0f} %)")
-
-                rig = estimate_rig(rig_frames(model, frames), model.camera, begin, tell)
-            stage_results.save(folder / "rig.npz", rig)
-            for line in rig_lines(rig, metres):
-                self.say(f"rig: {line}")
-
-        folder = self.cache.run("rig", depends, work)
-        rig, start = (stage_results.load(folder / f"{name}.npz", RigEstimate) for name in ("rig", "start"))
-        return rig, start
+        rig = load(self.cache.run("rig", depends, work) / "rig.npz", RigEstimate)
+        return rig, kept_start(begin, "Where the search begins.")
 
     def drift(self, model: SfmModel, frames: list[CaptureFrame], rig: RigEstimate) -> DriftEstimate:
         """Find how far each thermal image reads too high, unless the user switched that off."""
@@ -367,8 +376,8 @@ class _Capture:
                 drift = DriftEstimate(np.zeros(len(frames)), (), np.nan, np.nan, False, why)
             else:
                 drift = estimate_drift(rig_frames(model, frames), rig.thermal_camera, rig.visible_to_thermal)
-            stage_results.save(folder / "drift.npz", drift)
+            save(folder / "drift.npz", drift)
             self.say(f"drift: {drift.explanation}")
 
         folder = self.cache.run("drift", {"drift": self.settings.drift}, work)
-        return stage_results.load(folder / "drift.npz", DriftEstimate)
+        return load(folder / "drift.npz", DriftEstimate)

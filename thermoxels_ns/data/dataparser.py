@@ -26,8 +26,7 @@ from thermoxels_ns.data.pose_refinement import PoseSource, refine_poses
 from thermoxels_ns.data.scene_box import BoxEvidence, find_scene_box
 from thermoxels_ns.data.scene_file import BOUNDS_NAME, Frame, SceneFile, read_scene_file
 from thermoxels_ns.data.splits import Split, split_frames
-from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
-from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, read_thermal_file
+from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixels, read_thermal_file
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
 _FAR_SIDES = 16.0

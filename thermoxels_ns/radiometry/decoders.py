@@ -1,11 +1,14 @@
-"""Guards picture decoders: sizes are limited, and every error names the file."""
+"""Guards picture decoders: sizes are limited, every error names the file; and what headers say of the camera."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
@@ -13,6 +16,8 @@ from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsEr
 
 LARGEST_SIDE = 8192
 """Pixels along a side: four times the largest thermal sensors and super-resolution modes (about 2048)."""
+JPEG_START, PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+_MAKE, _MODEL, _CHANGED_AT, _TAKEN_AT, _EXIF = 271, 272, 306, 36867, 34665
 LARGEST_FILE_BYTES = 2**29  # a table of 4096 x 4096 numbers of 30 characters; camera files are far smaller
 
 
@@ -66,3 +71,50 @@ def check_file_size(path: Path) -> None:
         expected = f"a thermal image of at most {LARGEST_FILE_BYTES} bytes"
         remedy = "Write one file per image; read videos frame by frame."
         raise ThermalFileError(str(path), expected=expected, got=f"{size} bytes", remedy=remedy)
+
+
+def app_segments(path: Path, whole: bool = False) -> list[tuple[str, bytes]]:
+    """Name (APP1, APP3, ...) and content of a JPEG's segments before the picture, where cameras keep what is none.
+
+    With `whole` the picture is decoded too, which fails where the file is cut off.
+    """
+    with Image.open(path, formats=("JPEG", "MPO")) as image:
+        if whole:
+            image.load()
+        return list(getattr(image, "applist", []))
+
+
+@dataclass(frozen=True)
+class ExifFacts:
+    """None: the file does not say."""
+
+    make: str | None = None
+    model: str | None = None
+    taken_at: datetime | None = None  # without a time zone, as the camera's clock showed it
+
+    @property
+    def camera(self) -> str | None:
+        """Maker and model."""
+        return " ".join(word for word in (self.make, self.model) if word) or None
+
+
+def read_exif_facts(image: Image.Image) -> ExifFacts:
+    """Read the tags of an opened image; its pixels are not touched."""
+    exif = image.getexif()
+    tags: Mapping[int, Any] = {**exif, **exif.get_ifd(_EXIF)}
+    return ExifFacts(
+        _text(tags.get(_MAKE)),
+        _text(tags.get(_MODEL)),
+        _time(tags.get(_TAKEN_AT)) or _time(tags.get(_CHANGED_AT)),
+    )
+
+
+def _text(value: object) -> str | None:
+    return value.split("\0", 1)[0].strip() or None if isinstance(value, str) else None
+
+
+def _time(value: object) -> datetime | None:
+    try:
+        return datetime.strptime(str(value), "%Y:%m:%d %H:%M:%S")
+    except ValueError:
+        return None

@@ -14,25 +14,16 @@ import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
-from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
-from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
-from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
-from thermoxels_ns.radiometry.jpeg_segments import APP1, APP3, JPEG_START, DamagedJpegError, check_jpeg, jpeg_segments
+from thermoxels_ns.radiometry.decoders import (
+    ExifFacts,
+    app_segments,
+    check_thermal_size,
+    errors_name,
+    read_exif_facts,
+)
+from thermoxels_ns.radiometry.measurement_model import ConditionOverrides, Conditions
 
 _SDK = "the DJI Thermal SDK (www.dji.com/downloads/softwares/dji-thermal-sdk)"
-_STATUS = {
-    -1: "out of memory",
-    -2: "a null pointer",
-    -3: "parameters out of range",
-    -4: "no valid counts in the R-JPEG",
-    -5: "no valid header in the R-JPEG",
-    -6: "no valid calibration curve in the R-JPEG",
-    -7: "an R-JPEG that cannot be parsed",
-    -8: "a wrong size",
-    -9: "an invalid handle",
-    -10: "a wrong input format",
-    -11: "a wrong output format",
-}
 _FUNCTIONS = (
     "dirp_create_from_rjpeg",
     "dirp_get_rjpeg_resolution",
@@ -67,21 +58,15 @@ class DjiImage:
     """One R-JPEG of a DJI camera after reading."""
 
     temperature_c: npt.NDArray[np.float32]  # shape (height, width), [degrees C]
-    camera_conditions: Conditions
     conditions: Conditions
     exif: ExifFacts
 
 
-def is_dji_rjpeg(content: bytes) -> bool:
+def is_dji_rjpeg(path: Path) -> bool:
     """Whether a JPEG is DJI's and holds counts: its photographs have the maker's name, but no APP3 segments."""
-    counts = made_by_dji = False
-    try:
-        for marker, payload in jpeg_segments(content):
-            made_by_dji |= marker == APP1 and b"DJI" in payload
-            counts |= marker == APP3
-    except DamagedJpegError:
-        pass  # what comes before the damage tells what the file was to be
-    return content.startswith(JPEG_START) and made_by_dji and counts
+    segments = app_segments(path)
+    made_by_dji = any(name == "APP1" and b"DJI" in content for name, content in segments)
+    return made_by_dji and any(name == "APP3" for name, _ in segments)
 
 
 def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrides) -> DjiImage:
@@ -91,10 +76,10 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
     programs, and is free to download. So the user names the library. A `ThermalFileError` is raised where there is
     none, it is another one, it refuses the file or the parameters, or the file is cut off.
     """
-    content = path.read_bytes()
     whole = "a whole DJI R-JPEG, as the drone wrote it"
     with errors_name(path, whole, "Copy the file from the drone again.", ThermalFileError):
-        check_jpeg(content)  # before a library in another language takes it
+        app_segments(path, whole=True)  # before a library in another language takes it
+        content = path.read_bytes()
     if library is None:
         expected = "DJI's library libdirp, the only one that turns the counts of a DJI R-JPEG into degrees"
         remedy = f"Download {_SDK} and pass --dji-library with the path of libdirp.so (libdirp.dll on Windows)."
@@ -107,7 +92,7 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
         status = getattr(dirp, function)(*arguments)
         if status != 0:
             expected = f"{function} of {library.name} to take the file"
-            got = f"status {status} ({_STATUS.get(status, 'unknown')})"
+            got = f"status {status}"
             remedy = f"Copy the file from the drone again, unedited; use a newer library. {_LIMITS}"
             raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
@@ -157,7 +142,7 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
         errors_name(path, "a JPEG with readable tags", error=ThermalFileError),
         Image.open(path, formats=("JPEG", "MPO")) as image,
     ):
-        return DjiImage(temperature_c, before, after, read_exif_facts(image))
+        return DjiImage(temperature_c, after, read_exif_facts(image))
 
 
 def _load(library: Path) -> ctypes.CDLL:

@@ -1,40 +1,77 @@
-"""FLIR's radiometric JPEG: counts and calibration behind the picture."""
+"""FLIR's radiometric JPEG: counts, calibration and settings behind the picture."""
 
 from __future__ import annotations
 
+import io
 import re
+import struct
 from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
-from thermoxels_ns.core.errors import ThermalFileError
-from thermoxels_ns.radiometry.conditions import Conditions
-from thermoxels_ns.radiometry.decoders import errors_name
-from thermoxels_ns.radiometry.flir_records import (
-    CAMERA_INFO,
-    EMBEDDED_PICTURE,
-    PICTURE_IN_PICTURE,
-    RAW_DATA,
-    CameraInfo,
-    DamagedRecordError,
-    PictureInPicture,
-    fff_records,
-    read_camera_info,
-    read_counts,
-    read_embedded_picture,
-    read_picture_in_picture,
-)
-from thermoxels_ns.radiometry.jpeg_segments import APP1, JPEG_START, DamagedJpegError, jpeg_segments
-from thermoxels_ns.radiometry.measurement_model import RadiometricModel
+from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
+from thermoxels_ns.core.units import kelvin_to_celsius
+from thermoxels_ns.radiometry.decoders import JPEG_START, PNG_START, app_segments, check_thermal_size, errors_name
+from thermoxels_ns.radiometry.measurement_model import AirConstants, Conditions, PlanckConstants, RadiometricModel
 
-_WANTED = (RAW_DATA, CAMERA_INFO, PICTURE_IN_PICTURE, EMBEDDED_PICTURE)
+_RAW_DATA, _PICTURE, _CAMERA_INFO, _PICTURE_IN_PICTURE = 0x01, 0x0E, 0x20, 0x2A
+"""Record types that are read; palettes, measuring tools and voice notes are not."""
 _REMEDY = "Copy the file from the camera again; programs that edit pictures drop its thermal part."
-_FLIR_MARK = b"FLIR\0"
-_FLIR_HEADER_BYTES = 8
+_FLIR_HEADER_BYTES, _IMAGE_HEADER_BYTES = 8, 32
 _FIRST_SEGMENT = re.compile(rb"\xff\xe1..FLIR\0", re.DOTALL)
 _HEAD_BYTES = 2**18  # the first FLIR segment comes after the EXIF segments, each at most 64 KiB
+_MOST_RECORDS = 1000
+
+
+@dataclass(frozen=True)
+class _Record:
+    """The bytes of one record, which has its own byte order."""
+
+    content: bytes
+    order: str
+
+    @classmethod
+    def marked(cls, content: bytes) -> _Record:
+        """A record that begins with the number 2 in its byte order."""
+        return cls(content, "<" if content[:2] == b"\2\0" else ">")
+
+    def numbers(self, offset: int, codes: str) -> tuple[float, ...]:
+        """Numbers at a byte offset; `codes` are those of `struct`."""
+        return struct.unpack_from(self.order + codes, self.content, offset)
+
+    def text(self, offset: int, length: int) -> str | None:
+        """Text up to the first zero byte; None where there is none."""
+        raw = self.content[offset : offset + length].split(b"\0", 1)[0]
+        return raw.decode("latin-1").strip() or None
+
+
+@dataclass(frozen=True)
+class PictureInPicture:
+    """How the camera lays its thermal image over the photograph, in its own numbers: start values, no calibration.
+
+    What they mean is not published, and they hold for one distance: things nearer or farther lie elsewhere.
+    """
+
+    real_to_thermal: float  # Real2IR: ratio of the two images' scales
+    offset_x: int  # shift of the thermal image's centre to the right, roughly in pixels of the photograph
+    offset_y: int  # the same downwards
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """Calibration, settings and make of a FLIR camera."""
+
+    planck: PlanckConstants
+    air: AirConstants
+    conditions: Conditions  # the camera's own settings when the picture was taken (or edited)
+    raw_range: tuple[int, int]  # counts from and to which the calibration holds
+    field_of_view_deg: float | None  # horizontal, as the camera states it; some state nonsense such as 180
+    model: str | None
+    taken_at: datetime | None
 
 
 @dataclass(frozen=True)
@@ -76,33 +113,120 @@ def read_flir_jpeg(path: Path) -> FlirImage:
         ThermalFileError: The file is cut off, a record is missing or damaged, or its size cannot be.
     """
     with errors_name(path, "a whole FLIR R-JPEG, as the camera wrote it", _REMEDY, ThermalFileError):
-        records = dict[int, bytes]()
-        for kind, content in fff_records(_flir_block(path.read_bytes())):
-            # Records may overlap: a thousand of them that each claim the whole block are not copied.
-            if kind in _WANTED and kind not in records:
-                records[kind] = bytes(content)
-        for kind, name in ((RAW_DATA, "raw counts"), (CAMERA_INFO, "calibration")):
+        parts: dict[int, bytes] = {}
+        last = 0
+        for name, payload in app_segments(path, whole=True):  # each says its number and the last one's
+            if name == "APP1" and payload.startswith(b"FLIR\0") and len(payload) > _FLIR_HEADER_BYTES:
+                parts[payload[6]], last = payload[_FLIR_HEADER_BYTES:], max(last, payload[7])
+        missing = sorted(set(range(last + 1)) - set(parts))
+        if missing:
+            raise ValueError(f"{len(parts)} of {last + 1} FLIR segments (missing: {missing})")
+        records = _records(b"".join(parts[number] for number in range(last + 1)))
+        for kind, name in ((_RAW_DATA, "raw counts"), (_CAMERA_INFO, "calibration")):
             if kind not in records:
-                raise DamagedRecordError(f"no record with {name}")
-        pip = records.get(PICTURE_IN_PICTURE)
-        picture = records.get(EMBEDDED_PICTURE)
+                raise ValueError(f"no record with {name}")
+        alignment, picture = records.get(_PICTURE_IN_PICTURE), records.get(_PICTURE, b"")[_IMAGE_HEADER_BYTES:]
         return FlirImage(
-            read_counts(path, records[RAW_DATA]),
-            read_camera_info(records[CAMERA_INFO]),
-            None if pip is None else read_picture_in_picture(pip),
-            None if picture is None else read_embedded_picture(picture),
+            _counts(path, records[_RAW_DATA]),
+            _camera_info(_Record.marked(records[_CAMERA_INFO])),
+            None if alignment is None else _picture_in_picture(alignment),
+            picture if picture.startswith((JPEG_START, PNG_START)) else None,  # else it is in the camera's own form
         )
 
 
-def _flir_block(content: bytes) -> bytes:
-    """Join the parts of the FFF block: each APP1 segment says its number and the last one's."""
-    parts: dict[int, bytes] = {}
-    last = -1
-    for marker, payload in jpeg_segments(content):
-        if marker == APP1 and payload.startswith(_FLIR_MARK) and len(payload) > _FLIR_HEADER_BYTES:
-            parts[payload[6]] = payload[_FLIR_HEADER_BYTES:]
-            last = max(last, payload[7])
-    missing = sorted(set(range(last + 1)) - set(parts))
-    if not parts or missing:
-        raise DamagedJpegError(f"{len(parts)} of {last + 1} FLIR segments (missing: {missing})")
-    return b"".join(parts[number] for number in range(last + 1))
+def _records(fff: bytes) -> dict[int, bytes]:
+    """Content of the wanted records that an FFF block lists, by their types.
+
+    An R-JPEG carries one FFF block in its APP1 segments. Layout and field offsets are those of the public tag tables of
+    ExifTool (FLIR tags).
+    """
+    version = {order: struct.unpack_from(f"{order}I", fff, 20)[0] for order in "><"}
+    order = next((order for order, number in version.items() if 100 <= number < 200), None)
+    if fff[:4] not in (b"FFF\0", b"AFF\0") or order is None:
+        raise ValueError(f"a FLIR block that starts with {fff[:24]!r}")
+    start, count = struct.unpack_from(f"{order}II", fff, 24)
+    records = dict[int, bytes]()
+    for number in range(min(count, _MOST_RECORDS)):
+        kind, _, _, _, offset, length = struct.unpack_from(f"{order}HHIIII", fff, start + 32 * number)
+        # Records may overlap: a thousand of them that each claim the whole block are not copied.
+        if kind in (_RAW_DATA, _PICTURE, _CAMERA_INFO, _PICTURE_IN_PICTURE) and kind not in records:
+            if offset + length > len(fff):
+                raise ValueError(f"a record up to byte {offset + length} of {len(fff)}: the file is cut off")
+            records[kind] = fff[offset : offset + length]
+    return records
+
+
+def _counts(path: Path, content: bytes) -> npt.NDArray[np.uint16]:
+    """Read the raw counts, stored plainly or as a PNG, shape (height, width).
+
+    Most cameras write the PNG's 16 bits in the wrong byte order and none says so. A thermal image is smooth, and with
+    its bytes swapped it is noise; so the order with the smaller mean difference between neighbours is right.
+    """
+    record, data = _Record.marked(content), content[_IMAGE_HEADER_BYTES:]
+    width, height = (int(number) for number in record.numbers(2, "HH"))
+    check_thermal_size(path, width, height)
+    if not data.startswith(PNG_START):
+        counts = np.frombuffer(data, dtype=f"{record.order}u2", count=width * height)
+        return counts.reshape(height, width).astype(np.uint16)
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        if image.size != (width, height) or not image.mode.startswith("I"):
+            raise ValueError(f"a PNG of {image.size} and mode {image.mode} for {width} x {height} counts")
+        counts = np.asarray(image).astype(np.uint16)
+    return min((counts.byteswap(), counts), key=_roughness)
+
+
+def _roughness(counts: npt.NDArray[np.uint16]) -> float:
+    plain = counts.astype(np.float64)
+    return float(np.abs(np.diff(plain, axis=0)).sum() + np.abs(np.diff(plain, axis=1)).sum())
+
+
+def _camera_info(record: _Record) -> CameraInfo:
+    emissivity, distance, reflected, air, window, window_transmission = record.numbers(0x20, "6f")
+    (humidity,) = record.numbers(0x3C, "f")
+    r1, b, f = record.numbers(0x58, "3f")
+    (o,), (r2,) = record.numbers(0x308, "i"), record.numbers(0x30C, "f")
+    low, high = record.numbers(0x310, "HH")
+    (field_of_view,) = record.numbers(0x1B4, "f")
+    model = record.text(0xD4, 32)
+    try:
+        return CameraInfo(
+            planck=PlanckConstants(r1=r1, r2=r2, b=b, f=f, o=float(o)),
+            air=AirConstants(*record.numbers(0x70, "5f")),
+            conditions=Conditions(
+                emissivity=emissivity,
+                reflected_c=_celsius(reflected),
+                distance_m=distance,
+                relative_humidity=humidity / 100.0 if humidity > 2.0 else humidity,  # some write percent
+                air_c=_celsius(air),
+                window_transmission=window_transmission or 1.0,  # a camera without the setting writes 0
+                window_c=_celsius(window),
+            ),
+            raw_range=(int(low), int(high)) if low < high else (0, 0xFFFF),
+            field_of_view_deg=field_of_view if field_of_view > 0 else None,
+            model=model if model is None or model.lower().startswith("flir") else f"FLIR {model}",
+            taken_at=_taken_at(record),
+        )
+    except ThermoxelsError as problem:
+        raise ValueError(f"a camera info record with a wrong value: {problem}") from problem
+
+
+def _celsius(kelvin: float) -> float | None:
+    """A temperature, or None where the camera has not set it and writes 0 K."""
+    return float(kelvin_to_celsius(kelvin)) if kelvin != 0.0 else None
+
+
+def _taken_at(record: _Record) -> datetime | None:
+    """Time of the shutter with its zone; None where the clock was never set or the record is of an old kind."""
+    try:
+        seconds, milliseconds, zone = record.numbers(0x384, "IIh")
+        east = timezone(timedelta(minutes=-int(zone)))
+        return datetime.fromtimestamp(int(seconds) + (int(milliseconds) & 0xFFFF) / 1000.0, east) if seconds else None
+    except (struct.error, ValueError, OverflowError, OSError):
+        return None
+
+
+def _picture_in_picture(content: bytes) -> PictureInPicture:
+    """Read the factory alignment; the record has no mark of its byte order."""
+    little, big = (_Record(content, order).numbers(0, "fhh") for order in "<>")
+    scale, x, y = little if 0.01 < little[0] < 100.0 else big
+    return PictureInPicture(scale, int(x), int(y))

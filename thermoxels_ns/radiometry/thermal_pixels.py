@@ -1,9 +1,8 @@
-"""Pixels of thermal files by a known unit: degrees Celsius, NaN where nothing was measured."""
+"""Pixels of thermal files by a known unit: degrees Celsius, NaN where nothing was measured or a pixel is stuck."""
 
 from __future__ import annotations
 
 import csv
-import struct
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +10,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 from PIL import Image, TiffImagePlugin
 
 from thermoxels_ns.core.errors import ThermalFileError
@@ -22,9 +22,9 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 THERMAL_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".csv")  # file types that `read_thermal_file` knows
 
 _WIDTH, _HEIGHT, _SAMPLE_BITS, _SAMPLE_FORMAT = 256, 257, 258, 339  # tags of TIFF
-_SIGNED, _FLOATING = 2, 3  # sample formats
-_LONGEST_LINE = 2**20
-"""More characters in a line are no row of a thermal image: 8192 numbers of 30 characters are a quarter of it."""
+_FLOATING = 3  # a sample format
+MIN_FRAMES = 5  # fewer frames than this cannot tell a stuck pixel from a quiet one
+_WINDOW = 2  # half width of the neighbourhood: 5 x 5, so that a dead column or row is still a minority of it
 _EXPECTED = "a readable thermal file"
 _REMEDY = "The file is damaged or not what its suffix says; copy it again or remove its frame."
 _TIFF_SUFFIXES = (".tif", ".tiff")
@@ -212,15 +212,6 @@ def _read_raw(path: Path, suffix: str) -> _RawPixels:
 
 def _read_csv(path: Path) -> npt.NDArray[np.float64]:
     """Read rows of numbers split by commas or semicolons; empty cells and nan, NA, null, - are NaN."""
-    width = height = 0
-    with path.open(encoding="latin-1") as stream:  # counts alone, whatever the file's own encoding
-        while line := stream.readline(_LONGEST_LINE):
-            width, height = max(width, 1 + max(line.count(","), line.count(";"))), height + 1
-            if len(line) == _LONGEST_LINE:
-                expected = f"a table with lines below {_LONGEST_LINE} characters"
-                remedy = "The file is damaged or no table; write one row of the image per line."
-                raise ThermalFileError(str(path), expected=expected, got=f"a longer one, line {height}", remedy=remedy)
-            check_thermal_size(path, width, height)
     text = path.read_text(encoding="utf-8-sig")
     semicolons = ";" in text
     rows = []
@@ -233,6 +224,7 @@ def _read_csv(path: Path) -> npt.NDArray[np.float64]:
             rows.append([_number(cell.replace(",", ".") if semicolons else cell) for cell in cells])
     if not rows or len({len(row) for row in rows}) != 1:
         raise _damaged(path, f"rows of lengths {sorted({len(row) for row in rows})}")
+    check_thermal_size(path, len(rows[0]), len(rows))
     return np.array(rows, dtype=np.float64)
 
 
@@ -241,47 +233,36 @@ def _number(cell: str) -> float:
 
 
 def _read_image(path: Path) -> _RawPixels:
-    size = size_of_double_tiff(path)
+    pixels = None
+    size = size_of_double_tiff(path)  # of numbers of 64 bits, which Pillow does not open
     if size is not None:
         check_thermal_size(path, *size)
-        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # Pillow knows no numbers of 64 bits
-        if pixels is None or pixels.dtype != np.float64:
-            raise _damaged(path, "an image of 64-bit numbers that cannot be decoded")
+    else:
+        with Image.open(path) as image:
+            check_thermal_size(path, *image.size)
+            pages = getattr(image, "n_frames", 1)
+            if pages != 1:
+                remedy = "Save the page that holds the temperatures as a file of its own."
+                raise ThermalFileError(str(path), expected="one image", got=f"{pages} pages", remedy=remedy)
+            image.load()  # raises on truncated data
+            if image.mode in ("L", "F") or image.mode.startswith("I"):
+                pixels = np.asarray(image)
+                # Some versions of Pillow hold counts of 16 bits in 32; and some files have the other byte order.
+                short = image.mode == "I" and image.format == "PNG"
+                pixels = pixels.astype(np.uint16 if short else pixels.dtype.newbyteorder("="))
+    if pixels is None:  # colours, of which Pillow keeps 8 bits
+        pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise _damaged(path, "an image that cannot be decoded")
+    if pixels.ndim == 2:
         return _RawPixels(pixels)
-    with Image.open(path) as image:
-        check_thermal_size(path, *image.size)
-        if getattr(image, "n_frames", 1) != 1:
-            remedy = "Save the page that holds the temperatures as a file of its own."
-            got = f"{getattr(image, 'n_frames', 1)} pages"
-            raise ThermalFileError(str(path), expected="one image", got=got, remedy=remedy)
-        image.load()  # raises on truncated data
-        bits = _integer_type(path, image)
-        if image.mode == "P":
-            image = image.convert("RGBA")
-        pixels = np.asarray(image)
-        mode = image.mode
-    if mode == "F":
-        return _RawPixels(pixels)
-    if mode in ("L", "RGB", "RGBA", "LA") and pixels.dtype.itemsize < np.dtype(bits).itemsize:
-        deep = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # Pillow cuts 16-bit colour PNG and TIFF to 8 bits
-        if deep is None or deep.dtype != bits:
-            raise _damaged(path, "a 16-bit colour image that cannot be decoded")
-        pixels = deep
-    if mode == "L" or mode.startswith("I"):
-        return _RawPixels(pixels if pixels.dtype == bits else pixels.astype(bits))
-    if mode in ("RGB", "RGBA", "LA"):
-        if pixels.ndim == 2:
-            return _RawPixels(pixels)
-        has_alpha = pixels.shape[-1] in (2, 4)
-        colours = pixels[..., :-1] if has_alpha else pixels
-        if not (colours == colours[..., :1]).all():
-            remedy = "Export the radiometric data (16-bit PNG or TIFF, .npy, .csv) or a grey palette."
-            got = "a false-colour picture: its palette cannot be turned back into temperatures"
-            raise ThermalFileError(str(path), expected="a grey image (all channels equal)", got=got, remedy=remedy)
-        no_data = pixels[..., -1] == 0 if has_alpha else None
-        return _RawPixels(np.ascontiguousarray(colours[..., 0]), no_data)
-    got, remedy = f"image mode {mode}", "Export the thermal image as 16-bit grey PNG or TIFF."
-    raise ThermalFileError(str(path), expected="a grey or floating-point image", got=got, remedy=remedy)
+    has_alpha = pixels.shape[-1] in (2, 4)
+    colours = pixels[..., :-1] if has_alpha else pixels
+    if not (colours == colours[..., :1]).all():
+        remedy = "Export the radiometric data (16-bit PNG or TIFF, .npy, .csv) or a grey palette."
+        got = "a false-colour picture: its palette cannot be turned back into temperatures"
+        raise ThermalFileError(str(path), expected="a grey image (all channels equal)", got=got, remedy=remedy)
+    return _RawPixels(np.ascontiguousarray(colours[..., 0]), pixels[..., -1] == 0 if has_alpha else None)
 
 
 def size_of_double_tiff(path: Path) -> tuple[int, int] | None:
@@ -297,22 +278,27 @@ def size_of_double_tiff(path: Path) -> tuple[int, int] | None:
     return (tags.get(_WIDTH, 0), tags.get(_HEIGHT, 0)) if kind == [(64,), (_FLOATING,)] else None
 
 
-def _integer_type(path: Path, image: Image.Image) -> npt.DTypeLike:
-    """Type of the file's counts, which Pillow's modes do not always tell (mode I holds 16-bit files too)."""
-    if image.format == "PNG":
-        with path.open("rb") as stream:
-            depth = struct.unpack("B", stream.read(25)[24:])[0]  # IHDR: signature 8, length 4, type 4, size 8
-        return np.uint16 if depth == 16 else np.uint8
-    if image.format == "TIFF":
-        tags: Any = getattr(image, "tag_v2", {})
-        width = tags.get(_SAMPLE_BITS, (8,))
-        width = int(width[0] if isinstance(width, tuple) else width)
-        signed = tags.get(_SAMPLE_FORMAT, (1,))
-        signed = int(signed[0] if isinstance(signed, tuple) else signed) == _SIGNED
-        length = 1 if width <= 8 else 2 if width <= 16 else 4
-        return np.dtype(f"{'i' if signed else 'u'}{length}")
-    return np.uint8
-
-
 def _damaged(path: Path, problem: object) -> ThermalFileError:
     return ThermalFileError(str(path), expected=_EXPECTED, got=problem, remedy=_REMEDY)
+
+
+def find_dead_pixels(stack: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Find pixels that show exactly one value in every frame while their surroundings change.
+
+    A stuck pixel alone is no proof: where the image border always shows the same cold sky, or in a scene of one
+    temperature, live pixels are constant too. So three things must hold: the pixel has one finite value in all
+    frames; fewer than half of all pixels do; and the median of the 5 x 5 pixels around it differs from its value in
+    at least half of the frames. Temperatures (frames, height, width) to (height, width); fewer than 5 frames tell none.
+    """
+    frames, height, width = stack.shape
+    dead = np.zeros((height, width), dtype=bool)
+    constant = np.isfinite(stack[0]) & (stack == stack[:1]).all(axis=0)
+    if frames < MIN_FRAMES or not constant.any() or constant.mean() >= 0.5:
+        return dead
+    side = 2 * _WINDOW + 1
+    differs = np.zeros(np.count_nonzero(constant), dtype=np.int64)
+    for frame in stack:
+        around = sliding_window_view(np.pad(frame, _WINDOW, mode="reflect"), (side, side))[constant]
+        differs += np.nanmedian(around, axis=(1, 2)) != frame[constant]
+    dead[constant] = 2 * differs >= frames
+    return dead

@@ -2,43 +2,88 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from thermoxels_ns.core.errors import ThermalFileError
-from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
-from thermoxels_ns.radiometry.count_scales import (
-    COUNT_SCALES,
-    NPY_START,
-    CameraName,
-    looks_like_csv,
-    read_count_image,
-    read_npy,
+from thermoxels_ns.radiometry.decoders import (
+    JPEG_START,
+    PNG_START,
+    ExifFacts,
+    app_segments,
+    check_file_size,
+    check_thermal_size,
+    errors_name,
+    read_exif_facts,
 )
-from thermoxels_ns.radiometry.decoders import check_file_size, errors_name
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg, read_dji_rjpeg
-from thermoxels_ns.radiometry.flir_records import PictureInPicture
-from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.radiometry.jpeg_segments import JPEG_START, check_jpeg
-from thermoxels_ns.radiometry.measurement_model import corrected_temperature_c
+from thermoxels_ns.radiometry.flir_rjpeg import PictureInPicture, is_flir_jpeg, read_flir_jpeg
+from thermoxels_ns.radiometry.measurement_model import ConditionOverrides, Conditions, corrected_temperature_c
 from thermoxels_ns.radiometry.thermal_pixels import (
     PixelReport,
     ThermalImage,
     ThermalUnit,
     masked_image,
     read_thermal_file,
+    size_of_double_tiff,
 )
 
 ThermogramFormat = Literal["FLIR R-JPEG", "DJI R-JPEG", "TIFF", "PNG", "NPY", "CSV"]
+CameraName = Literal["workswell", "flir-high-gain", "flir-low-gain", "flir-duo", "sensefly"]
 
 _HEAD_BYTES = 4096
-_PNG_START = b"\x89PNG\r\n\x1a\n"
-_TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_STARTS: dict[bytes, ThermogramFormat] = {
+    b"II*\0": "TIFF",
+    b"MM\0*": "TIFF",
+    b"II+\0": "TIFF",
+    b"MM\0+": "TIFF",
+    PNG_START: "PNG",
+    b"\x93NUMPY": "NPY",
+}
+_NUMBERS = re.compile(rb"(?:\xef\xbb\xbf)?[-+0-9.,;eE\s\"]|nan|na|n/a|null|none", re.IGNORECASE)
+_TEXT = re.compile(rb"[\t\n\r -~\xef\xbb\xbf]*")
+
+
+@dataclass(frozen=True)
+class CountScale:
+    """A camera's counts: degrees C = count * celsius_per_count + celsius_offset."""
+
+    celsius_per_count: float
+    celsius_offset: float
+    cameras: str  # which cameras write so, in words
+
+    @property
+    def unit(self) -> ThermalUnit:
+        """The same for `read_thermal_file`."""
+        return ThermalUnit.linear(self.celsius_per_count, self.celsius_offset)
+
+
+COUNT_SCALES: dict[CameraName, CountScale] = {
+    "workswell": CountScale(1.0 / 40.0, -100.0, "Workswell WIRIS Pro and later"),
+    "flir-high-gain": CountScale(0.04, -273.15, "FLIR Duo Pro R and Vue Pro R, range -25 to 135 C"),
+    "flir-low-gain": CountScale(0.4, -273.15, "FLIR Duo Pro R and Vue Pro R, range -40 to 550 C"),
+    "flir-duo": CountScale(0.01, -273.15, "FLIR Duo R (the first one)"),
+    "sensefly": CountScale(0.01, -100.0, "senseFly thermoMAP and Duet T"),
+}
+"""From the makers' manuals. FLIR's two gains cannot be told apart by the file, so the user says which."""
+
+
+def recognised_camera(make: str | None, model: str | None) -> CameraName | None:
+    """Find the preset of a camera by what its file says of it; None where the file leaves a choice.
+
+    >>> recognised_camera("Workswell", "WIRIS Pro"), recognised_camera("FLIR", "Duo Pro R")
+    ('workswell', None)
+    """
+    make, model = (make or "").strip().lower(), (model or "").strip().lower()
+    if make.startswith("workswell") and model.startswith("wiris pro"):
+        return "workswell"
+    return "sensefly" if make.startswith("sensefly") else None
 
 
 @dataclass(frozen=True)
@@ -47,12 +92,8 @@ class ThermogramMetadata:
 
     format: ThermogramFormat  # by content, not by name
     camera: str | None = None  # maker and model
-    serial: str | None = None  # of the camera
-    lens: str | None = None
-    taken_at: datetime | None = None  # when; with a time zone where the file has one
     field_of_view_deg: float | None = None
     """Horizontal, of the thermal lens, as the camera states it; some state nonsense such as 180."""
-    camera_conditions: Conditions | None = None  # emissivity and the rest that the camera was set to
     conditions: Conditions | None = None
     """Those that the temperatures were computed with: the camera's, with the user's in their place."""
     picture_in_picture: PictureInPicture | None = None  # factory alignment of photograph and thermal image
@@ -125,13 +166,15 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
     try:
         found = detect_format(path)
         if found == "FLIR R-JPEG":
-            return _read_flir(path, options)
-        if found == "DJI R-JPEG":
-            return _read_dji(path, options)
-        return _read_stored(path, found, options)
+            image, metadata = _read_flir(path, options)
+        elif found == "DJI R-JPEG":
+            image, metadata = _read_dji(path, options)
+        else:
+            image, metadata = _read_stored(path, found, options)
     except OSError as problem:
         got, remedy = problem.strerror or str(problem), "Check its permissions, or copy it again."
         raise ThermalFileError(str(path), expected="a file that can be read", got=got, remedy=remedy) from problem
+    return Thermogram(image.temperature_c, metadata, image.report)
 
 
 def detect_format(path: Path) -> ThermogramFormat:
@@ -142,37 +185,26 @@ def detect_format(path: Path) -> ThermogramFormat:
     check_file_size(path)
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
-    if head.startswith(JPEG_START):
-        return _jpeg_format(path)
-    if head.startswith(_TIFF_STARTS):
-        return "TIFF"
-    if head.startswith(_PNG_START):
-        return "PNG"
-    if head.startswith(NPY_START):
-        return "NPY"
-    if looks_like_csv(head):
+    found: ThermogramFormat | None = next((name for start, name in _STARTS.items() if head.startswith(start)), None)
+    if found is not None:
+        return found
+    if _TEXT.fullmatch(head) and _NUMBERS.match(head) and re.search(rb"[0-9]", head):  # as tables of numbers start
         return "CSV"
     expected = "a FLIR or DJI R-JPEG, a TIFF, a 16-bit PNG, or a table of degrees C (.npy, .csv)"
-    got = f"none of them: it starts with {head[:8]!r}"
-    remedy = "Export it from the camera's program in one of these formats."
+    got, remedy = f"none of them: it starts with {head[:8]!r}", "Export it from the camera's program in one of these."
+    if head.startswith(JPEG_START):
+        if is_flir_jpeg(path):
+            return "FLIR R-JPEG"
+        with errors_name(path, "a whole radiometric JPEG", "Copy the file from the camera again.", ThermalFileError):
+            if is_dji_rjpeg(path):
+                return "DJI R-JPEG"
+            app_segments(path, whole=True)
+        got = "a plain JPEG: a photograph, or a false-colour picture, whose palette cannot be turned back"
+        remedy = "Use the file as the camera wrote it; editing, messengers and cloud albums drop the thermal part."
     raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 
-def _jpeg_format(path: Path) -> ThermogramFormat:
-    if is_flir_jpeg(path):
-        return "FLIR R-JPEG"
-    content = path.read_bytes()
-    if is_dji_rjpeg(content):
-        return "DJI R-JPEG"
-    with errors_name(path, "a whole radiometric JPEG", "Copy the file from the camera again.", ThermalFileError):
-        check_jpeg(content)
-    expected = "a radiometric JPEG: counts and calibration beside the picture"
-    got = "a plain JPEG: a photograph, or a false-colour picture, whose palette cannot be turned back"
-    remedy = "Use the file as the camera wrote it; editing, messengers and cloud albums drop the thermal part."
-    raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
-
-
-def _read_flir(path: Path, options: RadiometryOptions) -> Thermogram:
+def _read_flir(path: Path, options: RadiometryOptions) -> tuple[ThermalImage, ThermogramMetadata]:
     flir = read_flir_jpeg(path)
     camera = flir.camera
     conditions = options.applied_to(camera.conditions)
@@ -180,48 +212,79 @@ def _read_flir(path: Path, options: RadiometryOptions) -> Thermogram:
     metadata = ThermogramMetadata(
         format="FLIR R-JPEG",
         camera=camera.model,
-        serial=camera.serial,
-        lens=camera.lens,
-        taken_at=camera.taken_at,
         field_of_view_deg=camera.field_of_view_deg,
-        camera_conditions=camera.conditions,
         conditions=conditions,
         picture_in_picture=flir.picture_in_picture,
     )
-    return Thermogram(image.temperature_c, metadata, image.report)
+    return image, metadata
 
 
-def _read_dji(path: Path, options: RadiometryOptions) -> Thermogram:
+def _read_dji(path: Path, options: RadiometryOptions) -> tuple[ThermalImage, ThermogramMetadata]:
     dji = read_dji_rjpeg(path, options.dji_library, options)
     image = masked_image(dji.temperature_c, options.valid_range_c)
     metadata = ThermogramMetadata(
         format="DJI R-JPEG",
         camera=dji.exif.camera,
-        serial=dji.exif.serial,
-        taken_at=dji.exif.taken_at,
-        camera_conditions=dji.camera_conditions,
         conditions=dji.conditions,
     )
-    return Thermogram(image.temperature_c, metadata, image.report)
+    return image, metadata
 
 
-def _read_stored(path: Path, found: ThermogramFormat, options: RadiometryOptions) -> Thermogram:
+def _read_stored(
+    path: Path, found: ThermogramFormat, options: RadiometryOptions
+) -> tuple[ThermalImage, ThermogramMetadata]:
     """Formats that hold temperatures (or counts linear in them) and not what they were computed with."""
     before, after = options.stored, options.applied_to(options.stored)
-    metadata = ThermogramMetadata(format=found, camera_conditions=before, conditions=after)
+    unit, exif = options.given_unit, ExifFacts()
     if found in ("TIFF", "PNG"):
-        given = options.camera, options.given_unit, options.valid_range_c
-        image, exif, step = read_count_image(path, f".{found.lower()}", *given)
-        metadata = replace(
-            metadata, camera=exif.camera, serial=exif.serial, taken_at=exif.taken_at, celsius_per_count=step
-        )
-    elif found == "NPY":
-        image = read_npy(path, options.given_unit, options.valid_range_c)
-    else:
-        image = read_thermal_file(path, ThermalUnit.celsius(), options.valid_range_c, ".csv")
+        unit, exif = _unit_of_image(path, options)
+    elif found == "NPY" and unit is None:
+        with errors_name(path, "a readable array of numbers", error=ThermalFileError):
+            whole_numbers = np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind in "ui"
+        if whole_numbers:
+            expected = "an array of degrees C (float32 or float64), or whole numbers with a known unit"
+            remedy = "Pass --camera, or --celsius-per-count and --celsius-offset."
+            raise ThermalFileError(str(path), expected=expected, got="whole numbers and no unit", remedy=remedy)
+    unit = ThermalUnit.celsius() if unit is None or found == "CSV" else unit
+    image = read_thermal_file(path, unit, options.valid_range_c, f".{found.lower()}")
+    metadata = ThermogramMetadata(
+        format=found,
+        camera=exif.camera,
+        conditions=after,
+        celsius_per_count=unit.scale if found in ("TIFF", "PNG") and unit.kind == "linear" else None,
+    )
     if before != after:  # pixels that are no temperature under other conditions count as out of range
         again = masked_image(corrected_temperature_c(image.temperature_c, before, after), options.valid_range_c)
         lost = again.report.masked - image.report.masked
         report = replace(image.report, out_of_range=image.report.out_of_range + lost)
         image = ThermalImage(again.temperature_c, report)
-    return Thermogram(image.temperature_c, metadata, image.report)
+    return image, metadata
+
+
+def _unit_of_image(path: Path, options: RadiometryOptions) -> tuple[ThermalUnit, ExifFacts]:
+    """Unit of a TIFF or PNG, and what its tags say.
+
+    What the user says comes before what the file says. Refused are pictures of 8 bits or in colour, and counts that may
+    mean several things.
+    """
+    unit = options.given_unit
+    with errors_name(path, "a readable TIFF or PNG", error=ThermalFileError):
+        if size_of_double_tiff(path) is not None:
+            return unit or ThermalUnit.celsius(), ExifFacts()
+        with Image.open(path, formats=("TIFF", "PNG")) as image:
+            check_thermal_size(path, *image.size)
+            mode, exif = image.mode, read_exif_facts(image)
+    if mode != "F" and not mode.startswith("I"):
+        expected = "one channel of 16-bit counts or of floats, [degrees C]"
+        got = f"image mode {mode}: a picture for the eye, whose shades are no temperatures"
+        remedy = "Export the radiometric TIFF from the camera or its program."
+        raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
+    camera = recognised_camera(exif.make, exif.model)
+    if unit is not None or mode == "F":
+        return unit or ThermalUnit.celsius(), exif
+    if camera is None:
+        known = ", ".join(f"{name} ({scale.cameras})" for name, scale in COUNT_SCALES.items())
+        remedy = f"Pass --camera with one of {known}; or --celsius-per-count and --celsius-offset."
+        got = f"counts of {exif.camera or 'an unnamed camera'}, which may mean several things"
+        raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
+    return COUNT_SCALES[camera].unit, exif

@@ -10,12 +10,11 @@ import numpy.typing as npt
 
 from thermoxels_ns.capture.folder_scan import shown_name
 from thermoxels_ns.capture.frames import measurement_rows
-from thermoxels_ns.capture.rig.explanation import turn_deg, turn_error_deg, why_turn_is_unsure, with_error
 from thermoxels_ns.capture.rig.start import rig_frames
 from thermoxels_ns.capture.scene_writer import scene_names
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.radiometry.dead_pixels import MIN_FRAMES
+from thermoxels_ns.radiometry.thermal_pixels import MIN_FRAMES
 from thermoxels_ns.reports.capture_pictures import colours, jpeg_of, overlay
 from thermoxels_ns.reports.charts import bars, histogram
 from thermoxels_ns.reports.page import build_page, write_page
@@ -75,9 +74,8 @@ def capture_page(
         result=result,
         overlays=overlays,
         cameras=_cameras(result),
-        turn=with_error(turn_deg(rig), turn_error_deg(rig), 2),
+        turn=with_error(rig.turn_deg, rig.turn_error_deg, 2),
         shift=float(np.linalg.norm(rig.visible_to_thermal[:3, 3])),
-        unsure=why_turn_is_unsure(rig),
         errors=errors,
         median_error=np.median(errors) if errors.size else math.nan,
         error_chart=histogram(errors, "reprojection error, pixels of the photographs", limits=(0.0, limit)),
@@ -117,3 +115,13 @@ def _cameras(result: CaptureResult) -> list[tuple[str, ...]]:
         ),
         ("distortion k1, k2", *(f"{c.k1:.4f}, {c.k2:.4f}" for c, _ in columns)),
     ]
+
+
+def with_error(value: float, error: float, decimals: int) -> str:
+    """Write a number with its standard error, where it has one.
+
+    >>> with_error(70.04, 0.26, 1), with_error(1.0, float("nan"), 2), with_error(1.0, 0.0, 2)
+    ('70.0 ± 0.3', '1.00', '1.00')
+    """
+    plus = f" ± {error:.{decimals}f}" if np.isfinite(error) and error > 0.0 else ""
+    return f"{value:.{decimals}f}{plus}"

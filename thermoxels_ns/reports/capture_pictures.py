@@ -11,7 +11,7 @@ from PIL import Image
 
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame
-from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
+from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.core.camera import Camera
 
 _WIDTH = 640

@@ -9,7 +9,7 @@ from tests.support.known_rig import turned
 from thermoxels_ns.capture.rig.board import board_of, find_board, in_scene_units, rig_from_board_photos, rig_from_boards
 from thermoxels_ns.capture.rig_types import RigEstimate, RigStart
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.sfm.scale_and_up import MetricScale
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
@@ -102,14 +102,14 @@ def test_without_a_scale_metres_cannot_be_used(folder: Path, tmp_path: Path) -> 
 def test_pictures_that_do_not_serve_are_refused(
     folder: Path, tmp_path: Path, pairs: list[tuple[np.ndarray, np.ndarray]]
 ) -> None:
-    with pytest.raises(SceneError, match="thermal images: expected 80 x 64 pixels"):
+    with pytest.raises(SceneError, match="board pictures"):
         found(folder, tmp_path / "a", size=(80, 64))
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(SceneError, match="got none; no camera files"):
+    with pytest.raises(SceneError, match="empty"):
         found(empty, tmp_path / "c")
     two = write_board_folder(tmp_path / "two", pairs[:2])
-    with pytest.raises(SceneError, match=r"in 2 of 2 pairs.*Pairs: board0, board1"):
+    with pytest.raises(SceneError, match="in 2 of 2 pairs"):
         found(two, tmp_path / "d")
 
 
@@ -118,10 +118,6 @@ def test_options_of_the_board_belong_together() -> None:
     board = board_of(whole)
     assert board is not None and (board.columns, board.rows, board.square_m) == (7, 5, 0.03)
     assert board_of(SETTINGS) is None
-    for wrong, words in (
-        (replace(whole, board=None), "got no --board"),
-        (replace(whole, rig=Path("r.json")), "all of them and --rig"),
-        (replace(whole, board="5x5"), "not as many along both"),
-    ):
-        with pytest.raises(SceneError, match=words):
+    for wrong in (replace(whole, board=None), replace(whole, rig=Path("r.json")), replace(whole, board="5x5")):
+        with pytest.raises(SceneError, match="checker board"):
             board_of(wrong)

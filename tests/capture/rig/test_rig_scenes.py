@@ -10,10 +10,8 @@ from PIL import Image
 
 from tests.support.known_rig import changes_between, drawn_capture, projection_difference_px
 from thermoxels_ns.capture.rig.drift import estimate_drift
-from thermoxels_ns.capture.rig.explanation import turn_errors_deg
-from thermoxels_ns.capture.rig.parameters import PARAMETERS
 from thermoxels_ns.capture.rig.search import estimate_rig
-from thermoxels_ns.capture.rig_types import RigFrame, RigStart
+from thermoxels_ns.capture.rig_types import PARAMETERS, RigFrame, RigStart
 from thermoxels_ns.core.camera import Camera
 
 
@@ -112,7 +110,7 @@ def test_points_and_offsets_are_sure_and_each_number_as_sure_as_stated(
     assert capture.projection_error_px(found) < 0.17
     assert capture.focal_error(found) < focal_limit
     assert capture.turn_error_deg(found) < LARGEST_TURN_DEG
-    assert capture.turn_error_deg(found) < 2.0 * turn_errors_deg(found.covariance)[0]
+    assert capture.turn_error_deg(found) < 2.0 * found.turn_error_deg
     errors = np.array([found.standard_errors[name] for name in PARAMETERS])
     true_changes = changes_between(start, capture.thermal, capture.visible_to_thermal)
     off = changes_between(start, found.thermal_camera, found.visible_to_thermal) - true_changes

@@ -7,9 +7,8 @@ import pytest
 
 from tests.support.known_rig import KnownCapture, known_capture, painted_sky
 from thermoxels_ns.capture.rig.images import prepare_frames
-from thermoxels_ns.capture.rig.parameters import RigModel, prior_sigmas
 from thermoxels_ns.capture.rig.search import estimate_rig
-from thermoxels_ns.capture.rig_types import RigFrame, RigStart
+from thermoxels_ns.capture.rig_types import RigFrame, RigModel, RigStart, prior_sigmas
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 

@@ -36,14 +36,14 @@ def test_lengths_follow_the_scales(tmp_path, ours, shift):
     ],
 )
 def test_mirrors_and_other_matrices_are_refused(tmp_path, rig):
-    with pytest.raises(SceneError, match="rig: expected 4 x 4 numbers, a rotation and a shift"):
+    with pytest.raises(SceneError, match="rig: expected"):
         read_rig(rig_file(tmp_path, rig=rig.tolist()), (64, 48))
 
 
 @pytest.mark.parametrize("width", [float("inf"), float("nan"), 64.5, 1e400, -float("inf")])
 def test_sizes_are_whole_numbers_of_pixels(tmp_path, width):
     file = rig_file(tmp_path, thermal_camera={**CAMERA, "w": width})
-    with pytest.raises(SceneError, match=r"transforms.json: thermal_camera.w: expected a whole number of pixels"):
+    with pytest.raises(SceneError, match=r"transforms.json: thermal_camera"):
         read_rig(file, (64, 48))
     rig = read_rig(rig_file(tmp_path, thermal_camera={**CAMERA, "w": 64.0}), (64, 48))
     assert rig.thermal_camera.width == 64

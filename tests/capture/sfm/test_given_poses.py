@@ -6,7 +6,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from tests.support.posed_model import CAMERA, ring_model
-from thermoxels_ns.capture.sfm.colmap_conversion import model_of_colmap, read_colmap
+from thermoxels_ns.capture.sfm.colmap import model_of_colmap, read_colmap
 from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, read_given_poses
 from thermoxels_ns.capture.sfm.poses import Poses
 from thermoxels_ns.core.errors import SceneError

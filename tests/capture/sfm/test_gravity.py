@@ -5,7 +5,7 @@ import pytest
 from PIL import Image, ImageOps
 from scipy.spatial.transform import Rotation
 
-from thermoxels_ns.capture.sfm.gravity import find_up, level_rotation
+from thermoxels_ns.capture.sfm.scale_and_up import find_up, level_rotation
 from thermoxels_ns.synthetic.camera_rings import look_at
 
 SHAKEN = Rotation.from_euler("xyz", [40, -70, 25], degrees=True).as_matrix()

@@ -8,7 +8,7 @@ from PIL import Image
 
 from tests.support.posed_model import CAMERA, ring_model
 from thermoxels_ns.capture.photograph import GpsFix
-from thermoxels_ns.capture.sfm.metric_scale import (
+from thermoxels_ns.capture.sfm.scale_and_up import (
     MeasuredDistance,
     local_metres,
     scale_from_distance,

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
+from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 
 
 def test_a_slanted_plane_has_its_own_depth_and_not_that_of_its_nearest_points() -> None:

@@ -14,13 +14,12 @@ from scipy.optimize import least_squares
 
 from thermoxels_ns.capture.folder_scan import scan_folder
 from thermoxels_ns.capture.frames import read_frames
-from thermoxels_ns.capture.pairs import PairOptions, find_pairs
+from thermoxels_ns.capture.pairs import find_pairs, no_pairs
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas
 from thermoxels_ns.capture.rig.start import BASELINE_SIGMA_M, rig_start
-from thermoxels_ns.capture.rig_types import FloatArray, RigEstimate, RigStart
+from thermoxels_ns.capture.rig_types import PARAMETERS, FloatArray, RigEstimate, RigModel, RigStart, prior_sigmas
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.sfm.scale_and_up import MetricScale
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
@@ -33,7 +32,6 @@ _CORNER_SIGMA_PX = 0.3
 _PERCENTILES = (1.0, 99.0)
 _SMALLEST_SIDE_PX = 480
 _LARGEST_ENLARGEMENT = 6
-_MOST_LISTED = 10  # pairs that an error names
 
 
 @dataclass(frozen=True)
@@ -137,24 +135,18 @@ def rig_from_boards(
 
 
 def board_of(settings: CaptureSettings) -> CheckerBoard | None:
-    """The board that the options describe, None where they name none; a `SceneError` where one of them is missing."""
-    names = ("board_photos", "board", "board_square_m")
-    missing = [f"--{name.replace('_', '-')}" for name in names if getattr(settings, name) is None]
-    if len(missing) == len(names):
+    """The board that the options describe, None where they name none; a `SceneError` where they are not whole."""
+    photos, size, square_m = settings.board_photos, settings.board, settings.board_square_m
+    if photos is None and size is None and square_m is None:
         return None
-    if missing or settings.rig is not None:
-        expected = "--board-photos, --board and --board-square-m together, and no --rig beside them"
-        got = ("no " + " and no ".join(missing)) if missing else "all of them and --rig"
-        remedy = "Pass --board-photos FOLDER --board 7x5 --board-square-m 0.03, or none of them."
+    match = _SIZE.fullmatch(str(size).strip())
+    if photos is None or match is None or square_m is None or settings.rig is not None:
+        expected = "--board-photos, --board such as 7x5 and --board-square-m together, and no --rig beside them"
+        got = f"{photos}, {size}, {square_m} and --rig {settings.rig}"
+        remedy = "Pass --board-photos FOLDER --board 7x5 --board-square-m 0.03 (inner corners), or none of them."
         raise SceneError("checker board", expected=expected, got=got, remedy=remedy)
-    match = _SIZE.fullmatch(str(settings.board).strip())
-    if match is None:
-        expected = "inner corners along both sides, such as 7x5"
-        remedy = "Count the corners where four squares meet; one less than squares."
-        raise SceneError("--board", expected=expected, got=repr(settings.board), remedy=remedy)
     sides = sorted(map(int, match.groups()), reverse=True)
-    assert settings.board_square_m is not None
-    return CheckerBoard(sides[0], sides[1], settings.board_square_m)
+    return CheckerBoard(sides[0], sides[1], square_m)
 
 
 def rig_from_board_photos(
@@ -175,29 +167,24 @@ def rig_from_board_photos(
     found = scan_folder(source)
     if found.unreadable and not settings.skip_bad:
         raise SceneError(next(iter(found.unreadable.values())))
-    search = find_pairs(found, PairOptions(settings.time_limit_s, settings.clock_offset_s))
+    search = find_pairs(found, settings.time_limit_s, settings.clock_offset_s)
     if not search.pairs:
-        example = next((f"{path.name}: {why}" for path, why in search.unpaired.items()), "no camera files")
-        expected = "photographs with thermal images"
-        got, remedy = f"none; {example}", "Give both of a shot the same name or time."
-        raise SceneError(f"board pictures in {source}", expected=expected, got=got, remedy=remedy)
+        raise no_pairs(found, search.unpaired, settings.dji_library is not None)
     read = read_frames(search.pairs, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
-    if read.thermal_size != thermal_size:
-        raise _another_camera("thermal images", thermal_size, read.thermal_size)
-    pairs, names = [], [frame.name for frame in read.frames]
+    pairs, size = [], (visible.width, visible.height)
     for frame in read.frames:
         photograph = open_photograph(frame.photograph)
-        if photograph.size != (visible.width, visible.height):
-            raise _another_camera(frame.photograph_source, (visible.width, visible.height), photograph.size)
+        if read.thermal_size != thermal_size or photograph.size != size:
+            expected = f"{size} pixels and {thermal_size} thermal pixels, as in the capture"
+            got, remedy = f"{photograph.size} and {read.thermal_size}", "Use the same cameras in the same mode."
+            raise SceneError(f"board pictures: {frame.photograph_source}", expected=expected, got=got, remedy=remedy)
         pairs.append((np.asarray(photograph.convert("L")), np.load(frame.thermal, allow_pickle=False)))
     start = rig_start(read.frames, visible, thermal_size, settings.thermal_field_of_view_deg)
     estimate = rig_from_boards(pairs, visible, replace(start, translation_sigma=BASELINE_SIGMA_M), board)
     if not estimate.determined:
         expected = f"at least three pairs in which both cameras show the {board.columns} x {board.rows} corners"
-        more = f" and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
-        got = f"{estimate.explanation} Pairs: {', '.join(names[:_MOST_LISTED])}{more}"
         remedy = "Check --board; heat the board evenly, hold it still, and let it fill a third of the picture."
-        raise SceneError(f"board pictures in {source}", expected=expected, got=got, remedy=remedy)
+        raise SceneError(f"board pictures in {source}", expected=expected, got=estimate.explanation, remedy=remedy)
     say(f"board: {estimate.explanation}")
     return estimate
 
@@ -213,9 +200,3 @@ def in_scene_units(rig: RigEstimate, scale: MetricScale | None, missing: str) ->
     covariance[_SHIFTS] /= scale.metres_per_unit
     covariance[:, _SHIFTS] /= scale.metres_per_unit
     return replace(rig, visible_to_thermal=transform, covariance=covariance)
-
-
-def _another_camera(name: str, wanted: Sequence[int], got: Sequence[int]) -> SceneError:
-    expected = f"{wanted[0]} x {wanted[1]} pixels, as in the capture"
-    remedy = "Photograph the board with the same cameras in the same mode."
-    return SceneError(f"board pictures: {name}", expected=expected, got=f"{got[0]} x {got[1]}", remedy=remedy)

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.capture.rig.images import read_temperatures
 from thermoxels_ns.capture.rig_types import DriftEstimate, FloatArray, RigFrame, radius_squared
-from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
+from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.core.camera import Camera
 
 _RADIAL_TERMS = 2
@@ -74,13 +74,11 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
         after = f"{after_k:.3g} K with the best correction, at points it was not fitted to"
         return _nothing(frames, before_k, f"two images differ by {before_k:.3g} K at shared points, and by {after}")
     best = _fit(samples, _RADIAL_TERMS if radial else 0)
-    groups = _groups(samples)
     corner_k = sum(best.radial)
     explanation = (
         f"Two images differ by {before_k:.3g} K at shared scene points (median), after the correction by {after_k:.3g} "
         f"K at points it was not fitted to; offsets from {best.offsets_k.min():+.2f} to {best.offsets_k.max():+.2f} K"
         + (f", image corners read {corner_k:+.2f} K" if radial else ", no radial term")
-        + (f"; {groups} groups of images share no points, each has mean offset 0" if groups > 1 else "")
         + "."
     )
     return DriftEstimate(best.offsets_k, tuple(map(float, best.radial)), before_k, after_k, True, explanation)
@@ -147,15 +145,6 @@ def _disagreement_k(samples: DriftSamples, wrong: FloatArray) -> float:
         differences.append(np.abs(reading[lag:] - reading[:-lag])[same])
     every = np.concatenate(differences)
     return float(np.median(every)) if len(every) else float("nan")
-
-
-def _groups(samples: DriftSamples) -> int:
-    """How many groups of frames there are that share no point with another group."""
-    frames, points = samples.num_frames, samples.num_points
-    ends = (samples.frame, frames + samples.point)
-    links = csr_matrix((np.ones(len(samples.point)), ends), shape=(frames + points,) * 2)
-    _, label = connected_components(links, directed=False)
-    return len(np.unique(label[:frames]))
 
 
 def _nothing(frames: int, before_k: float, reason: str) -> DriftEstimate:
@@ -240,14 +229,8 @@ def _read(image: npt.NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArra
     smooth = cv2.GaussianBlur(image, (0, 0), _BLUR_PX, borderType=cv2.BORDER_REPLICATE)  # NaN spreads, and is left out
     gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125)
     gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125)
-    planes = np.dstack([smooth, np.hypot(gx, gy)])
-    if not len(pixels):
-        return np.zeros(0), np.zeros(0)
-    x, y = (pixels - 0.5).T
-    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
-    u, v = (x - left)[:, None], (y - top)[:, None]
-    rows, columns = np.clip([top, top + 1], 0, image.shape[0] - 1), np.clip([left, left + 1], 0, image.shape[1] - 1)
-    above = (1.0 - u) * planes[rows[0], columns[0]] + u * planes[rows[0], columns[1]]
-    below = (1.0 - u) * planes[rows[1], columns[0]] + u * planes[rows[1], columns[1]]
-    value = (1.0 - v) * above + v * below
-    return value[:, 0].astype(np.float64), value[:, 1].astype(np.float64)
+    place = pixels[:, ::-1].T - 0.5
+    value, steepness = (
+        ndimage.map_coordinates(plane, place, order=1, mode="nearest") for plane in (smooth, np.hypot(gx, gy))
+    )
+    return value.astype(np.float64), steepness.astype(np.float64)

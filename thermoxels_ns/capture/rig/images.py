@@ -1,4 +1,4 @@
-"""Edges of photographs and thermal images, at one size after another, coarse to fine."""
+"""Edges of photographs and thermal images at one size after another, and how well a rig makes them agree."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.rig.parameters import RigModel
-from thermoxels_ns.capture.rig.score import EdgePoints, RigScore, ThermalEdges
-from thermoxels_ns.capture.rig_types import RigFrame
-from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
+from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.rig_types import FloatArray, RigFrame, RigModel
+from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.radiometry.decoders import errors_name
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -38,7 +36,92 @@ _STRONG_PERCENTILE, _SMALLEST_SHARE = 98.0, 3e-3
 _CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE = 6.0, 0.02
 _FEWEST_FOR_PATTERN = 8
 _PATTERN_CORRELATION = 0.25
-_NEIGHBOURS = 20
+_BORDER_PX, _BORDER_SHARE = 2.0, 0.05
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class EdgePoints:
+    """Edges of one photograph as points in front of its camera."""
+
+    points: FloatArray  # shape (n, 3), the visible camera's OpenCV axes
+    value: npt.NDArray[np.complex64]  # edge values, shape (n,)
+
+
+class ThermalEdges:
+    """Edge values of one thermal image and all that is needed to sample them smoothly."""
+
+    def __init__(self, field: npt.NDArray[np.complex64]) -> None:
+        """Take edge values, shape (height, width)."""
+        height, width = field.shape
+        self.field = field
+        self.weight: npt.NDArray[np.float32] = np.minimum.outer(_ramp(height), _ramp(width)).astype(np.float32)
+        # Zeros around, so that everything outside reads 0.
+        values = np.pad(np.dstack([field.real, field.imag]).astype(np.float32), ((2, 2), (2, 2), (0, 0)))
+        self._planes = np.zeros((height + 4, width + 4, 6), np.float32)
+        self._planes[..., :2] = values
+        self._planes[:, 1:-1, 2:4] = 0.5 * (values[:, 2:] - values[:, :-2])
+        self._planes[1:-1, :, 4:] = 0.5 * (values[2:] - values[:-2])
+
+    def sample(self, pixels: FloatArray) -> npt.NDArray[np.float32]:
+        """Edge values at pixels (n, 2), and their derivatives along x and y: complex as pairs (n, 6); 0 outside."""
+        return _bilinear(self._planes, pixels + 2.0)
+
+    def weight_at(self, pixels: FloatArray) -> FloatArray:
+        """How much points at pixel positions (n, 2) count, shape (n,); 0 outside the image."""
+        return _bilinear(np.pad(self.weight, 2)[..., None], pixels + 2.0)[:, 0].astype(np.float64)
+
+
+class RigScore:
+    """The score of all frames at one size of the thermal images.
+
+    Every photograph becomes a set of points in front of its camera, where its edges are, each with an edge value a.
+    The rig says where they fall in the thermal image, whose edge value there is b. The score is
+    sum(w Re a* b) / sqrt(sum(w |a|^2) sum(w |b|^2)) over the points of all frames: 1 if all edges agree, 0 by chance.
+
+    What is maximised is the sum(w Re a* b) alone, with weights w that fall to 0 at the border of the thermal image and
+    do not follow the rig. The points lie only where photographs have edges, so the last factor is no constant of the
+    thermal images, and points at the border come and go: with either of them it pays to move points to where b is
+    small, and the focal length comes out half a percent too long.
+    """
+
+    def __init__(
+        self, edges: Sequence[EdgePoints], thermal: Sequence[ThermalEdges], rig: RigModel, around: FloatArray
+    ) -> None:
+        """Take edges of photographs and thermal images, what changes count from, and where the weights are taken."""
+        self.edges, self.thermal, self.rig = edges, thermal, rig
+        self._weights = [t.weight_at(rig.project(around, e.points)) for e, t in zip(edges, thermal)]
+        self._own = sum(float(w @ np.abs(e.value) ** 2) for e, w in zip(edges, self._weights))
+        self._scale = 1.0 / np.sqrt(max(self._own * self._sums(around)[1], _TINY))
+
+    def around(self, change: FloatArray) -> RigScore:
+        """Same images, the points' weights taken at another place."""
+        return RigScore(self.edges, self.thermal, self.rig, change)
+
+    def value(self, change: FloatArray) -> float:
+        """Score of all frames together."""
+        product, other = self._sums(change)
+        return product / np.sqrt(max(self._own * other, _TINY))
+
+    def _sums(self, change: FloatArray) -> tuple[float, float]:
+        """Weighted sums of Re a* b and |b|^2."""
+        product, other = 0.0, 0.0
+        for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
+            sampled = thermal.sample(self.rig.project(change, one.points))
+            product += float(weight @ (one.value.real * sampled[:, 0] + one.value.imag * sampled[:, 1]))
+            other += float(weight @ (sampled[:, 0] ** 2 + sampled[:, 1] ** 2))
+        return product, other
+
+    def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
+        """What is maximised, and its derivative split by the frames that it comes from, shape (frames, 10)."""
+        total, rows = 0.0, []
+        for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
+            values = thermal.sample(self.rig.project(change, one.points))
+            by_real, by_imaginary = (self._scale * weight * part for part in (one.value.real, one.value.imag))
+            total += float(by_real @ values[:, 0] + by_imaginary @ values[:, 1])
+            slope = np.column_stack([by_real * values[:, k] + by_imaginary * values[:, k + 1] for k in (2, 4)])
+            rows.append(self.rig.pull_back(change, one.points, slope))
+        return total, np.array(rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,13 +228,7 @@ def read_photograph(frame: RigFrame, camera: Camera) -> FloatImage:
     """Photograph of a frame as grey values; EXIF's orientation is not applied, as in structure from motion."""
     source = frame.photograph
     if isinstance(source, Path):
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        with errors_name(f"{frame.name}: {source.name}", "a readable photograph"):
-            encoded = np.frombuffer(source.read_bytes(), np.uint8)
-        image = cv2.imdecode(encoded, flags) if len(encoded) else None
-        if image is None:
-            remedy, got = "Copy it from the camera again or leave the frame out.", "a file that is damaged or no image"
-            raise SceneError(f"{frame.name}: {source.name}", expected="a readable photograph", got=got, remedy=remedy)
+        image = np.asarray(open_photograph(source).convert("L"))
     else:
         image = np.asarray(source)
         image = image[..., :3].mean(axis=2) if image.ndim == 3 else image
@@ -197,8 +274,8 @@ def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0)
 def without_fixed_pattern(images: Sequence[FloatImage]) -> tuple[list[FloatImage], float]:
     """Local contrasts without what stays in place while the camera moves, and how far two halves of the frames agree.
 
-    Rows, columns and single pixels may read differently. The pattern is the median local contrast over the frames
-    around each one, because cameras renew it now and then. It is taken out only if two halves of the frames agree.
+    Rows, columns and single pixels may read differently. The pattern is the median local contrast over the frames. It
+    is taken out only if two halves of the frames agree.
     """
     contrast = [local_contrast(image) for image in images]
     if len(contrast) < _FEWEST_FOR_PATTERN:
@@ -210,13 +287,7 @@ def without_fixed_pattern(images: Sequence[FloatImage]) -> tuple[list[FloatImage
     agreement = float(a @ b) / scale if scale > 0.0 else 0.0
     if not agreement > _PATTERN_CORRELATION:
         return contrast, agreement
-    cleaned, window = [], min(_NEIGHBOURS, len(stack))
-    step = max(window // 4, 1)
-    for first in range(0, len(stack), step):  # one median serves a few neighbouring frames
-        start = min(max(first + step // 2 - window // 2, 0), len(stack) - window)
-        pattern = np.median(stack[start : start + window], axis=0)
-        cleaned += [image - pattern for image in stack[first : first + step]]
-    return cleaned, agreement
+    return [*(stack - np.median(stack, axis=0))], agreement
 
 
 def local_contrast(image: FloatImage) -> FloatImage:
@@ -230,3 +301,22 @@ def local_contrast(image: FloatImage) -> FloatImage:
     weight = cv2.GaussianBlur(known, (0, 0), reach)
     around = cv2.GaussianBlur(filled, (0, 0), reach) / np.maximum(weight, 1e-6)
     return np.where(bad, np.float32(np.nan), filled - around).astype(np.float32)
+
+
+def _bilinear(planes: npt.NDArray[np.float32], pixels: FloatArray) -> npt.NDArray[np.float32]:
+    """Sample planes (height, width, k) at pixel positions (n, 2); NaN and what is far off reads the corner."""
+    rows, columns, depth = planes.shape
+    place = np.nan_to_num(pixels, nan=-9.0, posinf=-9.0, neginf=-9.0) - 0.5
+    x, y = np.clip(place[:, 0], 0.0, columns - 1.001), np.clip(place[:, 1], 0.0, rows - 1.001)
+    left, top = x.astype(np.int64), y.astype(np.int64)
+    u, v = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
+    flat, first = planes.reshape(rows * columns, depth), top * columns + left
+    above = flat[first] * (1 - u) + flat[first + 1] * u
+    below = flat[first + columns] * (1 - u) + flat[first + columns + 1] * u
+    return above * (1 - v) + below * v
+
+
+def _ramp(length: int) -> npt.NDArray[np.float64]:
+    """0 near both ends, where edges are not known well, and 1 from a small share of the length on."""
+    distance = np.minimum(np.arange(length) + 0.5, length - np.arange(length) - 0.5) - _BORDER_PX
+    return np.clip(distance / max(_BORDER_SHARE * length, 2.0), 0.0, 1.0)

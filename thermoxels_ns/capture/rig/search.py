@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
+from scipy import fft
 
-from thermoxels_ns.capture.rig.coarse_search import CoarseSearch
-from thermoxels_ns.capture.rig.explanation import uncertainty_text
-from thermoxels_ns.capture.rig.fit import RigFit, RigMaximizer
-from thermoxels_ns.capture.rig.images import PreparedFrames, prepare_frames
-from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas
-from thermoxels_ns.capture.rig.refinement import refine
-from thermoxels_ns.capture.rig_types import FloatArray, RigEstimate, RigFrame, RigStart
+from thermoxels_ns.capture.rig.images import EdgePoints, PreparedFrames, RigScore, prepare_frames
+from thermoxels_ns.capture.rig.refinement import RigFit, RigMaximizer, refine
+from thermoxels_ns.capture.rig_types import (
+    PARAMETERS,
+    FloatArray,
+    RigEstimate,
+    RigFrame,
+    RigModel,
+    RigStart,
+    prior_sigmas,
+)
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 
@@ -26,13 +32,30 @@ _FARTHEST_SIGMAS = 5.0
 _WORTH_TRYING = 0.8
 _SMALLEST_ERROR_PX, _LARGEST_ERROR_SHARE = 1.5, 0.005
 _PROBE_STEP = 1e-4
+_Spectra = tuple[npt.NDArray, ...]
+_REACH_SIGMAS = 2.5
+_STEP_PX = 2.5
+_COARSE_FRAMES = 16
+_CANDIDATES = 4
+_APART_PX = 3.0
+_SMALLEST_OVERLAP = 0.3
+_PADDING = 1.6
+_CHANCE_DRAWS = 3
+_WORDS = (
+    *("the tilt up or down", "the turn left or right", "the roll", "the shift to the side", "the shift up or down"),
+    *("the shift ahead", "the focal length", "the principal point's column", "the principal point's row"),
+    "the distortion",
+)
+_SAME = 0.8
+"""Correlation from which on two numbers stand for each other: knowing one would make the other 1.7 times as sure."""
+_NOTHING_LEARNT = 0.8  # share of the first standard deviation that is left where the images say next to nothing
 
 
 def estimate_rig(
     frames: Sequence[RigFrame],
     visible: Camera,
     start: RigStart,
-    progress: Callable[[str, float], None] = lambda message, share: None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> RigEstimate:
     """Find the thermal camera's intrinsics and the fixed transform from the visible to the thermal camera.
 
@@ -51,16 +74,16 @@ def estimate_rig(
         remedy = "Check that structure from motion registered the photographs and that poses are in OpenGL axes."
         raise SceneError("rig", expected=expected, got=got, remedy=remedy)
     chosen = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, min(len(usable), _MOST_FRAMES)).astype(int))]
-    progress("Reading the frames", 0.0)
+    say("Reading the frames")
     prepared = prepare_frames(chosen, visible, start.thermal_camera)
-    return _RigSearch(prepared, start, progress).run()
+    return _RigSearch(prepared, start, say).run()
 
 
 @dataclass(frozen=True, eq=False)
 class _RigSearch:
     prepared: PreparedFrames
     start: RigStart
-    progress: Callable[[str, float], None]
+    say: Callable[[str], None]
 
     def run(self) -> RigEstimate:
         depth = self.prepared.median_depth
@@ -76,7 +99,7 @@ class _RigSearch:
         coarse_rigs: list[RigFit] = []
         chance, level = 0.0, 0
         for level, size in enumerate(sizes[:_SEARCHED_SIZES]):  # small things show in the second size only
-            self.progress(f"Comparing edges, all directions, {size[0]} x {size[1]} pixels", 0.1 * (1 + level))
+            self.say(f"Comparing edges, all directions, {size[0]} x {size[1]} pixels")
             coarse = self.prepared.score(rig, unchanged, size, _COARSE_BLUR_PX) if level else coarse
             search = CoarseSearch(coarse, sigmas, depth)
             coarse_rigs, chance = search.best(), search.best_by_chance()
@@ -95,8 +118,8 @@ class _RigSearch:
         change = max(maxima, key=lambda fit: fit.score).change
         finer = sizes[level + 1 :] or sizes[-1:]
         score, maximizer = coarse, RigMaximizer(coarse, sigmas, depth)
-        for number, size in enumerate(finer):
-            self.progress(f"Comparing edges, {size[0]} x {size[1]} pixels", 0.3 + 0.6 * number / len(finer))
+        for size in finer:
+            self.say(f"Comparing edges, {size[0]} x {size[1]} pixels")
             blur_px = _FINE_BLUR_PX if size == sizes[-1] else _COARSE_BLUR_PX
             score = self.prepared.score(rig, change, size, blur_px)
             maximizer = RigMaximizer(score, sigmas, depth)
@@ -107,7 +130,7 @@ class _RigSearch:
         reason = self._rejection(change, sigmas, before, after, error_px)
         if reason is not None:
             return self._kept(rig, sigmas, before, reason)
-        self.progress("Comparing windows", 0.9)
+        self.say("Comparing windows")
         better = refine(self.prepared, rig, change, sigmas)
         windows = ""
         if better is not None:
@@ -118,16 +141,15 @@ class _RigSearch:
                 after = score.value(change)
                 windows = f" and {better.windows} windows of them that agree"
             error_px = self._projection_sigma(rig, change, covariance)
-        self.progress("Rig found", 1.0)
         camera, transform = rig.changed(change)
-        turn_deg = np.degrees(np.arccos(np.clip(0.5 * (np.trace(transform[:3, :3]) - 1.0), -1.0, 1.0)))
+        found = RigEstimate(camera, transform, True, "", PARAMETERS, covariance, before, after, error_px)
         explanation = (
-            f"Found from {len(self.prepared.frames)} frames{windows}: focal length {camera.fl_x:.1f} pixels, "
-            f"{turn_deg:.2f} degrees and {np.linalg.norm(transform[:3, 3]):.3g} world units from the visible camera; "
-            f"scene points fall within {error_px:.2f} thermal pixels (standard error). Start: {self.start.source}. "
-            f"{uncertainty_text(covariance, sigmas)}"
-        ).rstrip()
-        return RigEstimate(camera, transform, True, explanation, PARAMETERS, covariance, before, after, error_px)
+            f"Found from {len(self.prepared.frames)} frames{windows}: focal length {camera.fl_x:.1f} pixels, turned by "
+            f"{found.turn_deg:.2f} ± {found.turn_error_deg:.2f} degrees and {np.linalg.norm(transform[:3, 3]):.3g} "
+            f"units from the visible camera; scene points fall within {error_px:.2f} thermal pixels (standard error). "
+            f"Start: {self.start.source}.{_unsure(covariance, sigmas)}"
+        )
+        return replace(found, explanation=explanation)
 
     def _rejection(
         self, change: FloatArray, sigmas: FloatArray, before: float, after: float, error_px: float
@@ -166,3 +188,128 @@ class _RigSearch:
             slopes[number] = (rig.project(moved, points) - here) / _PROBE_STEP
         variance = np.einsum("inx,ij,jnx->n", slopes, covariance, slopes)
         return float(np.sqrt(np.nanmedian(variance)))
+
+
+def _unsure(covariance: FloatArray, sigmas: FloatArray) -> str:
+    """Say which of the ten numbers of a rig are not to be trusted alone; empty where all are."""
+    errors = np.sqrt(np.diag(covariance))
+    alike = np.triu(np.abs(covariance) > _SAME * np.outer(errors, errors), 1)
+    pairs = [f"{_WORDS[first]} and {_WORDS[second]}" for first, second in zip(*np.nonzero(alike))]
+    unknown = [
+        word for word, error, sigma in zip(_WORDS, errors, sigmas) if sigma > 0 and error > _NOTHING_LEARNT * sigma
+    ]
+    text = f" The images hardly tell apart {'; '.join(pairs)}." if pairs else ""
+    return text + (f" They say next to nothing about {', '.join(unknown)}." if unknown else "")
+
+
+class CoarseSearch:
+    """Compares all shifts of the photographs' edges at once, for a range of focal lengths and rolls.
+
+    A small turn of the thermal camera shifts its image; so for one focal length and roll the scores of all turns are
+    cross-correlations, which Fourier transforms give together.
+    """
+
+    def __init__(self, score: RigScore, sigmas: FloatArray, median_depth: float) -> None:
+        """Take the score at the coarsest size, the ten standard deviations and the points' depth [world units]."""
+        camera = score.rig.camera
+        self._rig = score.rig
+        # Lengths that Fourier transforms are fast at, with room for shifts.
+        rows, columns = (int(fft.next_fast_len(int(_PADDING * n)) or 0) for n in (camera.height, camera.width))
+        self._shape: tuple[int, int] = (rows, columns)
+        content = [float(np.sum(np.abs(edges.field) ** 2 * edges.weight)) for edges in score.thermal]
+        chosen = np.sort(np.argsort(-np.array(content), kind="stable")[:_COARSE_FRAMES])
+        self._edges = [score.edges[number] for number in chosen]
+        self._thermal = [score.thermal[number] for number in chosen]
+        turn = np.hypot(sigmas[:2], sigmas[3:5][::-1] / median_depth)[::-1]  # about y moves along x
+        self._reach_px = np.minimum(_REACH_SIGMAS * turn * camera.fl_x, 0.5 * np.array([columns, rows]) - 2.0)
+        corner_px = 0.5 * float(np.hypot(camera.width, camera.height))
+        self._focals = _steps(_REACH_SIGMAS * float(sigmas[6]), _STEP_PX / (0.5 * camera.width))
+        self._rolls = _steps(_REACH_SIGMAS * float(sigmas[2]), _STEP_PX / corner_px)
+
+    def best(self) -> list[RigFit]:
+        """Find the best few places that differ, best first."""
+        found = self._found([self._spectra(edges.field, edges.weight) for edges in self._thermal])
+        kept: list[RigFit] = []
+        for rig in sorted(found, key=lambda rig: -rig.score):
+            apart = [np.abs((rig.change - other.change)[:2]).max() * self._rig.camera.fl_x for other in kept]
+            if not apart or min(apart) >= _APART_PX:
+                kept.append(rig)
+            if len(kept) == _CANDIDATES:
+                break
+        return kept
+
+    def best_by_chance(self) -> float:
+        """Highest score that the same search finds if edges of the same scales lie anywhere (noise, random phases)."""
+        draw = np.random.default_rng(0)
+        highest = 0.0
+        for _ in range(_CHANCE_DRAWS):
+            spectra = []
+            for edges in self._thermal:
+                phases = np.exp(2j * np.pi * draw.random(edges.field.shape))
+                noise = np.asarray(fft.ifft2(np.asarray(fft.fft2(edges.field)) * phases))
+                spectra.append(self._spectra(noise, edges.weight))
+            highest = max(highest, *(rig.score for rig in self._found(spectra)))
+        return highest
+
+    def _spectra(self, field: npt.NDArray, weight: npt.NDArray) -> _Spectra:
+        """Fourier transforms of a thermal image's edge values, weights and edge strengths."""
+        weighted = fft.fft2((field * weight).astype(np.complex64), s=self._shape)
+        planes = weight, (np.abs(field) ** 2 * weight).astype(np.float32)
+        return (np.asarray(weighted), *(np.asarray(fft.rfft2(plane, s=self._shape)) for plane in planes))
+
+    def _found(self, spectra: Sequence[_Spectra]) -> list[RigFit]:
+        found: list[RigFit] = []
+        for log_focal in self._focals:
+            for roll in self._rolls:
+                change = np.zeros(10)
+                change[2], change[6] = roll, log_focal
+                found += self._best_shifts(self._surface(spectra, change), change)
+        return found
+
+    def _surface(self, spectra: Sequence[_Spectra], change: FloatArray) -> FloatArray:
+        """Score for every whole shift of the thermal image, shape (rows, columns), shift 0 at [0, 0]."""
+        product: npt.NDArray = np.zeros(self._shape, np.complex64)
+        own: npt.NDArray = np.zeros((self._shape[0], self._shape[1] // 2 + 1), np.complex64)
+        other = own.copy()
+        for edges, (field, weight, strength) in zip(self._edges, spectra):
+            value, power, count = self._splat(edges, change)
+            product += np.conj(np.asarray(fft.fft2(value))) * field
+            own += np.conj(np.asarray(fft.rfft2(power))) * weight
+            other += np.conj(np.asarray(fft.rfft2(count))) * strength
+        overlap, strengths = np.asarray(fft.irfft2(own, s=self._shape)), np.asarray(fft.irfft2(other, s=self._shape))
+        enough = overlap > _SMALLEST_OVERLAP * max(float(overlap.max()), 1e-12)
+        norm = np.where(enough, np.maximum(overlap * strengths, 1e-12), np.inf)
+        return np.asarray(fft.ifft2(product)).real / np.sqrt(norm)
+
+    def _splat(self, edges: EdgePoints, change: FloatArray) -> tuple[npt.NDArray, npt.NDArray, npt.NDArray]:
+        """Edge values, their power and their number in each pixel of the padded image, around which shifts wrap."""
+        rows, columns = self._shape
+        pixels = np.nan_to_num(self._rig.project(change, edges.points), nan=-1e6)
+        x, y = np.floor(pixels[:, 0]).astype(np.int64), np.floor(pixels[:, 1]).astype(np.int64)
+        spare_x, spare_y = columns - self._rig.camera.width, rows - self._rig.camera.height
+        inside = (x >= -spare_x // 2) & (x < columns - spare_x // 2) & (y >= -spare_y // 2) & (y < rows - spare_y // 2)
+        place, value = (y[inside] % rows) * columns + x[inside] % columns, edges.value[inside]
+        real, imaginary, power, count = (
+            np.bincount(place, weights, rows * columns).reshape(self._shape).astype(np.float32)
+            for weights in (value.real, value.imag, np.abs(value) ** 2, np.ones(len(value)))
+        )
+        return real + np.complex64(1j) * imaginary, power, count
+
+    def _best_shifts(self, surface: FloatArray, change: FloatArray) -> list[RigFit]:
+        """The highest places of one surface within reach, as turns of the camera."""
+        across, down = (int(np.ceil(reach)) for reach in self._reach_px)
+        window = np.roll(surface, (down, across), axis=(0, 1))[: 2 * down + 1, : 2 * across + 1]
+        focal = np.array([self._rig.camera.fl_x, self._rig.camera.fl_y]) * np.exp(change[6])
+        found = []
+        for place in np.argsort(-window, axis=None, kind="stable")[:_CANDIDATES]:
+            row, column = divmod(int(place), window.shape[1])
+            shifted = change.copy()
+            shifted[:2] = -(row - down) / focal[1], (column - across) / focal[0]
+            found.append(RigFit(shifted, float(window[row, column])))
+        return found
+
+
+def _steps(reach: float, step: float) -> FloatArray:
+    """Values from -reach to reach, at most `step` apart, with 0 among them."""
+    count = int(np.ceil(reach / step))
+    return np.linspace(-reach, reach, 2 * count + 1) if count else np.zeros(1)

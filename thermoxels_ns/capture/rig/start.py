@@ -16,7 +16,7 @@ from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json
-from thermoxels_ns.data.transforms_json import read_intrinsics
+from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
 
 _MOST_ERROR_PX = 4.0
 """Points that project farther than this from where they were seen are not used, [pixels of the photographs]."""
@@ -95,28 +95,11 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
     missing or no camera of this size, or no rotation and shift.
     """
     content: Any = read_json(file)
-    remedy = "Pass the transforms.json of an earlier capture with the same camera."
-    try:
-        entries = content["thermal_camera"]
-        for name in ("w", "h"):
-            if not float(entries[name]).is_integer():  # neither infinity nor NaN is one
-                where = f"{file.name}: thermal_camera.{name}"
-                raise SceneError(where, expected="a whole number of pixels", got=entries[name], remedy=remedy)
-        camera = read_intrinsics(entries, {}, None, f"{file.name}: thermal_camera")
-        transform = np.array(content["rig"], dtype=np.float64)
-    except (KeyError, TypeError, ValueError, AttributeError) as problem:
-        if isinstance(problem, SceneError):
-            raise
-        got = f"no {problem}" if isinstance(problem, KeyError) else str(problem)
-        raise SceneError(str(file), expected="'thermal_camera' and 'rig'", got=got, remedy=remedy) from problem
-    rigid = transform.shape == (4, 4) and bool(np.isfinite(transform).all())
-    if rigid:  # a rotation, which keeps left and right, and a shift
-        rotation = transform[:3, :3]
-        rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-2 and np.linalg.det(rotation) > 0.0
-        rigid &= np.array_equal(transform[3], [0.0, 0.0, 0.0, 1.0])
-    if not rigid:
-        expected, got = "4 x 4 numbers, a rotation and a shift", transform.tolist()
-        raise SceneError(f"{file}: rig", expected=expected, got=got, remedy=remedy)
+    if not isinstance(content, dict) or not isinstance(content.get("thermal_camera"), dict):
+        remedy = "Pass the transforms.json of an earlier capture with the same camera."
+        raise SceneError(str(file), expected="'thermal_camera' and 'rig'", got="neither or one", remedy=remedy)
+    camera = read_intrinsics(content["thermal_camera"], {}, None, f"{file.name}: thermal_camera")
+    transform = read_pose(content.get("rig"), f"{file}: rig")
     if (camera.width, camera.height) != thermal_size:
         expected = f"{thermal_size[0]} x {thermal_size[1]} pixels, as the images have"
         got, remedy = f"{camera.width} x {camera.height}", "Pass the rig of the same camera and mode."

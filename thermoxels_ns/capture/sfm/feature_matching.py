@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.capture.settings import LensModel, Matching
-from thermoxels_ns.capture.sfm.colmap_process import check_free_space, quiet_colmap, run_in_process
+from thermoxels_ns.capture.sfm.colmap import run_in_process
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import remove_file
+from thermoxels_ns.core.checks import replace_when_done
 
 EXHAUSTIVE_UP_TO = 80  # photographs up to which every pair is matched; the time grows with the square of their number
 _NEIGHBOURS = 8
@@ -22,9 +22,6 @@ away."""
 _ANCHORS = 40
 """Sequential matching: so many photographs spread over the capture are matched with each other, so that a path that
 returns to its start is closed."""
-_BYTES_PER_FEATURE, _BYTES_PER_MATCH, _LEAST_BYTES = 200, 8, 2_000_000
-"""Of the database: 152 bytes of a feature and its row; 7.5 bytes per feature and pair of photographs were measured
-where all photographs show the same room, fewer elsewhere."""
 _CHUNK = 8
 _PAIR_CHUNK = 200
 
@@ -84,30 +81,18 @@ def fill_database(
     """Find features in photographs and match them; what an interrupted run has done is not done again.
 
     `camera` is the start value of their lens at their reduced size; `known_focal` says that its focal length is more
-    than a guess. An `OutputError` is raised where there is too little free space.
+    than a guess.
     """
-    database, count = photographs.database, len(photographs.frame_of_image)
-    pairs = image_pairs(count, options.matching)
-    there = database.stat().st_size if database.is_file() else 0
-    needed = _LEAST_BYTES + options.max_features * (_BYTES_PER_FEATURE * count + _BYTES_PER_MATCH * len(pairs))
-    remedy = "Make space, choose another --output, or lower --max-features"
-    check_free_space(database.parent, needed - there, "features and matches", remedy)
-    run_in_process(_find_and_match, (photographs, camera, known_focal, options, pairs), database.parent, say)
+    arguments = photographs, camera, known_focal, options
+    run_in_process(_find_and_match, arguments, photographs.database.parent, say)
 
 
 def _find_and_match(
-    photographs: ReducedPhotographs,
-    camera: Camera,
-    known_focal: bool,
-    options: PoseOptions,
-    pairs: npt.NDArray[np.int64],
-    say: Callable[[str], None],
+    photographs: ReducedPhotographs, camera: Camera, known_focal: bool, options: PoseOptions, say: Callable[[str], None]
 ) -> None:
-    """`fill_database` for these pairs of photographs (p, 2), in this process."""
-    with quiet_colmap(photographs.database.parent):
-        _add_images(photographs, camera, options.lens, known_focal)
-        _find_features(photographs, options, say)
-        _match(photographs, pairs, options, say)
+    _add_images(photographs, camera, options.lens, known_focal)
+    _find_features(photographs, options, say)
+    _match(photographs, image_pairs(len(photographs.frame_of_image), options.matching), options, say)
 
 
 def _find_features(photographs: ReducedPhotographs, options: PoseOptions, say: Callable[[str], None]) -> None:
@@ -119,14 +104,11 @@ def _find_features(photographs: ReducedPhotographs, options: PoseOptions, say: C
         reader.mask_path = str(photographs.masks)
     extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=options.threads)
     extraction.sift.max_num_features = options.max_features
-    with pycolmap.Database.open(database) as opened:
-        done = {image.name for image in opened.read_all_images() if opened.num_keypoints_for_image(image.image_id) > 0}
-    todo = [name for name in names if name not in done]
-    for start in range(0, len(todo), _CHUNK):
-        some = todo[start : start + _CHUNK]
+    for start in range(0, len(names), _CHUNK):  # COLMAP passes over those that have features
+        some = names[start : start + _CHUNK]
         given: dict[str, Any] = {"reader_options": reader, "extraction_options": extraction}
         pycolmap.extract_features(database, photographs.images, some, **given)
-        say(f"features: {len(names) - len(todo) + start + len(some)} of {len(names)} photographs")
+        say(f"features: {start + len(some)} of {len(names)} photographs")
 
 
 def _match(
@@ -162,14 +144,10 @@ def _add_images(photographs: ReducedPhotographs, camera: Camera, lens: LensModel
     """Number the photographs in their order; else the threads that look for features would number them by chance."""
     import pycolmap
 
-    database, names = photographs.database, photographs.frame_of_image
-    with pycolmap.Database.open(database) as opened:
-        # A frame is written after its image; where there is one frame per name, no killed run left a part.
-        if opened.num_images() == len(names) == opened.num_frames():
-            return
-    for path in database.parent.glob(f"{database.name}*"):  # with its journal
-        remove_file(path)
-    with pycolmap.Database.open(database) as opened:
+    if photographs.database.is_file():
+        return
+    names = photographs.frame_of_image
+    with replace_when_done(photographs.database) as temporary, pycolmap.Database.open(temporary) as opened:
         colmap_camera = as_colmap(camera, lens)
         colmap_camera.has_prior_focal_length = known_focal
         opened.write_camera(colmap_camera, use_camera_id=True)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.capture.sfm.colmap_conversion import model_of_colmap, read_colmap
+from thermoxels_ns.capture.sfm.colmap import model_of_colmap, read_colmap
 from thermoxels_ns.capture.sfm.poses import Poses, common_size, why_other_size
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.errors import SceneError
@@ -34,9 +34,8 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
     else:
         expected, got = "a COLMAP model's folder or a transforms.json", f"nothing at {path}"
         raise SceneError("poses", expected=expected, got=got, remedy="Check the path.")
-    order = {name: number for number, name in enumerate(photographs)}
     missing = {name: f"{path.name} has no pose of it" for name in photographs if name not in model.frames}
-    return Poses(reordered(model, lambda name: order[name]), missing)
+    return Poses(model, missing)
 
 
 def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Poses:
@@ -59,45 +58,26 @@ def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Pose
     return Poses(replace(model, camera=camera.resized(*size), point_error_px=error_px, sighting_pixel=pixel), dropped)
 
 
-def reordered(model: SfmModel, key: Callable[[str], Any]) -> SfmModel:
-    """Same model with its frames sorted by a key of their names."""
-    order = sorted(range(len(model.frames)), key=lambda index: key(model.frames[index]))
-    number = np.argsort(order)[model.sighting_frame] if len(model.sighting_frame) else model.sighting_frame
-    rows = np.argsort(number, kind="stable")
-    return replace(
-        model,
-        frames=tuple(model.frames[index] for index in order),
-        camera_to_world=model.camera_to_world[order],
-        sighting_frame=number[rows],
-        sighting_point=model.sighting_point[rows],
-        sighting_pixel=model.sighting_pixel[rows],
-    )
-
-
 def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
     content: Any = read_json(path)
     entries = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise SceneError(str(path), expected="a list 'frames'", got="none", remedy="Pass another transforms.json.")
-    names = []
+    numbers = {}
     for index, entry in enumerate(entries):
-        where = f"{path.name}: frame {index}"
         name = str(entry.get("file_path", ""))
-        path_inside(path.parent, name, where)
-        names.append(name)
-    frame_of = _frames_of(names, photographs, path)
+        path_inside(path.parent, name, f"{path.name}: frame {index}")
+        numbers[name] = index
     frames, poses, cameras = [], [], set()
-    for index, (name, entry) in enumerate(zip(names, entries)):
-        if name not in frame_of:
-            continue
-        where = f"{path.name}: frame {index}"
+    for name, frame in _frames_of(list(numbers), photographs, path).items():
+        entry, where = entries[numbers[name]], f"{path.name}: frame {numbers[name]}"
         camera = read_intrinsics(content, entry, None, where)
         if camera.k3 or camera.k4 or camera.lens != "perspective":
             expected = "a perspective lens with distortion k1, k2, p1, p2"
             got = f"{camera.lens}, k3 {camera.k3}, k4 {camera.k4}"
             raise SceneError(where, expected=expected, got=got, remedy="Undistort first.")
         cameras.add(camera)
-        frames.append(frame_of[name])
+        frames.append(frame)
         poses.append(read_pose(entry.get("transform_matrix"), f"{where}: transform_matrix"))
     if len(cameras) != 1:
         remedy = "Give one set of intrinsics for all frames, or let thermoxels capture find the poses."
@@ -109,7 +89,7 @@ def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
 
 
 def _frames_of(names: list[str], photographs: Mapping[str, str], path: Path) -> dict[str, str]:
-    """Frame of every name in a file of poses: by the photograph's name, or by its stem where that is clear."""
+    """Frame by name in a file of poses, in the photographs' order; a stem will do where it is clear."""
     by_file: dict[str, list[str]] = {}
     for frame, source in photographs.items():
         for key in {source, PurePosixPath(source).name, PurePosixPath(source).stem, frame}:
@@ -127,4 +107,5 @@ def _frames_of(names: list[str], photographs: Mapping[str, str], path: Path) -> 
         remedy = "Pass the poses of these photographs; they are recognised by their file names."
         got = f"{sorted(twice)[0]} twice" if twice else f"{names[0] if names else 'no name'} and no known one"
         raise SceneError(str(path), expected="names of the capture's photographs", got=got, remedy=remedy)
-    return found
+    order = list(photographs)
+    return dict(sorted(found.items(), key=lambda item: order.index(item[1])))

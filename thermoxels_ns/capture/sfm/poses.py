@@ -14,8 +14,7 @@ from PIL import Image
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
-from thermoxels_ns.capture.sfm.colmap_conversion import model_of_colmap
-from thermoxels_ns.capture.sfm.colmap_process import quiet_colmap, run_in_process
+from thermoxels_ns.capture.sfm.colmap import model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, as_colmap, fill_database
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
@@ -85,30 +84,21 @@ def add_points(
     options: PoseOptions | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> SfmModel:
-    """Find the points that at least two photographs with known poses share; camera and poses stay as they are."""
+    """Find the points that at least two photographs with known poses share; camera and poses stay as they are.
+
+    The photographs have the size of their camera.
+    """
     options = options or PoseOptions()
-    names = list(given.frames)
-    if len(names) < 2:
-        expected = "poses of at least 2 photographs, which see the same points"
-        remedy = "Give poses of more photographs, or let thermoxels capture find them."
-        raise SceneError("given poses", expected=expected, got=len(names), remedy=remedy)
-    size, other = common_size({name: photographs[name] for name in names})
-    if other or size != (given.camera.width, given.camera.height):
-        expected = f"photographs of {given.camera.width} x {given.camera.height} pixels, as their camera has"
-        remedy = "Use the photographs that the poses were computed from."
-        raise SceneError("given poses", expected=expected, got=f"{size[0]} x {size[1]}", remedy=remedy)
+    size = given.camera.width, given.camera.height
     small = _reduced_size(size, options.image_size)
-    reduced = _reduced({name: photographs[name] for name in names}, folder, size, small, masks)
+    reduced = _reduced({name: photographs[name] for name in given.frames}, folder, size, small, masks)
     fill_database(reduced, given.camera.resized(*small), True, replace(options, lens="OPENCV"), say)
     return run_in_process(_triangulate, (reduced, given, options.seed), folder, say)
 
 
 def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, tuple[int, int]]]:
     """Find the size that most photographs have, and the frames of another size with theirs."""
-    sizes = {}
-    for name, path in photographs.items():
-        facts = read_photograph_facts(path)
-        sizes[name] = (facts.width, facts.height)
+    sizes = {name: read_photograph_facts(path).size for name, path in photographs.items()}
     if not sizes:
         raise _too_few(0, "photographs")
     counted = list(sizes.values())
@@ -181,10 +171,8 @@ def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> 
 
     folder = matched.database.parent
     pycolmap.set_random_seed(seed)
-    groups: dict[int, Any] = {}
-    with quiet_colmap(folder):
-        given = matched.database, matched.images, folder, _options(seed)
-        groups = pycolmap.incremental_mapping(*given, next_image_callback=next_image)
+    given = matched.database, matched.images, folder, _options(seed)
+    groups: dict[int, Any] = pycolmap.incremental_mapping(*given, next_image_callback=next_image)
     if not groups:
         return None, {}
     largest, *others = sorted(groups.values(), key=lambda group: (-group.num_reg_images(), -len(group.points3D)))
@@ -219,20 +207,18 @@ def _triangulate(matched: ReducedPhotographs, posed: SfmModel, seed: int, say: C
     options.fix_existing_frames = True
     folder = matched.database.parent
     pycolmap.set_random_seed(seed)
-    with quiet_colmap(folder):
-        given = start, matched.database, matched.images, folder
-        found = pycolmap.triangulate_points(*given, clear_points=True, options=options, refine_intrinsics=False)
+    given = start, matched.database, matched.images, folder
+    found = pycolmap.triangulate_points(*given, clear_points=True, options=options, refine_intrinsics=False)
     model = model_of_colmap(found, matched.frame_of_image, matched.size)
     sighting_frame = np.array([number[frame] for frame in model.frames], dtype=np.int64)[model.sighting_frame]
-    order = np.lexsort((model.sighting_point, sighting_frame))
     return replace(
         posed,
         points=model.points,
         colours=model.colours,
         point_error_px=model.point_error_px,
-        sighting_frame=sighting_frame[order],
-        sighting_point=model.sighting_point[order],
-        sighting_pixel=model.sighting_pixel[order],
+        sighting_frame=sighting_frame,
+        sighting_point=model.sighting_point,
+        sighting_pixel=model.sighting_pixel,
     )
 
 

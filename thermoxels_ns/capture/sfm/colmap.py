@@ -1,0 +1,183 @@
+"""COLMAP: it runs in a process of its own that says why it stopped, and its models become ours."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
+from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.data.colmap_model import camera_to_world, read_model
+
+Say = Callable[[str], None]
+_Result = TypeVar("_Result")
+
+_KILLED = -int(getattr(signal, "SIGKILL", 9))
+_FATAL_ONLY = 3
+_FULL_BYTES = 1_000_000
+"""Free space up to which a disk is taken for the reason why a program ended: programs write whole pages."""
+_FIELDS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+}
+"""COLMAP's lens models that ours can hold, and the order of their numbers."""
+
+
+def run_in_process(
+    work: Callable[..., _Result], arguments: tuple[Any, ...], folder: Path, say: Say = lambda _: None
+) -> _Result:
+    """Call ``work(*arguments, say)`` in a new process, wait for its end and return what it returned.
+
+    What ends COLMAP from inside, such as a thread that cannot write, then does not end this process. The new one ends
+    with this one, also where this one is killed. `work` is a function at the top of a module; pickle must be able to
+    hold what goes in and out.
+
+    Raises:
+        OutputError: It ended because the disk of `folder` is full.
+        ThermoxelsError: It raised one, or ended without a word.
+        OSError: It raised one.
+    """
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe(duplex=False)
+    log = folder / "colmap.log"
+    child = context.Process(target=_serve, args=(there, log, work, arguments), daemon=True)
+    child.start()
+    there.close()
+    ended: tuple[Any, Exception | None] | None = None  # what it returned, and what it raised
+    try:
+        with suppress(EOFError):
+            while ended is None:
+                message = here.recv()
+                if isinstance(message, str):
+                    say(message)
+                else:
+                    ended = message
+        child.join()
+    finally:
+        if child.is_alive():
+            child.kill()
+            child.join()
+        words = log.read_text("utf-8", "replace") if log.is_file() else ""
+        log.unlink(missing_ok=True)
+    if ended is None:
+        reason, free = _reason(child.exitcode, words), shutil.disk_usage(folder).free
+        if free < _FULL_BYTES or "disk is full" in reason:  # whatever COLMAP says
+            expected, got = f"free space for features, matches and poses in {folder}", f"{free / 1e6:.0f} MB"
+            raise OutputError("disk", expected=expected, got=got, remedy="Make space; finished stages are kept.")
+        remedy = "Check free space and memory and run the command again; if that does not help, begin anew with "
+        raise ThermoxelsError("COLMAP", expected="to end", got=reason, remedy=remedy + "--from-stage poses.")
+    if ended[1] is not None:
+        raise ended[1]
+    return ended[0]
+
+
+def _serve(pipe: Connection, log: Path, work: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    """Do what `run_in_process` of the process that started this one asks for; COLMAP's words go into a file."""
+    with log.open("ab") as file:
+        for stream in (1, 2):
+            os.dup2(file.fileno(), stream)
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    import pycolmap  # brings a BLAS of its own, whose sums depend on the number of its threads
+
+    log_of_colmap: Any = pycolmap.logging
+    log_of_colmap.minloglevel = _FATAL_ONLY
+    ended: tuple[Any, Exception | None]
+    with threadpool_limits(1, "blas"):
+        try:
+            ended = work(*arguments, pipe.send), None
+        except (ThermoxelsError, OSError) as problem:
+            ended = None, problem
+    pipe.send(ended)
+
+
+def _exit_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _reason(status: int | None, words: str) -> str:
+    """Say why the process ended: the last line that names an error, else its last one, else its status."""
+    if status == _KILLED:
+        return "it was killed, as systems do where memory runs out (lower --threads, --image-size or --max-features)"
+    said = [line for line in words.splitlines() if line.strip()]
+    telling = [line for line in said if "error" in line.lower()] or said[-1:]
+    return f"exit status {status}" + (f" ({telling[-1]})" if telling else "")
+
+
+def model_of_colmap(
+    reconstruction: Any, frame_of_image: Mapping[str, str], size: tuple[int, int] | None = None
+) -> SfmModel:
+    """Turn a pycolmap reconstruction into our model, in the order of `frame_of_image` and without other images.
+
+    `size` is the photographs' width and height where the model was made from smaller ones. A `SceneError` is raised
+    where no frame has a pose, or there are several cameras or an unknown lens model.
+    """
+    by_name = {image.name: image for image in reconstruction.images.values() if image.has_pose}
+    posed = [by_name[name] for name in frame_of_image if name in by_name]
+    cameras = {image.camera_id for image in posed}
+    if len(cameras) != 1:
+        remedy = "Give a model of these photographs with one camera (--ImageReader.single_camera 1)."
+        got = f"{len(posed)} of the {len(frame_of_image)} photographs, of {len(cameras)} cameras"
+        raise SceneError("COLMAP model", expected="photographs of one camera", got=got, remedy=remedy)
+    camera = reconstruction.cameras[cameras.pop()]
+    name = camera.model.name
+    if name not in _FIELDS:
+        remedy = "Run COLMAP with --ImageReader.camera_model OPENCV, or let thermoxels capture find the poses."
+        raise SceneError("COLMAP camera", expected="a lens model out of " + ", ".join(_FIELDS), got=name, remedy=remedy)
+    values: dict[str, Any] = dict(zip(_FIELDS[name], map(float, camera.params)))
+    focal = values.pop("f", None)
+    if focal is not None:
+        values |= {"fl_x": focal, "fl_y": focal}
+    found = Camera(int(camera.width), int(camera.height), **values)
+    size = size or (found.width, found.height)
+    factor = np.array([size[0] / found.width, size[1] / found.height])
+    ids = sorted(reconstruction.points3D)
+    points = [reconstruction.points3D[i] for i in ids]
+    number = {i: n for n, i in enumerate(ids)}
+    poses, frames, seen, pixels = [], [], [], []
+    for index, image in enumerate(posed):
+        poses.append(camera_to_world(image))
+        # A track may hold two features of one photograph; the first one is kept.
+        own = {number[f.point3D_id]: f.xy for f in reversed(image.points2D) if f.has_point3D()}
+        order = sorted(own)
+        frames += [index] * len(order)
+        seen += order
+        pixels += [own[point] for point in order]
+    return SfmModel(
+        tuple(frame_of_image[image.name] for image in posed),
+        found.resized(*size),
+        np.stack(poses),
+        np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
+        np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        np.array([point.error for point in points], dtype=np.float64) * float(factor.mean()),
+        np.array(frames, dtype=np.int64),
+        np.array(seen, dtype=np.int64),
+        np.array(pixels, dtype=np.float64).reshape(-1, 2) * factor,
+    )
+
+
+def read_colmap(folder: Path) -> Any:
+    """Read a COLMAP model's folder; a `SceneError` where it holds no readable model."""
+    try:
+        return read_model(folder)
+    except SceneError as problem:
+        expected = "a COLMAP model (cameras, images and points3D as .bin or .txt)"
+        remedy = "Pass --poses the folder that holds them, such as sparse/0."
+        raise SceneError(str(folder), expected=expected, got=problem, remedy=remedy) from problem
