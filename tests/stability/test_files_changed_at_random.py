@@ -27,7 +27,7 @@ from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.run import run_scene
-from thermoxels_ns.heat.scene_file import load_heat_scene
+from thermoxels_ns.heat.scene import load_heat_scene
 from thermoxels_ns.heat.solving import Goals
 from thermoxels_ns.mesh.boundary.patch_rules import load_patch_rules
 from thermoxels_ns.mesh.files.formats import write_mesh

@@ -11,7 +11,7 @@ import numpy as np
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.colmap_model import camera_to_world, read_model
+from thermoxels_ns.data.tracks import camera_to_world, read_model
 
 _FIELDS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Literal
 
@@ -76,7 +75,7 @@ class _Plane:
 class _Colour:
     """A colour in a file, in whole numbers to 255 or in decimals to 1.0."""
 
-    rgb: tuple[Real, Real, Real]
+    rgb: tuple[int | float, int | float, int | float]
     max_distance: float = math.inf
 
     def __post_init__(self) -> None:
