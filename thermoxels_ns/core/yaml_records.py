@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_h
 import yaml
 from typing_extensions import dataclass_transform
 
-from thermoxels_ns.core.errors import RecordError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import RecordError, ThermoxelsError, explain, printable
 
 if TYPE_CHECKING:  # pydantic is slow to import, and presets do without
     from pydantic import ConfigDict, ValidationError
@@ -30,6 +30,7 @@ _EXPECTED = {
     "int_type": "a whole number",
     "bool_type": "true or false",
     "string_type": "a text",
+    "string_pattern_mismatch": "a text",
     "tuple_type": "a list of entries",
     "dict_type": "key: value lines",
     "dataclass_type": "key: value lines",
@@ -38,6 +39,7 @@ _EXPECTED = {
     "less_than_equal": "a number of at most {le:g}",
 }
 """What is expected where pydantic raises an error of a type, with words of its context."""
+_MOST_TOLD = 20  # Mistakes of a file that are told at once
 _MOST_PARTS = 1_000_000  # Of the json that a file becomes
 
 
@@ -140,7 +142,7 @@ def _config(infinite: bool = False) -> ConfigDict:
 
 
 def _told(name: str, problem: ValidationError, target: Any, content: Any, positional: list[str] | None = None) -> str:
-    """Say all mistakes, one a line; `positional` are names of fields that were given in order."""
+    """Say all mistakes, at most `_MOST_TOLD`, one a line; `positional` are names of fields that were given in order."""
     found: dict[tuple[str | int, ...], tuple[bool, str]] = {}
     for one in problem.errors(include_url=False):
         place, at, path, chosen = one["loc"], content, list[str | int](), False
@@ -159,14 +161,15 @@ def _told(name: str, problem: ValidationError, target: Any, content: Any, positi
         chosen = chosen or one["type"] == "too_short"
         found.setdefault(tuple(path), (chosen, _mistake(name, path, at, dict(one), target)))
     deeper = {path[:length] for path in found for length in range(len(path))}
-    return "\n".join(said for path, (chosen, said) in found.items() if not (chosen and path in deeper))
+    told = [said for path, (chosen, said) in found.items() if not (chosen and path in deeper)]
+    return "\n".join(told[:_MOST_TOLD])
 
 
 def _mistake(name: str, path: list[str | int], value: object, one: dict[str, Any], target: Any) -> str:
     """One of pydantic's errors as a sentence of ours."""
     kind, where, above = one["type"], _where(name, path), _where(name, path[:-1]) or target.__name__
     if kind == "value_error":
-        return ": ".join(filter(None, (where, str(one["ctx"]["error"]).removeprefix(": "))))
+        return ": ".join(filter(None, (printable(where), str(one["ctx"]["error"]).removeprefix(": "))))
     if kind == "missing":
         number = isinstance(path[-1], int)
         expected, remedy = ("more entries", "Add them.") if number else (f"the key {path[-1]}", f"Add {path[-1]}.")
