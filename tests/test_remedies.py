@@ -15,8 +15,8 @@ import thermoxels_ns
 from thermoxels_ns import cli
 from thermoxels_ns.commands.export import ExportThermoxelsMesh
 from thermoxels_ns.config import thermoxels
+from thermoxels_ns.core.config_loader import typed
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.option_help import typed
 from thermoxels_ns.nerfstudio_bridge import METHODS, _with_dataparser_last
 
 PACKAGE = Path(thermoxels_ns.__file__).parent
@@ -63,8 +63,6 @@ def test_every_option_in_a_remedy_is_one_of_a_command(monkeypatch):
         "--missing-thermal skip",
         "--scene-box -1 -1 -1 1 1 1",
         "--eval-mode interval --eval-interval 2",
-        "--orientation-method up --center-method poses",
-        "--scale-factor 2",
         "--downscale-factor=2",
         "--valid_range_c -100 1999",
     ],
@@ -80,7 +78,7 @@ def test_advice_on_the_scene_may_stand_anywhere(advised, around):
 
 
 @pytest.mark.parametrize(
-    "words", ["", "nerfacto --scale-factor 2", "thermoxels --data S", "thermoxels colmap --data S"]
+    "words", ["", "nerfacto --downscale-factor 2", "thermoxels --data S", "thermoxels colmap --data S"]
 )
 def test_other_words_stay_where_they_are(words):
     assert _with_dataparser_last(words.split()) == words.split()
@@ -96,7 +94,7 @@ def test_typed_options_are_found(monkeypatch):
     assert typed("--load-dir") and typed("--optimizers.sh.scheduler") and not typed("--load-step")
 
 
-@pytest.mark.parametrize("field", ["missing_thermal", "downscale_factor", "scale_factor", "scene_box", "eval_mode"])
+@pytest.mark.parametrize("field", ["missing_thermal", "downscale_factor", "scene_box", "eval_mode"])
 def test_commands_without_options_of_the_scene_say_where_they_stand(monkeypatch, capsys, field):
     """ns-eval has no --missing-thermal: it reads config.yml, where the field is found and can be changed."""
     problem = SceneError("frame 1", expected="x", got="y", remedy=f"Pass --{field.replace('_', '-')} 2.")

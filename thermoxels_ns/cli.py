@@ -19,7 +19,6 @@ from thermoxels_ns.commands.cost import Cost
 from thermoxels_ns.commands.demo import Demo
 from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.option_help import join_help_lines
 from thermoxels_ns.synthetic.catalogue import SceneWord
 from thermoxels_ns.synthetic.imperfections import Imperfections
 
@@ -105,7 +104,6 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         The exit status: 0, 1 for an error of the input (which is printed), 130 if the user interrupted it.
     """
-    join_help_lines(Capture, Demo, Synthetic, Cost, Heat, Audit)
     command = tyro.cli(
         Commands, prog="thermoxels", args=arguments, description="RGB and thermal photographs to a solid with heat."
     )

@@ -9,7 +9,6 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from thermoxels_ns import nerfstudio_bridge
-from thermoxels_ns.core.option_help import join_help_lines
 from thermoxels_ns.core.yaml_records import read_preset, with_overrides
 from thermoxels_ns.data.datamanager import ThermalDataManagerConfig
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
@@ -76,5 +75,3 @@ thermoxels = MethodSpecification(_trainer(), "RGB and thermal photographs to a v
 thermoxels_paper = _preset("thermoxels-paper", RowRMSpropConfig, RowRMSpropConfig)
 thermoxels_arco = _preset("thermoxels-arco")
 plenoxels_t = _preset("plenoxels-t")
-
-join_help_lines(*(method.config for method in (thermoxels, thermoxels_paper, thermoxels_arco, plenoxels_t)))

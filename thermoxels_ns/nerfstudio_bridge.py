@@ -18,10 +18,8 @@ import tyro
 import yaml
 
 from thermoxels_ns.core.checks import refuse_what_is_in_the_way, writable_folder
-from thermoxels_ns.core.config_loader import ConfigLoader
+from thermoxels_ns.core.config_loader import ConfigLoader, ModuleWith
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
-from thermoxels_ns.core.module_with import ModuleWith
-from thermoxels_ns.core.option_help import join_help_lines
 
 if TYPE_CHECKING:
     from thermoxels_ns.evaluation.truth_comparison import RenderedRays
@@ -157,7 +155,6 @@ def _with_mesh_export(commands: Any) -> Any:
     """Add our subcommand to ``Annotated[Union[...], markers]`` or ``Union[...]``, keeping members and markers."""
     from thermoxels_ns.commands.export import ExportThermoxelsMesh
 
-    join_help_lines(ExportThermoxelsMesh)
     ours = Annotated[ExportThermoxelsMesh, tyro.conf.subcommand(name=_SUBCOMMAND)]
     markers = getattr(commands, "__metadata__", ())
     members = get_args(get_args(commands)[0] if markers else commands)

@@ -114,7 +114,7 @@ def test_wall_and_insulation_are_refused_with_what_they_resist_together(walls) -
     layers = {"insulation": Layer(("room",), Measured(0.02), Measured(0.04))}
     unknown = Unknown("conductivity", "wall"), Unknown("thickness", "insulation")
     found = calibrate(walls["plain"], replace(WALL, layers=layers, unknown=unknown))
-    assert "cannot be told apart: conductivity of wall times thickness of insulation to the power of -" in found.refused
+    assert "conductivity of wall and thickness of insulation cannot be told apart" in found.refused
 
 
 def test_what_readings_do_not_show_is_refused(walls) -> None:
@@ -140,40 +140,31 @@ def test_intervals_hold_the_truth_though_all_is_off(side) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "named"),
     [
-        ({"unknown": ()}, r"calibrate: unknown: expected one to 4 different entries, got none"),
-        ({"unknown": (*WALL.unknown, *WALL.unknown)}, r"one to 4 different entries, got conductivity of wall, cond"),
-        ({"unknown": (Unknown("thickness", "wall"),)}, r"expected one out of conductivity of wall, got thickness of"),
-        ({"conductivity": {"wall": Measured(0.1, 0.1)}}, r"conductivity of wall: expected a number that is surely abo"),
-        ({"layers": {"wall": Layer(("room",), Measured(0.1), Measured(1.0))}}, r"names that no region has, got wall"),
+        ({"unknown": ()}, "unknown"),
+        ({"unknown": (*WALL.unknown, *WALL.unknown)}, "unknown"),
+        ({"unknown": (Unknown("thickness", "wall"),)}, "unknown"),
+        ({"conductivity": {"wall": Measured(0.1, 0.1)}}, "conductivity: wall"),
+        ({"layers": {"wall": Layer(("room",), Measured(0.1), Measured(1.0))}}, "layers"),
     ],
 )
-def test_what_cannot_be_asked_is_said(changes, message) -> None:
-    with pytest.raises(AuditError, match=message):
+def test_what_cannot_be_asked_is_said(changes, named) -> None:
+    with pytest.raises(AuditError, match=f"^{named}: expected"):
         replace(WALL, **changes)
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("wall", "changes", "named"),
     [
-        (
-            {"conductivity": {"wal": Measured(1.0)}, "unknown": (Unknown("conductivity", "wal"),)},
-            r"calibrate: conductivity: expected regions out of wall, got 'wal'\. Correct the name; regions are those",
-        ),
-        ({"behind": ("rom",)}, r"calibrate: behind: expected patches out of .*room.*, got 'rom'"),
-        ({"behind": ("room", "facade")}, r"calibrate: behind: expected another side of the body, got nothing that cou"),
-        ({"layers": {"x": Layer(("facade",), Measured(0.1), Measured(1.0))}}, r"calibrate: layers: x: expected patch"),
-        ({"film": {"room": Measured(5.0)}}, r"calibrate: film: expected patches out of facade, got 'room'"),
+        ("plain", {"conductivity": {"wal": Measured(1.0)}, "unknown": (Unknown("conductivity", "wal"),)}, "conduct"),
+        ("plain", {"behind": ("rom",)}, "behind: expected patches out of .*room.*, got 'rom'"),
+        ("plain", {"behind": ("room", "facade")}, "behind: expected another side"),
+        ("plain", {"layers": {"x": Layer(("facade",), Measured(0.1), Measured(1.0))}}, "layers: x"),
+        ("plain", {"film": {"room": Measured(5.0)}}, "film"),
+        ("window", {}, "conductivity: .*got none for glazing"),
     ],
 )
-def test_what_does_not_fit_the_mesh_is_said(walls, changes, message) -> None:
-    with pytest.raises(AuditError, match=message):
-        calibrate(walls["plain"], replace(WALL, **changes))
-
-
-def test_every_region_needs_a_conductivity(walls) -> None:
-    with pytest.raises(
-        AuditError, match=r"calibrate: conductivity: .*got none for glazing\. Add glazing: 0\.8 W/\(m K\)"
-    ):
-        calibrate(walls["window"], WALL)
+def test_what_does_not_fit_the_mesh_is_said(walls, wall, changes, named) -> None:
+    with pytest.raises(AuditError, match=f"^calibrate: {named}"):
+        calibrate(walls[wall], replace(WALL, **changes))

@@ -40,11 +40,6 @@ def changed(tmp_path: Path):
     return change
 
 
-def test_air_outside_may_be_unknown_in_a_view_from_inside_alone(changed) -> None:
-    with pytest.raises(AuditError, match=r"outside: air: expected a temperature beside seen from outside, got none"):
-        load_conditions(changed("outside", value={"wind": "1 m/s"}))
-
-
 def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) -> None:
     write_example(tmp_path / "new" / "mine.yaml")
     conditions = load_conditions(tmp_path / "new" / "mine.yaml")
@@ -57,51 +52,44 @@ def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) 
 
 
 @pytest.mark.parametrize(
-    ("keys", "value", "message"),
+    ("keys", "value", "named"),
     [
-        (("inside", "air"), "0.5 C", r"inside: air: expected air that is warmer than outside .*no U-value follows"),
-        (("inside", "air"), "-5 C", r"inside: air: expected air that is warmer than outside"),
-        (("inside", "air"), 20.0, r"inside: air: expected a number with its unit, C, got 20\.0 .* Write 20\.0 C\."),
-        (("inside", "air"), "-300 C", r"air: expected a temperature above absolute zero"),
-        (("outside", "wind"), "-1 m/s", r"wind: expected a speed of at least 0"),
-        (("outside", "wind"), None, r"outside: wind: expected a speed, because iso-6946 needs it.*Add wind: 1\.5"),
-        (("surfaces", "0", "emissivity"), 0, r"emissivity: expected a number that is surely above 0 and at most 1"),
-        (("surfaces", "0", "emissivity"), "0.99 +- 0.02", r"emissivity: expected .* at most 1, got 0\.99 \+- 0\.02"),
-        (("surfaces", "0", "emissivity"), 1.2, r"emissivity: expected .* at most 1"),
-        (("surfaces", "0", "emisivity"), 0.9, r"Did you mean emissivity"),
-        (("surfaces",), [], r"surfaces: expected at least one entry"),
+        (("inside", "air"), "0.5 C", r"inside: air: .*no U-value follows"),
+        (("inside", "air"), 20.0, r"inside: air: .* Write 20\.0 C\."),
+        (("inside", "air"), "-300 C", r"inside: air"),
+        (("outside", "wind"), "-1 m/s", r"outside: wind"),
+        (("outside", "wind"), None, r"outside: wind"),
+        (("outside",), {"wind": "1 m/s"}, r"outside: air"),
+        (("surfaces", "0", "emissivity"), 0, r"surfaces entry 1: emissivity"),
+        (("surfaces", "0", "emissivity"), "0.99 +- 0.02", r"surfaces entry 1: emissivity"),
+        (("surfaces", "0", "emisivity"), 0.9, r"surfaces entry 1: .*Did you mean emissivity"),
+        (("surfaces",), [], r"surfaces"),
         (("surroundings",), {"ground": "1 C"}, r"surroundings: expected either reflected or sky, got neither"),
-        (("surroundings", "ground"), "1 C", r"ground: expected none beside reflected"),
-        (("surroundings",), {"sky": {"cloud": 2, "dew_point": "0 C"}}, r"cloud: expected a share from 0 to 1"),
-        (("film", "model"), "madding", r"film: model of surfaces seen from outside: expected one of iso-6946"),
-        (("film", "model"), "given", r"coefficient: expected one beside the model given"),
-        (("film", "coefficient"), "8 W/(m2 K)", r"coefficient: expected none beside the model iso-6946"),
-        (("film", "factor"), "0.1 +- 0.2", r"factor: expected a number that is surely at least 0"),
-        (("camera", "offset"), None, r"expected the key offset"),
-        (("camera", "emissivity"), 0.95, r"reflected: expected a temperature.*Add what the camera was set to"),
-        (
-            ("references",),
-            [{"at": [float("nan"), 0.0, 1.2], "temperature": "1.4 C"}],
-            r"at: expected three finite numbers, got \[nan, 0\.0, 1\.2\]\. Give metres",
-        ),
-        (("limits", "u"), {"*": "0.3 W"}, r"limits: u: \*: expected a number with its unit, W/\(m2 K\)"),
+        (("surroundings", "ground"), "1 C", r"surroundings: ground"),
+        (("surroundings",), {"sky": {"cloud": 2, "dew_point": "0 C"}}, r"surroundings: sky: cloud"),
+        (("film", "model"), "madding", r"film: model"),
+        (("film", "model"), "given", r"film: coefficient"),
+        (("film", "coefficient"), "8 W/(m2 K)", r"film: coefficient"),
+        (("film", "factor"), "0.1 +- 0.2", r"film: factor"),
+        (("camera", "offset"), None, r"camera: expected the key offset"),
+        (("camera", "emissivity"), 0.95, r"camera: reflected"),
+        (("references",), [{"at": [float("nan"), 0.0, 1.2], "temperature": "1.4 C"}], r"references entry 1: at"),
+        (("limits", "u"), {"*": "0.3 W"}, r"limits: u: \*"),
     ],
 )
-def test_bad_conditions_are_one_clear_error(changed, keys, value, message) -> None:
-    with pytest.raises(AuditError, match=message):
+def test_bad_conditions_are_one_clear_error(changed, keys, value, named) -> None:
+    with pytest.raises(AuditError, match=rf"(?m)^conditions\.yaml: {named}"):
         load_conditions(changed(*keys, value=value))
 
 
 def test_a_sky_is_none_of_a_room(changed) -> None:
-    path = changed("surroundings", value={"sky": {"cloud": 0.5, "dew_point": "0 C"}})
-    path.write_text(path.read_text().replace("outside", "inside", 1).replace("side: outside", "side: inside"))
-    content = yaml.safe_load(PLAIN) | {
-        "side": "inside",
+    path = changed("side", value="inside")
+    content = yaml.safe_load(path.read_text()) | {
         "film": {"model": "madding", "factor": 1.0},
         "surroundings": {"sky": {"cloud": 0.5, "dew_point": "0 C"}},
     }
     path.write_text(yaml.safe_dump(content))
-    with pytest.raises(AuditError, match=r"surroundings: expected a reflected temperature inside, got a sky"):
+    with pytest.raises(AuditError, match=r"surroundings: expected a reflected temperature inside"):
         load_conditions(path)
 
 

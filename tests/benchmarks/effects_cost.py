@@ -24,7 +24,7 @@ from thermoxels_ns.fem.linear_solver import LinearSolver
 from thermoxels_ns.fem.p1_kernels import lumped_mass, stiffness_matrix
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.heat.scene_file import load_heat_scene
+from thermoxels_ns.heat.scene import load_heat_scene
 from thermoxels_ns.heat.screening import screen
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 

@@ -16,7 +16,7 @@ from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.scene_scale import scale_from_scene_file, up_from_scene_file
-from thermoxels_ns.data.sparse_tracks import read_tracks
+from thermoxels_ns.data.tracks import read_tracks
 from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
 
 THERMAL = Camera(40, 30, 50.0, 50.0, 20.5, 14.5, k1=0.01)

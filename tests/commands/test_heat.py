@@ -22,7 +22,7 @@ from thermoxels_ns.fem.problem import AdaptiveSteps
 from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.heat.scene_file import load_heat_scene
+from thermoxels_ns.heat.scene import load_heat_scene
 from thermoxels_ns.mesh.files.formats import write_mesh
 from thermoxels_ns.mesh.files.vtu import read_mesh
 from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES, cut_open

@@ -2,7 +2,7 @@ import numpy as np
 import torch
 
 from tests.reference.two_renderers import random_grid, random_request
-from thermoxels_ns.core.buffer_pool import BUFFERS, PATIENCE, SMALLEST, BufferPool, rounded_size
+from thermoxels_ns.core.arrays import BUFFERS, PATIENCE, SMALLEST, BufferPool, rounded_size
 from thermoxels_ns.field.refine import refine
 from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.render.renderers import fused_render

@@ -13,7 +13,6 @@ from nerfstudio.plugins.registry_dataparser import discover_dataparsers
 from nerfstudio.plugins.types import MethodSpecification
 
 from thermoxels_ns import config
-from thermoxels_ns.core import json_values, yaml_records
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.core.yaml_records import read_preset, read_yaml, with_overrides
@@ -166,25 +165,3 @@ def test_a_key_given_twice_is_found_among_many(tmp_path, read):
     (tmp_path / "a").write_text(text)
     with pytest.raises(ThermoxelsError, match=r"a: expected a .*, got the key k7 twice"):
         read(tmp_path / "a")
-
-
-def mapping_of(keys):
-    one = yaml.ScalarNode("tag:yaml.org,2002:int", "1")
-    nodes = [(yaml.ScalarNode("tag:yaml.org,2002:str", key), one) for key in keys]
-    return yaml_records._UniqueKeyLoader("").construct_mapping(yaml.MappingNode("tag:yaml.org,2002:map", nodes))
-
-
-@pytest.mark.parametrize("build", [mapping_of, lambda keys: json_values._unique([(key, 1) for key in keys])])
-def test_keys_are_not_compared_with_each_other(build):
-    compared = [0]
-
-    class Key(str):
-        __hash__ = str.__hash__
-
-        def __eq__(self, other):
-            compared[0] += 1
-            return str.__eq__(self, other)
-
-    count = 2000
-    assert build([Key(f"k{number}") for number in range(count)]) == {f"k{number}": 1 for number in range(count)}
-    assert compared[0] < 10 * count  # each with each: two million

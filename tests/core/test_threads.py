@@ -52,12 +52,6 @@ def test_an_error_in_a_range_reaches_the_caller_and_the_next_call_works(count):
     assert sum(run_ranges(work, 500)) == 500  # type: ignore[arg-type]
 
 
-def test_tasks_keep_their_order():
-    set_num_threads(4)
-    assert run_tasks([lambda n=n: n for n in range(20)]) == list(range(20))
-    assert run_tasks([]) == [] and run_ranges(lambda a, b: b, 0) == []
-
-
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
 def test_a_forked_process_has_threads_of_its_own():
     """Data loaders fork: the pool that they inherit has no living thread, and work given to it would never end."""

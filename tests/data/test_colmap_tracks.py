@@ -1,18 +1,16 @@
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
 import pytest
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, check_complete
-from thermoxels_ns.data.colmap_tracks import _matched, _points, read_colmap_tracks
+from thermoxels_ns.data.colmap_tracks import _matched, read_colmap_tracks
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import read_scene_file
-from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, write_tracks
+from thermoxels_ns.data.tracks import COLMAP_FOLDERS, TRACKS_KEY, SparseTracks, check_complete, write_tracks
 
 TAGS = ["train", "train", "eval", "train", "train", "train"]
 NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]
@@ -188,18 +186,6 @@ def test_photographs_of_one_name_are_told_apart_by_their_folders():
     assert _matched(images, ["images/1.jpg", "2.jpg"]) == [(2, 1)]
     assert _matched(["1.jpg"], ["a/1.jpg", "b/1.jpg"]) == []
     assert _matched(["1.jpg", "left/1.jpg"], ["images/left/1.jpg", "images/1.jpg"]) == [(1, 0), (0, 1)]
-
-
-def test_images_may_have_any_numbers():
-    def point(*images):
-        elements = [SimpleNamespace(image_id=image) for image in images]
-        return SimpleNamespace(xyz=(1.0, 2.0, 3.0), error=0.5, track=SimpleNamespace(elements=elements))
-
-    many = 2_000_000_000  # an array with one entry for each number up to it has 16 GB
-    model = SimpleNamespace(points3D={1: point(many, 7, 5, 7), 2: point(many + 1, 5)})
-    points, error_px, frame, point_of = _points(model, {many: 0, 5: 1, 7: 2})
-    assert points.tolist() == [[1.0, 2.0, 3.0]] * 2 and error_px.tolist() == [0.5, 0.5]
-    assert list(zip(point_of.tolist(), frame.tolist())) == [(0, 0), (0, 1), (0, 2), (1, 1)]
 
 
 @pytest.mark.parametrize("part", ["cameras", "frames", "images", "points3D"])

@@ -8,10 +8,10 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConf
 from nerfstudio.scripts.render import _disable_datamanager_setup
 from PIL import Image
 
-from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
-from thermoxels_ns.data.camera_rays import CameraRays
+from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.data.datamanager import ThermalDataManager, ThermalDataManagerConfig
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.ray_sampler import CameraRays
 
 DISTORTION = {"k1": 0.08, "k2": -0.02, "p1": 0.003, "p2": -0.002}
 
@@ -77,14 +77,6 @@ def test_own_thermal_camera_gives_a_second_stream(scene_folder):
     counts = np.concatenate([c.ravel() for c, n in zip(scene.counts, scene.names) if "train" in n])
     np.testing.assert_allclose(batch["thermal"][300:, 0].numpy(), counts[pixels] / 65535.0, atol=4e-6)
     assert not batch["thermal"][:300].any() and not batch["image"][300:].any() and batch["image"][:300].any()
-
-
-def test_resolutions_thirty_times_apart(scene_folder):
-    scene = scene_folder(frames=5, size=(120, 90), thermal_size=(4, 3))
-    served = manager(scene.path, train_num_rays_per_batch=50, thermal_num_rays_per_batch=400)
-    bundle, _ = served.next_train(0)
-    pixels = check_rays(bundle[50:], all_rays(served.train_dataset.thermal_cameras))
-    assert len(torch.unique(pixels)) == 4 * 12
 
 
 @pytest.mark.parametrize("own_camera", [False, True])
@@ -219,15 +211,6 @@ def test_a_stream_that_does_not_train_has_no_training_rays(scene_folder):
     served = manager(scene_folder().path, streams="thermal")
     assert list(served.training_rays(RGB_STREAM)) == []
     assert sum(len(part) for part in served.training_rays(RGB_STREAM | THERMAL_STREAM)) == 8 * 18 * 24
-
-
-def test_nerfstudios_loaders_give_whole_images(scene_folder):
-    served = manager(scene_folder(own_camera=True, thermal_size=(12, 10)).path)
-    pairs = list(served.fixed_indices_eval_dataloader)
-    assert len(pairs) == 2
-    for camera, batch in pairs:
-        assert camera.shape == (1,) and batch["image"].shape == (18, 24, 3) and batch["thermal"].shape == (10, 12, 1)
-        assert batch["thermal_camera"].shape == (1,)
 
 
 def test_render_script_can_set_it_up_without_data(scene_folder):

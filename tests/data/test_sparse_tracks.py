@@ -1,5 +1,4 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,7 +6,7 @@ import pytest
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
-from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, feature_rays, read_tracks, write_tracks
+from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, feature_rays, read_tracks, write_tracks
 
 TAGS = ["train", "train", "eval", "train", "train", "train"]
 NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]
@@ -41,7 +40,7 @@ def test_what_is_written_is_read(scene):
 
 def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_world(scene):
     folder, tracks = scene
-    outputs = lines_of(folder, scale_factor=0.5)
+    outputs = lines_of(folder)
     lines = outputs.metadata["feature_rays"]
     centres = outputs.cameras.camera_to_worlds[:, :, 3].double().numpy()
     assert len(lines.origins) == 5 * 30
@@ -53,16 +52,6 @@ def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_w
     assert lines.points == pytest.approx(moved, abs=1e-6)
     assert (np.diff(lines.point) >= 0).all()
     assert lines_of(folder, "val").metadata["feature_rays"] is None
-
-
-def test_points_that_only_evaluation_sees_a_third_time_are_left_out(scene):
-    folder, tracks = scene
-    of_eval = tracks.frames.index(next(name for name in tracks.frames if "eval" in name))
-    others = [number for number in range(6) if number != of_eval][:2]
-    few = np.isin(tracks.sighting_frame, [of_eval, *others]) | (tracks.sighting_point >= 3)
-    tracks = replace(tracks, sighting_frame=tracks.sighting_frame[few], sighting_point=tracks.sighting_point[few])
-    write_tracks(folder.path / "tracks.npz", tracks)
-    assert len(lines_of(folder).metadata["feature_rays"].points) == 27
 
 
 def test_a_point_that_its_neighbours_contradict_is_listed_without_lines(scene):
@@ -96,26 +85,6 @@ def test_badly_known_points_are_left_out(scene):
     assert len(feature_rays(tracks, together).points) == 0
 
 
-def test_sightings_given_twice_count_once(scene):
-    folder, tracks = scene
-    frames = [frame for frame in read_scene_file(folder.path).frames if "train" in frame.name]
-    twice = replace(
-        tracks, sighting_frame=np.tile(tracks.sighting_frame, 3), sighting_point=np.tile(tracks.sighting_point, 3)
-    )
-    assert len(feature_rays(twice, frames).origins) == len(feature_rays(tracks, frames).origins) == 5 * 30
-    assert len(feature_rays(twice, frames[:2]).points) == 0  # two photographs are not six
-
-
-def test_an_error_that_was_not_computed_is_no_error_and_none_is_not_believed(scene):
-    folder, tracks = scene
-    frames = [frame for frame in read_scene_file(folder.path).frames if "train" in frame.name]
-    error = tracks.point_error_px.copy()
-    error[:3], error[3], error[4] = -1.0, np.nan, 0.0
-    lines = feature_rays(replace(tracks, point_error_px=error), frames)
-    assert np.array_equal(lines.points, tracks.points[4:])
-    assert (lines.uncertainty > 0.0).all()
-
-
 def test_one_camera_and_points_behind_it(scene):
     folder, tracks = scene
     frames = [frame for frame in read_scene_file(folder.path).frames if "train" in frame.name]
@@ -143,14 +112,28 @@ def test_the_error_of_a_length_is_that_of_a_triangulation(scene):
     assert lines.uncertainty == pytest.approx(expected)
 
 
-def test_tracks_of_other_photographs_or_poses_are_refused(scene):
+def _rewritten(**changes):
+    """Write tracks in which some arrays are others, made of those that are there."""
+    return lambda path, tracks: write_tracks(path, replace(tracks, **{k: make(tracks) for k, make in changes.items()}))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "named"),
+    [
+        (_rewritten(frames=lambda _: tuple(f"other_{n}" for n in range(6))), "photographs of this scene.*other_0"),
+        (_rewritten(points=lambda tracks: tracks.points + np.array([0.0, 0.0, 100.0])), "behind"),
+        (_rewritten(sighting_point=lambda tracks: tracks.sighting_point + 1), "pairs of their numbers"),
+        (lambda path, _: path.write_bytes(b""), "points"),
+        (lambda path, _: path.write_bytes(b"not a zip"), "points"),
+        (lambda path, _: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "points"),
+        (lambda path, tracks: np.savez(path, points=tracks.points), "point_error_px"),
+        (lambda path, _: path.unlink(), "points"),
+    ],
+)
+def test_files_of_tracks_that_cannot_be_used_are_refused(scene, spoil, named):
     folder, tracks = scene
-    path = folder.path / "tracks.npz"
-    write_tracks(path, replace(tracks, frames=tuple(f"other_{n}" for n in range(6))))
-    with pytest.raises(SceneError, match=r"tracks\.npz.*photographs of this scene.*other_0"):
-        lines_of(folder)
-    write_tracks(path, replace(tracks, points=tracks.points + np.array([0.0, 0.0, 100.0])))
-    with pytest.raises(SceneError, match=r"tracks\.npz.*behind"):
+    spoil(folder.path / "tracks.npz", tracks)
+    with pytest.raises(SceneError, match=rf"tracks\.npz.*{named}"):
         lines_of(folder)
 
 
@@ -161,23 +144,4 @@ def test_tracks_outside_the_scene_are_refused(scene, outside):
     folder.meta[TRACKS_KEY] = outside.format(folder=folder.path)
     folder.rewrite()
     with pytest.raises(SceneError, match=r"tracks_file_path.*tracks\.npz"):
-        lines_of(folder)
-
-
-def test_a_missing_or_damaged_file_is_named(scene):
-    folder, tracks = scene
-    path: Path = folder.path / "tracks.npz"
-    content = path.read_bytes()
-    for damaged in (b"", b"not a zip", content[: len(content) // 2]):
-        path.write_bytes(damaged)
-        with pytest.raises(SceneError, match=r"tracks\.npz.*expected an \.npz with points"):
-            lines_of(folder)
-    np.savez(path, points=tracks.points)
-    with pytest.raises(SceneError, match=r"tracks\.npz.*point_error_px"):
-        lines_of(folder)
-    write_tracks(path, replace(tracks, sighting_point=tracks.sighting_point + 1))
-    with pytest.raises(SceneError, match=r"tracks\.npz.*pairs of their numbers"):
-        lines_of(folder)
-    path.unlink()
-    with pytest.raises(SceneError, match=r"tracks\.npz"):
         lines_of(folder)

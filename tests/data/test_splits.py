@@ -1,7 +1,7 @@
 import pytest
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.splits import SplitMode, split_frames
+from thermoxels_ns.data.dataparser import SplitMode, split_frames
 
 NAMES = [f"images/{letter}.jpg" for letter in "abcdefghij"]
 
@@ -9,7 +9,7 @@ NAMES = [f"images/{letter}.jpg" for letter in "abcdefghij"]
 def listed(mode: SplitMode = "auto", left_out: tuple[str, ...] = (), **lists: str) -> tuple[str, str, str]:
     """The letters that train, validate and test, from lists of letters."""
     meta = {f"{side}_filenames": [f"images/{letter}.jpg" for letter in letters] for side, letters in lists.items()}
-    split = split_frames(NAMES, meta, mode, 8, None, left_out)
+    split = split_frames(NAMES, meta, mode, 8, left_out)
     train, val, test = ("".join(NAMES[i][7] for i in part) for part in (split.train, split.val, split.test))
     return train, val, test
 
@@ -44,32 +44,26 @@ def test_a_listed_frame_that_was_left_out_is_not_missed_and_an_unknown_one_is() 
         listed(train="abcx", val="h", left_out=("images/y.jpg",))
 
 
-@pytest.mark.parametrize(("interval", "offset", "held"), [(8, None, "e"), (4, None, "cg"), (4, 0, "aei"), (5, 4, "ej")])
-def test_every_nth_frame_is_held_out_from_the_middle_of_the_interval_on(interval, offset, held) -> None:
-    split = split_frames(NAMES, {}, "auto", interval, offset)
+@pytest.mark.parametrize(("interval", "held"), [(8, "e"), (4, "cg")])
+def test_every_nth_frame_is_held_out_from_the_middle_of_the_interval_on(interval, held) -> None:
+    split = split_frames(NAMES, {}, "auto", interval)
     assert "".join(NAMES[i][7] for i in split.val) == held and split.val == split.test
     assert sorted(split.train + split.val) == list(range(10))
-
-
-@pytest.mark.parametrize(("interval", "offset"), [(1, None), (0, None), (4, 4), (4, -1)])
-def test_intervals_that_hold_out_all_or_nothing_are_refused(interval, offset) -> None:
-    with pytest.raises(SceneError, match="eval_interval, eval_offset"):
-        split_frames(NAMES, {}, "interval", interval, offset)
 
 
 @pytest.mark.parametrize("given", [5, ["images/a.jpg", 5], "images/a.jpg"])
 def test_lists_that_are_none_are_refused(given) -> None:
     with pytest.raises(SceneError, match="test_filenames: expected a list of file names, got"):
-        split_frames(NAMES, {"test_filenames": given}, "auto", 8, None)
+        split_frames(NAMES, {"test_filenames": given}, "auto", 8)
 
 
 def test_names_go_before_lists_and_lists_before_numbers() -> None:
     names = ["frame_eval_1.jpg", "frame_train_1.jpg", "frame_train_2.jpg"]
     lists = {"train_filenames": names[:2], "val_filenames": names[2:]}
-    assert split_frames(names, lists, "auto", 8, None).val == [0]
-    assert split_frames(names, lists, "lists", 8, None).val == [2]
-    assert split_frames(names, lists, "interval", 3, None).val == [1]
+    assert split_frames(names, lists, "auto", 8).val == [0]
+    assert split_frames(names, lists, "lists", 8).val == [2]
+    assert split_frames(names, lists, "interval", 3).val == [1]
     with pytest.raises(SceneError, match=r"split by file name: .* got other.jpg \(1 such\)"):
-        split_frames([*names, "other.jpg"], {}, "auto", 8, None)
+        split_frames([*names, "other.jpg"], {}, "auto", 8)
     with pytest.raises(SceneError, match="evaluation frames: expected at least one of the 2 frames"):
-        split_frames(names[1:], {}, "filename", 8, None)
+        split_frames(names[1:], {}, "filename", 8)

@@ -66,16 +66,16 @@ def test_a_table_of_ones_own(tmp_path) -> None:
     [
         ("", r"^mine\.yaml: expected key: value lines, got nothing"),
         (f"adobe: {ROW}\nadobe: {ROW}\n", "the key adobe twice"),
-        (f"adobe: {ROW.replace('a book', ' ')}\n", r"^mine\.yaml: adobe: source: expected a text, got nothing"),
+        (f"adobe: {ROW.replace('a book', ' ')}\n", r"^mine\.yaml: adobe: source"),
         (
             f"adobe: {ROW.replace('2000', '-1')}\n",
-            r"^mine\.yaml: adobe: density_kg_m3: expected a finite number above 0",
+            r"^mine\.yaml: adobe: density_kg_m3",
         ),
         (
             f"adobe: {ROW.replace('density_kg_m3', 'density_g_cm3')}\n",
             r"got density_g_cm3. Did you mean density_kg_m3\?",
         ),
-        (f"adobe: {ROW.replace(', source: a book', '')}\n", r"^mine\.yaml: adobe: expected the key source, got cond"),
+        (f"adobe: {ROW.replace(', source: a book', '')}\n", r"^mine\.yaml: adobe: expected the key source"),
     ],
 )
 def test_wrong_tables_are_refused(tmp_path, text: str, message: str) -> None:

@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 
 from tests.support.scene_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
@@ -121,23 +120,6 @@ def test_every_patch_is_spoken_of() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "shown"),
-    [("roof", "patches: [exterior-*, roof], or write adiabatic: [cut, roof]."), ("no", "[exterior-*, 'no']")],
-)
-def test_a_patch_with_a_name_of_its_own_is_to_be_named_beside_the_others(name: str, shown: str) -> None:
-    mesh = room()
-    assert mesh.boundary is not None
-    names = tuple(name if patch == "exterior-up" else patch for patch in mesh.boundary.patch_names)
-    mesh = replace(mesh, boundary=replace(mesh.boundary, patch_names=names))
-    with pytest.raises(HeatError, match=f"nothing on {name} ") as caught:
-        effects(mesh, adiabatic=("cut",), outside_air=OUTSIDE, inside_air=INSIDE)
-    assert shown in str(caught.value)
-    suggested = str(caught.value).split("patches: ")[1].split("]")[0] + "]"
-    air = replace(OUTSIDE, patches=tuple(yaml.safe_load(suggested)))
-    assert len(effects(mesh, adiabatic=("cut",), outside_air=air, inside_air=INSIDE)) == 2
-
-
-@pytest.mark.parametrize(
     ("named", "message"),
     [
         (
@@ -232,7 +214,7 @@ def test_materials_by_region() -> None:
         HeatScene({"roof": brick}, adiabatic=("*",)).problem(mesh)
     with pytest.raises(HeatError, match=r"materials: .* got none for solid. Add them, or '\*' for all others"):
         HeatScene({"slab": brick}, adiabatic=("*",)).problem(two)
-    with pytest.raises(HeatError, match="materials: expected at least one, got none"):
+    with pytest.raises(HeatError, match="materials"):
         HeatScene({})
 
 

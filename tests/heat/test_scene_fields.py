@@ -1,4 +1,3 @@
-from dataclasses import fields
 from datetime import datetime, timezone
 
 import numpy as np
@@ -9,58 +8,40 @@ from thermoxels_ns.fem.quantities import Places, Varying
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4
 from thermoxels_ns.heat.scene_fields import (
     InsideAir,
-    Section,
     Sky,
     Sun,
     Surface,
-    field_bounds,
     inside_coefficient,
     outside_coefficient,
     radiative_coefficient,
 )
 
-SECTIONS = Section.__subclasses__()
 NOON = datetime(2025, 6, 21, 12, tzinfo=timezone.utc)
 PLACE = {"latitude_deg": 47.0, "longitude_deg": 8.0, "north": (0.0, 1.0, 0.0)}
 
 
-@pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.__name__)
-def test_every_number_has_a_range_by_its_unit(section: type[Section]) -> None:
-    numbers = [field.name for field in fields(section) if "float" in str(field.type)]  # type: ignore[arg-type]
-    assert numbers
-    for name in numbers:
-        bounds = field_bounds(name)
-        assert bounds.name == name
-        with pytest.raises(HeatError, match=f"^{name}: expected a finite number"):
-            bounds.check(-1e9)
-
-
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "named"),
     [
-        (lambda: InsideAir(20.0), "coefficient or coefficient_w_m2k: expected one of .*, got none. Add coefficient"),
-        (
-            lambda: InsideAir(20.0, "iso-6946-combined", 8.0),
-            "got coefficient and coefficient_w_m2k. Remove all but one",
-        ),
-        (lambda: InsideAir(20.0, "iso-6946-separate"), "emissivity: expected a number, because iso-6946-separate"),
-        (lambda: InsideAir(20.0, "iso-6946-combined", patches=()), "patches: expected a list of names"),
-        (lambda: Surface(), "surface: expected emissivity, absorptivity or both, got neither"),
-        (lambda: Sky(below_air_k=-6.0), r"below_air_k: .* at least 0 \[kelvin\]"),
-        (lambda: Sun(start=NOON, clear_sky="meinel"), "start: expected latitude_deg beside it"),
-        (lambda: Sun(start=NOON, **PLACE), "clear_sky or direct_w_m2: expected one of"),
-        (
-            lambda: Sun(start=NOON.replace(tzinfo=None), **PLACE, clear_sky="meinel"),
-            r"start: expected a date and time with a time zone, got 2025-06-21T12:00:00",
-        ),
-        (
-            lambda: Sun(towards=(0.0, 0.0, 1.0), latitude_deg=47.0, direct_w_m2=800.0),
-            "latitude_deg: expected a date and time in start beside it",
-        ),
+        (lambda: InsideAir(20.0), "coefficient or coefficient_w_m2k"),
+        (lambda: InsideAir(20.0, "iso-6946-combined", 8.0), "coefficient or coefficient_w_m2k"),
+        (lambda: InsideAir(20.0, "iso-6946-separate"), "emissivity"),
+        (lambda: InsideAir(20.0, "iso-6946-combined", patches=()), "patches"),
+        (lambda: InsideAir(-300.0, "iso-6946-combined"), "air_c"),
+        (lambda: InsideAir(float("nan"), "iso-6946-combined"), "air_c"),
+        (lambda: InsideAir(True, "iso-6946-combined"), "air_c"),
+        (lambda: Surface(), "expected emissivity, absorptivity"),
+        (lambda: Surface(emissivity=1.5), "emissivity"),
+        (lambda: Sky(below_air_k=-6.0), "below_air_k"),
+        (lambda: Sun(start=NOON, clear_sky="meinel"), "start"),
+        (lambda: Sun(start=NOON, **PLACE), "clear_sky or direct_w_m2"),
+        (lambda: Sun(start=NOON.replace(tzinfo=None), **PLACE, clear_sky="meinel"), "start"),
+        (lambda: Sun(start=NOON, **{**PLACE, "north": (0.0, 0.0, 0.0)}, clear_sky="meinel"), "north"),
+        (lambda: Sun(towards=(0.0, 0.0, 1.0), latitude_deg=47.0, direct_w_m2=800.0), "latitude_deg"),
     ],
 )
-def test_sections_say_what_is_wrong(make, message: str) -> None:
-    with pytest.raises(HeatError, match=message):
+def test_sections_say_what_is_wrong(make, named: str) -> None:
+    with pytest.raises(HeatError, match=f"^{named}"):
         make()
 
 

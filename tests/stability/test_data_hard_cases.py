@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.data.datamanager import ThermalDataManager, ThermalDataManagerConfig
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 

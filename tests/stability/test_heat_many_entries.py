@@ -15,8 +15,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, HeatFlux
-from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_file import load_heat_scene
+from thermoxels_ns.heat.scene import HeatScene, load_heat_scene
 from thermoxels_ns.heat.screening import screen
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 

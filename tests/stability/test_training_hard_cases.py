@@ -8,7 +8,7 @@ from PIL import Image
 from tests.support.boxed_scene import write_boxed_scene
 from tests.support.short_training import train
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.ray_streams import RGB_STREAM
+from thermoxels_ns.core.feature_rays import RGB_STREAM
 from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.raycast import render_view
 from thermoxels_ns.synthetic.scene_folder import make_scene

@@ -7,8 +7,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 
 from thermoxels_ns.core.errors import MemoryBudgetError, SceneError, ThermoxelsError
-from thermoxels_ns.core.feature_rays import FeatureRays
-from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM, FeatureRays
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.refine import prune

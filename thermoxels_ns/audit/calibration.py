@@ -16,7 +16,7 @@ from thermoxels_ns.audit.conditions import Calibrate, Conditions, Film, unknown_
 from thermoxels_ns.audit.draws import Draws, Interval, emissivity_name, interval_of
 from thermoxels_ns.audit.exchange import HALF_STEP_K, film_flow_w_m2, radiant_k4, triangle_exchange
 from thermoxels_ns.audit.results import Calibration
-from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface
+from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface, chosen_names
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
@@ -78,7 +78,7 @@ class _Wall:
     ) -> None:
         self.conditions, self.asked, self.surface, self.groups = conditions, asked, surface, groups
         names, patch = surface.selection.patch_names, surface.selection.facet_patch
-        behind = _matching("behind", names, asked.behind)
+        behind = chosen_names("calibrate: behind", names, asked.behind)
         insulated = {name for pattern in asked.adiabatic for name in matching_names(names, pattern)}
         self.behind = np.flatnonzero(np.isin(patch, [names.index(name) for name in behind - insulated]))
         seen = [n for n, name in enumerate(names) if name not in behind | insulated]
@@ -98,7 +98,7 @@ class _Wall:
             name: self._on(f"layers: {name}", self.behind, one.patches) for name, one in asked.layers.items()
         }
         regions = surface.mesh.region_names
-        made_of = _matching("conductivity", regions, tuple(asked.conductivity), "regions")
+        made_of = chosen_names("calibrate: conductivity", regions, asked.conductivity, "regions")
         unknown = sorted({regions[n] for n in np.unique(surface.mesh.region)} - made_of)
         if unknown:
             remedy = f"Add {unknown[0]}: 0.8 W/(m K), or '*' for all others."
@@ -183,7 +183,7 @@ class _Wall:
         """Mark which of some triangles belong to patches that match."""
         names, patch = self.surface.selection.patch_names, self.surface.selection.facet_patch[facets]
         there = tuple(names[n] for n in np.unique(patch))
-        return np.isin(patch, [names.index(name) for name in _matching(entry, there, patterns)])
+        return np.isin(patch, [names.index(name) for name in chosen_names(f"calibrate: {entry}", there, patterns)])
 
 
 class _Fit:
@@ -260,18 +260,13 @@ class _Fit:
                 f"{np.log(2.0) * sensitive_k:.2g} K. Take it as known, or measure a surface that it acts on."
             )
         told = f"{', '.join(named[:-1])} and {named[-1]} cannot be told apart"
-        if len(which) > 2:
-            return f"{told}: only combinations of them are known. Take all but one of them as known."
-        first, second = named
-        power = -float(share[which[1]])  # first times second to this power does not change along the direction
-        values = [self.start[self.names[n]] * np.exp(self.logarithm[n]) for n in which]
-        known = f"{values[0] * values[1] ** power:.3g}"
-        if abs(abs(power) - 1.0) < 0.05:
-            what, between = ("ratio", "per") if power < 0.0 else ("product", "times")
-            known = f"their {what} is, {known} {units[first]} {between} {units[second]}"
-        else:
-            known = f"{first} times {second} to the power of {power:.2g} is, {known}"
-        return f"{told}: {known}. Take one of the two as known."
+        power = -float(share[which[1]])  # of two, the first times the second to this power is known
+        if len(which) > 2 or abs(abs(power) - 1.0) >= 0.05:
+            return f"{told}: only a combination of them is known. Take all but one of them as known."
+        values = [self.start[name] * np.exp(self.logarithm[n]) for n, name in zip(which, named)]
+        what, between = ("ratio", "per") if power < 0.0 else ("product", "times")
+        known = f"{values[0] * values[1] ** power:.3g} {units[named[0]]} {between} {units[named[1]]}"
+        return f"{told}: their {what} is, {known}. Take one of the two as known."
 
     def _local(self, gain: FloatArray) -> Iterator[tuple[int, FloatArray]]:
         """Each patch, and how far its own error of 1 K moves what `gain`, (m, c), makes of residuals, shape (m,)."""
@@ -352,16 +347,3 @@ class _Fit:
                 inverse = inverse + np.outer(step - change, step @ inverse) / (step @ change)
             pull = after
         return x
-
-
-def _matching(entry: str, names: tuple[str, ...], patterns: tuple[str, ...], what: str = "patches") -> set[str]:
-    """Names that match any pattern; raises `AuditError` for one that matches none."""
-    found = set[str]()
-    for pattern in patterns:
-        here = matching_names(names, pattern)
-        if not here:
-            got, expected = repr(pattern), f"{what} out of {', '.join(names)}"
-            remedy = f"Correct the name; {what} are those of the mesh, see --patches of ns-export thermoxels-mesh."
-            raise AuditError(f"calibrate: {entry}", expected=expected, got=got, remedy=remedy)
-        found |= set(here)
-    return found

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import Field
 
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import AuditError
-from thermoxels_ns.core.measured import Measured
+from thermoxels_ns.core.measured import Measured, Unit
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml
+from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml, record
 
-Share: TypeAlias = Annotated[Measured, "1"]
-Temperature: TypeAlias = Annotated[Measured, "C"]
-Difference: TypeAlias = Annotated[Measured, "K"]
-Hours: TypeAlias = Annotated[Measured, "h"]
-Conductivity: TypeAlias = Annotated[Measured, "W/(m K)"]
+Share: TypeAlias = Annotated[Measured, Unit("1")]
+Emissivity: TypeAlias = Annotated[Measured, Unit("1", 0.0, 1.0, above=True)]
+Temperature: TypeAlias = Annotated[Measured, Unit("C", -ZERO_CELSIUS_K)]
+Difference: TypeAlias = Annotated[Measured, Unit("K")]
+Hours: TypeAlias = Annotated[Measured, Unit("h")]
+Conductivity: TypeAlias = Annotated[Measured, Unit("W/(m K)", 0.0, above=True)]
 
 Side = Literal["outside", "inside"]
 FilmModel = Literal["iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo", "madding", "given"]
@@ -35,7 +38,7 @@ EXAMPLE = "conditions-example.yaml"
 MOST_UNKNOWN = 4  # Properties that one calibration may look for
 
 
-@dataclass(frozen=True)
+@record(AuditError)
 class Camera:
     """The thermal camera and how far its readings may be off."""
 
@@ -43,22 +46,18 @@ class Camera:
     repeatability: Difference
     """What to add to the readings of one part of the surface but not of another, 0 +- 0.2 K: what is left of drift
     between images, and of how the model was made from them."""
-    emissivity: Share = field(
-        default_factory=lambda: Measured(1.0)
-    )  # Emissivity that the readings were taken with, 0 to 1
+    emissivity: Emissivity = Measured(1.0)  # Emissivity that the readings were taken with, 0 to 1
     reflected: Temperature | None = None  # Reflected temperature that they were taken with, if that is below 1
     model: str = ""
     serial_number: str = ""
 
     def __post_init__(self) -> None:
-        _check_emissivity("emissivity", self.emissivity)
         if self.emissivity.low < 1.0 and self.reflected is None:
             got, remedy = "none beside an emissivity below 1", "Add what the camera was set to, such as 20 C."
             raise AuditError("reflected", expected="a temperature", got=got, remedy=remedy)
-        _check_temperatures(reflected=self.reflected)
 
 
-@dataclass(frozen=True)
+@record(AuditError)
 class InsideAir:
     """The air behind the surface, or, seen from inside, before it."""
 
@@ -66,39 +65,26 @@ class InsideAir:
     lowest_24h: Temperature | None = None  # During the last 24 hours
     highest_24h: Temperature | None = None
 
-    def __post_init__(self) -> None:
-        _check_temperatures(air=self.air, lowest_24h=self.lowest_24h, highest_24h=self.highest_24h)
 
-
-@dataclass(frozen=True)
+@record(AuditError)
 class OutsideAir(InsideAir):
     """The open air."""
 
-    air: Temperature = field(default_factory=lambda: Measured(math.nan))
+    air: Temperature = Measured(math.nan)
     """[degrees Celsius]; not a number: not known, which only a view from inside may leave out."""
-    wind: Annotated[Measured, "m/s"] | None = None  # Wind speed near the surface, [m/s], at least 0
+    wind: Annotated[Measured, Unit("m/s", 0.0, surely=False)] | None = None  # Near the surface, [m/s]
     wind_direction: str = ""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.wind is not None and self.wind.value < 0.0:
-            raise _out_of_range("wind", "a speed of at least 0", f"{self.wind.value:g} m/s", "1.5 +- 0.5 m/s")
 
-
-@dataclass(frozen=True)
+@record(AuditError)
 class SkyModel:
     """A sky whose radiation follows from the air, its moisture and clouds."""
 
-    cloud: Share  # Share of the sky that clouds cover, 0 to 1
+    cloud: Annotated[Measured, Unit("1", 0.0, 1.0, surely=False)]  # Share of the sky that clouds cover
     dew_point: Temperature  # Dew point of the outside air, [degrees Celsius]
 
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.cloud.value <= 1.0:
-            raise _out_of_range("cloud", "a share from 0 to 1", f"{self.cloud.value:g}", "0.3 +- 0.1")
-        _check_temperatures(dew_point=self.dew_point)
 
-
-@dataclass(frozen=True)
+@record(AuditError)
 class Surroundings:
     """What the surface reflects and exchanges radiation with: one reflected temperature, or a sky above the ground."""
 
@@ -110,20 +96,19 @@ class Surroundings:
         if (self.reflected is None) == (self.sky is None):
             got = "neither" if self.sky is None else "both"
             remedy = "Write reflected: -3 +- 3 C, or sky: {cloud: 0.3 +- 0.1, dew_point: -4 +- 1 C}."
-            raise AuditError("surroundings", expected="either reflected or sky", got=got, remedy=remedy)
+            raise AuditError("", expected="either reflected or sky", got=got, remedy=remedy)
         if self.ground is not None and self.sky is None:
             remedy = "Remove ground, or give a sky instead of reflected."
             raise AuditError("ground", expected="none beside reflected", got="one", remedy=remedy)
-        _check_temperatures(reflected=self.reflected, ground=self.ground)
 
 
-@dataclass(frozen=True)
+@record(AuditError)
 class Film:
     """The model of heat exchange between surface and surroundings, and how far it may be off."""
 
     model: FilmModel
-    factor: Share  # What to multiply its convective part by, such as 1.0 +- 0.2
-    coefficient: Annotated[Measured, "W/(m2 K)"] | None = None  # Convection, for the model "given" and no other
+    factor: Annotated[Measured, Unit("1", 0.0)]  # What to multiply its convective part by, such as 1.0 +- 0.2
+    coefficient: Annotated[Measured, Unit("W/(m2 K)", 0.0)] | None = None  # Convection, for the model "given" alone
 
     def __post_init__(self) -> None:
         if (self.model == "given") != (self.coefficient is not None):
@@ -131,39 +116,25 @@ class Film:
             expected = f"{'one' if needed else 'none'} beside the model {self.model}"
             remedy = "Add coefficient: 8 +- 1 W/(m2 K)." if needed else "Remove coefficient, or write model: given."
             raise AuditError("coefficient", expected=expected, got="none" if needed else "one", remedy=remedy)
-        if self.factor.low < 0.0:
-            raise _out_of_range("factor", "a number that is surely at least 0", f"{self.factor.low:g}", "1.0 +- 0.2")
-        if self.coefficient is not None and self.coefficient.low < 0.0:
-            got = f"{self.coefficient.low:g} W/(m2 K)"
-            raise _out_of_range("coefficient", "one that is surely at least 0", got, "8 +- 1 W/(m2 K)")
 
 
-@dataclass(frozen=True)
+@record(AuditError)
 class Surface:
     """How patches emit. Of several entries for one patch, the last one holds."""
 
-    emissivity: Share  # For long-wave radiation, above 0 and at most 1
+    emissivity: Emissivity  # For long-wave radiation, above 0 and at most 1
     patches: tuple[str, ...] = ("*",)  # Patches, by name or pattern
 
-    def __post_init__(self) -> None:
-        _check_emissivity("emissivity", self.emissivity)
 
-
-@dataclass(frozen=True)
+@record(AuditError)
 class Reference:
     """A surface temperature that was measured by contact, from which the camera's offset follows."""
 
     at: tuple[float, float, float]  # Where, in the coordinates of the mesh, [m]
     temperature: Temperature  # [degrees Celsius]
 
-    def __post_init__(self) -> None:
-        _check_temperatures(temperature=self.temperature)
-        if not all(map(math.isfinite, self.at)):
-            remedy = "Give metres in the coordinates of the mesh, such as at: [1.0, 0.0, 1.2]."
-            raise AuditError("references: at", expected="three finite numbers", got=list(self.at), remedy=remedy)
 
-
-@dataclass(frozen=True)
+@record(AuditError)
 class Survey:
     """What a report after EN 13187 says, and nothing is computed from."""
 
@@ -179,40 +150,40 @@ class Survey:
     hours_dry: Hours | None = None  # Since the surface was last wet
     precipitation: str = ""
     least_difference_24h: Difference | None = None  # Smallest difference of the airs during the last 24 hours
-    pressure_difference: Annotated[Measured, "Pa"] | None = None
+    pressure_difference: Annotated[Measured, Unit("Pa")] | None = None
 
 
-@dataclass(frozen=True)
+@record(AuditError)
 class Limits:
     """What the user asks for; the page says what meets it."""
 
-    u: dict[str, Annotated[Measured, "W/(m2 K)"]] = field(default_factory=dict)
+    u: dict[str, Annotated[Measured, Unit("W/(m2 K)")]] = field(default_factory=dict)
     """Largest U-value of patches, by name or pattern; of several that match, the last one holds."""
-    psi: Annotated[Measured, "W/(m K)"] | None = None  # Largest psi of a linear thermal bridge
+    psi: Annotated[Measured, Unit("W/(m K)")] | None = None  # Largest psi of a linear thermal bridge
     f_rsi: Share | None = None  # Smallest temperature factor for a resistance inside of 0.25 m2 K / W
-    loss: Annotated[Measured, "W"] | None = None  # Largest heat loss of what was observed
+    loss: Annotated[Measured, Unit("W")] | None = None  # Largest heat loss of what was observed
 
 
-@dataclass(frozen=True)
+@record(AuditError)
 class Year:
     """A heating season, and what heat costs."""
 
-    degree_days: Annotated[Measured, "K d"]  # Difference of the airs times time
-    price: Annotated[Measured, "/kWh"] | None = None
+    degree_days: Annotated[Measured, Unit("K d")]  # Difference of the airs times time
+    price: Annotated[Measured, Unit("/kWh")] | None = None
     currency: str = ""
-    co2: Annotated[Measured, "kg/kWh"] | None = None
+    co2: Annotated[Measured, Unit("kg/kWh")] | None = None
 
 
-@dataclass(frozen=True)
+@record(AuditError)
 class Layer:
     """A layer that the mesh does not have, such as insulation, on the far side of what was photographed."""
 
     patches: tuple[str, ...]  # Patches behind the surface that it lies on, by name or pattern
-    thickness: Annotated[Measured, "m"]
+    thickness: Annotated[Measured, Unit("m", 0.0, above=True)]
     conductivity: Conductivity
 
 
-@dataclass(frozen=True)
+@record(AuditError)
 class Unknown:
     """A property that is to be found out; the value that stands for it is where the search starts."""
 
@@ -220,7 +191,7 @@ class Unknown:
     of: str  # The entry of `conductivity`, `layers` or `film` that it belongs to
 
 
-@dataclass(frozen=True)
+@record(AuditError)
 class Calibrate:
     """A model of what is behind the surface, some properties of which are to be found out."""
 
@@ -228,29 +199,26 @@ class Calibrate:
     """Of regions of the mesh, by name or pattern; of several that match, the last one holds."""
     unknown: tuple[Unknown, ...]  # One to four
     layers: dict[str, Layer] = field(default_factory=dict)
-    film: dict[str, Annotated[Measured, "W/(m2 K)"]] = field(default_factory=dict)
+    film: dict[str, Annotated[Measured, Unit("W/(m2 K)", 0.0, above=True)]] = field(default_factory=dict)
     """Convection of photographed patches, by name or pattern, in place of the film model; radiation stays."""
     behind: tuple[str, ...] = ("interior-*",)  # Patches that the air on the far side touches
     adiabatic: tuple[str, ...] = ("cut",)  # Patches that no heat crosses
 
     def __post_init__(self) -> None:
-        for name, value in self.stated().items():
-            if value.low <= 0.0:
-                raise _out_of_range(name, "a number that is surely above 0", f"{value.low:g}", "0.8 +- 0.1 W/(m K)")
         both = sorted(set(self.conductivity) & set(self.layers))
         if both:
             remedy = "Give the layer another name."
-            raise AuditError("calibrate: layers", expected="names that no region has", got=both[0], remedy=remedy)
+            raise AuditError("layers", expected="names that no region has", got=both[0], remedy=remedy)
         names = [unknown_name(one) for one in self.unknown]
         if not 1 <= len(set(names)) <= MOST_UNKNOWN or len(set(names)) < len(names):
             remedy = "Write unknown: [{property: conductivity, of: wall}], for example."
             expected = f"one to {MOST_UNKNOWN} different entries"
-            raise AuditError("calibrate: unknown", expected=expected, got=", ".join(names) or "none", remedy=remedy)
+            raise AuditError("unknown", expected=expected, got=", ".join(names) or "none", remedy=remedy)
         for name in names:
             if name not in self.stated():
                 remedy = "Give it there, where the search is to start."
                 expected = f"one out of {', '.join(self.stated())}"
-                raise AuditError("calibrate: unknown", expected=expected, got=name, remedy=remedy)
+                raise AuditError("unknown", expected=expected, got=name, remedy=remedy)
 
     def stated(self) -> dict[str, Measured]:
         """All properties by name, such as "conductivity of wall", as they are stated."""
@@ -265,20 +233,20 @@ def unknown_name(one: Unknown) -> str:
     return f"{one.property} of {one.of}"
 
 
-@dataclass(frozen=True, kw_only=True)
+@record(AuditError)
 class Conditions:
     """All that is known beside the photographs."""
 
     side: Side  # From where the surface was seen
     inside: InsideAir
-    outside: OutsideAir = field(default_factory=OutsideAir)  # In a view from inside it may be left out
     surroundings: Surroundings
     film: Film
     camera: Camera
-    surfaces: tuple[Surface, ...]
+    surfaces: Annotated[tuple[Surface, ...], Field(min_length=1)]
+    outside: OutsideAir = field(default_factory=OutsideAir)  # In a view from inside it may be left out
     leave_out: tuple[str, ...] = ()  # Patches that mirror, by name or pattern: glass, metal
     references: tuple[Reference, ...] = ()  # Without any, the offset of the camera is what is stated
-    storeys: dict[str, Annotated[Measured, "m"]] = field(default_factory=dict)
+    storeys: dict[str, Annotated[Measured, Unit("m")]] = field(default_factory=dict)
     """Height at which each storey begins, above the lowest point of the mesh, [m]."""
     survey: Survey = field(default_factory=Survey)
     limits: Limits = field(default_factory=Limits)
@@ -295,9 +263,6 @@ class Conditions:
             got = f"{inside.value:g} +- {inside.off_by:g} C inside, {outside.value:g} +- {outside.off_by:g} C outside"
             remedy = "Measure while the building is heated and it is cold outside; no U-value follows from this."
             raise AuditError("inside: air", expected=expected, got=got, remedy=remedy)
-        if not self.surfaces:
-            remedy = 'Write surfaces: [{patches: ["*"], emissivity: 0.93 +- 0.02}].'
-            raise AuditError("surfaces", expected="at least one entry", got="none", remedy=remedy)
         if self.side == "inside" and self.surroundings.sky is not None:
             remedy = "Write surroundings: {reflected: 19.5 +- 0.5 C}."
             raise AuditError("surroundings", expected="a reflected temperature inside", got="a sky", remedy=remedy)
@@ -348,19 +313,3 @@ def _check_models(conditions: Conditions) -> None:
     if conditions.side == "outside" and model in WINDY and conditions.outside.wind is None:
         remedy = "Add wind: 1.5 +- 0.5 m/s, for example."
         raise AuditError("outside: wind", expected=f"a speed, because {model} needs it", got="none", remedy=remedy)
-
-
-def _check_emissivity(name: str, value: Measured) -> None:
-    if not (value.low > 0.0 and value.high <= 1.0 + 1e-12):
-        got = f"{value.value:g} +- {value.off_by:g}"
-        raise _out_of_range(name, "a number that is surely above 0 and at most 1", got, "0.93 +- 0.02")
-
-
-def _check_temperatures(**values: Measured | None) -> None:
-    for name, value in values.items():
-        if value is not None and value.low < -ZERO_CELSIUS_K:
-            raise _out_of_range(name, "a temperature above absolute zero", f"{value.low:g} C", "20.0 +- 0.5 C")
-
-
-def _out_of_range(name: str, expected: str, got: Any, example: str) -> AuditError:
-    return AuditError(name, expected=expected, got=got, remedy=f"Write {example}, for example.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,10 +96,11 @@ def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, floa
     names = selection.patch_names
     entry_of_patch = np.full(len(names), -1)
     for number, surface in enumerate(conditions.surfaces):
-        entry_of_patch[_chosen(f"surfaces entry {number + 1}: patches", names, surface.patches)] = number
-    left_out = np.zeros(len(names), dtype=bool)
-    left_out[_chosen("leave_out", names, conditions.leave_out)] = True
-    _chosen("limits: u", names, tuple(conditions.limits.u))
+        entry_of_patch[
+            np.isin(names, [*chosen_names(f"surfaces entry {number + 1}: patches", names, surface.patches)])
+        ] = number
+    left_out = np.isin(names, [*chosen_names("leave_out", names, conditions.leave_out)])
+    chosen_names("limits: u", names, conditions.limits.u)
 
     patch = tags.patch
     unseen = ~tags.seen
@@ -157,13 +159,13 @@ def alike_triangles(surface: AuditedSurface) -> AlikeTriangles:
     )
 
 
-def _chosen(name: str, names: tuple[str, ...], patterns: tuple[str, ...]) -> IntArray:
-    """Number the patches that match any pattern; raises `AuditError` for one that matches none."""
-    chosen = set[int]()
+def chosen_names(name: str, names: tuple[str, ...], patterns: Iterable[str], what: str = "patches") -> set[str]:
+    """Names that match any pattern; raises `AuditError` for one that matches none."""
+    chosen = set[str]()
     for pattern in patterns:
         found = matching_names(names, pattern)
         if not found:
-            remedy = "Correct the name; patches are those of the mesh, see --patches of ns-export thermoxels-mesh."
-            raise AuditError(name, expected=f"patches out of {', '.join(names)}", got=repr(pattern), remedy=remedy)
-        chosen |= {names.index(one) for one in found}
-    return np.array(sorted(chosen), dtype=np.int64)
+            remedy = f"Correct the name; {what} are those of the mesh, see --patches of ns-export thermoxels-mesh."
+            raise AuditError(name, expected=f"{what} out of {', '.join(names)}", got=repr(pattern), remedy=remedy)
+        chosen |= set(found)
+    return chosen

@@ -22,7 +22,7 @@ from thermoxels_ns.capture.stage_cache import CACHE_FOLDER
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.json_values import write_json
-from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, write_tracks
+from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, write_tracks
 
 JSON_NAME = "transforms.json"
 POINTS_NAME = "sparse_points.ply"

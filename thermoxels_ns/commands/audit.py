@@ -5,7 +5,7 @@ from __future__ import annotations
 # Only light imports at the top, so that --help answers at once.
 import time as clock
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,45 +113,29 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
 
 def answers_of(options: Audit, found: Found) -> dict[str, Any]:
     """Everything that answers.json says."""
-    date = found.conditions.survey.date
-    conditions = asdict(replace(found.conditions, survey=replace(found.conditions.survey, date=None)))
-    conditions["survey"]["date"] = None if date is None else date.isoformat()
+    from pydantic_core import to_jsonable_python
+
+    calibration = found.calibration
+    named = ("found", "units", "refused", "moved_most_by", "misfit_k")
     told = {
         "mesh": options.mesh,
-        "conditions": conditions,
-        "whole": asdict(found.whole),
-        "patches": [asdict(one) for one in found.patches],
-        "storeys": [asdict(one) for one in found.storeys],
-        "defects": [asdict(one) for one in found.defects],
-        "limits": [asdict(one) for one in found.limits],
-        "f_rsi": [asdict(one) for one in found.f_rsi],
-        "year": None if found.year is None else asdict(found.year),
-        "calibration": _calibration(found),
-        "forbidden": list(found.check.forbidden),
-        "doubts": list(found.check.doubts),
-        "missing_for_en_13187": list(found.check.missing),
-        "loss_moved_by_w": dict(found.budget),
-        "not_counted_m2": dict(found.not_counted_m2),
+        "conditions": found.conditions,
+        "whole": found.whole,
+        "patches": found.patches,
+        "storeys": found.storeys,
+        "defects": found.defects,
+        "limits": found.limits,
+        "f_rsi": found.f_rsi,
+        "year": found.year,
+        "calibration": None if calibration is None else {name: getattr(calibration, name) for name in named},
+        "forbidden": found.check.forbidden,
+        "doubts": found.check.doubts,
+        "missing_for_en_13187": found.check.missing,
+        "loss_moved_by_w": found.budget,
+        "not_counted_m2": found.not_counted_m2,
     }
-    return {name: _without_what_is_not_known(one) for name, one in told.items()}
-
-
-def _without_what_is_not_known(value: Any) -> Any:
-    """The same with null for numbers that are not known, or ends of intervals that are not there."""
-    if isinstance(value, Mapping):
-        return {name: _without_what_is_not_known(one) for name, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_without_what_is_not_known(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _calibration(found: Found) -> dict[str, Any] | None:
-    """What a calibration found."""
-    one = found.calibration
-    if one is None:
-        return None
-    told = {"found": {name: asdict(value) for name, value in one.found.items()}, "units": one.units}
-    return {**told, "refused": one.refused, "moved_most_by": one.moved_most_by, "misfit_k": one.misfit_k}
+    # null for numbers that are not known, and for ends of intervals that are not there
+    return to_jsonable_python(told, inf_nan_mode="null")
 
 
 def _metres_per_unit(export: dict[str, Any]) -> float:

@@ -191,7 +191,7 @@ def up_of(options: ExportOptions, scene_file: Mapping[str, Any] | None, viewpoin
 def _heat_settings(options: ExportOptions) -> tuple[HeatScene, Material, TimeSteps]:
     """The scene of the heat step, its material and its steps, with the options' changes applied."""
     from thermoxels_ns.fem.problem import TimeSteps
-    from thermoxels_ns.heat.scene_file import load_heat_scene
+    from thermoxels_ns.heat.scene import load_heat_scene
 
     scene = load_heat_scene(options.heat_preset)
     given, *others = set(scene.materials.values())

@@ -98,7 +98,7 @@ def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
 def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     """Do what `run_heat` does without writing anything."""
     from thermoxels_ns.heat.run import run_scene
-    from thermoxels_ns.heat.scene_file import load_heat_scene
+    from thermoxels_ns.heat.scene import load_heat_scene
     from thermoxels_ns.heat.solving import Goals
     from thermoxels_ns.mesh.files.vtu import read_mesh
 

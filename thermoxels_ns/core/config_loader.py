@@ -1,4 +1,4 @@
-"""Reads nerfstudio's config.yml without running code from it."""
+"""nerfstudio from outside: its config.yml read without running code from it, its command line, its modules."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import dataclasses
 import enum
 import importlib
 import os
+import sys
 from collections.abc import Iterator
 from importlib.metadata import entry_points
+from types import ModuleType
 from typing import Any
 
 import yaml
@@ -87,3 +89,31 @@ def _plugin_packages() -> set[str]:
     for name in ("NERFSTUDIO_METHOD_CONFIGS", "NERFSTUDIO_DATAPARSER_CONFIGS"):
         values += [word.partition("=")[2] for word in os.environ.get(name, "").split(",")]
     return {"nerfstudio", "thermoxels_ns", *(value.split(":")[0].split(".")[0] for value in values)} - {""}
+
+
+def typed(option: str) -> bool:
+    """Whether this process was started with an option, or with one whose name goes on after it."""
+    start = option.replace("_", "-")
+    return any(word.replace("_", "-").startswith(start) for word in sys.argv[1:])
+
+
+def typed_value(option: str) -> str | None:
+    """Return the value that this process was started with for an option, the last one; None where it was not typed."""
+    found = None
+    for word, following in zip(sys.argv[1:], [*sys.argv[2:], None]):
+        name, equals, value = word.partition("=")
+        if name.replace("_", "-") == option:
+            found = value if equals else following
+    return found
+
+
+class ModuleWith(ModuleType):
+    """A module with some of its names replaced."""
+
+    def __init__(self, module: ModuleType, **replaced: Any) -> None:
+        super().__init__(module.__name__, doc=module.__doc__)
+        self._module = module
+        vars(self).update(replaced)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._module, name)

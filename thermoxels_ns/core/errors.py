@@ -12,6 +12,10 @@ class ThermoxelsError(Exception):
         super().__init__(what if expected is None else explain(what, expected=expected, got=got, remedy=remedy))
 
 
+class RecordError(ThermoxelsError, ValueError):
+    """An entry of a file or a record is wrong."""
+
+
 class SceneError(ThermoxelsError, ValueError):
     """A scene folder, its json, its images or its cameras cannot be used."""
 

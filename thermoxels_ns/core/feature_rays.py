@@ -1,4 +1,4 @@
-"""Feature rays: straight from cameras to points that their photographs agree on."""
+"""Which photographs rays belong to, and feature rays: from cameras to points that their photographs agree on."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+
+# A batch is one `RayBundle` whose ``metadata["stream"]`` holds these bits per ray, shape (n, 1), uint8.
+RGB_STREAM = 1  # The ray carries a colour target
+THERMAL_STREAM = 2  # The ray carries a temperature target
 
 NEIGHBOURS = 8  # Points nearest to a point in a photograph that its distance is compared with
 FEWEST_NEIGHBOURS = 4  # With fewer in a photograph it says nothing about the point

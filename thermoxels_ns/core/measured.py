@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from typing import Any
 
 from thermoxels_ns.core.errors import ThermoxelsError
 
@@ -48,6 +49,36 @@ class Measured:
     def high(self) -> float:
         """Largest true value."""
         return self.value + self.off_by
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What a value is measured in, and where it may lie: ``Annotated[Measured, Unit("1", 0.0, 1.0)]`` in a record."""
+
+    name: str  # "1" for none
+    low: float = -math.inf
+    high: float = math.inf
+    surely: bool = True  # Whether no value in the range may lie beyond; False: the value itself alone may not
+    above: bool = False  # Whether `low` itself is beyond
+
+    def read(self, content: object) -> Measured:
+        """Read or check a value, or raise a ValueError that holds a `ThermoxelsError` without a name."""
+        try:
+            found = content if isinstance(content, Measured) else read_measured("", content, self.name)
+            low, high = (found.low, found.high) if self.surely else (found.value, found.value)
+            if low < self.low or high > self.high + 1e-12 or (self.above and low <= self.low):
+                above = f"{'above' if self.above else 'of at least'} {self.low:g}" if self.low > -math.inf else ""
+                most = f"at most {self.high:g}" if self.high < math.inf else ""
+                expected = f"a value {'surely ' * self.surely}{' and '.join(filter(None, (above, most)))} [{self.name}]"
+                raise _wrong("", expected, f"{found.value:g} +- {found.off_by:g}", "Correct it.")
+        except ThermoxelsError as problem:
+            raise ValueError(problem) from problem
+        return found
+
+    def __get_pydantic_core_schema__(self, *_: Any) -> Any:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_plain_validator_function(self.read)
 
 
 def read_measured(name: str, content: object, unit: str) -> Measured:

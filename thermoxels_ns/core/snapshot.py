@@ -64,24 +64,25 @@ class GridSnapshot:
     views: Views | None = None  # The training cameras of both streams. None: not known
 
     def __post_init__(self) -> None:
-        lattice = self.lattice
-        for name in ("density", "temperature_c", "observed_weight"):
-            _check(name, getattr(self, name), lattice.shape)
-        if self.voxel_density is not None:
-            _check("voxel_density", self.voxel_density, lattice.cell_shape)
-        if self.colour is not None:
-            _check("colour", self.colour, (*lattice.shape, 3), least=0.0, most=1.0)
-        if self.evidence is not None:
-            _check("voxel_weight", self.evidence.voxel_weight, lattice.cell_shape, least=0.0)
-            _check("half_depth_density", self.evidence.half_depth_density, (None,), least=0.0)
-            if self.evidence.voxel_ends is not None:
-                _check("voxel_ends", self.evidence.voxel_ends, lattice.cell_shape, least=0.0)
-        if self.views is not None:
-            count = len(self.views.camera_to_world)
-            _check("camera_to_world", self.views.camera_to_world, (count, 3, 4), remedy=_CAMERAS)
-            _check("focal", self.views.focal, (count, 2), least=_SMALLEST_FOCAL, remedy=_CAMERAS)
-            _check("centre", self.views.centre, (count, 2), remedy=_CAMERAS)
-            _check("size", self.views.size, (count, 2), least=1, remedy=_CAMERAS)
+        corners, cells, seen, views = self.lattice.shape, self.lattice.cell_shape, self.evidence, self.views
+        count = 0 if views is None else len(views.camera_to_world)
+        for part, name, shape, least, most in (
+            (self, "density", corners, -np.inf, np.inf),
+            (self, "temperature_c", corners, -np.inf, np.inf),
+            (self, "observed_weight", corners, -np.inf, np.inf),
+            (self, "voxel_density", cells, -np.inf, np.inf),
+            (self, "colour", (*corners, 3), 0.0, 1.0),
+            (seen, "voxel_weight", cells, 0.0, np.inf),
+            (seen, "half_depth_density", (None,), 0.0, np.inf),
+            (seen, "voxel_ends", cells, 0.0, np.inf),
+            (views, "camera_to_world", (count, 3, 4), -np.inf, np.inf),
+            (views, "focal", (count, 2), _SMALLEST_FOCAL, np.inf),
+            (views, "centre", (count, 2), -np.inf, np.inf),
+            (views, "size", (count, 2), 1.0, np.inf),
+        ):
+            array = None if part is None else getattr(part, name)
+            if array is not None:
+                _check(f"grid snapshot {name}", array, shape, least, most, _CAMERAS if part is views else _FIELD)
 
     def centre_density(self) -> npt.NDArray[np.float64]:
         """Density at the voxel centres, shape `lattice.cell_shape`, [1 / world unit]."""
@@ -96,15 +97,8 @@ _CAMERAS = "Correct the camera poses and intrinsics of the scene."
 
 
 def _check(
-    name: str,
-    array: npt.NDArray,
-    shape: tuple[int | None, ...],
-    *,
-    least: float = -np.inf,
-    most: float = np.inf,
-    remedy: str = _FIELD,
+    name: str, array: npt.NDArray, shape: tuple[int | None, ...], least: float, most: float, remedy: str
 ) -> None:
-    name = f"grid snapshot {name}"
     check_shape(name, array, shape, remedy, MeshError)
     check_finite(name, array, remedy, MeshError)
     if array.size and not least <= array.min() <= array.max() <= most:

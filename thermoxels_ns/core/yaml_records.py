@@ -4,25 +4,43 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import math
 import re
-import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from datetime import date, datetime
-from numbers import Real
+from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
+from typing_extensions import dataclass_transform
 
-from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.measured import read_measured
+from thermoxels_ns.core.errors import RecordError, ThermoxelsError, explain, printable
+
+if TYPE_CHECKING:  # pydantic is slow to import, and presets do without
+    from pydantic import ConfigDict, ValidationError
 
 Record = TypeVar("Record")
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _NUMBER = "Write it without quotes and without a unit; a power of ten needs a point and a sign, as in 1.0e+3."
+_EXPECTED = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "a text",
+    "string_pattern_mismatch": "a text",
+    "tuple_type": "a list of entries",
+    "dict_type": "key: value lines",
+    "dataclass_type": "key: value lines",
+    "greater_than": "a number above {gt:g}",
+    "greater_than_equal": "a number of at least {ge:g}",
+    "less_than_equal": "a number of at most {le:g}",
+}
+"""What is expected where pydantic raises an error of a type, with words of its context."""
+_MOST_TOLD = 20  # Mistakes of a file that are told at once
+_MOST_PARTS = 1_000_000  # Of the json that a file becomes
 
 
 def configs_folder() -> Path:
@@ -35,12 +53,12 @@ def configs_folder() -> Path:
 
 
 @contextmanager
-def raising(error: type[ThermoxelsError]) -> Iterator[None]:
+def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
     """Raise what is wrong with a file as an error of the caller's kind; a context, or a decorator of a reader."""
     try:
         yield
     except ThermoxelsError as problem:
-        raise error(str(problem)) from problem
+        raise error(f"{before}{problem}") from problem
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -56,115 +74,137 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise wrong(path.name, "a yaml file", " ".join(str(problem).split())) from problem
     except ValueError as problem:  # a date such as 2025-13-01
         raise wrong(path.name, "a yaml file with dates that exist", problem) from problem
-    return as_mapping(path.name, content)
-
-
-def as_mapping(name: str, content: object) -> dict[str, Any]:
-    """Return what was read if it is a mapping whose keys are text."""
     if not isinstance(content, dict) or not content:
-        raise wrong(name, "key: value lines", shown(content))
-    for key in content:
-        if not isinstance(key, str):
-            raise wrong(name, "keys that are text", repr(key), "Put it in quotes.")
+        raise wrong(path.name, "key: value lines", shown(content))
     return content
 
 
-def as_record(name: str, content: object, target: type[Record]) -> Record:
-    """Turn a mapping into a dataclass, whose fields without a default are required.
-
-    `name` says where the mapping stands, for messages, such as "winter.yaml: sky". Raises `ThermoxelsError` if a key is
-    unknown or missing, or a value is of the wrong kind or out of range.
-    """
-    content = as_mapping(name, content)
-    hints = get_type_hints(target, include_extras=True)
-    own = {field.name: field for field in dataclasses.fields(target) if field.init}  # type: ignore[arg-type]
-    check_keys(name, content, tuple(own))
-    missing = [key for key, field in own.items() if key not in content and _is_required(field)]
-    if missing:
-        raise wrong(name, f"the key {missing[0]}", ", ".join(content), f"Add {missing[0]}.")
-    values = {key: as_value(f"{name}: {key}", value, hints[key]) for key, value in content.items()}
-    try:
-        return target(**values)
-    except ThermoxelsError as problem:
-        raise ThermoxelsError(f"{name}: {problem}") from problem
-
-
-def check_keys(name: str, content: dict[str, Any], known: tuple[str, ...]) -> None:
-    """Refuse keys that are not known, with the key that was probably meant."""
-    for key in content:
-        if key not in known:
-            meant = _meant(key, known)
-            remedy = f"Did you mean {meant}?" if meant else "Correct or remove that key."
-            raise wrong(name, f"keys out of {', '.join(known)}", key, remedy)
-
-
-def as_value(name: str, content: object, hint: Any) -> Any:
-    """Turn what was read into a value of the type that a dataclass field has, or raise `ThermoxelsError`.
-
-    Numbers (`Real`: as written, whole or not), truth values, texts, moments, choices (Literal), tuples of fixed or any
-    length, mappings from text, dataclasses and ``Annotated[Measured, unit]`` are known; of a union, a field takes the
-    first of these kinds.
-    """
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin in (Union, types.UnionType):
-        return as_value(name, content, next(kind for kind in arguments if kind is not type(None)))
-    if origin is Annotated:
-        return read_measured(name, content, arguments[1])
-    if origin is dict:
-        entries = as_mapping(name, content).items()
-        return {key: as_value(f"{name}: {key}", value, arguments[1]) for key, value in entries}
-    if origin is Literal:
-        if content not in arguments or isinstance(content, bool):
-            raise wrong(name, f"one of {', '.join(map(str, arguments))}", shown(content))
-        return content
-    if origin is tuple and arguments[-1] is not Ellipsis:
-        if not isinstance(content, list) or len(content) != len(arguments):
-            raise wrong(name, f"{len(arguments)} numbers in square brackets", shown(content))
-        return tuple(as_value(name, item, kind) for item, kind in zip(content, arguments))
-    if origin is tuple:
-        if not isinstance(content, list):
-            expected = "a list of entries, each with a dash before it"
-            if arguments[0] is str:
-                expected = "a list of names in square brackets"
-            raise wrong(name, expected, shown(content))
-        numbered = (f"{name} entry {number}" for number in range(1, len(content) + 1))
-        return tuple(as_value(entry, item, arguments[0]) for entry, item in zip(numbered, content))
-    if dataclasses.is_dataclass(hint):
-        assert isinstance(hint, type)
-        return as_record(name, content, hint)
-    return _plain(name, content, hint)
+def wrong(name: str, expected: str, got: object, remedy: str = "Correct the file.") -> RecordError:
+    """Make the error for something in a file."""
+    return RecordError(name, expected=expected, got=got, remedy=remedy)
 
 
 def shown(content: object) -> str:
     """Show what was read in a message."""
-    return "nothing" if content is None else repr(content)
+    return "nothing" if content is None else repr(content)[:200]
 
 
-def wrong(name: str, expected: str, got: object, remedy: str = "Correct the file.") -> ThermoxelsError:
-    """Make the error for something in a file."""
-    return ThermoxelsError(name, expected=expected, got=got, remedy=remedy)
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
+def record(error: type[ThermoxelsError]) -> Callable[[type[Record]], type[Record]]:
+    """Make a frozen dataclass whose values pydantic checks by their types; mistakes are one error of this kind.
+
+    What concerns several fields is checked in ``__post_init__``, which raises an error of ours that is a ValueError.
+    """
+    from pydantic import ValidationError
+    from pydantic.dataclasses import dataclass
+
+    def decorate(plain: type[Record]) -> type[Record]:
+        made: Any = dataclass(frozen=True, config=_config())(plain)
+        build = made.__init__
+
+        def checked(self: Any, *values: Any, **named: Any) -> None:
+            try:
+                build(self, *values, **named)
+            except ValidationError as problem:
+                names = [field.name for field in dataclasses.fields(made) if field.init and not field.kw_only]
+                raise error(_told("", problem, made, dict(zip(names, values)) | named, names)) from problem
+
+        made.__init__ = checked
+        return made
+
+    return decorate
 
 
-def _plain(name: str, content: object, kind: type) -> Any:
-    if kind in (float, Real):
-        if isinstance(content, (int, float)) and not isinstance(content, bool):
-            if isinstance(content, int) and content.bit_length() > 1023:
-                raise wrong(name, "a number below 1e308", f"one of {content.bit_length()} binary digits")
-            return float(content) if kind is float else content
-        raise wrong(name, "a number", shown(content), _as_number(content))
-    if kind is int:
-        if isinstance(content, int) and not isinstance(content, bool):
-            return content
-        raise wrong(name, "a whole number", shown(content))
-    if kind is datetime:
-        if isinstance(content, datetime):
-            return content
-        got = str(content) if isinstance(content, date) else shown(content)
-        raise wrong(name, "a date and a time", got, "Write 2025-06-21T12:00:00+02:00, without quotes.")
-    if isinstance(content, kind):
-        return content
-    kinds = {bool: "true or false", str: "a text"}
-    raise wrong(name, kinds[kind], shown(content), "Put it in quotes." if kind is str else "Correct the file.")
+def as_record(name: str, content: Mapping[str, Any], target: type[Record]) -> Record:
+    """Turn what was read from a file into a dataclass, whose fields without a default are required.
+
+    `name` says where it stands, for messages, such as "winter.yaml". Raises `ThermoxelsError` that names all keys that
+    are unknown or missing, and all values of a wrong kind or out of range.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        parts = list(islice(json.JSONEncoder(default=str).iterencode(content), _MOST_PARTS + 1))
+    except ValueError as problem:  # an entry that holds itself
+        raise wrong(name, "a yaml file", problem) from problem
+    if len(parts) > _MOST_PARTS:  # a few entries that refer to each other may stand for more than memory holds
+        raise wrong(name, f"at most {_MOST_PARTS:,} entries", "more", "Do not refer to entries by & and *.")
+    alone: Any = tuple.__class_getitem__(target)  # hands the configuration on to dataclasses that have none
+    try:
+        # Of json, pydantic takes lists for tuples and mappings for dataclasses, and converts nothing else.
+        return TypeAdapter(alone, config=_config(infinite=True)).validate_json(f"[{''.join(parts)}]")[0]
+    except ValidationError as problem:
+        raise ThermoxelsError(_told(name, problem, target, content)) from problem
+
+
+def _config(infinite: bool = False) -> ConfigDict:
+    return {"extra": "forbid", "strict": True, "allow_inf_nan": infinite, "arbitrary_types_allowed": True}
+
+
+def _told(name: str, problem: ValidationError, target: Any, content: Any, positional: list[str] | None = None) -> str:
+    """Say all mistakes, at most `_MOST_TOLD`, one a line; `positional` are names of fields that were given in order."""
+    found: dict[tuple[str | int, ...], tuple[bool, str]] = {}
+    for one in problem.errors(include_url=False):
+        place, at, path, chosen = one["loc"], content, list[str | int](), False
+        if positional is None:
+            place = place[1:]
+        elif place and isinstance(place[0], int):
+            place = (positional[place[0]], *place[1:])
+        for part in place:
+            try:
+                at = at[part]  # the value, or what lacks it
+            except (TypeError, KeyError, IndexError):
+                if part is not place[-1] or one["type"] != "missing":
+                    chosen = True  # the place names one of several kinds that a value may have
+                    continue
+            path.append(part)
+        chosen = chosen or one["type"] == "too_short"
+        found.setdefault(tuple(path), (chosen, _mistake(name, path, at, dict(one), target)))
+    deeper = {path[:length] for path in found for length in range(len(path))}
+    told = [said for path, (chosen, said) in found.items() if not (chosen and path in deeper)]
+    return "\n".join(told[:_MOST_TOLD])
+
+
+def _mistake(name: str, path: list[str | int], value: object, one: dict[str, Any], target: Any) -> str:
+    """One of pydantic's errors as a sentence of ours."""
+    kind, where, above = one["type"], _where(name, path), _where(name, path[:-1]) or target.__name__
+    if kind == "value_error":
+        return ": ".join(filter(None, (printable(where), str(one["ctx"]["error"]).removeprefix(": "))))
+    if kind == "missing":
+        number = isinstance(path[-1], int)
+        expected, remedy = ("more entries", "Add them.") if number else (f"the key {path[-1]}", f"Add {path[-1]}.")
+        got = ", ".join(map(str, value)) if isinstance(value, (dict, list)) else "nothing"  # type: ignore[arg-type]
+        return explain(above, expected=expected, got=got, remedy=remedy)
+    if kind == "unexpected_keyword_argument":
+        known = tuple(key for key in _keys_at(target, path[:-1]) if key != path[-1])
+        meant = _meant(str(path[-1]), known)
+        remedy = f"Did you mean {meant}?" if meant else "Correct or remove that key."
+        return explain(above, expected=f"keys out of {', '.join(known)}", got=path[-1], remedy=remedy)
+    if kind == "literal_error":
+        expected = f"one of {one['ctx']['expected'].replace(chr(39), '').replace(' or ', ', ')}"
+    elif kind in _EXPECTED:
+        expected = _EXPECTED[kind].format(**one.get("ctx", {}))
+    else:
+        expected = re.sub(r"^\w+ should (be |have |match )?| after validation.*", "", one["msg"])
+    remedy = {"float_type": _as_number(value), "string_type": "Put it in quotes."}.get(kind, "Correct it.")
+    return explain(where or above, expected=expected, got=shown(value), remedy=remedy)
+
+
+def _where(name: str, path: list[str | int]) -> str:
+    """Name a place in a file, such as ``winter.yaml: surfaces entry 2: patches``."""
+    for part in path:
+        name = f"{name} entry {part + 1}" if isinstance(part, int) else f"{name}: {part}" if name else part
+    return name
+
+
+def _keys_at(hint: Any, path: list[str | int]) -> tuple[str, ...]:
+    """Keys of the dataclass, or of several, that a path leads to from a type."""
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        if not path:
+            return tuple(field.name for field in dataclasses.fields(hint) if field.init)
+        return _keys_at(get_type_hints(hint, include_extras=True).get(str(path[0])), path[1:])
+    rest = path[1:] if get_origin(hint) in (tuple, dict, Mapping) else path
+    return tuple(key for part in get_args(hint) for key in _keys_at(part, rest))
 
 
 def _as_number(content: object) -> str:
@@ -189,10 +229,6 @@ def _meant(key: str, known: tuple[str, ...]) -> str:
     return close[0] if close else ""
 
 
-def _is_required(field: dataclasses.Field) -> bool:
-    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-
-
 class _UniqueKeyLoader(yaml.SafeLoader):
     """Refuses a key that stands twice in one mapping, where yaml forgets the first."""
 
@@ -203,7 +239,13 @@ class _UniqueKeyLoader(yaml.SafeLoader):
             if name in seen:
                 raise yaml.constructor.ConstructorError(None, None, f"the key {name} twice", key.start_mark)
             seen.add(name)
-        return super().construct_mapping(node, deep)
+        found = super().construct_mapping(node, deep)
+        odd = next((key for key in found if not isinstance(key, str)), "")
+        if odd != "":
+            raise yaml.constructor.ConstructorError(
+                None, None, f"the key {odd!r}, no text without quotes", node.start_mark
+            )
+        return found
 
 
 Config = TypeVar("Config")

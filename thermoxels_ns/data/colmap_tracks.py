@@ -13,9 +13,16 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import FeatureRays, FloatArray, IntArray
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
-from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, feature_rays, read_tracks
+from thermoxels_ns.data.tracks import (
+    COLMAP_FOLDERS,
+    TRACKS_KEY,
+    SparseTracks,
+    camera_to_world,
+    feature_rays,
+    read_model,
+    read_tracks,
+)
 from thermoxels_ns.data.transforms_json import path_inside
 
 MOST_OFF_PX = 2.0

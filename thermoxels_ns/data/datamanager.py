@@ -107,7 +107,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Return the training batch of a step: rays, and ``image`` (n, 3) and ``thermal`` (n, 1) targets.
 
-        ``ray_bundle.metadata["stream"]`` says which targets a ray has (see `thermoxels_ns.core.ray_streams`).
+        ``ray_bundle.metadata["stream"]`` says which targets a ray has (see `thermoxels_ns.core.feature_rays`).
         """
         number = step if self.test_mode == "val" else self.train_count
         self.train_count += 1
@@ -133,7 +133,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     ) -> Iterator[RayBundle]:
         """Give a regular, always equal subset of the training rays, in order, without decoding photographs.
 
-        The bits of `core.ray_streams` say which: thermal gives valid pixels only, both bits give every ray once; a
+        The bits of `core.feature_rays` say which: thermal gives valid pixels only, both bits give every ray once; a
         stream that does not train (see the option streams) gives nothing. The stride, every n-th pixel in both
         directions, is widened per photograph until no more than `max_rays_per_image` remain. Bundles have `chunk` rays
         or fewer.

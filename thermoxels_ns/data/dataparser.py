@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Optional
@@ -11,7 +11,6 @@ from typing import Any, Literal, Optional
 import numpy as np
 import numpy.typing as npt
 import torch
-from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
@@ -25,7 +24,6 @@ from thermoxels_ns.data.colmap_tracks import TrackSource, find_feature_rays
 from thermoxels_ns.data.pose_refinement import PoseSource, refine_poses
 from thermoxels_ns.data.scene_box import BoxEvidence, find_scene_box
 from thermoxels_ns.data.scene_file import BOUNDS_NAME, Frame, SceneFile, read_scene_file
-from thermoxels_ns.data.splits import Split, split_frames
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixels, read_thermal_file
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
@@ -39,6 +37,10 @@ _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
 _MOST_FRAMES = 64  # frames per resolution that the search for dead pixels keeps in memory
 
 
+SplitMode = Literal["auto", "filename", "lists", "interval"]
+_KEYS = {"train": "train_filenames", "val": "val_filenames", "test": "test_filenames"}
+
+
 @dataclass
 class ThermalDataParserConfig(DataParserConfig):
     """Scenes of paired colour and thermal photographs: ThermoScenes layout, or a thermal camera of its own."""
@@ -47,30 +49,17 @@ class ThermalDataParserConfig(DataParserConfig):
     """Class to instantiate."""
     data: Path = Path()
     """Scene folder (with transforms.json or transforms_thermal.json), or the json itself."""
-    scale_factor: float = 1.0
-    """Size of the world relative to the default. At 1 the scene box's longest side is 2, which the learning rates of
-    the voxel field are made for."""
     downscale_factor: Optional[int] = None  # noqa: UP045 - read by tyro
     """Divide the resolution of the colour photographs by this; they are resized when loaded, nothing is written.
     Thermal images keep their resolution. Default: full resolution."""
-    orientation_method: Literal["pca", "up", "vertical", "none"] = "none"
-    """How to turn the world. none keeps the axes of the input poses, so that the scene box stays as tight as given;
-    the others are nerfstudio's."""
-    center_method: Literal["box", "poses", "focus", "none"] = "box"
-    """What goes to the origin: the middle of the scene box (default, the lattice then spans -1 to 1), the mean camera,
-    the point the cameras look at, or nothing."""
-    auto_scale_poses: bool = True
-    """Scale the world so that the scene box's longest side is 2. Off: input units."""
     scene_box: Optional[tuple[tuple[float, float, float], tuple[float, float, float]]] = None  # noqa: UP045
     """Box to reconstruct, in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax. Default: scene_box in
     the json, else from the sparse points, else from depths that photographs agree on, else from the cameras."""
-    eval_mode: Literal["auto", "filename", "lists", "interval"] = "auto"
+    eval_mode: SplitMode = "auto"
     """Which frames evaluate. auto takes the first that the scene has: names with frame_train_ / frame_eval_, the lists
     train_filenames / val_filenames / test_filenames in the json, every eval_interval-th frame."""
     eval_interval: int = 8
-    """Every n-th frame by sorted name evaluates (eval_mode interval)."""
-    eval_offset: Optional[int] = None  # noqa: UP045
-    """First frame that evaluates (eval_mode interval). Default: half of eval_interval, so that the ends of the
+    """Every n-th frame by sorted name evaluates (eval_mode interval), from half of it on, so that the ends of the
     sequence stay in training."""
     missing_thermal: Literal["error", "skip"] = "error"
     """A frame without a thermal image: stop, or leave the frame out and name it."""
@@ -97,23 +86,24 @@ class ThermalSurvey:
 
 @dataclass(frozen=True)
 class _World:
-    """The similarity from input coordinates to nerfstudio's: p_ns = scale * (rotation p + translation)."""
+    """The way from input coordinates to nerfstudio's: p_ns = scale * (p + translation); the axes stay.
 
-    rotation: npt.NDArray[np.float64]
+    The middle of the scene box goes to the origin, and its longest side becomes `SCENE_SIZE`.
+    """
+
     translation: npt.NDArray[np.float64]
     scale: float
 
     def poses(self, poses: npt.NDArray[np.float64]) -> torch.Tensor:
         """Move camera-to-world matrices, shape (n, 4, 4), to shape (n, 3, 4) float32."""
-        moved = np.empty((len(poses), 3, 4))
-        moved[:, :, :3] = self.rotation @ poses[:, :3, :3]
-        moved[:, :, 3] = self.scale * (poses[:, :3, 3] @ self.rotation.T + self.translation)
+        moved = poses[:, :3].copy()
+        moved[:, :, 3] = self.scale * (poses[:, :3, 3] + self.translation)
         return torch.from_numpy(moved.astype(np.float32))
 
     @property
     def transform(self) -> torch.Tensor:
         """nerfstudio's dataparser_transform, shape (3, 4): rotation and translation before the scale."""
-        return torch.from_numpy(np.column_stack([self.rotation, self.translation]).astype(np.float32))
+        return torch.from_numpy(np.column_stack([np.eye(3), self.translation]).astype(np.float32))
 
 
 @dataclass(frozen=True)
@@ -125,7 +115,7 @@ class _Scene:
     survey: ThermalSurvey
     world: _World
     box: SceneBox
-    input_box: tuple[tuple[float, ...], ...] | None  # the same in input coordinates; None: turned against their axes
+    input_box: tuple[tuple[float, ...], ...]  # the same in input coordinates
     pixel_size: float  # width of a photograph's pixel where most of what is seen stands, in nerfstudio's world
     feature_rays: FeatureRays | None  # what the training photographs see of the tracks; nerfstudio's world
     adjusted: bool  # whether the poses of training photographs are others than the json's
@@ -139,8 +129,8 @@ class ThermalDataParser(DataParser):
     The outputs' metadata hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``, ``thermal_cameras``
     (`Cameras` of the split, or None where a pair shares camera and resolution), ``thermal_unit``, ``valid_range_c``,
     ``thermal_dead_pixels`` (a mask per resolution), ``image_scale`` (1 / downscale_factor), ``pixel_size`` (width of a
-    pixel where most of what is seen stands, in the world), ``input_box`` (the scene box in input coordinates, None if
-    the world is turned), ``scene_name`` and, for train, ``feature_rays`` (`FeatureRays`, or None without tracks).
+    pixel where most of what is seen stands, in the world), ``input_box`` (the scene box in input coordinates),
+    ``scene_name`` and, for train, ``feature_rays`` (`FeatureRays`, or None without tracks).
     ``fitted_poses`` (n, 3, 4) say where held-out photographs themselves say that they were taken, and
     ``adjusted_poses`` (camera to world in input coordinates, by the photograph's name) those of training, both None
     where no pose was adjusted.
@@ -221,13 +211,12 @@ class ThermalDataParser(DataParser):
             raise SceneError("valid_range_c", expected=expected, got=got, remedy="Pass --valid-range-c -100 2000.")
         file = read_scene_file(Path(config.data), config.missing_thermal)
         names = [frame.name for frame in file.frames]
-        every = config.eval_interval, config.eval_offset
-        split = split_frames(names, file.meta, config.eval_mode, *every, file.left_out)
+        split = split_frames(names, file.meta, config.eval_mode, config.eval_interval, file.left_out)
         rays, given, fitted = find_feature_rays(file, split.train, config.tracks), file, {}
         if rays is None and config.refine_poses == "auto":
             file, fitted = refine_poses(given, split.train, CONSOLE.print)
         evidence = find_scene_box(file, config.scene_box, split.train)
-        world, box, input_box, pixel_size = self._place(file, evidence)
+        world, box, input_box, pixel_size = _place(evidence)
         paths, training = [f.thermal for f in file.frames], {file.frames[index].thermal for index in split.train}
         survey = survey_thermal_files(paths, file.unit, config.valid_range_c, file.bounds_c, training)
         _refuse_several_sizes(file.frames, survey.shapes)
@@ -248,51 +237,21 @@ class ThermalDataParser(DataParser):
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
         if rays is not None:
-            rays = rays.moved(world.rotation, world.translation, world.scale)
+            rays = rays.moved(np.eye(3), world.translation, world.scale)
         return _Scene(file, split, survey, world, box, input_box, pixel_size, rays, file is not given, fitted)
 
-    def _oriented(self, poses: npt.NDArray[np.float64]) -> torch.Tensor:
-        """nerfstudio's choice of rotation and shift for these poses (n, 4, 4), shape (3, 4) float32."""
-        method, centre = self.config.orientation_method, self.config.center_method
-        centering = "none" if centre == "box" else centre
-        try:
-            _, oriented = auto_orient_and_center_poses(torch.from_numpy(poses.astype(np.float32)), method, centering)
-        except (IndexError, RuntimeError):  # vertical needs three cameras; a decomposition may not converge
-            oriented = torch.full((3, 4), torch.nan)
-        if not bool(torch.isfinite(oriented).all()):
-            expected = "cameras that tell where up and the middle are"
-            got = f"{len(poses)} cameras that do not, by {method} and {centre}"
-            remedy = "Pass --orientation-method none --center-method box."
-            raise SceneError("orientation_method, center_method", expected=expected, got=got, remedy=remedy)
-        return oriented
 
-    def _place(
-        self, file: SceneFile, evidence: BoxEvidence
-    ) -> tuple[_World, SceneBox, tuple[tuple[float, ...], ...] | None, float]:
-        """Choose orientation, origin and scale, and express the scene box and a pixel's width in the new world."""
-        config = self.config
-        oriented = self._oriented(np.stack([frame.pose for frame in file.frames]))
-        rotation = _nearest_rotation(oriented[:, :3].numpy().astype(np.float64))
-        box = evidence.box(rotation)
-        far = bool(np.abs(box).max() > _FAR_SIDES * (box[1] - box[0]).max())
-        if far:
-            rotation = _as_kept(rotation)
-            box = evidence.box(rotation)
-        if config.center_method == "box":
-            translation = -box.mean(axis=0)
-        else:
-            translation = oriented[:, 3].numpy().astype(np.float64)
-        longest = float((box[1] - box[0]).max())
-        if far:
-            translation = _as_kept(translation)
-        scale = (SCENE_SIZE / longest if config.auto_scale_poses else 1.0) * config.scale_factor
-        if not (np.isfinite(scale) and scale > 0):
-            got, remedy = config.scale_factor, "Pass --scale-factor 1."
-            raise SceneError("scale_factor", expected="a finite number above 0", got=got, remedy=remedy)
-        placed = scale * (box + translation)
-        placed_box = SceneBox(aabb=torch.from_numpy(placed.astype(np.float32)))
-        input_box = tuple(map(tuple, box.tolist())) if np.array_equal(rotation, np.eye(3)) else None
-        return _World(rotation, translation, scale), placed_box, input_box, scale * evidence.pixel_size(box, rotation)
+def _place(evidence: BoxEvidence) -> tuple[_World, SceneBox, tuple[tuple[float, ...], ...], float]:
+    """Choose origin and scale, and express the scene box and a pixel's width in the new world."""
+    axes = np.eye(3)
+    box = evidence.box(axes)
+    translation, longest = -box.mean(axis=0), float((box[1] - box[0]).max())
+    if np.abs(box).max() > _FAR_SIDES * longest:
+        # As nerfstudio keeps it for the way back: five million metres from the origin that is off by half a metre.
+        translation = translation.astype(np.float32).astype(np.float64)
+    scale = SCENE_SIZE / longest
+    placed = SceneBox(aabb=torch.from_numpy((scale * (box + translation)).astype(np.float32)))
+    return _World(translation, scale), placed, tuple(map(tuple, box.tolist())), scale * evidence.pixel_size(box, axes)
 
 
 def _share_that_meets(frames: list[Frame], world: _World, box: SceneBox, source: str) -> float:
@@ -423,21 +382,6 @@ def survey_thermal_files(
     return ThermalSurvey(shapes, TemperatureRange.spanning(low, high), dead)
 
 
-def _as_kept(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Round to single precision, in which nerfstudio keeps rotation and shift for the way back to input coordinates.
-
-    Five million metres from the origin that is half a metre. With the rounded numbers used for the way there too, the
-    world is off centre by as much, and what comes back is where it was.
-    """
-    return values.astype(np.float32).astype(np.float64)
-
-
-def _nearest_rotation(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Remove the float32 rounding of nerfstudio's orientation."""
-    left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ right, dtype=np.float64)
-
-
 def _thermal_intrinsics(frame: Frame, shape: tuple[int, int]) -> Camera:
     """The projection of a thermal image: its own camera's, or the photograph's at the thermal resolution."""
     height, width = shape
@@ -483,3 +427,97 @@ def _same_cameras(first: Cameras, second: Cameras) -> bool:
         torch.allclose(getattr(first, name), getattr(second, name), rtol=1e-6, atol=1e-7)
         for name in ("fx", "fy", "cx", "cy", "distortion_params", "camera_to_worlds")
     )
+
+
+@dataclass(frozen=True)
+class Split:
+    """Positions of frames in the sorted list of names."""
+
+    train: list[int]
+    val: list[int]
+    test: list[int]
+    how: str  # how the split was made, for the report
+
+
+def split_frames(
+    names: Sequence[str],
+    meta: Mapping[str, Any],
+    mode: SplitMode,
+    interval: int,
+    left_out: Sequence[str] = (),
+) -> Split:
+    """Split frames, given by their sorted names, into training and evaluation.
+
+    "auto" takes the first that the scene has: names with frame_train_ and frame_eval_, lists in the json
+    (train_filenames, val_filenames, test_filenames), every n-th frame from half the interval on, so that the ends of
+    the sequence, which the others see least, stay in training. Lists may hold names left out.
+
+    Raises:
+        SceneError: A side is empty, a frame is on both sides or a listed name is unknown.
+    """
+    tagged = [("frame_train_" in Path(n).name, "frame_eval_" in Path(n).name) for n in names]
+    lists = any(key in meta for key in _KEYS.values())
+    if mode == "filename" or (mode == "auto" and any(train or test for train, test in tagged)):
+        split = _by_name(names, tagged)
+    elif mode == "lists" or (mode == "auto" and lists):
+        split = _by_lists(names, meta, left_out)
+    else:
+        split = _by_interval(names, interval)
+    for side, chosen in (("training", split.train), ("evaluation", split.val), ("evaluation", split.test)):
+        if not chosen:
+            expected = f"at least one of the {len(names)} frames ({split.how})"
+            remedy = "Add frames or choose another split, e.g. --eval-mode interval --eval-interval 2."
+            raise SceneError(f"{side} frames", expected=expected, got="none", remedy=remedy)
+    both = set(split.train) & (set(split.val) | set(split.test))
+    if both:
+        remedy = "Remove them from one list: evaluation frames must never train."
+        got = ", ".join(names[i] for i in sorted(both)) + " in training and in evaluation"
+        raise SceneError("split lists", expected="no frame on both sides", got=got, remedy=remedy)
+    return split
+
+
+def _by_name(names: Sequence[str], tagged: list[tuple[bool, bool]]) -> Split:
+    unclear = [name for name, (train, evaluate) in zip(names, tagged) if train == evaluate]
+    if unclear:
+        expected, got = "frame_train_ or frame_eval_ in every name", f"{unclear[0]} ({len(unclear)} such)"
+        remedy = "Rename them or pass --eval-mode interval."
+        raise SceneError("split by file name", expected=expected, got=got, remedy=remedy)
+    evaluate = [i for i, (_, test) in enumerate(tagged) if test]
+    return Split([i for i, (train, _) in enumerate(tagged) if train], evaluate, evaluate, "by file name")
+
+
+def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[str]) -> Split:
+    position = {Path(name).as_posix(): i for i, name in enumerate(names)}
+    found: dict[str, list[int] | None] = {}
+    for side, key in _KEYS.items():
+        given = meta.get(key, [])
+        if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
+            remedy = 'Write ["images/a.jpg", "images/b.jpg"], for example.'
+            raise SceneError(key, expected="a list of file names", got=repr(given)[:80], remedy=remedy)
+        listed = [Path(name).as_posix() for name in given] if key in meta else None
+        listed = None if listed is None else [name for name in listed if name not in left_out]
+        unknown = [name for name in listed or [] if name not in position]
+        if unknown:
+            remedy = "Correct the list; it must write names as 'file_path' does."
+            got = f"{unknown[0]} ({len(unknown)} unknown)"
+            raise SceneError(key, expected="names that are in 'frames'", got=got, remedy=remedy)
+        found[side] = None if listed is None else sorted({position[name] for name in listed})
+    val = found["val"] or found["test"]
+    test = found["test"] or found["val"]
+    held = set(val or []) | set(test or [])
+    train = found["train"]
+    if train is None:
+        train = [i for i in range(len(names)) if i not in held]
+    if val is None or test is None:
+        val = test = [i for i in range(len(names)) if i not in set(train)]
+    return Split(train, val, test, f"by {', '.join(key for key in _KEYS.values() if key in meta)} in the json")
+
+
+def _by_interval(names: Sequence[str], interval: int) -> Split:
+    start = interval // 2
+    if interval < 2:
+        expected, remedy = "an interval of at least 2", "Pass --eval-interval 8."
+        raise SceneError("eval_interval", expected=expected, got=interval, remedy=remedy)
+    evaluate = list(range(start, len(names), interval))
+    train = [i for i in range(len(names)) if i % interval != start]
+    return Split(train, evaluate, evaluate, f"every {interval}th frame from number {start}")

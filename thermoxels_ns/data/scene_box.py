@@ -13,8 +13,8 @@ from PIL import Image
 
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
+from thermoxels_ns.data.tracks import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH, read_pose
 from thermoxels_ns.radiometry.decoders import errors_name
 

@@ -4,33 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import asdict, replace
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
+from pydantic import Field
 
-from thermoxels_ns.core.checks import check_finite, check_positive, check_shape, is_number
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.core.yaml_records import as_record, raising, record
 
 Vector = tuple[float, float, float]
+Length: TypeAlias = Annotated[float, Field(gt=0.0)]
+StandardError: TypeAlias = Annotated[float, Field(ge=0.0)]
 
 _FILE = "transforms.json"
-_KEY, _ERROR_KEY, _UP_KEY = "metres_per_unit", "metres_per_unit_standard_error", "up"
 
 
-@dataclass(frozen=True)
+@record(ThermoxelsError)
 class SceneScale:
     """Metres per unit of the scene's coordinates, with its standard error."""
 
-    metres_per_unit: float  # Length of one input unit, above 0, [m]
-    standard_error: float | None  # Standard error of `metres_per_unit`, at least 0, [m]; None where nobody knows it
+    metres_per_unit: Length  # Length of one input unit, [m]
+    standard_error: StandardError | None  # Standard error of `metres_per_unit`, [m]; None where nobody knows it
     source: str  # Where the scale comes from: a sentence
-
-    @property
-    def relative_standard_error(self) -> float | None:
-        """Standard error over scale; None where it is not known."""
-        return None if self.standard_error is None else self.standard_error / self.metres_per_unit
 
     def area_standard_error(self, area_m2: float) -> float | None:
         """What the scale's error makes of an area, twice its relative error, [m^2]; None where it is not known."""
@@ -46,22 +42,48 @@ class SceneScale:
 
     def as_mapping(self) -> dict[str, Any]:
         """The scale as json can hold it."""
-        return asdict(self)
+        return asdict(self)  # type: ignore[call-overload]
 
     def _share(self, power: int, size: float) -> float | None:
         """Standard error of a quantity that grows with a power of the scale, to first order."""
-        relative = self.relative_standard_error
-        return None if relative is None else power * relative * abs(size)
+        return None if self.standard_error is None else power * (self.standard_error / self.metres_per_unit) * abs(size)
+
+
+@record(ThermoxelsError)
+class _KnownDistance:
+    point_a: Vector
+    point_b: Vector
+    distance_m: Length
+    standard_error_m: StandardError | None
+
+
+@record(SceneError)
+class _InFile:
+    """What a scene's json says."""
+
+    metres_per_unit: Length | None = None
+    metres_per_unit_standard_error: StandardError | None = None
+    up: Vector | None = None
+
+    def __post_init__(self) -> None:
+        if self.metres_per_unit is None and self.metres_per_unit_standard_error is not None:
+            remedy = "Add 'metres_per_unit', or remove it."
+            raise SceneError(
+                "metres_per_unit_standard_error", expected="'metres_per_unit' beside it", got="none", remedy=remedy
+            )
+        if self.up is not None and not 0.0 < math.hypot(*self.up) < math.inf:
+            remedy = "Correct the json, for instance to [0, 0, 1], or remove the key."
+            raise SceneError("up", expected="three finite numbers, not all 0", got=[*self.up], remedy=remedy)
 
 
 def scale_from_option(metres_per_unit: float) -> SceneScale:
     """Take the scale as the user gives it, or raise `ThermoxelsError`; its error is not known."""
-    check_positive(_KEY, metres_per_unit, "Pass the length of one input unit in metres, such as 1.")
-    return SceneScale(float(metres_per_unit), None, f"Given by the user: {metres_per_unit:g} m per unit.")
+    given = SceneScale(metres_per_unit, None, "")
+    return replace(given, source=f"Given by the user: {given.metres_per_unit:g} m per unit.")
 
 
 def scale_from_known_distance(
-    point_a: npt.ArrayLike, point_b: npt.ArrayLike, distance_m: float, standard_error_m: float | None = None
+    point_a: Vector, point_b: Vector, distance_m: float, standard_error_m: float | None = None
 ) -> SceneScale:
     """Find the scale from two points of the scene whose distance was measured, [input units] and [m].
 
@@ -72,33 +94,26 @@ def scale_from_known_distance(
     >>> scale_from_known_distance((0, 0, 0), (0, 3, 4), 10.0, standard_error_m=0.1).standard_error
     0.02
     """
-    a, b = _point("point_a", point_a), _point("point_b", point_b)
-    check_positive("distance_m", distance_m, "Pass the measured distance between the points in metres.")
-    if standard_error_m is not None:
-        remedy = "Pass it in metres, or leave it out."
-        _check_not_negative("standard_error_m", standard_error_m, remedy, ThermoxelsError)
+    known = _KnownDistance(point_a, point_b, distance_m, standard_error_m)
+    a, b = np.array(known.point_a), np.array(known.point_b)
     apart = float(np.linalg.norm(b - a))
+    words = [f"({', '.join(f'{x:.6g}' for x in point.tolist())})" for point in (a, b)]
     if not apart > 1e-12 * max(float(np.abs(a).max()), float(np.abs(b).max())):
         remedy = "Pass two points far from each other, in the coordinates of transforms.json."
-        got = f"{_in_words(a)} and {_in_words(b)}"
+        got = " and ".join(words)
         raise ThermoxelsError("known distance", expected="two different points", got=got, remedy=remedy)
     error = None if standard_error_m is None else standard_error_m / apart
-    source = f"From {distance_m:g} m measured between {_in_words(a)} and {_in_words(b)}, {apart:.6g} units apart."
-    return SceneScale(float(distance_m) / apart, error, source)
+    source = f"From {distance_m:g} m measured between {words[0]} and {words[1]}, {apart:.6g} units apart."
+    return SceneScale(known.distance_m / apart, error, source)
 
 
 def scale_from_scene_file(meta: Mapping[str, Any]) -> SceneScale | None:
     """Read scale and standard error from a scene's json, None if it has none; raises `SceneError` for wrong values."""
-    value, error = meta.get(_KEY), meta.get(_ERROR_KEY)
+    found = _in_file(meta)
+    value = found.metres_per_unit
     if value is None:
-        if error is not None:
-            remedy = f"Add '{_KEY}' or remove '{_ERROR_KEY}'."
-            raise SceneError(f"{_FILE}: {_ERROR_KEY}", expected=f"'{_KEY}' beside it", got="none", remedy=remedy)
         return None
-    check_positive(f"{_FILE}: {_KEY}", value, "Correct the json, or remove the key.", SceneError)
-    if error is not None:
-        _check_not_negative(f"{_FILE}: {_ERROR_KEY}", error, "Correct the json, or remove the key.", SceneError)
-    return SceneScale(float(value), None if error is None else float(error), f"From {_FILE}: {value:g} m per unit.")
+    return SceneScale(value, found.metres_per_unit_standard_error, f"From {_FILE}: {value:g} m per unit.")
 
 
 def up_from_scene_file(meta: Mapping[str, Any]) -> Vector | None:
@@ -107,17 +122,17 @@ def up_from_scene_file(meta: Mapping[str, Any]) -> Vector | None:
     >>> up_from_scene_file({"up": [0, 0, 2]})
     (0.0, 0.0, 1.0)
     """
-    value = meta.get(_UP_KEY)
-    if value is None:
+    up = _in_file(meta).up
+    if up is None:
         return None
-    numbers = isinstance(value, list | tuple) and all(is_number(v) and math.isfinite(v) for v in value)
-    length = math.hypot(*value) if numbers else 0.0
-    if not numbers or len(value) != 3 or not 0.0 < length < math.inf:
-        remedy = "Correct the json, for instance to [0, 0, 1], or remove the key."
-        got = repr(value)
-        raise SceneError(f"{_FILE}: {_UP_KEY}", expected="three finite numbers, not all 0", got=got, remedy=remedy)
-    x, y, z = (float(v) / length for v in value)
+    x, y, z = (part / math.hypot(*up) for part in up)
     return (x, y, z)
+
+
+@raising(SceneError)
+def _in_file(meta: Mapping[str, Any]) -> _InFile:
+    keys = ("metres_per_unit", "metres_per_unit_standard_error", "up")
+    return as_record(_FILE, {key: meta[key] for key in keys if meta.get(key) is not None}, _InFile)
 
 
 def choose_scale(
@@ -140,21 +155,3 @@ def choose_scale(
         beside = f"It goes before the {in_file.metres_per_unit:g} m per unit of {_FILE}."
         return replace(given, source=f"{given.source} {beside}")
     return given
-
-
-def _point(name: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    remedy = "Pass three finite numbers in the coordinates of transforms.json."
-    try:
-        point = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as problem:
-        raise ThermoxelsError(name, expected="three numbers", got=repr(value), remedy=remedy) from problem
-    return check_finite(name, check_shape(name, point, (3,), remedy), remedy)
-
-
-def _check_not_negative(name: str, value: object, remedy: str, error: type[ThermoxelsError]) -> None:
-    if not (isinstance(value, int | float) and is_number(value) and math.isfinite(value) and value >= 0.0):
-        raise error(name, expected="a finite number of at least 0", got=repr(value), remedy=remedy)
-
-
-def _in_words(point: npt.NDArray[np.float64]) -> str:
-    return "(" + ", ".join(f"{float(x):.6g}" for x in point) + ")"

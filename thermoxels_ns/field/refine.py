@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from thermoxels_ns.core.buffer_pool import BUFFERS
+from thermoxels_ns.core.arrays import BUFFERS
 from thermoxels_ns.field.harmonics import num_coefficients
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels

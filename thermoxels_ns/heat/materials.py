@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import cast
+from typing import Annotated, Any, TypeAlias, cast
 
 import numpy as np
+from pydantic import Field
 
-from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml
+from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml, record
 from thermoxels_ns.fem.problem import HeatProblem
 
+Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
+Text: TypeAlias = Annotated[str, Field(pattern=r"\S")]
 
-@dataclass(frozen=True)
+
+@record(HeatError)
 class Material:
     """A uniform, isotropic solid with constant properties.
 
@@ -25,21 +27,10 @@ class Material:
     '8.7810e-07 m2/s'
     """
 
-    name: str
-    conductivity_w_mk: float  # Thermal conductivity, [W / (m K)], above 0
-    density_kg_m3: float  # Mass density, [kg / m3], above 0
-    specific_heat_j_kgk: float  # Specific heat capacity, [J / (kg K)], above 0
-
-    def __post_init__(self) -> None:
-        if not (isinstance(self.name, str) and self.name.strip()):
-            raise HeatError("material name", expected="a name", got=repr(self.name), remedy="Give the material a name.")
-        for field, unit in (
-            ("conductivity_w_mk", "W/(m K)"),
-            ("density_kg_m3", "kg/m3"),
-            ("specific_heat_j_kgk", "J/(kg K)"),
-        ):
-            remedy = f"Give {self.name} a value in {unit}."
-            object.__setattr__(self, field, check_positive(field, getattr(self, field), remedy, HeatError))
+    name: Text
+    conductivity_w_mk: Positive  # Thermal conductivity, [W / (m K)]
+    density_kg_m3: Positive  # Mass density, [kg / m3]
+    specific_heat_j_kgk: Positive  # Specific heat capacity, [J / (kg K)]
 
     @property
     def heat_capacity_j_m3k(self) -> float:
@@ -52,40 +43,25 @@ class Material:
         return self.conductivity_w_mk / self.heat_capacity_j_m3k
 
 
-@dataclass(frozen=True)
-class MaterialFigures:
-    """A material in a file, whose name is the key before it; fields as in `Material`."""
-
-    conductivity_w_mk: float
-    density_kg_m3: float
-    specific_heat_j_kgk: float
-
-    def __post_init__(self) -> None:
-        self.named("it")
-
-    def named(self, name: str) -> Material:
-        """Make the material."""
-        return Material(name, self.conductivity_w_mk, self.density_kg_m3, self.specific_heat_j_kgk)
-
-
-@dataclass(frozen=True)
-class MaterialRow(MaterialFigures):
+@record(HeatError)
+class MaterialRow(Material):
     """A row of the table: design values for conditions as in a building, and where they come from."""
 
-    source: str
+    source: Text
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.source.strip():
-            remedy = "Write where the figures come from."
-            raise HeatError("source", expected="a text", got=repr(self.source), remedy=remedy)
+
+def with_names(content: Any) -> Any:
+    """Put the keys of materials in a file into them, as their names."""
+    if not isinstance(content, dict):
+        return content
+    return {key: {**entry, "name": key} if isinstance(entry, dict) else entry for key, entry in content.items()}
 
 
 @raising(HeatError)
 def load_material_table(path: Path | str | None = None) -> dict[str, MaterialRow]:
     """Read the rows of a yaml file of materials by name, None: of our own; raises `HeatError` for a wrong one."""
     file = configs_folder() / "materials.yaml" if path is None else Path(path)
-    return {name: as_record(f"{file.name}: {name}", row, MaterialRow) for name, row in read_yaml(file).items()}
+    return as_record(file.name, with_names(read_yaml(file)), dict[str, MaterialRow])
 
 
 def material(name: str, table: Mapping[str, MaterialRow] | None = None) -> Material:
@@ -100,7 +76,8 @@ def material(name: str, table: Mapping[str, MaterialRow] | None = None) -> Mater
         remedy = f"Did you mean {close[0]}?" if close else "Correct the name, or give the three figures themselves."
         expected = f"one of {', '.join(rows)}"
         raise HeatError("material", expected=expected, got=repr(name), remedy=remedy)
-    return rows[name].named(name)
+    row = rows[name]
+    return Material(name, row.conductivity_w_mk, row.density_kg_m3, row.specific_heat_j_kgk)
 
 
 def materials_by_region(problem: HeatProblem) -> dict[str, Material]:

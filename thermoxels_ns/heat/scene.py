@@ -1,17 +1,24 @@
-"""A heat scene: materials, surroundings and time; it becomes a problem on a mesh."""
+"""A heat scene: materials, surroundings and time, from a yaml file or not; it becomes a problem on a mesh.
+
+``configs/scene-all-effects.yaml`` explains every key of a file.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, make_dataclass, replace
 from fnmatch import fnmatchcase
-from typing import TypeVar
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
 import numpy as np
 import yaml
+from pydantic import Discriminator, Field, Tag
 
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml, record, wrong
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Quantity, Varying
 from thermoxels_ns.fem.selection import Selection, matching_names
@@ -25,17 +32,17 @@ from thermoxels_ns.heat.effects import (
     InternalHeat,
     Radiation,
 )
-from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.materials import Material, material, with_names
 from thermoxels_ns.heat.scene_fields import (
     WITH_RADIATION,
+    Celsius,
+    Direction,
     Ground,
     InsideAir,
     OutsideAir,
     Sky,
     Sun,
     Surface,
-    check_direction,
-    field_bounds,
     unclear,
 )
 from thermoxels_ns.heat.sky import Vector, outdoor_radiation, swinbank_sky_c
@@ -46,21 +53,19 @@ Value = TypeVar("Value")
 
 _Z_UP: Vector = (0.0, 0.0, 1.0)
 _PATCHES_OF_THEIR_OWN = "Give each of the two its own patches: [names]."
-_SIDES = ("exterior-", "interior-")
-_OF_THE_MESHER = ("cut",)
 
 
-@dataclass(frozen=True)
+@record(HeatError)
 class HeatScene:
     """What a scene file names. What it does not name is not built."""
 
-    materials: Mapping[str, Material]
+    materials: Annotated[Mapping[str, Material], Field(min_length=1)]
     """What regions of the mesh are made of, by name or pattern; of several that match a region, the last one holds."""
     time: TimeSteps | AdaptiveSteps | None = None
     """How the body is followed through time; None: its steady state is asked for."""
-    initial_c: float | None = None
+    initial_c: Celsius | None = None
     """Temperature of the whole body at the start, [degrees Celsius]; None: that of the photographs."""
-    up: Vector | None = None  # Direction that points up in the coordinates of the mesh; None: as the mesh says
+    up: Direction | None = None  # Direction that points up in the coordinates of the mesh; None: as the mesh says
     inside_air: InsideAir | None = None  # The air of a room
     outside_air: OutsideAir | None = None  # The open air and its wind
     surfaces: tuple[Surface, ...] = ()  # How surfaces radiate to sky and ground and absorb sunlight; later entries hold
@@ -79,13 +84,26 @@ class HeatScene:
     description: str = ""  # What the scene is, for reports
 
     def __post_init__(self) -> None:
-        if not self.materials:
-            remedy = "Name one for all regions, as in {'*': Material(...)}."
-            raise unclear("materials", "at least one", "none", remedy)
-        check_direction("up", self.up)
-        if self.initial_c is not None:
-            object.__setattr__(self, "initial_c", float(field_bounds("initial_c").check(self.initial_c)))
-        self._check_what_belongs_together()
+        if self.sky is not None and self.sky.needs_air and self.outside_air is None:
+            remedy = "Add outside_air, or give the sky's temperature_c."
+            raise unclear("sky", "outside_air beside it, whose temperature it follows", "none", remedy)
+        for key, air in (("inside_air", self.inside_air), ("outside_air", self.outside_air)):
+            if self.steady and air is not None and air.air_series is not None:
+                remedy = "Add time: {duration_s: 86400}, or remove air_series."
+                raise unclear(f"{key}: air_series", "time beside it", "steady", remedy)
+        radiates = self.sky is not None or (self.ground is not None and self.ground.surface_c is not None)
+        for key, source, there in (
+            ("emissivity", "sky, or ground with surface_c", radiates),
+            ("absorptivity", "sun", self.sun is not None),
+        ):
+            has = any(getattr(surface, key) is not None for surface in self.surfaces)
+            if there and not has:
+                remedy = f"Add surfaces: [{{{key}: 0.6}}], for example."
+                raise unclear(f"surfaces: {key}", f"a number beside {source}", "none", remedy)
+            if has and not there:
+                raise unclear(f"surfaces: {key}", f"{source} beside it", "none", f"Add it, or remove {key}.")
+        if self.ground is not None and self.ground.reflectance is not None and self.sun is None:
+            raise unclear("ground: reflectance", "a sun to reflect", "none", "Add sun, or remove reflectance.")
 
     @property
     def steady(self) -> bool:
@@ -174,28 +192,6 @@ class HeatScene:
             return above(air)
         return replace(air, function=lambda places, time_s: above(float(np.max(air.function(places, time_s)))))
 
-    def _check_what_belongs_together(self) -> None:
-        if self.sky is not None and self.sky.needs_air and self.outside_air is None:
-            remedy = "Add outside_air, or give the sky's temperature_c."
-            raise unclear("sky", "outside_air beside it, whose temperature it follows", "none", remedy)
-        for key, air in (("inside_air", self.inside_air), ("outside_air", self.outside_air)):
-            if self.steady and air is not None and air.air_series is not None:
-                remedy = "Add time: {duration_s: 86400}, or remove air_series."
-                raise unclear(f"{key}: air_series", "time beside it", "steady", remedy)
-        radiates = self.sky is not None or (self.ground is not None and self.ground.surface_c is not None)
-        for key, source, there in (
-            ("emissivity", "sky, or ground with surface_c", radiates),
-            ("absorptivity", "sun", self.sun is not None),
-        ):
-            has = any(getattr(surface, key) is not None for surface in self.surfaces)
-            if there and not has:
-                remedy = f"Add surfaces: [{{{key}: 0.6}}], for example."
-                raise unclear(f"surfaces: {key}", f"a number beside {source}", "none", remedy)
-            if has and not there:
-                raise unclear(f"surfaces: {key}", f"{source} beside it", "none", f"Add it, or remove {key}.")
-        if self.ground is not None and self.ground.reflectance is not None and self.sun is None:
-            raise unclear("ground: reflectance", "a sun to reflect", "none", "Add sun, or remove reflectance.")
-
     def _check_counted_once(self, where: list[tuple[str, set[str]]]) -> None:
         """Refuse two kinds of air on one patch, and radiation in a coefficient beside radiation of its own."""
         touching = ("inside_air", "outside_air", "convection", "ground_contact")
@@ -218,6 +214,67 @@ class HeatScene:
                     if name in linear:
                         remedy = f"Set coefficient: iso-6946-convection in {name}, which leaves radiation out."
                     check_disjoint("radiation", [(name, chosen), (other, elsewhere)], remedy)
+
+
+def _steps(content: Any) -> str:
+    return "equal" if isinstance(content, dict) and {"steps", "step_seconds"} & set(content) else "adaptive"
+
+
+_Time = Annotated[Annotated[TimeSteps, Tag("equal")] | Annotated[AdaptiveSteps, Tag("adaptive")], Discriminator(_steps)]
+
+
+@cache
+def _file_record() -> type:
+    """The keys of a file: those of `HeatScene`, with three differences."""
+    hints = get_type_hints(HeatScene, include_extras=True)
+    own = [(one.name, hints[one.name], one) for one in fields(HeatScene)]
+    return make_dataclass("Scene", [
+        ("materials", dict[str, str | Material]),
+        ("initial", Literal["photographs"] | dict[Literal["temperature_c"], Celsius], "photographs"),
+        ("steady", bool, False),
+        ("time", _Time | None, None),
+        *(one for one in own if one[0] not in ("materials", "initial_c", "time")),
+    ])  # fmt: skip
+
+
+def heat_scene_names() -> list[str]:
+    """List the names that `load_heat_scene` knows."""
+    return sorted(path.stem.removeprefix("scene-") for path in configs_folder().glob("scene-*.yaml"))
+
+
+@raising(HeatError)
+def load_heat_scene(name: Path | str) -> HeatScene:
+    """Read a heat scene from a yaml file, or by the name of one that the package brings, such as ``winter-night``.
+
+    A file has the fields of `HeatScene` as keys, with three differences: materials are names of the table or
+    three figures, the start is ``initial: photographs`` or ``initial: {temperature_c: 15}``, and a scene has
+    either ``steady: true`` or ``time:`` with the fields of `TimeSteps` or of `AdaptiveSteps`. Raises `HeatError` for
+    what is wrong in it.
+    """
+    path = Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        path = configs_folder() / f"scene-{name}.yaml"
+        if not path.is_file():
+            expected = f"one of {', '.join(heat_scene_names())}, or the path of a yaml file"
+            raise wrong("heat scene", expected, repr(str(name)), "Correct the name.")
+    content = read_yaml(path)
+    for air in (content.get("inside_air"), content.get("outside_air")):
+        if isinstance(air, dict) and isinstance(air.get("air_series"), str):
+            air["air_series"] = str(path.parent / air["air_series"])
+    if "materials" in content:
+        content["materials"] = with_names(content["materials"])
+    found = vars(as_record(path.name, content, _file_record()))
+    initial, steady = found.pop("initial"), found.pop("steady")
+    if steady == (found["time"] is not None):
+        got = "both" if steady else "neither"
+        remedy = "Remove one of the two." if steady else "Add time: {steps: 10, step_seconds: 60}, for example."
+        raise wrong(path.name, "either steady: true or time", got, remedy)
+    found["initial_c"] = None if initial == "photographs" else initial["temperature_c"]
+    with raising(HeatError, f"{path.name}: "):
+        found["materials"] = {
+            region: material(one) if isinstance(one, str) else one for region, one in found["materials"].items()
+        }
+        return HeatScene(**found)
 
 
 def _irradiance(sun: Sun, reflectance: float) -> Varying:
@@ -283,7 +340,10 @@ class ScenePatches:
         if forgotten:
             shares = (f"{patch} ({100.0 * self.area_m2[patch] / whole:.3g} % of the surface)" for patch in forgotten)
             expected, got = "something that acts on every patch, or the patch named adiabatic", ", ".join(shares)
-            remedy = f"{_what_may_act(acting, forgotten)}, or write adiabatic: {_yaml_list((*adiabatic, *forgotten))}."
+            written = yaml.safe_dump(
+                [*adiabatic, *forgotten], default_flow_style=True, allow_unicode=True, width=math.inf
+            )
+            remedy = f"Name them in an entry that acts on them, or write adiabatic: {written.strip()}."
             raise HeatError("heat scene", expected=expected, got=f"nothing on {got}", remedy=remedy)
 
 
@@ -296,21 +356,6 @@ def check_disjoint(what: str, entries: Sequence[tuple[str, set[str]]], remedy: s
             got = f"{second} on {', '.join(both)} as well"
             raise HeatError(first, expected=f"{what} once on each patch", got=got, remedy=remedy)
         taken |= dict.fromkeys(elsewhere, second)
-
-
-def _what_may_act(acting: set[str], forgotten: Sequence[str]) -> str:
-    """What to do about patches on which nothing acts; those with names of the user's own left exterior-... for them."""
-    own = [name for name in forgotten if name not in _OF_THE_MESHER and not name.startswith(_SIDES)]
-    if not own:
-        return "Add what acts there"
-    sides = [f"{side}*" for side in _SIDES if any(name.startswith(side) for name in acting)][:1]
-    patches = _yaml_list((*sides, *(_as_pattern(name) for name in own)))
-    return f"Name them in the entry that acts on them, such as patches: {patches}"
-
-
-def _yaml_list(names: Sequence[str]) -> str:
-    """Names as a list of a scene file; in quotes where yaml would read more into one."""
-    return yaml.safe_dump([*names], default_flow_style=True, allow_unicode=True, width=math.inf).strip()
 
 
 def _as_pattern(name: str) -> str:

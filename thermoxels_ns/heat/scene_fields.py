@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from datetime import datetime
+from dataclasses import field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, TypeAlias, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import AfterValidator, AwareDatetime, Field
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
+from thermoxels_ns.core.yaml_records import record
 from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying, tabulated
 from thermoxels_ns.heat.effects import HOTTEST_C, STEFAN_BOLTZMANN_W_M2K4, Convection
 from thermoxels_ns.heat.sky import Vector
@@ -97,70 +97,31 @@ INSIDE = ("interior-*",)  # Patches that the air inside acts on, unless others a
 
 WITH_RADIATION = ("iso-6946-combined", "iso-6946-separate")  # Coefficients that hold radiation as well
 
-_RANGES: dict[str, Bounds] = {
-    "emissivity": Bounds("emissivity", "1", 0.0, 1.0),
-    "absorptivity": Bounds("absorptivity", "1", 0.0, 1.0),
-    "reflectance": Bounds("reflectance", "1", 0.0, 1.0),
-    "latitude_deg": Bounds("latitude_deg", "degrees", -90.0, 90.0),
-    "longitude_deg": Bounds("longitude_deg", "degrees", -180.0, 180.0),
-}
-_UNITS: dict[str, tuple[str, float, float]] = {
-    "_w_m2k": ("W/(m2 K)", 0.0, math.inf),
-    "_w_m2": ("W/m2", 0.0, math.inf),
-    "_m_s": ("m/s", 0.0, math.inf),
-    "_c": ("degrees Celsius", -ZERO_CELSIUS_K, HOTTEST_C),
-    "_k": ("kelvin", 0.0, math.inf),
-}
+
+def _direction(vector: Vector) -> Vector:
+    if not 0.0 < math.hypot(*vector) < math.inf:
+        raise unclear("", "a direction", list(vector), "Give three numbers, such as [0, 1, 0].")
+    return vector
 
 
-def field_bounds(name: str) -> Bounds:
-    """Give the range of a number by the name of its field, which ends with its unit.
-
-    >>> field_bounds("wind_m_s").unit
-    'm/s'
-    """
-    if name in _RANGES:
-        return _RANGES[name]
-    ending = next(ending for ending in _UNITS if name.endswith(ending))
-    return Bounds(name, *_UNITS[ending])
+Celsius: TypeAlias = Annotated[float, Field(ge=-ZERO_CELSIUS_K, le=HOTTEST_C)]
+AtLeastZero: TypeAlias = Annotated[float, Field(ge=0.0)]
+Fraction: TypeAlias = Annotated[float, Field(ge=0.0, le=1.0)]
+Direction: TypeAlias = Annotated[Vector, AfterValidator(_direction)]
+Patches: TypeAlias = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
-class Section:
-    """Checks the fields of a section: numbers by the units in their names, choices, and names of patches."""
-
-    def __post_init__(self) -> None:
-        hints = get_type_hints(type(self))
-        for own in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, own.name)
-            kinds = (hints[own.name], *get_args(hints[own.name]))
-            choices = next((get_args(kind) for kind in kinds if get_origin(kind) is Literal), ())
-            if value is None and type(None) in kinds:
-                continue
-            if float in kinds:
-                number = field_bounds(own.name).check(cast(Any, value))
-                object.__setattr__(self, own.name, float(number))
-            if choices and value not in choices:
-                raise unclear(own.name, f"one of {', '.join(choices)}", repr(value), "Correct it.")
-            if own.name == "patches" and (not value or isinstance(value, str)):
-                raise unclear("patches", "a list of names or patterns", repr(value), "Name at least one, in a list.")
-        self._check()
-
-    def _check(self) -> None:
-        """Check what concerns several fields."""
-
-
-@dataclass(frozen=True)
-class _Air(Section):
+@record(HeatError)
+class _Air:
     """Air whose temperature is a number, or changes with time as a file says."""
 
-    air_c: float  # Temperature of the air, [degrees Celsius], at least -273.15
+    air_c: Celsius  # Temperature of the air, [degrees Celsius], at least -273.15
     air_series: str | None = field(default=None, kw_only=True)
     """A csv file beside the scene with the columns hours (since the start) and air_c: the temperature as time goes, in
     straight lines, held before and after; air_c is then what coefficients are taken at. A sky that follows the air
     follows it too."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         _ = self.temperature  # refuses a file that cannot be read
 
     @property
@@ -169,7 +130,7 @@ class _Air(Section):
         return self.air_c if self.air_series is None else read_air_series(self.air_series)
 
 
-@dataclass(frozen=True)
+@record(HeatError)
 class InsideAir(_Air):
     """The air of a room."""
 
@@ -177,14 +138,15 @@ class InsideAir(_Air):
     """Heat transfer coefficient by the orientation of each surface, after ISO 6946: iso-6946-combined (1 / Rsi,
     convection and radiation together), iso-6946-separate (hci + 4 eps sigma T^3 at the temperature of the air), or
     iso-6946-convection (hci alone, for scenes that name radiation themselves)."""
-    coefficient_w_m2k: float | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
-    emissivity: float | None = None  # Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else
+    coefficient_w_m2k: AtLeastZero | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
+    emissivity: Fraction | None = None  # Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else
     heat_flow: HeatFlow = "into-body"
     """into-body: the air is warmer than the surfaces, as in a heated room, and loses most to the ceiling; out-of-body:
     it is colder. Named coefficients depend on it."""
-    patches: tuple[str, ...] = INSIDE  # Patches that it acts on, by name or pattern
+    patches: Patches = INSIDE  # Patches that it acts on, by name or pattern
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
+        super().__post_init__()
         _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
 
     def convection(self) -> Convection:
@@ -196,7 +158,7 @@ class InsideAir(_Air):
         return Convection(self.patches, coefficient, self.temperature)
 
 
-@dataclass(frozen=True)
+@record(HeatError)
 class OutsideAir(_Air):
     """The open air."""
 
@@ -204,13 +166,14 @@ class OutsideAir(_Air):
     """Heat transfer coefficient: iso-6946-combined (1 / Rse = 25, convection and radiation together), iso-6946-separate
     (4 + 4 v, and 4 eps sigma T^3 at the temperature of the air), iso-6946-convection (4 + 4 v alone, for scenes that
     name radiation themselves), or thermoxels-original (18.6 v^0.605, convection alone)."""
-    coefficient_w_m2k: float | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
-    wind_m_s: float | None = None
+    coefficient_w_m2k: AtLeastZero | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
+    wind_m_s: AtLeastZero | None = None
     """Wind speed beside the surfaces, [m / s], for the coefficients that depend on it and for no other."""
-    emissivity: float | None = None  # Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else
-    patches: tuple[str, ...] = OUTSIDE  # Patches that it acts on, by name or pattern
+    emissivity: Fraction | None = None  # Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else
+    patches: Patches = OUTSIDE  # Patches that it acts on, by name or pattern
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
+        super().__post_init__()
         _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
         windy = self.coefficient not in (None, "iso-6946-combined")
         _check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
@@ -225,31 +188,31 @@ class OutsideAir(_Air):
         return Convection(self.patches, coefficient, self.temperature)
 
 
-@dataclass(frozen=True)
-class Surface(Section):
+@record(HeatError)
+class Surface:
     """How surfaces radiate and absorb; sky, ground and sun act on those that are named so."""
 
-    emissivity: float | None = None
+    emissivity: Fraction | None = None
     """Emissivity for long-wave radiation, 0 to 1; without it they do not radiate to sky and ground."""
-    absorptivity: float | None = None  # Share of the sunlight that they absorb, 0 to 1; without it they take up none
-    patches: tuple[str, ...] = OUTSIDE
+    absorptivity: Fraction | None = None  # Share of the sunlight that they absorb, 0 to 1; without it they take up none
+    patches: Patches = OUTSIDE
     """Patches, by name or pattern; of several entries for one patch, the later one holds."""
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         if self.emissivity is None and self.absorptivity is None:
-            raise unclear("surface", "emissivity, absorptivity or both", "neither", "Give one of them.")
+            raise unclear("", "emissivity, absorptivity or both", "neither", "Give one of them.")
 
 
-@dataclass(frozen=True)
-class Sky(Section):
+@record(HeatError)
+class Sky:
     """The sky that surfaces radiate to. One of the three ways to give its temperature is needed."""
 
-    temperature_c: float | None = None  # Its effective temperature, [degrees Celsius], at least -273.15
+    temperature_c: Celsius | None = None  # Its effective temperature, [degrees Celsius], at least -273.15
     model: Literal["swinbank"] | None = None  # swinbank: a clear sky, 0.0552 T^1.5 of the outside air in kelvin
-    below_air_k: float | None = None
+    below_air_k: AtLeastZero | None = None
     """How much colder it is than the outside air, [K]; 6 is common for skies with some clouds (Whillier 1967)."""
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         _check_one(temperature_c=self.temperature_c, model=self.model, below_air_k=self.below_air_k)
 
     @property
@@ -258,44 +221,46 @@ class Sky(Section):
         return self.temperature_c is None
 
 
-@dataclass(frozen=True)
-class Ground(Section):
+@record(HeatError)
+class Ground:
     """The ground that surfaces see."""
 
-    surface_c: float | None = None
+    surface_c: Celsius | None = None
     """Temperature of its surface, [degrees Celsius], at least -273.15; without it nothing radiates to the ground."""
-    reflectance: float | None = None
+    reflectance: Fraction | None = None
     """Share of the sunlight that it reflects, 0 to 1 (grass 0.2, fresh snow 0.8); without it, it reflects none."""
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         if self.surface_c is None and self.reflectance is None:
-            raise unclear("ground", "surface_c, reflectance or both", "neither", "Give one of them.")
+            raise unclear("", "surface_c, reflectance or both", "neither", "Give one of them.")
 
 
-@dataclass(frozen=True)
-class Sun(Section):
+@record(HeatError)
+class Sun:
     """Sunlight: from a date and place, or from a direction; as strong as given, or as under a clear sky.
 
     No part of the body shades another.
     """
 
-    start: datetime | None = None
+    start: AwareDatetime | None = None
     """Date and time of the scene's start, with a time zone, such as 2025-06-21T12:00:00+02:00; the sun moves on."""
-    latitude_deg: float | None = None  # Latitude of the place, north positive, [degrees], -90 to 90; goes with `start`
-    longitude_deg: float | None = None
+    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = (
+        None  # Latitude of the place, north positive, [degrees], -90 to 90; goes with `start`
+    )
+    longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0)] | None = None
     """Longitude of the place, east positive, [degrees], -180 to 180; goes with `start`."""
-    north: Vector | None = None  # Direction that points north in the coordinates of the mesh; goes with `start`
-    towards: Vector | None = None
+    north: Direction | None = None  # Direction that points north in the coordinates of the mesh; goes with `start`
+    towards: Direction | None = None
     """Direction from the mesh to the sun in the coordinates of the mesh, instead of date and place."""
     clear_sky: Literal["meinel"] | None = None
     """meinel: direct and diffuse light under a clear sky at sea level by the height of the sun; goes with `start`."""
-    direct_w_m2: float | None = None
+    direct_w_m2: AtLeastZero | None = None
     """Direct light on a surface that faces the sun, [W / m2], at least 0, as long as the sun is up."""
-    diffuse_w_m2: float = 0.0
+    diffuse_w_m2: AtLeastZero = 0.0
     """Light from the sky on a surface that faces up, [W / m2], at least 0, as long as the sun is up."""
-    patches: tuple[str, ...] = OUTSIDE  # Patches that it may reach, by name or pattern
+    patches: Patches = OUTSIDE  # Patches that it may reach, by name or pattern
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         _check_one(start=self.start, towards=self.towards)
         for name in ("latitude_deg", "longitude_deg", "north"):
             given = getattr(self, name)
@@ -309,17 +274,12 @@ class Sun(Section):
         if self.clear_sky is not None and self.diffuse_w_m2 > 0.0:
             got = f"{self.diffuse_w_m2:g}"
             raise unclear("diffuse_w_m2", "none beside clear_sky", got, "Remove one of the two.")
-        if self.start is not None and self.start.utcoffset() is None:
-            remedy = f"Write {self.start.isoformat()}+01:00, for example, or Z at its end for universal time."
-            raise unclear("start", "a date and time with a time zone", self.start.isoformat(), remedy)
-        for name in ("north", "towards"):
-            check_direction(name, getattr(self, name))
 
 
 def read_air_series(path: str) -> Varying:
     """Read the temperature of air from a csv file with the columns hours and air_c; raises `HeatError`."""
     table = _air_series(path)
-    field_bounds("air_c").check(table[:, 1])
+    Bounds("air_c", "degrees Celsius", -ZERO_CELSIUS_K, HOTTEST_C).check(table[:, 1])
     return tabulated(3600.0 * table[:, 0], table[:, 1])
 
 
@@ -331,24 +291,20 @@ def air_series_hours(path: str) -> npt.NDArray[np.float64]:
 def _air_series(path: str) -> npt.NDArray[np.float64]:
     """Hours and temperatures of a csv file, shape (k, 2)."""
     try:
-        rows = [row for row in csv.reader(Path(path).read_text(encoding="utf-8-sig").splitlines()) if any(row)]
-    except (OSError, UnicodeDecodeError, csv.Error) as problem:
+        lines = [line for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip(" ,")]
+    except (OSError, UnicodeDecodeError) as problem:
         got = problem.strerror if isinstance(problem, OSError) else str(problem)
         raise unclear("air_series", "a csv file beside the scene", f"{path}: {got}", "Correct the name.") from problem
-    if not rows or [name.strip() for name in rows[0]] != ["hours", "air_c"]:
-        got = ",".join(rows[0]) if rows else "nothing"
+    if not lines or [name.strip() for name in lines[0].split(",")] != ["hours", "air_c"]:
+        got = lines[0] if lines else "nothing"
         raise unclear(f"air_series: {path}", "the first line hours,air_c", got, "Write it so.")
     try:
-        return np.array([[float(hours), float(air_c)] for hours, air_c in rows[1:]]).reshape(-1, 2)
+        return np.array(
+            [[float(hours), float(air_c)] for hours, air_c in (line.split(",") for line in lines[1:])]
+        ).reshape(-1, 2)
     except ValueError as problem:
         remedy = "Write 1.5,-3.2, for example."
         raise unclear(f"air_series: {path}", "two numbers in each line", str(problem), remedy) from problem
-
-
-def check_direction(name: str, vector: Vector | None) -> None:
-    """Refuse three numbers that are no direction."""
-    if vector is not None and not 0.0 < math.hypot(*vector) < math.inf:
-        raise unclear(name, "a direction", list(vector), "Give three numbers, such as [0, 1, 0].")
 
 
 def _check_coefficient(named: str | None, number: float | None, emissivity: float | None) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from thermoxels_ns.core.buffer_pool import BUFFERS
+from thermoxels_ns.core.arrays import BUFFERS
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.threads import num_threads, run_ranges, run_tasks
 from thermoxels_ns.field.voxel_grid import VoxelGrid

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 
 from thermoxels_ns.audit.conditions import Survey, unknown_name
-from thermoxels_ns.audit.defect_figures import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE
 from thermoxels_ns.audit.draws import CONFIDENCE
 from thermoxels_ns.audit.results import Audit
+from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE
 from thermoxels_ns.reports.audit_pictures import MOST_DEFECTS, AuditPictures
 from thermoxels_ns.reports.numbers import number_text, stated_text
 from thermoxels_ns.reports.page import Picture, build_page

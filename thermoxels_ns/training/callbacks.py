@@ -15,8 +15,8 @@ from threadpoolctl import threadpool_limits
 from torch.nn import Parameter
 
 from thermoxels_ns.core.errors import PruningError
+from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.field.refine import RowChange, prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import backdrop_without_walls, mean_colours

@@ -18,9 +18,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM, FeatureRays
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
@@ -308,8 +307,8 @@ class ThermoxelsModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation, in_box (1 if it meets the box).
 
-        Rays of a batch carry their stream (see `core.ray_streams`). In training only what it needs is rendered, and the
-        outputs are those that losses are made of. A crop that the viewer sets (nears, fars) is kept.
+        Rays of a batch carry their stream (see `core.feature_rays`). In training only what it needs is rendered, and
+        the outputs are those that losses are made of. A crop that the viewer sets (nears, fars) is kept.
         """
         request = self._request(ray_bundle.origins, ray_bundle.directions, ray_bundle.nears, ray_bundle.fars)
         stream = ray_bundle.metadata.get("stream")

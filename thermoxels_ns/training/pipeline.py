@@ -16,10 +16,10 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from thermoxels_ns.core.config_loader import ModuleWith
 from thermoxels_ns.core.errors import CheckpointError, SceneError
+from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.core.module_with import ModuleWith
-from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.core.threads import set_num_threads
 from thermoxels_ns.field.voxel_grid import VoxelGrid

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int64
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from thermoxels_ns.core.ray_streams import THERMAL_STREAM
+from thermoxels_ns.core.feature_rays import THERMAL_STREAM
 from thermoxels_ns.field.interpolation import TrilinearPoints, splat
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.renderers import GridSamples
@@ -138,7 +138,7 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
     is only ever used mixed with its neighbours', so an image can be right while single corners overshoot; the average
     over what rays used has no such freedom. Only first hits count for it: samples of rays that end on something
     (opacity above one half), before half of the ray's light is spent. What leaks through a surface measures nothing
-    behind it. A ray that says of no stream (see `core.ray_streams`) counts as thermal too.
+    behind it. A ray that says of no stream (see `core.feature_rays`) counts as thermal too.
     """
     grid = model.grid
     device = grid.density.device

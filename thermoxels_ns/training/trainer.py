@@ -25,9 +25,8 @@ from thermoxels_ns.core.checks import (
     replace_when_done,
     writable_folder,
 )
-from thermoxels_ns.core.config_loader import ConfigLoader
+from thermoxels_ns.core.config_loader import ConfigLoader, typed, typed_value
 from thermoxels_ns.core.errors import CheckpointError, OutputError, ThermoxelsError
-from thermoxels_ns.core.option_help import typed, typed_value
 from thermoxels_ns.training.schedule import QUALITIES, Quality, Schedule, schedule_for
 
 LOCAL_HOST = "127.0.0.1"

@@ -9,7 +9,6 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -63,7 +62,7 @@ class Plane:
 class Colour:
     """A colour in whole numbers to 255 or in decimals to 1.0, and the longest distance to it on the same scale."""
 
-    rgb: tuple[Real, Real, Real]
+    rgb: tuple[int | float, int | float, int | float]
     max_distance: float = math.inf
 
     def __post_init__(self) -> None:

@@ -1,18 +1,21 @@
-"""Tracks of structure from motion: their file, and the feature rays they give."""
+"""Tracks of structure from motion: their file, a COLMAP model beside a scene, and the feature rays they give."""
 
 from __future__ import annotations
 
 import io
+import struct
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import remedy_of, replace_when_done
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.feature_rays import FeatureRays, FloatArray, IntArray, agrees_with_neighbours
+from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.data.scene_file import Frame
 
 TRACKS_KEY = "tracks_file_path"  # name in transforms.json under which the file of tracks is given
@@ -22,6 +25,13 @@ LEAST_ERROR_PX = 0.3  # error that a point has at least: what three photographs 
 LEAST_PARALLAX_DEG = 2.0  # largest angle between the rays of a point below which its distance is not known
 MOST_BEHIND = 0.1  # share of sightings behind their camera above which tracks belong to other poses
 _REMEDY = f"Write the scene again with thermoxels capture, or remove {TRACKS_KEY} from the json to train without it."
+
+COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "sparse")
+"""Where a model may lie in a scene's folder, the first that does counts."""
+
+_LEAST_CAMERA_BYTES = 48  # of a camera with three parameters; others have more
+_LAYOUT = {"frames": (64, "<I", 16), "images": (64, "<Q", 24), "points3D": (43, "<Q", 8)}
+"""Bytes of an entry before the number of its parts (of an image: before its name), that number, bytes of each part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,3 +145,59 @@ def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray
     across = np.linalg.norm(np.cross(directions, mean[point]), axis=1)
     np.maximum.at(off, point, np.arctan2(across, (directions * mean[point]).sum(axis=1)))
     return 2.0 * off
+
+
+def read_model(folder: Path) -> Any:
+    """Read the COLMAP model in a folder as a `pycolmap.Reconstruction`; a `SceneError` where a file is not whole."""
+    import pycolmap  # slow to import and only needed here
+
+    check_complete(folder)
+    try:
+        return pycolmap.Reconstruction(str(folder))
+    except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
+        raise SceneError(f"it cannot be read, {(str(problem).strip() or repr(problem)).splitlines()[-1]}") from problem
+
+
+def camera_to_world(image: Any) -> FloatArray:
+    """Pose of a pycolmap image, camera axes x right, y up, z back as transforms.json has them, shape (4, 4)."""
+    pose = np.eye(4)
+    pose[:3] = image.cam_from_world().inverse().matrix()
+    return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def check_complete(folder: Path) -> None:
+    """Refuse a model with a file (named) that may not be read, or ends before what it announces.
+
+    Of the one pycolmap would say that it is none, of the other it would read on behind the end.
+    """
+    for name in ("cameras", "frames", "images", "points3D"):
+        for path in (folder / f"{name}.txt", folder / f"{name}.bin"):
+            if not path.is_file():
+                continue
+            try:
+                with path.open("rb") as file:
+                    whole = path.suffix == ".txt" or _complete(name, file.read())
+            except OSError as problem:
+                got = f"{path.name}: {problem.strerror}; check its permissions and the disk"
+                raise SceneError(f"it cannot be read, {got}") from problem
+            if not whole:
+                said = f"{path.name} ends before its last entry, as after an interrupted copy"
+                raise SceneError(f"it cannot be read, {said}")
+
+
+def _complete(name: str, data: bytes) -> bool:
+    try:
+        (count,) = struct.unpack_from("<Q", data)
+        end = 8
+        if name == "cameras":
+            return len(data) >= end + count * _LEAST_CAMERA_BYTES
+        before, kind, size = _LAYOUT[name]
+        for _ in range(count):
+            end += before
+            if name == "images":
+                end = data.index(b"\0", end) + 1
+            (parts,) = struct.unpack_from(kind, data, end)
+            end += struct.calcsize(kind) + parts * size
+    except (struct.error, ValueError):  # a number, or the end of a name, behind the end
+        return False
+    return end <= len(data)
