@@ -12,8 +12,9 @@ from thermoxels_ns.core import threads
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.threads import num_threads, set_num_threads
 from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
+from thermoxels_ns.render.fused import render as fused_render
 from thermoxels_ns.render.ray_render import RenderOptions
-from thermoxels_ns.render.renderers import fused_render, sample_rays
+from thermoxels_ns.render.renderers import sample_rays
 from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.optimizers import RowAdam, RowRMSprop
 
