@@ -165,8 +165,9 @@ def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> March
     active = (steps.deltas > 0).flatten().nonzero()[:, 0]
     ray = active // steps.t.shape[1]
     positions = origins[ray] + directions[ray] * steps.t.flatten()[active][:, None]
-    kept = grid.in_kept_voxel(positions)
-    active, ray, at = active[kept], ray[kept], grid.locate(positions[kept])
+    at = grid.locate(positions)
+    kept = at.kept()  # of a point that rounding puts outside the box, the nearest voxel counts, as in the kernels
+    active, ray, at = active[kept], ray[kept], at.select(kept)
     density = torch.zeros_like(steps.t).flatten().index_put((active,), grid.density_at(at)).view_as(steps.t)
     return Marched(steps, density, ray_weights(density, steps.deltas), active, ray, at)
 
