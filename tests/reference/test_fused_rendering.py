@@ -3,7 +3,6 @@
 import itertools
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -15,7 +14,6 @@ from tests.reference.two_renderers import (
     as_double,
     assert_twins_agree,
     in_double,
-    keep_only,
     random_grid,
     random_request,
     see,
@@ -178,40 +176,6 @@ def test_no_rays():
         assert all(float(g.abs().sum()) == 0.0 for g in seen.gradients.values())
 
 
-# What is skipped: blocks without kept voxels.
-
-
-def flat(shape: tuple[int, int, int], *index: tuple[int, int, int]) -> np.ndarray:
-    return np.sort(np.array([np.ravel_multi_index(i, shape) for i in index], dtype=np.int64))
-
-
-SHAPES = [(8, 8, 8), (9, 17, 5), (16, 8, 24), (7, 1, 3), (1, 1, 1), (23, 25, 24)]
-
-
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-@pytest.mark.parametrize("pattern", ["all", "none", "first", "last", "one block", "two corners", "few", "checkers"])
-def test_block_skipping(shape, pattern):
-    total, random = int(np.prod(shape)), np.random.default_rng(2)
-    index = np.stack(np.unravel_index(np.arange(total), shape), -1)
-    last = tuple(n - 1 for n in shape)
-    cells = {
-        "all": np.arange(total),
-        "none": np.zeros(0, dtype=np.int64),
-        "first": np.array([0]),
-        "last": np.array([total - 1]),
-        "one block": np.flatnonzero((index // 8 == [n // 16 for n in shape]).all(1)),
-        "two corners": np.unique(flat(shape, (0, 0, 0), last)),
-        "few": np.flatnonzero(random.random(total) < 0.02),
-        "checkers": np.flatnonzero(index.sum(1) % 2 == 0),
-    }[pattern]
-    lattice = Lattice((-0.3, 0.2, -1.0), 0.125, tuple(n + 1 for n in shape))
-    grid = random_grid(0, 0, "softplus", cells, lattice)
-    reference = assert_twins_agree(grid, random_request(grid, 60), EVERYTHING)
-    if len(cells) == 0:
-        assert bool(torch.isinf(reference.values["depth"]).all())
-        assert bool((reference.values["transmittance"] == 1.0).all())
-
-
 @st.composite
 def cases(draw):
     """A lattice of any shape, a sparse pattern and rays, some of them along the axes and on faces between voxels."""
@@ -265,17 +229,3 @@ def test_both_backends_list_the_same_samples(case):
 def test_any_pattern_has_the_reference_s_values_and_gradients(case):
     grid, request, options = case
     assert_twins_agree(grid, request, replace(EVERYTHING, steps_per_voxel=options.steps_per_voxel))
-
-
-@pytest.mark.parametrize("backend", ["fused", "reference"])
-def test_samples_leave_out_what_no_voxel_keeps(backend):
-    grid = keep_only(random_grid(0, lattice=Lattice((0.0, 0.0, 0.0), 1.0, (25, 3, 3))), flat((24, 2, 2), (20, 1, 0)))
-    grid.density.data.fill_(0.3)
-    request = RayRequest(torch.tensor([[-3.0, 1.5, 0.25]]), torch.tensor([[1.0, 0.0, 0.0]]))
-    samples = sample_rays(grid, request, RenderOptions(), backend)
-    assert samples.at.number.tolist() == [0, 0] and samples.ray.tolist() == [0, 0]
-    torch.testing.assert_close(
-        samples.at.fraction, torch.tensor([[0.25, 0.5, 0.25], [0.75, 0.5, 0.25]]), atol=1e-6, rtol=0
-    )
-    assert float(samples.before[1]) == pytest.approx(float(samples.weight[0]), rel=1e-6)
-    assert float(samples.transmittance) == pytest.approx(1.0 - float(samples.weight.sum()), rel=1e-6)

@@ -219,10 +219,3 @@ def test_views_that_all_look_the_same_way(tmp_path):
     (scene / "transforms.json").write_text(json.dumps(transforms))
     pipeline = train(scene, 70, SCHEDULE)
     assert all_finite(pipeline) and np.isfinite(evaluate(pipeline)["psnr"])
-
-
-def test_training_repeats_bit_for_bit(tmp_path):
-    scene = sphere(tmp_path / "scene", views=4)
-    first, second = (train(scene, 8, rays=128) for _ in range(2))
-    for a, b in zip(first.parameters(), second.parameters()):
-        assert torch.equal(a, b)
