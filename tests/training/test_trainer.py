@@ -108,15 +108,6 @@ def test_checkpoints_that_a_training_cannot_go_on_from(scene, checkpoints, tmp_p
         trainer(scene, tmp_path, *options, "--load-dir", str(checkpoints)).setup()
 
 
-@pytest.mark.parametrize("where", ["run", "nowhere", "empty"])
-def test_folders_without_checkpoints(scene, checkpoints, tmp_path, where):
-    """The run's own folder, whose name stands in nerfstudio's log, holds them one level below."""
-    (tmp_path / "empty").mkdir()
-    folder = checkpoints.parent if where == "run" else tmp_path / where
-    with pytest.raises(CheckpointError, match=r"no step-\*.ckpt in .* Pass the folder nerfstudio_models"):
-        trainer(scene, tmp_path, "--load-dir", str(folder)).setup()
-
-
 @pytest.mark.parametrize("steps", [10, 33, 400, 20_000])
 @pytest.mark.parametrize("resolution", [1, 20, 32, 33, 50, 64, 96, 100, 128, 256, 512, 1024])
 def test_a_schedule_is_one_that_a_model_accepts(resolution, steps):
