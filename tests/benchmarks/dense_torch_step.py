@@ -15,7 +15,7 @@ from torch import Tensor
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.field.harmonics import harmonics
 from thermoxels_ns.field.voxel_grid import VoxelGrid, activate_density
-from thermoxels_ns.render.compositing import ray_weights, sample_box
+from thermoxels_ns.render.reference import ray_weights, sample_box
 
 
 class DenseField:

@@ -1,16 +1,15 @@
 """Colour gets columns for further harmonics: colours, gradients and optimisers go on as if they had been there."""
 
 import copy
-from dataclasses import replace
 
 import pytest
 import torch
 
-from tests.reference.two_renderers import EVERYTHING, RENDERERS, random_grid, random_request, see
+from tests.reference.two_renderers import random_grid
 from thermoxels_ns.field.harmonics import num_coefficients
 from thermoxels_ns.field.refine import widen_colour
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.render.renderers import total_variation
+from thermoxels_ns.render.reference import total_variation
 from thermoxels_ns.training.optimizers import RowAdam, RowRMSprop
 
 STEPS = [(0, 1), (0, 2), (1, 2)]
@@ -36,30 +35,6 @@ def test_colours_stay_and_new_columns_are_nil(low, high):
     assert int((grid.sh != 0).sum()) == int((before != 0).sum())
     torch.testing.assert_close(grid.rgb_at(grid.locate(points), directions), colours, rtol=0, atol=1e-6)
     assert torch.equal(change(before), grid.sh)
-
-
-@pytest.mark.parametrize("renderer", RENDERERS)
-@pytest.mark.parametrize("low, high", STEPS)
-def test_narrow_rows_render_and_differentiate_like_wide_ones_with_zeros(renderer, low, high):
-    """To the last bit: also total variation, whose mean counts the channels that are not stored."""
-    narrow = random_grid(low, kept=0.5)
-    wide, request = copy.deepcopy(narrow), random_request(narrow)
-    widen_colour(wide, high)
-    count = len(narrow.voxels)
-    blocks = {"density": (3, count), "sh": (count // 4, count // 2), "temperature": (0, 9)}
-    options = replace(EVERYTHING, variation=blocks, sh_degree=low, colour_channels=3 * num_coefficients(high))
-    few, many = see(renderer, narrow, request, options), see(renderer, wide, request, options)
-    for name, values in many.values.items():
-        if name == "variation of sh":  # a sum over other columns in another order
-            torch.testing.assert_close(few.values[name], values, rtol=1e-5, atol=0)
-        else:
-            assert torch.equal(few.values[name], values), name
-    for name, gradient in many.gradients.items():
-        if name == "sh":
-            assert float(gradient.abs().max()) > 0
-            assert int((gradient != 0).sum()) == int((gradient[:, places_of(low, high)] != 0).sum())
-            gradient = gradient[:, places_of(low, high)]
-        assert torch.equal(few.gradients[name], gradient), name
 
 
 def test_variation_of_columns_that_are_not_stored_is_that_of_zeros():

@@ -62,16 +62,6 @@ def test_old_corners_keep_their_values_to_the_last_bit(factor, kept):
     torch.testing.assert_close(change(torch.full((old.num_rows, 1), 7.0)), torch.full((grid.voxels.num_rows, 1), 7.0))
 
 
-def test_refinement_keeps_the_children_of_kept_voxels():
-    grid = random_grid()
-    prune(grid, grid.voxels.cells == at_index(grid.lattice, (2, 3, 1)))
-    points = points_inside(grid, 3000)
-    before = grid.in_kept_voxel(points)
-    refine(grid, 2)
-    assert int(grid.kept.sum()) == len(grid.voxels) == 8 and grid.voxels.num_rows == 27
-    assert torch.equal(before, grid.in_kept_voxel(points)) and bool(before.any())
-
-
 @pytest.mark.parametrize("factor", [2, 3, 4])
 def test_split_voxels_are_those_of_the_dense_mask(factor):
     voxels = random_grid(kept=0.3).voxels

@@ -33,8 +33,8 @@ def test_training_refines_prunes_and_saves(trained: Trained):
     saved = sorted(p.name for p in trained.checkpoints.iterdir())
     assert saved == ["step-000000020.ckpt", "step-000000039.ckpt"]
     state = torch.load(trained.checkpoints / saved[-1], weights_only=False)["pipeline"]
-    shape = state["_model.field.grid.corner_shape"].tolist()
-    rows, cells = state["_model.field.grid.density"].shape[0], state["_model.field.grid.cells"]
+    shape = state["_model.grid.corner_shape"].tolist()
+    rows, cells = state["_model.grid.density"].shape[0], state["_model.grid.cells"]
     voxels = KeptVoxels(Lattice((0.0, 0.0, 0.0), 1.0, tuple(shape)), cells.numpy())
     assert max(shape) == 25 and rows == voxels.num_rows <= np.prod(shape)
 

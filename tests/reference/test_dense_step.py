@@ -8,8 +8,8 @@ import torch
 from torch.nn.functional import cosine_similarity
 
 from tests.reference.two_renderers import random_grid
+from thermoxels_ns.render.fused import render as fused_render
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
-from thermoxels_ns.render.renderers import fused_render
 
 _PATH = Path(__file__).parents[1] / "benchmarks" / "dense_torch_step.py"
 _SPEC = importlib.util.spec_from_file_location("dense_torch_step", _PATH)

@@ -5,17 +5,12 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.reference.two_renderers import random_grid, random_request
 from tests.support.boxed_scene import write_boxed_scene
 from tests.support.short_training import train_with_optimizers
 from thermoxels_ns.core import threads
-from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.core.threads import num_threads, set_num_threads
+from thermoxels_ns.core.threads import num_threads
 from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
-from thermoxels_ns.render.ray_render import RenderOptions
-from thermoxels_ns.render.renderers import fused_render, sample_rays
 from thermoxels_ns.synthetic.scene_folder import make_scene
-from thermoxels_ns.training.optimizers import RowAdam, RowRMSprop
 
 
 @pytest.fixture
@@ -57,57 +52,6 @@ def assert_same_bits(results: list[dict[str, torch.Tensor]]) -> None:
         assert other.keys() == first.keys()
         differing = [name for name, value in first.items() if not torch.equal(value, other[name])]
         assert differing == []
-
-
-@pytest.mark.parametrize("kept", [1.0, 0.3])
-def test_values_and_gradients(kept):
-    lattice = Lattice.covering((-1, -1, -1), (1, 1, 1), 24)
-    results = []
-    for count in COUNTS:
-        set_num_threads(count)
-        assert num_threads() == count
-        grid = random_grid(2, 1, "exp", kept, lattice, density=0.0)
-        voxels = len(grid.voxels)
-        options = RenderOptions(
-            distortion_scale=2.0,
-            sparsity=True,
-            thermal_moves_density=True,
-            variation={name: (voxels // 3, voxels // 2) for name in grid.row_parameters()},
-        )
-        request = random_request(grid, 1500)
-        seen = fused_render(grid, request, options)
-        pairs = [(name, value) for name, value in vars(seen).items() if isinstance(value, torch.Tensor)]
-        generator = torch.Generator().manual_seed(0)
-        loss = sum(seen.variation.values(), torch.zeros(()))
-        for name, value in pairs:
-            if name != "depth":
-                loss = loss + (torch.rand(value.shape, generator=generator) * value).sum()
-        loss.backward()
-        found = dict(pairs) | {f"variation {name}": value for name, value in seen.variation.items()}
-        for name, parameter in grid.row_parameters().items():
-            found |= {f"{name} rows": parameter.grad._indices(), f"{name} gradient": parameter.grad._values()}
-            assert len(parameter.grad._values()) > 1000
-        samples = sample_rays(grid, request, options, "fused")
-        found |= {"ray": samples.ray, "weight": samples.weight, "number": samples.at.number}
-        results.append(flat(found))
-    assert_same_bits(results)
-
-
-@pytest.mark.parametrize("make", [RowAdam, RowRMSprop])
-def test_updates(make):
-    results = []
-    for count in COUNTS:
-        set_num_threads(count)
-        generator = torch.Generator().manual_seed(0)
-        parameter = torch.nn.Parameter(torch.randn(30_000, 7, generator=generator))
-        optimizer = make([parameter], lr=0.01)
-        for _ in range(3):
-            rows = (torch.rand(30_000, generator=generator) < 0.5).nonzero()[:, 0]
-            values = torch.randn(len(rows), 7, generator=generator)
-            parameter.grad = torch.sparse_coo_tensor(rows[None], values, parameter.shape)
-            optimizer.step()
-        results.append(flat({"value": parameter, "state": dict(optimizer.state[parameter])}))
-    assert_same_bits(results)
 
 
 def test_a_training_that_refines_and_prunes(tmp_path):

@@ -11,11 +11,11 @@ from torch.nn.functional import normalize
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import DensityActivation, VoxelGrid
+from thermoxels_ns.render import fused, reference
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
-from thermoxels_ns.render.renderers import fused_render, reference_render
 
 Renderer = Callable[[VoxelGrid, RayRequest, RenderOptions], RayRender]
-RENDERERS: dict[str, Renderer] = {"reference": reference_render, "fused": fused_render}
+RENDERERS: dict[str, Renderer] = {"reference": reference.render, "fused": fused.render}
 PER_RAY = ("rgb", "thermal", "transmittance", "accumulation", "distortion", "sparsity")
 EVERYTHING = RenderOptions(distortion_scale=2.0, sparsity=True)
 
@@ -90,21 +90,15 @@ class Seen:
     gradients: dict[str, Tensor]
 
 
-def see(
-    renderer: str, grid: VoxelGrid, request: RayRequest, options: RenderOptions = EVERYTHING, background: bool = False
-) -> Seen:
+def see(renderer: str, grid: VoxelGrid, request: RayRequest, options: RenderOptions = EVERYTHING) -> Seen:
     """Render, and differentiate a random combination of everything that has a gradient."""
     generator = torch.Generator().manual_seed(7)
-    dtype, rays = grid.density.dtype, len(request.origins)
-    backdrop = [torch.rand(rays, n, generator=generator).to(dtype).requires_grad_() for n in (3, 1)]
+    dtype = grid.density.dtype
     for parameter in grid.parameters():
         parameter.grad = None
     render = RENDERERS[renderer](grid, request, options)
     values = {name: getattr(render, name) for name in PER_RAY}
     values |= {f"variation of {name}": value for name, value in render.variation.items()}
-    if background:
-        behind = render.with_background(*backdrop, request, options.thermal_moves_density)
-        values["rgb"], values["thermal"] = behind if render.rgb is not None else (None, behind[1])
     values = {name: value for name, value in values.items() if value is not None}
     # Sizes that differ by orders of magnitude would hide each other's errors.
     scale = {"sparsity": 1e-3, "thermal": 1.0 if options.thermal_moves_density else 3.0}
@@ -118,9 +112,6 @@ def see(
     for name, parameter in grid.row_parameters().items():
         gradient = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
         gradients[name] = gradient.to_dense().double()
-    if background:
-        held = zip(("background rgb", "background thermal"), backdrop)
-        gradients |= {name: torch.zeros_like(p) if p.grad is None else p.grad.double() for name, p in held}
     values["depth"] = render.depth
     return Seen({name: value.detach().double() for name, value in values.items()}, gradients)
 
@@ -145,12 +136,10 @@ def assert_same(found: Seen, reference: Seen, values: float, gradients: float) -
             assert cosine > 0.9999, f"gradient of {name}: cosine {cosine}"
 
 
-def assert_twins_agree(
-    grid: VoxelGrid, request: RayRequest, options: RenderOptions = EVERYTHING, background: bool = False
-) -> Seen:
+def assert_twins_agree(grid: VoxelGrid, request: RayRequest, options: RenderOptions = EVERYTHING) -> Seen:
     """Compare the fused renderer in both precisions with the reference in double precision, and return the latter."""
     twin, exact = as_double(grid), in_double(request)
-    reference = see("reference", twin, exact, options, background)
-    assert_same(see("fused", twin, exact, options, background), reference, 1e-11, 1e-11)
-    assert_same(see("fused", grid, request, options, background), reference, 1e-5, 1e-4)
+    reference = see("reference", twin, exact, options)
+    assert_same(see("fused", twin, exact, options), reference, 1e-11, 1e-11)
+    assert_same(see("fused", grid, request, options), reference, 1e-5, 1e-4)
     return reference

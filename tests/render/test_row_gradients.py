@@ -16,9 +16,9 @@ from tests.reference.two_renderers import (
 )
 from thermoxels_ns.core.threads import num_threads, set_num_threads
 from thermoxels_ns.render import fused
+from thermoxels_ns.render.fused import render as fused_render
 from thermoxels_ns.render.kernels import AHEAD
 from thermoxels_ns.render.ray_render import RenderOptions
-from thermoxels_ns.render.renderers import fused_render
 from thermoxels_ns.training.optimizers import touched_rows
 
 
@@ -32,15 +32,14 @@ def three_threads():
 
 @pytest.mark.usefixtures("three_threads")
 @pytest.mark.parametrize("kept", [1.0, 0.4], ids=["dense", "sparse"])
-@pytest.mark.parametrize("degree", [0, 2])
 @pytest.mark.parametrize("ranges", [1, 30, 400])
-def test_any_number_of_row_ranges_gives_the_reference_s_sums(monkeypatch, ranges, degree, kept):
+def test_any_number_of_row_ranges_gives_the_reference_s_sums(monkeypatch, ranges, kept):
     """Ranges of a few rows cut through voxels, blocks of total variation and groups of samples."""
     monkeypatch.setattr(fused, "RANGES_PER_THREAD", ranges)
     grid = as_double(random_grid(2, 1, "exp", kept, density=0.0))
     request, count = in_double(random_request(grid)), len(grid.voxels)
     blocks = {"density": (3, count), "sh": (count // 3, count // 2), "temperature": (0, 1)}
-    options = replace(EVERYTHING, variation=blocks, sh_degree=degree)
+    options = replace(EVERYTHING, variation=blocks)
     reference = see("reference", grid, request, options)
     assert_same(see("fused", grid, request, options), reference, 1e-11, 1e-11)
     assert all(float(g.norm()) > 0 for g in reference.gradients.values())
@@ -63,7 +62,7 @@ def test_a_batch_that_needs_more_room_than_the_last_one_is_complete(monkeypatch)
 @pytest.mark.parametrize("renders", [1, 2])
 def test_gradients_of_renders_in_one_step_are_summed_in_the_order_of_rows(renders):
     """Torch puts one list of rows behind the other, which the optimisers must find and put in order."""
-    grid, flat = random_grid(1, kept=0.5), RenderOptions(sh_degree=1)
+    grid, flat = random_grid(1, kept=0.5), RenderOptions()
     dense = []
     for seed in range(renders):
         request = random_request(grid, 80, seed)

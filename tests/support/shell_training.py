@@ -14,9 +14,8 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import MemoryNeed, memory_need
 from thermoxels_ns.field.refine import prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.render import fused  # noqa: F401 (the compiled kernels belong to the imports)
+from thermoxels_ns.render.fused import render as fused_render
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
-from thermoxels_ns.render.renderers import fused_render
 from thermoxels_ns.training.optimizers import RowAdam
 
 

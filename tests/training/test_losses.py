@@ -6,9 +6,9 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.render.compositing import ray_distortion, ray_sparsity
 from thermoxels_ns.render.ray_render import RenderOptions
-from thermoxels_ns.render.renderers import render_rays, total_variation
+from thermoxels_ns.render.reference import ray_distortion, ray_sparsity, total_variation
+from thermoxels_ns.render.renderers import render_rays
 from thermoxels_ns.training import losses
 from thermoxels_ns.training.losses import MARGIN_ERRORS, MARGIN_VOXELS, FeatureRaySampler, feature_ray_loss
 

@@ -230,7 +230,7 @@ def test_snapshot_holds_what_rays_say_on_the_whole_lattice():
     np.testing.assert_allclose(evidence.half_depth_density, 5.0, rtol=1e-5)
     # Degree 0 alone, as the field renders it at the corners from any side.
     corners = torch.as_tensor(model.grid.lattice.corner_positions(), dtype=torch.float32)[4:].reshape(-1, 3)
-    seen = model.grid.rgb_at(model.grid.locate(corners), torch.eye(3)[torch.arange(len(corners)) % 3], degree=0)
+    seen = model.grid.rgb_at(model.grid.locate(corners), torch.eye(3)[torch.arange(len(corners)) % 3])
     np.testing.assert_allclose(colour[4:].reshape(-1, 3), seen.detach(), atol=1e-6)
     assert colour[4:].std() > 0.1 and (colour[:4] == 0.5).all()
 
@@ -350,6 +350,6 @@ def test_both_backends_train_alike():
 
 
 def test_a_lattice_beyond_the_budget_is_refused_before_it_is_built(monkeypatch):
-    monkeypatch.setattr("thermoxels_ns.training.model.VoxelField", lambda *_: pytest.fail("the field was built"))
+    monkeypatch.setattr("thermoxels_ns.training.model.VoxelGrid", lambda *_: pytest.fail("the field was built"))
     with pytest.raises(MemoryBudgetError, match=r"4096 x 4096 x 2048 voxels .*--pipeline.model.memory-budget-gb"):
         make(resolutions=(4096,), memory_budget_gb=64.0)

@@ -157,21 +157,6 @@ def test_rows_out_of_order_are_found_wherever_they_are(late, same):
     )
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_parameters_of_any_shape_and_without_a_gradient(kind):
-    image, other = torch.nn.Parameter(torch.ones(4, 5, 3)), torch.nn.Parameter(torch.ones(3))
-    optimizer = KINDS[kind]([image, other], lr=0.1)
-    image.grad = torch.zeros(4, 5, 3)
-    image.grad[2] = 1.0
-    optimizer.step()
-    assert torch.equal(other, torch.ones(3)) and other not in optimizer.state
-    changed = (image != 1).flatten(1).any(-1)
-    assert changed.tolist() == [False, False, True, False]
-    image.grad, other.grad = None, torch.zeros(3)
-    optimizer.step()
-    assert torch.equal(other, torch.ones(3))
-
-
 def trained_grid(kind: str) -> tuple[VoxelGrid, dict[str, RowOptimizer]]:
     """A sparse grid after a few steps that touched some rows."""
     torch.manual_seed(0)

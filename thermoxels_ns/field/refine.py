@@ -9,7 +9,6 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from thermoxels_ns.core.arrays import BUFFERS
 from thermoxels_ns.field.harmonics import num_coefficients
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels
@@ -64,7 +63,6 @@ def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
     Density is per world unit, so nothing is rescaled. Rows change by trilinear interpolation; old corners keep theirs
     exactly.
     """
-    BUFFERS.release()  # rows are there twice for a moment; what steps on the old lattice needed makes room
     new = split_voxels(grid.voxels, factor)
     at = parents_of_corners(grid.voxels, new, factor)
 
@@ -83,7 +81,6 @@ def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
 @torch.no_grad()
 def prune(grid: VoxelGrid, keep: npt.NDArray[np.bool_]) -> RowChange:
     """Keep only some of the kept voxels, one boolean for each, and return how rows change: by a copy."""
-    BUFFERS.release()
     voxels = grid.voxels
     new = KeptVoxels(voxels.lattice, voxels.cells[keep])
     stay: npt.NDArray[np.int64] = np.searchsorted(voxels.corners, new.corners)
@@ -104,7 +101,6 @@ def widen_colour(grid: VoxelGrid, degree: int) -> ColumnChange:
     stored are 0.
     """
     assert grid.sh is not None and grid.sh_degree is not None and grid.sh_degree < degree
-    BUFFERS.release()  # what steps on the narrow rows needed makes room for the wide ones
     few, many = num_coefficients(grid.sh_degree), num_coefficients(degree)
 
     def change(values: Tensor) -> Tensor:

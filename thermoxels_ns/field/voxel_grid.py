@@ -7,9 +7,6 @@ from typing import Literal, get_args
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from nerfstudio.cameras.rays import RaySamples
-from nerfstudio.field_components.field_heads import FieldHeadNames
-from nerfstudio.fields.base_field import Field
 from torch import Tensor, nn
 
 from thermoxels_ns.core.lattice import Lattice
@@ -180,15 +177,12 @@ class VoxelGrid(nn.Module):
         """Density, [1 / world unit], >= 0."""
         return activate_density(interpolate(self.density, at)[:, 0], self.activation)
 
-    def rgb_at(
-        self, at: TrilinearPoints, directions: Float[Tensor, "n 3"], degree: int | None = None
-    ) -> Float[Tensor, "n 3"]:
-        """Colour in [0, 1] seen along unit directions: the sigmoid of the interpolated harmonics up to `degree`."""
+    def rgb_at(self, at: TrilinearPoints, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Colour in [0, 1] seen along unit directions: the sigmoid of the interpolated harmonics."""
         assert self.sh is not None and self.sh_degree is not None, "this grid has no colour"
-        degree = self.sh_degree if degree is None else min(degree, self.sh_degree)
-        coefficients = interpolate(self.sh, at).view(len(directions), 3, num_coefficients(self.sh_degree))
-        basis = harmonics(directions, degree)[:, None]
-        return torch.sigmoid((coefficients[..., : basis.shape[-1]] * basis).sum(-1))
+        basis = harmonics(directions, self.sh_degree)[:, None]
+        coefficients = interpolate(self.sh, at).view(len(directions), 3, basis.shape[-1])
+        return torch.sigmoid((coefficients * basis).sum(-1))
 
     def thermal_at(self, at: TrilinearPoints, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
         """Normalised temperature; the first coefficient is its mean over directions."""
@@ -225,40 +219,3 @@ class VoxelGrid(nn.Module):
         values = torch.zeros(self.lattice.cell_shape, dtype=centre.dtype, device=centre.device)
         values.view(-1)[self.cells] = centre
         return values
-
-
-class VoxelField(Field):
-    """Density, view-dependent colour and temperature, trilinear on a corner lattice (the paper's V_i)."""
-
-    def __init__(
-        self,
-        lattice: Lattice,
-        sh_degree: int | None,
-        temperature_degree: int,
-        start_density: float,
-        activation: DensityActivation,
-    ):
-        super().__init__()
-        self.grid = VoxelGrid(lattice, sh_degree, temperature_degree, start_density, activation)
-
-    def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, None]:
-        """Density at the samples' positions, shape (..., 1); 0 outside the kept voxels."""
-        positions = ray_samples.frustums.get_positions()
-        flat = positions.reshape(-1, 3)
-        density = self.grid.density_at(self.grid.locate(flat))
-        density = torch.where(self.grid.in_kept_voxel(flat), density, torch.zeros_like(density))
-        return density.view(*positions.shape[:-1], 1), None
-
-    def get_outputs(
-        self, ray_samples: RaySamples, density_embedding: Tensor | None = None
-    ) -> dict[FieldHeadNames | str, Tensor]:  # type: ignore[override]
-        """Colour (if the grid has it) and normalised temperature under the key "thermal", shape (..., 3 and 1)."""
-        positions = ray_samples.frustums.get_positions()
-        directions = ray_samples.frustums.directions.expand_as(positions).reshape(-1, 3)
-        at = self.grid.locate(positions.reshape(-1, 3))
-        outputs: dict[FieldHeadNames | str, Tensor] = {
-            "thermal": self.grid.thermal_at(at, directions).view(*positions.shape[:-1], 1)
-        }
-        if self.grid.sh is not None:
-            outputs[FieldHeadNames.RGB] = self.grid.rgb_at(at, directions).view(*positions.shape[:-1], 3)
-        return outputs

@@ -1,1 +1,1 @@
-"""Ray sampling and compositing; knows fields only as callables."""
+"""Rays to pixels: sampling, compositing and their compiled twins."""

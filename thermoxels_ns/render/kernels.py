@@ -53,6 +53,7 @@ prefetch: Any = intrinsic(_prefetch)
 Floats = npt.NDArray[np.floating]
 Ints = Any  # arrays of integers; numba knows which
 
+Y00 = 0.28209479177387814  # The first harmonic
 BLOCK = 8  # Voxels along the side of a block; the rule is that of `KeptVoxels`
 OPAQUE = 100.0  # Optical depth of a step from which it counts as opaque
 EXP_LIMIT = 15.0  # Raw density from which `exp` stays constant
@@ -97,7 +98,6 @@ class Settings(NamedTuple):
     distortion_scale: float  # Length that counts as 1 in the distortion; 0: not computed
     sparsity: int  # 1: sum the sparsity term
     thermal_moves_density: int
-    sh_active: int  # Colour harmonics per channel that take part; those behind them count as 0
 
 
 class Records(NamedTuple):
@@ -156,7 +156,7 @@ class RecordedSamples:
 
 @kernel
 def chord(rays: Rays, r: int, volume: Volume):
-    """Entry and exit distance of a ray, both 0 for a miss; each axis guarded as in `compositing.intersect_box`."""
+    """Entry and exit distance of a ray, both 0 for a miss; each axis guarded as in `reference.intersect_box`."""
     enter, leave = float(rays.near[r]), float(rays.far[r])
     for axis in range(3):
         origin, direction = float(rays.origins[r, axis]), float(rays.directions[r, axis])
@@ -246,7 +246,7 @@ def next_sample(i: int, enter: float, length: float, step: float, path, volume: 
 @kernel
 def basis_of(directions: Floats, r: int, count: int, scale: float, basis: Floats):
     """Spherical harmonics of a ray's direction, the first `count` of `harmonics.harmonics`, times `scale`."""
-    basis[0] = 0.28209479177387814 * scale
+    basis[0] = Y00 * scale
     if count > 1:
         x, y, z = float(directions[r, 0]), float(directions[r, 1]), float(directions[r, 2])
         one = 0.4886025119029199 * scale
@@ -272,23 +272,6 @@ def gather(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: fl
         into[k] = (wa0 * ra0[k] + wa1 * ra1[k] + wb0 * rb0[k] + wb1 * rb1[k]) + (
             wc0 * rc0[k] + wc1 * rc1[k] + wd0 * rd0[k] + wd1 * rd1[k]
         )
-
-
-@kernel(fastmath={"contract"})
-def gather_some(
-    values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, count: int, active: int, into: Floats
-):
-    """Interpolate the first `active` of every `count` channels."""
-    gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
-    a, b, c, d = rows[number, 0], rows[number, 1], rows[number, 2], rows[number, 3]
-    one = values.dtype.type
-    wa0, wa1, wb0, wb1 = one(gx * gy * gz), one(gx * gy * fz), one(gx * fy * gz), one(gx * fy * fz)
-    wc0, wc1, wd0, wd1 = one(fx * gy * gz), one(fx * gy * fz), one(fx * fy * gz), one(fx * fy * fz)
-    for channel in range(0, into.shape[0], count):
-        for k in range(channel, channel + active):
-            into[k] = (wa0 * values[a, k] + wa1 * values[a + 1, k] + wb0 * values[b, k] + wb1 * values[b + 1, k]) + (
-                wc0 * values[c, k] + wc1 * values[c + 1, k] + wd0 * values[d, k] + wd1 * values[d + 1, k]
-            )
 
 
 @kernel(fastmath={"contract"})
@@ -352,7 +335,7 @@ def march_rays(
 
     Returns:
         Number of samples whose density is NaN, or -1 if there are more samples than places; place behind the last
-        record, or the number of samples per ray so far.
+        record.
     """
     distance, length_of, raw = np.empty(AHEAD), np.empty(AHEAD), np.empty(AHEAD)
     wrong = 0
@@ -367,7 +350,7 @@ def march_rays(
         records.offset[r] = start
         while i >= 0 and left >= settings.early_stop:
             if n + AHEAD > end:
-                return -1, (n - begin) // max(1, r - first) + 1
+                return -1, n
             found = 0
             while found < AHEAD:
                 i, number, t, delta, fx, fy, fz = next_sample(i, enter, length, settings.step, path, volume)

@@ -11,11 +11,11 @@ from thermoxels_ns.render.kernels import (
     COLOUR,
     DENSITY,
     TEMPERATURE,
+    Y00,
     Floats,
     Ints,
     Rays,
     SampleGradients,
-    Settings,
     Volume,
     basis_of,
     prefetch,
@@ -39,8 +39,7 @@ class Blocks(NamedTuple):
 
     first: Ints  # First voxel, (3,) int64
     last: Ints  # One behind the last voxel; the first where there is no block
-    push: Floats  # Gradient of the block's total variation, (3,) float64
-    channels: Ints  # Channels of which it is the mean, (3,) int64: those without a column are 0
+    push: Floats  # Gradient of the sum of the block's total variation, (3,) float64
     smallest: float  # Added under the root
 
 
@@ -53,8 +52,6 @@ class RowGradients(NamedTuple):
     density: Floats
     sh_rows: Ints
     sh: Floats
-    sh_sums: Floats
-    """Of the harmonics that take part, for three channels one after the other; `sh` itself if that is all."""
     temperature_rows: Ints
     temperature: Floats
 
@@ -159,7 +156,7 @@ def list_rows(first_row: int, last_row: int, density: int, colour: int, temperat
             density += 1
         if bits & COLOUR:
             rows.place[row, 1], rows.sh_rows[colour] = colour, row
-            rows.sh_sums[colour, :] = 0.0
+            rows.sh[colour, :] = 0.0
             colour += 1
         if bits & TEMPERATURE:
             rows.place[row, 2], rows.temperature_rows[temperature] = temperature, row
@@ -183,7 +180,7 @@ def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
     for corner in range(4):
         row = voxel_rows[number, corner]
         prefetch(rows.density, rows.place[row, 0], 0)
-        prefetch(rows.sh_sums, rows.place[row, 1], 0)
+        prefetch(rows.sh, rows.place[row, 1], 0)
         prefetch(rows.temperature, rows.place[row, 2], 0)
 
 
@@ -204,7 +201,6 @@ def add_samples(
     last_row: int,
     rays: Rays,
     volume: Volume,
-    settings: Settings,
     samples: SampleGradients,
     order: Order,
     rows: RowGradients,
@@ -214,12 +210,11 @@ def add_samples(
     Each thread owns a range of rows and adds samples in the order of their voxels: no two add to the same row, and the
     sums are the same bits for any number of threads.
     """
-    channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
-    active = min(channels // 3, settings.sh_active)
+    count, thermal_channels = volume.sh.shape[1] // 3, volume.temperature.shape[1]
     dtype = volume.density.dtype
     basis, thermal_basis = np.empty(9), np.empty(9)
-    colour, shares = np.zeros(3 * active, dtype), np.empty(8, dtype)
-    flat = active == 1
+    colour, shares = np.zeros(3 * count, dtype), np.empty(8, dtype)
+    flat = count == 1
     begin, end = first_voxel(volume.voxel_rows, 3, first_row - 1), first_voxel(volume.voxel_rows, 0, last_row)
     stop = order.group[_groups_before(end, order)]
     for at in range(order.group[begin >> order.shift], stop):
@@ -239,12 +234,12 @@ def add_samples(
         inside = volume.voxel_rows[number, 0] >= first_row and volume.voxel_rows[number, 3] + 1 < last_row
         slope, heat = samples.raw_density[n], samples.temperature[n]
         if bits & COLOUR:
-            basis_of(rays.directions, r, active, 1.0, basis)
+            basis_of(rays.directions, r, count, 1.0, basis)
             for c in range(3):
-                for k in range(active):
-                    colour[c * active + k] = samples.logits[n, c] * basis[k]
+                for k in range(count):
+                    colour[c * count + k] = samples.logits[n, c] * basis[k]
         if bits & TEMPERATURE and thermal_channels > 1:
-            basis_of(rays.directions, r, thermal_channels, 1.0 / 0.28209479177387814, thermal_basis)
+            basis_of(rays.directions, r, thermal_channels, 1.0 / Y00, thermal_basis)
         corner_shares(samples, n, shares)
         for corner in range(8):
             row = volume.voxel_rows[number, corner >> 1] + (corner & 1)
@@ -256,12 +251,12 @@ def add_samples(
             if bits & COLOUR:
                 place = rows.place[row, 1]
                 if flat:
-                    rows.sh_sums[place, 0] += share * colour[0]
-                    rows.sh_sums[place, 1] += share * colour[1]
-                    rows.sh_sums[place, 2] += share * colour[2]
+                    rows.sh[place, 0] += share * colour[0]
+                    rows.sh[place, 1] += share * colour[1]
+                    rows.sh[place, 2] += share * colour[2]
                 else:
-                    for k in range(3 * active):
-                        rows.sh_sums[place, k] += share * colour[k]
+                    for k in range(3 * count):
+                        rows.sh[place, k] += share * colour[k]
             if bits & TEMPERATURE:
                 place = rows.place[row, 2]
                 if thermal_channels == 1:
@@ -269,17 +264,6 @@ def add_samples(
                 else:
                     for k in range(thermal_channels):
                         rows.temperature[place, k] += share * heat * thermal_basis[k]
-
-
-@kernel
-def spread_harmonics(first: int, last: int, rows: RowGradients):
-    """Put the sums of places `first` to `last` where their harmonics stand among all; the others get 0."""
-    count, active = rows.sh.shape[1] // 3, rows.sh_sums.shape[1] // 3
-    for place in range(first, last):
-        rows.sh[place, :] = 0.0
-        for c in range(3):
-            for k in range(active):
-                rows.sh[place, c * count + k] = rows.sh_sums[place, c * active + k]
 
 
 @kernel(fastmath={"contract"})
@@ -312,12 +296,12 @@ def add_variation(
     place: Ints,
     gradient: Floats,
 ):
-    """Add the gradient of the mean total variation of a parameter's block to rows `first_row` to `last_row`."""
+    """Add the gradient of the total variation of a parameter's block to rows `first_row` to `last_row`."""
     channels = values.shape[1]
     first, last = blocks.first[kind], blocks.last[kind]
     one = values.dtype.type
     tiny = one(blocks.smallest)
-    scale = one(blocks.push[kind] / (blocks.channels[kind] * max(1, last - first)))
+    scale = one(blocks.push[kind])
     px, py, pz = np.empty(channels, values.dtype), np.empty(channels, values.dtype), np.empty(channels, values.dtype)
     begin, end = first_voxel(voxel_rows, 2, first_row), first_voxel(voxel_rows, 0, last_row)
     for number in range(max(begin, first), min(end, last)):

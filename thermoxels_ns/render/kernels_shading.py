@@ -8,6 +8,7 @@ import numpy as np
 
 from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.render.kernels import (
+    Y00,
     Floats,
     Ints,
     Rays,
@@ -18,7 +19,6 @@ from thermoxels_ns.render.kernels import (
     basis_of,
     gather,
     gather_one,
-    gather_some,
     place_of,
     prefetch,
     prefetch_corners,
@@ -26,24 +26,22 @@ from thermoxels_ns.render.kernels import (
 
 NEAR, FAR = 8, 24
 """Samples ahead whose values, and whose row numbers, are asked for."""
-_Y00 = 0.28209479177387814
 
 
 @kernel
-def prefetch_colours(values: Floats, rows: Ints, number: int, active: int):
+def prefetch_colours(values: Floats, rows: Ints, number: int):
     """Ask for the colours of a voxel's corners, whose rows are longer than a cache line unless there is one colour."""
     channels = values.shape[1]
     if channels == 3:
         prefetch_corners(values, rows, number)
         return
-    second = channels - channels // 3 + active - 1
     for corner in range(4):
         row = np.int64(rows[number, corner])
         # The two rows of a corner and the next one stand one behind the other.
         prefetch(values, row, 0)
         prefetch(values, row, 16)
         prefetch(values, row + 1, 0)
-        prefetch(values, row + 1, second)
+        prefetch(values, row + 1, channels - 1)
 
 
 @kernel
@@ -55,7 +53,6 @@ def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings,
     """
     channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
     count = channels // 3
-    active = min(count, settings.sh_active)
     one = volume.density.dtype.type
     coefficients = np.empty(channels, volume.sh.dtype)
     thermal_coefficients = np.empty(thermal_channels, volume.temperature.dtype)
@@ -64,9 +61,9 @@ def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings,
     for r in range(first, last):
         wants_rgb, wants_thermal = (rays.wants[r] & 1) != 0 and channels > 0, (rays.wants[r] & 2) != 0
         if wants_rgb:
-            basis_of(rays.directions, r, active, 1.0, basis)
+            basis_of(rays.directions, r, count, 1.0, basis)
         if wants_thermal and thermal_channels > 1:
-            basis_of(rays.directions, r, thermal_channels, 1.0 / _Y00, thermal_basis)
+            basis_of(rays.directions, r, thermal_channels, 1.0 / Y00, thermal_basis)
         red, green, blue, thermal = 0.0, 0.0, 0.0, 0.0
         wanted = records.used[r] if wants_rgb or wants_thermal else 0
         for n in range(records.offset[r], records.offset[r] + wanted):
@@ -75,23 +72,21 @@ def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings,
             if n + NEAR < end and records.weight[n + NEAR] > settings.smallest_weight:
                 # What this ray wants is a good guess of what the next one wants.
                 if wants_rgb:
-                    prefetch_colours(volume.sh, volume.voxel_rows, records.number[n + NEAR], active)
+                    prefetch_colours(volume.sh, volume.voxel_rows, records.number[n + NEAR])
                 if wants_thermal:
                     prefetch_corners(volume.temperature, volume.voxel_rows, records.number[n + NEAR])
             if not records.weight[n] > settings.smallest_weight:  # as rounded: the backward pass asks the same
                 continue
             number, (fx, fy, fz), weight = records.number[n], place_of(records, n), float(records.weight[n])
             if wants_rgb:
-                if active < count and active > 1:
-                    gather_some(volume.sh, volume.voxel_rows, number, fx, fy, fz, count, active, coefficients)
-                elif active > 1:
+                if count > 1:
                     gather(volume.sh, volume.voxel_rows, number, fx, fy, fz, coefficients)
                 for c in range(3):
                     logit = 0.0
-                    if active == 1:
-                        logit = _Y00 * gather_one(volume.sh, volume.voxel_rows, number, fx, fy, fz, c * count)
+                    if count == 1:
+                        logit = Y00 * gather_one(volume.sh, volume.voxel_rows, number, fx, fy, fz, c)
                     else:
-                        for k in range(active):
+                        for k in range(count):
                             logit += coefficients[c * count + k] * basis[k]
                     records.rgb[n, c] = one(1.0) / (one(1.0) + math.exp(one(-logit)))
                 red += weight * records.rgb[n, 0]

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+
+from thermoxels_ns.field.interpolation import TrilinearPoints
 
 
 @dataclass(frozen=True)
@@ -19,6 +21,12 @@ class RayRequest:
     far: Float[Tensor, " rays"] | None = None  # Distance where it ends; None: at the box
     rgb_rays: Bool[Tensor, " rays"] | None = None  # Rays that want colour; None: all that can. The others get 0
     thermal_rays: Bool[Tensor, " rays"] | None = None  # Rays that want temperature; None: all. The others get 0
+
+    def near_and_far(self) -> tuple[Tensor, Tensor]:
+        """`near` and `far` as one number per ray."""
+        like = self.origins[:, 0]
+        far = torch.full_like(like, torch.inf) if self.far is None else self.far
+        return torch.as_tensor(self.near, dtype=like.dtype, device=like.device).expand(len(like)), far
 
 
 @dataclass(frozen=True)
@@ -35,8 +43,6 @@ class RenderOptions:
     thermal_moves_density: bool = False  # Let the thermal sum carry gradients into the weights
     distortion_scale: float | None = None
     """Length that counts as 1 in the distortion of each ray, world units; None: not computed."""
-    sh_degree: int | None = None
-    """Degree up to which the stored colour harmonics take part; None: all. What lies behind gets no gradient."""
     colour_channels: int | None = None
     """Channels over which total variation of colour is averaged: those that are not stored yet are 0 and count. None:
     the stored ones."""
@@ -47,46 +53,24 @@ class RenderOptions:
 
 @dataclass(frozen=True)
 class RayRender:
-    """What a bundle of rays sees, without what stands behind the box."""
+    """What a bundle of rays sees."""
 
     rgb: Float[Tensor, "rays 3"] | None  # Sum of weight times colour; None where there is no colour
     thermal: Float[Tensor, "rays 1"]  # Sum of weight times normalised temperature
-    transmittance: Float[Tensor, " rays"]  # Share of the background that is left
+    transmittance: Float[Tensor, " rays"]  # Share of the light that comes from behind
     accumulation: Float[Tensor, " rays"]  # 1 - transmittance, with all digits when it is small
     depth: Float[Tensor, " rays"]  # Expected distance of what was hit; infinite where nothing was. Carries no gradient
     distortion: Float[Tensor, " rays"] | None = None  # Distortion of each ray
     sparsity: Float[Tensor, " rays"] | None = None  # Sum of log(1 + 2 density^2) over each ray's samples
     variation: dict[str, Float[Tensor, ""]] = field(default_factory=dict)  # Total variation of the blocks asked for
-    surroundings: Float[Tensor, " rays"] | None = None
-    """Share of the light from infinity that the surroundings keep from each ray; None without any."""
-
-    def with_background(
-        self, rgb: Tensor | None, thermal: Tensor | None, request: RayRequest, thermal_moves_density: bool = False
-    ) -> tuple[Tensor | None, Tensor]:
-        """Colour and temperature with what stands behind the box: C + T_end C_background (paper, eq. 1 and 2).
-
-        Args:
-            rgb: Colour at infinity, (rays, 3); None: black.
-            thermal: Normalised temperature at infinity, (rays, 1); None: 0, the scene's minimum.
-            request: The rays; those that do not want a value get 0.
-            thermal_moves_density: Let the thermal sum carry gradients into the weights.
-        """
-        left = self.transmittance[:, None]
-        seen, warm = self.rgb, self.thermal
-        if seen is not None and rgb is not None:
-            behind = left * rgb
-            seen = seen + (behind if request.rgb_rays is None else behind * request.rgb_rays[:, None])
-        if thermal is not None:
-            behind = (left if thermal_moves_density else left.detach()) * thermal
-            warm = warm + (behind if request.thermal_rays is None else behind * request.thermal_rays[:, None])
-        return seen, warm
 
 
-def near_and_far(request: RayRequest) -> tuple[Tensor, Tensor]:
-    """`near` and `far` as one number per ray."""
-    origins = request.origins
-    near = torch.as_tensor(request.near, dtype=origins.dtype, device=origins.device).expand(len(origins))
-    far = request.far
-    if far is None:
-        far = torch.full((len(origins),), torch.inf, dtype=origins.dtype, device=origins.device)
-    return near, far
+@dataclass(frozen=True)
+class GridSamples:
+    """Samples of rays in kept voxels, ray after ray, for statistics. No gradients."""
+
+    ray: Int64[Tensor, " n"]  # Ray of each sample, ascending
+    at: TrilinearPoints  # Where the samples lie
+    weight: Float[Tensor, " n"]  # Share of the pixel
+    before: Float[Tensor, " n"]  # Share of the pixel that is spent before the sample
+    transmittance: Float[Tensor, " rays"]  # Share of the pixel that is left for the background

@@ -22,16 +22,15 @@ from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM, FeatureR
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.core.units import TemperatureRange
-from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
+from thermoxels_ns.field.background import SkyTemperature, SphereImage
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.kept_voxels import check_memory
 from thermoxels_ns.field.refine import ColumnChange, RowChange, refine, widen_colour
 from thermoxels_ns.field.surroundings import Surroundings
-from thermoxels_ns.field.voxel_grid import VoxelField
-from thermoxels_ns.render.compositing import intersect_box
-from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
-from thermoxels_ns.render.renderers import GridSamples, render_rays, sample_rays
-from thermoxels_ns.render.surroundings_render import render_surroundings
+from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
+from thermoxels_ns.render.reference import intersect_box
+from thermoxels_ns.render.renderers import GridSamples, Scene, SceneRender, render_scene, sample_rays
 from thermoxels_ns.training import losses
 from thermoxels_ns.training.image_metrics import (
     SATURATED,
@@ -52,7 +51,6 @@ whenever those of the box are."""
 SURROUNDINGS_DENSITY = 0.005  # Their density at the start, [1 / voxel]: a tenth of the light is lost
 SURROUNDINGS_VARIATION = 100.0
 """Their total variation counts this many times that of the box; chosen on one real scene (1: 16.6, 100: 17.7 dB)."""
-LEAST_LIGHT = 0.003  # Share of a ray's light that leaves the box from which its surroundings are asked for
 
 
 class ThermoxelsModel(Model):
@@ -94,7 +92,7 @@ class ThermoxelsModel(Model):
         channels, budget = config.row_channels(config.resolutions[0]), config.memory_budget_gb
         need = check_memory(lattice, int(np.prod(lattice.cell_shape)), channels, budget)
         CONSOLE.log(f"memory at the start: {need}")
-        self.field = VoxelField(
+        self.grid = VoxelGrid(
             lattice,
             config.first_sh_degree(),
             config.temperature_degree,
@@ -143,11 +141,6 @@ class ThermoxelsModel(Model):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     @property
-    def grid(self):
-        """The voxel grid."""
-        return self.field.grid
-
-    @property
     def seen_surroundings(self) -> Surroundings | None:
         """What lies outside the box; None where all of it lies at infinity."""
         return self.surroundings if bool(self.backdrop_on[2]) else None
@@ -190,9 +183,10 @@ class ThermoxelsModel(Model):
             How values of its columns change; None where they stay.
         """
         degree, stored = self.config.sh_degree, self.grid.sh_degree
-        if degree is None or stored is None or stored >= degree or self._active_sh_degree() != degree:
-            return None
-        return widen_colour(self.grid, degree)
+        early = int(self.trained_steps) < self.config.view_dependence_from
+        return (
+            None if early or degree is None or stored is None or stored >= degree else widen_colour(self.grid, degree)
+        )
 
     def update_to_step(self, step: int) -> None:
         """Tell the model which step it is at (schedules, random blocks)."""
@@ -212,33 +206,27 @@ class ThermoxelsModel(Model):
         """How exactly to render."""
         config = self.config
         return RenderOptions(
-            config.steps_per_voxel,
-            config.smallest_weight,
-            config.early_stop,
-            config.thermal_density_gradient,
-            sh_degree=self._active_sh_degree(),
+            config.steps_per_voxel, config.smallest_weight, config.early_stop, config.thermal_density_gradient
         )
 
     def _training_options(self) -> RenderOptions:
         """The same, and what this step's loss needs beside pixels."""
-        weights, grid = self.loss_weights, self.grid
-        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
         return replace(
             self._options(),
             distortion_scale=2.0 * self.unit if self._distortion_weight() > 0 else None,
-            sparsity=weights.sparsity > 0,
+            sparsity=self.loss_weights.sparsity > 0,
             colour_channels=None if self.config.sh_degree is None else 3 * num_coefficients(self.config.sh_degree),
-            variation={
-                name: losses.random_block(len(grid.voxels), self.config.tv_share, generator)
-                for name in grid.row_parameters()
-                if getattr(weights, f"tv_{name}")
-            },
+            variation=self._blocks(self.grid, 1_000_003),
         )
 
-    def _active_sh_degree(self) -> int | None:
-        """Degree of the colour at this step: the same from all sides until surfaces stand where they are."""
-        degree = self.config.sh_degree
-        return 0 if degree is not None and int(self.trained_steps) < self.config.view_dependence_from else degree
+    def _blocks(self, grid: VoxelGrid, stream: int) -> dict[str, tuple[int, int]]:
+        """The parts of a grid whose total variation this step looks at."""
+        generator = torch.Generator().manual_seed(self.config.seed * stream + self.step)
+        return {
+            name: losses.random_block(len(grid.voxels), self.config.tv_share, generator)
+            for name in self.grid.row_parameters()
+            if getattr(self.loss_weights, f"tv_{name}") and name in grid.row_parameters()
+        }
 
     @torch.no_grad()
     def correct_photographs(
@@ -257,52 +245,13 @@ class ThermoxelsModel(Model):
         """List the samples of rays in kept voxels and their weights, for statistics."""
         return sample_rays(self.grid, self._request(origins, directions), self._options(), self.config.backend)
 
-    def render_rays(self, request: RayRequest, options: RenderOptions) -> tuple[Tensor | None, Tensor, RayRender]:
-        """Colour and temperature of rays with what stands behind the box, and what they were made of."""
-        seen = render_rays(self.grid, request, options, self.config.backend)
+    def render_rays(self, request: RayRequest, options: RenderOptions) -> SceneRender:
+        """What rays see, from the box to infinity."""
         rgb_on, thermal_on, _ = self.backdrop_on.tolist()
-        backdrop, sky = self.background_rgb, self.background_thermal
-        colour = (
-            seen_behind(backdrop, request.directions, request.rgb_rays) if backdrop is not None and rgb_on else None
-        )
-        warmth = seen_behind(sky, request.directions, request.thermal_rays) if sky is not None and thermal_on else None
-        if self.seen_surroundings is not None:
-            colour, warmth, seen = self._with_surroundings(
-                self.seen_surroundings, seen, request, options, colour, warmth
-            )
-        rgb, thermal = seen.with_background(colour, warmth, request, options.thermal_moves_density)
-        return rgb, thermal, seen
-
-    def _with_surroundings(
-        self,
-        surroundings: Surroundings,
-        seen: RayRender,
-        request: RayRequest,
-        options: RenderOptions,
-        colour: Tensor | None,
-        warmth: Tensor | None,
-    ) -> tuple[Tensor | None, Tensor, RayRender]:
-        """Colour and temperature behind the box, of what lies before infinity too; their variation joins that seen."""
-        if options.variation:
-            voxels, parameters = len(surroundings.grid.voxels), surroundings.grid.row_parameters()
-            generator = torch.Generator().manual_seed(self.config.seed * 3_000_017 + self.step)
-            blocks = {
-                name: losses.random_block(voxels, self.config.tv_share, generator)
-                for name in options.variation
-                if name in parameters
-            }
-            options = replace(options, variation=blocks)
-        asked = seen.transmittance.detach() > LEAST_LIGHT
-        far = render_surroundings(surroundings, request, options, self.config.backend, asked)
-        left = far.transmittance[:, None]
-        if far.rgb is not None:
-            colour = far.rgb if colour is None else far.rgb + left * colour
-        warmth = far.thermal if warmth is None else far.thermal + left.detach() * warmth
-        both = {
-            name: value + SURROUNDINGS_VARIATION * far.variation.get(name, 0.0)
-            for name, value in seen.variation.items()
-        }
-        return colour, warmth, replace(seen, variation=both, surroundings=1.0 - far.transmittance)
+        around = self.seen_surroundings
+        rgb, thermal = self.background_rgb if rgb_on else None, self.background_thermal if thermal_on else None
+        blocks = self._blocks(around.grid, 3_000_017) if around is not None and options.variation else None
+        return render_scene(Scene(self.grid, around, rgb, thermal), request, options, self.config.backend, blocks)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation, in_box (1 if it meets the box).
@@ -322,7 +271,8 @@ class ThermoxelsModel(Model):
                 request = replace(request, rgb_rays=rgb_rays)
             return batch | self._image_outputs(request)
         request = replace(request, rgb_rays=rgb_rays, thermal_rays=thermal_rays)
-        rgb, thermal, seen = self.render_rays(request, self._training_options())
+        seen = self.render_rays(request, self._training_options())
+        rgb, thermal = seen.rgb, seen.thermal
         # The gradient of `index_select` adds rays in their order; that of an index leaves the order to a race.
         gains_on, offsets_on = self.corrected.tolist()
         if self.log_gain is not None and gains_on and rgb is not None:
@@ -335,15 +285,15 @@ class ThermoxelsModel(Model):
             offset = self._refined(self.thermal_offset, self.config.per_image_offset)
             offset = offset - offset.mean()
             thermal = thermal + offset.index_select(0, ray_bundle.camera_indices[:, 0])[:, None]
-        return batch | {"rgb": rgb, "thermal": thermal, "accumulation": seen.accumulation[:, None], "render": seen}
+        return batch | {"rgb": rgb, "thermal": thermal, "accumulation": seen.box.accumulation[:, None], "render": seen}
 
     def _refined(self, correction: Tensor, wanted: str) -> Tensor:
         """What was found in photographs stays until surfaces stand, which would pull at it before; then it learns."""
         return correction.detach() if wanted == "auto" and self.step < self.config.distortion_ramp[1] else correction
 
     def _image_outputs(self, request: RayRequest) -> dict[str, Tensor]:
-        rgb, thermal, seen = self.render_rays(request, self._options())
-        origins = request.origins
+        seen = self.render_rays(request, self._options())
+        rgb, thermal, origins = seen.rgb, seen.thermal, request.origins
         if rgb is None or (request.rgb_rays is not None and not bool(request.rgb_rays.any())):
             rgb = thermal.expand(-1, 3)
         # A ray that hits nothing is drawn behind the box: image writers cannot show infinity.
@@ -353,8 +303,8 @@ class ThermoxelsModel(Model):
             "rgb": rgb.clamp(0, 1),
             "thermal": thermal,
             "temperature_c": self.temperature_range.to_celsius(thermal),
-            "depth": torch.minimum(seen.depth, far)[:, None],
-            "accumulation": seen.accumulation[:, None],
+            "depth": torch.minimum(seen.box.depth, far)[:, None],
+            "accumulation": seen.box.accumulation[:, None],
             "in_box": intersect_box(origins, request.directions, lo, hi, request.near)[2][:, None].to(origins.dtype),
         }
 
@@ -379,23 +329,27 @@ class ThermoxelsModel(Model):
             terms["thermal_loss"] = weights.thermal * losses.thermal_loss(seen, measured, self.config.thermal_l2_share)
         if not self.training:
             return terms
-        render: RayRender = outputs["render"]
-        for name, value in render.variation.items():
+        render: SceneRender = outputs["render"]
+        box, around = render.box, render.around
+        for name, value in box.variation.items():
+            if around is not None:
+                value = value + SURROUNDINGS_VARIATION * around.variation.get(name, 0.0)
             terms[f"tv_{name}_loss"] = getattr(weights, f"tv_{name}") * value
-        if render.sparsity is not None:
-            terms["sparsity_loss"] = weights.sparsity * render.sparsity.mean()
+        if box.sparsity is not None:
+            terms["sparsity_loss"] = weights.sparsity * box.sparsity.mean()
         if weights.beta:
-            terms["beta_loss"] = weights.beta * losses.beta_loss(render.accumulation)
-        if render.distortion is not None:
-            terms["distortion_loss"] = self._distortion_weight() * render.distortion.mean()
-        if weights.surroundings and render.surroundings is not None:
-            terms["surroundings_loss"] = weights.surroundings * render.surroundings.mean()
-        if weights.tracks and self.feature_ray_sampler is not None:
-            terms["tracks_loss"] = weights.tracks * self._feature_ray_loss(self.feature_ray_sampler)
-        if weights.tracks and self.plane_ray_sampler is not None:
-            terms["planes_loss"] = weights.tracks * self._feature_ray_loss(self.plane_ray_sampler)
-        if weights.backdrop and self.backdrop_ray_sampler is not None:
-            terms["backdrop_loss"] = weights.backdrop * self._feature_ray_loss(self.backdrop_ray_sampler)
+            terms["beta_loss"] = weights.beta * losses.beta_loss(box.accumulation)
+        if box.distortion is not None:
+            terms["distortion_loss"] = self._distortion_weight() * box.distortion.mean()
+        if weights.surroundings and around is not None:
+            terms["surroundings_loss"] = weights.surroundings * (1.0 - around.transmittance).mean()
+        for name, weight, sampler in (
+            ("tracks", weights.tracks, self.feature_ray_sampler),
+            ("planes", weights.tracks, self.plane_ray_sampler),
+            ("backdrop", weights.backdrop, self.backdrop_ray_sampler),
+        ):
+            if weight and sampler is not None:
+                terms[f"{name}_loss"] = weight * self._feature_ray_loss(sampler)
         return terms
 
     def _feature_ray_loss(self, rays: losses.FeatureRaySampler) -> Tensor:
@@ -404,14 +358,13 @@ class ThermoxelsModel(Model):
         generator = torch.Generator().manual_seed((config.seed + 1) * 2_000_003 + self.step)
         step = 0.0 if self.seen_surroundings is None else self.seen_surroundings.step
         request = rays.request(config.track_rays, near, lattice.voxel_size, generator, self.device, step)
-        seen = render_rays(self.grid, request, self._options(), config.backend)
-        if (outside := self.seen_surroundings) is not None:
-            asked = seen.transmittance.detach() > LEAST_LIGHT
-            far = render_surroundings(outside, request, self._options(), config.backend, asked).transmittance
-            left = seen.transmittance * far
-            seen = replace(seen, transmittance=left, accumulation=1.0 - left)
+        seen = self.render_rays(request, self._options())
+        lost, left = seen.box.accumulation, seen.box.transmittance
+        if seen.around is not None:
+            left = left * seen.around.transmittance
+            lost = 1.0 - left
         last = max(lattice.cell_shape) >= config.resolutions[-1]
-        return losses.feature_ray_loss(seen.accumulation, seen.transmittance, 0.0 if last else rays.coarse_light)
+        return losses.feature_ray_loss(lost, left, 0.0 if last else rays.coarse_light)
 
     def _distortion_weight(self) -> float:
         """Weight of the distortion term at this step: it grows over its ramp."""

@@ -24,13 +24,13 @@ from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.core.threads import set_num_threads
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
-from thermoxels_ns.render.renderers import choose_backend, fused_render
+from thermoxels_ns.render.renderers import choose_backend, render_rays
 from thermoxels_ns.training.image_metrics import half_transparent_share
 from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.optimizers import RowAdam
 
-_GRID = "_model.field.grid."
-_ACTIVATION = "_model.field.grid.activation_index"
+_GRID = "_model.grid."
+_ACTIVATION = f"{_GRID}activation_index"
 
 
 @dataclass
@@ -262,7 +262,9 @@ def compile_kernels(say: Callable[[str], None]) -> None:
         origins = 3.0 * torch.nn.functional.normalize(torch.randn(4, 3, generator=generator), dim=-1)
         request = RayRequest(origins, torch.nn.functional.normalize(-origins, dim=-1))
         variation = {name: (0, 2) for name in grid.row_parameters()}
-        seen = fused_render(grid, request, RenderOptions(distortion_scale=1.0, sparsity=True, variation=variation))
+        seen = render_rays(
+            grid, request, RenderOptions(distortion_scale=1.0, sparsity=True, variation=variation), "fused"
+        )
         assert seen.rgb is not None
         (seen.rgb.sum() + seen.thermal.sum() + sum(seen.variation.values())).backward()
         RowAdam(list(grid.parameters())).step()

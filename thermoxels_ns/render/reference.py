@@ -1,15 +1,19 @@
-"""The volume rendering sum of the paper (eq. 1 and 2) and its samples, in plain torch."""
+"""The plain twin of the compiled renderer: the volume rendering sum of the paper (eq. 1 and 2) in torch."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.field.interpolation import TrilinearPoints
+from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.render.ray_render import GridSamples, RayRender, RayRequest, RenderOptions
 
 
 @dataclass(frozen=True)
@@ -71,8 +75,6 @@ def sample_box(
 OPAQUE_OPTICAL_DEPTH = 100.0
 """Optical depth of one step from which it counts as opaque: exp(-100) is 0 in float32, 4e-44 in float64."""
 
-RowsFn = Callable[[Tensor], Tensor]
-
 
 @dataclass(frozen=True)
 class RayWeights:
@@ -81,16 +83,6 @@ class RayWeights:
     weights: Float[Tensor, "rays steps"]  # Share of the pixel that each step fills
     transmittance: Float[Tensor, " rays"]  # Share of the background that is left behind the last step
     accumulation: Float[Tensor, " rays"]  # 1 - transmittance, with all digits when it is small
-
-
-@dataclass(frozen=True)
-class Composite:
-    """What a bundle of rays sees."""
-
-    rgb: Float[Tensor, "rays 3"] | None  # Colour in [0, 1]; None if no colour was asked for
-    thermal: Float[Tensor, "rays 1"] | None  # Normalised temperature; None if none was asked for
-    accumulation: Float[Tensor, " rays"]  # Opacity of the whole ray, in [0, 1]
-    depth: Float[Tensor, " rays"]  # Expected distance of what was hit, world units; infinite where nothing was
 
 
 def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> RayWeights:
@@ -126,60 +118,6 @@ def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "ray
     )
 
 
-def composite(
-    steps: RaySteps,
-    along: RayWeights,
-    rgb_at: RowsFn | None = None,
-    thermal_at: RowsFn | None = None,
-    rgb_rays: Bool[Tensor, " rays"] | None = None,
-    thermal_rays: Bool[Tensor, " rays"] | None = None,
-    thermal_moves_density: bool = False,
-    smallest_weight: float = 0.0,
-) -> Composite:
-    """Sum colour and temperature along rays (paper, eq. 1 and 2), without the background: C = sum_i w_i c_i.
-
-    Appearance is asked for only at steps whose weight exceeds `smallest_weight` on rays that want it.
-
-    Args:
-        steps: Samples.
-        along: Their weights.
-        rgb_at: Maps the flat indices (into rays x steps) of samples to colours (n, 3); None: no colour.
-        thermal_at: Maps flat indices of samples to normalised temperatures (n, 1); None: no temperature.
-        rgb_rays: Rays that want colour; None: all. The others get 0.
-        thermal_rays: Rays that want temperature; None: all. The others get 0.
-        thermal_moves_density: Let the thermal sum carry gradients into the weights (off: temperature never
-            moves geometry).
-        smallest_weight: Steps of at most this weight add no colour and no temperature; the error of a pixel is
-            at most `smallest_weight` times its number of steps. 0 is exact.
-
-    Returns:
-        The composite; a ray that misses is 0, with depth infinite.
-    """
-    accumulation = along.accumulation
-    expected = (along.weights * steps.t).sum(-1)
-    depth = torch.where(
-        accumulation > 0, expected / accumulation.clamp(min=1e-30), torch.full_like(expected, torch.inf)
-    )
-    thermal_weights = along.weights if thermal_moves_density else along.weights.detach()
-    rgb = _sum_rows(along.weights, rgb_at, rgb_rays, 3, smallest_weight)
-    thermal = _sum_rows(thermal_weights, thermal_at, thermal_rays, 1, smallest_weight)
-    return Composite(rgb=rgb, thermal=thermal, accumulation=accumulation, depth=depth)
-
-
-def _sum_rows(
-    weights: Tensor, rows_at: RowsFn | None, rays: Tensor | None, channels: int, smallest_weight: float
-) -> Tensor | None:
-    if rows_at is None:
-        return None
-    num_rays, num_steps = weights.shape
-    wanted = weights.detach() > smallest_weight
-    if rays is not None:
-        wanted &= rays[:, None]
-    flat = wanted.flatten().nonzero()[:, 0]
-    rows = rows_at(flat) * weights.flatten()[flat][:, None]
-    return rows.new_zeros((num_rays, channels)).index_add(0, flat // num_steps, rows)
-
-
 def ray_sparsity(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> Float[Tensor, " rays"]:
     """Cauchy sparsity of each ray: sum_i log(1 + 2 s_i^2) over real steps (Plenoxels, eq. 5; SNeRG)."""
     terms = torch.log1p(2.0 * density.clamp(max=1e9) ** 2)
@@ -203,3 +141,101 @@ def ray_distortion(
     moment_before = torch.cumsum(moment, -1) - moment
     between = 2.0 * torch.sum(weights * (t * weight_before - moment_before), -1)
     return between + torch.sum(weights**2 * deltas, -1) / 3.0
+
+
+@dataclass(frozen=True)
+class Marched:
+    """Samples of rays through the box, and what density makes of them."""
+
+    steps: RaySteps
+    density: Float[Tensor, "rays steps"]  # Density at the samples, 0 where nothing was asked, [1 / world unit]
+    along: RayWeights
+    active: Int64[Tensor, " n"]  # Flat indices (into rays x steps) of the samples in kept voxels, ascending
+    ray: Int64[Tensor, " n"]  # The ray of each of them
+    at: TrilinearPoints  # Where they lie
+
+
+def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> Marched:
+    """Sample rays through the kept voxels and weigh the samples."""
+    origins, directions, lattice = request.origins, request.directions, grid.lattice
+    lo = torch.tensor(lattice.lo, dtype=origins.dtype, device=origins.device)
+    hi = torch.tensor(lattice.hi, dtype=origins.dtype, device=origins.device)
+    step = lattice.voxel_size / options.steps_per_voxel
+    steps = sample_box(origins, directions, lo, hi, step, request.near, request.far)
+    active = (steps.deltas > 0).flatten().nonzero()[:, 0]
+    ray = active // steps.t.shape[1]
+    positions = origins[ray] + directions[ray] * steps.t.flatten()[active][:, None]
+    at = grid.locate(positions)
+    kept = at.kept()  # of a point that rounding puts outside the box, the nearest voxel counts, as in the kernels
+    active, ray, at = active[kept], ray[kept], at.select(kept)
+    density = torch.zeros_like(steps.t).flatten().index_put((active,), grid.density_at(at)).view_as(steps.t)
+    return Marched(steps, density, ray_weights(density, steps.deltas), active, ray, at)
+
+
+def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
+    """Render rays in plain torch: what every faster renderer is tested against."""
+    marched = march(grid, request, options)
+    steps, along, ray = marched.steps, marched.along, marched.ray
+    weight = along.weights.flatten()[marched.active]
+
+    def summed(values_at: Callable[..., Tensor], wants: Tensor | None, weight: Tensor, channels: int) -> Tensor:
+        """Sum values over the samples with a weight that counts, on rays that want them: C = sum_i w_i c_i."""
+        chosen = weight.detach() > options.smallest_weight
+        chosen = (chosen if wants is None else chosen & wants[ray]).nonzero()[:, 0]
+        values = values_at(marched.at.select(chosen), request.directions[ray[chosen]]) * weight[chosen][:, None]
+        return values.new_zeros((len(steps.t), channels)).index_add(0, ray[chosen], values)
+
+    thermal_weight = weight if options.thermal_moves_density else weight.detach()
+    expected = (along.weights * steps.t).sum(-1)
+    depth = torch.where(along.accumulation > 0, expected / along.accumulation.clamp(min=1e-30), torch.inf)
+    distortion = sparsity = None
+    if options.distortion_scale:
+        distortion = ray_distortion(along.weights, steps.t, steps.deltas, options.distortion_scale)
+    if options.sparsity:
+        sparsity = ray_sparsity(marched.density, steps.deltas)
+    corners, parameters = grid.voxels.tables(grid.density.device)[0], grid.row_parameters()
+    variation = {
+        name: total_variation(parameters[name], corners[a:b], options.colour_channels if name == "sh" else None)
+        for name, (a, b) in options.variation.items()
+    }
+    return RayRender(
+        summed(grid.rgb_at, request.rgb_rays, weight, 3) if grid.sh is not None else None,
+        summed(grid.thermal_at, request.thermal_rays, thermal_weight, 1),
+        along.transmittance,
+        along.accumulation,
+        depth.detach(),
+        distortion,
+        sparsity,
+        variation,
+    )
+
+
+def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> GridSamples:
+    """March rays and list their samples; neither colour nor temperature is read."""
+    marched = march(grid, request, options)
+    weights = marched.along.weights
+    before = torch.cumsum(weights, -1) - weights
+    weight, before = weights.flatten()[marched.active], before.flatten()[marched.active]
+    return GridSamples(marched.ray, marched.at, weight, before, marched.along.transmittance)
+
+
+def total_variation(
+    rows: Float[Tensor, "rows c"],
+    corners: Int64[Tensor, "voxels 8"],
+    channels: int | None = None,
+    smallest: float = 1e-10,
+) -> Float[Tensor, ""]:
+    """Mean over voxels and channels of sqrt(dx^2 + dy^2 + dz^2), differences from corner 0 (Plenoxels, eq. 4).
+
+    Args:
+        rows: Corner values.
+        corners: Rows of the corners of the voxels to look at, in the order of `lattice.CORNER_OFFSETS`.
+        channels: Channels of which the mean is taken, those without a column being 0; None: the columns.
+        smallest: Added under the root so that its gradient is finite where the field is flat.
+    """
+    columns = rows.shape[1]
+    channels = columns if channels is None else channels
+    here = rows[corners[:, 0]]
+    dz, dy, dx = rows[corners[:, 1]] - here, rows[corners[:, 2]] - here, rows[corners[:, 4]] - here
+    total = torch.sum(torch.sqrt(dx * dx + dy * dy + dz * dz + smallest)) / (len(corners) * channels)
+    return total + (1.0 - columns / channels) * math.sqrt(smallest)
