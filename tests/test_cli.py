@@ -9,7 +9,8 @@ import pytest
 
 from thermoxels_ns import cli
 from thermoxels_ns.commands.demo import SceneName
-from thermoxels_ns.synthetic.scene_folder import SCENE_NAMES, load_truth
+from thermoxels_ns.synthetic.catalogue import SCENE_NAMES
+from thermoxels_ns.synthetic.scene_folder import load_truth
 
 SMALL = ["--num-train", "3", "--num-eval", "1", "--width", "16", "--height", "12"]
 

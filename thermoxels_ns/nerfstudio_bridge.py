@@ -19,7 +19,7 @@ import yaml
 
 from thermoxels_ns.core.checks import refuse_what_is_in_the_way, writable_folder
 from thermoxels_ns.core.config_loader import ConfigLoader, ModuleWith
-from thermoxels_ns.core.errors import OutputError, ThermoxelsError
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 
 if TYPE_CHECKING:
     from thermoxels_ns.evaluation.truth_comparison import RenderedRays
@@ -171,19 +171,23 @@ def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
     from rich.markup import escape
 
     from thermoxels_ns.core.lattice import input_from_world
-    from thermoxels_ns.evaluation.truth_comparison import depth_metrics, geometry_metrics, has_truth, load_known_truth
+    from thermoxels_ns.evaluation.truth_comparison import depth_metrics, geometry_metrics, load_known_truth
 
     def say(line: str) -> None:
         CONSOLE.print(escape(line))
 
     datamanager: Any = pipeline.datamanager
-    known = load_known_truth(datamanager.get_datapath()) if has_truth(datamanager.get_datapath(), say) else None
-    if known is None:
-        return {}
     outputs = datamanager.train_dataparser_outputs
     world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
-    # With the rays' evidence and the cameras, as an export has them: they decide what is solid.
-    figures = geometry_metrics(pipeline.grid_snapshot(), world_to_input, known, say)
+    try:
+        known = load_known_truth(datamanager.get_datapath())
+        if known is None:
+            return {}
+        # With the rays' evidence and the cameras, as an export has them: they decide what is solid.
+        figures = geometry_metrics(pipeline.grid_snapshot(), world_to_input, known, say)
+    except SceneError as problem:
+        say(f"Geometry is not compared with the truth: {problem}")
+        return {}
     return figures | depth_metrics(_held_out_rays(pipeline), pipeline.model.grid.lattice, world_to_input, known.scene)
 
 

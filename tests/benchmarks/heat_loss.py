@@ -31,7 +31,7 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 
 def exact_mesh(scene, voxels: int) -> TetMesh:
-    snapshot = exact_snapshot(scene.signed_distance, Lattice.covering(*scene.scene_box, voxels))
+    snapshot = exact_snapshot(scene.solid.signed_distance, Lattice.covering(*scene.scene_box, voxels))
     return build_mesh(snapshot, SolidSelection(density_threshold=1.0, close_gaps=0), np.eye(4)).mesh
 
 
@@ -64,8 +64,8 @@ def main() -> None:
         truth = heat_lost_j(exact, arguments.hours)
         area, volume = size(exact)
         rows.append(
-            f"| {known.scene.name} | exact shape, meshed | {100 * (area / known.scene.area_m2 - 1):+.1f} % "
-            f"| {100 * (volume / known.scene.volume_m3 - 1):+.1f} % | {truth / 3.6e6:.4g} kWh |"
+            f"| {known.scene.name} | exact shape, meshed | {100 * (area / known.scene.solid.area - 1):+.1f} % "
+            f"| {100 * (volume / known.scene.solid.volume - 1):+.1f} % | {truth / 3.6e6:.4g} kWh |"
         )
         for mode in ("voxel", "conforming"):
             built = build_mesh(trained.snapshot, SolidSelection(), trained.world_to_input, MeshOptions(mode)).mesh
@@ -78,8 +78,8 @@ def main() -> None:
                 area, volume = size(mesh)
                 lost = heat_lost_j(mesh, arguments.hours)
                 rows.append(
-                    f"| {known.scene.name} | {name} | {100 * (area / known.scene.area_m2 - 1):+.1f} % "
-                    f"| {100 * (volume / known.scene.volume_m3 - 1):+.1f} % | {100 * (lost / truth - 1):+.1f} % |"
+                    f"| {known.scene.name} | {name} | {100 * (area / known.scene.solid.area - 1):+.1f} % "
+                    f"| {100 * (volume / known.scene.solid.volume - 1):+.1f} % | {100 * (lost / truth - 1):+.1f} % |"
                 )
     print("\n| scene | mesh | area | volume | heat lost |\n|---|---|---:|---:|---:|")
     print("\n".join(rows))

@@ -84,7 +84,7 @@ def body_named(name: str) -> Body:
 
         return Body(distance, 2 * (a * b + b * c + a * c), a * b * c)
     scene = make_scene(name)
-    return Body(scene.signed_distance, scene.area_m2, scene.volume_m3, scene.scene_box)
+    return Body(scene.solid.signed_distance, scene.solid.area, scene.solid.volume, scene.scene_box)
 
 
 def snapshot_of(body: Body, voxels: int) -> GridSnapshot:

@@ -16,7 +16,7 @@ from thermoxels_ns.commands.export import ExportThermoxelsMesh
 from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 from thermoxels_ns.core.yaml_records import configs_folder
-from thermoxels_ns.synthetic.house_corner import BRIDGE_PSI_W_MK
+from thermoxels_ns.synthetic.drawn_scenes import BRIDGE_PSI_W_MK
 
 PATCHES = configs_folder() / "house-corner-patches.yaml"
 IMAGES = {

@@ -13,7 +13,7 @@ from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import Depths, depths_of
 from thermoxels_ns.multiview.votes import supporting_photographs
-from thermoxels_ns.synthetic.box_solid import BoxSolid
+from thermoxels_ns.synthetic.solids import BoxSolid
 
 VOXEL = 0.05
 LATTICE = Lattice((-1.6, -1.6, -0.4), VOXEL, (65, 65, 65))

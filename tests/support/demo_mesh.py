@@ -32,6 +32,6 @@ def demo_mesh(scene_name: str, voxels: int, boundary: BoundaryMode = "conforming
     scene = make_scene(scene_name)
     lattice = Lattice.covering(*scene.scene_box, voxels)
     temperature_c = scene.surface_temperature_c(lattice.corner_positions().reshape(-1, 3)).reshape(lattice.shape)
-    snapshot = exact_snapshot(scene.signed_distance, lattice, temperature_c)
+    snapshot = exact_snapshot(scene.solid.signed_distance, lattice, temperature_c)
     selection = SolidSelection(density_threshold=1.0, close_gaps=0)
     return build_mesh(snapshot, selection, np.eye(4), MeshOptions(boundary)).mesh

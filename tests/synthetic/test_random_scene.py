@@ -1,8 +1,6 @@
 """Scenes from a seed: exact, the same everywhere, nothing thinner than three voxels, and photographed from outside."""
 
-import dataclasses
 import itertools
-import math
 from pathlib import Path
 
 import numpy as np
@@ -10,24 +8,18 @@ import pytest
 import tyro
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
 from thermoxels_ns.synthetic.catalogue import SceneWord, make_scene
-from thermoxels_ns.synthetic.random_plan import SMALLEST, WIDEST, Plan
-from thermoxels_ns.synthetic.random_scene import FAMILIES, random_scene, random_seed
+from thermoxels_ns.synthetic.random_plan import SMALLEST, Plan
+from thermoxels_ns.synthetic.random_scene import FAMILIES, random_scene
 from thermoxels_ns.synthetic.raycast import visible_surface_points
 from thermoxels_ns.synthetic.scene_folder import load_truth, write_scene
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
-from thermoxels_ns.synthetic.solid_union import SolidUnion
+from thermoxels_ns.synthetic.solids import BoxSolid, SolidUnion, distance_to_box
 
-MANY = range(30)
+MANY = range(15)
 ONE_OF_EACH = range(len(FAMILIES))
 # Things that rest on something are this close to it, found by the nearest of random points [voxels of the plan].
 _CONTACT = 0.06
-
-
-def size(scene: SyntheticScene) -> float:
-    lo, hi = scene.scene_box
-    return float(np.subtract(hi, lo).max())
 
 
 def laid_out(number: int, seed: int) -> Plan:
@@ -42,28 +34,24 @@ def boxes_of(scene: SyntheticScene) -> BoxSolid:
     return part
 
 
-def test_a_seed_in_the_name_makes_the_scene() -> None:
-    scene = make_scene("random-17")
-    assert scene.name == "random-17" and make_scene("random-17") is scene
-    assert scene.volume_m3 == random_scene(17).volume_m3 != random_scene(18).volume_m3
-    assert [random_seed(f"random-{n}") for n in (0, 8, 10**17)] == [0, 8, 10**17]
-
-
 @pytest.mark.parametrize(
     "name",
-    ["random", "random-", "random-017", "random--1", "random-1.5", "random-x", "Random-1", "random-1 ", "random-²"],
+    [
+        "random",
+        "random-",
+        "random-017",
+        "random--1",
+        "random-1.5",
+        "random-x",
+        "Random-1",
+        "random-1 ",
+        "random-²",
+        "random-" + "9" * 5000,
+    ],
 )
-def test_other_names_are_refused_with_the_names_there_are(name: str) -> None:
-    with pytest.raises(SceneError, match=r"random-N or wild-N .* house-corner.*got '[Rr]andom") as problem:
+def test_other_names_are_refused(name: str) -> None:
+    with pytest.raises(SceneError):
         make_scene(name)
-    assert repr(name) in str(problem.value)
-
-
-def test_a_number_too_long_for_a_seed_and_a_negative_one_are_refused() -> None:
-    with pytest.raises(SceneError, match="random-N"):
-        make_scene("random-" + "9" * 5000)
-    with pytest.raises(SceneError, match="seed: expected a whole number from 0 on, got -1"):
-        random_scene(-1)
 
 
 def test_the_command_line_takes_names_and_seeds_and_refuses_others(capsys: pytest.CaptureFixture[str]) -> None:
@@ -79,7 +67,7 @@ def test_truth_comes_back_from_the_folder(tmp_path: Path) -> None:
     write_scene(make_scene("random-4"), tmp_path, num_train=2, num_eval=1, width=16, height=12, progress=False)
     truth = load_truth(tmp_path)
     assert truth is not None and truth.name == "random-4"
-    assert (truth.volume_m3, truth.area_m2) == (random_scene(4).volume_m3, random_scene(4).area_m2)
+    assert (truth.solid.volume, truth.solid.area) == (random_scene(4).solid.volume, random_scene(4).solid.area)
 
 
 # Volume [m3], area [m2], height of the first camera [m], temperature at the first of the surface points [C].
@@ -96,36 +84,29 @@ PINNED = {
 def test_a_seed_means_the_same_scene_on_every_machine(seed: int) -> None:
     scene = random_scene(seed)
     height = scene.poses(42, 6)[0][0][2, 3]
-    temperature = scene.surface_temperature_c(scene.surface_points(10)[0])[0]
-    assert (scene.volume_m3, scene.area_m2, height, temperature) == pytest.approx(PINNED[seed], rel=1e-6)
-
-
-def test_ten_seeds_show_every_family_twice_and_no_scene_twice() -> None:
-    scenes = [random_scene(seed) for seed in range(10)]
-    assert len({scene.volume_m3 for scene in scenes}) == len({scene.focal_share for scene in scenes}) == 10
-    has_round = [isinstance(scene.solid, SolidUnion) for scene in scenes]
-    assert has_round == [family.name in ("machinery", "pipes and radiators") for family in FAMILIES] * 2
+    temperature = scene.surface_temperature_c(scene.solid.surface_points(10)[0])[0]
+    assert (scene.solid.volume, scene.solid.area, height, temperature) == pytest.approx(PINNED[seed], rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", MANY)
 def test_every_seed_makes_a_scene_that_lies_in_its_box_with_room_around_it(seed: int) -> None:
     scene = make_scene(f"random-{seed}")
     (lo, hi), (solid_lo, solid_hi) = np.array(scene.scene_box), np.array(scene.solid.bounds)
-    voxel = size(scene) / 64
+    voxel = scene.size / 64
     assert (solid_lo - lo >= 2 * voxel).all() and (hi - solid_hi >= 2 * voxel).all()
-    assert (solid_hi - solid_lo).max() > 0.9 * size(scene)
-    points, normals = scene.surface_points(2000, seed=3)
-    assert np.abs(scene.signed_distance(points)).max() < 1e-12 * size(scene)
-    assert not scene.contains(points + 1e-6 * size(scene) * normals).any()
-    assert scene.contains(points - 1e-6 * size(scene) * normals).all()
+    assert (solid_hi - solid_lo).max() > 0.9 * scene.size
+    points, normals = scene.solid.surface_points(2000, seed=3)
+    assert np.abs(scene.solid.signed_distance(points)).max() < 1e-12 * scene.size
+    assert not scene.solid.contains(points + 1e-6 * scene.size * normals).any()
+    assert scene.solid.contains(points - 1e-6 * scene.size * normals).all()
 
 
 @pytest.mark.parametrize("seed", MANY)
 def test_every_camera_stands_outside_and_has_the_scene_in_half_of_its_picture(seed: int) -> None:
     scene = make_scene(f"random-{seed}")
-    camera, points = scene.camera(320, 240), scene.surface_points(2000)[0]
+    camera, points = scene.camera(320, 240), scene.solid.surface_points(2000)[0]
     poses = np.concatenate(scene.poses(42, 6))
-    assert scene.signed_distance(poses[:, :3, 3]).min() > 0.3 * size(scene) and poses[:, 2, 3].min() > 0.0
+    assert scene.solid.signed_distance(poses[:, :3, 3]).min() > 0.3 * scene.size and poses[:, 2, 3].min() > 0.0
     shares = []
     for pose in poses:
         pixel = camera.project_world(pose, points)
@@ -138,9 +119,9 @@ def test_every_camera_stands_outside_and_has_the_scene_in_half_of_its_picture(se
 @pytest.mark.parametrize("seed", range(20, 35))
 def test_wild_scenes_stand_free_before_each_kind_of_surroundings_and_fill_the_picture(seed: int) -> None:
     scene = make_scene(f"wild-{seed}")
-    camera, points = scene.camera(320, 240), scene.surface_points(1000)[0]
+    camera, points = scene.camera(320, 240), scene.solid.surface_points(1000)[0]
     poses = np.concatenate(scene.poses(42, 6))
-    assert scene.signed_distance(poses[:, :3, 3]).min() > 0.3 * size(scene)
+    assert scene.solid.signed_distance(poses[:, :3, 3]).min() > 0.3 * scene.size
     assert all(camera.contains(camera.project_world(pose, points)).all() for pose in poses)
     inside = np.random.default_rng(1).uniform(*scene.solid.bounds, (2000, 3))
     if scene.around is not None:
@@ -148,7 +129,7 @@ def test_wild_scenes_stand_free_before_each_kind_of_surroundings_and_fill_the_pi
     sky = scene.background_rgb([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     kind = "around" if scene.around else "plain" if (sky[0] == sky[1]).all() else "smooth"
     assert kind == ("smooth", "plain", "around")[seed % 3]
-    points, normals = scene.surface_points(2000)
+    points, normals = scene.solid.surface_points(2000)
     assert scene.colour(points, normals).std(axis=0).max() > 0.05
 
 
@@ -157,20 +138,19 @@ def test_wild_scenes_have_plain_walls_mirrors_and_railings_and_random_ones_have_
     for seed in range(20, 40):
         scene = make_scene(f"wild-{seed}")
         mirrors.append(scene.mirror is not None)
-        lo, hi = boxes_of(scene).filled_boxes
-        thinnest.append(127 / size(scene) * (hi - lo).min(axis=1).min())
+        thinnest.append(127 / scene.size * np.subtract(*np.array(boxes_of(scene).boxes).T[::-1]).min())
         wall = Plan(np.random.default_rng(0), plain_walls=seed % 2 == 0)
         plain.append(wall.paints[wall.paint("wall")].contrast == 0.0)
     assert 3 <= sum(mirrors) <= 14 and plain == [True, False] * 10
     assert make_scene("random-20").mirror is None and not np.isclose(
-        make_scene("wild-20").volume_m3, random_scene(20).volume_m3
+        make_scene("wild-20").solid.volume, random_scene(20).solid.volume
     )
 
 
 @pytest.mark.parametrize("seed", MANY)
 def test_nothing_is_thinner_or_closer_than_three_voxels_of_128(seed: int) -> None:
     scene = make_scene(f"random-{seed}")
-    boxes, voxel = boxes_of(scene), size(scene) / 127
+    boxes, voxel = boxes_of(scene), scene.size / 127
     points, normals = boxes.surface_points(2500, seed=2)
     for voxels in np.linspace(0.02, 2.99, 12):
         assert boxes.contains(points - voxels * voxel * normals).all()
@@ -192,23 +172,11 @@ def test_round_things_keep_their_distance_or_rest_on_something(number: int, seed
         assert all(other.signed_distance(points).min() > SMALLEST for other in things if other is not thing)
 
 
-@pytest.mark.parametrize(("number", "seed"), list(itertools.product(ONE_OF_EACH, range(4))))
-def test_boxes_touch_each_other_from_the_ground_up(number: int, seed: int) -> None:
-    boxes = np.array([piece.shape for piece in laid_out(number, seed).pieces if isinstance(piece.shape, tuple)])
-    lo, hi = boxes[:, 0], boxes[:, 1]
-    meet = np.all((lo[:, None] <= hi[None] + 1e-9) & (lo[None] <= hi[:, None] + 1e-9), axis=2)
-    reached = np.zeros(len(boxes), dtype=bool)
-    reached[0] = True
-    for _ in boxes:
-        reached = meet[reached].any(axis=0)
-    assert reached.all() and (hi - lo).max() <= WIDEST and np.ptp(boxes.reshape(-1, 3), axis=0).max() <= WIDEST
-
-
 @pytest.mark.parametrize("seed", range(10))
 def test_temperatures_fill_their_bounds_and_are_continuous(seed: int) -> None:
     scene = make_scene(f"random-{seed}")
     lowest, highest = scene.temperature_bounds_c
-    points, normals = scene.surface_points(20_000, seed=5)
+    points, normals = scene.solid.surface_points(20_000, seed=5)
     surface = scene.surface_temperature_c(points)
     directions = np.random.default_rng(0).standard_normal((3000, 3))
     directions = np.concatenate([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
@@ -218,14 +186,14 @@ def test_temperatures_fill_their_bounds_and_are_continuous(seed: int) -> None:
     assert lowest <= both.min() and both.max() <= highest and np.ptp(both) > 0.9 * (highest - lowest)
     along = np.cross(normals, [0.31, 0.55, 0.77])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    beside = scene.surface_temperature_c(points + 0.01 * size(scene) / 127 * along)
+    beside = scene.surface_temperature_c(points + 0.01 * scene.size / 127 * along)
     assert np.abs(beside - surface).max() < 0.02 * (highest - lowest)
 
 
 @pytest.mark.parametrize("seed", range(10))
 def test_paints_go_from_textured_to_plain_and_tell_pieces_apart(seed: int) -> None:
     scene = make_scene(f"random-{seed}")
-    points, normals = scene.surface_points(4000, seed=6)
+    points, normals = scene.solid.surface_points(4000, seed=6)
     colour = scene.colour(points, normals)
     assert colour.shape == (4000, 3) and colour.min() >= 0.0 and colour.max() <= 1.0 and colour.std() > 0.05
     contrasts = [paint.contrast for paint in laid_out(seed % len(FAMILIES), seed).paints]
@@ -255,21 +223,10 @@ def test_a_plan_in_another_unit_is_the_same_plan() -> None:
     assert (larger.part(2.5 * points, normals) == plan.part(points, normals)).mean() > 0.999
 
 
-def test_pieces_that_touch_pass_their_warmth_on() -> None:
-    plan = Plan(np.random.default_rng(0))
-    for x, warmth in ((0.0, 0.0), (10.0, 1.0)):
-        plan.put(((x, 0.0, 0.0), (x + 10.0, 10.0, 10.0)), plan.paint("stone"), warmth)
-    plan.pieces[:] = [dataclasses.replace(piece, slope=np.zeros(3)) for piece in plan.pieces]
-    warmth = plan.warmth([[1.0, 0.0, 5.0], [10.0, 0.0, 5.0], [19.0, 0.0, 5.0]])
-    # Nine voxels from the contact the other's share is exp(-9 / 2) of the own one.
-    far = math.exp(-4.5) / (1.0 + math.exp(-4.5))
-    np.testing.assert_allclose(warmth, [far, 0.5, 1.0 - far])
-
-
 @pytest.mark.parametrize("seed", ONE_OF_EACH)
 def test_most_of_what_can_be_seen_is_seen_by_three_cameras(seed: int) -> None:
     scene = make_scene(f"random-{seed}")
-    points, normals = scene.surface_points(3000)
+    points, normals = scene.solid.surface_points(3000)
     seen = visible_surface_points(scene, scene.poses(42, 6)[0], scene.camera(320, 240), points, normals)
     if FAMILIES[seed].arc_deg is None:
         assert seen[normals[:, 2] > -0.5].mean() > 0.9

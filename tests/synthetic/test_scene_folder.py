@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.raycast import render_view
-from thermoxels_ns.synthetic.scene_folder import SCENE_NAMES, load_truth, make_scene, write_scene
+from thermoxels_ns.synthetic.scene_folder import load_truth, make_scene, write_scene
 
 SMALL = {"num_train": 3, "num_eval": 2, "width": 40, "height": 30, "progress": False}
 
@@ -54,38 +54,26 @@ def test_layout_is_that_of_thermoscenes(tmp_path: Path) -> None:
     np.testing.assert_array_equal([f["transform_matrix"] for f in content["frames"]], [*train, *held_out])
 
 
-@pytest.mark.parametrize("name", SCENE_NAMES)
-def test_sixteen_bit_png_round_trip(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("thermal_format", "name", "within_k"),
+    [("png16", "hot-object", 1e-3), ("tiff", "house-corner", 0.0051), ("npy", "sphere", 2e-6)],
+)
+def test_files_hold_the_pictures_that_the_scene_shows(tmp_path, thermal_format, name, within_k) -> None:
     scene = make_scene(name)
-    write_scene(scene, tmp_path, photo_format="png", **SMALL)
-    for frame in transforms(tmp_path)["frames"]:
-        view = render_view(scene, np.array(frame["transform_matrix"]), scene.camera(40, 30))
-        assert np.abs(png_to_celsius(tmp_path, frame) - view.temperature_c).max() < 1e-3
-        rgb = np.asarray(Image.open(tmp_path / frame["file_path"]))
-        assert rgb.shape == (30, 40, 3)
-        assert np.abs(rgb / 255.0 - view.rgb).max() <= 0.5 / 255.0 + 1e-6
-
-
-def test_tiff_counts_have_a_linear_unit(tmp_path: Path) -> None:
-    scene = make_scene("house-corner")
-    write_scene(scene, tmp_path, thermal_format="tiff", **SMALL)
+    write_scene(scene, tmp_path, photo_format="png", thermal_format=thermal_format, thermal_width=20, **SMALL)
     content = transforms(tmp_path)
-    frame = content["frames"][0]
-    counts = np.asarray(Image.open(tmp_path / frame["thermal_file_path"]))
-    assert frame["thermal_file_path"].endswith(".tiff") and counts.dtype == np.uint16
-    celsius = counts * content["thermal_unit"]["celsius_per_count"] + content["thermal_unit"]["celsius_offset"]
-    view = render_view(scene, np.array(frame["transform_matrix"]), scene.camera(40, 30))
-    assert np.abs(celsius - view.temperature_c).max() <= 0.005 + 1e-9
-
-
-def test_npy_holds_celsius_and_thermal_images_may_be_smaller(tmp_path: Path) -> None:
-    scene = make_scene("sphere")
-    write_scene(scene, tmp_path, thermal_format="npy", thermal_width=20, **SMALL)
-    frame = transforms(tmp_path)["frames"][1]
-    celsius = np.load(tmp_path / frame["thermal_file_path"])
-    assert celsius.dtype == np.float32 and celsius.shape == (15, 20)
-    view = render_view(scene, np.array(frame["transform_matrix"]), scene.camera(20, 15))
-    np.testing.assert_allclose(celsius, view.temperature_c, rtol=1e-6)
+    for frame in content["frames"]:
+        path, pose = tmp_path / frame["thermal_file_path"], np.array(frame["transform_matrix"])
+        if thermal_format == "png16":
+            celsius = png_to_celsius(tmp_path, frame)
+        elif thermal_format == "npy":
+            celsius = np.load(path)
+        else:
+            unit = content["thermal_unit"]
+            celsius = np.asarray(Image.open(path)) * unit["celsius_per_count"] + unit["celsius_offset"]
+        assert np.abs(celsius - render_view(scene, pose, scene.camera(20, 15)).temperature_c).max() < within_k
+        rgb = np.asarray(Image.open(tmp_path / frame["file_path"])) / 255.0
+        np.testing.assert_allclose(rgb, render_view(scene, pose, scene.camera(40, 30)).rgb, atol=0.5 / 255.0 + 1e-6)
 
 
 def test_own_thermal_camera_is_a_rigid_offset_with_its_own_lens(tmp_path: Path) -> None:
@@ -158,49 +146,25 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
     assert all_bytes(tmp_path / "a") != all_bytes(tmp_path / "c")
 
 
-@pytest.mark.parametrize(
-    ("text", "match"),
-    [
-        ('{"synthetic_scene": "castle"}', f"{', '.join(SCENE_NAMES)}.*got 'castle'"),
-        ('{"seed": 1}', "synthetic_scene"),
-        ('{"synthetic_scene": ', "readable json"),
-        ("[1, 2]", "json object"),
-    ],
-)
-def test_bad_truth_is_an_error(tmp_path: Path, text: str, match: str) -> None:
+@pytest.mark.parametrize("text", ['{"synthetic_scene": "castle"}', '{"seed": 1}', '{"synthetic_scene": ', "[1, 2]"])
+def test_bad_truth_is_an_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "truth.json").write_text(text)
-    with pytest.raises(SceneError, match=match):
+    with pytest.raises(SceneError):
         load_truth(tmp_path)
 
 
 def test_real_photographs_have_no_truth_and_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text('{"frames": []}')
     assert load_truth(tmp_path) is None
-    with pytest.raises(SceneError, match="describes other photographs"):
+    with pytest.raises(SceneError):
         write_scene(make_scene("sphere"), tmp_path, **SMALL)
     assert (tmp_path / "transforms.json").read_text() == '{"frames": []}'
 
 
-def test_nothing_stale_stays_of_an_older_scene(tmp_path: Path) -> None:
-    """Fewer views and another thermal format; what the older json does not list, or lists elsewhere, is not ours."""
-    folder = tmp_path / "scene"
-    write_scene(make_scene("sphere"), folder, thermal_format="tiff", **{**SMALL, "num_train": 5})
-    (folder / "images" / "mine.png").write_text("mine")
-    outside = tmp_path / "outside.png"
-    outside.write_text("not ours")
-    content = transforms(folder)
-    content["frames"] += [{"file_path": "../outside.png", "thermal_file_path": str(outside)}, {"file_path": 3}, "odd"]
-    (folder / "transforms.json").write_text(json.dumps(content))
-    write_scene(make_scene("sphere"), folder, **SMALL)
-    listed = {f[key] for f in transforms(folder)["frames"] for key in ("file_path", "thermal_file_path")}
-    ours = {"transforms.json", "temperature_bounds.json", "truth.json"}
-    assert set(all_bytes(folder)) == {*listed, *ours, "images/mine.png"}
-    assert outside.read_text() == "not ours"
-
-
-def test_an_interrupted_write_leaves_no_scene_that_loads(tmp_path: Path) -> None:
+def test_nothing_stale_stays_of_an_older_scene_not_even_of_an_interrupted_write(tmp_path: Path) -> None:
     scene = make_scene("sphere")
-    write_scene(scene, tmp_path, **SMALL)
+    write_scene(scene, tmp_path, thermal_format="tiff", **{**SMALL, "num_train": 5})
+    (tmp_path / "images" / "mine.png").write_text("mine")
 
     def broken(points: np.ndarray) -> np.ndarray:
         raise KeyboardInterrupt
@@ -210,29 +174,26 @@ def test_an_interrupted_write_leaves_no_scene_that_loads(tmp_path: Path) -> None
     assert not (tmp_path / "transforms.json").exists()
     assert not [p for p in tmp_path.rglob("*") if ".part" in p.name]
     write_scene(scene, tmp_path, **SMALL)
-    assert len(transforms(tmp_path)["frames"]) == 5
+    listed = {f[key] for f in transforms(tmp_path)["frames"] for key in ("file_path", "thermal_file_path")}
+    ours = {"transforms.json", "temperature_bounds.json", "truth.json"}
+    assert set(all_bytes(tmp_path)) == {*listed, *ours, "images/mine.png"} and len(listed) == 10
 
 
 @pytest.mark.parametrize(
-    ("options", "match"),
+    ("options", "field"),
     [
-        ({"thermal_width": 7}, "thermal_width.*aspect 40:30"),
-        ({"thermal_format": "jpeg"}, "thermal_format.*png16"),
-        ({"photo_format": "npy"}, "photo_format.*jpeg, png"),
+        ({"thermal_width": 7}, "thermal_width"),
+        ({"thermal_format": "jpeg"}, "thermal_format"),
+        ({"photo_format": "npy"}, "photo_format"),
         ({"imperfections": Imperfections(noise_k=-1.0)}, "noise_k"),
         ({"imperfections": Imperfections(drift_k=float("nan"))}, "drift_k"),
         ({"num_train": 0}, "number of views"),
         ({"width": 0}, "^width: "),
         ({"height": 1_000_000}, "^height: "),
+        ({"thermal_width": 0}, "^thermal_width: "),
     ],
 )
-def test_bad_options_say_what_is_wrong_and_write_nothing(tmp_path: Path, options: dict, match: str) -> None:
-    with pytest.raises(ThermoxelsError, match=match):
+def test_bad_options_say_what_is_wrong_and_write_nothing(tmp_path: Path, options: dict, field: str) -> None:
+    with pytest.raises(ThermoxelsError, match=field):
         write_scene(make_scene("sphere"), tmp_path / "new", **{**SMALL, **options})
     assert not (tmp_path / "new").exists()
-
-
-def test_a_folder_that_is_a_file_is_an_output_error(tmp_path: Path) -> None:
-    (tmp_path / "taken").write_text("")
-    with pytest.raises(OutputError):
-        write_scene(make_scene("sphere"), tmp_path / "taken", **SMALL)

@@ -19,8 +19,7 @@ from thermoxels_ns.core.json_values import read_json, read_json_object
 from thermoxels_ns.mesh.boundary.patches import apply_patches, load_patch_rules
 from thermoxels_ns.reports.capture_pictures import colours, jpeg_of
 from thermoxels_ns.reports.page import build_page
-from thermoxels_ns.synthetic.catalogue import make_scene
-from thermoxels_ns.synthetic.house_corner import BRIDGE_PSI_W_MK, HOUSE, true_u_w_m2k
+from thermoxels_ns.synthetic.drawn_scenes import BRIDGE_PSI_W_MK, house_corner, true_u_w_m2k
 
 _AGAIN = "Run the demo again."
 _ENERGY_UNITS = ("J", "kJ", "MJ", "GJ", "TJ", "PJ")  # Each a thousand of the one before
@@ -182,7 +181,7 @@ def compare(answers: Path, rules: Path) -> tuple[Compared, ...]:
 
 def true_u_of_patches(rules: Path) -> dict[str, float]:
     """Mean true U-value of each element that a file of patches cuts out of the house, [W/(m2 K)]."""
-    points, normals = make_scene(HOUSE).surface_points(_POINTS)
+    points, normals = house_corner().solid.surface_points(_POINTS)
     every, none = np.ones(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
     applied = apply_patches(
         load_patch_rules(rules), centroids_m=points, normals=normals, up=(0.0, 0.0, 1.0), seen=every, on_box=none

@@ -4,49 +4,161 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import check_positive
-from thermoxels_ns.core.errors import MeshError, SceneError, ThermoxelsError
-from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.checks import check_positive, check_shape
+from thermoxels_ns.core.errors import MeshError, SceneError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
-from thermoxels_ns.evaluation.voxel_accuracy import MIN_VIEWS, TrueShape, surface_fscore
-from thermoxels_ns.mesh.build import check_similarity
+from thermoxels_ns.data.scene_file import read_scene_file
+from thermoxels_ns.mesh.build import apply_transform, check_similarity
 from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import fill_enclosed
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
-from thermoxels_ns.synthetic.raycast import first_surface
-from thermoxels_ns.synthetic.scene_folder import load_truth, visible_surface_points
+from thermoxels_ns.synthetic.raycast import first_surface, visible_surface_points
+from thermoxels_ns.synthetic.scene_folder import load_truth
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
+MIN_VIEWS = 3  # A point of a surface is seen if at least this many training cameras see it
 TOLERANCE_VOXELS = 1.5  # Surfaces closer than this agree, [voxels]
 DEPTH_TOLERANCE = 0.02  # Depths that differ by more, relative to the true one, are off
 COMMON_RESOLUTION = 128  # Voxels along the longest side of the exact box whose size `fscore_128` is measured with
 
 _SURFACE_POINTS = 20_000
+_PER_SIDE = 2  # Points along each side of a voxel's face that stand for it
 _TRAINING_PREFIX = "frame_train_"
-_JSON_NAME = "transforms.json"
+
+
+class TrueShape(Protocol):
+    """A body whose shape is known exactly, in coordinates of its own (truth units)."""
+
+    def signed_distance(self, points: FloatArray, /) -> FloatArray:
+        """Distance of points (n, 3) to the surface, shape (n,), negative inside the body."""
+        ...
+
+
+@dataclass(frozen=True)
+class SurfaceScore:
+    """Agreement of a reconstructed surface, or of a part of it, with the true one."""
+
+    precision: float = 0.0
+    """Share of the reconstructed boundary within the tolerance of the true surface, 0 to 1; 0 if there is none."""
+    recall: float = 0.0
+    """Share of the true surface that cameras see within the tolerance of the reconstructed boundary, 0 to 1."""
+    share: float = 0.0  # Of the boundary that is scored, 0 to 1
+    mean_distance: float | None = None
+    """Mean distance of the reconstructed boundary to the true surface, [truth units]; None without a boundary."""
+
+    @property
+    def fscore(self) -> float:
+        """Harmonic mean of precision and recall; 0 if both are."""
+        return 2.0 * self.precision * self.recall / (self.precision + self.recall or 1.0)
+
+
+def surface_fscore(
+    cells: BoolArray,
+    lattice: Lattice,
+    truth: TrueShape,
+    true_points_seen: FloatArray,
+    tolerance: float,
+    world_to_truth: FloatArray,
+    views: Views,
+    surroundings: TrueShape | None = None,
+    within: BoolArray | None = None,
+) -> tuple[SurfaceScore, SurfaceScore]:
+    """Compare the boundary of the solid voxels with the true surface: all of it, and the part that cameras see.
+
+    Enclosed cavities are filled first: no camera sees what is inside. The boundary is sampled at four points per voxel
+    face. Faces where the lattice or the region ends, which cut the scene, do not count for precision. Distances for
+    recall go to the nearest sample, at most 0.36 voxels beyond the face itself.
+
+    A voxel face is seen if `MIN_VIEWS` cameras have a free line, past the solid voxels, to the empty voxel before it.
+    The score of that part tells what photographs could have shown from what was guessed behind it.
+
+    Args:
+        cells: Solid voxels, shape `lattice.cell_shape`.
+        lattice: Where they are, [world units].
+        truth: The true body.
+        true_points_seen: True surface that enough training cameras see, shape (m, 3), m at least 1, [truth units].
+        tolerance: Distance that counts as agreement, above 0, [truth units]; 1.5 voxels by custom.
+        world_to_truth: Similarity, shape (4, 4), from the lattice's world to truth coordinates.
+        views: The training cameras, in the coordinates of the lattice.
+        surroundings: What truly stands beside the body. Boundary in it, or within the tolerance of it, is neither right
+            nor wrong: photographs do not say where the body ends and its surroundings begin.
+        within: The region that was taken, shape `lattice.cell_shape`; None: all.
+    """
+    cells = check_shape("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
+    transform = check_similarity("world_to_truth", world_to_truth)
+    solid = fill_enclosed(cells)
+    corners, empty, on_border = _boundary_samples(solid, np.ones_like(solid) if within is None else within)
+    if len(corners) == 0:
+        return SurfaceScore(), SurfaceScore()
+    points = apply_transform(transform, lattice.index_to_world(corners))
+
+    def recall(some: FloatArray) -> float:
+        return float(np.mean(KDTree(some).query(true_points_seen)[0] <= tolerance)) if len(some) else 0.0
+
+    inner, recalled = points[~on_border], recall(points)
+    distance = np.abs(truth.signed_distance(inner))
+    scored = np.ones(len(inner), dtype=bool)
+    if surroundings is not None:
+        scored = (surroundings.signed_distance(inner) > tolerance) | (distance <= tolerance)
+    if not scored.any():
+        return SurfaceScore(recall=recalled), SurfaceScore()
+    agrees = distance <= tolerance
+    whole = SurfaceScore(float(agrees[scored].mean()), recalled, float(scored.mean()), float(distance[scored].mean()))
+    shown = scored.copy()
+    if len(views.focal) == 0:
+        return whole, SurfaceScore()
+    shown &= count_cameras(solid, lattice, views).free[tuple(empty[~on_border].T)] >= MIN_VIEWS
+    if not shown.any():
+        return whole, SurfaceScore()
+    return whole, SurfaceScore(float(agrees[shown].mean()), recall(inner[shown]), float(shown.mean()))
+
+
+def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, IntArray, BoolArray]:
+    """Points on the faces between solid and empty voxels, [corner indices], the empty voxel beside each (n, 3), and
+    which faces lie on the border of the lattice or of the region (n,); beyond a border there may be no voxel."""
+    steps, within, found = (np.arange(_PER_SIDE) + 0.5) / _PER_SIDE, np.pad(within, 1), []
+    for axis in range(3):
+        rise = np.diff(np.pad(cells, [(int(a == axis),) * 2 for a in range(3)]).astype(np.int8), axis=axis)
+        corner = np.argwhere(rise != 0)
+        empty = corner.copy()
+        empty[:, axis] -= rise[tuple(corner.T)] > 0
+        u, v = (a for a in range(3) if a != axis)
+        offsets = np.zeros((_PER_SIDE, _PER_SIDE, 3))
+        offsets[..., u], offsets[..., v] = steps[:, None], steps[None, :]
+        points = (corner[:, None, :] + offsets.reshape(1, -1, 3)).reshape(-1, 3)
+        found.append((points, *(np.repeat(x, _PER_SIDE**2, axis=0) for x in (empty, ~within[tuple((empty + 1).T)]))))
+    points, empty, on_border = (np.concatenate(each) for each in zip(*found))
+    return points, empty, on_border
 
 
 @dataclass(frozen=True)
 class SurfaceDistances:
-    """Distances between two surfaces, [truth units]: means both ways, their mean, the largest, the closest ones."""
+    """Distances between two surfaces, [truth units]."""
 
     mesh_to_truth: float  # Mean distance of the mesh's surface, spread evenly by area, to the true surface
     truth_to_mesh: float  # Mean distance of the given true points to the mesh's surface
-    chamfer: float
     hausdorff: float
     closest_temperature_c: FloatArray
     """Temperature of the mesh at its surface point closest to each true point, shape (m,), [degrees Celsius]."""
     closest_distance: FloatArray
+
+    @property
+    def chamfer(self) -> float:
+        """Mean of the mean distances both ways."""
+        return 0.5 * (self.mesh_to_truth + self.truth_to_mesh)
 
 
 def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArray:
@@ -80,6 +192,7 @@ def surface_distances(
     which a mesh can be expected to have, to the nearest point of any triangle.
     """
     import pyvista as pv
+    from trimesh.triangles import points_to_barycentric
 
     points = mesh.points_m / metres_per_unit
     facets = mesh.facets[mesh.facet_tags != FACET_BOX]
@@ -95,28 +208,16 @@ def surface_distances(
     cell, closest = surface.find_closest_cell(true_points, return_closest_point=True)  # type: ignore[misc]
     inwards = np.linalg.norm(closest - true_points, axis=1)
     triangle = facets[np.asarray(cell)]
-    share = _barycentric(points[triangle], np.asarray(closest))
+    share = np.clip(points_to_barycentric(points[triangle], np.asarray(closest)), 0.0, 1.0)
     return SurfaceDistances(
         mesh_to_truth=float(outwards.mean()),
         truth_to_mesh=float(inwards.mean()),
-        chamfer=0.5 * float(outwards.mean() + inwards.mean()),
         hausdorff=float(max(outwards.max(), inwards.max())),
-        closest_temperature_c=np.einsum("ij,ij->i", share, mesh.temperature_c[triangle]),
+        closest_temperature_c=np.einsum(
+            "ij,ij->i", share / share.sum(axis=1, keepdims=True), mesh.temperature_c[triangle]
+        ),
         closest_distance=inwards,
     )
-
-
-def _barycentric(corners: FloatArray, points: FloatArray) -> FloatArray:
-    """Weights of triangle corners (m, 3, 3) that give points (m, 3) in the triangles, in [0, 1] with sum 1."""
-    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    w = points - corners[:, 0]
-    uu, uv, vv = (np.einsum("ij,ij->i", a, b) for a, b in ((u, u), (u, v), (v, v)))
-    wu, wv = np.einsum("ij,ij->i", w, u), np.einsum("ij,ij->i", w, v)
-    divisor = uu * vv - uv * uv
-    second = (vv * wu - uv * wv) / divisor
-    third = (uu * wv - uv * wu) / divisor
-    share = np.clip(np.stack([1.0 - second - third, second, third], axis=1), 0.0, None)
-    return share / share.sum(axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +233,47 @@ class KnownTruth:
         """What stands around the scene and is not scored."""
         return None if self.scene.around is None else self.scene.around.solid
 
+    @cached_property
+    def points_seen(self) -> FloatArray:
+        """Points spread evenly over the part of the true surface that enough training cameras see, (m, 3), [m].
+
+        Raises `SceneError` if they see nothing of it.
+        """
+        points, normals = self.scene.solid.surface_points(_SURFACE_POINTS, seed=0)
+        seen = visible_surface_points(self.scene, self.training_poses, self.camera, points, normals, MIN_VIEWS)
+        if not seen.any():
+            expected = f"a part of the surface that at least {MIN_VIEWS} of them see"
+            got = f"none, with {len(self.training_poses)} training cameras"
+            remedy = "Write the scene with more training views."
+            raise SceneError("training cameras", expected=expected, got=got, remedy=remedy)
+        return points[seen]
+
+    def score(
+        self,
+        cells: BoolArray,
+        lattice: Lattice,
+        world_to_truth: FloatArray,
+        tolerance_m: float,
+        within: BoolArray | None,
+    ) -> tuple[SurfaceScore, SurfaceScore]:
+        """See `surface_fscore`, for a similarity (4, 4) from the lattice's world to the scene's, [m]."""
+        scale = _scale_of(world_to_truth)
+        poses, camera, count = self.training_poses, self.camera, len(self.training_poses)
+        axes = world_to_truth[:3, :3].T / scale  # the inverse of its rotation (and mirror)
+        centres = (poses[:, :3, 3] - world_to_truth[:3, 3]) @ axes.T / scale
+        views = Views(
+            camera_to_world=np.concatenate([axes @ poses[:, :3, :3], centres[:, :, None]], axis=2),
+            focal=np.tile([camera.fl_x, camera.fl_y], (count, 1)),
+            centre=np.tile([camera.cx, camera.cy], (count, 1)),
+            size=np.tile([camera.width, camera.height], (count, 1)),
+        )
+        truth = self.scene.solid, self.points_seen, tolerance_m
+        return surface_fscore(cells, lattice, *truth, world_to_truth, views, self.surroundings, within)
+
+
+def _scale_of(similarity: FloatArray) -> float:
+    return float(np.cbrt(abs(np.linalg.det(similarity[:3, :3]))))
+
 
 def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
     """Get the truth of a scene folder (or its ``transforms.json``) and its training cameras; None for real photographs.
@@ -140,30 +282,14 @@ def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
     """
     folder = Path(scene_folder)
     folder = folder.parent if folder.is_file() else folder
-    path = folder / _JSON_NAME
-    if not path.is_file():
-        return None
     scene = load_truth(folder)
     if scene is None:
         return None
-    content = read_json(path, error=SceneError)
-    try:
-        poses = [
-            frame["transform_matrix"]
-            for frame in content["frames"]
-            if Path(frame["file_path"]).name.startswith(_TRAINING_PREFIX)
-        ]
-        fl_x, fl_y, cx, cy = (float(content[key]) for key in ("fl_x", "fl_y", "cx", "cy"))
-        camera = Camera(int(content["w"]), int(content["h"]), fl_x, fl_y, cx, cy)
-        training_poses = np.asarray(poses, dtype=np.float64)
-    except (KeyError, TypeError, ValueError, AttributeError) as problem:
-        if isinstance(problem, SceneError):
-            raise
-        raise _unusable(path, "intrinsics and frames as a synthetic scene has them", repr(problem)) from problem
-    if training_poses.ndim != 3 or training_poses.shape[1:] != (4, 4) or not np.isfinite(training_poses).all():
-        expected = f"finite 4x4 poses of frames named {_TRAINING_PREFIX}*"
-        raise _unusable(path, expected, f"an array of shape {training_poses.shape}")
-    return KnownTruth(scene, training_poses, camera)
+    frames = [f for f in read_scene_file(folder, "skip").frames if f.image.name.startswith(_TRAINING_PREFIX)]
+    if not frames:
+        expected, remedy = f"frames named {_TRAINING_PREFIX}*", "Write the synthetic scene again."
+        raise SceneError(str(folder / "transforms.json"), expected=expected, got="none", remedy=remedy)
+    return KnownTruth(scene, np.array([frame.pose for frame in frames]), frames[0].intrinsics)
 
 
 def compare_with_truth(
@@ -209,105 +335,72 @@ def compare_with_truth(
         return None
     transform = check_similarity("world_to_truth", world_to_truth)
     check_positive("metres_per_unit", metres_per_unit, "Pass the scale the mesh was built with.", MeshError)
-    voxel_m = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
+    voxel_m = lattice.voxel_size * _scale_of(transform)
     tolerance_m = TOLERANCE_VOXELS * voxel_m
-    seen = points_seen(known)
-    views = _training_views(known, transform)
-    score = surface_fscore(
-        *(cells, lattice, known.scene, seen, tolerance_m, transform, views),
-        surroundings=known.surroundings,
-        within=within,
-    )
-    assert score.seen is not None
+    score, of_seen = known.score(cells, lattice, transform, tolerance_m, within)
     solid = np.asarray(cells, dtype=bool)
     result: dict[str, Any] = {
         "scene": known.scene.name,
         "voxel_size_m": voxel_m,
         "tolerance_voxels": TOLERANCE_VOXELS,
-        "true_points_seen": len(seen),
+        "true_points_seen": len(known.points_seen),
         "precision": score.precision,
         "recall": score.recall,
         "fscore": score.fscore,
-        "share_seen": score.seen.share,
-        "precision_seen": score.seen.precision,
-        "recall_seen": score.seen.recall,
-        "fscore_seen": score.seen.fscore,
+        "share_seen": of_seen.share,
+        "precision_seen": of_seen.precision,
+        "recall_seen": of_seen.recall,
+        "fscore_seen": of_seen.fscore,
         "mean_distance_voxels": None if score.mean_distance is None else score.mean_distance / voxel_m,
         "mean_distance_m": score.mean_distance,
         "volume_m3": int(np.count_nonzero(solid)) * voxel_m**3,
         "filled_volume_m3": int(np.count_nonzero(fill_enclosed(solid))) * voxel_m**3,
-        "true_volume_m3": float(known.scene.volume_m3),
+        "true_volume_m3": float(known.scene.solid.volume),
         "area_m2": _num_faces(solid) * voxel_m**2,
-        "true_area_m2": float(known.scene.area_m2),
+        "true_area_m2": float(known.scene.solid.area),
     }
     if mesh is not None:
-        result |= _mesh_errors(known, mesh, seen, voxel_m, metres_per_unit)
+        result |= _mesh_errors(known, mesh, voxel_m, metres_per_unit)
         result |= _temperature_errors(known.scene, mesh, tolerance_m, metres_per_unit)
     return {name: _scaled(name, value, metres_per_unit) for name, value in result.items()}
 
 
-def has_truth(scene_folder: Path | str, say: Callable[[str], None] = print) -> bool:
-    """Whether a scene's exact shape is known; what stands in the way of a synthetic scene's is said."""
-    try:
-        return load_known_truth(scene_folder) is not None
-    except ThermoxelsError as problem:
-        say(f"Geometry is not compared with the truth: {problem}")
-        return False
-
-
 def geometry_metrics(
-    snapshot: GridSnapshot,
-    world_to_input: FloatArray,
-    truth: Path | str | KnownTruth,
-    say: Callable[[str], None] = print,
+    snapshot: GridSnapshot, world_to_input: FloatArray, known: KnownTruth, say: Callable[[str], None] = print
 ) -> dict[str, float]:
-    """Compare the surface that an export with default options has with the exact scene, if it is known.
+    """Compare the surface that an export with default options has with the exact scene.
 
     The surface is the boundary of the voxels that `SolidSelection` chooses by default; precision, recall and F-score,
     0 to 1, and the arguments are those of `compare_with_truth`. `say` gets the reason where a figure cannot be given.
 
     Returns:
-        Nothing for real photographs. Else ``fscore``, ``precision``, ``recall`` at 1.5 voxels of the snapshot's
-        lattice; ``fscore_128``, at 1.5 voxels of 128 along the exact box, to compare resolutions and boxes;
-        ``fscore_seen`` and ``fscore_128_seen``, of the part of the boundary that training cameras see (the rest is a
-        guess); and the mean distance to the true surface. Without any solid voxel the scores are 0 and there is no
-        distance.
+        ``fscore``, ``precision``, ``recall`` at 1.5 voxels of the snapshot's lattice; ``fscore_128``, at 1.5 voxels of
+        128 along the exact box, to compare resolutions and boxes; ``fscore_seen`` and ``fscore_128_seen``, of the part
+        of the boundary that training cameras see (the rest is a guess); and the mean distance to the true surface.
+        Without any solid voxel the scores are 0 and there is no distance.
+
+    Raises:
+        SceneError: No true point is seen by enough training cameras.
     """
-    try:
-        known = truth if isinstance(truth, KnownTruth) else load_known_truth(truth)
-        if known is None:
-            return {}
-        seen = points_seen(known)
-    except ThermoxelsError as problem:
-        say(f"Geometry is not compared with the truth: {problem}")
-        return {}
+    known.points_seen  # noqa: B018 - before anything slow
     try:
         solid = select_solid(snapshot, SolidSelection(), makes_up_volume=False)
     except MeshError as problem:
         say(f"The geometry scores 0: {problem}")
         return dict.fromkeys(("fscore", "precision", "recall", "fscore_128"), 0.0)
-
-    lattice = snapshot.lattice
-    transform = check_similarity("world_to_input", world_to_input)
-    voxel_m = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
-    common_voxel_m = float(np.subtract(known.scene.scene_box[1], known.scene.scene_box[0]).max()) / COMMON_RESOLUTION
-    views = _training_views(known, transform)
-    own, common = (
-        surface_fscore(
-            *(solid.cells, lattice, known.scene, seen, TOLERANCE_VOXELS * size_m, transform, views),
-            surroundings=known.surroundings,
-            within=solid.within,
-        )
-        for size_m in (voxel_m, common_voxel_m)
+    lattice, transform = snapshot.lattice, check_similarity("world_to_input", world_to_input)
+    voxel_m = lattice.voxel_size * _scale_of(transform)
+    (own, own_seen), (common, common_seen) = (
+        known.score(solid.cells, lattice, transform, TOLERANCE_VOXELS * size_m, solid.within)
+        for size_m in (voxel_m, known.scene.size / COMMON_RESOLUTION)
     )
-    assert own.seen is not None and common.seen is not None
     result = {
         "fscore": own.fscore,
         "precision": own.precision,
         "recall": own.recall,
         f"fscore_{COMMON_RESOLUTION}": common.fscore,
-        "fscore_seen": own.seen.fscore,
-        f"fscore_{COMMON_RESOLUTION}_seen": common.seen.fscore,
+        "fscore_seen": own_seen.fscore,
+        f"fscore_{COMMON_RESOLUTION}_seen": common_seen.fscore,
     }
     if own.mean_distance is not None:
         result["surface_distance_voxels"] = own.mean_distance / voxel_m
@@ -340,7 +433,7 @@ def depth_metrics(
         in the box. Figures without a ray are left out.
     """
     transform = check_similarity("world_to_input", world_to_input)
-    scale = float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
+    scale = _scale_of(transform)
     errors, filled = [np.zeros(0)], [np.zeros(0, dtype=bool)]
     for rays in frames:
         origins = rays.origins @ transform[:3, :3].T + transform[:3, 3]
@@ -365,41 +458,13 @@ def _scaled(name: str, value: Any, metres_per_unit: float) -> Any:
     return value if value is None or power == 0 else value * metres_per_unit**power
 
 
-def points_seen(known: KnownTruth) -> FloatArray:
-    """Points spread evenly over the part of the true surface that enough training cameras see, shape (m, 3), [m]."""
-    points, normals = known.scene.surface_points(_SURFACE_POINTS, seed=0)
-    seen = visible_surface_points(known.scene, known.training_poses, known.camera, points, normals, MIN_VIEWS)
-    if not seen.any():
-        expected = f"a part of the surface that at least {MIN_VIEWS} of them see"
-        got = f"none, with {len(known.training_poses)} training cameras"
-        remedy = "Write the scene with more training views."
-        raise SceneError("training cameras", expected=expected, got=got, remedy=remedy)
-    return points[seen]
-
-
-def _training_views(known: KnownTruth, world_to_truth: FloatArray) -> Views:
-    """The training cameras in the coordinates of the lattice."""
-    scale = float(np.cbrt(abs(np.linalg.det(world_to_truth[:3, :3]))))
-    poses, camera, count = known.training_poses, known.camera, len(known.training_poses)
-    axes = world_to_truth[:3, :3].T / scale  # the inverse of its rotation (and mirror)
-    centres = (poses[:, :3, 3] - world_to_truth[:3, 3]) @ axes.T / scale
-    return Views(
-        camera_to_world=np.concatenate([axes @ poses[:, :3, :3], centres[:, :, None]], axis=2),
-        focal=np.tile([camera.fl_x, camera.fl_y], (count, 1)),
-        centre=np.tile([camera.cx, camera.cy], (count, 1)),
-        size=np.tile([camera.width, camera.height], (count, 1)),
-    )
-
-
 def _num_faces(cells: BoolArray) -> int:
     """Number of voxel faces between solid and empty, those on the lattice's border included."""
     padded = np.pad(cells, 1)
     return sum(int(np.count_nonzero(np.diff(padded, axis=axis))) for axis in range(3))
 
 
-def _mesh_errors(
-    known: KnownTruth, mesh: TetMesh, seen: FloatArray, voxel_m: float, metres_per_unit: float
-) -> dict[str, Any]:
+def _mesh_errors(known: KnownTruth, mesh: TetMesh, voxel_m: float, metres_per_unit: float) -> dict[str, Any]:
     """Size of the mesh, its distance to the true surface, and temperature errors where they meet."""
     area = facet_areas(mesh.points_m, mesh.facets)
     if mesh.boundary is not None:
@@ -408,8 +473,8 @@ def _mesh_errors(
         "mesh_volume_m3": float(signed_volumes(mesh.points_m, mesh.tets).sum()) / metres_per_unit**3,
         "mesh_area_m2": float(area.sum()) / metres_per_unit**2,
     }
-    tolerance_m = TOLERANCE_VOXELS * voxel_m
-    distances = surface_distances(mesh, known.scene, seen, metres_per_unit, known.surroundings, tolerance_m)
+    tolerance_m, seen = TOLERANCE_VOXELS * voxel_m, known.points_seen
+    distances = surface_distances(mesh, known.scene.solid, seen, metres_per_unit, known.surroundings, tolerance_m)
     if distances is None:
         return result
     reached = distances.closest_distance <= tolerance_m
@@ -429,7 +494,7 @@ def _temperature_errors(
     """Temperature errors on the part of the boundary that lies where it should: measured nodes, and all of them."""
     nodes = np.unique(mesh.facets)
     points = mesh.points_m[nodes] / metres_per_unit
-    near = np.abs(scene.signed_distance(points)) <= tolerance_m
+    near = np.abs(scene.solid.signed_distance(points)) <= tolerance_m
     nodes, points = nodes[near], points[near]
     error_k = np.abs(mesh.temperature_c[nodes] - scene.surface_temperature_c(points))
     measured = mesh.observed[nodes]
@@ -444,7 +509,3 @@ def _temperature_errors(
         "temperature_mae_unmeasured_c": mean(error_k[~measured]),
         "temperature_p95_all_c": float(np.quantile(error_k, 0.95)) if len(error_k) else None,
     }
-
-
-def _unusable(path: Path, expected: str, got: str) -> SceneError:
-    return SceneError(str(path), expected=expected, got=got, remedy="Write the synthetic scene again.")

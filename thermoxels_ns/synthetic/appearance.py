@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.synthetic.solids import Box
 
 _SPACINGS_VOXELS = (2.0, 4.0, 10.0)
 _AMPLITUDES = (0.45, 0.55, 0.5)
 _REFERENCE_RESOLUTION = 64
+_HORIZON_BLEND = 0.08
+_GROUND_RISE_K = 2.0
 # Brightness first, then two colour differences; columns are the noise channels.
 _CHANNELS_TO_RGB = np.array([[0.8, 0.3, 0.0], [0.8, -0.1, 0.25], [0.8, -0.15, -0.3]], dtype=np.float32)
-
-RgbArray = npt.NDArray[np.float32]
 
 
 class SolidTexture:
@@ -32,13 +33,13 @@ class SolidTexture:
         draw = np.random.default_rng(seed)
         self._lo = np.asarray(box[0], dtype=np.float64)
         voxel = float(np.subtract(box[1], box[0]).max()) / _REFERENCE_RESOLUTION
-        self._octaves: list[tuple[float, float, int, RgbArray]] = []
+        self._octaves: list[tuple[float, float, int, Float32Array]] = []
         for spacing, amplitude in zip(_SPACINGS_VOXELS, _AMPLITUDES):
             size = int(np.ceil(_REFERENCE_RESOLUTION / spacing)) + 4
             values = draw.uniform(-1.0, 1.0, (size**3, 3)).astype(np.float32)
             self._octaves.append((spacing * voxel, amplitude, size, values))
 
-    def __call__(self, points: npt.ArrayLike) -> RgbArray:
+    def __call__(self, points: npt.ArrayLike) -> Float32Array:
         """Colour deviation at points (n, 3) [m]: red, green and blue around 0, mostly within -1 to 1."""
         relative = np.asarray(points, dtype=np.float64) - self._lo
         noise = np.zeros((len(relative), 3), dtype=np.float32)
@@ -74,7 +75,7 @@ class SunLight:
     towards: tuple[float, float, float] = (0.45, -0.6, 0.66)  # direction to the light, any length
     ambient: float = 0.62  # brightness of a surface that faces away from the light; one that faces it has 1
 
-    def brightness(self, normals: npt.ArrayLike) -> RgbArray:
+    def brightness(self, normals: npt.ArrayLike) -> Float32Array:
         """Brightness of surfaces with unit normals (n, 3), shape (n, 1)."""
         sun = np.asarray(self.towards) / np.linalg.norm(self.towards)
         facing = np.maximum(np.asarray(normals) @ sun, 0.0)
@@ -88,7 +89,7 @@ def painted(
     paints: Sequence[Paint],
     texture: SolidTexture,
     light: SunLight,
-) -> RgbArray:
+) -> Float32Array:
     """Colour of surface points: base colour plus texture, times the brightness of the light.
 
     Points [m] and normals have shape (n, 3), `part` indexes `paints` for each, shape (n,); red, green, blue in [0, 1],
@@ -100,12 +101,6 @@ def painted(
     return np.clip(colour, 0.0, 1.0).astype(np.float32, copy=False)
 
 
-FloatArray = npt.NDArray[np.float64]
-
-_HORIZON_BLEND = 0.08
-_GROUND_RISE_K = 2.0
-
-
 def sky_temperature_c(directions: npt.ArrayLike, horizon_c: float, drop_k: float) -> FloatArray:
     """Apparent temperature [C] of the sky along unit directions (n, 3), linear in the sine of the elevation; of the far
     ground below the horizon. The zenith is `drop_k` colder than the horizon, the ground straight below 2 K warmer.
@@ -114,7 +109,13 @@ def sky_temperature_c(directions: npt.ArrayLike, horizon_c: float, drop_k: float
     return horizon_c - drop_k * _rise(z) + _GROUND_RISE_K * _rise(-z)
 
 
-def sky_rgb(directions: npt.ArrayLike) -> npt.NDArray[np.float32]:
+def plain(rgb: Sequence[float]) -> Callable[[npt.ArrayLike], Float32Array]:
+    """A sky or backdrop of one colour, red, green and blue 0 to 1, in every direction."""
+    colour = np.asarray(rgb, dtype=np.float32)
+    return lambda directions: np.tile(colour, (len(np.asarray(directions)), 1))
+
+
+def sky_rgb(directions: npt.ArrayLike) -> Float32Array:
     """Pale haze at the horizon, blue above, grey green below: unit directions (n, 3) to colours (n, 3)."""
     z = np.asarray(directions, dtype=np.float64)[:, 2:]
     haze, blue, ground = (0.82, 0.86, 0.90), (0.26, 0.45, 0.80), (0.46, 0.48, 0.40)
@@ -123,7 +124,7 @@ def sky_rgb(directions: npt.ArrayLike) -> npt.NDArray[np.float32]:
     return np.clip(colour, 0.0, 1.0).astype(np.float32)
 
 
-def room_rgb(directions: npt.ArrayLike) -> npt.NDArray[np.float32]:
+def room_rgb(directions: npt.ArrayLike) -> Float32Array:
     """Light grey walls, a little warmer to one side and darker below: unit directions (n, 3) to colours (n, 3)."""
     x, y, z = np.asarray(directions, dtype=np.float32).T
     return np.stack([0.74 + 0.04 * x + 0.06 * z, 0.73 + 0.07 * z, 0.72 + 0.03 * y + 0.08 * z], axis=1)

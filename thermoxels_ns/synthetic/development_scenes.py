@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermoxels_ns.synthetic.appearance import Paint, SunLight, sky_rgb, sky_temperature_c
+from thermoxels_ns.synthetic.appearance import Paint, SunLight, plain, sky_rgb, sky_temperature_c
 from thermoxels_ns.synthetic.camera_rings import CameraRing, CameraWalk
 from thermoxels_ns.synthetic.random_plan import HAIR, Plan
 from thermoxels_ns.synthetic.random_scene import scene_of_plan
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, Vector
-from thermoxels_ns.synthetic.surroundings import before_wall, plain, with_street
+from thermoxels_ns.synthetic.surroundings import before_wall, with_street
 
 _ROOM_C, _AIR_C, _SKY_DROP_K = 20.0, 4.0, 25.0
 

@@ -7,12 +7,21 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.synthetic.appearance import Paint
-from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
-from thermoxels_ns.synthetic.solid_union import SolidUnion
-from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, Vector, box_beside
+from thermoxels_ns.synthetic.solids import (
+    Box,
+    BoxSolid,
+    Cylinder,
+    SolidUnion,
+    Sphere,
+    Vector,
+    box_beside,
+    box_between,
+    distance_to_box,
+    fade_towards,
+)
 
-FloatArray = npt.NDArray[np.float64]
 Shape = Box | Sphere | Cylinder
 Range = tuple[float, float]
 
@@ -124,8 +133,7 @@ class Plan:
         """The same plan in another unit of length; it shares the source of choices."""
 
         def box(corners: Box) -> Box:
-            (x0, y0, z0), (x1, y1, z1) = corners
-            return (x0 * factor, y0 * factor, z0 * factor), (x1 * factor, y1 * factor, z1 * factor)
+            return box_between(*(np.array(corners) * factor))
 
         def shape(old: Shape) -> Shape:
             if isinstance(old, tuple):
@@ -151,7 +159,7 @@ class Plan:
         joined = BoxSolid(boxes, self.removed)
         return SolidUnion((joined, *round_things)) if round_things else joined
 
-    def part(self, points: npt.ArrayLike, normals: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    def part(self, points: npt.ArrayLike, normals: npt.ArrayLike) -> IntArray:
         """Paint of the last piece that holds a point just below the surface: points and normals (n, 3) to (n,)."""
         inner = np.asarray(points, dtype=np.float64) - 0.01 * self.unit * np.asarray(normals, dtype=np.float64)
         number = np.zeros(len(inner), dtype=np.int64)
@@ -177,8 +185,7 @@ class Plan:
         own = np.array([p.warmth + (points - np.mean(bounds_of(p.shape), axis=0)) @ p.slope for p in self.pieces])
         warmth = np.einsum("pn,pn->n", share, own) / share.sum(axis=0)
         for glow in self.glows:
-            near = np.maximum(1.0 - distance_to_box(points, *glow.core) / glow.reach, 0.0)
-            warmth += (glow.warmth - warmth) * near * near * (3.0 - 2.0 * near)
+            fade_towards(warmth, points, glow.core, glow.warmth, glow.reach)
         return warmth
 
 

@@ -13,17 +13,30 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.appearance import SolidTexture, SunLight, painted, room_rgb, sky_rgb, sky_temperature_c
+from thermoxels_ns.synthetic.appearance import (
+    SolidTexture,
+    SunLight,
+    painted,
+    plain,
+    room_rgb,
+    sky_rgb,
+    sky_temperature_c,
+)
 from thermoxels_ns.synthetic.camera_rings import CameraRing
-from thermoxels_ns.synthetic.random_buildings import detached_house, facade, railing, wings
+from thermoxels_ns.synthetic.random_arrangements import (
+    detached_house,
+    facade,
+    machinery,
+    pipes_and_radiators,
+    railing,
+    wings,
+)
 from thermoxels_ns.synthetic.random_plan import Plan, bounds_of
-from thermoxels_ns.synthetic.random_plant import machinery, pipes_and_radiators
 from thermoxels_ns.synthetic.scene_truth import RgbFunction, SyntheticScene
 from thermoxels_ns.synthetic.solids import Box, box_between
-from thermoxels_ns.synthetic.surroundings import plain, with_room, with_street
-
-FloatArray = npt.NDArray[np.float64]
+from thermoxels_ns.synthetic.surroundings import with_room, with_street
 
 _PICTURE_ASPECT = 0.75
 _RIM = 0.95
@@ -163,7 +176,7 @@ def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
     if not wild or kind == 0:
         return scene
     if kind == 1:
-        points, normals = scene.surface_points(_SURFACE_SAMPLES, seed=1)
+        points, normals = scene.solid.surface_points(_SURFACE_SAMPLES, seed=1)
         colours = (scene.colour(points, normals).mean(axis=0), _MID_GREY, _WHITE, draw.uniform(0.05, 1.0, 3))
         rgb = np.asarray(colours[int(draw.integers(len(colours)))]).tolist()
         return dataclasses.replace(scene, background_rgb=plain(rgb))

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.scene_truth import Surroundings, SyntheticScene
+from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solids import Hits
-
-FloatArray = npt.NDArray[np.float64]
 
 _VISIBLE_TOLERANCE = 1e-7
 _GRAZING_COSINE = 1e-6
@@ -23,13 +22,16 @@ _RAYS_PER_CHUNK = 16_384  # about what stays in a processor's cache
 class RenderedView:
     """What one camera sees."""
 
-    rgb: npt.NDArray[np.float32]  # mean colour of each pixel's samples, 0 to 1, shape (height, width, 3)
+    rgb: Float32Array  # mean colour of each pixel's samples, 0 to 1, shape (height, width, 3)
     temperature_c: FloatArray  # mean temperature of each pixel's samples [degrees Celsius], shape (height, width)
     depth_m: FloatArray
     """Distance along the ray through the pixel's centre [m], infinite where it does not meet the solid first, shape
     (height, width)."""
-    hit: npt.NDArray[np.bool_]
-    """Whether the ray through the pixel's centre meets the solid first, shape (height, width)."""
+
+    @property
+    def hit(self) -> BoolArray:
+        """Whether the ray through the pixel's centre meets the solid first, shape (height, width)."""
+        return np.isfinite(self.depth_m)
 
 
 def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samples_per_axis: int = 2) -> RenderedView:
@@ -44,17 +46,13 @@ def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samp
     pose = np.asarray(pose, dtype=np.float64)
     origin = _position_outside(scene, pose)
     shape = (camera.height, camera.width)
-    directions = camera.directions(pose, samples_per_axis)
-    rgb, temperature_c = _look(scene, origin, directions.reshape(-1, 3))
+    rgb, temperature_c = _look(scene, origin, camera.directions(pose, samples_per_axis).reshape(-1, 3))
     distance, own = first_surface(scene, origin, camera.directions(pose).reshape(-1, 3))
-    depth = np.where(own, distance, np.inf).reshape(shape)
     rgb, temperature_c = rgb.reshape(*shape, -1, 3).mean(axis=2), temperature_c.reshape(*shape, -1).mean(axis=2)
-    return RenderedView(rgb, temperature_c, depth, np.isfinite(depth))
+    return RenderedView(rgb, temperature_c, np.where(own, distance, np.inf).reshape(shape))
 
 
-def first_surface(
-    scene: SyntheticScene, origins: FloatArray, directions: FloatArray
-) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+def first_surface(scene: SyntheticScene, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Find what rays meet first, in the scene or around it, from origins (n, 3) or (3,) [m] along unit vectors (n, 3).
 
     Returns:
@@ -71,7 +69,7 @@ def visible_surface_points(
     points: npt.ArrayLike,
     normals: npt.ArrayLike,
     min_views: int = 3,
-) -> npt.NDArray[np.bool_]:
+) -> BoolArray:
     """Find the surface points (n, 3) [m] that at least `min_views` of the cameras (c, 4, 4) see, shape (n,).
 
     A camera sees a point if the point lies in its image, faces it and is the first hit of the ray towards it.
@@ -84,50 +82,42 @@ def visible_surface_points(
     for pose in np.asarray(poses, dtype=np.float64):
         origin = _position_outside(scene, pose)
         ray = points - origin
-        distance = np.linalg.norm(ray, axis=1)
         candidate = camera.contains(camera.project_world(pose, points))
-        candidate &= np.einsum("ij,ij->i", ray, normals) < -_GRAZING_COSINE * distance
+        candidate &= np.einsum("ij,ij->i", ray, normals) < -_GRAZING_COSINE * np.linalg.norm(ray, axis=1)
         index = np.flatnonzero(candidate)
         # Unnormalised directions: a free line of sight hits at 1.
-        nearest = np.min([hits.distance for hits in _first_hits(scene, origin, ray[index])[0]], axis=0)
-        views[index[nearest >= 1.0 - _VISIBLE_TOLERANCE]] += 1
+        views[index[first_surface(scene, origin, ray[index])[0] >= 1.0 - _VISIBLE_TOLERANCE]] += 1
     return views >= min_views
 
 
-def _bodies(scene: SyntheticScene) -> tuple[SyntheticScene | Surroundings, ...]:
-    """The scene and what stands around it."""
-    return (scene,) if scene.around is None else (scene, scene.around)
-
-
-def _first_hits(
-    scene: SyntheticScene, origins: FloatArray, directions: FloatArray
-) -> tuple[list[Hits], npt.NDArray[np.int64]]:
-    """Where rays enter each of the bodies, and the number of the one they meet first (n,); -1 where they meet none."""
-    hits = [body.solid.intersect(origins, directions) for body in _bodies(scene)]
+def _first_hits(scene: SyntheticScene, origins: FloatArray, directions: FloatArray) -> tuple[list[Hits], IntArray]:
+    """Where rays enter the scene and what is around it, and the number of what they meet first (n,); -1: nothing."""
+    bodies = (scene,) if scene.around is None else (scene, scene.around)
+    hits = [body.solid.intersect(origins, directions) for body in bodies]
     distance = np.array([one.distance for one in hits])
     return hits, np.where(np.isfinite(distance.min(axis=0)), distance.argmin(axis=0), -1)
 
 
 def _look(
     scene: SyntheticScene, origins: FloatArray, directions: FloatArray, mirrors: bool = True
-) -> tuple[npt.NDArray[np.float32], FloatArray]:
+) -> tuple[Float32Array, FloatArray]:
     """Colour (n, 3) and temperature (n,) along rays from one origin (3,) or from one each (n, 3).
 
     A mirroring surface adds the colour along the reflected ray, on which mirrors show their paint only.
     """
-    rgb = np.empty((len(directions), 3), dtype=np.float32)
-    temperature_c = np.empty(len(directions))
+    rgb, temperature_c = np.empty(directions.shape, dtype=np.float32), np.empty(len(directions))
     for start in range(0, len(directions), _RAYS_PER_CHUNK):
         part = slice(start, start + _RAYS_PER_CHUNK)
         ray = directions[part]
         origin = np.broadcast_to(origins if origins.ndim == 1 else origins[part], ray.shape)
         hits, first = _first_hits(scene, origin, ray)
-        for number, body in enumerate(_bodies(scene)):
+        for number, body in enumerate((scene, scene.around)[: len(hits)]):
+            assert body is not None
             met = np.flatnonzero(first == number)
             normals = hits[number].normal[met]
             points = origin[met] + hits[number].distance[met, None] * ray[met]
             colour = body.colour(points, normals)
-            if mirrors and number == 0 and scene.mirror is not None:
+            if mirrors and body is scene and scene.mirror is not None:
                 share = scene.mirror(points, normals)
                 shiny = np.flatnonzero(share)
                 towards, normal = ray[met[shiny]], normals[shiny]
@@ -143,7 +133,7 @@ def _look(
 
 def _position_outside(scene: SyntheticScene, pose: FloatArray) -> FloatArray:
     origin = pose[:3, 3]
-    if float(scene.signed_distance(origin[None])[0]) < 0.0:
+    if float(scene.solid.signed_distance(origin[None])[0]) < 0.0:
         expected, got = f"a point outside the solid of scene {scene.name}", f"{origin.tolist()}, which is inside it"
         remedy = "Move the camera out of the solid."
         raise SceneError("camera position", expected=expected, got=got, remedy=remedy)

@@ -4,37 +4,26 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 from rich.progress import track
+from scipy.spatial.transform import Rotation
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import check_ranges, remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
-from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
+from thermoxels_ns.synthetic.catalogue import make_scene
 from thermoxels_ns.synthetic.imperfections import PERFECT, DrawnFlaws, Imperfections
-from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
+from thermoxels_ns.synthetic.raycast import render_view
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
-
-__all__ = [
-    "SCENE_NAMES",
-    "SyntheticScene",
-    "ThermalFormat",
-    "load_truth",
-    "make_scene",
-    "visible_surface_points",
-    "write_scene",
-]
 
 ThermalFormat = Literal["png16", "tiff", "npy"]
 """16-bit PNG that spans the temperature bounds; uint16 TIFF of centikelvin counts; float32 numpy in Celsius."""
 PhotoFormat = Literal["jpeg", "png"]  # JPEG, as cameras write it, of quality 92 by default; PNG, which loses nothing
-
-FloatArray = npt.NDArray[np.float64]
 
 _SUFFIXES = {"png16": ".png", "tiff": ".tiff", "npy": ".npy"}
 _PHOTO_SUFFIXES: dict[str, str] = {"jpeg": ".jpg", "png": ".png"}
@@ -80,7 +69,13 @@ def write_scene(
         OutputError: The folder cannot be written to.
     """
     thermal_size = _thermal_size(width, height, thermal_width, own_thermal_camera)
-    _check_options(photo_format, thermal_format)
+    for name, text, known in (
+        ("photo_format", photo_format, _PHOTO_SUFFIXES),
+        ("thermal_format", thermal_format, _SUFFIXES),
+    ):
+        if text not in known:
+            remedy = "Choose one of these formats."
+            raise SceneError(name, expected=f"one of {', '.join(known)}", got=repr(text), remedy=remedy)
     imperfections.check()
     camera = scene.camera(width, height)
     thermal_camera = scene.camera(*thermal_size)
@@ -150,7 +145,7 @@ def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
     path = Path(scene_folder) / TRUTH
     if not path.is_file():
         return None
-    truth = _read_json(path)
+    truth = read_json_object(path, "Check the scene folder, or write the scene again.", SceneError)
     if not isinstance(truth.get("synthetic_scene"), str):
         expected = 'an object with the text "synthetic_scene"'
         remedy = "Write the scene again, or remove the file for real photographs."
@@ -160,10 +155,8 @@ def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
 
 def _thermal_size(width: int, height: int, thermal_width: int | None, own_camera: bool) -> tuple[int, int]:
     """Width and height of the thermal images; one camera for both bands needs the same aspect exactly."""
-    for name, value in (("width", width), ("height", height), ("thermal_width", thermal_width)):
-        if value is not None and not 1 <= value <= _MOST_SIDE:
-            remedy = f"Pass --{name.replace('_', '-')} 320."
-            raise SceneError(name, expected=f"1 to {_MOST_SIDE} pixels", got=value, remedy=remedy)
+    sizes = {"width": width, "height": height, "thermal_width": width if thermal_width is None else thermal_width}
+    check_ranges("--", {name: (value, 1, _MOST_SIDE, f"1 to {_MOST_SIDE} pixels") for name, value in sizes.items()})
     if own_camera:
         chosen = thermal_width or max(width // 2, 1)
         return chosen, max(round(chosen * _THERMAL_ASPECT), 1)
@@ -176,32 +169,16 @@ def _thermal_size(width: int, height: int, thermal_width: int | None, own_camera
     return chosen, height * chosen // width
 
 
-def _check_options(photo_format: str, thermal_format: str) -> None:
-    formats = (("photo_format", photo_format, PhotoFormat), ("thermal_format", thermal_format, ThermalFormat))
-    for name, text, known in formats:
-        if text not in get_args(known):
-            expected = f"one of {', '.join(get_args(known))}"
-            raise SceneError(name, expected=expected, got=repr(text), remedy="Choose one of these formats.")
-
-
 def _prepared_folder(folder: Path | str) -> Path:
     """Make the folders and take away an earlier synthetic scene, so that nothing stale or half-written stays."""
-    # The json goes last: whatever interrupts this, the next call still knows what to take away.
     target = writable_folder(folder)
-    old = target / "transforms.json"
-    if old.exists():
-        content = _read_json(old)
-        if "truth" not in content and not (target / TRUTH).is_file():  # earlier checkouts wrote it there
-            expected = "an empty folder or one with an earlier synthetic scene"
-            got = f"{target}, whose transforms.json describes other photographs"
-            raise SceneError("output folder", expected=expected, got=got, remedy="Choose another folder.")
-        listed = content.get("frames")
-        frames = [frame for frame in listed if isinstance(frame, dict)] if isinstance(listed, list) else []
-        names = [frame.get(key) for frame in frames for key in ("file_path", "thermal_file_path")]
-        for path in [target / name for name in names if isinstance(name, str)]:
-            if path.resolve().is_relative_to(target.resolve()) and path.is_file():
-                remove_file(path)
-        remove_file(old)
+    if (target / TRUTH).is_file():
+        for path in (target / "transforms.json", *target.glob("images/frame_*"), *target.glob("thermal/frame_*")):
+            remove_file(path)  # truth.json goes when it is replaced: until then the next call knows what to take away
+    elif (target / "transforms.json").exists():
+        expected = "an empty folder or one with an earlier synthetic scene"
+        got = f"{target}, whose transforms.json describes other photographs"
+        raise SceneError("output folder", expected=expected, got=got, remedy="Choose another folder.")
     for name in ("images", "thermal"):
         writable_folder(target / name)
     return target
@@ -209,24 +186,15 @@ def _prepared_folder(folder: Path | str) -> Path:
 
 def _second_camera_offset(scene: SyntheticScene) -> FloatArray:
     """Pose (4, 4) of the thermal camera in the frame of the first one; the shift is a share of the scene's size."""
-    x, y, z = _RIG_ROTATION_RAD
-    turn_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
-    turn_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
-    turn_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
     offset = np.eye(4)
-    offset[:3, :3] = turn_z @ turn_y @ turn_x
-    offset[:3, 3] = np.multiply(_RIG_SHIFT_SHARE, np.subtract(scene.scene_box[1], scene.scene_box[0]).max())
+    offset[:3, :3] = Rotation.from_euler("xyz", _RIG_ROTATION_RAD).as_matrix()
+    offset[:3, 3] = np.multiply(_RIG_SHIFT_SHARE, scene.size)
     return offset
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
-    values = {name: getattr(camera, name) for name in names}
-    return {"camera_model": "OPENCV", "w": camera.width, "h": camera.height, **values}
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    return read_json_object(path, "Check the scene folder, or write the scene again.", SceneError)
+    return {"camera_model": "OPENCV", "w": camera.width, "h": camera.height} | {n: getattr(camera, n) for n in names}
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

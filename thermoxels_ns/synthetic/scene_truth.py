@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.synthetic.camera_rings import CameraRing, CameraWalk, ring_poses
-from thermoxels_ns.synthetic.solid_union import Solid
-from thermoxels_ns.synthetic.solids import Box
+from thermoxels_ns.synthetic.solids import Box, Solid
 
-FloatArray = npt.NDArray[np.float64]
-RgbFunction = Callable[..., npt.NDArray[np.float32]]
+RgbFunction = Callable[..., Float32Array]
 
 _ASPECT = 4.0 / 3.0
 
@@ -46,30 +45,13 @@ class SyntheticScene:
     rings: tuple[CameraRing | CameraWalk, ...]
     focal_share: float  # focal length over the image width, for a 4:3 image
     around: Surroundings | None = None  # what stands between the scene and what lies at infinity (`background_rgb`)
-    mirror: Callable[[npt.ArrayLike, npt.ArrayLike], npt.NDArray[np.float32]] | None = None
+    mirror: Callable[[npt.ArrayLike, npt.ArrayLike], Float32Array] | None = None
     """(points (n, 3), normals (n, 3)) to the share of light (n,) that a surface reflects as a mirror does."""
 
     @property
-    def area_m2(self) -> float:
-        """Exact area of the surface [m2]."""
-        return self.solid.area
-
-    @property
-    def volume_m3(self) -> float:
-        """Exact volume of the solid [m3]."""
-        return self.solid.volume
-
-    def contains(self, points: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Which of the points (n, 3) lie in the solid or on its surface."""
-        return self.solid.contains(points)
-
-    def signed_distance(self, points: npt.ArrayLike) -> FloatArray:
-        """Distance of the points (n, 3) to the surface [m], negative inside."""
-        return self.solid.signed_distance(points)
-
-    def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
-        """Draw points uniformly by area: positions (count, 3) and outward normals (count, 3)."""
-        return self.solid.surface_points(count, seed)
+    def size(self) -> float:
+        """Longest side of the scene box [m]."""
+        return float(np.subtract(self.scene_box[1], self.scene_box[0]).max())
 
     def camera(self, width: int, height: int) -> Camera:
         """Camera of the given image size [pixels] that frames the scene in every view of the rings."""

@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.synthetic.appearance import Paint, SolidTexture, SunLight, painted
-from thermoxels_ns.synthetic.box_solid import distance_to_box
+from thermoxels_ns.core.arrays import Float32Array
+from thermoxels_ns.synthetic.appearance import Paint, SolidTexture, SunLight, painted, plain
 from thermoxels_ns.synthetic.random_plan import Plan
-from thermoxels_ns.synthetic.scene_truth import RgbFunction, Surroundings, SyntheticScene
-from thermoxels_ns.synthetic.solids import Box, Sphere, box_beside
-
-FloatArray = npt.NDArray[np.float64]
+from thermoxels_ns.synthetic.scene_truth import Surroundings, SyntheticScene
+from thermoxels_ns.synthetic.solids import Box, Sphere, box_beside, distance_to_box
 
 _HOUSES, _TREES, _CUPBOARDS = 18, 14, 7
 _FARTHEST = 20.0
 _GAP = 1.2
 _GLASS_SHARE, _GLASS_DIM = (0.32, 0.68), 0.35
-
-
-def plain(rgb: Sequence[float]) -> RgbFunction:
-    """A sky or backdrop of one colour, red, green and blue 0 to 1, in every direction."""
-    colour = np.asarray(rgb, dtype=np.float32)
-    return lambda directions: np.tile(colour, (len(np.asarray(directions)), 1))
 
 
 def with_street(scene: SyntheticScene, seed: int) -> SyntheticScene:
@@ -105,7 +96,7 @@ def before_wall(scene: SyntheticScene, behind_m: float, half_m: float, paint: Pa
 def _place(scene: SyntheticScene, seed: int) -> tuple[Plan, tuple[float, float], float, float, float]:
     """An empty plan, the middle (x, y) and size of the scene, how far from it its cameras stand, and a floor below."""
     lo, hi = np.array(scene.scene_box)
-    size, middle = float((hi - lo).max()), 0.5 * (lo + hi)
+    size, middle = scene.size, 0.5 * (lo + hi)
     cameras = scene.poses(48, 6)[0][:, :3, 3]
     reach = _GAP * max(float(np.linalg.norm((cameras - middle)[:, :2], axis=1).max()), size)
     floor = min(float(scene.solid.bounds[0][2]), float(cameras[:, 2].min()) - 0.1 * size)
@@ -120,12 +111,11 @@ def _surrounded(
 
     `windows`: paints of walls that have them, where storeys begin [m] and their height [m].
     """
-    size = float(np.subtract(scene.scene_box[1], scene.scene_box[0]).max())
-    lo = np.asarray(scene.scene_box[0])
+    size, lo = scene.size, np.asarray(scene.scene_box[0])
     texture, light = SolidTexture((tuple(lo.tolist()), tuple((lo + 3.0 * size).tolist())), seed), SunLight()
     air_c = float(scene.background_temperature_c([[1.0, 0.0, 0.0]])[0])
 
-    def colour(points: npt.ArrayLike, normals: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    def colour(points: npt.ArrayLike, normals: npt.ArrayLike) -> Float32Array:
         points, normals, part = np.asarray(points), np.asarray(normals), plan.part(points, normals)
         rgb = painted(points, normals, part, plan.paints, texture, light)
         if windows is not None:
