@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -47,23 +47,12 @@ def heat_transfer(u, v, w):
     return w.coefficient * u * v
 
 
-class Form(Protocol):
-    """What all forms that heat flows through have in common.
+class _Boundary:
+    """Boundary triangles of a term: integrals over them by scikit-fem, and their grouping by patch.
 
     Temperatures come as differences from a reference, which keeps round-off relative to the differences. Every form
     also gives its heat flow per patch or region, evaluated as the equations do, so that balances close to round-off.
     """
-
-    effect: str  # Label of the effect that it comes from
-    groups: tuple[str, ...]  # Names of the patches or regions that it acts on
-
-    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat flow into the body through each group, shape (g,), [W]."""
-        ...
-
-
-class _Boundary:
-    """Boundary triangles of a term: integrals over them by scikit-fem, and their grouping by patch."""
 
     def __init__(self, effect: str, facets: npt.NDArray[np.int64], space: Space) -> None:
         selection = space.selection
@@ -108,13 +97,13 @@ class _Boundary:
         """Heat flux into the body at the points of integration, or even over each triangle, [W / m2]."""
         raise NotImplementedError
 
-    def facet_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
+    def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body through each triangle, shape (k,), [W]."""
         return (self.flux_w_m2(relative_k, time_s) * self.basis.dx).sum(axis=1)
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body through each patch, [W]."""
-        return sums_by_number(self.group, self.facet_heat_w(relative_k, time_s), len(self.groups))
+        return sums_by_number(self.group, self.part_heat_w(relative_k, time_s), len(self.groups))
 
 
 class ConvectionForm(_Boundary):
@@ -136,9 +125,9 @@ class ConvectionForm(_Boundary):
 
     def load(self, time_s: float) -> Vector:
         """Entries integral(h T_ambient phi_i), relative to the reference, shape (n,), [W]."""
-        return self.vector(self.at(self.term.coefficient_w_m2k, time_s) * self.ambient_k(time_s))
+        return self.vector(self.at(self.term.coefficient_w_m2k, time_s) * self.surroundings_k(time_s))
 
-    def ambient_k(self, time_s: float) -> Vector:
+    def surroundings_k(self, time_s: float) -> Vector:
         """T_ambient at each triangle, relative to the reference, shape (k, 1), [K]."""
         return self.at(self.term.ambient_c, time_s) - self._reference_c
 
@@ -152,7 +141,7 @@ class ConvectionForm(_Boundary):
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
         """h (T_ambient - T), [W / m2]."""
-        apart_k = self.ambient_k(time_s) - self.surface_k(relative_k)
+        apart_k = self.surroundings_k(time_s) - self.surface_k(relative_k)
         return self.at(self.term.coefficient_w_m2k, time_s) * apart_k
 
 
@@ -214,10 +203,9 @@ class SourceForm:
         heat = self._heat_w(time_s)
         return bool(np.any(heat < 0.0)), bool(np.any(heat > 0.0))
 
-    def mean_w_m3(self, time_s: float) -> Vector:
-        """Mean size of the source in each of its tetrahedra, shape (k,), [W / m3]."""
-        size = np.abs(self.term.source_w_m3.at(self._places, time_s))
-        return size.reshape(len(self.term.tets), -1).mean(axis=1)
+    def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
+        """Heat set free at each point of integration, [W], whatever the temperature."""
+        return self._heat_w(time_s)
 
     def _heat_w(self, time_s: float) -> Vector:
         return self.term.source_w_m3.at(self._places, time_s) * self._volumes
@@ -288,7 +276,7 @@ class FixedForm:
         """Area of each triangle, shape (k,), to share a node's heat by."""
         self._constant_k: Vector | None = None
 
-    def temperature_k(self, time_s: float) -> Vector:
+    def surroundings_k(self, time_s: float) -> Vector:
         """Temperatures of `nodes`, relative to the reference, [K]."""
         if self.in_time or self._constant_k is None:
             self._constant_k = self.term.temperature_c.at(self._places, time_s) - self.reference_c
@@ -356,7 +344,7 @@ class FixedNodes:
     def _temperature_k(self, time_s: float) -> Vector:
         known = np.full(len(self.nodes), np.nan)
         for number, form in enumerate(self._forms):
-            place, wanted = self._places[number], form.temperature_k(time_s)
+            place, wanted = self._places[number], form.surroundings_k(time_s)
             clash = np.abs(known[place] - wanted) > _SAME_TEMPERATURE_K
             if clash.any():
                 raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
@@ -375,7 +363,7 @@ class FixedNodes:
         other = others[0]
         place = np.flatnonzero(np.isin(other.nodes, nodes))
         node = int(other.nodes[place[0]])
-        first = other.temperature_k(time_s)[place[0]] + other.reference_c
+        first = other.surroundings_k(time_s)[place[0]] + other.reference_c
         second = wanted[np.flatnonzero(nodes == node)[0]] + form.reference_c
         return explain(
             "fixed temperature",
@@ -396,7 +384,7 @@ class EffectForms:
     fixed: tuple[FixedForm, ...]
 
     @property
-    def exchanging(self) -> tuple[Form, ...]:
+    def exchanging(self) -> tuple[ConvectionForm | FluxForm | SourceForm | RadiationForm, ...]:
         """Forms that heat flows through other than by fixed nodes: convection, loads, radiation."""
         return (*self.convection, *self.loads, *self.radiation)
 

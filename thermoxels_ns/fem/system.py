@@ -85,8 +85,6 @@ class HeatSystem:
         self._convection, self._loads, self._radiation = forms.convection, forms.loads, forms.radiation
         self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*forms.convection, *forms.radiation)
         """Heat flows through the surface that depend on its temperature."""
-        self.sources: tuple[SourceForm, ...] = tuple(form for form in forms.loads if isinstance(form, SourceForm))
-        """Heat sources."""
         self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
         """Nodes whose temperature is given."""
         with self.assembled.form("stiffness"):
@@ -270,7 +268,7 @@ class HeatSystem:
         forms = [
             form for form in (*self._convection, *self._loads, *self._radiation) if not isinstance(form, SourceForm)
         ]
-        found = [FacetHeat(form.effect, form.facets, form.facet_heat_w(relative_k, time_s)) for form in forms]
+        found = [FacetHeat(form.effect, form.facets, form.part_heat_w(relative_k, time_s)) for form in forms]
         kept_w = -self.net_heat_at_fixed(relative_k, time_s)
         return (*found, *(FacetHeat(*part) for part in self.fixed.facet_heat_w(kept_w)))
 
@@ -302,8 +300,7 @@ class HeatSystem:
 
     def _surroundings_k(self, time_s: float) -> tuple[float, float]:
         low, high = np.inf, -np.inf
-        ambients = [form.ambient_k(time_s) for form in self._convection]
-        ambients += [form.surroundings_k(time_s) for form in self._radiation]
+        ambients = [form.surroundings_k(time_s) for form in self.surface_forms]
         ambients += [self.fixed.temperature_k(time_s)] if len(self.fixed.nodes) else []
         for ambient in ambients:
             low, high = min(low, float(ambient.min())), max(high, float(ambient.max()))

@@ -19,9 +19,8 @@ from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, 
 from thermoxels_ns.heat.results import HeatResults, WallResult, heat_results, volume_shares, wall_of_scene
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_hours
-from thermoxels_ns.heat.screening import Screening
 from thermoxels_ns.heat.sky import Vector as Direction
-from thermoxels_ns.heat.solving import Accuracy, Goals, Say, solve_problem
+from thermoxels_ns.heat.solving import Accuracy, Goals, LeftOut, Say, solve_problem
 from thermoxels_ns.mesh.quality.checks import count_tets_in_other_bodies, count_twin_nodes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -36,7 +35,7 @@ class HeatRun:
     problem: HeatProblem  # The problem with all that the scene names, on the given mesh
     solved: HeatProblem  # What was solved: without what is left out, and, if a tolerance asked for it, on a finer mesh
     nodes: SolutionNodes  # All temperatures of the solution on a mesh that has a node for each
-    screening: Screening
+    left_out: tuple[LeftOut, ...]  # What brings too little heat to be built
     accuracy: Accuracy | None  # What is known of the error; None if no tolerance was given
     warnings: tuple[str, ...]
     solution: Solution
@@ -78,7 +77,7 @@ def run_scene(
     found = solve_problem(problem, scene.time, goals, say)
     solution, solved = found.solution, found.problem
     done = clock.perf_counter()
-    seconds = {"screen": found.screening.seconds, "solve": done - start - found.screening.seconds}
+    seconds = {"solve": done - start}
     say(f"Heat: {solution.status} ({seconds['solve']:.1f} s)")
     closed = f"Energy balance closed to {solution.energy_residual:.1e}"
     say(f"{closed}; what is unbalanced changes no heat flow by more than {solution.unbalanced_w:.1e} W.")
@@ -96,7 +95,7 @@ def run_scene(
         problem=problem,
         solved=solved,
         nodes=nodes,
-        screening=found.screening,
+        left_out=found.left_out,
         accuracy=found.accuracy,
         warnings=warnings,
         solution=solution,
