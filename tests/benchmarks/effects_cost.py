@@ -20,7 +20,7 @@ from measuring import take_turns
 from scipy import sparse
 
 from tests.support.scene_bodies import tagged_body
-from thermoxels_ns.fem.linear_solver import LinearSolver
+from thermoxels_ns.fem.implicit_equation import LinearSolver
 from thermoxels_ns.fem.p1_kernels import lumped_mass, stiffness_matrix
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.time_loop import solve_heat

@@ -7,8 +7,8 @@ from threadpoolctl import threadpool_limits
 from tests.support.heat_bodies import CONCRETE, STEEL
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem import linear_solver
-from thermoxels_ns.fem.linear_solver import LinearSolver
+from thermoxels_ns.fem import implicit_equation as linear_solver
+from thermoxels_ns.fem.implicit_equation import LinearSolver
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem

@@ -7,13 +7,12 @@ from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.forms import FluxForm, heat_transfer
-from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.problem import FluxTerm, HeatProblem
 from thermoxels_ns.fem.quantities import Bounded, Bounds, Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.fem.terms import FluxTerm
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
 

@@ -17,7 +17,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.implicit_equation import MOST_UNBALANCED
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, theta_scheme
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, theta_scheme
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import NOTHING
 from thermoxels_ns.fem.time_loop import solve_heat

@@ -15,11 +15,18 @@ from skfem import BilinearForm
 
 from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.problem import HeatProblem, effect_labels
+from thermoxels_ns.fem.problem import (
+    ConvectionTerm,
+    FixedTerm,
+    FluxTerm,
+    HeatProblem,
+    RadiationTerm,
+    SourceTerm,
+    effect_labels,
+)
 from thermoxels_ns.fem.quantities import Bounded
 from thermoxels_ns.fem.solution import Assembled
 from thermoxels_ns.fem.space import Space, sums_by_number
-from thermoxels_ns.fem.terms import ConvectionTerm, FixedTerm, FluxTerm, RadiationTerm, SourceTerm
 
 Vector = npt.NDArray[np.float64]
 

@@ -11,8 +11,7 @@ import numpy.typing as npt
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps, effect_labels
-from thermoxels_ns.fem.runge_kutta import RungeKutta, Step
-from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2, RungeKutta, Scheme, Step
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
 from thermoxels_ns.fem.steady import OVERSHOOT_K, too_cold
 from thermoxels_ns.fem.system import HeatSystem

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.fem.problem import ConvectionTerm, Effect, FixedTerm, FluxTerm, RadiationTerm, SourceTerm, Term
 from thermoxels_ns.fem.quantities import Bounded, Bounds, Quantity
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.terms import ConvectionTerm, Effect, FixedTerm, FluxTerm, RadiationTerm, SourceTerm, Term
 
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8  # Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]
 

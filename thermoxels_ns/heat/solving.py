@@ -13,13 +13,12 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.forms import FixedForm, effect_forms
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
+from thermoxels_ns.fem.problem import AdaptiveSteps, Effect, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Bounds
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution, Solution, SteadySolution, mean_flows_w
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.terms import Effect
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.fem.tolerance import (
     Tolerance,
