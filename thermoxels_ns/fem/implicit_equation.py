@@ -45,7 +45,11 @@ PATIENCE = 1500
 """Iterations with the diagonal after which multigrid takes over where they stand: it is dear to set up, and its
 iterations hardly grow with the mesh, with flat cells or with contrasts."""
 PATIENCE_WHEN_REPEATED = 800  # The same for a matrix that is used again, when its set-up is paid once
-MOST_ITERATIONS = 500  # With multigrid
+MOST_ITERATIONS = 300  # With multigrid, which takes 15 to 50 where it helps
+LAST_ITERATIONS = 20_000
+"""Iterations with the diagonal at the end: multigrid stalls on quadratic tetrahedra 100 times as long as high, and these
+go on."""
+_PER_UNKNOWN = 10  # The same per unknown: without round-off one would be enough
 _BLOCK = 1 << 16  # Entries that are scaled at a time, to save memory
 
 
@@ -99,6 +103,9 @@ class LinearSolver:
             if not converged and np.all(np.isfinite(x)):
                 x, more, converged = self._iterate(b / unit, x, MOST_ITERATIONS, self._multigrid)
                 count, how = count + more, "multigrid"
+            if not converged and np.all(np.isfinite(x)):
+                x, more, converged = self._iterate(b / unit, x, min(LAST_ITERATIONS, _PER_UNKNOWN * len(b)), None)
+                count += more
         outcome = f"converged in {count}" if converged else f"stopped after {count}"
         status = f"Conjugate gradients with {how} {outcome} iterations."
         return LinearSolution(unit * self._scale * x, count, converged, status)
@@ -128,6 +135,7 @@ class LinearSolver:
         levels = smoothed_aggregation_solver(
             self._scaled,
             B=(1.0 / self._scale)[:, None],
+            strength=("symmetric", {"theta": 0.05}),  # flat cells couple across alone
             smooth=("jacobi", {"weighting": "local"}),
             presmoother=("gauss_seidel", {"sweep": "forward"}),
             postsmoother=("gauss_seidel", {"sweep": "backward"}),
