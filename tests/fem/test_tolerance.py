@@ -263,24 +263,6 @@ def test_too_little_memory_is_a_status() -> None:
     assert advised == [True, False, False]
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Tolerance(None, None), "tolerance: expected temperature_k or heat_flow, got neither"),
-        (lambda: Tolerance(0.0), "temperature_k: expected a finite number above 0"),
-        (lambda: Tolerance(1.0, -0.1), "heat_flow: expected a finite number above 0"),
-        (
-            lambda: solve_to_tolerance(nafems_t3(), Tolerance(None, 0.1), duration_s=32.0),
-            "tolerance: expected one in kelvin, got heat_flow only",
-        ),
-        (lambda: solve_to_tolerance(shell(), Tolerance(1.0), memory_bytes=-1.0), "memory_bytes: expected a finite"),
-    ],
-)
-def test_bad_input(make, message) -> None:
-    with pytest.raises(HeatError, match=message):
-        make()
-
-
 @pytest.mark.parametrize("outputs", [1, 2])
 def test_heat_that_rushes_in_at_the_start_is_not_missed(outputs: int) -> None:
     """A rod whose end is suddenly held at 100 C: the mean flow through it is 2 k dT / sqrt(pi a t)."""

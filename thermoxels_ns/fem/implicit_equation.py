@@ -47,8 +47,8 @@ iterations hardly grow with the mesh, with flat cells or with contrasts."""
 PATIENCE_WHEN_REPEATED = 800  # The same for a matrix that is used again, when its set-up is paid once
 MOST_ITERATIONS = 300  # With multigrid, which takes 15 to 50 where it helps
 LAST_ITERATIONS = 20_000
-"""Iterations with the diagonal at the end: multigrid stalls on quadratic tetrahedra 100 times as long as high, and these
-go on."""
+"""Iterations with the diagonal at the end: multigrid stalls on quadratic tetrahedra 100 times as long as high, these do
+not."""
 _PER_UNKNOWN = 10  # The same per unknown: without round-off one would be enough
 _BLOCK = 1 << 16  # Entries that are scaled at a time, to save memory
 

@@ -62,6 +62,11 @@ class TimeSteps:
         """Start, then the end of every step, shape (steps + 1,), [s]."""
         return np.arange(self.steps + 1, dtype=np.float64) * self.step_seconds
 
+    @property
+    def lengths_s(self) -> tuple[npt.NDArray[np.float64], ...]:
+        """Lengths of the steps in each interval at whose ends temperatures are kept, [s]."""
+        return (np.array([self.step_seconds]),) * self.steps
+
 
 @dataclass(frozen=True)
 class AdaptiveSteps:

@@ -96,7 +96,7 @@ def solve_heat(
     if failure and not allow_unconverged:
         raise HeatError(failure)
     said = "" if doubled is None else doubled.describe()
-    status = failure or balance.success(loop.describe()) + said + _skips(problem, time)
+    status = failure or balance.success(loop.repeated) + said + _skips(problem, time)
     solution = balance.close(status, not failure, adaptive=adaptive)
     return solution if doubled is None else replace(solution, time_error_k=doubled.most_k)
 
@@ -154,7 +154,8 @@ class _TimeLoop:
         self._system, self._scheme, self._time = system, scheme, time
         self.runge_kutta = RungeKutta(system, scheme, relative_tolerance=relative_tolerance)
         self._allowed_k = STEP_SHARE * time.tolerance_k if isinstance(time, AdaptiveSteps) else np.inf
-        self._repeated = 0
+        self.repeated = 0
+        """Steps that were repeated with a shorter length."""
 
     def steps(self, start_k: Vector) -> Iterator[_Taken]:
         """Take all steps; the last one may be a failure."""
@@ -162,45 +163,35 @@ class _TimeLoop:
             return self._adaptive(start_k, self._time)
         return self._given(start_k, self._time)
 
-    def describe(self) -> str:
-        """Count the steps that were repeated, in a sentence, or nothing."""
-        return f" {self._repeated} more were repeated with a shorter length." if self._repeated else ""
-
     def _given(self, start_k: Vector, time: TimeSteps | GivenSteps) -> Iterator[_Taken]:
         """Take steps of known lengths."""
-        if isinstance(time, TimeSteps):
-            intervals = [[time.step_seconds]] * time.steps
-        else:
-            intervals = [lengths_s.tolist() for lengths_s in time.lengths_s]
-        relative_k, count, total = start_k, 0, sum(len(lengths_s) for lengths_s in intervals)
-        for now_s, lengths_s in zip(time.times_s.tolist(), intervals):
+        relative_k, count, total = start_k, 0, sum(map(len, time.lengths_s))
+        for now_s, lengths_s in zip(time.times_s.tolist(), time.lengths_s):
             for number, step_s in enumerate(lengths_s, start=1):
                 count += 1
                 step = self.runge_kutta.step(relative_k, now_s, step_s)
-                failure = ""
-                if not step.converged:
-                    remedy = "Use shorter steps or check the mesh's quality."
-                    failure = f"Step {count} of {total} failed. {step.status} {remedy}"
+                remedy = "Use shorter steps or check the mesh's quality."
+                failure = "" if step.converged else f"Step {count} of {total} failed. {step.status} {remedy}"
                 yield _Taken(step, step_s, number == len(lengths_s), failure)
                 relative_k, now_s = step.relative_k, now_s + step_s
 
     def _adaptive(self, start_k: Vector, time: AdaptiveSteps) -> Iterator[_Taken]:
         """Take steps as long as their estimated errors allow."""
         relative_k, now_s, wished_s = start_k, 0.0, self._first_length(start_k, time)
-        for end_s in time.times_s[1:]:
+        for end_s in time.times_s[1:].tolist():
             while now_s < end_s:
-                left_s = float(end_s) - now_s
+                left_s = end_s - now_s
                 step_s = _fitted(min(wished_s, self._system.problem.resolution_s), left_s)
                 step = self.runge_kutta.step(relative_k, now_s, step_s, estimate=True)
                 factor = self._factor(step)
                 if not step.converged or step.error_k > self._allowed_k:
-                    self._repeated += 1
+                    self.repeated += 1
                     wished_s = step_s * min(factor, _SAFETY)
                     if wished_s < _SHORTEST * time.duration_s or now_s + 0.25 * wished_s == now_s:
                         yield _Taken(step, step_s, False, self._failure(step, now_s, time))
                         return
                     continue
-                now_s = float(end_s) if step_s == left_s else now_s + step_s
+                now_s = end_s if step_s == left_s else now_s + step_s
                 relative_k = step.relative_k
                 next_s = step_s * (factor if factor > _KEEP_BELOW else min(factor, 1.0))
                 # A step cut short by an interval's end says nothing against the length wished for.
@@ -282,9 +273,10 @@ class HeatBalance:
         self._range_k = low, high = self._system.allowed_range_k(self._range_k, times)
         return max(low - float(relative_k.min()), float(relative_k.max()) - high)
 
-    def success(self, of_steps: str) -> str:
-        """Say that all went well, and how; `of_steps` is what is to be said about other steps."""
-        sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most.{of_steps}"
+    def success(self, repeated: int) -> str:
+        """Say that all went well, and how."""
+        sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
+        sentence += f" {repeated} more were repeated with a shorter length." if repeated else ""
         if self._overshooting:
             sentence += (
                 f" In {self._overshooting} a temperature left the range of the start and of the surroundings, by up to "
