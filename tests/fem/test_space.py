@@ -7,7 +7,7 @@ from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.forms import FluxForm, heat_transfer
-from thermoxels_ns.fem.problem import FluxTerm, HeatProblem
+from thermoxels_ns.fem.problem import HeatProblem, Term
 from thermoxels_ns.fem.quantities import Bounded, Bounds, Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space
@@ -141,6 +141,6 @@ def test_integrals_over_the_surface_are_those_of_a_basis_on_facets(options) -> N
     )
     assert abs(matrix - expected).max() < 1e-12 * abs(expected).max()
     flux = Bounded(Varying(lambda places, time_s: value[:, 0], in_time=False), Bounds("flux", "W/m2"))
-    found = FluxForm(FluxTerm("sun", np.arange(len(facets)), (flux,)), space).load(0.0)
+    found = FluxForm("sun", Term("flux", np.arange(len(facets)), (flux,)), space, 0.0).load(0.0)
     expected = LinearForm(lambda v, w: w.flux * v).assemble(theirs, flux=np.broadcast_to(value, theirs.dx.shape))
     assert abs(found - expected).max() < 1e-12 * abs(expected).max()

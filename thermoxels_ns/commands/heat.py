@@ -145,14 +145,32 @@ def read_export_summary(mesh: Path, say: Say) -> dict[str, Any]:
 def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
     """Everything that answers.json says."""
     solution = run.solution
-    error, time_error_k = getattr(solution, "error", None), getattr(solution, "time_error_k", math.nan)
+    accuracy, error, time_error_k = (
+        run.accuracy,
+        getattr(solution, "error", None),
+        getattr(solution, "time_error_k", math.nan),
+    )
     return {
         "mesh": options.mesh,
         "scene": options.scene,
         "description": run.scene.description,
         "steady": run.scene.steady,
         "warnings": list(run.warnings),
-        "accuracy": None if run.accuracy is None else asdict(run.accuracy),
+        "accuracy": None
+        if accuracy is None
+        else {
+            "tolerance_k": accuracy.tolerance.temperature_k,
+            "flow_tolerance": accuracy.tolerance.heat_flow,
+            "met": accuracy.met,
+            "estimated_k": accuracy.settings.error.temperature_k,
+            "estimated_flow": accuracy.settings.error.heat_flow,
+            "order": accuracy.settings.order,
+            "refinements": accuracy.settings.refinements,
+            "step_tolerance_k": accuracy.settings.step_tolerance_k,
+            "seconds": accuracy.seconds,
+            "status": accuracy.status,
+            "levels": [asdict(level) for level in accuracy.levels],
+        },
         "mesh_error": None if error is None else asdict(error),
         "solved": {
             "tets": len(run.solved.mesh.tets),

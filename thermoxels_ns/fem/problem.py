@@ -8,7 +8,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeAlias, runtime_checkable
+from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -136,56 +136,19 @@ def _check_count(name: str, value: int, remedy: str) -> None:
 
 
 @dataclass(frozen=True)
-class _OnFacets:
-    effect: str  # Label of the effect that it comes from
-    facets: npt.NDArray[np.int64]  # Numbers of boundary triangles, shape (k,)
+class Term:
+    """What an effect adds to the heat equation besides conduction and storage; positive is into the body."""
 
-
-@dataclass(frozen=True)
-class ConvectionTerm(_OnFacets):
-    """Convection or ground contact, q = h (T_ambient - T) through boundary triangles, positive into the body."""
-
-    coefficient_w_m2k: Bounded
-    ambient_c: Bounded
-
-
-@dataclass(frozen=True)
-class FluxTerm(_OnFacets):
-    """A given heat flux through boundary triangles, positive into the body."""
-
-    factors: tuple[Bounded, ...]  # The heat flux is the product of these, [W / m2]
-
-
-@dataclass(frozen=True)
-class RadiationTerm(_OnFacets):
-    """q = sigma eps (T_s^4 - T^4) through boundary triangles, temperatures in kelvin, positive into the body."""
-
-    emissivity: Bounded
-    surroundings_c: Bounded
-    stefan_boltzmann_w_m2k4: float
-
-
-@dataclass(frozen=True)
-class SourceTerm:
-    """A given heat source in tetrahedra."""
-
-    effect: str
-    tets: npt.NDArray[np.int64]
-    source_w_m3: Bounded
-
-
-@dataclass(frozen=True)
-class FixedTerm(_OnFacets):
-    """Given temperatures at the nodes of boundary triangles."""
-
-    temperature_c: Bounded
-
-
-Term: TypeAlias = ConvectionTerm | FluxTerm | RadiationTerm | SourceTerm | FixedTerm  # All kinds
+    kind: Literal["convection", "flux", "radiation", "source", "fixed"]
+    parts: npt.NDArray[np.int64]  # Numbers of boundary triangles, of a source of tetrahedra, shape (k,)
+    quantities: tuple[Bounded, ...]
+    """convection: h and T_ambient in h (T_ambient - T); flux: what it is the product of; radiation: eps and T_s in
+    factor eps (T_s^4 - T^4), temperatures in kelvin; source: [W / m3]; fixed: the temperature of the nodes."""
+    factor: float = 1.0  # Stefan-Boltzmann constant of radiation, [W / (m2 K4)]
 
 
 class Effect(ABC):
-    """Something that a heat problem may contain besides conduction: checked input that knows its own terms.
+    """Something that a heat problem may contain besides conduction: checked input that knows its own term.
 
     A dataclass whose fields are quantities, or names of `patches` or `regions` that it acts on.
     """
@@ -215,8 +178,8 @@ class Effect(ABC):
         return Bounded(getattr(self, name), self.bounds[name])
 
     @abstractmethod
-    def terms(self, selection: Selection) -> tuple[Term, ...]:
-        """Give the terms that it adds to the heat equation of a body; `HeatError` if that lacks a patch or region."""
+    def term(self, selection: Selection) -> Term:
+        """Give the term that it adds to the heat equation of a body; `HeatError` if that lacks a patch or region."""
 
 
 def _checked_names(field: str, names: object) -> tuple[str, ...]:

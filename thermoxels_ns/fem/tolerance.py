@@ -100,6 +100,7 @@ class ToleratedSolution:
 
     solution: Solution  # Temperatures and heat flows. Nodes of the given mesh come first
     problem: HeatProblem  # What was solved: the given problem, or the same on a finer mesh
+    tolerance: Tolerance  # Errors that were allowed
     settings: Level  # Order, refinements and steps that were chosen, and the estimated errors
     met: bool  # Whether the estimated errors are within the tolerance
     status: str  # The outcome as a sentence, with the estimate and the seconds
@@ -276,7 +277,7 @@ class _Run:
         if failure and not allow_unmet:
             raise HeatError(status)
         self.say(status)
-        return ToleratedSolution(chosen[2], chosen[1], last, not failure, status, seconds, levels)
+        return ToleratedSolution(chosen[2], chosen[1], self.tolerance, last, not failure, status, seconds, levels)
 
 
 def _halved(problem: HeatProblem, start: Solution | None = None) -> HeatProblem:

@@ -17,11 +17,12 @@ from thermoxels_ns.core.units import kelvin_to_celsius
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
+from thermoxels_ns.fem.tolerance import ToleratedSolution
 from thermoxels_ns.heat.results import HeatResults, WallResult, heat_results, volume_shares, wall_of_scene
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_hours
 from thermoxels_ns.heat.sky import Vector as Direction
-from thermoxels_ns.heat.solving import Accuracy, Goals, LeftOut, Say, solve_problem
+from thermoxels_ns.heat.solving import Goals, LeftOut, Say, solve_problem
 from thermoxels_ns.mesh.quality.checks import count_tets_in_other_bodies, count_twin_nodes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -102,7 +103,7 @@ class HeatRun:
     solved: HeatProblem  # What was solved: without what is left out, and, if a tolerance asked for it, on a finer mesh
     nodes: SolutionNodes  # All temperatures of the solution on a mesh that has a node for each
     left_out: tuple[LeftOut, ...]  # What brings too little heat to be built
-    accuracy: Accuracy | None  # What is known of the error; None if no tolerance was given
+    accuracy: ToleratedSolution | None  # What is known of the error; None if no tolerance was given
     warnings: tuple[str, ...]
     solution: Solution
     results: HeatResults

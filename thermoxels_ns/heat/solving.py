@@ -5,8 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +21,7 @@ from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.fem.tolerance import (
     Tolerance,
+    ToleratedSolution,
     describe_bytes,
     peak_bytes,
     solve_to_tolerance,
@@ -108,25 +108,6 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class Accuracy:
-    """What is known of the error, and how the tolerance was met."""
-
-    tolerance_k: float | None  # Error of any temperature that was allowed, [K]; None: any
-    flow_tolerance: float | None
-    """Error of the mean heat flow of any effect that was allowed, as a share of all heat; None: any."""
-    met: bool
-    estimated_k: float  # Estimated largest error of a temperature, [K]
-    estimated_flow: float  # Estimated largest error of a heat flow as a share of all heat
-    order: int  # 1 for linear tetrahedra, 2 for quadratic ones
-    refinements: int  # How often the size of the given mesh was halved
-    step_tolerance_k: float | None  # Tolerance of the time steps, [K]; None without steps
-    seconds: float
-    status: str
-    levels: tuple[dict[str, Any], ...]
-    """All solutions on the way with their estimates and seconds, the one that counts last."""
-
-
-@dataclass(frozen=True)
 class SolvedProblem:
     """A solution, what it is one of, and what is known of its error (None without a tolerance)."""
 
@@ -134,7 +115,7 @@ class SolvedProblem:
     """What was solved last: without what is left out, and perhaps on a finer mesh than the given one."""
     solution: Solution
     left_out: tuple[LeftOut, ...]
-    accuracy: Accuracy | None
+    accuracy: ToleratedSolution | None
 
 
 def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lambda _: None) -> SolvedProblem:
@@ -275,21 +256,7 @@ def _solve(problem: HeatProblem, time: Time, goals: Goals, say: Say) -> SolvedPr
         log=say,
         progress=_Progress(say),
     )
-    last = found.settings
-    accuracy = Accuracy(
-        tolerance_k=goals.tolerance_k,
-        flow_tolerance=goals.flow_tolerance,
-        met=found.met,
-        estimated_k=last.error.temperature_k,
-        estimated_flow=last.error.heat_flow,
-        order=last.order,
-        refinements=last.refinements,
-        step_tolerance_k=last.step_tolerance_k,
-        seconds=found.seconds,
-        status=found.status,
-        levels=tuple(asdict(level) for level in found.levels),
-    )
-    return SolvedProblem(found.problem, found.solution, (), accuracy)
+    return SolvedProblem(found.problem, found.solution, (), found)
 
 
 def _with_mesh_error(found: SolvedProblem, goals: Goals) -> SolvedProblem:
