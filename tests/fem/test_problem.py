@@ -22,6 +22,7 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 REGIONS = {"inner": lambda p: p[..., 0] < 0.25, "outer": lambda p: p[..., 0] > 0.25}
 BOX = box_mesh(np.linspace(0, 0.5, 5), [0, 0.2], [0, 0.2], regions=REGIONS)
+EMPTY = replace(CONCRETE, density_kg_m3=1.0, specific_heat_j_kgk=1e-12)
 NAN, INF = float("nan"), float("inf")
 Refused = list[tuple[str, Callable[[], Any]]]
 
@@ -57,6 +58,10 @@ STEPS: Refused = [
     *(("outputs", lambda n=n: AdaptiveSteps(60.0, outputs=n)) for n in (0, 1.5)),
     *(("theta", lambda t=t: theta_scheme(t)) for t in (0.49, 1.01, NAN)),
     ("scheme", lambda: solve_heat(body(), AdaptiveSteps(3600.0), scheme=CRANK_NICOLSON)),
+    *(
+        ("heat capacity", lambda t=t: solve_heat(HeatProblem(BOX, EMPTY), t))
+        for t in (TimeSteps(3, 1.0), AdaptiveSteps(9.0))
+    ),
     ("tolerance", lambda: Tolerance(None, None)),
     ("temperature_k", lambda: Tolerance(0.0)),
     ("heat_flow", lambda: Tolerance(1.0, -0.1)),

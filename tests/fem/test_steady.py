@@ -7,7 +7,6 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import implicit_equation
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.solution import heat_by_effect
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
@@ -121,22 +120,3 @@ def test_the_residual_is_round_off_also_where_nothing_flows_or_flows_cancel() ->
     air = Varying(lambda places, _: np.where(places.points_m[:, 1] > 0.2, 30.0, -10.0), in_time=False)
     through = solve_steady(HeatProblem(mesh, STEEL, effects=(Convection(SIDES[:1], 8.0, air),)))
     assert abs(through.effects[0].heat_w[0]) < 1e-6 and through.energy_residual < 1e-9
-
-
-def test_heat_is_sorted_by_effect_in_linear_time() -> None:
-    """Groups are looked at once, however many effects there are."""
-
-    class Counted(list):
-        looks = 0
-
-        def __iter__(self):
-            Counted.looks += len(self)
-            return super().__iter__()
-
-    names = [f"air {i}" for i in range(300)]
-    groups = Counted((name, patch) for name in names for patch in ("wall", "roof"))
-    heat_w = np.arange(600.0)[None]
-    sorted_heat = heat_by_effect(names[::-1], groups, heat_w)
-    assert Counted.looks == 600
-    assert [heat.effect for heat in sorted_heat] == names[::-1]
-    assert sorted_heat[0].group_names == ("wall", "roof") and sorted_heat[0].group_heat_w.tolist() == [[598.0, 599.0]]

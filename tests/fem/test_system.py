@@ -3,10 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.fem.problem import HeatProblem, effect_labels
+from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, GroundContact, HeatFlux, InternalHeat, Radiation
@@ -105,13 +104,3 @@ def test_what_changes_in_time_is_assembled_again(box, concrete) -> None:
     np.testing.assert_allclose(loads, air_w + wind_w + still_w, rtol=1e-12)
     # The matrix and what the airs bring: three each, twice.
     assert system.assembled.counts["convection"] == 6 + 6
-
-
-def test_labels_differ_even_where_a_patch_is_named_like_a_number() -> None:
-    """Two equal labels would count the heat of both effects twice."""
-    side = [0.0, 0.1]
-    airs = tuple(Convection((name,), 8.0, 0.0) for name in ("wall (2)", "wall", "wall", "wall (2)"))
-    problem = HeatProblem(box_mesh(side, side, side), CONCRETE, effects=airs)
-    labels = effect_labels(problem)
-    assert len(set(labels)) == 4, labels
-    assert labels[:3] == tuple(f"convection on {name}" for name in ("wall (2)", "wall", "wall (3)"))

@@ -144,12 +144,6 @@ def test_two_temperatures_at_one_node_are_refused(box, concrete) -> None:
     np.testing.assert_allclose([part.heat_w[0] for part in heat.effects], one.effects[0].group_heat_w[0], rtol=1e-9)
 
 
-def test_effects_of_one_kind_and_place_are_told_apart(box, concrete) -> None:
-    heat = at_once(box, concrete, HeatFlux(("x0",), 1.0), HeatFlux(("x0",), 2.0), HeatFlux(("x1",), 3.0)).effects
-    assert [part.effect for part in heat] == ["heat flux on x0", "heat flux on x0 (2)", "heat flux on x1"]
-    np.testing.assert_allclose([part.heat_w[0] for part in heat], AREA_X * np.array([1.0, 2.0, 3.0]), rtol=1e-9)
-
-
 EVERY = {
     "fixed": FixedTemperature(("x0",), 10.0),
     "convection": Convection(("x1",), 8.0, 5.0),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -34,7 +35,10 @@ search: the slope of radiation, 4 sigma eps T^3, then changes by no more than a 
 _SETTLED = 1e-5
 """Largest change in a Newton step, as a share of the absolute temperature, after which the method may end: the error
 left is about the square of it."""
-_SHORTEST = 1e-30  # Share of a step below which the line search ends: a cold body that sees a hot one has no slope
+_ENOUGH = 0.5
+"""The line search ends where the slope of the energy along the step has fallen to this share of what it was at its
+start, or has changed sign and is no larger than that."""
+_MOST_SEARCHES = 200  # Bisections of the line search
 _EPS = float(np.finfo(np.float64).eps)
 _ROUND_OFF = 8.0 * _EPS  # Round-off of a sum as a share of the sum of sizes
 PATIENCE = 1500
@@ -234,8 +238,9 @@ class ImplicitEquation:
         """Find the temperatures at the end from T_0, shape (n,), [K]; earlier stages give `given_w`, shape (n,), [W].
 
         Radiation grows with the temperature and its slope is symmetric, so the solution is the one minimum of a convex
-        energy. A step short enough along Newton's direction always leaves less unbalanced: it is shortened until it
-        does. Without radiation its first step is the solution, and further ones correct what the linear solver left.
+        energy. Newton's direction always leads down, and how far to go is a search for the zero of one increasing
+        function along it: no damping factor is guessed, and the method converges from any start. Without radiation its
+        first step is the solution, and further ones correct what the linear solver left.
         """
         balance, fixed, nonlinear = _Balance(self, start_k, time_s, given_w), self.system.fixed, self.system.nonlinear
         change_k = np.zeros(self.system.num_nodes)
@@ -251,14 +256,10 @@ class ImplicitEquation:
         while count < most and np.isfinite(rest.unbalanced_w):
             direction, linear = self._newton_direction(balance, change_k, rest)
             spent, count = spent + linear.iterations, count + 1
+            length = _length(balance, change_k, direction) if nonlinear else 1.0
             settled = not nonlinear or balance.is_short(change_k, direction, _SETTLED)
-            safe, length = not nonlinear or balance.is_short(change_k, direction, _SAFE), 1.0
-            then_k = change_k + direction
+            then_k = change_k + length * direction
             then = balance.residual(then_k)
-            while not safe and not then.unbalanced_w < rest.unbalanced_w and length > _SHORTEST:
-                length *= 0.25
-                then_k = change_k + length * direction
-                then = balance.residual(then_k)
             better = then.unbalanced_w < 0.5 * rest.unbalanced_w or then.floating_w < 0.5 * rest.floating_w
             if better or not settled or then.unbalanced_w < rest.unbalanced_w:
                 change_k, rest = then_k, then
@@ -403,3 +404,38 @@ class _Balance:
         """Whether no absolute temperature changes by more than a share of it."""
         kelvin = self._start_k + change_k + self._equation.system.reference_c + ZERO_CELSIUS_K
         return bool(np.all(np.abs(direction) <= share * np.maximum(np.abs(kelvin), COLDEST_SLOPE_K)))
+
+    def rise(self, change_k: Vector, direction: Vector) -> Callable[[float], float]:
+        """Slope of the energy along a direction: minus the power of the residual."""
+        equation, free = self._equation, self._equation.at_free(direction)
+        linear_w = self.residual(change_k).heat_w - self._radiated(change_k)
+        constant = float(np.sum(direction * linear_w))
+        curvature = float(np.sum(free * (equation.matrix @ free)))
+
+        def along(length: float) -> float:
+            radiated_w = self._radiated(change_k + length * direction)
+            return length * curvature - constant - float(np.sum(direction * radiated_w))
+
+        return along
+
+    def _radiated(self, change_k: Vector) -> Vector:
+        return self._equation.system.radiation_load(self._start_k + change_k, self._time_s)
+
+
+def _length(balance: _Balance, change_k: Vector, direction: Vector) -> float:
+    """Find how much of a direction to go: all of it, or about to where the energy along it is least."""
+    if balance.is_short(change_k, direction, _SAFE):
+        return 1.0
+    rise = balance.rise(change_k, direction)
+    start = rise(0.0)
+    if start >= 0.0 or rise(1.0) <= _ENOUGH * -start:
+        return 1.0
+    left, right = 0.0, 1.0
+    for _ in range(_MOST_SEARCHES):
+        # The zero may lie many powers of ten below 1: a cold body that sees a hot one has next to no slope.
+        middle = 0.25 * right if left == 0.0 else 0.5 * (left + right)
+        value = rise(middle)
+        if abs(value) <= _ENOUGH * -start:
+            return middle
+        left, right = (middle, right) if value < 0.0 else (left, middle)
+    return right

@@ -82,23 +82,32 @@ def solve_heat(
     if scheme is None:
         scheme = BACKWARD_EULER if isinstance(time, TimeSteps) else SDIRK2
     loop = _TimeLoop(system, scheme, time, relative_tolerance)
-    doubled = _DoubledSteps(loop.runge_kutta, states[0]) if estimate_steps and isinstance(time, TimeSteps) else None
     failure = ""
     for taken in loop.steps(states[0]):
         failure = taken.failure or too_cold(system, taken.step.relative_k)
         if failure:
             break
         balance.add(taken.step, taken.step_s, ends_interval=taken.ends_interval)
-        if doubled is not None:
-            doubled.follow(taken.step.relative_k, taken.step_s)
         if progress is not None:
             progress(balance.followed_s / time.duration_s, balance.steps)
     if failure and not allow_unconverged:
         raise HeatError(failure)
-    said = "" if doubled is None else doubled.describe()
-    status = failure or balance.success(loop.repeated) + said + _skips(problem, time)
+    status = failure or balance.success(loop.repeated) + _skips(problem, time)
     solution = balance.close(status, not failure, adaptive=adaptive)
-    return solution if doubled is None else replace(solution, time_error_k=doubled.most_k)
+    if failure or not estimate_steps or not isinstance(time, TimeSteps):
+        return solution
+    doubled: HeatSolution | None = None
+    if time.steps >= 2:
+        doubled = solve_heat(
+            problem,
+            TimeSteps(time.steps // 2, 2.0 * time.step_seconds),
+            scheme=scheme,
+            lumped=lumped,
+            lumped_boundary=lumped_boundary,
+            relative_tolerance=relative_tolerance,
+            allow_unconverged=True,
+        )
+    return _error_of_equal_steps(solution, doubled, scheme.order)
 
 
 @dataclass(frozen=True)
@@ -111,40 +120,21 @@ class _Taken:
     failure: str = ""  # Why the computation ends here; empty if the step was accepted
 
 
-class _DoubledSteps:
-    """Follows equal steps with steps of twice their length, to tell their error (Richardson 1911).
+def _error_of_equal_steps(found: HeatSolution, doubled: HeatSolution | None, order: int) -> HeatSolution:
+    """Tell the error of equal steps by steps of twice their length (Richardson 1911).
 
     Steps of half the length leave 1 / 2^p of the error of a scheme of order p, so that both differ by 2^p - 1 of the
     error of the shorter ones.
     """
-
-    def __init__(self, runge_kutta: RungeKutta, start_k: Vector) -> None:
-        self._runge_kutta, self._state_k = runge_kutta, start_k.copy()
-        self._steps, self._now_s, self._last_k = 0, 0.0, float("nan")
-        self.most_k = float("nan")
-        """Largest error of the shorter steps at any temperature so far, [K]; NaN before the second one."""
-
-    def follow(self, relative_k: Vector, step_s: float) -> None:
-        """Compare with the temperatures after the next of the equal steps, shape (n,), [K]; every second one counts."""
-        self._steps += 1
-        if self._steps % 2:
-            return
-        step = self._runge_kutta.step(self._state_k, self._now_s, 2.0 * step_s)
-        self._state_k, self._now_s = step.relative_k, self._now_s + 2.0 * step_s
-        if step.converged:
-            self._last_k = float(np.max(np.abs(relative_k - step.relative_k))) / (
-                2.0**self._runge_kutta.scheme.order - 1
-            )
-            self.most_k = float(np.fmax(self.most_k, self._last_k))
-
-    def describe(self) -> str:
-        """Say it in a sentence, or nothing."""
-        if not np.isfinite(self.most_k):
-            return " The error of the steps is not estimated: it takes two of them."
-        return (
-            f" The steps make an error of about {self.most_k:.2g} K at most and {self._last_k:.2g} K at the end (from "
-            "steps of twice the length)."
-        )
+    if doubled is None or len(doubled.times_s) < 2:
+        return replace(found, status=f"{found.status} The error of the steps is not estimated: it takes two of them.")
+    apart_k = np.abs(found.temperature_c[: 2 * len(doubled.times_s) - 1 : 2] - doubled.temperature_c).max(axis=1)
+    most_k, last_k = (float(part) / (2.0**order - 1.0) for part in (apart_k.max(), apart_k[-1]))
+    said = (
+        f" The steps make an error of about {most_k:.2g} K at most and {last_k:.2g} K at the end (from steps of twice "
+        "the length)."
+    )
+    return replace(found, status=found.status + said, time_error_k=most_k)
 
 
 class _TimeLoop:

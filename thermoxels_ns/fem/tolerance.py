@@ -37,8 +37,8 @@ to 0.07 K in all, because conduction forgets."""
 _AIM = 0.95  # Share of the allowed error that a solution is chosen to make
 _MOST_HALVINGS = 8  # Halvings of the mesh size or of the steps beyond which nothing is tried
 _MESH_COST, _STEP_COST = 10.0, 2.0  # How much more half the mesh size and half the steps cost
-_BYTES_PER_TET = {1: 300.0, 2: 1850.0}
-"""Most memory by the order of the tetrahedra, measured on meshes of curved bodies; lattices take about half."""
+_BYTES_PER_TET, _BYTES_PER_FACET = {1: 400.0, 2: 2600.0}, {1: 600.0, 2: 4000.0}
+"""Most memory by the order of the tetrahedra, measured with convection and radiation; without radiation about half."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,8 @@ def peak_bytes(problem: HeatProblem, *, order: int = 1, refinements: int = 0, ti
     libraries, about 150 MB, come on top.
     """
     mesh = problem.mesh
-    return 8.0**refinements * (_BYTES_PER_TET[order] * len(mesh.tets) + 8.0 * times * len(mesh.points_m))
+    volume = _BYTES_PER_TET[order] * len(mesh.tets) + 8.0 * times * len(mesh.points_m)
+    return 8.0**refinements * volume + 4.0**refinements * _BYTES_PER_FACET[order] * len(mesh.facets)
 
 
 def describe_bytes(amount: float) -> str:
