@@ -20,12 +20,11 @@ from measuring import take_turns
 from scipy import sparse
 
 from tests.support.scene_bodies import tagged_body
-from thermoxels_ns.fem.linear_solver import LinearSolver
+from thermoxels_ns.fem.implicit_equation import LinearSolver
 from thermoxels_ns.fem.p1_kernels import lumped_mass, stiffness_matrix
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.scene import load_heat_scene
-from thermoxels_ns.heat.screening import screen
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 TOLERANCE = 1e-12
@@ -65,12 +64,7 @@ class EffectsCost:
             median = statistics.median(seconds[name])
             share = median / statistics.median(seconds["all effects"])
             print(f"| {name} | {median:.2f} | {share:.2f} | {solution.newton_iterations.sum()} | {shown} |")
-        self.screening(whole, steps)
         self.conduction_only(problems["conduction only"], steps)
-
-    def screening(self, whole: HeatProblem, steps: TimeSteps) -> None:
-        taken, _ = take_turns({"screen": lambda: screen(whole, steps, 0.01)}, self.repeats)
-        print(f"\nScreening all effects at 0.01 K: {statistics.median(taken['screen']):.3f} s")
 
     def conduction_only(self, problem: HeatProblem, steps: TimeSteps) -> None:
         """Conduction alone, through the effects layer and by hand."""

@@ -38,13 +38,12 @@ from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import planes
 from tests.support.heat_problems import finer, nafems_t3
 from tests.support.shell_mesh import shell_mesh
-from thermoxels_ns.fem.error_estimate import ErrorSize, difference_between
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
-from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
+from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.fem.tolerance import Tolerance, solve_to_tolerance
+from thermoxels_ns.fem.tolerance import Tolerance, difference_between, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection
 
 DURATION_S = 32.0

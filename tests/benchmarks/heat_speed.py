@@ -46,45 +46,37 @@ class HeatSpeed:
     """Length of a step, [s]."""
     repeats: int = 5
     """Runs per median."""
-    consistent: bool = True
-    """Add a table with the consistent mass matrix; the other one has it lumped on both sides."""
     side: str = ""
     """Internal: run this side once on the mesh in `folder` and print its peak memory."""
     folder: Path = Path()
     """Internal: where the mesh is."""
-    lumped: bool = True
-    """Internal: for `side`."""
 
     def main(self) -> None:
         if self.side:
             print(json.dumps(self.peak_memory_mb()))
             return
-        for lumped in (True, False) if self.consistent else (True,):
-            print(
-                f"\n{'Lumped' if lumped else 'Consistent'} mass, {self.steps} steps of {self.step_seconds:g} s, "
-                f"medians of {self.repeats}\n"
-            )
-            print(
-                "| tetrahedra | scikit-fem | ours | ours / scikit-fem | per million tetrahedra "
-                "| memory of scikit-fem | ours | ours / scikit-fem | largest difference |"
-            )
-            print("|---|---|---|---|---|---|---|---|---|")
-            for voxels in self.voxels:
-                print(self.row(voxels, lumped, alone=False), flush=True)
-            for voxels in self.ours_alone:
-                print(self.row(voxels, lumped, alone=True), flush=True)
+        print(f"\nLumped mass, {self.steps} steps of {self.step_seconds:g} s, medians of {self.repeats}\n")
+        print(
+            "| tetrahedra | scikit-fem | ours | ours / scikit-fem | per million tetrahedra "
+            "| memory of scikit-fem | ours | ours / scikit-fem | largest difference |"
+        )
+        print("|---|---|---|---|---|---|---|---|---|")
+        for voxels in self.voxels:
+            print(self.row(voxels, alone=False), flush=True)
+        for voxels in self.ours_alone:
+            print(self.row(voxels, alone=True), flush=True)
 
-    def row(self, voxels: int, lumped: bool, *, alone: bool) -> str:
+    def row(self, voxels: int, *, alone: bool) -> str:
         points, tets = cube(voxels)
         start = temperatures(points)
-        sides = {"ours": lambda: self.ours(points, tets, start, lumped)}
+        sides = {"ours": lambda: self.ours(points, tets, start)}
         if not alone:
-            sides["scikit-fem"] = lambda: self.scikit_fem(points, tets, start, lumped)
+            sides["scikit-fem"] = lambda: self.scikit_fem(points, tets, start)
         seconds, last = take_turns(sides, self.repeats, time.perf_counter)
         with tempfile.TemporaryDirectory() as folder:
             np.save(Path(folder) / "points.npy", points)
             np.save(Path(folder) / "tets.npy", tets)
-            memory = {side: self.in_own_process(side, Path(folder), lumped) for side in sides}
+            memory = {side: self.in_own_process(side, Path(folder)) for side in sides}
         ours, ours_mb = statistics.median(seconds["ours"]), memory["ours"]
         per_million = f"{1e6 * ours / len(tets):.2f} s"
         if alone:
@@ -97,10 +89,10 @@ class HeatSpeed:
             f"| {theirs_mb:.0f} MB | {ours_mb:.0f} MB | {memory_ratio} | {difference:.0e} K |"
         )
 
-    def in_own_process(self, side: str, folder: Path, lumped: bool) -> float:
+    def in_own_process(self, side: str, folder: Path) -> float:
         """Peak memory of one side, [MB]."""
         options = [f"--side={side}", f"--folder={folder}", f"--steps={self.steps}"]
-        options += [f"--step-seconds={self.step_seconds!r}", "--lumped" if lumped else "--no-lumped"]
+        options += [f"--step-seconds={self.step_seconds!r}"]
         done = subprocess.run([sys.executable, __file__, *options], capture_output=True, text=True, check=True)
         return float(json.loads(done.stdout.splitlines()[-1]))
 
@@ -108,13 +100,13 @@ class HeatSpeed:
         """Run one side in this process; what the imports and the kernels need does not count."""
         run = self.ours if self.side == "ours" else self.scikit_fem
         points, tets = cube(1)
-        run(points, tets, temperatures(points), self.lumped)
+        run(points, tets, temperatures(points))
         before = most_memory_kb()
         points, tets = np.load(self.folder / "points.npy"), np.load(self.folder / "tets.npy")
-        run(points, tets, temperatures(points), self.lumped)
+        run(points, tets, temperatures(points))
         return (most_memory_kb() - before) / 1024.0
 
-    def ours(self, points: np.ndarray, tets: np.ndarray, start: np.ndarray, lumped: bool) -> np.ndarray:
+    def ours(self, points: np.ndarray, tets: np.ndarray, start: np.ndarray) -> np.ndarray:
         from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
         from thermoxels_ns.fem.time_loop import solve_heat
         from thermoxels_ns.heat.materials import Material
@@ -124,9 +116,9 @@ class HeatSpeed:
         mesh = TetMesh(points, tets, start, seen, none, none[:, 0], region)
         problem = HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0))
         time_steps = TimeSteps(self.steps, self.step_seconds)
-        return solve_heat(problem, time_steps, lumped=lumped, relative_tolerance=TOLERANCE).temperature_c
+        return solve_heat(problem, time_steps, relative_tolerance=TOLERANCE).temperature_c
 
-    def scikit_fem(self, points: np.ndarray, tets: np.ndarray, start: np.ndarray, lumped: bool) -> np.ndarray:
+    def scikit_fem(self, points: np.ndarray, tets: np.ndarray, start: np.ndarray) -> np.ndarray:
         from skfem import Basis, BilinearForm, ElementTetP1, MeshTet
         from skfem.helpers import dot
 
@@ -141,8 +133,7 @@ class HeatSpeed:
         space = MeshTet(np.ascontiguousarray(points.T), np.ascontiguousarray(tets.T))
         basis = Basis(space, ElementTetP1())
         stiffness, mass = conduction.assemble(basis), storage.assemble(basis)
-        if lumped:
-            mass = sparse.diags(np.asarray(mass.sum(axis=1)).ravel(), format="csr")
+        mass = sparse.diags(np.asarray(mass.sum(axis=1)).ravel(), format="csr")
         matrix = (mass / self.step_seconds + stiffness).tocsr()
         jacobi = sparse.diags(1.0 / matrix.diagonal())
         states = [start]

@@ -29,18 +29,3 @@ def test_second_order_in_space(lumped: bool) -> None:
         errors.append(float(np.sqrt(np.mean((end - exact) ** 2))))
     orders = observed_orders(errors)
     assert orders[-1] > 1.85, f"observed orders in h: {orders}, errors {errors}"
-
-
-def test_first_order_in_time() -> None:
-    """Against very short steps on the same mesh, so that only the time error is left."""
-    mesh = make_body(np.ones((6, 6, 6), bool), LENGTH / 6, cosines)
-    until = 1.0 / RATE
-
-    def end(steps: int) -> np.ndarray:
-        return solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(steps, until / steps)).temperature_c[-1]
-
-    # Richardson's extrapolation of backward Euler is of second order: a reference good enough for a first-order error.
-    reference = 2.0 * end(800) - end(400)
-    errors = [float(np.abs(end(steps) - reference).max()) for steps in (10, 20, 40)]
-    orders = observed_orders(errors)
-    assert np.all(np.abs(orders - 1.0) < 0.08), f"observed orders in dt: {orders}, errors {errors}"

@@ -7,7 +7,7 @@ import pytest
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_matrices import HeatMatrices, assemble
-from thermoxels_ns.fem.linear_solver import LinearSolver
+from thermoxels_ns.fem.implicit_equation import LinearSolver
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
 from thermoxels_ns.mesh.quality.checks import facet_areas

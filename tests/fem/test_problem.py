@@ -1,69 +1,132 @@
+"""What a heat problem and its parts refuse, each naming the field that is wrong."""
+
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
+from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.problem import AdaptiveSteps, Effect, HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Varying, tabulated
+from thermoxels_ns.fem.runge_kutta import CRANK_NICOLSON, theta_scheme
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.tolerance import Tolerance, solve_to_tolerance
+from thermoxels_ns.heat.effects import Convection, GroundContact, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+REGIONS = {"inner": lambda p: p[..., 0] < 0.25, "outer": lambda p: p[..., 0] > 0.25}
+BOX = box_mesh(np.linspace(0, 0.5, 5), [0, 0.2], [0, 0.2], regions=REGIONS)
+EMPTY = replace(CONCRETE, density_kg_m3=1.0, specific_heat_j_kgk=1e-12)
+NAN, INF = float("nan"), float("inf")
+Refused = list[tuple[str, Callable[[], Any]]]
+
+
+def body(**changes: Any) -> HeatProblem:
+    return HeatProblem(replace(BOX, **changes), {"inner": CONCRETE, "outer": CONCRETE})
+
+
+def tagged(**changes: Any) -> HeatSystem:
+    assert BOX.boundary is not None
+    return HeatSystem(body(boundary=replace(BOX.boundary, **changes)))
+
+
+def acting(*effects: Effect) -> Any:
+    return solve_steady(replace(body(), effects=effects))
+
+
+def heated(function: Callable) -> Any:
+    return acting(Convection(("x0",), Varying(function), 20.0))
+
+
+def moved(values: np.ndarray, place: Any, value: float) -> np.ndarray:
+    changed = values.copy()
+    changed[place] = value
+    return changed
+
+
+STEPS: Refused = [
+    *(("steps", lambda n=n: TimeSteps(n, 60.0)) for n in (0, -1, 2.5, True, "10")),
+    *(("step_seconds", lambda s=s: TimeSteps(10, s)) for s in (0.0, -60.0, NAN, INF)),
+    ("duration_s", lambda: AdaptiveSteps(0.0)),
+    ("tolerance_k", lambda: AdaptiveSteps(60.0, -1.0)),
+    *(("outputs", lambda n=n: AdaptiveSteps(60.0, outputs=n)) for n in (0, 1.5)),
+    *(("theta", lambda t=t: theta_scheme(t)) for t in (0.49, 1.01, NAN)),
+    ("scheme", lambda: solve_heat(body(), AdaptiveSteps(3600.0), scheme=CRANK_NICOLSON)),
+    *(
+        ("heat capacity", lambda t=t: solve_heat(HeatProblem(BOX, EMPTY), t))
+        for t in (TimeSteps(3, 1.0), AdaptiveSteps(9.0))
+    ),
+    ("tolerance", lambda: Tolerance(None, None)),
+    ("temperature_k", lambda: Tolerance(0.0)),
+    ("heat_flow", lambda: Tolerance(1.0, -0.1)),
+    ("tolerance", lambda: solve_to_tolerance(body(), Tolerance(None, 0.1), duration_s=32.0)),
+    ("memory_bytes", lambda: solve_to_tolerance(body(), Tolerance(1.0), memory_bytes=-1.0)),
+]
+MESHES: Refused = [
+    ("mesh points", lambda: body(points_m=moved(BOX.points_m, (3, 1), NAN))),
+    ("mesh tets", lambda: body(tets=np.concatenate([BOX.tets[:1, [1, 0, 2, 3]], BOX.tets[1:]]))),
+    ("mesh tets", lambda: body(points_m=BOX.points_m * [1.0, 1.0, 0.0])),
+    ("mesh tets", lambda: body(tets=moved(BOX.tets, (0, 0), len(BOX.points_m)))),
+    ("mesh tets", lambda: body(tets=BOX.tets[:0])),
+    (
+        "mesh points",
+        lambda: body(points_m=np.vstack([BOX.points_m, [[9, 9, 9]]]), temperature_c=np.append(BOX.temperature_c, 0)),
+    ),
+    *(("mesh temperature_c", lambda t=t: body(temperature_c=moved(BOX.temperature_c, 5, t))) for t in (NAN, -274.0)),
+    ("mesh temperature_c", lambda: body(temperature_c=BOX.temperature_c[:-1])),
+    *(("boundary area_factor", lambda a=a: tagged(area_factor=a)) for a in (np.zeros(len(BOX.facets)), np.ones(3))),
+    ("boundary patch", lambda: tagged(patch=np.full(len(BOX.facets), 7))),
+    ("boundary normal", lambda: tagged(normal=np.full((len(BOX.facets), 3), NAN))),
+]
+PROBLEMS: Refused = [
+    *(
+        ("material", lambda m=m: HeatProblem(BOX, m))
+        for m in ({}, {"inner": 1}, "concrete", dict.fromkeys(("inner", "outer", "roof"), CONCRETE))
+    ),
+    ("effects", lambda: HeatProblem(BOX, CONCRETE, effects=[HeatFlux(("x0",), 1.0)])),  # type: ignore[arg-type]
+    ("effects", lambda: HeatProblem(BOX, CONCRETE, effects=("sun",))),  # type: ignore[arg-type]
+    *(("up", lambda u=u: HeatProblem(BOX, CONCRETE, up=u)) for u in ((0.0, 0.0, 0.0), (1.0, 2.0))),
+    *(
+        ("table", lambda t=t, v=v: tabulated(t, v))
+        for t, v in (([0, 1], [1]), ([1, 0], [1, 2]), ([0, NAN], [1, 2]), (["a", "b"], [1, 2]))
+    ),
+    *(("steady heat problem", lambda e=e: acting(*e)) for e in ((), (HeatFlux(("*",), 1.0),))),
+    ("steady heat problem", lambda: acting(Convection(("*",), 0.0, 20.0))),
+]
+EFFECTS: Refused = [
+    ("patches", lambda: Convection("x0", 5.0, 20.0)),  # type: ignore[arg-type]
+    ("coefficient_w_m2k", lambda: Convection(("*",), -1.0, 20.0)),
+    *(("flux_w_m2", lambda f=f: HeatFlux(("*",), f)) for f in (True, np.ones(3), lambda places, time_s: 1.0)),
+    ("emissivity", lambda: Radiation(("*",), 1.01, 20.0)),
+    ("surroundings_c", lambda: Radiation(("*",), 0.9, 1e300)),
+    ("air_c", lambda: Convection(("*",), 5.0, 1e6)),
+    ("resistance_m2k_w", lambda: GroundContact(("*",), 0.0, 10.0)),
+    *(("patches", lambda p=p: acting(HeatFlux(p, 1.0))) for p in (("roof",), ("x0", "X?"))),
+    ("regions", lambda: acting(InternalHeat(("oven",), 1.0))),
+    ("function of coefficient_w_m2k", lambda: heated(lambda places, _: np.ones(3))),
+    ("coefficient_w_m2k", lambda: heated(lambda places, _: -1.0)),
+    ("coefficient_w_m2k", lambda: heated(lambda places, _: np.full(len(places), np.nan))),
+]
+
+
+@pytest.mark.parametrize(("name", "make"), [*STEPS, *MESHES, *PROBLEMS, *EFFECTS])
+def test_what_cannot_be_is_refused_by_its_name(name, make) -> None:
+    with pytest.raises(HeatError, match=f"^{name}: expected"):
+        make()
+
+
+def test_the_box_itself_is_accepted() -> None:
+    assert isinstance(BOX, TetMesh) and HeatSystem(body()).num_nodes == len(BOX.points_m)
 
 
 @pytest.mark.parametrize("field", ["conductivity_w_mk", "density_kg_m3", "specific_heat_j_kgk"])
-@pytest.mark.parametrize("bad", [0.0, float("nan"), "1.7"])
-def test_material_refuses_impossible_values(concrete, field, bad) -> None:
+@pytest.mark.parametrize("bad", [0.0, NAN, "1.7"])
+def test_material_refuses_impossible_values(field, bad) -> None:
     with pytest.raises(HeatError, match=field):
-        replace(concrete, **{field: bad})
-
-
-@pytest.mark.parametrize(
-    ("steps", "seconds", "message"),
-    [
-        *((steps, 60.0, "steps: expected a whole number") for steps in (0, -1, 2.5, True, "10")),
-        *((10, seconds, "step_seconds") for seconds in (0.0, -60.0, float("nan"), float("inf"))),
-    ],
-)
-def test_steps_must_be_whole_and_positive(steps, seconds, message) -> None:
-    with pytest.raises(HeatError, match=message):
-        TimeSteps(steps, seconds)
-
-
-def broken(mesh, what: str):
-    points, tets, temperature = mesh.points_m.copy(), mesh.tets.copy(), mesh.temperature_c.copy()
-    if what == "nan point":
-        points[3, 1] = np.nan
-    elif what == "inverted":
-        tets[0, [0, 1]] = tets[0, [1, 0]]
-    elif what == "flat":
-        points = points * np.array([1.0, 1.0, 0.0])
-    elif what == "unused":
-        points, temperature = np.vstack([points, [[9.0, 9.0, 9.0]]]), np.append(temperature, 0.0)
-    elif what == "out of range":
-        tets[0, 0] = len(points)
-    elif what == "empty":
-        tets = tets[:0]
-    elif what == "nan temperature":
-        temperature[5] = np.nan
-    elif what == "too cold":
-        temperature[5] = -274.0
-    elif what == "too few temperatures":
-        temperature = temperature[:-1]
-    return replace(mesh, points_m=points, tets=tets, temperature_c=temperature)
-
-
-@pytest.mark.parametrize(
-    ("what", "message"),
-    [
-        ("nan point", "mesh points: expected finite numbers only"),
-        ("inverted", "1 of .* flat or inverted"),
-        ("flat", "flat or inverted"),
-        ("unused", "1 of .* in none"),
-        ("out of range", "mesh tets"),
-        ("empty", "at least one tetrahedron"),
-        ("nan temperature", "mesh temperature_c: expected finite"),
-        ("too cold", "absolute zero"),
-        ("too few temperatures", "mesh temperature_c: expected shape"),
-    ],
-)
-def test_unusable_meshes_are_refused(random_body, concrete, what, message) -> None:
-    HeatProblem(random_body, concrete)
-    with pytest.raises(HeatError, match=message):
-        HeatProblem(broken(random_body, what), concrete)
+        replace(CONCRETE, **{field: bad})

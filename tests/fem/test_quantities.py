@@ -3,7 +3,6 @@ import pytest
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Places, Quantity, Varying, tabulated
 from thermoxels_ns.fem.time_loop import solve_heat
@@ -23,15 +22,6 @@ def test_a_table_is_straight_from_entry_to_entry_and_held_outside() -> None:
     table, nowhere = tabulated([10.0, 20.0, 50.0], [1.0, 3.0, 0.0]), Places(np.zeros((1, 3)), np.zeros((1, 3)))
     assert [table.function(nowhere, time_s) for time_s in (0.0, 10.0, 15.0, 35.0, 99.0)] == [1.0, 1.0, 2.0, 1.5, 0.0]
     assert table.resolution_s == 10.0 and table.in_time
-
-
-@pytest.mark.parametrize(
-    ("times_s", "values"),
-    [([0.0, 1.0], [1.0]), ([1.0, 0.0], [1.0, 2.0]), ([0.0, np.nan], [1, 2]), (["a", "b"], [1.0, 2.0])],
-)
-def test_a_table_that_is_none_is_refused(times_s, values) -> None:
-    with pytest.raises(HeatError, match="table: expected at least two times, ascending"):
-        tabulated(times_s, values)
 
 
 def test_adaptive_steps_do_not_step_over_a_table() -> None:

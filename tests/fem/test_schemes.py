@@ -8,7 +8,7 @@ from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -34,31 +34,6 @@ EVERY = (
 
 def bar(parts: int = 8, temperature_c=20.0) -> TetMesh:
     return box_mesh(np.arange(parts + 1) * H, [0, H, 2 * H], [0, H, 2 * H], temperature_c=temperature_c)
-
-
-@pytest.mark.parametrize("scheme", SCHEMES, ids=lambda scheme: scheme.name)
-def test_coefficients_meet_their_order_conditions(scheme: Scheme) -> None:
-    """Sums of the table that make a scheme of its order, row sums, stiff accuracy."""
-    a, c, b = np.array(scheme.weights), np.array(scheme.nodes), np.array(scheme.ends)
-    np.testing.assert_allclose(a.sum(axis=1), c, atol=1e-15)
-    assert b.sum() == pytest.approx(1.0, abs=1e-15) and c[-1] == 1.0
-    assert (abs(b @ c - 0.5) < 1e-15) == (scheme.order >= 2)
-    # At a very long step a decaying mode is left with this share of itself.
-    implicit = np.diag(a) > 0
-    infinite = 0.0 if implicit.all() else (a[-1, 0] - 0.0) / a[-1, -1]
-    assert infinite <= 1.0
-    if scheme.estimate is not None:
-        weights, start = np.array(scheme.estimate[1:]), scheme.estimate[0]
-        assert start + weights.sum() == pytest.approx(1.0, abs=1e-14)
-        assert weights @ c == pytest.approx(0.5, abs=1e-14)
-        assert weights @ a @ c == pytest.approx(1.0 / 6.0, abs=1e-14)
-
-
-@pytest.mark.parametrize("theta", [0.49, 1.01, float("nan")])
-def test_theta_out_of_range_is_refused(theta) -> None:
-    with pytest.raises(HeatError, match=r"theta: expected a number from 0\.5 to 1"):
-        theta_scheme(theta)
-    assert theta_scheme(1.0) is BACKWARD_EULER
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=lambda scheme: scheme.name)
@@ -190,26 +165,6 @@ def test_a_step_of_sdirk2_that_overshoots_says_so(monkeypatch) -> None:
     solution = solve_heat(problem, AdaptiveSteps(1000 * STEP_S, 100.0))
     assert "a temperature left the range" in solution.status and solution.overshoot_k > 0.01
     assert solution.energy_residual_of_spread < 1e-12
-
-
-def test_a_scheme_without_estimate_cannot_adapt() -> None:
-    problem = HeatProblem(bar(), CONCRETE)
-    with pytest.raises(HeatError, match=r"scheme: expected one with an error estimate.*got Crank-Nicolson"):
-        solve_heat(problem, AdaptiveSteps(3600.0), scheme=CRANK_NICOLSON)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"duration_s": 0.0}, "duration_s: expected a finite number above 0"),
-        ({"duration_s": 60.0, "tolerance_k": -1.0}, "tolerance_k: expected a finite number above 0"),
-        ({"duration_s": 60.0, "outputs": 0}, "outputs: expected a whole number from 1"),
-        ({"duration_s": 60.0, "outputs": 1.5}, "outputs: expected a whole number"),
-    ],
-)
-def test_adaptive_options_are_checked(options, message) -> None:
-    with pytest.raises(HeatError, match=message):
-        AdaptiveSteps(**options)
 
 
 def test_cooling_below_absolute_zero_is_refused() -> None:

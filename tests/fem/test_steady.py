@@ -7,7 +7,6 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import implicit_equation
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.solution import heat_by_effect
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
@@ -79,14 +78,6 @@ def test_too_few_newton_steps_are_a_status(monkeypatch) -> None:
     assert np.isfinite(solution.temperature_c).all()
 
 
-@pytest.mark.parametrize("effects", [(), (HeatFlux(("*",), 1.0),), (Convection(("*",), 0.0, 20.0),)])
-def test_a_body_that_nothing_holds_has_no_steady_state(effects) -> None:
-    with pytest.raises(
-        HeatError, match=r"steady heat problem: expected convection.*none on 1 of 1 pieces.*\(0, 0, 0\)"
-    ):
-        solve_steady(HeatProblem(slab(), STEEL, effects=effects))
-
-
 def test_a_loose_piece_is_named() -> None:
     mesh = box_mesh(np.linspace(0, 0.5, 6), [0, 0.1], [0, 0.1], keep=lambda p: abs(p[..., 0] - 0.25) > 0.06)
     problem = HeatProblem(mesh, STEEL, effects=(Convection(("x0",), 5.0, 10.0),))
@@ -129,30 +120,3 @@ def test_the_residual_is_round_off_also_where_nothing_flows_or_flows_cancel() ->
     air = Varying(lambda places, _: np.where(places.points_m[:, 1] > 0.2, 30.0, -10.0), in_time=False)
     through = solve_steady(HeatProblem(mesh, STEEL, effects=(Convection(SIDES[:1], 8.0, air),)))
     assert abs(through.effects[0].heat_w[0]) < 1e-6 and through.energy_residual < 1e-9
-
-
-def test_heat_is_sorted_by_effect_in_linear_time() -> None:
-    """Groups are looked at once, however many effects there are."""
-
-    class Counted(list):
-        looks = 0
-
-        def __iter__(self):
-            Counted.looks += len(self)
-            return super().__iter__()
-
-    names = [f"air {i}" for i in range(300)]
-    groups = Counted((name, patch) for name in names for patch in ("wall", "roof"))
-    heat_w = np.arange(600.0)[None]
-    sorted_heat = heat_by_effect(names[::-1], groups, heat_w)
-    assert Counted.looks == 600
-    assert [heat.effect for heat in sorted_heat] == names[::-1]
-    assert sorted_heat[0].group_names == ("wall", "roof") and sorted_heat[0].group_heat_w.tolist() == [[598.0, 599.0]]
-
-
-def test_two_temperatures_at_one_node_are_named_as_they_were_given():
-    side = np.linspace(0.0, 1.0, 3)
-    effects = (FixedTemperature(("x0",), 21.5), FixedTemperature(("y0",), 35.25))
-    problem = HeatProblem(box_mesh(side, side, side), STEEL, effects=effects)
-    with pytest.raises(HeatError, match=r"got 21\.5 C from .* and 35\.25 C from .* at node \d+ and 2 more"):
-        solve_steady(problem)

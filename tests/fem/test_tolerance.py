@@ -1,26 +1,39 @@
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.support.building_corner import building_corner
-from tests.support.heat_bodies import CONCRETE
+from tests.support.heat_bodies import CONCRETE, STEEL
 from tests.support.heat_meshes import box_mesh, graded
 from tests.support.heat_problems import finer, nafems_t3
+from tests.support.obtuse_bodies import dressed
 from tests.support.shell_mesh import shell_mesh
+from tests.support.stuffed_shapes import SHAPES, tet_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.error_estimate import ErrorSize, difference_between, mean_flows_w
+from thermoxels_ns.fem import tolerance
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
+from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, SteadySolution, mean_flows_w
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_tolerance
-from thermoxels_ns.heat.effects import Convection, FixedTemperature, Radiation
+from thermoxels_ns.fem.tolerance import (
+    Tolerance,
+    ToleratedSolution,
+    difference_between,
+    peak_bytes,
+    solve_to_tolerance,
+    steady_error,
+)
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.mesh.stuffing.isosurface import stuff
 
 WITHIN = 3.0
 """Factor that an estimate may be off by."""
+MOST_FLOW = 20.0
+"""Factor by which heat flows of quadratic tetrahedra may be better than estimated: 3 beside an edge."""
 
 
 def true_error(found: ToleratedSolution, given: HeatProblem, exact: SteadySolution | HeatSolution) -> ErrorSize:
@@ -55,7 +68,7 @@ def test_iso_10211_case_3(iso, tolerance) -> None:
     for level in found.levels:
         assert np.isfinite(level.error.temperature_k) and level.seconds > 0.0
     assert 1 / WITHIN < settings.error.temperature_k / true.temperature_k < WITHIN, (settings.error, true)
-    assert 1 / WITHIN < settings.error.heat_flow / true.heat_flow < WITHIN, (settings.error, true)
+    assert 1 / WITHIN < settings.error.heat_flow / true.heat_flow < MOST_FLOW, (settings.error, true)
 
 
 @pytest.mark.parametrize(("tolerance_k", "refinements"), [(0.2, 0), (0.02, 1)])
@@ -68,7 +81,7 @@ def test_spherical_shell(tolerance_k, refinements) -> None:
     true, estimate = true_error(found, problem, exact), found.settings.error
     assert true.temperature_k <= tolerance_k and found.met
     assert 1 / WITHIN < estimate.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
-    assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < WITHIN, (found.settings, true)
+    assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < MOST_FLOW, (found.settings, true)
 
 
 @pytest.mark.parametrize(("tolerance_k", "refinements"), [(2.0, 0), (0.5, 1), (0.2, 2)])
@@ -86,6 +99,84 @@ def test_nafems_t3(tolerance_k, refinements) -> None:
     assert 1 / WITHIN < found.settings.error.temperature_k / true_k < WITHIN, (found.settings, true_k)
 
 
+INSIDE, OUTSIDE = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0)
+
+
+def axis(end: float, parts: int) -> np.ndarray:
+    return np.linspace(0.0, end, parts + 1)
+
+
+def notched(*effects) -> HeatProblem:
+    keep = lambda p: (p[..., 0] > 0.5) | (p[..., 1] > 0.5)  # noqa: E731
+    return HeatProblem(box_mesh(axis(1.0, 8), axis(1.0, 8), axis(0.25, 2), keep=keep), CONCRETE, effects=effects)
+
+
+def bridge() -> HeatProblem:
+    """A steel plate through wool, 1000 times as conductive."""
+    regions = {"wool": lambda p: p[..., 0] > -1.0, "steel": lambda p: (p[..., 1] > 0.15) & (p[..., 1] < 0.25)}
+    mesh = box_mesh(axis(0.4, 16), axis(0.4, 16), axis(0.05, 2), regions=regions)
+    wool = Material("wool", 0.05, 30.0, 1000.0)
+    return HeatProblem(mesh, {"wool": wool, "steel": STEEL}, effects=(INSIDE, OUTSIDE))
+
+
+def plate() -> HeatProblem:
+    effects = FixedTemperature(("x0",), 50.0), Convection(("z0", "z1"), 8.0, 5.0), InternalHeat(("*",), 2e4)
+    return HeatProblem(box_mesh(axis(1.0, 16), axis(1.0, 16), [0.0, 0.01]), STEEL, effects=effects)
+
+
+def graded_body() -> HeatProblem:
+    steps = np.concatenate([[0.0], np.geomspace(0.01, 1.0, 10)])
+    effects = Convection(("x0",), 100.0, 100.0), Convection(("y0",), 25.0, 0.0)
+    return HeatProblem(box_mesh(steps, steps, [0.0, 0.05, 0.1]), CONCRETE, effects=effects)
+
+
+def fin() -> HeatProblem:
+    effects = FixedTemperature(("x0",), 80.0), Convection(("y0", "y1"), 60.0, 20.0)
+    mesh = box_mesh(axis(0.2, 10), axis(0.01, 2), [0.0, 0.01])
+    return HeatProblem(mesh, Material("aluminium", 200.0, 2700.0, 900.0), effects=effects)
+
+
+def stove() -> HeatProblem:
+    effects = (
+        FixedTemperature(("inside",), 300.0),
+        Radiation(("outside",), 0.9, 20.0),
+        Convection(("outside",), 5.0, 20.0),
+    )
+    return HeatProblem(shell_mesh(0.1, 0.3, 4, 3, eighth=True), CONCRETE, effects=effects)
+
+
+def side_by_side(conductivity_w_mk: float) -> HeatProblem:
+    """Two materials along the flow between two airs, one of them of 1 W/(m K): they share nodes under both films."""
+    regions = {"one": lambda p: p[..., 1] < 0.5, "other": lambda p: p[..., 1] > 0.5}
+    mesh = box_mesh(axis(1.0, 8), axis(1.0, 8), axis(0.125, 1), regions=regions)
+    one, other = (Material("any", k, 1000.0, 1000.0) for k in (1.0, conductivity_w_mk))
+    return HeatProblem(mesh, {"one": one, "other": other}, effects=(INSIDE, Convection(("x1",), 25.0, 0.0)))
+
+
+BODIES = {
+    "notch, given temperatures": lambda: notched(FixedTemperature(("x0",), 20.0), FixedTemperature(("y0",), 0.0)),
+    "notch, two airs": lambda: notched(Convection(("x1", "y1"), 25.0, -10.0), Convection(("other",), 8.0, 20.0)),
+    "conductivities 1000 apart": bridge,
+    "thin heated plate": plate,
+    "graded": graded_body,
+    "fin": fin,
+    "radiating sphere": stove,
+    "side by side, 1e-8": lambda: side_by_side(1e-8),
+    "side by side, 0.035": lambda: side_by_side(0.035),
+    "side by side, 1e8": lambda: side_by_side(1e8),
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_the_error_of_linear_tetrahedra_is_estimated_within_a_factor_of_two(name) -> None:
+    problem = BODIES[name]()
+    found, fine = solve_steady(problem), finer(problem, 1 if len(problem.mesh.tets) > 1500 else 2)
+    exact = solve_steady(fine, order=2, relative_tolerance=1e-9)
+    true, estimate = difference_between(found, exact, len(problem.mesh.points_m)), steady_error(problem, found)
+    ratios = true.temperature_k / estimate.temperature_k, true.heat_flow / estimate.heat_flow
+    assert all(1 / 2 < ratio < 2 for ratio in ratios), ratios
+
+
 def nafems_t4() -> HeatProblem:
     mesh = box_mesh(np.linspace(0.0, 0.6, 7), np.linspace(0.0, 1.0, 11), [0.0, 0.1], temperature_c=50.0)
     effects = (FixedTemperature(("y0",), 100.0), Convection(("x1", "y1"), 750.0, 0.0))
@@ -100,7 +191,7 @@ def test_nafems_t4(tolerance) -> None:
     true, estimate = true_error(found, problem, exact), found.settings.error
     assert found.met and tolerance.excess(true) <= 1.0
     assert 1 / WITHIN < estimate.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
-    assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < WITHIN, (found.settings, true)
+    assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < MOST_FLOW, (found.settings, true)
 
 
 def test_nafems_t2_has_no_error() -> None:
@@ -130,7 +221,7 @@ def test_slab_with_convection(biot) -> None:
         true, estimate = true_error(found, problem, exact), found.settings.error
         assert found.met and true.temperature_k <= tolerance_k
         assert 1 / WITHIN < estimate.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
-        assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < WITHIN, (found.settings, true)
+        assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < MOST_FLOW, (found.settings, true)
 
 
 @pytest.mark.parametrize(
@@ -156,13 +247,13 @@ def test_radiation_and_changing_coefficients_in_time(effect) -> None:
 
 def test_too_little_memory_is_a_status() -> None:
     problem = shell()
-    room = 4000.0 * len(problem.mesh.tets)
+    room = 12_000.0 * len(problem.mesh.tets)
     with pytest.raises(HeatError, match=r"Not within 1e-05 K: P2, given mesh.*size halved 1x needs about .* MiB"):
         solve_to_tolerance(problem, Tolerance(1e-5), memory_bytes=room, log=silent)
     found = solve_to_tolerance(problem, Tolerance(1e-5), memory_bytes=room, allow_unmet=True, log=silent)
     assert not found.met and found.settings.order == 2 and "a larger error" in found.status
     assert np.isfinite(found.solution.temperature_c).all()
-    with pytest.raises(HeatError, match="memory_bytes: expected room for a first estimate, got P1 on the given mesh"):
+    with pytest.raises(HeatError, match="memory_bytes: expected room for a first estimate, got P2 on the given mesh"):
         solve_to_tolerance(problem, Tolerance(1.0), memory_bytes=1e4, log=silent)
     transient = solve_to_tolerance(
         nafems_t3(), Tolerance(0.01), duration_s=32.0, memory_bytes=1e6, allow_unmet=True, log=silent
@@ -172,24 +263,6 @@ def test_too_little_memory_is_a_status() -> None:
     flows = solve_to_tolerance(problem, Tolerance(None, 1e-9), memory_bytes=room, allow_unmet=True, log=silent)
     advised = ["--flow-tolerance 0.01" in each.status for each in (found, transient, flows)]
     assert advised == [True, False, False]
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Tolerance(None, None), "tolerance: expected temperature_k or heat_flow, got neither"),
-        (lambda: Tolerance(0.0), "temperature_k: expected a finite number above 0"),
-        (lambda: Tolerance(1.0, -0.1), "heat_flow: expected a finite number above 0"),
-        (
-            lambda: solve_to_tolerance(nafems_t3(), Tolerance(None, 0.1), duration_s=32.0),
-            "tolerance: expected one in kelvin, got heat_flow only",
-        ),
-        (lambda: solve_to_tolerance(shell(), Tolerance(1.0), memory_bytes=-1.0), "memory_bytes: expected a finite"),
-    ],
-)
-def test_bad_input(make, message) -> None:
-    with pytest.raises(HeatError, match=message):
-        make()
 
 
 @pytest.mark.parametrize("outputs", [1, 2])
@@ -204,7 +277,7 @@ def test_heat_that_rushes_in_at_the_start_is_not_missed(outputs: int) -> None:
     (flow_w,) = mean_flows_w(found.solution).values()
     assert found.settings.refinements >= 1
     true = abs(exact_w - flow_w) / (0.5 * abs(flow_w))
-    assert 0.6 < found.settings.error.heat_flow / true < 1.5, (found.settings, true)
+    assert 1 / WITHIN < found.settings.error.heat_flow / true < WITHIN, (found.settings, true)
 
 
 def test_where_nothing_flows_any_share_of_it_is_met() -> None:
@@ -225,3 +298,56 @@ def test_a_body_of_given_temperatures_alone_has_nothing_to_solve() -> None:
     steady = solve_to_tolerance(problem, Tolerance(0.05), log=silent)
     assert steady.met and steady.solution.temperature_c.max() == 20.0
     assert solve_to_tolerance(problem, Tolerance(5.0), duration_s=3600.0, log=silent).met
+
+
+def test_where_quadratic_tetrahedra_fail_linear_ones_go_on(monkeypatch) -> None:
+    def failing(problem, *, order, **options):
+        if order == 2:
+            raise HeatError("No steady state was found.")
+        return solve_steady(problem, order=order, **options)
+
+    monkeypatch.setattr(tolerance, "solve_steady", failing)
+    lines: list[str] = []
+    found = solve_to_tolerance(fin(), Tolerance(None, 1e-3), log=lines.append)
+    assert found.met and found.settings.order == 1 and found.settings.refinements > 0
+    assert any("P2 failed: No steady state was found." in line for line in lines)
+    small = solve_to_tolerance(fin(), Tolerance(None, 1e-5), memory_bytes=2e6, allow_unmet=True, log=lines.append)
+    assert not small.met and "P1 on the mesh size halved" in small.status
+
+
+@pytest.mark.parametrize("tolerance_k", [5.0, 0.1], ids=["given mesh", "finer mesh"])
+def test_an_effect_that_acts_nowhere_brings_nothing(tolerance_k) -> None:
+    mesh = box_mesh(np.linspace(0.0, 0.2, 5), [0.0, 0.1], [0.0, 0.1])
+    assert mesh.boundary is not None
+    tags = replace(mesh.boundary, patch_names=(*mesh.boundary.patch_names, "without triangles"))
+    air, nowhere = Convection(("x0",), 50.0, 0.0), Convection(("without triangles",), 20.0, 0.0)
+    found, alone = (
+        solve_to_tolerance(
+            HeatProblem(replace(mesh, boundary=tags), CONCRETE, effects=effects),
+            Tolerance(tolerance_k),
+            duration_s=3600.0,
+            log=silent,
+        )
+        for effects in ((air, nowhere), (air,))
+    )
+    assert (found.settings.refinements > 0) is (tolerance_k < 1.0)
+    assert found.met and not found.solution.effects[1].heat_w.any()
+    np.testing.assert_array_equal(found.solution.temperature_c, alone.solution.temperature_c)
+
+
+BALL = dressed(tet_mesh(stuff(SHAPES["sphere"].level(20)), 0.05))
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("mesh", [box_mesh(*[np.linspace(0.0, 1.0, 15)] * 3), BALL], ids=["lattice", "stuffed"])
+def test_a_solution_takes_no_more_memory_than_forecast_and_a_quarter_at_least(mesh, order) -> None:
+    problem = HeatProblem(mesh, CONCRETE, effects=(Convection(("*",), 8.0, 10.0), Radiation(("*",), 0.9, 0.0)))
+    solve_steady(problem, order=order)  # when kernels and modules are loaded
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        solve_steady(problem, order=order)
+        peak = tracemalloc.get_traced_memory()[1] - before
+    finally:
+        tracemalloc.stop()
+    assert 0.25 * peak_bytes(problem, order=order) < peak < 1.1 * peak_bytes(problem, order=order)

@@ -37,31 +37,6 @@ def at_once(mesh: TetMesh, material, *effects: Effect) -> HeatSolution:
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Convection("x0", 5.0, 20.0), r"patches: expected a tuple of names, got 'x0'.*patches=\(\"name\",\)"),
-        (
-            lambda: Convection(("*",), -1.0, 20.0),
-            r"coefficient_w_m2k: expected a finite number of at least 0 \[W/\(m2 K",
-        ),
-        (lambda: HeatFlux(("*",), True), "flux_w_m2: expected a finite number .*got True"),
-        (lambda: HeatFlux(("*",), np.ones(3)), "flux_w_m2: expected a number or a Varying"),
-        (lambda: HeatFlux(("*",), lambda places, time_s: 1.0), r"Wrap a function: Varying\(function"),
-        (lambda: Radiation(("*",), 1.01, 20.0), "emissivity: expected .*at least 0 and at most 1"),
-        (
-            lambda: Radiation(("*",), 0.9, 1e300),
-            r"surroundings_c: expected .*at most 10000 \[degrees Celsius\], got 1e\+300",
-        ),
-        (lambda: Convection(("*",), 5.0, 1e6), "air_c: expected .*at most 10000"),
-        (lambda: GroundContact(("*",), 0.0, 10.0), "resistance_m2k_w: expected a finite number above 0"),
-    ],
-)
-def test_impossible_values_are_refused(make, message) -> None:
-    with pytest.raises(HeatError, match=message):
-        make()
-
-
-@pytest.mark.parametrize(
     ("effect", "watts"),
     [
         (HeatFlux(("x0",), 100.0), 100.0 * AREA_X),
@@ -142,26 +117,6 @@ def test_a_star_is_the_whole_boundary_also_without_tags(box, concrete) -> None:
         assert at_once(mesh, concrete, HeatFlux(("*",), 10.0)).heat_w[0] == pytest.approx(10.0 * area, rel=1e-9)
 
 
-def with_coefficient(function) -> Convection:
-    return Convection(("x0",), Varying(function), 20.0)
-
-
-@pytest.mark.parametrize(
-    ("effect", "message"),
-    [
-        (HeatFlux(("roof",), 1.0), r"patches: expected names or patterns of x0, x1, y0, y1, z0, z1, other, got 'roof'"),
-        (HeatFlux(("x0", "X?"), 1.0), "got 'X\\?'"),
-        (InternalHeat(("oven",), 1.0), "regions: expected names or patterns of solid, got 'oven'"),
-        (with_coefficient(lambda places, _: np.ones(3)), "function of coefficient_w_m2k: expected one number, or one"),
-        (with_coefficient(lambda places, _: -1.0), "coefficient_w_m2k: expected a finite number of at least 0"),
-        (with_coefficient(lambda places, _: np.full(len(places), np.nan)), "coefficient_w_m2k: .*got .* that are not"),
-    ],
-)
-def test_unknown_names_and_functions_without_usable_numbers_are_refused(box, concrete, effect, message) -> None:
-    with pytest.raises(HeatError, match=message):
-        at_once(box, concrete, effect)
-
-
 def test_functions_are_told_where_they_are(box, concrete) -> None:
     seen = {}
 
@@ -187,12 +142,6 @@ def test_two_temperatures_at_one_node_are_refused(box, concrete) -> None:
     np.testing.assert_array_equal(heat.temperature_c, one.temperature_c)
     assert sum(part.heat_w[0] for part in heat.effects) == pytest.approx(one.effects[0].heat_w[0], rel=1e-9)
     np.testing.assert_allclose([part.heat_w[0] for part in heat.effects], one.effects[0].group_heat_w[0], rtol=1e-9)
-
-
-def test_effects_of_one_kind_and_place_are_told_apart(box, concrete) -> None:
-    heat = at_once(box, concrete, HeatFlux(("x0",), 1.0), HeatFlux(("x0",), 2.0), HeatFlux(("x1",), 3.0)).effects
-    assert [part.effect for part in heat] == ["heat flux on x0", "heat flux on x0 (2)", "heat flux on x1"]
-    np.testing.assert_allclose([part.heat_w[0] for part in heat], AREA_X * np.array([1.0, 2.0, 3.0]), rtol=1e-9)
 
 
 EVERY = {

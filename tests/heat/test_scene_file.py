@@ -10,7 +10,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.schemes import BACKWARD_EULER
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import (

@@ -1,17 +1,29 @@
 from dataclasses import replace
+from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_meshes import SIDES, box_mesh, planes
+from tests.support.obtuse_bodies import body
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import tabulated
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Varying, tabulated
+from thermoxels_ns.fem.solution import SteadySolution, mean_flows_w
 from thermoxels_ns.heat import solving as heat_solving
-from thermoxels_ns.heat.effects import Convection, HeatFlux
+from thermoxels_ns.heat.effects import (
+    AbsorbedSolar,
+    Convection,
+    Effect,
+    FixedTemperature,
+    HeatFlux,
+    InternalHeat,
+    Radiation,
+)
 from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.sun import moving_sun
 
 
 class Clock:
@@ -60,97 +72,126 @@ def test_what_is_left_is_told_by_the_last_steps(clock) -> None:
     ]
 
 
-def feebly_warmed(depth_m: float = 0.3) -> HeatProblem:
-    """A wall between two airs, warmed by 0.05 W/m2, which 25 W/(m2 K) turn into at most 2 mK."""
-    mesh = box_mesh(planes(0.0, depth_m, step=depth_m / 6), [0.0, 0.1], [0.0, 0.1], temperature_c=20.0)
-    effects = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0), HeatFlux(("x1",), 0.05)
-    return HeatProblem(mesh, CONCRETE, effects=effects)
+AIRS = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0)
+CONFORMING = body()
+"""A slab cut from voxels at 30 degrees, with obtuse angles as exports have."""
 
 
-def solved(problem: HeatProblem, **goals: Any) -> heat_solving.SolvedProblem:
-    return heat_solving.solve_problem(problem, None, heat_solving.Goals(**goals))
+def solved(problem: HeatProblem, time: heat_solving.Time = None, **goals: Any) -> heat_solving.SolvedProblem:
+    return heat_solving.solve_problem(problem, time, heat_solving.Goals(**goals))
 
 
-def test_what_is_left_out_counts_against_the_tolerance(monkeypatch) -> None:
-    """0.05 W/m2 take 2 mK of 50 mK: the solver may err by the other 48, and the estimate holds both."""
-    given: list[Any] = []
-    inner = heat_solving.solve_to_tolerance
-
-    def remember(problem, tolerance, **named):
-        given.append(tolerance)
-        return inner(problem, tolerance, **named)
-
-    monkeypatch.setattr(heat_solving, "solve_to_tolerance", remember)
-    found = solved(feebly_warmed(), tolerance_k=0.05).accuracy
-    assert found is not None and found.left_out_k == pytest.approx(0.002, rel=1e-6)
-    assert given[0].temperature_k == pytest.approx(0.048, rel=1e-6)
-    assert found.left_out_k < found.estimated_k <= 0.05 and found.met
-    everything = solved(feebly_warmed(), tolerance_k=0.05, leave_out_below_k=0.0).accuracy
-    assert everything is not None and everything.left_out_k == 0.0 and given[1].temperature_k == 0.05
+def sun(strength: float) -> Effect:
+    return AbsorbedSolar(("x1",), 0.6, 500.0 * strength)
 
 
-@pytest.mark.parametrize(
-    ("tolerance_k", "share", "given", "expected"),
-    [
-        *((None, None, None, 0.01), (0.05, None, None, 0.01), (0.5, None, None, 0.1)),
-        *((None, 0.01, None, 0.0), (0.5, 0.01, None, 0.0), (0.5, 0.01, 0.2, 0.2), (None, None, 0.0, 0.0)),
-    ],
-)
-def test_what_may_be_left_out_unless_it_is_said(tolerance_k, share, given, expected) -> None:
-    goals = heat_solving.Goals(tolerance_k=tolerance_k, flow_tolerance=share, leave_out_below_k=given)
-    assert goals.left_out_k == pytest.approx(expected) and np.isfinite(expected)
+def wind(strength: float) -> Effect:
+    return Convection(("x1",), 20.0 * strength, -5.0)
 
 
-def tight_wall(flux_w_m2: float) -> HeatProblem:
+def sky(strength: float) -> Effect:
+    return Radiation(("*",), 0.9 * strength, -30.0)
+
+
+def source(strength: float) -> Effect:
+    return InternalHeat(("*",), 1000.0 * strength)
+
+
+@pytest.mark.parametrize("time", [None, TimeSteps(5, 36_000.0), AdaptiveSteps(36_000.0, 0.5, outputs=2)], ids=str)
+@pytest.mark.parametrize("make", [sun, wind, sky, source])
+def test_what_is_left_out_brings_little_and_what_brings_more_is_built(make, time) -> None:
+    """On a conforming mesh, from far too little to far too much to be left out."""
+    left_out = []
+    for strength in (1e-6, 1e-3, 1.0):
+        problem = HeatProblem(CONFORMING, CONCRETE, effects=(*AIRS, make(strength)))
+        found, whole = solved(problem, time), solved(problem, time, leave_out_below=0.0)
+        left_out.append(len(found.left_out))
+        flows, all_flows = mean_flows_w(found.solution), mean_flows_w(whole.solution)
+        through_w = 0.5 * sum(map(abs, all_flows.values()))
+        for effect, flow in all_flows.items():
+            assert abs(flows.get(effect, 0.0) - flow) <= heat_solving.LEAVE_OUT_BELOW * through_w
+        for entry in found.left_out:
+            assert abs(all_flows[entry.effect]) <= entry.heat_w * 1.001
+            assert entry.share <= heat_solving.LEAVE_OUT_BELOW
+    assert left_out == sorted(left_out, reverse=True) and left_out[0] == 1 and left_out[-1] == 0
+
+
+def tight_wall(flux: float | Varying) -> HeatProblem:
     """A wall of U = 0.1 W/(m2 K) between airs of 20 and 0 degrees, with a flux on its outer face."""
     mesh = box_mesh(planes(0.0, 0.34, step=0.034), [0.0, 0.1], [0.0, 0.1], temperature_c=20.0)
-    effects = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0), HeatFlux(("x1",), flux_w_m2)
-    return HeatProblem(mesh, Material("wool", 0.035, 30.0, 1000.0), effects=effects)
+    return HeatProblem(mesh, Material("wool", 0.035, 30.0, 1000.0), effects=(*AIRS, HeatFlux(("x1",), flux)))
 
 
 @pytest.mark.parametrize("time", [None, TimeSteps(10, 1e6)])
-def test_what_matters_to_heat_flows_is_built_however_little_it_warms(time) -> None:
-    """0.2 W/m2 warm a face with 25 W/(m2 K) by 0.008 K, but 2 W/m2 are all that flows through the wall."""
+def test_what_matters_beside_the_heat_that_really_flows_is_taken_in_again(time) -> None:
+    """0.2 W/m2 are little beside what two airs could bring, but 2 W/m2 are all that flows through the wall."""
     lines: list[str] = []
     found = heat_solving.solve_problem(tight_wall(0.2), time, heat_solving.Goals(), lines.append)
-    assert found.screening.left_out == () and len(found.solution.effects) == 3
-    assert found.screening.kept[2].reason == "it matters to heat flows"
-    assert any("solved again" in line and "--leave-out-below-k 0.01" in line for line in lines)
-    in_kelvin = heat_solving.solve_problem(tight_wall(0.2), time, heat_solving.Goals(leave_out_below_k=0.01))
-    assert len(in_kelvin.screening.left_out) == 1, "if kelvins are asked for, they count alone"
-    outside_w = [float(np.mean(each.solution.effects[1].heat_w)) for each in (found, in_kelvin)]
-    assert outside_w[0] / outside_w[1] > 1.05
-    little = heat_solving.solve_problem(tight_wall(0.01), time, heat_solving.Goals())
-    assert [entry.effect for entry in little.screening.left_out] == ["heat flux on x1"]
-    assert little.screening.bound_w == pytest.approx(0.01 * 0.01)
+    assert found.left_out == () and len(found.solution.effects) == 3
+    assert any("solved again with heat flux on x1 (up to 0.002 W)" in line for line in lines)
+    little = solved(tight_wall(0.005), time)
+    assert [entry.effect for entry in little.left_out] == ["heat flux on x1"]
+    assert little.left_out[0].heat_w == pytest.approx(0.005 * 0.01)
+    assert little.left_out[0].share == pytest.approx(0.005 / 2.0, rel=0.05)
 
 
-def test_nothing_that_brings_heat_is_left_out_beside_a_tolerance_of_heat_flows() -> None:
-    found = solved(tight_wall(0.01), flow_tolerance=0.05, leave_out_below_k=0.1)
-    assert found.screening.left_out == ()
+def test_together_they_keep_within_the_share() -> None:
+    """Two fluxes of 0.3 % of the heat each: one may go, which of them does not matter."""
+    wall = tight_wall(0.006)
+    found = solved(replace(wall, effects=(*AIRS, HeatFlux(("x1",), 0.006), HeatFlux(("x0",), 0.006))))
+    assert len(found.left_out) == 1 and len(found.solution.effects) == 3
 
 
-def test_to_a_tolerance_effects_are_looked_at_as_steps_are_taken(monkeypatch) -> None:
-    """Steps are then chosen by their error: what happens between the scene's own steps counts."""
-    pulse = tabulated([0.0, 600.0, 1200.0, 1800.0], [0.0, 500.0, 0.0, 0.0])
-    problem = replace(tight_wall(0.0), effects=(HeatFlux(("x1",), pulse),))
-    asked: list[Any] = []
-
-    def remember(kept, tolerance, **named):
-        asked.append(kept)
-        raise HeatError("enough")
-
-    monkeypatch.setattr(heat_solving, "solve_to_tolerance", remember)
-    with pytest.raises(HeatError, match="enough"):
-        heat_solving.solve_problem(problem, TimeSteps(1, 1800.0), heat_solving.Goals(tolerance_k=0.5))
-    assert asked[0].effects == problem.effects
+def test_beside_a_tolerance_all_that_brings_heat_is_built() -> None:
+    idle = Convection(("x1",), 0.0, -50.0)
+    problem = replace(tight_wall(1e-6), effects=(*tight_wall(1e-6).effects, idle))
+    found = solved(problem, flow_tolerance=0.05)
+    assert [entry.heat_w for entry in found.left_out] == [0.0] and len(found.solution.effects) == 3
+    with pytest.raises(HeatError, match="leave-out-below"):
+        heat_solving.Goals(flow_tolerance=0.05, leave_out_below=0.01)
 
 
-def test_a_body_on_which_nothing_acts_is_said_to_be_insulated() -> None:
-    lines: dict[int, list[str]] = {0: [], 1: []}
-    for count, said_of in lines.items():
-        effects = (HeatFlux(("x1",), 5.0),) * count
-        heat_solving.solve_problem(
-            replace(tight_wall(0.0), effects=effects), TimeSteps(1, 60.0), heat_solving.Goals(), said_of.append
-        )
-    assert [any("Nothing acts" in line for line in said_of) for said_of in lines.values()] == [True, False]
+def zigzag(resolution_s: float, shift: float) -> Varying:
+    times_s = resolution_s * (np.arange(60) - shift)
+    return tabulated(times_s, np.arange(60) % 2 * 2000.0)
+
+
+@pytest.mark.parametrize(
+    ("flux", "time"),
+    [
+        *(
+            (Varying(lambda _, t, end=n * 0.1: 2000.0 if abs(t - end) < 1e-6 else 0.0), TimeSteps(300, 0.1))
+            for n in (1, 77, 300)
+        ),
+        *((zigzag(3600.0, shift), AdaptiveSteps(36_000.0)) for shift in (0.0, 0.25, 0.5)),
+        (Varying(lambda _, t: 0.0), AdaptiveSteps(36_000.0)),
+        (
+            moving_sun(datetime(2026, 10, 1, tzinfo=timezone.utc), 50.0, 0.0, (0.0, 1.0, 0.0)),
+            AdaptiveSteps(172_800.0, 1.0, outputs=2),
+        ),
+    ],
+)
+def test_what_changes_with_time_is_looked_at_often_enough(flux, time) -> None:
+    """A pulse of one step, a table that turns at every entry, what does not say how fast, the sun."""
+    steady_sun = AbsorbedSolar(SIDES, 0.7, flux)
+    problem = replace(tight_wall(0.0), effects=(*AIRS, steady_sun))
+    assert solved(problem, time).left_out == ()
+
+
+def test_the_only_exchange_of_a_steady_body_stays() -> None:
+    """Air as warm as the body brings no heat, but without it there is no steady state."""
+    lone = replace(tight_wall(0.0), effects=(Convection(("x0",), 5.0, 20.0),))
+    assert solved(lone).left_out == () and len(solved(lone, TimeSteps(3, 60.0)).left_out) == 1
+
+
+def test_what_fixes_temperatures_stays() -> None:
+    """A flux onto a fixed surface changes no temperature, but its heat counts."""
+    fixed = FixedTemperature(("x0",), 20.0)
+    problem = replace(tight_wall(0.0), effects=(fixed, HeatFlux(("x0",), 1e6)))
+    assert solved(problem, TimeSteps(3, 60.0)).left_out == ()
+
+
+def test_a_mesh_error_is_estimated_without_a_tolerance_if_there_is_room() -> None:
+    for memory_gb, known in ((4.0, True), (1e-3, False)):
+        solution = solved(HeatProblem(CONFORMING, CONCRETE, effects=AIRS), memory_gb=memory_gb).solution
+        assert isinstance(solution, SteadySolution) and (solution.error is not None) is known

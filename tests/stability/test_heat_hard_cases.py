@@ -30,14 +30,6 @@ def test_maximum_principle_at_any_step_length(fourier: float) -> None:
     assert np.all(np.diff(states.min(axis=1)) >= -1e-9) and np.all(np.diff(states.max(axis=1)) <= 1e-9)
 
 
-def test_consistent_mass_breaks_it_for_short_steps() -> None:
-    """The reason why lumping is the default: beside a jump from 20 to 90 degrees the consistent mass undershoots."""
-    mesh = make_body(np.ones((8, 4, 4), bool), 0.05, lambda points: np.where(points[:, 0] < 0.22, 20.0, 90.0))
-    problem, time = HeatProblem(mesh, CONCRETE), TimeSteps(1, 1e-2 * 0.05**2 / CONCRETE.diffusivity_m2_s)
-    assert solve_heat(problem, time).temperature_c.min() >= 20.0 - 1e-9
-    assert solve_heat(problem, time, lumped=False).temperature_c.min() < 19.5
-
-
 @pytest.mark.parametrize("conductivity", [1e-9, 0.024, 400.0, 1e9])
 def test_conductivity_extremes(conductivity: float) -> None:
     material = Material("extreme", conductivity, 2200.0, 880.0)
@@ -85,16 +77,12 @@ def test_voxels_that_touch_by_an_edge_or_a_corner(touching: str) -> None:
     assert np.ptp(solution.temperature_c[-1]) < 1e-4
 
 
-def test_wall_of_one_voxel() -> None:
-    cells = np.ones((12, 12, 1), bool)
+@pytest.mark.parametrize("shape", [(12, 12, 1), (1, 1, 1)])
+def test_walls_and_bodies_of_one_voxel(shape) -> None:
+    cells = np.ones(shape, bool)
     solution = solve_heat(HeatProblem(make_body(cells, 0.02, spots), CONCRETE), TimeSteps(10, 60.0))
     assert solution.energy_residual < 1e-14
     assert solution.temperature_c.min() >= -30.0 and solution.temperature_c.max() <= 90.0
-
-
-def test_single_voxel() -> None:
-    solution = solve_heat(HeatProblem(make_body(np.ones((1, 1, 1), bool), 0.02, spots), CONCRETE), TimeSteps(1, 60.0))
-    assert solution.converged and solution.energy_residual < 1e-14
 
 
 def test_differences_of_a_nanokelvin_survive() -> None:

@@ -16,7 +16,7 @@ from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, HeatFlux
 from thermoxels_ns.heat.scene import HeatScene, load_heat_scene
-from thermoxels_ns.heat.screening import screen
+from thermoxels_ns.heat.solving import _weak
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 MOST_RATIO = 2.6
@@ -61,8 +61,8 @@ AIR = "convection: [{patches: ['*'], air_c: 5.0, coefficient_w_m2k: 5.0}]"
 WORK: dict[str, tuple[bool, Callable[[HeatProblem], Any]]] = {
     "labels of effects alike": (True, effect_labels),
     "assembling": (False, HeatSystem),
-    "screening": (False, lambda problem: screen(problem, TimeSteps(2, 60.0), 0.01)),
-    "screening, steady": (False, lambda problem: screen(problem, None, 0.01)),
+    "leaving out": (False, lambda problem: _weak(problem, TimeSteps(2, 60.0), 0.01)),
+    "leaving out, steady": (False, lambda problem: _weak(problem, None, 0.01)),
 }
 
 

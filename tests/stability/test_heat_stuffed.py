@@ -9,7 +9,7 @@ from tests.support.obtuse_bodies import AT_THE_BOUNDS, BLOCKS, CONCRETE, STEP_S,
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, box_distance, centres, stiffness, turn
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.schemes import CRANK_NICOLSON, SDIRK2
+from thermoxels_ns.fem.runge_kutta import CRANK_NICOLSON, SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, Radiation

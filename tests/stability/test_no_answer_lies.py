@@ -5,6 +5,7 @@ close and how high temperatures are, how it is turned, and the length of steps.
 """
 
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -16,10 +17,11 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.implicit_equation import MOST_UNBALANCED
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, theta_scheme
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, theta_scheme
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import NOTHING
 from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.tolerance import steady_error
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -166,6 +168,9 @@ def steady_case(seed: int, order: int) -> Outcome:
     try:
         problem, x, cold, exact_k, flows = wall(rng, hostile, order)
         solution = solve_steady(problem, order=order)
+        if order == 1:
+            with suppress(HeatError):
+                solution = replace(solution, error=steady_error(problem, solution))
     except HeatError as error:
         return Outcome(hostile, None, str(error))
     kelvin, watts = stated(solution, problem, flows)

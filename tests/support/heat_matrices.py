@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from thermoxels_ns.fem.p1_kernels import lumped_mass, mass_matrix, stiffness_matrix
+from thermoxels_ns.fem.p1_kernels import lumped_mass, stiffness_matrix
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.space import Space
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -24,4 +26,6 @@ def assemble(mesh: TetMesh, material: Material, *, lumped: bool = True) -> HeatM
     if lumped:
         nodal = lumped_mass(mesh.points_m, mesh.tets, material.heat_capacity_j_m3k)
         return HeatMatrices(stiffness, sparse.diags(nodal, format="csr"), nodal)
-    return HeatMatrices(stiffness, *mass_matrix(mesh.points_m, mesh.tets, material.heat_capacity_j_m3k))
+    mass, nodal = Space(Selection(mesh), lumped=False).mass(material.heat_capacity_j_m3k)
+    assert mass is not None
+    return HeatMatrices(stiffness, mass, nodal)

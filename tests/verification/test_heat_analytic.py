@@ -38,13 +38,3 @@ def test_each_mode_decays_exactly_as_backward_euler_says() -> None:
         states = solve_heat(HeatProblem(mesh, CONCRETE, 20.0 + 10.0 * mode), TimeSteps(5, dt)).temperature_c
         expected = 20.0 + 10.0 * mode * (1.0 / 1.7) ** np.arange(6)[:, None]
         np.testing.assert_allclose(states, expected, atol=1e-9)
-
-
-def test_slowest_mode_of_a_box() -> None:
-    """Smallest rate of an insulated box of length L: a (pi / L)^2, to the accuracy of 16 voxels."""
-    mesh = make_body(np.ones((16, 3, 2), bool), 0.05)
-    matrices = assemble(mesh, CONCRETE)
-    values = eigh(matrices.stiffness_w_k.toarray(), matrices.mass_j_k.toarray(), eigvals_only=True)
-    exact = CONCRETE.diffusivity_m2_s * (np.pi / 0.8) ** 2
-    assert abs(values[0]) < 1e-9 * exact
-    assert values[1] == pytest.approx(exact, rel=5e-3)

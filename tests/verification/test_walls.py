@@ -8,7 +8,7 @@ from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, graded, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.schemes import SDIRK2
+from thermoxels_ns.fem.runge_kutta import SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, FixedTemperature

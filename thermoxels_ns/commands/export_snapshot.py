@@ -131,7 +131,7 @@ def export_snapshot(
     truth = None
     if scale is not None:
         say(f"Heat: {time.steps} steps of {time.step_seconds:g} s through {material.name}")
-        everything = Goals(leave_out_below_k=0.0, memory_gb=None)
+        everything = Goals(leave_out_below=0.0, memory_gb=None)
         found = solve_problem(scene.problem(mesh, up=up), time, everything, say).solution
         assert isinstance(found, HeatSolution), "the scene has time steps"
         solution = found

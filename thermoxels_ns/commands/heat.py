@@ -56,13 +56,12 @@ class Heat:
     memory_gb: float = 4.0
     """Most memory that solving may take, [GiB]. What needs more is refused before any of it is taken."""
     allow_unmet: bool = False
-    """If a tolerance cannot be met within the memory, write the best that fits and say so, instead of an error.
-    Through time the first estimate needs room for a mesh of half the size."""
-    leave_out_below_k: float | None = None
-    """Effects that together can change no temperature by more than this are left out, [K]; the report lists each with
-    its bound. 0 builds all that brings heat; so do meshes with obtuse angles, as exports are, and --flow-tolerance.
-    Left out: a fifth of --tolerance, which counts against it, or 0.01 without one (a fifth of the default tolerance of
-    the time steps), and what may change a mean heat flow by more than 1 % of all heat that flows is built, too."""
+    """If a tolerance cannot be met within the memory, write the best that fits and say so, instead of an error. The
+    first estimate needs room for quadratic tetrahedra, through time for a mesh of half the size."""
+    leave_out_below: float | None = None
+    """Effects that together bring less than this share of all heat that flows are left out; the report lists each with
+    its watts at the solution. 0 builds all that brings heat; so does a tolerance. Left out: 0.005, half of what
+    building physics asks of a heat flow."""
     up: tuple[float, float, float] | None = None
     """Direction that points up in the coordinates of the mesh, if the scene does not say. Default: that of the
     export's summary.json beside the mesh, or else z."""
@@ -107,7 +106,7 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     goals = Goals(
         tolerance_k=options.tolerance,
         flow_tolerance=options.flow_tolerance,
-        leave_out_below_k=options.leave_out_below_k,
+        leave_out_below=options.leave_out_below,
         memory_gb=options.memory_gb,
         allow_unmet=options.allow_unmet,
     )
@@ -145,16 +144,33 @@ def read_export_summary(mesh: Path, say: Say) -> dict[str, Any]:
 
 def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
     """Everything that answers.json says."""
-    screening, solution = run.screening, run.solution
-    error, time_error_k = getattr(solution, "error", None), getattr(solution, "time_error_k", math.nan)
+    solution = run.solution
+    accuracy, error, time_error_k = (
+        run.accuracy,
+        getattr(solution, "error", None),
+        getattr(solution, "time_error_k", math.nan),
+    )
     return {
         "mesh": options.mesh,
         "scene": options.scene,
         "description": run.scene.description,
         "steady": run.scene.steady,
         "warnings": list(run.warnings),
-        "leave_out_below_k": screening.tolerance_k,
-        "accuracy": None if run.accuracy is None else asdict(run.accuracy),
+        "accuracy": None
+        if accuracy is None
+        else {
+            "tolerance_k": accuracy.tolerance.temperature_k,
+            "flow_tolerance": accuracy.tolerance.heat_flow,
+            "met": accuracy.met,
+            "estimated_k": accuracy.settings.error.temperature_k,
+            "estimated_flow": accuracy.settings.error.heat_flow,
+            "order": accuracy.settings.order,
+            "refinements": accuracy.settings.refinements,
+            "step_tolerance_k": accuracy.settings.step_tolerance_k,
+            "seconds": accuracy.seconds,
+            "status": accuracy.status,
+            "levels": [asdict(level) for level in accuracy.levels],
+        },
         "mesh_error": None if error is None else asdict(error),
         "solved": {
             "tets": len(run.solved.mesh.tets),
@@ -168,11 +184,8 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
             {"point_m": point, "temperature_c": run.probes_c[:, number]}
             for number, point in enumerate(run.probes.points_m)
         ],
-        "built": [asdict(entry) for entry in screening.kept],
-        "left_out": [asdict(entry) for entry in screening.left_out],
-        "left_out_bound_k": screening.bound_k,
-        "left_out_bound_w": screening.bound_w,
-        "left_out_note": screening.note,
+        "built": [heat.effect for heat in solution.effects],
+        "left_out": [asdict(entry) for entry in run.left_out],
         "assembled": dict(solution.assembled.counts),
         "newton_iterations": int(np.sum(solution.newton_iterations)),
         "linear_iterations": int(np.sum(solution.iterations)),

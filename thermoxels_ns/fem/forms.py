@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from contextlib import nullcontext
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,11 +16,9 @@ from skfem import BilinearForm
 
 from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.problem import HeatProblem, effect_labels
-from thermoxels_ns.fem.quantities import Bounded
+from thermoxels_ns.fem.problem import HeatProblem, Term, effect_labels
 from thermoxels_ns.fem.solution import Assembled
 from thermoxels_ns.fem.space import Space, sums_by_number
-from thermoxels_ns.fem.terms import ConvectionTerm, FixedTerm, FluxTerm, RadiationTerm, SourceTerm
 
 Vector = npt.NDArray[np.float64]
 
@@ -47,27 +46,19 @@ def heat_transfer(u, v, w):
     return w.coefficient * u * v
 
 
-class Form(Protocol):
-    """What all forms that heat flows through have in common.
+class _Boundary:
+    """Boundary triangles of a term: integrals over them by scikit-fem, and their grouping by patch.
 
     Temperatures come as differences from a reference, which keeps round-off relative to the differences. Every form
     also gives its heat flow per patch or region, evaluated as the equations do, so that balances close to round-off.
     """
 
-    effect: str  # Label of the effect that it comes from
-    groups: tuple[str, ...]  # Names of the patches or regions that it acts on
-
-    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat flow into the body through each group, shape (g,), [W]."""
-        ...
-
-
-class _Boundary:
-    """Boundary triangles of a term: integrals over them by scikit-fem, and their grouping by patch."""
-
-    def __init__(self, effect: str, facets: npt.NDArray[np.int64], space: Space) -> None:
-        selection = space.selection
-        self.effect, self.facets = effect, facets
+    def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
+        selection, facets = space.selection, term.parts
+        self.effect, self.kind, self.facets, self._reference_c = effect, term.kind, facets, reference_c
+        self.quantities, self._factor = term.quantities, term.factor
+        self.load_in_time = any(quantity.in_time for quantity in term.quantities)
+        """Whether its heat changes with time at one temperature."""
         self.basis = space.surface(facets)
         self.nodes = space.facet_nodes(facets)
         self._numbers, self._space = self.nodes.T.ravel(), space
@@ -78,9 +69,9 @@ class _Boundary:
         self.groups = tuple(selection.patch_names[number] for number in used)
         self._kept: dict[int, dict[float, Vector]] = {}
 
-    def at(self, quantity: Bounded, time_s: float) -> Vector:
+    def at(self, number: int, time_s: float) -> Vector:
         """Ask for a quantity of the term at each triangle, shape (k, 1): it is even over the triangle."""
-        kept = self._kept.setdefault(id(quantity), {})
+        quantity, kept = self.quantities[number], self._kept.setdefault(number, {})
         return at_time(kept, time_s if quantity.in_time else 0.0, lambda t: quantity.at(self.places, t)[:, None])
 
     def surface_k(self, relative_k: Vector) -> Vector:
@@ -108,63 +99,54 @@ class _Boundary:
         """Heat flux into the body at the points of integration, or even over each triangle, [W / m2]."""
         raise NotImplementedError
 
-    def facet_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
+    def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body through each triangle, shape (k,), [W]."""
         return (self.flux_w_m2(relative_k, time_s) * self.basis.dx).sum(axis=1)
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body through each patch, [W]."""
-        return sums_by_number(self.group, self.facet_heat_w(relative_k, time_s), len(self.groups))
+        return sums_by_number(self.group, self.part_heat_w(relative_k, time_s), len(self.groups))
 
 
-class ConvectionForm(_Boundary):
+class _Exchange(_Boundary):
+    """Exchange with surroundings; the quantities are its strength and the temperature of the surroundings."""
+
+    def strength(self, time_s: float) -> Vector:
+        """Convection's h, [W / (m2 K)], or radiation's sigma eps, [W / (m2 K4)], at each triangle, shape (k, 1)."""
+        return self._factor * self.at(0, time_s)
+
+    def surroundings_k(self, time_s: float) -> Vector:
+        """Temperature of the surroundings at each triangle, relative to the reference, shape (k, 1), [K]."""
+        return self.at(1, time_s) - self._reference_c
+
+    def exchanging_nodes(self, time_s: float) -> npt.NDArray[np.int64]:
+        """Nodes whose temperature its surroundings pull on: the strength is above 0 there."""
+        return np.unique(self.nodes[self.strength(time_s)[:, 0] > 0.0])
+
+
+class ConvectionForm(_Exchange):
     """Convection and ground contact, h (T_ambient - T): a matrix and a load (a Robin boundary condition)."""
 
-    kind = "convection"
-
-    def __init__(self, term: ConvectionTerm, space: Space, reference_c: float) -> None:
-        super().__init__(term.effect, term.facets, space)
-        self.term, self._reference_c = term, reference_c
-        self.matrix_in_time = term.coefficient_w_m2k.in_time
+    @property
+    def matrix_in_time(self) -> bool:
         """Whether h, and with it the matrix, changes with time."""
-        self.load_in_time = self.matrix_in_time or term.ambient_c.in_time
-        """Whether h T_ambient changes with time."""
+        return self.quantities[0].in_time
 
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix:
         """Entries integral(h phi_i phi_j), [W / K]."""
-        return self.matrix(self.at(self.term.coefficient_w_m2k, time_s))
+        return self.matrix(self.strength(time_s))
 
     def load(self, time_s: float) -> Vector:
         """Entries integral(h T_ambient phi_i), relative to the reference, shape (n,), [W]."""
-        return self.vector(self.at(self.term.coefficient_w_m2k, time_s) * self.ambient_k(time_s))
-
-    def ambient_k(self, time_s: float) -> Vector:
-        """T_ambient at each triangle, relative to the reference, shape (k, 1), [K]."""
-        return self.at(self.term.ambient_c, time_s) - self._reference_c
-
-    def exchanging_nodes(self, time_s: float) -> npt.NDArray[np.int64]:
-        """Nodes whose temperature its surroundings pull on: the coefficient is above 0 there."""
-        return np.unique(self.nodes[self.at(self.term.coefficient_w_m2k, time_s)[:, 0] > 0.0])
-
-    def slope_w_m2k(self, relative_k: Vector, time_s: float) -> Vector:
-        """h of each triangle, shape (k, 1), [W / (m2 K)]."""
-        return self.at(self.term.coefficient_w_m2k, time_s)
+        return self.vector(self.strength(time_s) * self.surroundings_k(time_s))
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
         """h (T_ambient - T), [W / m2]."""
-        apart_k = self.ambient_k(time_s) - self.surface_k(relative_k)
-        return self.at(self.term.coefficient_w_m2k, time_s) * apart_k
+        return self.strength(time_s) * (self.surroundings_k(time_s) - self.surface_k(relative_k))
 
 
 class FluxForm(_Boundary):
-    """A given heat flux: a load."""
-
-    kind = "flux"
-
-    def __init__(self, term: FluxTerm, space: Space) -> None:
-        super().__init__(term.effect, term.facets, space)
-        self._factors = term.factors
-        self.load_in_time = any(factor.in_time for factor in term.factors)
+    """A given heat flux, the product of its quantities: a load."""
 
     def load(self, time_s: float) -> Vector:
         """Entries integral(q phi_i), [W]."""
@@ -180,30 +162,29 @@ class FluxForm(_Boundary):
         return bool(np.any(flux < 0.0)), bool(np.any(flux > 0.0))
 
     def _given_w_m2(self, time_s: float) -> Vector:
-        flux = np.ones((len(self.nodes), 1))
-        for factor in self._factors:
-            flux = flux * self.at(factor, time_s)
-        return flux
+        return math.prod((self.at(number, time_s) for number in range(len(self.quantities))), start=np.ones(1))
 
 
 class SourceForm:
     """A given heat source: a load."""
 
-    kind = "source"
-
-    def __init__(self, term: SourceTerm, space: Space) -> None:
-        self.effect = term.effect
-        self.term, self._space = term, space
-        self._places, self._volumes = space.source_points(term.tets)
+    def __init__(self, effect: str, term: Term, space: Space) -> None:
+        self.effect, self.kind, self._tets, self._space = effect, term.kind, term.parts, space
+        self._source = term.quantities[0]
+        self._places, self._volumes = space.source_points(term.parts)
         mesh = space.selection.mesh
-        used, group = np.unique(mesh.region[term.tets], return_inverse=True)
-        self._group = np.repeat(group, len(self._places) // len(term.tets))
+        used, group = np.unique(mesh.region[term.parts], return_inverse=True)
+        self._group = np.repeat(group, len(self._places) // len(term.parts))
         self.groups = tuple(mesh.region_names[number] for number in used)
-        self.load_in_time = term.source_w_m3.in_time
+        self.load_in_time = self._source.in_time
 
     def load(self, time_s: float) -> Vector:
         """Entries integral(s phi_i), [W]."""
-        return self._space.source_load(self.term.tets, self._heat_w(time_s))
+        return self._space.source_load(self._tets, self._heat_w(time_s))
+
+    def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
+        """Heat set free at each point of integration, [W], whatever the temperature."""
+        return self._heat_w(time_s)
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat set free in each region, [W]."""
@@ -214,26 +195,16 @@ class SourceForm:
         heat = self._heat_w(time_s)
         return bool(np.any(heat < 0.0)), bool(np.any(heat > 0.0))
 
-    def mean_w_m3(self, time_s: float) -> Vector:
-        """Mean size of the source in each of its tetrahedra, shape (k,), [W / m3]."""
-        size = np.abs(self.term.source_w_m3.at(self._places, time_s))
-        return size.reshape(len(self.term.tets), -1).mean(axis=1)
-
     def _heat_w(self, time_s: float) -> Vector:
-        return self.term.source_w_m3.at(self._places, time_s) * self._volumes
+        return self._source.at(self._places, time_s) * self._volumes
 
 
-class RadiationForm(_Boundary):
+class RadiationForm(_Exchange):
     """sigma eps (T_s^4 - T^4): a load that depends on the temperature, and its exact slope.
 
     Below absolute zero, where only the iterations of a solver can get to, T^4 stands for |T|^3 T: the law is then
     monotone everywhere, the equations are those of a convex minimum, and their solution is unique.
     """
-
-    def __init__(self, term: RadiationTerm, space: Space, reference_c: float) -> None:
-        super().__init__(term.effect, term.facets, space)
-        self.term, self._reference_c = term, reference_c
-        self._reference_k = reference_c + ZERO_CELSIUS_K
 
     def load(self, relative_k: Vector, time_s: float) -> Vector:
         """Entries integral(sigma eps (T_s^4 - T^4) phi_i), [W]."""
@@ -241,58 +212,37 @@ class RadiationForm(_Boundary):
 
     def slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
         """Minus the derivative of the load, entries integral(4 sigma eps T^3 phi_i phi_j), [W / K]."""
-        return self.matrix(self.slope_w_m2k(relative_k, time_s))
-
-    def slope_w_m2k(self, relative_k: Vector, time_s: float) -> Vector:
-        """4 sigma eps T^3 at the points of integration, shape (k, q), [W / (m2 K)]."""
-        kelvin = np.maximum(np.abs(self.surface_k(relative_k) + self._reference_k), COLDEST_SLOPE_K)
-        return 4.0 * self._strength(time_s) * (kelvin * kelvin * kelvin)
-
-    def surroundings_k(self, time_s: float) -> Vector:
-        """T_s at each triangle, relative to the reference, shape (k, 1), [K]."""
-        return self.at(self.term.surroundings_c, time_s) - self._reference_c
-
-    def exchanging_nodes(self, time_s: float) -> npt.NDArray[np.int64]:
-        """Nodes whose temperature its surroundings pull on: the coefficient is above 0 there."""
-        return np.unique(self.nodes[self._strength(time_s)[:, 0] > 0.0])
-
-    def _strength(self, time_s: float) -> Vector:
-        return self.term.stefan_boltzmann_w_m2k4 * self.at(self.term.emissivity, time_s)
+        kelvin = self.surface_k(relative_k) + self._reference_c + ZERO_CELSIUS_K
+        return self.matrix(4.0 * self.strength(time_s) * np.maximum(np.abs(kelvin), COLDEST_SLOPE_K) ** 3)
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
         """Sigma eps (T_s^4 - T^4), [W / m2]."""
         surface, around = self.surface_k(relative_k), self.surroundings_k(time_s)
-        t, s = surface + self._reference_k, around + self._reference_k
+        t, s = (kelvin + self._reference_c + ZERO_CELSIUS_K for kelvin in (surface, around))
         # s^4 - t^4 = (s - t) (s + t) (s^2 + t^2): no digits are lost where both are close.
         ss, tt = s * s, t * t
         fourth = np.where(t >= 0.0, (around - surface) * (s + t) * (ss + tt), ss * ss + tt * tt)
-        return self._strength(time_s) * fourth
+        return self.strength(time_s) * fourth
 
 
 class FixedForm:
     """Given temperatures: nodes that are no unknowns, and the shares of their heat that belong to each patch."""
 
-    def __init__(self, term: FixedTerm, space: Space, reference_c: float) -> None:
+    def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
         selection = space.selection
-        self.effect = term.effect
-        self.reference_c = reference_c
-        self.term = term
-        self.owners: npt.NDArray[np.int64] = space.facet_nodes(term.facets)
+        self.effect, self.facets, self.reference_c = effect, term.parts, reference_c
+        self.owners: npt.NDArray[np.int64] = space.facet_nodes(term.parts)
         """Nodes of each triangle, shape (k, m)."""
         self.nodes = np.unique(self.owners)
-        self._places = space.node_places(self.nodes)
-        self.in_time = term.temperature_c.in_time
-        used, self.group = np.unique(selection.facet_patch[term.facets], return_inverse=True)
+        self._places, self._temperature = space.node_places(self.nodes), term.quantities[0]
+        used, self.group = np.unique(selection.facet_patch[term.parts], return_inverse=True)
         self.groups = tuple(selection.patch_names[number] for number in used)
-        self.area_m2: Vector = selection.facet_area_m2[term.facets]
+        self.area_m2: Vector = selection.facet_area_m2[term.parts]
         """Area of each triangle, shape (k,), to share a node's heat by."""
-        self._constant_k: Vector | None = None
 
-    def temperature_k(self, time_s: float) -> Vector:
+    def surroundings_k(self, time_s: float) -> Vector:
         """Temperatures of `nodes`, relative to the reference, [K]."""
-        if self.in_time or self._constant_k is None:
-            self._constant_k = self.term.temperature_c.at(self._places, time_s) - self.reference_c
-        return self._constant_k
+        return self._temperature.at(self._places, time_s) - self.reference_c
 
 
 class FixedNodes:
@@ -338,7 +288,7 @@ class FixedNodes:
         """Effect, triangles and the heat flow into the body through each, [W], from that at `nodes`, shape (d,)."""
         heat_w, begin, found = self.facet_shares @ kept_w, 0, []
         for form in self._forms:
-            found.append((form.effect, form.term.facets, heat_w[begin : begin + len(form.owners)]))
+            found.append((form.effect, form.facets, heat_w[begin : begin + len(form.owners)]))
             begin += len(form.owners)
         return found
 
@@ -356,7 +306,7 @@ class FixedNodes:
     def _temperature_k(self, time_s: float) -> Vector:
         known = np.full(len(self.nodes), np.nan)
         for number, form in enumerate(self._forms):
-            place, wanted = self._places[number], form.temperature_k(time_s)
+            place, wanted = self._places[number], form.surroundings_k(time_s)
             clash = np.abs(known[place] - wanted) > _SAME_TEMPERATURE_K
             if clash.any():
                 raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
@@ -375,7 +325,7 @@ class FixedNodes:
         other = others[0]
         place = np.flatnonzero(np.isin(other.nodes, nodes))
         node = int(other.nodes[place[0]])
-        first = other.temperature_k(time_s)[place[0]] + other.reference_c
+        first = other.surroundings_k(time_s)[place[0]] + other.reference_c
         second = wanted[np.flatnonzero(nodes == node)[0]] + form.reference_c
         return explain(
             "fixed temperature",
@@ -396,41 +346,33 @@ class EffectForms:
     fixed: tuple[FixedForm, ...]
 
     @property
-    def exchanging(self) -> tuple[Form, ...]:
+    def exchanging(self) -> tuple[ConvectionForm | FluxForm | SourceForm | RadiationForm, ...]:
         """Forms that heat flows through other than by fixed nodes: convection, loads, radiation."""
         return (*self.convection, *self.loads, *self.radiation)
 
 
 def effect_forms(
-    problem: HeatProblem,
-    space: Space,
-    reference_c: float,
-    assembled: Assembled | None = None,
+    problem: HeatProblem, space: Space, reference_c: float, assembled: Assembled | None = None
 ) -> EffectForms:
     """Turn effects into terms and terms into forms; what acts nowhere has none.
 
     `assembled` counts fixed temperatures, which are ready at once. Raises `HeatError` if the mesh lacks a patch or
     region of an effect.
     """
-    convection: list[ConvectionForm] = []
-    loads: list[FluxForm | SourceForm] = []
-    radiation: list[RadiationForm] = []
-    fixed: list[FixedForm] = []
+    convection, loads, radiation, fixed = [], [], [], []
     for label, effect in zip(effect_labels(problem), problem.effects):
-        for bare in effect.terms(space.selection):
-            if not len(bare.tets if isinstance(bare, SourceTerm) else bare.facets):
-                continue
-            term = replace(bare, effect=label)
-            if isinstance(term, ConvectionTerm):
-                convection.append(ConvectionForm(term, space, reference_c))
-            elif isinstance(term, FluxTerm):
-                loads.append(FluxForm(term, space))
-            elif isinstance(term, SourceTerm):
-                loads.append(SourceForm(term, space))
-            elif isinstance(term, RadiationTerm):
-                radiation.append(RadiationForm(term, space, reference_c))
-            else:
-                counted: AbstractContextManager[None] = nullcontext() if assembled is None else assembled.form("fixed")
-                with counted:
-                    fixed.append(FixedForm(term, space, reference_c))
+        term = effect.term(space.selection)
+        if not len(term.parts):
+            continue
+        if term.kind == "convection":
+            convection.append(ConvectionForm(label, term, space, reference_c))
+        elif term.kind == "flux":
+            loads.append(FluxForm(label, term, space, reference_c))
+        elif term.kind == "source":
+            loads.append(SourceForm(label, term, space))
+        elif term.kind == "radiation":
+            radiation.append(RadiationForm(label, term, space, reference_c))
+        else:
+            with nullcontext() if assembled is None else assembled.form("fixed"):
+                fixed.append(FixedForm(label, term, space, reference_c))
     return EffectForms(tuple(convection), tuple(loads), tuple(radiation), tuple(fixed))

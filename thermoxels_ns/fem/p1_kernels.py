@@ -1,4 +1,4 @@
-"""Compiled stiffness and mass of linear tetrahedra (P1), and the edges of a mesh."""
+"""Compiled stiffness and lumped mass of linear tetrahedra (P1), and the edges of a mesh."""
 
 from __future__ import annotations
 
@@ -106,40 +106,22 @@ def stiffness_matrix(
 
 
 def lumped_mass(points_m: Vector, tets: Numbers, heat_capacity_j_m3k: float | Vector) -> Vector:
-    """Compute rho c * integral(phi_i) for every node, the row sums of `mass_matrix`, shape (n,), [J / K].
+    """Compute rho c * integral(phi_i) for every node, the row sums of the mass matrix, shape (n,), [J / K].
 
     With non-obtuse tetrahedra, such as those of a lattice, backward Euler with this mass keeps every temperature
     within the initial range for any step length (Li and Huang, arXiv 1209.5657).
     """
-    return _capacities(points_m, tets, heat_capacity_j_m3k, MeshEdges(np.zeros(0, np.int64), np.zeros(0, np.int32)))[0]
-
-
-def mass_matrix(
-    points_m: Vector, tets: Numbers, heat_capacity_j_m3k: float | Vector, *, edges: MeshEdges | None = None
-) -> tuple[sparse.csr_matrix, Vector]:
-    """Assemble the consistent M, entries rho c * integral(phi_i phi_j), and its row sums, the lumped mass, [J / K].
-
-    M is symmetric bit for bit. Arguments and errors are those of `stiffness_matrix`, with rho c in [J / (m3 K)].
-    """
-    edges = mesh_edges(tets, len(points_m)) if edges is None else edges
-    nodal, along = _capacities(points_m, tets, heat_capacity_j_m3k, edges)
-    # In a tetrahedron of volume V, phi_i integrates to V / 4 and its square to V / 10.
-    return _symmetric_matrix(edges, along, 0.4 * nodal), nodal
+    points_m, tets, unit_m = _checked(points_m, tets)
+    capacity = _per_tet("heat_capacity_j_m3k", heat_capacity_j_m3k, len(tets))
+    nodal = np.zeros(len(points_m))
+    _refuse_flat(_add_capacities(points_m, tets, capacity, 1.0 / unit_m, nodal), len(tets))
+    return nodal * unit_m**3
 
 
 def refuse_flat_tets(points_m: npt.NDArray[np.float64], tets: npt.NDArray[np.int64]) -> None:
     """Raise `HeatError` if points or tetrahedra have the wrong shape or range, or tetrahedra are inverted or flat."""
     points_m, tets, unit_m = _checked(points_m, tets)
     _refuse_flat(_count_flat(points_m, tets, 1.0 / unit_m), len(tets))
-
-
-def _capacities(points_m, tets, heat_capacity_j_m3k, edges: MeshEdges) -> tuple[npt.NDArray, npt.NDArray]:
-    points_m, tets, unit_m = _checked(points_m, tets)
-    capacity = _per_tet("heat_capacity_j_m3k", heat_capacity_j_m3k, len(tets))
-    nodal, along = np.zeros(len(points_m)), np.zeros(len(edges.other))
-    flat = _add_capacities(points_m, tets, capacity, 1.0 / unit_m, nodal, edges.first, edges.other, along)
-    _refuse_flat(flat, len(tets))
-    return nodal * unit_m**3, along * unit_m**3
 
 
 def _symmetric_matrix(edges: MeshEdges, edge_values: Vector, diagonal: Vector) -> sparse.csr_matrix:
@@ -281,24 +263,16 @@ def _add_couplings(points, tets, conductivity, scale, first, other, coupling):
 
 
 @kernel
-def _add_capacities(points, tets, capacity, scale, nodal, first, other, edge):
+def _add_capacities(points, tets, capacity, scale, nodal):
     """Returns the number of tetrahedra that are flat or inverted."""
     each = 0 if len(capacity) == 1 else 1
     flat = 0
     for t in range(len(tets)):
         tet = tets[t]
         a, b, c = _sides(points, tet, scale)
-        six_volumes = _dot(a, _cross(b, c))
-        if _is_flat(a, b, c):
-            flat += 1
-            continue
-        share = capacity[each * t] * six_volumes
+        flat += _is_flat(a, b, c)
         for i in range(4):
-            nodal[tet[i]] += share / 24.0
-        if len(edge) > 0:
-            for i in range(3):
-                for j in range(i + 1, 4):
-                    edge[_place(first, other, tet[i], tet[j])] += share / 120.0
+            nodal[tet[i]] += capacity[each * t] * _dot(a, _cross(b, c)) / 24.0
     return flat
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import numbers
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,8 @@ from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.p1_kernels import refuse_flat_tets
-from thermoxels_ns.fem.terms import Effect
+from thermoxels_ns.fem.quantities import Bounded, Bounds
+from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 MOST_CONTRAST = 1e9
@@ -59,6 +61,11 @@ class TimeSteps:
     def times_s(self) -> npt.NDArray[np.float64]:
         """Start, then the end of every step, shape (steps + 1,), [s]."""
         return np.arange(self.steps + 1, dtype=np.float64) * self.step_seconds
+
+    @property
+    def lengths_s(self) -> tuple[npt.NDArray[np.float64], ...]:
+        """Lengths of the steps in each interval at whose ends temperatures are kept, [s]."""
+        return (np.array([self.step_seconds]),) * self.steps
 
 
 @dataclass(frozen=True)
@@ -126,6 +133,62 @@ class GivenSteps:
 def _check_count(name: str, value: int, remedy: str) -> None:
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not 1 <= value <= _MOST:
         raise HeatError(name, expected=f"a whole number from 1 to {_MOST:,}", got=repr(value), remedy=remedy)
+
+
+@dataclass(frozen=True)
+class Term:
+    """What an effect adds to the heat equation besides conduction and storage; positive is into the body."""
+
+    kind: Literal["convection", "flux", "radiation", "source", "fixed"]
+    parts: npt.NDArray[np.int64]  # Numbers of boundary triangles, of a source of tetrahedra, shape (k,)
+    quantities: tuple[Bounded, ...]
+    """convection: h and T_ambient in h (T_ambient - T); flux: what it is the product of; radiation: eps and T_s in
+    factor eps (T_s^4 - T^4), temperatures in kelvin; source: [W / m3]; fixed: the temperature of the nodes."""
+    factor: float = 1.0  # Stefan-Boltzmann constant of radiation, [W / (m2 K4)]
+
+
+class Effect(ABC):
+    """Something that a heat problem may contain besides conduction: checked input that knows its own term.
+
+    A dataclass whose fields are quantities, or names of `patches` or `regions` that it acts on.
+    """
+
+    kind: ClassVar[str]  # What it is called in reports
+    bounds: ClassVar[dict[str, Bounds]]  # Which fields are quantities, and their range
+
+    def __post_init__(self) -> None:
+        for name in ("patches", "regions"):
+            if hasattr(self, name):
+                object.__setattr__(self, name, _checked_names(name, getattr(self, name)))
+        for name, bounds in self.bounds.items():
+            object.__setattr__(self, name, bounds.check_quantity(getattr(self, name)))
+
+    @property
+    def where(self) -> tuple[str, ...]:
+        """Names or patterns of the patches, or of the regions, that it acts on."""
+        return getattr(self, "patches", None) or getattr(self, "regions", ())
+
+    @property
+    def label(self) -> str:
+        """Name for reports: what it is and where."""
+        return f"{self.kind} on {', '.join(self.where)}"
+
+    def bounded(self, name: str) -> Bounded:
+        """Give one of its quantities with its range."""
+        return Bounded(getattr(self, name), self.bounds[name])
+
+    @abstractmethod
+    def term(self, selection: Selection) -> Term:
+        """Give the term that it adds to the heat equation of a body; `HeatError` if that lacks a patch or region."""
+
+
+def _checked_names(field: str, names: object) -> tuple[str, ...]:
+    """Return names as a tuple; a single text is refused because its letters would be taken for names."""
+    listed = tuple(names) if isinstance(names, (tuple, list)) else ()
+    if not listed or not all(isinstance(name, str) and name.strip() for name in listed):
+        remedy = f'Write {field}=("name",), for example.'
+        raise HeatError(field, expected="a tuple of names", got=repr(names), remedy=remedy)
+    return listed
 
 
 @runtime_checkable

@@ -144,8 +144,7 @@ class SteadySolution:
     """Heat that is unbalanced at all nodes, round-off included, [W]; heat flows are uncertain by no more."""
     overshoot_k: float = 0.0  # How far any temperature is out of the range of the surroundings, [K]; 0 up to 0.01 K
     last_facet_heat: tuple[FacetHeat, ...] = ()  # Heat flow of each effect through boundary triangles
-    error: ErrorSize | None = None
-    """Estimated errors of linear tetrahedra on this mesh, see `p1_error`; None if there is no estimate."""
+    error: ErrorSize | None = None  # Estimated errors of the mesh, see `tolerance.steady_error`; None: not estimated
 
 
 def heat_by_effect(

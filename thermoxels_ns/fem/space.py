@@ -19,7 +19,6 @@ from thermoxels_ns.fem.p1_kernels import (
     TET_EDGES,
     MeshEdges,
     lumped_mass,
-    mass_matrix,
     mesh_edges,
     stiffness_matrix,
 )
@@ -118,8 +117,6 @@ class Space:
         mesh = self.selection.mesh
         if self.lumped:
             return None, lumped_mass(mesh.points_m, mesh.tets, heat_capacity_j_m3k)
-        if self.order == 1:
-            return mass_matrix(mesh.points_m, mesh.tets, heat_capacity_j_m3k, edges=self.edges)
         matrix = self.assembled(storage, 2 * self.order, heat_capacity=heat_capacity_j_m3k)
         return matrix, matrix @ np.ones(self.num_nodes)
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.error_estimate import p1_error
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
@@ -63,7 +60,7 @@ def solve_steady(
     flows_w = 0.0 if system.is_still(relative_k, time_s) else max(solution.flows_w, 0.5 * np.abs(group_heat).sum())
     temperature_c = relative_k + system.reference_c
     overshoot_k, overshoot = _overshoot(system, relative_k, time_s)
-    found = SteadySolution(
+    return SteadySolution(
         temperature_c=temperature_c[:num_mesh_nodes],
         effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
         energy_residual=0.5 * abs(float(group_heat.sum())) / flows_w if flows_w > 0.0 else 0.0,
@@ -77,8 +74,6 @@ def solve_steady(
         overshoot_k=overshoot_k,
         last_facet_heat=system.facet_heat(relative_k, time_s),
     )
-    estimated = order == 1 and system.lumped and not failure
-    return replace(found, error=p1_error(system, found, time_s)) if estimated else found
 
 
 def _overshoot(system: HeatSystem, relative_k: Vector, time_s: float) -> tuple[float, str]:

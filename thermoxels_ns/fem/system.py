@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cached_property
+
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
@@ -9,7 +12,15 @@ from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.forms import ConvectionForm, FixedNodes, RadiationForm, SourceForm, at_time, effect_forms
+from thermoxels_ns.fem.forms import (
+    ConvectionForm,
+    FixedNodes,
+    FluxForm,
+    RadiationForm,
+    SourceForm,
+    at_time,
+    effect_forms,
+)
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Assembled, FacetHeat
@@ -85,8 +96,6 @@ class HeatSystem:
         self._convection, self._loads, self._radiation = forms.convection, forms.loads, forms.radiation
         self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*forms.convection, *forms.radiation)
         """Heat flows through the surface that depend on its temperature."""
-        self.sources: tuple[SourceForm, ...] = tuple(form for form in forms.loads if isinstance(form, SourceForm))
-        """Heat sources."""
         self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
         """Nodes whose temperature is given."""
         with self.assembled.form("stiffness"):
@@ -104,15 +113,11 @@ class HeatSystem:
             *self.fixed.groups,
         )
         """Effect and patch or region of each heat flow of `group_heat_w`, then of each of the fixed nodes."""
-        self._mass: tuple[sparse.csr_matrix | None, Vector] | None = None
-        self._kept_convection: sparse.csr_matrix | None = None
         self._convection_at: dict[float, sparse.csr_matrix | None] = {}
-        self._kept_matrix: sparse.csr_matrix | None = None
-        self._kept_load: Vector | None = None
-        self._kept_loads: dict[float, Vector] = {}
-        self._kept_ambient: dict[float, Vector] = {}
-        self._fixed_rows: sparse.csr_matrix | None = None
-        self._kept_ranges: dict[float, tuple[float, float]] = {}
+        self._matrix_at: dict[float, sparse.csr_matrix] = {}
+        self._loads_at: dict[float, Vector] = {}
+        self._ambient_at: dict[float, Vector] = {}
+        self._ranges_at: dict[float, tuple[float, float]] = {}
 
     @property
     def num_nodes(self) -> int:
@@ -142,21 +147,11 @@ class HeatSystem:
     @property
     def nodal_mass_j_k(self) -> Vector:
         """Row sums of the mass matrix, shape (n,), [J / K]."""
-        return self._masses()[1]
-
-    @property
-    def total_mass_j_k(self) -> float:
-        """Heat capacity of the whole body, [J / K]."""
-        return float(np.sum(self.nodal_mass_j_k))
-
-    @property
-    def mass_matrix(self) -> sparse.csr_matrix | None:
-        """M, shape (n, n), [J / K]; None if it is lumped."""
-        return self._masses()[0]
+        return self._masses[1]
 
     def mass_product(self, relative_k: Vector) -> Vector:
         """M T, shape (n,), [J]."""
-        matrix, nodal = self._masses()
+        matrix, nodal = self._masses
         return nodal * relative_k if matrix is None else matrix @ relative_k
 
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix | None:
@@ -164,49 +159,51 @@ class HeatSystem:
 
         Raises `HeatError` if it is more than `MOST_TIMES_CONDUCTION` of what the cells conduct.
         """
-        if self._kept_convection is None:
-            self._kept_convection = self._checked(self._sum_of_convection(False, 0.0))
-        if not self.matrix_in_time:
-            return self._kept_convection
-        constant = self._kept_convection
-        return at_time(
-            self._convection_at, time_s, lambda t: self._checked(_sum_of(constant, self._sum_of_convection(True, t)))
-        )
+        return at_time(self._convection_at, time_s if self.matrix_in_time else 0.0, self._sum_of_convection)
 
-    def _checked(self, convection: sparse.csr_matrix | None) -> sparse.csr_matrix | None:
-        if convection is not None:
-            most = float(np.max(convection.diagonal() / np.maximum(self._stiffness.diagonal(), _LEAST)))
-            if not most <= MOST_TIMES_CONDUCTION:
-                remedy = "Give the surface the temperature of the air instead, or a smaller coefficient."
-                expected = (
-                    f"at most {MOST_TIMES_CONDUCTION:g} times as much heat per kelvin as the cells behind conduct"
-                )
-                raise HeatError("convection coefficient", expected=expected, got=f"{most:.1e} times", remedy=remedy)
-        return convection
+    def _sum_of_convection(self, time_s: float) -> sparse.csr_matrix | None:
+        if not self._convection:
+            return None
+        total = sparse.csr_matrix(self._stiffness.shape)
+        for form in self._convection:
+            with self.assembled.form("convection"):
+                total = sparse.csr_matrix(total + form.convection_matrix(time_s))
+        most = float(np.max(total.diagonal() / np.maximum(self._stiffness.diagonal(), _LEAST)))
+        if not most <= MOST_TIMES_CONDUCTION:
+            remedy = "Give the surface the temperature of the air instead, or a smaller coefficient."
+            expected = f"at most {MOST_TIMES_CONDUCTION:g} times as much heat per kelvin as the cells behind conduct"
+            raise HeatError("convection coefficient", expected=expected, got=f"{most:.1e} times", remedy=remedy)
+        return total
 
     def matrix(self, time_s: float, step_s: float) -> sparse.csr_matrix:
         """M / step + K + R, shape (n, n), [W / K]; without M for a step without end."""
-        matrix = self._kept_matrix
-        if matrix is None:
-            convection = self.convection_matrix(time_s)
-            matrix = self._stiffness if convection is None else sparse.csr_matrix(self._stiffness + convection)
+
+        def without_mass(at_s: float) -> sparse.csr_matrix:
+            convection = self.convection_matrix(at_s)
+            return self._stiffness if convection is None else sparse.csr_matrix(self._stiffness + convection)
+
+        time_s = time_s if self.matrix_in_time else 0.0
         if np.isinf(step_s):
-            # An estimate of the error asks for it again.
-            self._kept_matrix = None if self.matrix_in_time else matrix
-            return matrix
-        mass, nodal = self._masses()
-        if mass is None:
-            return sparse.csr_matrix(matrix + sparse.diags(nodal / step_s, format="csr"))
-        return sparse.csr_matrix(matrix + mass / step_s)
+            return at_time(self._matrix_at, time_s, without_mass, most=1)
+        mass, nodal = self._masses
+        storage = sparse.diags(nodal / step_s, format="csr") if mass is None else mass / step_s
+        return sparse.csr_matrix(without_mass(time_s) + storage)
 
     def load(self, time_s: float) -> Vector:
         """Heat that does not depend on the temperature, fluxes and sources, shape (n,), [W]."""
-        if self._kept_load is None:
-            self._kept_load = self._sum_of_loads(False, 0.0)
-        if not any(form.load_in_time for form in self._loads):
-            return self._kept_load
-        constant = self._kept_load
-        return at_time(self._kept_loads, time_s, lambda t: constant + self._sum_of_loads(True, t))
+        return self._sum_of_loads(self._loads, self._loads_at, time_s)
+
+    def _sum_of_loads(
+        self, forms: Sequence[ConvectionForm | FluxForm | SourceForm], kept: dict[float, Vector], time_s: float
+    ) -> Vector:
+        def add_up(at_s: float) -> Vector:
+            total = np.zeros(self.num_nodes)
+            for form in forms:
+                with self.assembled.form(form.kind):
+                    total += form.load(at_s)
+            return total
+
+        return at_time(kept, time_s if any(form.load_in_time for form in forms) else 0.0, add_up)
 
     def radiation_load(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat radiated into the body, shape (n,), [W]."""
@@ -228,7 +225,7 @@ class HeatSystem:
         """Heat from outside into each node: load, R (T_air - T) and radiation(T), each of shape (n,), [W]."""
         parts, convection = [self.load(time_s)], self.convection_matrix(time_s)
         if convection is not None:
-            parts.append(self._ambient_load(time_s) - convection @ relative_k)
+            parts.append(self._sum_of_loads(self._convection, self._ambient_at, time_s) - convection @ relative_k)
         if self.nonlinear:
             parts.append(self.radiation_load(relative_k, time_s))
         return parts
@@ -256,8 +253,6 @@ class HeatSystem:
         nodes = self.fixed.nodes
         if len(nodes) == 0:
             return np.zeros(0)
-        if self._fixed_rows is None:
-            self._fixed_rows = sparse.csr_matrix(self._stiffness[nodes])
         return self.exchanged_heat(relative_k, time_s)[nodes] - self._fixed_rows @ self.pieces.without_means(relative_k)
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
@@ -270,7 +265,7 @@ class HeatSystem:
         forms = [
             form for form in (*self._convection, *self._loads, *self._radiation) if not isinstance(form, SourceForm)
         ]
-        found = [FacetHeat(form.effect, form.facets, form.facet_heat_w(relative_k, time_s)) for form in forms]
+        found = [FacetHeat(form.effect, form.facets, form.part_heat_w(relative_k, time_s)) for form in forms]
         kept_w = -self.net_heat_at_fixed(relative_k, time_s)
         return (*found, *(FacetHeat(*part) for part in self.fixed.facet_heat_w(kept_w)))
 
@@ -298,12 +293,11 @@ class HeatSystem:
 
     def surroundings_k(self, time_s: float) -> tuple[float, float]:
         """Range of all that surrounds the body at a time, [K]; kept for some of the last times that were asked for."""
-        return at_time(self._kept_ranges, time_s, self._surroundings_k, most=_KEPT_RANGES)
+        return at_time(self._ranges_at, time_s, self._surroundings_k, most=_KEPT_RANGES)
 
     def _surroundings_k(self, time_s: float) -> tuple[float, float]:
         low, high = np.inf, -np.inf
-        ambients = [form.ambient_k(time_s) for form in self._convection]
-        ambients += [form.surroundings_k(time_s) for form in self._radiation]
+        ambients = [form.surroundings_k(time_s) for form in self.surface_forms]
         ambients += [self.fixed.temperature_k(time_s)] if len(self.fixed.nodes) else []
         for ambient in ambients:
             low, high = min(low, float(ambient.min())), max(high, float(ambient.max()))
@@ -312,42 +306,11 @@ class HeatSystem:
             low, high = -np.inf if cools else low, np.inf if heats else high
         return low, high
 
+    @cached_property
     def _masses(self) -> tuple[sparse.csr_matrix | None, Vector]:
-        if self._mass is None:
-            with self.assembled.form("mass"):
-                self._mass = self._space.mass(self.problem.heat_capacity_j_m3k)
-        return self._mass
+        with self.assembled.form("mass"):
+            return self._space.mass(self.problem.heat_capacity_j_m3k)
 
-    def _sum_of_convection(self, in_time: bool, time_s: float) -> sparse.csr_matrix | None:
-        total: sparse.csr_matrix | None = None
-        for form in self._convection:
-            if form.matrix_in_time == in_time:
-                with self.assembled.form("convection"):
-                    total = _sum_of(total, form.convection_matrix(time_s))
-        return total
-
-    def _sum_of_loads(self, in_time: bool, time_s: float) -> Vector:
-        total = np.zeros(self.num_nodes)
-        for form in self._loads:
-            if form.load_in_time == in_time:
-                with self.assembled.form(form.kind):
-                    total += form.load(time_s)
-        return total
-
-    def _ambient_load(self, time_s: float) -> Vector:
-        """R T_air, shape (n,), [W]."""
-        in_time = any(form.load_in_time for form in self._convection)
-        return at_time(self._kept_ambient, time_s if in_time else 0.0, self._sum_of_ambients)
-
-    def _sum_of_ambients(self, time_s: float) -> Vector:
-        total = np.zeros(self.num_nodes)
-        for form in self._convection:
-            with self.assembled.form(form.kind):
-                total += form.load(time_s)
-        return total
-
-
-def _sum_of(first: sparse.csr_matrix | None, second: sparse.csr_matrix | None) -> sparse.csr_matrix | None:
-    if first is None or second is None:
-        return second if first is None else first
-    return sparse.csr_matrix(first + second)
+    @cached_property
+    def _fixed_rows(self) -> sparse.csr_matrix:
+        return sparse.csr_matrix(self._stiffness[self.fixed.nodes])

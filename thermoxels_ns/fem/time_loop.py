@@ -11,8 +11,7 @@ import numpy.typing as npt
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps, effect_labels
-from thermoxels_ns.fem.runge_kutta import RungeKutta, Step
-from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2, RungeKutta, Scheme, Step
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
 from thermoxels_ns.fem.steady import OVERSHOOT_K, too_cold
 from thermoxels_ns.fem.system import HeatSystem
@@ -83,23 +82,32 @@ def solve_heat(
     if scheme is None:
         scheme = BACKWARD_EULER if isinstance(time, TimeSteps) else SDIRK2
     loop = _TimeLoop(system, scheme, time, relative_tolerance)
-    doubled = _DoubledSteps(loop.runge_kutta, states[0]) if estimate_steps and isinstance(time, TimeSteps) else None
     failure = ""
     for taken in loop.steps(states[0]):
         failure = taken.failure or too_cold(system, taken.step.relative_k)
         if failure:
             break
         balance.add(taken.step, taken.step_s, ends_interval=taken.ends_interval)
-        if doubled is not None:
-            doubled.follow(taken.step.relative_k, taken.step_s)
         if progress is not None:
             progress(balance.followed_s / time.duration_s, balance.steps)
     if failure and not allow_unconverged:
         raise HeatError(failure)
-    said = "" if doubled is None else doubled.describe()
-    status = failure or balance.success(loop.describe()) + said + _skips(problem, time)
+    status = failure or balance.success(loop.repeated) + _skips(problem, time)
     solution = balance.close(status, not failure, adaptive=adaptive)
-    return solution if doubled is None else replace(solution, time_error_k=doubled.most_k)
+    if failure or not estimate_steps or not isinstance(time, TimeSteps):
+        return solution
+    doubled: HeatSolution | None = None
+    if time.steps >= 2:
+        doubled = solve_heat(
+            problem,
+            TimeSteps(time.steps // 2, 2.0 * time.step_seconds),
+            scheme=scheme,
+            lumped=lumped,
+            lumped_boundary=lumped_boundary,
+            relative_tolerance=relative_tolerance,
+            allow_unconverged=True,
+        )
+    return _error_of_equal_steps(solution, doubled, scheme.order)
 
 
 @dataclass(frozen=True)
@@ -112,40 +120,21 @@ class _Taken:
     failure: str = ""  # Why the computation ends here; empty if the step was accepted
 
 
-class _DoubledSteps:
-    """Follows equal steps with steps of twice their length, to tell their error (Richardson 1911).
+def _error_of_equal_steps(found: HeatSolution, doubled: HeatSolution | None, order: int) -> HeatSolution:
+    """Tell the error of equal steps by steps of twice their length (Richardson 1911).
 
     Steps of half the length leave 1 / 2^p of the error of a scheme of order p, so that both differ by 2^p - 1 of the
     error of the shorter ones.
     """
-
-    def __init__(self, runge_kutta: RungeKutta, start_k: Vector) -> None:
-        self._runge_kutta, self._state_k = runge_kutta, start_k.copy()
-        self._steps, self._now_s, self._last_k = 0, 0.0, float("nan")
-        self.most_k = float("nan")
-        """Largest error of the shorter steps at any temperature so far, [K]; NaN before the second one."""
-
-    def follow(self, relative_k: Vector, step_s: float) -> None:
-        """Compare with the temperatures after the next of the equal steps, shape (n,), [K]; every second one counts."""
-        self._steps += 1
-        if self._steps % 2:
-            return
-        step = self._runge_kutta.step(self._state_k, self._now_s, 2.0 * step_s)
-        self._state_k, self._now_s = step.relative_k, self._now_s + 2.0 * step_s
-        if step.converged:
-            self._last_k = float(np.max(np.abs(relative_k - step.relative_k))) / (
-                2.0**self._runge_kutta.scheme.order - 1
-            )
-            self.most_k = float(np.fmax(self.most_k, self._last_k))
-
-    def describe(self) -> str:
-        """Say it in a sentence, or nothing."""
-        if not np.isfinite(self.most_k):
-            return " The error of the steps is not estimated: it takes two of them."
-        return (
-            f" The steps make an error of about {self.most_k:.2g} K at most and {self._last_k:.2g} K at the end (from "
-            "steps of twice the length)."
-        )
+    if doubled is None or len(doubled.times_s) < 2:
+        return replace(found, status=f"{found.status} The error of the steps is not estimated: it takes two of them.")
+    apart_k = np.abs(found.temperature_c[: 2 * len(doubled.times_s) - 1 : 2] - doubled.temperature_c).max(axis=1)
+    most_k, last_k = (float(part) / (2.0**order - 1.0) for part in (apart_k.max(), apart_k[-1]))
+    said = (
+        f" The steps make an error of about {most_k:.2g} K at most and {last_k:.2g} K at the end (from steps of twice "
+        "the length)."
+    )
+    return replace(found, status=found.status + said, time_error_k=most_k)
 
 
 class _TimeLoop:
@@ -155,7 +144,8 @@ class _TimeLoop:
         self._system, self._scheme, self._time = system, scheme, time
         self.runge_kutta = RungeKutta(system, scheme, relative_tolerance=relative_tolerance)
         self._allowed_k = STEP_SHARE * time.tolerance_k if isinstance(time, AdaptiveSteps) else np.inf
-        self._repeated = 0
+        self.repeated = 0
+        """Steps that were repeated with a shorter length."""
 
     def steps(self, start_k: Vector) -> Iterator[_Taken]:
         """Take all steps; the last one may be a failure."""
@@ -163,45 +153,35 @@ class _TimeLoop:
             return self._adaptive(start_k, self._time)
         return self._given(start_k, self._time)
 
-    def describe(self) -> str:
-        """Count the steps that were repeated, in a sentence, or nothing."""
-        return f" {self._repeated} more were repeated with a shorter length." if self._repeated else ""
-
     def _given(self, start_k: Vector, time: TimeSteps | GivenSteps) -> Iterator[_Taken]:
         """Take steps of known lengths."""
-        if isinstance(time, TimeSteps):
-            intervals = [[time.step_seconds]] * time.steps
-        else:
-            intervals = [lengths_s.tolist() for lengths_s in time.lengths_s]
-        relative_k, count, total = start_k, 0, sum(len(lengths_s) for lengths_s in intervals)
-        for now_s, lengths_s in zip(time.times_s.tolist(), intervals):
+        relative_k, count, total = start_k, 0, sum(map(len, time.lengths_s))
+        for now_s, lengths_s in zip(time.times_s.tolist(), time.lengths_s):
             for number, step_s in enumerate(lengths_s, start=1):
                 count += 1
                 step = self.runge_kutta.step(relative_k, now_s, step_s)
-                failure = ""
-                if not step.converged:
-                    remedy = "Use shorter steps or check the mesh's quality."
-                    failure = f"Step {count} of {total} failed. {step.status} {remedy}"
+                remedy = "Use shorter steps or check the mesh's quality."
+                failure = "" if step.converged else f"Step {count} of {total} failed. {step.status} {remedy}"
                 yield _Taken(step, step_s, number == len(lengths_s), failure)
                 relative_k, now_s = step.relative_k, now_s + step_s
 
     def _adaptive(self, start_k: Vector, time: AdaptiveSteps) -> Iterator[_Taken]:
         """Take steps as long as their estimated errors allow."""
         relative_k, now_s, wished_s = start_k, 0.0, self._first_length(start_k, time)
-        for end_s in time.times_s[1:]:
+        for end_s in time.times_s[1:].tolist():
             while now_s < end_s:
-                left_s = float(end_s) - now_s
+                left_s = end_s - now_s
                 step_s = _fitted(min(wished_s, self._system.problem.resolution_s), left_s)
                 step = self.runge_kutta.step(relative_k, now_s, step_s, estimate=True)
                 factor = self._factor(step)
                 if not step.converged or step.error_k > self._allowed_k:
-                    self._repeated += 1
+                    self.repeated += 1
                     wished_s = step_s * min(factor, _SAFETY)
                     if wished_s < _SHORTEST * time.duration_s or now_s + 0.25 * wished_s == now_s:
                         yield _Taken(step, step_s, False, self._failure(step, now_s, time))
                         return
                     continue
-                now_s = float(end_s) if step_s == left_s else now_s + step_s
+                now_s = end_s if step_s == left_s else now_s + step_s
                 relative_k = step.relative_k
                 next_s = step_s * (factor if factor > _KEEP_BELOW else min(factor, 1.0))
                 # A step cut short by an interval's end says nothing against the length wished for.
@@ -283,9 +263,10 @@ class HeatBalance:
         self._range_k = low, high = self._system.allowed_range_k(self._range_k, times)
         return max(low - float(relative_k.min()), float(relative_k.max()) - high)
 
-    def success(self, of_steps: str) -> str:
-        """Say that all went well, and how; `of_steps` is what is to be said about other steps."""
-        sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most.{of_steps}"
+    def success(self, repeated: int) -> str:
+        """Say that all went well, and how."""
+        sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
+        sentence += f" {repeated} more were repeated with a shorter length." if repeated else ""
         if self._overshooting:
             sentence += (
                 f" In {self._overshooting} a temperature left the range of the start and of the surroundings, by up to "

@@ -1,4 +1,4 @@
-"""Solve a heat problem to a tolerance: solve, refine or halve, estimate, repeat."""
+"""Solve a heat problem to a tolerance: solve, halve the mesh size or the steps, and compare (Richardson)."""
 
 from __future__ import annotations
 
@@ -6,29 +6,29 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.error_estimate import (
-    HALVED,
-    ErrorSize,
-    compared_values,
-    difference_between,
-    error_ratios,
-    error_size,
-    recovered_error_w_k,
-    richardson,
-)
-from thermoxels_ns.fem.memory import DEFAULT_MEMORY_BYTES, describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
-from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
+from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, Solution, SteadySolution, mean_flows_w, share_of_heat
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 
+Vector = npt.NDArray[np.float64]
+
+DEFAULT_MEMORY_BYTES = 4 * 2**30  # Most memory that a solution may need, [bytes]
+HALVED = 0.3
+"""Share of an error that is left after the mesh size or the steps are halved. Theory says 1/4 where temperatures are
+smooth, and 0.4 at the edges of a notch of a right angle, where they behave as r^(2/3)."""
+HALVED_QUADRATIC = 0.2  # The same of quadratic tetrahedra: 1/8 where temperatures are smooth, 0.4 at a notch
+TO_QUADRATIC = ErrorSize(0.2, 0.1)
+"""Shares of the errors of linear tetrahedra, of temperatures and of heat flows, that quadratic ones of the same size
+leave: they are 0.02 to 0.5 and 0.002 to 0.25 where temperatures are smooth and where they are singular."""
+_LEFT = {1: ErrorSize(HALVED, HALVED), 2: ErrorSize(HALVED_QUADRATIC, HALVED_QUADRATIC)}
 _STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
 """Of the linear solver: its error is far below any estimate here."""
 _STEPS_OVER_ERROR = 6.0
@@ -36,10 +36,9 @@ _STEPS_OVER_ERROR = 6.0
 to 0.07 K in all, because conduction forgets."""
 _AIM = 0.95  # Share of the allowed error that a solution is chosen to make
 _MOST_HALVINGS = 8  # Halvings of the mesh size or of the steps beyond which nothing is tried
-_SUDDENLY_HELD = 0.5
-"""Share of a flow's error that is left after the mesh size is halved where a surface is suddenly held."""
-_MESH_COST, _STEP_COST = 10.0, 2.0
-"""How much more half the mesh size and half the steps cost."""
+_MESH_COST, _STEP_COST = 10.0, 2.0  # How much more half the mesh size and half the steps cost
+_BYTES_PER_TET, _BYTES_PER_FACET = {1: 400.0, 2: 2600.0}, {1: 600.0, 2: 4000.0}
+"""Most memory by the order of the tetrahedra, measured with convection and radiation; without radiation about half."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +63,8 @@ class Tolerance:
 
     def excess(self, error: ErrorSize) -> float:
         """Error over what is allowed, whichever is worse; at most 1 is good."""
-        shares = [0.0]
-        if self.temperature_k is not None:
-            shares.append(error.temperature_k / self.temperature_k)
-        if self.heat_flow is not None:
-            shares.append(error.heat_flow / self.heat_flow)
-        return max(shares)
+        pairs = (error.temperature_k, self.temperature_k), (error.heat_flow, self.heat_flow)
+        return max(found / allowed for found, allowed in pairs if allowed is not None)
 
     def describe(self) -> str:
         """Say it in words."""
@@ -103,8 +98,9 @@ class Level:
 class ToleratedSolution:
     """A solution with what is known of its error."""
 
-    solution: SteadySolution | HeatSolution  # Temperatures and heat flows. Nodes of the given mesh come first
+    solution: Solution  # Temperatures and heat flows. Nodes of the given mesh come first
     problem: HeatProblem  # What was solved: the given problem, or the same on a finer mesh
+    tolerance: Tolerance  # Errors that were allowed
     settings: Level  # Order, refinements and steps that were chosen, and the estimated errors
     met: bool  # Whether the estimated errors are within the tolerance
     status: str  # The outcome as a sentence, with the estimate and the seconds
@@ -118,7 +114,6 @@ def solve_to_tolerance(
     *,
     duration_s: float | None = None,
     outputs: int = 10,
-    time_s: float = 0.0,
     memory_bytes: float = DEFAULT_MEMORY_BYTES,
     allow_unmet: bool = False,
     log: Callable[[str], None] = print,
@@ -126,24 +121,22 @@ def solve_to_tolerance(
 ) -> ToleratedSolution:
     """Solve a problem with order, mesh size and time steps whose estimated error is allowed.
 
-    A steady state is solved with linear tetrahedra on the given mesh first, whose errors `p1_error` estimates from that
-    solution alone. If they are too large, quadratic ones follow: the difference of both, and the ratio between the
-    recovered errors of their fluxes, tell the errors of both. If these are too large still, quadratic tetrahedra on
-    meshes of half the size follow, again and again. Where the solver fails on quadratic tetrahedra, as it may on very
-    flat ones, linear ones of half the size follow instead, each with its own estimate. What does not fit into memory
-    ends this with the best so far.
+    Errors are told by the difference of two solutions, of which the finer one has a share of the error of the coarser
+    one left (Richardson 1911): `TO_QUADRATIC` or `HALVED`.
 
-    In time tetrahedra stay linear, since the mass of quadratic ones cannot be lumped. Three solutions tell the errors
-    of the mesh and of the steps: one on the given mesh, one with all steps halved, one on a mesh of half the size. From
-    then on mesh and steps are made as fine as the tolerance asks for. Both errors are added with their signs, node by
-    node. The body is the one that the mesh describes: what flat facets lack of a round body's area is not estimated.
+    A steady state is solved with linear and then quadratic tetrahedra on the given mesh; as long as the error is too
+    large, quadratic ones of half the size follow. Where the solver fails on quadratic tetrahedra, as it may on very
+    flat ones, linear ones of half the size follow instead. In time tetrahedra stay linear, since the mass of quadratic
+    ones cannot be lumped. Three solutions tell the errors of the mesh and of the steps: one on the given mesh, one with
+    all steps halved, one on a mesh of half the size. From then on mesh and steps are made as fine as the tolerance asks
+    for. Both errors are added with their signs, node by node. What does not fit into memory ends this with the best so
+    far. The body is the one that the mesh describes: what flat facets lack of a round body's area is not estimated.
 
     Args:
         problem: Body, materials, initial temperatures and effects.
         tolerance: Allowed errors.
         duration_s: Time to follow the body for, [s]; None: its steady state.
         outputs: Number of equal intervals at whose ends temperatures are kept and compared.
-        time_s: Time at which effects that change are taken in a steady state, [s].
         memory_bytes: Most memory that a solution may need, [bytes].
         allow_unmet: Return the best solution that fits into memory, with `met` False and the reason in `status`,
             instead of raising.
@@ -156,12 +149,72 @@ def solve_to_tolerance(
     check_positive("memory_bytes", memory_bytes, "Give the memory in bytes, such as 4e9.", HeatError)
     run = _Run(problem, tolerance, float(memory_bytes), log)
     if duration_s is None:
-        return run.close(_solve_steady(run, time_s), allow_unmet)
+        return run.close(_solve_steady(run), allow_unmet)
     if tolerance.temperature_k is None:
         remedy = "Give temperature_k too: steps in time are chosen by it."
         raise HeatError("tolerance", expected="one in kelvin", got="heat_flow only", remedy=remedy)
     steps = AdaptiveSteps(duration_s, _STEPS_OVER_ERROR * tolerance.temperature_k, outputs=outputs)
     return run.close(_solve_in_time(run, steps, progress), allow_unmet)
+
+
+def steady_error(problem: HeatProblem, solution: SteadySolution) -> ErrorSize:
+    """Estimate the errors of a solution of linear tetrahedra by quadratic ones on the same mesh.
+
+    Raises `HeatError` where quadratic tetrahedra fail.
+    """
+    start = replace(problem, initial_temperature_c=solution.temperature_c)
+    finer = solve_steady(start, order=2, relative_tolerance=_STEADY_TOLERANCE)
+    return richardson(difference_between(solution, finer, len(problem.mesh.points_m)), TO_QUADRATIC)[0]
+
+
+def richardson(apart: ErrorSize, left: ErrorSize) -> tuple[ErrorSize, ErrorSize]:
+    """Estimate the errors of a coarser and a finer solution from their difference.
+
+    If the finer one has a share `left` of the error of the coarser one, they differ by 1 - left of it.
+
+    >>> richardson(ErrorSize(0.75, 0.5), ErrorSize(0.25, 0.0))
+    (ErrorSize(temperature_k=1.0, heat_flow=0.5), ErrorSize(temperature_k=0.25, heat_flow=0.0))
+    """
+    kelvin, flow = apart.temperature_k / (1.0 - left.temperature_k), apart.heat_flow / (1.0 - left.heat_flow)
+    return ErrorSize(kelvin, flow), ErrorSize(kelvin * left.temperature_k, flow * left.heat_flow)
+
+
+def difference_between(coarse: Solution, fine: Solution, num_nodes: int) -> ErrorSize:
+    """Compare two solutions at the same times at the first `num_nodes` nodes, which they share."""
+    return _error_size(_compared(fine, num_nodes) - _compared(coarse, num_nodes), fine)
+
+
+def _compared(solution: Solution, num_nodes: int) -> Vector:
+    """Temperatures of the first `num_nodes` nodes at all times, then the mean heat flow of each effect."""
+    flows_w = np.array(list(mean_flows_w(solution).values()))
+    return np.concatenate([solution.temperature_c[..., :num_nodes].ravel(), flows_w])
+
+
+def _error_size(error: Vector, solution: Solution) -> ErrorSize:
+    """Largest errors of a solution from those of its `_compared` values."""
+    errors, first_flow = np.abs(error), len(error) - len(solution.effects)
+    largest_w = float(np.max(errors[first_flow:], initial=0.0))
+    return ErrorSize(float(np.max(errors[:first_flow])), share_of_heat(largest_w, solution))
+
+
+def peak_bytes(problem: HeatProblem, *, order: int = 1, refinements: int = 0, times: int = 1) -> float:
+    """Forecast the most memory that a solution takes besides the problem itself, [bytes].
+
+    Every refinement makes eight tetrahedra of each; `times` are those whose temperatures are kept. Interpreter and
+    libraries, about 150 MB, come on top.
+    """
+    mesh = problem.mesh
+    volume = _BYTES_PER_TET[order] * len(mesh.tets) + 8.0 * times * len(mesh.points_m)
+    return 8.0**refinements * volume + 4.0**refinements * _BYTES_PER_FACET[order] * len(mesh.facets)
+
+
+def describe_bytes(amount: float) -> str:
+    """Say it in a unit that suits it.
+
+    >>> describe_bytes(3 * 2**30), describe_bytes(266000.0)
+    ('3 GiB', '0.25 MiB')
+    """
+    return f"{amount / 2**30:.2g} GiB" if amount >= 2**30 else f"{amount / 2**20:.{3 if amount >= 1e8 else 2}g} MiB"
 
 
 class _Run:
@@ -171,40 +224,26 @@ class _Run:
         self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable[[str], None]
     ) -> None:
         self.given, self.tolerance, self._memory_bytes, self.say = problem, tolerance, memory_bytes, log
-        self._solved: list[tuple[Level, HeatProblem, SteadySolution | HeatSolution]] = []
+        self.solved: list[tuple[Level, HeatProblem, Solution]] = []
         self._begin_s = time.perf_counter()
 
     @property
-    def excess(self) -> float:
-        """Smallest error of a solution over what is allowed."""
-        return min((self.tolerance.excess(level.error) for level, _, _ in self._solved), default=np.inf)
+    def met(self) -> bool:
+        """Whether the error of a solution is allowed."""
+        return any(self.tolerance.excess(level.error) <= 1.0 for level, _, _ in self.solved)
 
-    def add(
-        self,
-        problem: HeatProblem,
-        solution: SteadySolution | HeatSolution,
-        seconds: float,
-        error: ErrorSize,
-        refinements: int,
-    ) -> None:
+    def add(self, problem: HeatProblem, solution: Solution, seconds: float, error: ErrorSize, refinements: int) -> None:
         """Keep a solution, with its estimated errors and the number of times that the mesh size was halved for it."""
-        edges, steps_k = 0, None
-        if isinstance(solution, SteadySolution):
-            edges = len(solution.edge_temperature_c)
-        else:
-            steps_k = solution.time_error_k
-        num_nodes = solution.temperature_c.shape[-1] + edges
-        level = Level(2 if edges else 1, refinements, steps_k, num_nodes, error, seconds)
-        self._solved.append((level, problem, solution))
+        steady = isinstance(solution, SteadySolution)
+        edges = len(solution.edge_temperature_c) if steady else 0
+        nodes, steps_k = solution.temperature_c.shape[-1] + edges, None if steady else solution.time_error_k
+        level = Level(2 if edges else 1, refinements, steps_k, nodes, error, seconds)
+        self.solved.append((level, problem, solution))
         self.say(level.describe())
-
-    def forget(self) -> None:
-        """Take back what is estimated better by now."""
-        self._solved.clear()
 
     def lacks_memory(self, order: int, refinements: int, times: int = 1) -> str:
         """Say what a solution on the given mesh with its size halved so often takes; return that it does not fit."""
-        needed = peak_bytes(self.given, order=order, refinements=refinements, times=times, adaptive=times > 1)
+        needed = peak_bytes(self.given, order=order, refinements=refinements, times=times)
         where = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
         what = f"P{order} on {where} needs about {describe_bytes(needed)}"
         if needed <= self._memory_bytes:
@@ -218,16 +257,14 @@ class _Run:
         Raises:
             HeatError: The tolerance was not met, or nothing was solved at all.
         """
-        if not self._solved:
+        if not self.solved:
             remedy = "Allow more memory (--memory-gb), or use a coarser mesh."
             raise HeatError("memory_bytes", expected="room for a first estimate", got=failure, remedy=remedy)
-
-        def rank(solved: tuple[Level, HeatProblem, SteadySolution | HeatSolution]) -> tuple[float, float]:
-            excess = self.tolerance.excess(solved[0].error)
-            return (float(solved[0].num_nodes), excess) if excess <= 1.0 else (np.inf, excess)
-
-        chosen = min(self._solved, key=rank)
-        levels = *(solved[0] for solved in self._solved if solved is not chosen), chosen[0]
+        excess = [self.tolerance.excess(level.error) for level, _, _ in self.solved]
+        sizes = (float(level.num_nodes) for level, _, _ in self.solved)
+        rank = [(size if over <= 1.0 else np.inf, over) for size, over in zip(sizes, excess)]
+        chosen = self.solved[rank.index(min(rank))]
+        levels = *(solved[0] for solved in self.solved if solved is not chosen), chosen[0]
         last, seconds = chosen[0], time.perf_counter() - self._begin_s
         allowed = self.tolerance.describe()
         status = f"{'Not within' if failure else 'Within'} {allowed}: {last.describe()}, {seconds:.2f} s in all."
@@ -241,158 +278,106 @@ class _Run:
         if failure and not allow_unmet:
             raise HeatError(status)
         self.say(status)
-        return ToleratedSolution(chosen[2], chosen[1], last, not failure, status, seconds, levels)
+        return ToleratedSolution(chosen[2], chosen[1], self.tolerance, last, not failure, status, seconds, levels)
 
 
-SteadySolver: TypeAlias = Callable[[HeatProblem, int], tuple[SteadySolution, float]]  # Gives the seconds it took too
+def _halved(problem: HeatProblem, start: Solution | None = None) -> HeatProblem:
+    """The same on a mesh of half the size, which starts from its own start or from a steady solution."""
+    nodal, edges = (problem.start_c if start is None else start.temperature_c), getattr(start, "edge_temperature_c", ())
+    start_c = np.concatenate([nodal, edges]) if len(edges) else refined_values(problem.mesh, nodal)
+    return replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
 
 
-def _solve_steady(run: _Run, time_s: float) -> str:
+def _solve_steady(run: _Run) -> str:
     """Find a steady state that is good enough; returns why that was not possible, or nothing."""
 
     def solve(problem: HeatProblem, order: int) -> tuple[SteadySolution, float]:
         begin_s = time.perf_counter()
-        solution = solve_steady(problem, time_s=time_s, order=order, relative_tolerance=_STEADY_TOLERANCE)
+        solution = solve_steady(problem, order=order, relative_tolerance=_STEADY_TOLERANCE)
         return solution, time.perf_counter() - begin_s
 
-    problem, refinements, apart_k = run.given, 0, 0.0
-    failure = run.lacks_memory(1, 0)
+    failure = run.lacks_memory(2, 0)
     if failure:
         return failure
-    before, first_seconds = solve(problem, 1)
-    if before.error is not None:
-        run.add(problem, before, first_seconds, before.error, 0)
-    failure = "" if run.excess <= 1.0 else run.lacks_memory(2, 0)
-    if run.excess <= 1.0 or failure:
-        return failure
-    linear, before_w_k = before, recovered_error_w_k(problem, before)
-    problem = replace(problem, initial_temperature_c=before.temperature_c)
+    order, refinements, (before, first_seconds) = 2, 0, solve(run.given, 1)
+    problem = replace(run.given, initial_temperature_c=before.temperature_c)
     while True:
         try:
-            solution, seconds = solve(problem, 2)
+            solution, seconds = solve(problem, order)
         except HeatError as refusal:
+            if order == 1 or refinements:
+                return str(refusal)
             run.say(f"P2 failed: {refusal} Linear tetrahedra of half the size follow.")
-            return _halve_linear(run, solve, linear)
-        after_w_k = recovered_error_w_k(problem, solution)
-        apart = difference_between(before, solution, len(run.given.mesh.points_m))
-        decrease = apart.temperature_k / apart_k if apart_k > 0.0 else None
-        ratios = error_ratios(before_w_k, after_w_k, decrease)
-        error = ErrorSize(
-            richardson(apart.temperature_k, ratios.temperature_k), richardson(apart.heat_flow, ratios.heat_flow)
-        )
-        if refinements == 0:
-            both = ErrorSize(error.temperature_k + apart.temperature_k, error.heat_flow + apart.heat_flow)
-            run.forget()
-            run.add(run.given, before, first_seconds, both, 0)
-        run.add(problem, solution, seconds, error, refinements)
-        if run.excess <= 1.0:
-            return ""
+            order = 1
+        else:
+            left = TO_QUADRATIC if (order, refinements) == (2, 0) else _LEFT[order]
+            coarse, fine = richardson(difference_between(before, solution, len(run.given.mesh.points_m)), left)
+            if not run.solved:
+                run.add(run.given, before, first_seconds, coarse, 0)
+            run.add(problem, solution, seconds, fine, refinements)
+            if run.met:
+                return ""
+            before = solution
         refinements += 1
-        failure = run.lacks_memory(2, refinements)
+        failure = run.lacks_memory(order, refinements)
         if failure:
             return failure
-        # The nodes of quadratic tetrahedra are those of the finer mesh.
-        start_c = np.concatenate([solution.temperature_c, solution.edge_temperature_c])
-        problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
-        before, before_w_k, apart_k = solution, after_w_k, apart.temperature_k
-
-
-def _halve_linear(run: _Run, solve: SteadySolver, solution: SteadySolution) -> str:
-    """Halve the mesh size of linear tetrahedra until their own estimate is allowed; returns what `_solve_steady` does.
-
-    `solution` is that on the given mesh.
-    """
-    problem, refinements = run.given, 0
-    while True:
-        refinements += 1
-        failure = run.lacks_memory(1, refinements)
-        if failure:
-            return failure
-        start_c = refined_values(problem.mesh, solution.temperature_c)
-        problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
-        try:
-            solution, seconds = solve(problem, 1)
-        except HeatError as refusal:
-            return str(refusal)
-        if solution.error is not None:
-            run.add(problem, solution, seconds, solution.error, refinements)
-        if run.excess <= 1.0:
-            return ""
-
-
-class _Refinable:
-    """Solves a problem in time on meshes of halved size, with halved steps."""
-
-    def __init__(
-        self, problem: HeatProblem, steps: AdaptiveSteps, progress: Callable[[float, int], None] | None
-    ) -> None:
-        self.problems, self._steps, self._progress = [problem], steps, progress
-        self._num_nodes = len(problem.mesh.points_m)
-        self._first_steps: GivenSteps | None = None
-
-    def solve(self, refinements: int, halvings: int) -> tuple[HeatSolution, float]:
-        """Solve; the first solution, on the given mesh, chooses the steps to halve. Gives the seconds it took too."""
-        begin_s = time.perf_counter()
-        while len(self.problems) <= refinements:
-            coarse = self.problems[-1]
-            start_c = refined_values(coarse.mesh, coarse.start_c)
-            self.problems.append(replace(coarse, mesh=refine_mesh(coarse.mesh), initial_temperature_c=start_c))
-        steps = self._steps if self._first_steps is None else self._first_steps.halved(halvings)
-        solution = solve_heat(
-            self.problems[refinements], steps, relative_tolerance=_STEP_TOLERANCE, progress=self._progress
-        )
-        if self._first_steps is None:
-            self._first_steps = GivenSteps(self._steps.duration_s, solution.step_lengths_s, self._steps.tolerance_k)
-        return solution, time.perf_counter() - begin_s
+        problem = _halved(problem, before)
 
 
 def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, int], None] | None) -> str:
     """Follow a body through time well enough; returns why that was not possible, or nothing.
 
-    The error of m halvings of the mesh and j of the steps is of_mesh * left^m + of_steps * HALVED^j. There left is
-    HALVED, except for heat flows if a surface is suddenly held at a temperature: half an element around it has it at
-    once, heat that no flow accounts for and that halves with the size.
+    The error of m halvings of the mesh and j of the steps is of_mesh * HALVED^m + of_steps * HALVED^j.
     """
     failure = run.lacks_memory(1, 1, steps.num_times)
     if failure:
         return failure
-    num_nodes, num_values = len(run.given.mesh.points_m), len(run.given.mesh.points_m) * steps.num_times
-    body = _Refinable(run.given, steps, progress)
-    solved = {choice: body.solve(*choice) for choice in ((0, 0), (0, 1), (1, 0))}
-    values = {choice: compared_values(solution, num_nodes) for choice, (solution, _) in solved.items()}
-    first = values[0, 0]
-    left = np.full(len(first), HALVED)
-    if np.any(solved[0, 0][0].temperature_c[0] != run.given.start_c):
-        left[num_values:] = _SUDDENLY_HELD
-    of_steps, of_mesh = (first - values[0, 1]) / (1.0 - HALVED), (first - values[1, 0]) / (1.0 - left)
+    problems, num_nodes = [run.given], len(run.given.mesh.points_m)
+    solved: dict[tuple[int, int], Vector] = {}
+    lengths_s: tuple[Vector, ...] = ()
+    of_mesh = of_steps = np.zeros(0)
 
-    def error(choice: tuple[int, int]) -> ErrorSize:
-        total = of_mesh * left ** choice[0] + of_steps * HALVED ** choice[1]
-        return error_size(total, solved[1, 0][0])
+    def error(choice: tuple[int, int]) -> Vector:
+        return of_mesh * HALVED ** choice[0] + of_steps * HALVED ** choice[1]
 
-    def keep(choice: tuple[int, int]) -> None:
-        (solution, seconds), of_halved = solved[choice], HALVED ** choice[1] * of_steps[:num_values]
+    def solve(choice: tuple[int, int]) -> tuple[HeatProblem, HeatSolution, float]:
+        begin_s = time.perf_counter()
+        while len(problems) <= choice[0]:
+            problems.append(_halved(problems[-1]))
+        given = GivenSteps(steps.duration_s, lengths_s, steps.tolerance_k).halved(choice[1]) if lengths_s else steps
+        problem = problems[choice[0]]
+        solution = solve_heat(problem, given, relative_tolerance=_STEP_TOLERANCE, progress=progress)
+        solved[choice] = _compared(solution, num_nodes)
+        return problem, solution, time.perf_counter() - begin_s
+
+    def keep(choice: tuple[int, int], problem: HeatProblem, solution: HeatSolution, seconds: float) -> None:
+        of_halved = HALVED ** choice[1] * of_steps[: len(of_steps) - len(solution.effects)]
         solution = replace(solution, time_error_k=float(np.max(np.abs(of_halved))))
-        run.add(body.problems[choice[0]], solution, seconds, error(choice), choice[0])
+        run.add(problem, solution, seconds, _error_size(error(choice), solution), choice[0])
 
-    for choice in tuple(solved):
-        keep(choice)
+    first = solve((0, 0))
+    lengths_s = first[1].step_lengths_s
+    begun = {(0, 0): first, (0, 1): solve((0, 1)), (1, 0): solve((1, 0))}
+    coarsest = solved[0, 0]
+    of_steps, of_mesh = ((coarsest - solved[finer]) / (1.0 - HALVED) for finer in ((0, 1), (1, 0)))
+    for choice, found in begun.items():
+        keep(choice, *found)
     halvings = range(_MOST_HALVINGS + 1)
     choices = sorted(product(halvings, halvings), key=lambda choice: _MESH_COST ** choice[0] * _STEP_COST ** choice[1])
-    while run.excess > 1.0:
-        open_choices = (choice for choice in choices if choice not in solved)
-        choice = next((choice for choice in open_choices if run.tolerance.excess(error(choice)) <= _AIM), None)
+    while not run.met:
+        within = (c for c in choices if run.tolerance.excess(_error_size(error(c), first[1])) <= _AIM)
+        choice = next((choice for choice in within if choice not in solved), None)
         if choice is None:
             return f"It would take more than {_MOST_HALVINGS} halvings of the mesh size or of the steps"
         failure = run.lacks_memory(1, choice[0], steps.num_times)
         if failure:
             return failure
-        solved[choice] = body.solve(*choice)
-        change = first - compared_values(solved[choice][0], num_nodes)
-        mesh_gain, steps_gain = 1.0 - left ** choice[0], 1.0 - HALVED ** choice[1]
+        found = solve(choice)
+        change, (mesh_gain, steps_gain) = coarsest - solved[choice], (1.0 - HALVED**number for number in choice)
         if choice[0] > 0:
             of_mesh = (change - of_steps * steps_gain) / mesh_gain
         else:
             of_steps = change / steps_gain
-        keep(choice)
+        keep(choice, *found)
     return ""

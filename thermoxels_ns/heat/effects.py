@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.fem.problem import Effect, Term
 from thermoxels_ns.fem.quantities import Bounded, Bounds, Quantity
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.terms import ConvectionTerm, Effect, FixedTerm, FluxTerm, RadiationTerm, SourceTerm, Term
 
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8  # Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]
 
@@ -37,9 +37,9 @@ class FixedTemperature(SurfaceEffect):
     kind = "fixed temperature"
     bounds = {"temperature_c": Bounds("temperature_c", "degrees Celsius", _ABSOLUTE_ZERO_C, HOTTEST_C)}
 
-    def terms(self, selection: Selection) -> tuple[Term, ...]:
+    def term(self, selection: Selection) -> Term:
         """T = T_fixed at the nodes of the patches."""
-        return (FixedTerm(self.label, selection.facets(self.patches), self.bounded("temperature_c")),)
+        return Term("fixed", selection.facets(self.patches), (self.bounded("temperature_c"),))
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class HeatFlux(SurfaceEffect):
     kind = "heat flux"
     bounds = {"flux_w_m2": Bounds("flux_w_m2", "W/m2")}
 
-    def terms(self, selection: Selection) -> tuple[Term, ...]:
+    def term(self, selection: Selection) -> Term:
         """k grad T . n = q."""
-        return (FluxTerm(self.label, selection.facets(self.patches), (self.bounded("flux_w_m2"),)),)
+        return Term("flux", selection.facets(self.patches), (self.bounded("flux_w_m2"),))
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ class Convection(SurfaceEffect):
         "air_c": Bounds("air_c", "degrees Celsius", _ABSOLUTE_ZERO_C, HOTTEST_C),
     }
 
-    def terms(self, selection: Selection) -> tuple[Term, ...]:
+    def term(self, selection: Selection) -> Term:
         """k grad T . n = h (T_air - T)."""
-        facets = selection.facets(self.patches)
-        return (ConvectionTerm(self.label, facets, self.bounded("coefficient_w_m2k"), self.bounded("air_c")),)
+        quantities = self.bounded("coefficient_w_m2k"), self.bounded("air_c")
+        return Term("convection", selection.facets(self.patches), quantities)
 
 
 @dataclass(frozen=True)
@@ -94,10 +94,10 @@ class Radiation(SurfaceEffect):
         ),
     }
 
-    def terms(self, selection: Selection) -> tuple[Term, ...]:
+    def term(self, selection: Selection) -> Term:
         """k grad T . n = sigma eps (T_s^4 - T^4), temperatures in kelvin."""
-        facets, sigma = selection.facets(self.patches), self.stefan_boltzmann_w_m2k4
-        return (RadiationTerm(self.label, facets, self.bounded("emissivity"), self.bounded("surroundings_c"), sigma),)
+        quantities = self.bounded("emissivity"), self.bounded("surroundings_c")
+        return Term("radiation", selection.facets(self.patches), quantities, self.stefan_boltzmann_w_m2k4)
 
 
 @dataclass(frozen=True)
@@ -113,10 +113,10 @@ class AbsorbedSolar(SurfaceEffect):
         "irradiance_w_m2": Bounds("irradiance_w_m2", "W/m2", 0.0),
     }
 
-    def terms(self, selection: Selection) -> tuple[Term, ...]:
+    def term(self, selection: Selection) -> Term:
         """k grad T . n = absorptivity times irradiance."""
         factors = self.bounded("absorptivity"), self.bounded("irradiance_w_m2")
-        return (FluxTerm(self.label, selection.facets(self.patches), factors),)
+        return Term("flux", selection.facets(self.patches), factors)
 
 
 @dataclass(frozen=True)
@@ -132,12 +132,11 @@ class GroundContact(SurfaceEffect):
         "ground_c": Bounds("ground_c", "degrees Celsius", _ABSOLUTE_ZERO_C, HOTTEST_C),
     }
 
-    def terms(self, selection: Selection) -> tuple[Term, ...]:
+    def term(self, selection: Selection) -> Term:
         """k grad T . n = (T_ground - T) / R."""
-        facets = selection.facets(self.patches)
         coefficient = Bounds("1 / resistance_m2k_w", "W/(m2 K)", 0.0)
         conductance = Bounded(coefficient.check_quantity(1.0 / self.resistance_m2k_w), coefficient)
-        return (ConvectionTerm(self.label, facets, conductance, self.bounded("ground_c")),)
+        return Term("convection", selection.facets(self.patches), (conductance, self.bounded("ground_c")))
 
 
 @dataclass(frozen=True)
@@ -150,6 +149,6 @@ class InternalHeat(Effect):
     kind = "internal heat"
     bounds = {"source_w_m3": Bounds("source_w_m3", "W/m3")}
 
-    def terms(self, selection: Selection) -> tuple[Term, ...]:
+    def term(self, selection: Selection) -> Term:
         """Rho c dT/dt = div(k grad T) + s."""
-        return (SourceTerm(self.label, selection.tets(self.regions), self.bounded("source_w_m3")),)
+        return Term("source", selection.tets(self.regions), (self.bounded("source_w_m3"),))

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import (
-    EffectHeat,
     Solution,
     SolutionNodes,
     SteadySolution,
@@ -158,22 +157,26 @@ def _patches(
     problem: HeatProblem, solution: Solution, selection: Selection, nodes: SolutionNodes, lengths: Vector
 ) -> tuple[PatchResult, ...]:
     mesh, area, names, last_c = selection.mesh, selection.facet_area_m2, selection.patch_names, nodes.states_c[-1]
-    surface = [heat for effect, heat in zip(problem.effects, solution.effects) if not isinstance(effect, InternalHeat)]
-    heat = np.zeros((len(lengths), len(names))) + heat_through_parts(surface, names)
+    heat = {name: np.zeros(len(lengths)) for name in names}
+    for effect, part in zip(problem.effects, solution.effects):
+        if not isinstance(effect, InternalHeat):
+            for name, heat_w in zip(part.group_names, part.group_heat_w.T):
+                heat[name] = heat[name] + heat_w
     facet_c, end_s = last_c[mesh.facets].mean(axis=1), float(nodes.times_s[-1])
     results = []
     for number in np.unique(selection.facet_patch):
         chosen = selection.facet_patch == number
         on_patch, total = np.unique(mesh.facets[chosen]), float(area[chosen].sum())
         coldest, hottest = (int(on_patch[which(last_c[on_patch])]) for which in (np.argmin, np.argmax))
-        mean = float(heat[:, number] @ lengths / lengths.sum())
+        heat_w = heat[names[number]]
+        mean = float(heat_w @ lengths / lengths.sum())
         results.append(
             PatchResult(
                 patch=names[number],
                 area_m2=total,
                 heat_w=mean,
                 heat_w_m2=mean / total,
-                last_heat_w=float(heat[-1, number]),
+                last_heat_w=float(heat_w[-1]),
                 mean_c=float(facet_c[chosen] @ area[chosen]) / total,
                 coldest=describe_spot(selection, coldest, float(last_c[coldest]), end_s),
                 hottest=describe_spot(selection, hottest, float(last_c[hottest]), end_s),
@@ -385,20 +388,4 @@ def heat_by_part(solution: Solution, part: npt.NDArray[np.int64], count: int) ->
     total = np.zeros(count)
     for heat in solution.last_facet_heat:
         total += np.bincount(part[heat.facets], heat.heat_w, count)
-    return total
-
-
-def heat_through_parts(effects: Sequence[EffectHeat], part_names: Sequence[str]) -> Vector:
-    """Add up the effects' heat through each part, shape (s, p), [W].
-
-    >>> heat = EffectHeat("sun", np.array([3.0]), ("roof", "wall"), np.array([[2.0, 1.0]]))
-    >>> heat_through_parts([heat, heat], ["wall", "floor", "roof"]).tolist()
-    [[2.0, 0.0, 4.0]]
-    """
-    rows = len(effects[0].heat_w) if effects else 1
-    total, columns = np.zeros((rows, len(part_names))), {name: number for number, name in enumerate(part_names)}
-    for effect in effects:
-        for column, name in enumerate(effect.group_names):
-            if name in columns:
-                total[:, columns[name]] += effect.group_heat_w[:, column]
     return total

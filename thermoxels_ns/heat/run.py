@@ -11,21 +11,87 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import kelvin_to_celsius
-from thermoxels_ns.fem.probes import Probes, place_probes
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
+from thermoxels_ns.fem.tolerance import ToleratedSolution
 from thermoxels_ns.heat.results import HeatResults, WallResult, heat_results, volume_shares, wall_of_scene
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_hours
-from thermoxels_ns.heat.screening import Screening
 from thermoxels_ns.heat.sky import Vector as Direction
-from thermoxels_ns.heat.solving import Accuracy, Goals, Say, solve_problem
+from thermoxels_ns.heat.solving import Goals, LeftOut, Say, solve_problem
 from thermoxels_ns.mesh.quality.checks import count_tets_in_other_bodies, count_twin_nodes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]
+
+
+_OUTSIDE = 1e-9
+"""How far outside a tetrahedron, as a share of its height, a point may be and still count as on its face."""
+
+
+@dataclass(frozen=True)
+class Probes:
+    """Points in a body and how their temperature follows from that of the nodes."""
+
+    points_m: npt.NDArray[np.float64]  # Positions, shape (p, 3), [m]
+    nodes: npt.NDArray[np.int64]  # Nodes of the tetrahedron around each point, shape (p, 4)
+    weights: npt.NDArray[np.float64]  # Barycentric coordinates in it, shape (p, 4); each row adds up to 1
+
+    def at(self, nodal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Interpolate nodal values, shape (..., n), to the points, shape (..., p)."""
+        return np.einsum("...pa,pa->...p", nodal[..., self.nodes], self.weights)
+
+
+def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
+    """Find the tetrahedron around each point, shape (p, 3), [m]; raises `HeatError` if one lies outside the body.
+
+    >>> corner, none = np.vstack([np.zeros(3), np.eye(3)]), np.zeros((0, 3), np.int64)
+    >>> tets, seen = np.array([[0, 1, 2, 3]]), np.ones(4, bool)
+    >>> mesh = TetMesh(corner, tets, np.array([0.0, 8.0, 0.0, 0.0]), seen, none, none[:, 0], np.array([0]))
+    >>> place_probes(mesh, [[0.25, 0.25, 0.25]]).at(mesh.temperature_c).tolist()
+    [2.0]
+    """
+    remedy = "Give three coordinates in metres for each probe."
+    points = check_shape("probes", np.asarray(points_m, dtype=np.float64), (None, 3), remedy, HeatError)
+    check_finite("probes", points, remedy, HeatError)
+    corner = mesh.points_m[mesh.tets]
+    low, high = corner.min(axis=1), corner.max(axis=1)
+    slack = _OUTSIDE * float(np.max(high - low))
+    nodes, weights = np.zeros((len(points), 4), np.int64), np.zeros((len(points), 4))
+    for number, point in enumerate(points):
+        near = np.flatnonzero(np.all((low <= point + slack) & (high >= point - slack), axis=1))
+        shares = _barycentric(corner[near], point)
+        # On a face or at a node several tetrahedra have it: the one it lies deepest in, the first of equals.
+        best = int(np.argmax(shares.min(axis=1))) if len(near) else -1
+        if best < 0 or shares[best].min() < -_OUTSIDE:
+            raise _outside(mesh, number, point)
+        inside = np.clip(shares[best], 0.0, 1.0)
+        nodes[number], weights[number] = mesh.tets[near[best]], inside / inside.sum()
+    return Probes(points, nodes, weights)
+
+
+def _barycentric(corner: npt.NDArray[np.float64], point: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Barycentric coordinates of a point in tetrahedra, shape (k, 4)."""
+    sides = corner[:, 1:] - corner[:, :1]
+    others = np.linalg.solve(np.swapaxes(sides, 1, 2), (point - corner[:, 0])[..., None])[..., 0]
+    return np.concatenate([1.0 - others.sum(axis=1, keepdims=True), others], axis=1)
+
+
+def _outside(mesh: TetMesh, number: int, point: npt.NDArray[np.float64]) -> HeatError:
+    distance = np.linalg.norm(mesh.points_m - point, axis=1)
+    nearest = int(np.argmin(distance))
+    x, y, z = mesh.points_m[nearest]
+    low, high = (", ".join(f"{v:.4g}" for v in end) for end in (mesh.points_m.min(axis=0), mesh.points_m.max(axis=0)))
+    return HeatError(
+        f"probe {number + 1}",
+        expected=f"a point inside the body, which lies between ({low}) and ({high}) m",
+        got=f"({', '.join(f'{v:.6g}' for v in point)}), which is outside",
+        remedy=f"Move it; the nearest node is ({x:.6g}, {y:.6g}, {z:.6g}), {distance[nearest]:.3g} m away.",
+    )
 
 
 @dataclass(frozen=True)
@@ -36,8 +102,8 @@ class HeatRun:
     problem: HeatProblem  # The problem with all that the scene names, on the given mesh
     solved: HeatProblem  # What was solved: without what is left out, and, if a tolerance asked for it, on a finer mesh
     nodes: SolutionNodes  # All temperatures of the solution on a mesh that has a node for each
-    screening: Screening
-    accuracy: Accuracy | None  # What is known of the error; None if no tolerance was given
+    left_out: tuple[LeftOut, ...]  # What brings too little heat to be built
+    accuracy: ToleratedSolution | None  # What is known of the error; None if no tolerance was given
     warnings: tuple[str, ...]
     solution: Solution
     results: HeatResults
@@ -78,7 +144,7 @@ def run_scene(
     found = solve_problem(problem, scene.time, goals, say)
     solution, solved = found.solution, found.problem
     done = clock.perf_counter()
-    seconds = {"screen": found.screening.seconds, "solve": done - start - found.screening.seconds}
+    seconds = {"solve": done - start}
     say(f"Heat: {solution.status} ({seconds['solve']:.1f} s)")
     closed = f"Energy balance closed to {solution.energy_residual:.1e}"
     say(f"{closed}; what is unbalanced changes no heat flow by more than {solution.unbalanced_w:.1e} W.")
@@ -89,14 +155,14 @@ def run_scene(
 
     nodes = solution_nodes(solved, solution)
     wall = wall_of_scene(scene, solved, solution, nodes, doubtful=bool(about_patches))
-    probes = place_probes(solved.mesh, probes.points_m)  # in the mesh that was solved
+    probes = place_probes(nodes.mesh, probes.points_m)
     results = heat_results(solved, solution, nodes)
     return HeatRun(
         scene=scene,
         problem=problem,
         solved=solved,
         nodes=nodes,
-        screening=found.screening,
+        left_out=found.left_out,
         accuracy=found.accuracy,
         warnings=warnings,
         solution=solution,
@@ -105,7 +171,7 @@ def run_scene(
         no_wall=wall if isinstance(wall, str) else "",
         mean_c=nodes.states_c @ volume_shares(nodes.mesh),
         probes=probes,
-        probes_c=probes.at_quadratic(solved.mesh, nodes.states_c) if nodes.quadratic else probes.at(nodes.states_c),
+        probes_c=probes.at(nodes.states_c),
         seconds={**seconds, "answers": clock.perf_counter() - done},
     )
 

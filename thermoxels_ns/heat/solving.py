@@ -1,41 +1,54 @@
-"""Solve a problem with its own steps on its mesh, or to a tolerance."""
+"""Solve a problem without the effects that do not matter, with its own steps on its mesh or to a tolerance."""
 
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.memory import DEFAULT_MEMORY_BYTES, check_memory, describe_bytes, peak_bytes
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.forms import FixedForm, effect_forms
+from thermoxels_ns.fem.problem import AdaptiveSteps, Effect, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Bounds
-from thermoxels_ns.fem.solution import Solution, mean_flows_w
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.solution import HeatSolution, Solution, SteadySolution, mean_flows_w
+from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_tolerance
-from thermoxels_ns.heat.screening import Screening, screen
+from thermoxels_ns.fem.tolerance import (
+    Tolerance,
+    ToleratedSolution,
+    describe_bytes,
+    peak_bytes,
+    solve_to_tolerance,
+    steady_error,
+)
 
+Vector = npt.NDArray[np.float64]
 Say = Callable[[str], None]
 Time = TimeSteps | AdaptiveSteps | None  # How a body is followed; None: its steady state
 
-LEFT_OUT_SHARE = 0.2
-"""Share of the tolerance that effects which are left out may use together; the solver gets what they do not use."""
-LEAVE_OUT_BELOW_K = 0.01  # The same without a tolerance, [K]: a fifth of the default tolerance of the time steps
-LEFT_OUT_FLOW = 0.01
-"""Share of all heat that flows by which what is left out may change the mean heat flow of any effect (ISO 10211)."""
+LEAVE_OUT_BELOW = 0.005
+"""Share of all heat that flows that effects which are left out may bring together: half of what building physics asks
+of a heat flow (ISO 10211: 1 %)."""
+MOST_ATTEMPTS = 4  # Solutions with something left out, after which nothing is left out any more
 SAY_EVERY_S = 10.0  # Time between two lines of progress, [s]
 SAY_FIRST_S = 1.0  # Time of a first step from which on it is said, [s]: then the next ones will take some, too
+_LEAST_TIMES, _MOST_TIMES = 241, 200_001
+"""Least and most times at which an effect is asked for that the solver may ask for at any time."""
 
 _BOUNDS = {
     "tolerance_k": Bounds("tolerance", "K", 0.0, above_low=True, remedy="Pass --tolerance 0.05."),
     "flow_tolerance": Bounds(
         "flow-tolerance", "share of the heat flow", 0.0, 1.0, above_low=True, remedy="Pass --flow-tolerance 0.01."
     ),
-    "leave_out_below_k": Bounds("leave-out-below-k", "K", 0.0, remedy="Pass --leave-out-below-k 0.01."),
+    "leave_out_below": Bounds(
+        "leave-out-below", "share of the heat flow", 0.0, 1.0, remedy="Pass --leave-out-below 0.005."
+    ),
     "memory_gb": Bounds("memory-gb", "GiB", 0.0, above_low=True, remedy="Pass --memory-gb 4."),
 }
 
@@ -47,9 +60,8 @@ class Goals:
     tolerance_k: float | None = None  # Largest error of any temperature, [K]; None: any
     flow_tolerance: float | None = None
     """Largest error of the mean heat flow of any effect, as a share of all heat; None: any."""
-    leave_out_below_k: float | None = None
-    """Effects that together can change no temperature by more than this are left out, [K]; None: `left_out_k`, and no
-    mean heat flow of an effect by more than a hundredth of all heat that flows."""
+    leave_out_below: float | None = None
+    """Share of all heat below which effects are left out together; None: `LEAVE_OUT_BELOW`, or 0 beside a tolerance."""
     memory_gb: float | None = 4.0  # Most memory that solving may take, [GiB]; None: any
     allow_unmet: bool = False  # Whether the best that fits into the memory will do if a tolerance cannot be met
 
@@ -57,10 +69,9 @@ class Goals:
         for name, bounds in _BOUNDS.items():
             if getattr(self, name) is not None:
                 bounds.check(getattr(self, name))
-        if self.tolerance_k is not None and self.left_out_k >= self.tolerance_k:
-            expected = f"less than the tolerance of {self.tolerance_k:g} K"
-            remedy = "Leave it out for a fifth of the tolerance."
-            raise HeatError("leave-out-below-k", expected=expected, got=f"{self.left_out_k:g} K", remedy=remedy)
+        if self.estimated and self.leave_out_below:
+            expected, remedy = "0 or nothing beside a tolerance", "Remove one of the two."
+            raise HeatError("leave-out-below", expected=expected, got=f"{self.leave_out_below:g}", remedy=remedy)
 
     @property
     def estimated(self) -> bool:
@@ -68,18 +79,16 @@ class Goals:
         return self.tolerance_k is not None or self.flow_tolerance is not None
 
     @property
-    def left_out_k(self) -> float:
-        """What effects that are left out may change together, [K]."""
-        if self.leave_out_below_k is not None:
-            return self.leave_out_below_k
-        if self.flow_tolerance is not None:
-            return 0.0
-        return LEAVE_OUT_BELOW_K if self.tolerance_k is None else LEFT_OUT_SHARE * self.tolerance_k
+    def left_out_share(self) -> float:
+        """Share of all heat that effects which are left out may bring together."""
+        if self.leave_out_below is not None:
+            return self.leave_out_below
+        return 0.0 if self.estimated else LEAVE_OUT_BELOW
 
     @property
-    def left_out_w(self) -> float:
-        """Heat that they may bring, [W]: none beside a tolerance of heat flows, otherwise as it turns out."""
-        return np.inf if self.flow_tolerance is None else 0.0
+    def memory_bytes(self) -> float:
+        """Most memory that solving may take, [bytes]."""
+        return np.inf if self.memory_gb is None else self.memory_gb * 2**30
 
     def check_fits(self, time: Time) -> None:
         """Raise `HeatError` for a tolerance of heat flows alone beside a duration: it does not choose the steps."""
@@ -90,23 +99,12 @@ class Goals:
 
 
 @dataclass(frozen=True)
-class Accuracy:
-    """What is known of the error, and how the tolerance was met."""
+class LeftOut:
+    """An effect that was left out."""
 
-    tolerance_k: float | None  # Error of any temperature that was allowed, [K]; None: any
-    flow_tolerance: float | None
-    """Error of the mean heat flow of any effect that was allowed, as a share of all heat; None: any."""
-    met: bool
-    estimated_k: float  # Estimated largest error of a temperature, what is left out included, [K]
-    estimated_flow: float  # Estimated largest error of a heat flow as a share of all heat
-    left_out_k: float  # What of `estimated_k` is the bound of the effects that are left out, [K]
-    order: int  # 1 for linear tetrahedra, 2 for quadratic ones
-    refinements: int  # How often the size of the given mesh was halved
-    step_tolerance_k: float | None  # Tolerance of the time steps, [K]; None without steps
-    seconds: float
-    status: str
-    levels: tuple[dict[str, Any], ...]
-    """All solutions on the way with their estimates and seconds, the one that counts last."""
+    effect: str
+    heat_w: float  # Largest heat flow that it would bring to or take from the body that was solved at any time, [W]
+    share: float  # The same as a share of all heat that flows through the body on average
 
 
 @dataclass(frozen=True)
@@ -116,86 +114,159 @@ class SolvedProblem:
     problem: HeatProblem
     """What was solved last: without what is left out, and perhaps on a finer mesh than the given one."""
     solution: Solution
-    screening: Screening
-    accuracy: Accuracy | None
+    left_out: tuple[LeftOut, ...]
+    accuracy: ToleratedSolution | None
 
 
 def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lambda _: None) -> SolvedProblem:
     """Leave out what does not matter, and solve the rest; `say` gets one line of progress at a time.
 
+    What brings little heat at any temperature that the surroundings have is left out at first. At the solution it is
+    asked for again, and what brings more than `goals.left_out_share` of all heat is taken in and all solved again.
+
     Raises `HeatError` if it needs more memory than allowed, the solver fails, or the tolerance cannot be met.
     """
     goals.check_fits(time)
-    if time is not None:
-        allowed = DEFAULT_MEMORY_BYTES if goals.memory_gb is None else goals.memory_gb * 2**30
-        remedy = "Keep temperatures at fewer times: fewer steps or outputs; or pass a larger --memory-gb."
-        check_memory(8.0 * time.num_times * len(problem.mesh.points_m), allowed, remedy)
+    if not goals.estimated:
+        needed = peak_bytes(problem, times=1 if time is None else time.num_times)
+        say(f"Memory: about {describe_bytes(needed)} at most.")
+        if needed > goals.memory_bytes:
+            expected, got = f"at most {describe_bytes(goals.memory_bytes)}", f"about {describe_bytes(needed)}"
+            remedy = "Pass a larger --memory-gb, fewer steps or outputs, or export a coarser mesh."
+            raise HeatError("memory of the heat problem", expected=expected, got=got, remedy=remedy)
     # To a tolerance steps are chosen by their error, whatever the scene says.
     asked = AdaptiveSteps(time.duration_s) if goals.estimated and time is not None else time
-    found = _solve_screened(screen(problem, asked, goals.left_out_k, goals.left_out_w), time, goals, say)
-    through_w = 0.5 * sum(map(abs, mean_flows_w(found.solution).values()))
-    if goals.leave_out_below_k is None and found.screening.bound_w > LEFT_OUT_FLOW * through_w:
-        say(
-            f"What is left out may bring {found.screening.bound_w:.3g} W beside {through_w:.3g} W that flow, more "
-            f"than {LEFT_OUT_FLOW:.0%}: solved again with it (not if you pass --leave-out-below-k 0.01)."
-        )
-        again = screen(problem, asked, goals.left_out_k, LEFT_OUT_FLOW * through_w)
-        found = _solve_screened(again, time, goals, say)
+    labels, left = effect_labels(problem), _weak(problem, asked, goals.left_out_share)
+    for attempt in range(MOST_ATTEMPTS + 1):
+        left = left if attempt < MOST_ATTEMPTS else []
+        kept = replace(problem, effects=tuple(e for n, e in enumerate(problem.effects) if n not in left))
+        say(f"Built: {', '.join(label for n, label in enumerate(labels) if n not in left) or 'nothing'}.")
+        try:
+            found = _solve(kept, time, goals, say)
+        except HeatError:
+            if not left:
+                raise
+            say("Without what is left out there is no solution: solved again with it.")
+            left = []
+            continue
+        if not left:
+            return _with_mesh_error(found, goals)
+        through_w = 0.5 * sum(map(abs, mean_flows_w(found.solution).values()))
+        brings_w = _largest_w(problem, left, asked, found.solution)
+        # The least stay left out, as long as all of them together bring no more than allowed.
+        order = sorted(left, key=brings_w.__getitem__)
+        total_w = np.cumsum([brings_w[n] for n in order])
+        still = [n for n, sum_w in zip(order, total_w) if sum_w <= goals.left_out_share * through_w]
+        if len(still) == len(left):
+            shares = {n: brings_w[n] / through_w if through_w > 0.0 else 0.0 for n in left}
+            gone = tuple(LeftOut(labels[n], brings_w[n], shares[n]) for n in sorted(left))
+            for entry in gone:
+                say(f"Left out: {entry.effect}, up to {entry.heat_w:.3g} W, {entry.share:.2%} of all heat.")
+            return _with_mesh_error(replace(found, left_out=gone), goals)
+        back = ", ".join(f"{labels[n]} (up to {brings_w[n]:.3g} W)" for n in sorted(set(left) - set(still)))
+        say(f"Of {through_w:.3g} W that flow too much is left out: solved again with {back}.")
+        left = still
+    raise AssertionError("without anything left out the first solution counts")
+
+
+def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
+    """Number the effects that together have no more than a share of the power of the others."""
+    power_w = _largest_w(problem, range(len(problem.effects)), time)
+    total_w = sum(power for power in power_w.values() if np.isfinite(power))
+    weak, left_w = list[int](), 0.0
+    for number in sorted(power_w, key=power_w.__getitem__):
+        left_w += power_w[number]
+        if left_w <= share * (total_w - left_w) or left_w == 0.0:
+            weak.append(number)
+    return weak
+
+
+def _largest_w(
+    problem: HeatProblem, chosen: Sequence[int], time: Time, found: Solution | None = None
+) -> dict[int, float]:
+    """Sum of the sizes of the heat flows of each effect through its triangles or in its tetrahedra, at its worst time.
+
+    At the temperatures that were found, otherwise at the coldest and the warmest that the start and the surroundings
+    have. What fixes temperatures is infinite, and so is what may change between two looks without a word how fast.
+    """
+    reference_c, num_nodes = float(problem.start_c.mean()), len(problem.mesh.points_m)
+    forms = effect_forms(problem, Space(Selection(problem.mesh, problem.up)), reference_c)
+    kept_s = found.times_s if isinstance(found, HeatSolution) else np.zeros(1)
+    numbers = {label: number for number, label in enumerate(effect_labels(problem))}
+    looks = [_looks(effect, time, kept_s) for effect in problem.effects]
+    start_k = problem.start_c - reference_c
+    ends_k = [] if time is None else [float(start_k.min()), float(start_k.max())]
+    if found is None:
+        for form in (*forms.convection, *forms.radiation, *forms.fixed):
+            for time_s in looks[numbers[form.effect]]:
+                around_k = form.surroundings_k(time_s)
+                ends_k += [float(around_k.min()), float(around_k.max())]
+
+    def states(time_s: float) -> tuple[Vector, ...]:
+        if found is None:
+            return tuple(np.full(num_nodes, end_k) for end_k in {min(ends_k, default=0.0), max(ends_k, default=0.0)})
+        found_c = found.temperature_c[..., :num_nodes]
+        if isinstance(found, HeatSolution):
+            after = min(max(int(np.searchsorted(kept_s, time_s)), 1), len(kept_s) - 1)
+            share = (time_s - kept_s[after - 1]) / (kept_s[after] - kept_s[after - 1])
+            found_c = (1.0 - share) * found_c[after - 1] + share * found_c[after]
+        return (found_c - reference_c,)
+
+    largest = dict.fromkeys(chosen, 0.0)
+    for form in (*forms.exchanging, *forms.fixed):
+        number = numbers[form.effect]
+        if number in largest:
+            largest[number] = np.inf
+            if not isinstance(form, FixedForm) and len(looks[number]):
+                sizes = (np.abs(form.part_heat_w(k, t)).sum() for t in looks[number] for k in states(t))
+                largest[number] = float(max(sizes))
+    return largest
+
+
+def _looks(effect: Effect, time: Time, kept_s: Vector) -> list[float]:
+    """Times at which to ask for an effect, [s], to miss nothing; none if no times would do.
+
+    Equal steps ask at their ends, as they add them up. Adaptive steps may ask at any time: we ask twice in the time
+    that a quantity resolves.
+    """
+    quantities = [effect.bounded(name) for name in effect.bounds]
+    if time is None or not any(quantity.in_time for quantity in quantities):
+        return kept_s.tolist()
+    if isinstance(time, TimeSteps):
+        return [0.0, *(time.times_s[:-1] + time.step_seconds).tolist()]
+    count = 2.0 * time.duration_s / min(quantity.resolution_s for quantity in quantities)
+    if any(quantity.unresolved for quantity in quantities) or not count < _MOST_TIMES:
+        return []
+    return np.linspace(0.0, time.duration_s, max(int(np.ceil(count)) + 1, _LEAST_TIMES)).tolist()
+
+
+def _solve(problem: HeatProblem, time: Time, goals: Goals, say: Say) -> SolvedProblem:
+    if not goals.estimated:
+        if time is None:
+            return SolvedProblem(problem, solve_steady(problem), (), None)
+        solution = solve_heat(problem, time, estimate_steps=True, progress=_Progress(say))
+        return SolvedProblem(problem, solution, (), None)
+    found = solve_to_tolerance(
+        problem,
+        Tolerance(goals.tolerance_k, goals.flow_tolerance),
+        duration_s=None if time is None else time.duration_s,
+        outputs=1 if time is None else time.num_times - 1,
+        memory_bytes=goals.memory_bytes,
+        allow_unmet=goals.allow_unmet,
+        log=say,
+        progress=_Progress(say),
+    )
+    return SolvedProblem(found.problem, found.solution, (), found)
+
+
+def _with_mesh_error(found: SolvedProblem, goals: Goals) -> SolvedProblem:
+    """Estimate the error of the mesh of a steady state, if quadratic tetrahedra fit into memory and succeed."""
+    fits = peak_bytes(found.problem, order=2) <= goals.memory_bytes
+    if isinstance(found.solution, SteadySolution) and found.accuracy is None and fits:
+        with suppress(HeatError):
+            error = steady_error(found.problem, found.solution)
+            return replace(found, solution=replace(found.solution, error=error))
     return found
-
-
-def _solve_screened(screening: Screening, time: Time, goals: Goals, say: Say) -> SolvedProblem:
-    _say_what_is_built(screening, say)
-    kept, memory_bytes = screening.problem, np.inf if goals.memory_gb is None else goals.memory_gb * 2**30
-    if goals.estimated:
-        left_k = None if goals.tolerance_k is None else goals.tolerance_k - screening.bound_k
-        found = solve_to_tolerance(
-            kept,
-            Tolerance(left_k, goals.flow_tolerance),
-            duration_s=None if time is None else time.duration_s,
-            outputs=1 if time is None else time.num_times - 1,
-            memory_bytes=memory_bytes,
-            allow_unmet=goals.allow_unmet,
-            log=say,
-            progress=_Progress(say),
-        )
-        return SolvedProblem(found.problem, found.solution, screening, _accuracy(goals, screening, found))
-    times = 1 if time is None else time.num_times
-    needed = peak_bytes(kept, times=times, adaptive=time is not None)
-    say(f"Memory: about {describe_bytes(needed)} at most.")
-    check_memory(needed, memory_bytes, "Pass a larger --memory-gb, or export a coarser mesh.")
-    solution = (
-        solve_steady(kept) if time is None else solve_heat(kept, time, estimate_steps=True, progress=_Progress(say))
-    )
-    return SolvedProblem(kept, solution, screening, None)
-
-
-def _accuracy(goals: Goals, screening: Screening, found: ToleratedSolution) -> Accuracy:
-    last = found.settings
-    return Accuracy(
-        tolerance_k=goals.tolerance_k,
-        flow_tolerance=goals.flow_tolerance,
-        met=found.met,
-        estimated_k=last.error.temperature_k + screening.bound_k,
-        estimated_flow=last.error.heat_flow,
-        left_out_k=screening.bound_k,
-        order=last.order,
-        refinements=last.refinements,
-        step_tolerance_k=last.step_tolerance_k,
-        seconds=found.seconds,
-        status=found.status,
-        levels=tuple(asdict(level) for level in found.levels),
-    )
-
-
-def _say_what_is_built(screening: Screening, say: Say) -> None:
-    for entry in screening.left_out:
-        say(f"Left out: {entry.effect}, at most {entry.bound_k:.2g} K and {entry.bound_w:.3g} W: {entry.reason}.")
-    for entry in screening.kept:
-        bound = "" if entry.bound_k is None else f" (up to {_bound(entry.bound_k)})"
-        say(f"Built: {entry.effect}{bound}")
-    if not screening.kept and not screening.left_out:
-        say("Nothing acts on the body: its surface is insulated.")
 
 
 class _Progress:
@@ -237,8 +308,3 @@ def _duration(seconds: float) -> str:
     if seconds < 120.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
-
-
-def _bound(bound_k: float) -> str:
-    """Say a bound; far above what matters its size says nothing."""
-    return f"{bound_k:.2g} K" if bound_k < 99.5 else "100 K or more"

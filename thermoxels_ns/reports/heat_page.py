@@ -11,10 +11,10 @@ from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.fem.tolerance import ToleratedSolution
 from thermoxels_ns.heat.effects import Effect, FixedTemperature, InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.run import HeatRun, mesh_error_in_words
-from thermoxels_ns.heat.solving import Accuracy
 from thermoxels_ns.reports.charts import plot_over_time
 from thermoxels_ns.reports.numbers import duration_text, flow_text, least_flow, unit_signs
 from thermoxels_ns.reports.page import build_page
@@ -37,9 +37,6 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, comma
     names = [f"({', '.join(f'{part:.4g}' for part in point)}) m" for point in run.probes.points_m]
     over_time = isinstance(solution, HeatSolution)
     selection, labels = Selection(run.problem.mesh, run.problem.up), effect_labels(run.problem)
-    asked = [] if accuracy is None or accuracy.tolerance_k is None else [f"{accuracy.tolerance_k:g} K"]
-    if accuracy is not None and accuracy.flow_tolerance is not None:
-        asked.append(f"{100.0 * accuracy.flow_tolerance:g} % of the heat flow")
     return build_page(
         "heat.html.j2",
         run=run,
@@ -56,7 +53,6 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, comma
         materials=materials_by_region(run.problem),
         effects=[(label, _values(effect, selection)) for label, effect in zip(labels, run.problem.effects)],
         residual=0.0 if abs(residual) < least_w * duration_s else residual,
-        asked=asked,
         effort=_effort(run),
         command=command,
         files=files,
@@ -87,13 +83,15 @@ def _values(effect: Effect, selection: Selection) -> str:
     return "; ".join(shown)
 
 
-def _how_time_was_followed(time: TimeSteps | AdaptiveSteps | None, accuracy: Accuracy | None) -> str:
+def _how_time_was_followed(time: TimeSteps | AdaptiveSteps | None, accuracy: ToleratedSolution | None) -> str:
     """Say in words how a body was followed, by the scene's own steps or to a tolerance."""
     if time is None:
         return "the steady state"
     if accuracy is not None:
         duration = duration_text(float(time.times_s[-1]))
-        return f"{duration} in steps chosen by the tolerance (they may err by {accuracy.step_tolerance_k:.2g} K)"
+        return (
+            f"{duration} in steps chosen by the tolerance (they may err by {accuracy.settings.step_tolerance_k:.2g} K)"
+        )
     if isinstance(time, TimeSteps):
         return f"{time.steps} steps of {time.step_seconds:g} s"
     return f"{duration_text(time.duration_s)} in steps that keep within {time.tolerance_k:g} K"
