@@ -313,7 +313,7 @@ def exported(ball, tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize(
     ("size_bytes", "broken"),
-    [(1000, "quality.json"), (60_000, "mesh.vtu"), (75_000, "step-0001.vtu"), (100_000, r"mesh.*\.png")],
+    [(1000, "quality.json"), (75_000, "mesh.vtu"), (83_000, "step-0001.vtu"), (120_000, r"mesh.*\.png")],
 )
 def test_a_full_disk_is_one_line_and_leaves_no_half_of_a_file(ball, exported, tmp_path, size_bytes, broken) -> None:
     shutil.copytree(exported, tmp_path, dirs_exist_ok=True)
