@@ -4,6 +4,7 @@ import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from runpy import run_path
 
 import pytest
 
@@ -238,7 +239,7 @@ def test_names_say_something(path: Path) -> None:
     assert not NAMES_THAT_SAY_NOTHING & set(path.relative_to(PACKAGE).with_suffix("").parts)
 
 
-@pytest.mark.parametrize("page", ["docs/architecture.md", "CONTRIBUTING.md"])
+@pytest.mark.parametrize("page", ["docs/architecture.md", "docs/nomenclature.md", "CONTRIBUTING.md"])
 def test_the_map_names_files_that_are_there(page: str) -> None:
     text = (PACKAGE.parent / page).read_text(encoding="utf-8")
     named = set(re.findall(r"`((?:[a-z0-9_]+/)+[a-z0-9_]+\.py)`", text))
@@ -246,3 +247,8 @@ def test_the_map_names_files_that_are_there(page: str) -> None:
     assert [
         name for name in sorted(named) if not any((folder / name).is_file() for folder in (PACKAGE, PACKAGE.parent))
     ] == []
+
+
+def test_the_page_of_words_is_made_of_its_table() -> None:
+    made = run_path(str(PACKAGE.parent / "tools" / "nomenclature.py"))["page"]()
+    assert (PACKAGE.parent / "docs" / "nomenclature.md").read_text(encoding="utf-8") == made
