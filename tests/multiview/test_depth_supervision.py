@@ -70,7 +70,7 @@ def test_most_lines_of_a_scene_end_at_its_surface(untrained):
     outputs: Any = untrained.datamanager.train_dataparser_outputs
     to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
     points = lines.points @ to_input[:3, :3].T + to_input[:3, 3]
-    off = np.abs(make_scene("pipes").signed_distance(points))
+    off = np.abs(make_scene("pipes").solid.signed_distance(points))
     assert np.median(off) < 0.02 and np.quantile(off, 0.9) < 0.06, np.quantile(off, [0.5, 0.9])
 
 

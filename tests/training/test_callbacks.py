@@ -168,8 +168,8 @@ def test_surroundings_are_split_where_rays_see_some_and_dropped_where_infinity_e
     assert 0 < sizes[0] < 0.5 * 6 * 48 * 48 * 12, "only what rays cross is kept"
     assert (model.seen_surroundings is not None) == there
     assert sizes[3] > sizes[2] if there else sizes[1:4] == [1, 1, 1], "a third of the way to the first change"
-    seen = model.render_rays(RayRequest(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]])), RenderOptions())[2]
-    assert (seen.surroundings is not None) == there
+    seen = model.render_rays(RayRequest(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]])), RenderOptions())
+    assert (seen.around is not None) == there
 
 
 @pytest.mark.parametrize("carve", ["auto", "off"])
