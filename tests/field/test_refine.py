@@ -35,12 +35,12 @@ def values_at(grid: VoxelGrid, points: torch.Tensor):
 def test_refinement_changes_nothing_that_a_ray_can_see(activation, factor, kept):
     grid = random_grid(activation, kept, temperature_degree=1)
     points = points_inside(grid, 1000)
-    points = points[grid.in_kept_voxel(points)]
+    points = points[grid.locate(points).kept()]
     assert len(points) > 200
     before = values_at(grid, points)
     refine(grid, factor)
     assert grid.lattice.cell_shape == (8 * factor, 8 * factor, 4 * factor)
-    assert bool(grid.in_kept_voxel(points).all())
+    assert bool(grid.locate(points).kept().all())
     for old, new in zip(before, values_at(grid, points)):
         torch.testing.assert_close(old, new, atol=2e-5, rtol=2e-5)
 
@@ -84,7 +84,7 @@ def test_pruning_copies_what_stays(kept):
     seen = values_at(grid, points[stays])
     change = prune(grid, keep)
     np.testing.assert_array_equal(grid.voxels.cells, old.cells[keep])
-    assert torch.equal(grid.in_kept_voxel(points), stays) and 50 < int(stays.sum()) < 500
+    assert torch.equal(grid.locate(points).kept(), stays) and 50 < int(stays.sum()) < 500
     assert all(torch.equal(a, b) for a, b in zip(seen, values_at(grid, points[stays])))
     for name, parameter in grid.row_parameters().items():
         where = np.searchsorted(old.corners, grid.voxels.corners)
@@ -126,7 +126,7 @@ def test_checkpoint_of_a_finer_lattice_loads_into_a_coarse_grid_with_the_same_pa
     assert coarse.density is density and coarse.lattice == fine.lattice
     assert torch.equal(coarse.density, fine.density) and torch.equal(coarse.kept, fine.kept)
     points = points_inside(coarse)
-    points = points[coarse.in_kept_voxel(points)]
+    points = points[coarse.locate(points).kept()]
     assert len(points) and torch.equal(coarse.density_at(coarse.locate(points)), fine.density_at(fine.locate(points)))
     # It has taken over a copy.
     fine.density.data += 1.0

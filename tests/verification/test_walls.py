@@ -56,7 +56,7 @@ def test_u_value_of_a_wall_squashed_in_one_direction(axis, squashed, order) -> N
     exact = 1.0 / (1.0 / 8.0 + sides[0] / CONCRETE.conductivity_w_mk + 1.0 / 25.0)
     solution = solve_steady(wall, order=order)
     flow_w = 30.0 * exact * sides[1] * sides[2]
-    assert solution.effects[0].heat_w[0] == pytest.approx(flow_w, rel=1e-6 if squashed > 1e-4 else 1e-5)
+    assert solution.effects[0].heat_w[0] == pytest.approx(flow_w, rel=1e-6 if squashed > 1e-4 else 2e-6)
     assert solution.unbalanced_w < 1e-3 * flow_w
 
 

@@ -23,7 +23,6 @@ from thermoxels_ns.core.json_values import read_json
 
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
-LOCK_FILE = "lock"
 _FORMAT = 2  # of the results; raised when they are kept in another way, so that earlier ones are made again
 _KEY_FILE, _DONE_FILE = "key.txt", "seconds.txt"
 _Record = TypeVar("_Record")

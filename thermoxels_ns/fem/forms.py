@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -46,7 +47,7 @@ def heat_transfer(u, v, w):
     return w.coefficient * u * v
 
 
-class _Boundary:
+class _Boundary(ABC):
     """Boundary triangles of a term: integrals over them by scikit-fem, and their grouping by patch.
 
     Temperatures come as differences from a reference, which keeps round-off relative to the differences. Every form
@@ -95,9 +96,9 @@ class _Boundary:
         matrix.eliminate_zeros()
         return matrix
 
+    @abstractmethod
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flux into the body at the points of integration, or even over each triangle, [W / m2]."""
-        raise NotImplementedError
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body through each triangle, shape (k,), [W]."""

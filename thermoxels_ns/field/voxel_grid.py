@@ -192,13 +192,6 @@ class VoxelGrid(nn.Module):
         basis = harmonics_with_unit_mean(directions, self.temperature_degree)
         return (coefficients * basis).sum(-1, keepdim=True)
 
-    def in_kept_voxel(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-        """Whether world positions lie in a kept voxel; outside the lattice none is kept."""
-        lo = torch.tensor(self.lattice.lo, dtype=points.dtype, device=points.device)
-        hi = torch.tensor(self.lattice.hi, dtype=points.dtype, device=points.device)
-        inside = ((points >= lo) & (points <= hi)).all(-1)
-        return inside & self.locate(points).kept()
-
     @torch.no_grad()
     def corner_values(self, rows: Float[Tensor, " rows"], fill: float = 0.0) -> Float[Tensor, "x y z"]:
         """Spread one value per stored corner over the whole lattice; `fill` at the corners of no kept voxel."""
