@@ -104,6 +104,19 @@ MECHANISMS: Mapping[str, Without] = {
         replaced=((_CALLBACKS, "mean_colours", lambda *three: np.full((len(three[2]), 3), 0.5, np.float32)),)
     ),
 }
+
+
+def _all_of(*names: str) -> Without:
+    """Several mechanisms at once: where all of them gain less than the noise, so does each."""
+    chosen = [MECHANISMS[name] for name in names]
+    return Without(sum((one.options for one in chosen), ()), sum((one.replaced for one in chosen), ()))
+
+
+MECHANISMS = {
+    **MECHANISMS,
+    "pruning-rules": _all_of("opened-rays", "opaque-neighbours", "keep-ends", "thinning"),
+    "colours-and-distortion": _all_of("mean-colours", "distortion"),
+}
 EVERYTHING = "everything"
 
 SAHAROV, ARCO = "saharov32", "arco"

@@ -13,6 +13,7 @@ from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.feature_rays import FeatureRays, FloatArray
 from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.voxel_walk import cells_crossed
 from thermoxels_ns.multiview.stereo import ERROR_PLANES, Depths
 
 BoolArray = npt.NDArray[np.bool_]
@@ -70,7 +71,7 @@ def votes(lattice: Lattice, rays: FeatureRays) -> tuple[CountArray, CountArray]:
     origins, ends = lattice.world_to_index(rays.origins), lattice.world_to_index(rays.points)
     margin = MARGIN_VOXELS + MARGIN_ERRORS * rays.uncertainty / lattice.voxel_size
     crossing, last = np.zeros(shape.prod(), np.int32), np.full(shape.prod(), -1, np.int64)
-    _walk(origins, rays.point, ends, margin, shape, crossing, last)
+    _count_crossings(origins, rays.point, ends, margin, shape, crossing, last)
     place = np.floor(ends).astype(np.int64)
     place = place[((place >= 0) & (place < shape)).all(axis=1)]
     points = np.bincount(np.ravel_multi_index(tuple(place.T), tuple(shape)), minlength=shape.prod()).astype(np.int32)
@@ -78,51 +79,22 @@ def votes(lattice: Lattice, rays: FeatureRays) -> tuple[CountArray, CountArray]:
 
 
 @kernel
-def _walk(origins, point, ends, margin, shape, crossing, last):
-    """Walk each ray from voxel to voxel (Amanatides and Woo 1987); coordinates are those of the lattice.
+def _count_crossings(origins, point, ends, margin, shape, crossing, last):
+    """Count the voxels that each ray leaves `margin` before its end; coordinates are those of the lattice.
 
-    Rays to one point stand together: each point counts once per voxel. A voxel counts that a ray leaves `margin`
-    before its end.
+    Rays to one point stand together: each point counts once per voxel.
     """
-    voxel, step = np.empty(3, np.int64), np.empty(3, np.int64)
-    leaves, across = np.empty(3), np.empty(3)
+    cells, faces = np.empty(shape.sum(), np.int64), np.empty(shape.sum() + 1)
     for n in range(len(origins)):
         along = ends[point[n]] - origins[n]
         length = np.sqrt((along * along).sum())
-        if not length > margin[n]:
+        stop = length - margin[n]
+        if not stop > 0.0:
             continue
-        first, stop = 0.0, length - margin[n]
-        for axis in range(3):
-            speed = along[axis] / length
-            if speed != 0.0:
-                low, high = -origins[n, axis] / speed, (shape[axis] - origins[n, axis]) / speed
-                first, stop = max(first, min(low, high)), min(stop, max(low, high))
-            elif not 0.0 <= origins[n, axis] < shape[axis]:
-                stop = -1.0
-        if first >= stop:
-            continue
-        for axis in range(3):
-            speed = along[axis] / length
-            at = origins[n, axis] + first * speed
-            voxel[axis] = min(max(int(np.floor(at)), 0), shape[axis] - 1)
-            step[axis] = 1 if speed > 0.0 else -1
-            across[axis] = 1.0 / abs(speed) if speed != 0.0 else np.inf
-            face = voxel[axis] + (1 if speed > 0.0 else 0)
-            leaves[axis] = (face - origins[n, axis]) / speed if speed != 0.0 else np.inf
-        while True:
-            axis = 0 if leaves[0] <= leaves[1] else 1
-            if leaves[2] < leaves[axis]:
-                axis = 2
-            if leaves[axis] > length - margin[n]:
-                break
-            cell = (voxel[0] * shape[1] + voxel[1]) * shape[2] + voxel[2]
-            if last[cell] != point[n]:
-                last[cell] = point[n]
-                crossing[cell] += 1
-            voxel[axis] += step[axis]
-            if not 0 <= voxel[axis] < shape[axis]:
-                break
-            leaves[axis] += across[axis]
+        for k in range(cells_crossed(origins[n], along / length, stop, shape, cells, faces)):
+            if faces[k + 1] <= stop and last[cells[k]] != point[n]:
+                last[cells[k]] = point[n]
+                crossing[cells[k]] += 1
 
 
 def supporting_photographs(

@@ -11,6 +11,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.core.voxel_walk import cells_crossed
 
 MOST_CAMERAS = 128  # more cameras than this are thinned out evenly, in their order
 SEEN_SHARE = 0.1
@@ -168,45 +169,18 @@ def first_solid(
     """
     found = np.empty(len(directions))
     reach = np.broadcast_to(np.asarray(reach, dtype=np.float64), len(directions))
-    _march(np.ascontiguousarray(cells), eye, directions, reach, CLEAR_OF_CAMERA, found)
+    shape = np.array(cells.shape)
+    _enter_solid(cells.ravel(), shape, eye, directions, reach, CLEAR_OF_CAMERA, found)
     return found
 
 
 @kernel
-def _march(cells, eye, directions, reach, clear, found):
-    """Walk rays from voxel to voxel (Amanatides and Woo 1987) to the first solid one, see `first_solid`."""
-    shape = np.array(cells.shape)
-    voxel, step = np.empty(3, np.int64), np.empty(3, np.int64)
-    leaves, across = np.empty(3), np.empty(3)
+def _enter_solid(cells, shape, eye, directions, reach, clear, found):
+    """Find how far rays get, see `first_solid`; `cells` is flat."""
+    crossed, faces = np.empty(shape.sum(), np.int64), np.empty(shape.sum() + 1)
     for n in range(len(directions)):
         found[n] = np.inf
-        first, last = 0.0, reach[n]
-        for axis in range(3):
-            speed = directions[n, axis]
-            if speed != 0.0:
-                low, high = -eye[axis] / speed, (shape[axis] - eye[axis]) / speed
-                first, last = max(first, min(low, high)), min(last, max(low, high))
-            elif not 0.0 <= eye[axis] < shape[axis]:
-                last = -1.0
-        if first >= last:
-            continue
-        for axis in range(3):
-            speed = directions[n, axis]
-            voxel[axis] = min(max(int(np.floor(eye[axis] + first * speed)), 0), shape[axis] - 1)
-            step[axis] = 1 if speed > 0.0 else -1
-            across[axis] = abs(1.0 / speed) if speed != 0.0 else np.inf
-            face = voxel[axis] + (1 if speed > 0.0 else 0)
-            leaves[axis] = (face - eye[axis]) / speed if speed != 0.0 else np.inf
-        entered = first
-        while entered < last:
-            axis = 0 if leaves[0] <= leaves[1] else 1
-            if leaves[2] < leaves[axis]:
-                axis = 2
-            if cells[voxel[0], voxel[1], voxel[2]] and leaves[axis] > clear:
-                found[n] = max(entered, clear)
+        for k in range(cells_crossed(eye, directions[n], reach[n], shape, crossed, faces)):
+            if cells[crossed[k]] and faces[k + 1] > clear:
+                found[n] = max(faces[k], clear)
                 break
-            entered = leaves[axis]
-            voxel[axis] += step[axis]
-            if not 0 <= voxel[axis] < shape[axis]:
-                break
-            leaves[axis] += across[axis]
