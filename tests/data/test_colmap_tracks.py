@@ -104,7 +104,7 @@ def test_the_box_too_is_found_wherever_a_model_may_lie(scene_folder, where):
     add_model(scene, where, moved=False)
     file = read_scene_file(scene.path)
     evidence = find_scene_box(file, None, range(len(NAMES)))
-    box = evidence.box(np.eye(3))
+    box = evidence.box()
     assert evidence.source == f"the points of {where}"
     assert (box[0] < POINTS.min(axis=0)).all() and (box[1] > POINTS.max(axis=0)).all()
 

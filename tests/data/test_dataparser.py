@@ -145,14 +145,14 @@ def test_points_behind_all_cameras_do_not_count(scene_folder):
     frames = read_scene_file(scene_folder(frames=1, names=["one"]).path).frames
     cloud = np.random.default_rng(0).uniform(-1, 1, (500, 3))
     behind = cloud[:200] + 3.0 * frames[0].pose[:3, 3]
-    box = box_of_points(np.concatenate([cloud, behind]), frames, np.eye(3))
+    box = box_of_points(np.concatenate([cloud, behind]), frames)
     assert (np.abs(box) < 1.2).all() and (np.abs(box) > 1.0).all()
 
 
 def test_box_from_cameras_is_where_they_look(scene_folder):
     scene = scene_folder(scene_box=None)
     frames = read_scene_file(scene.path).frames
-    box = box_of_cameras(frames, np.eye(3))
+    box = box_of_cameras(frames)
     distance = np.sqrt(17.0)
     np.testing.assert_allclose(box, np.outer([-1, 1], np.full(3, distance * 24 / (1.1 * 24) / 2)), atol=1e-9)
     torch.testing.assert_close(parse(scene.path).scene_box.aabb, torch.tensor([[-1.0] * 3, [1.0] * 3]))

@@ -243,15 +243,14 @@ class ThermalDataParser(DataParser):
 
 def _place(evidence: BoxEvidence) -> tuple[_World, SceneBox, tuple[tuple[float, ...], ...], float]:
     """Choose origin and scale, and express the scene box and a pixel's width in the new world."""
-    axes = np.eye(3)
-    box = evidence.box(axes)
+    box = evidence.box()
     translation, longest = -box.mean(axis=0), float((box[1] - box[0]).max())
     if np.abs(box).max() > _FAR_SIDES * longest:
         # As nerfstudio keeps it for the way back: five million metres from the origin that is off by half a metre.
         translation = translation.astype(np.float32).astype(np.float64)
     scale = SCENE_SIZE / longest
     placed = SceneBox(aabb=torch.from_numpy((scale * (box + translation)).astype(np.float32)))
-    return _World(translation, scale), placed, tuple(map(tuple, box.tolist())), scale * evidence.pixel_size(box, axes)
+    return _World(translation, scale), placed, tuple(map(tuple, box.tolist())), scale * evidence.pixel_size(box)
 
 
 def _share_that_meets(frames: list[Frame], world: _World, box: SceneBox, source: str) -> float:

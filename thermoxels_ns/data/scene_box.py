@@ -54,19 +54,19 @@ class BoxEvidence:
     points: FloatArray | None = None
     tail: float = _TAIL_OF_POINTS
 
-    def box(self, rotation: FloatArray) -> Box:
-        """The box, axis-parallel after the world's `rotation`.
+    def box(self) -> Box:
+        """The box.
 
         Raises:
             SceneError: It has no volume, or what there is does not tell it.
         """
         if self.corners is not None:
-            return _rotated(self.corners, rotation)
+            return self.corners
         if self.points is not None:
-            return box_of_points(self.points, self.frames, rotation, self.tail)
-        return box_of_cameras(self.frames, rotation)
+            return box_of_points(self.points, self.frames, self.tail)
+        return box_of_cameras(self.frames)
 
-    def pixel_size(self, box: Box, rotation: FloatArray) -> float:
+    def pixel_size(self, box: Box) -> float:
         """Width of a photograph's pixel where most of what is seen in the box stands, in input units.
 
         The median over what photographs see of the points in the box; without points, what a pixel covers in the nearer
@@ -74,12 +74,11 @@ class BoxEvidence:
         """
         low, high = box
         if self.points is not None:
-            inside = ((self.points @ rotation.T >= low) & (self.points @ rotation.T <= high)).all(axis=1)
-            points, quantile = self.points[inside], 0.5
+            points, quantile = self.points[((self.points >= low) & (self.points <= high)).all(axis=1)], 0.5
         else:
             steps = (np.arange(_PROBES) + 0.5) / _PROBES
             grid = np.stack(np.meshgrid(*3 * [steps], indexing="ij"), axis=-1).reshape(-1, 3)
-            points, quantile = (low + grid * (high - low)) @ rotation, _NEARER_HALF
+            points, quantile = low + grid * (high - low), _NEARER_HALF
         frames = [f for f in _spread(self.frames, _MOST_PHOTOGRAPHS) if f.intrinsics.lens == "perspective"]
         if not frames or not len(points):
             return float("inf")
@@ -142,12 +141,10 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
     return stereo.feature_rays_to_depths(depths).points, len(frames)
 
 
-def box_of_points(
-    points: FloatArray, frames: Sequence[Frame], rotation: FloatArray, tail: float = _TAIL_OF_POINTS
-) -> Box:
+def box_of_points(points: FloatArray, frames: Sequence[Frame], tail: float = _TAIL_OF_POINTS) -> Box:
     """Enclose what photographs show close up of points (n, 3) in input coordinates.
 
-    Per axis of the rotated world all but `tail` [%] of them at either end, and 8 % of the longest extent more on every
+    Per axis all but `tail` [%] of them at either end, and 8 % of the longest extent more on every
     side (parts without texture have no points, and a flat scene keeps some depth). Points that are not finite or in no
     photograph's view do not count; nor do those that lie far behind others, or that few photographs have in view, where
     they cost too much, see `_worth_keeping`. A ground that runs on belongs to what is seen. A photograph with hardly
@@ -157,7 +154,7 @@ def box_of_points(
     points, frames = points[:: max(len(points) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
     depth = _depths_in_view(points, frames)
     seen = np.isfinite(depth).any(axis=0)
-    points, depth = points[seen] @ rotation.T, depth[:, seen]
+    points, depth = points[seen], depth[:, seen]
     for figure in (_rarity, _distance_behind) if len(points) >= _FEWEST_POINTS else ():
         kept = _worth_keeping(points, depth, figure(depth), tail)
         points, depth = points[kept], depth[:, kept]
@@ -170,7 +167,7 @@ def box_of_points(
     few = shown < _FEW_IN_VIEW * shown.max()
     if few.any():
         ahead = np.median([np.nanmedian(row) for row in depth[~few]])
-        ends = np.stack([f.pose[:3, 3] - ahead * f.pose[:3, 2] for f, blind in zip(frames, few) if blind]) @ rotation.T
+        ends = np.stack([f.pose[:3, 3] - ahead * f.pose[:3, 2] for f, blind in zip(frames, few) if blind])
         low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
     # Rounded outwards: another processor, on which a few depths differ, shall find the same.
     step = _ROUNDED * 2.0 ** np.floor(np.log2(max((high - low).max(), 1e-300)))
@@ -228,7 +225,7 @@ def _spread(frames: Sequence[Frame], most: int) -> list[Frame]:
     return [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))]
 
 
-def box_of_cameras(frames: Sequence[Frame], rotation: FloatArray) -> Box:
+def box_of_cameras(frames: Sequence[Frame]) -> Box:
     """Guess a cube from the cameras alone.
 
     Where they look at one place: its centre is the point nearest to all optical axes (least squares), half its side the
@@ -238,39 +235,21 @@ def box_of_cameras(frames: Sequence[Frame], rotation: FloatArray) -> Box:
     Raises:
         SceneError: All look into one direction, or outwards from one place.
     """
-    looked_at = _looked_at(frames, rotation)
-    if looked_at is None:
-        raise SceneError("scene box", expected="cameras that look at one place", got="parallel views", remedy=_REMEDY)
-    if looked_at[1] > 0.0:
-        return _checked(_cube(*looked_at), "box of the cameras")
-    origins = np.stack([rotation @ frame.pose[:3, 3] for frame in frames])
-    low, high = origins.min(axis=0), origins.max(axis=0)
-    return _checked(_cube(0.5 * (low + high), 2.0 * (high - low).max()), "box of the cameras")
-
-
-def _looked_at(frames: Sequence[Frame], rotation: FloatArray) -> tuple[FloatArray, float] | None:
-    """The point nearest to all optical axes, and half the width of what an average photograph shows at its distance.
-
-    The width is 0 where cameras look outwards; None where all look into one direction.
-    """
-    poses = np.stack([rotation @ frame.pose[:3] for frame in frames])
-    axes, origins = -poses[:, :, 2], poses[:, :, 3]
+    axes, origins = (np.stack([frame.pose[:3, column] for frame in frames]) for column in (2, 3))
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal = across.mean(axis=0)
     if np.linalg.eigvalsh(normal)[0] < 1e-3:  # mean squared sine of the angle to a common direction
-        return None
+        raise SceneError("scene box", expected="cameras that look at one place", got="parallel views", remedy=_REMEDY)
     centre = np.linalg.solve(normal, np.einsum("nij,nj->i", across, origins) / len(frames))
-    depth = ((centre - origins) * axes).sum(axis=1)
-    if np.median(depth) <= _CONVERGING * np.sqrt(((origins - origins.mean(axis=0)) ** 2).sum(axis=1).mean()):
-        return centre, 0.0
-    half_view = np.array(
-        [max(f.intrinsics.width / f.intrinsics.fl_x, f.intrinsics.height / f.intrinsics.fl_y) / 2 for f in frames]
-    )
-    return centre, float(np.median(depth[depth > 0] * half_view[depth > 0]))
-
-
-def _cube(centre: FloatArray, half: float) -> Box:
-    return np.stack([centre - half, centre + half])
+    depth = ((origins - centre) * axes).sum(axis=1)
+    if np.median(depth) > _CONVERGING * np.sqrt(((origins - origins.mean(axis=0)) ** 2).sum(axis=1).mean()):
+        views = [f.intrinsics for f in frames]
+        widths = np.array([max(v.width / v.fl_x, v.height / v.fl_y) for v in views])
+        half = float(np.median(0.5 * (depth * widths)[depth > 0.0]))
+    else:
+        low, high = origins.min(axis=0), origins.max(axis=0)
+        centre, half = 0.5 * (low + high), 2.0 * (high - low).max()
+    return _checked(np.stack([centre - half, centre + half]), "box of the cameras")
 
 
 def _checked(corners: Any, name: str) -> Box:
@@ -286,13 +265,6 @@ def _checked(corners: Any, name: str) -> Box:
     if not good:
         raise SceneError(name, expected=expected, got=corners, remedy=_REMEDY)
     return box
-
-
-def _rotated(box: Box, rotation: npt.NDArray[np.float64]) -> Box:
-    """Axis-parallel hull of a rotated box."""
-    centre = rotation @ box.mean(axis=0)
-    half = np.abs(rotation) @ (0.5 * (box[1] - box[0]))
-    return np.stack([centre - half, centre + half])
 
 
 def _read_ply(path: Path) -> npt.NDArray[np.float64]:
