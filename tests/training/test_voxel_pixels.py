@@ -18,13 +18,16 @@ from thermoxels_ns.training.model_config import MOST_VOXELS, ThermoxelsModelConf
         (113.0, (32, 64, 128)),
         (128.0, (32, 64, 128)),
         (160.0, (40, 80, 160)),
-        (5000.0, (48, 96, 192)),
-        (1.0, (8, 16, 32)),
+        (220.0, (56, 112, 224)),
+        (300.0, (40, 80, 160, 320)),
+        (5000.0, (48, 96, 192, 384)),
+        (50.0, (48,)),
+        (1.0, (8,)),
     ],
 )
-def test_resolutions_grow_and_shrink_alike_and_up_to_a_limit(voxels, expected):
+def test_resolutions_follow_the_photographs_up_to_a_limit(voxels, expected):
     config = ThermoxelsModelConfig(voxel_pixels=2.0).suited_to(voxels)
-    assert config.resolutions == expected
+    assert config.resolutions == expected and max(config.prune_at) < config.thin_at[0]
     config.check()
     assert config.resolutions[-1] <= MOST_VOXELS * 128
 
@@ -35,7 +38,7 @@ def test_resolutions_stay_where_nothing_is_asked_or_known(pixels, voxels):
 
 
 @pytest.mark.parametrize(
-    ("pixel_size", "expected"), [(2.0 / 160 / 1.6, (40, 80, 160)), (1e-6, (48, 96, 192)), (None, (32, 64, 128))]
+    ("pixel_size", "expected"), [(2.0 / 160 / 1.6, (40, 80, 160)), (1e-6, (48, 96, 192, 384)), (None, (32, 64, 128))]
 )
 def test_a_model_has_the_voxels_that_its_photographs_ask_for(pixel_size, expected):
     metadata = {"temperature_range": TemperatureRange(10.0, 30.0)}

@@ -14,10 +14,10 @@ from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.field.harmonics import MAX_DEGREE, num_coefficients
 from thermoxels_ns.field.voxel_grid import DensityActivation
 from thermoxels_ns.render.renderers import Backend
-from thermoxels_ns.training.schedule import QUALITIES, schedule_for
+from thermoxels_ns.training.schedule import COARSEST, QUALITIES, schedule_for
 
 _STANDARD = schedule_for(*QUALITIES["standard"])
-MOST_VOXELS = 1.5  # Voxels along the longest side that a scene may ask for, relative to the last of the resolutions
+MOST_VOXELS = 3.0  # Voxels along the longest side that a scene may ask for, relative to the last of the resolutions
 STEP_OF_COARSEST = 8  # Of so many voxels the coarsest resolution is a multiple
 
 
@@ -70,12 +70,15 @@ class ThermoxelsModelConfig(ModelConfig):
 
     resolutions: tuple[int, ...] = _STANDARD.resolutions
     """Voxels along the longest side of the scene box, coarse to fine; each a multiple of the one before. Unless they
-    are typed, voxel-pixels replaces them by up to one and a half times as many."""
+    are typed, voxel-pixels replaces them by up to three times as many."""
     voxel_pixels: float = 0.0
     """Width of the finest voxels in pixels of the photographs, where most of what they show stands. Finer ones follow
     noise, coarser ones cannot hold the shape. 0: as resolutions says."""
     refine_at: tuple[int, ...] = _STANDARD.refine_at
     """Steps at which the next resolution begins; one fewer than resolutions."""
+    steps: int = _STANDARD.steps
+    """Steps of a whole training, over which refine-at and prune-at are spread where voxel-pixels asks for another
+    number of resolutions."""
     prune_at: tuple[int, ...] = _STANDARD.prune_at
     """Further steps at which voxels that no ray gives weight to are dropped (done at every refinement too)."""
     prune_threshold: float = 0.03
@@ -222,16 +225,21 @@ class ThermoxelsModelConfig(ModelConfig):
     def suited_to(self, voxels: float) -> ThermoxelsModelConfig:
         """The settings for a scene along whose longest side that many voxels of `voxel_pixels` stand.
 
-        All resolutions grow or shrink alike, and at most to `MOST_VOXELS` times as many. They are rounded up, unless
+        There are at most `MOST_VOXELS` times as many as the last of the resolutions. Their number is rounded up, unless
         less than a quarter of a step would be added: fewer voxels cost more than they save (courtyard: F 0.81, 0.86 and
         0.89 of what is seen with 96, 112 and 128 voxels).
         """
         if not self.voxel_pixels or not math.isfinite(voxels):
             return self
-        first, last = self.resolutions[0], self.resolutions[-1]
-        wanted = min(voxels, MOST_VOXELS * last) * first / last
-        coarsest = STEP_OF_COARSEST * max(1, math.ceil(wanted / STEP_OF_COARSEST - 0.25))
-        return replace(self, resolutions=tuple(coarsest * each // first for each in self.resolutions))
+        wanted, splits = min(voxels, MOST_VOXELS * self.resolutions[-1]), 0
+        while STEP_OF_COARSEST * round(wanted / 2 ** (splits + 1) / STEP_OF_COARSEST) >= COARSEST:
+            splits += 1
+        finest = 2**splits * STEP_OF_COARSEST * max(1, math.ceil(wanted / 2**splits / STEP_OF_COARSEST - 0.25))
+        schedule = schedule_for(finest, self.steps)
+        if len(schedule.resolutions) == len(self.resolutions):
+            return replace(self, resolutions=schedule.resolutions)
+        at = schedule.refine_at, schedule.prune_at
+        return replace(self, resolutions=schedule.resolutions, refine_at=at[0], prune_at=at[1])
 
     def first_sh_degree(self) -> int | None:
         """Degree of colour that a training stores at its beginning: 0 until colour depends on the direction."""

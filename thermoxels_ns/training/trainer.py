@@ -36,6 +36,7 @@ _SCHEDULE = (
     "resolutions",
     "refine_at",
     "prune_at",
+    "steps",
     "thin_at",
     "distortion_ramp",
     "view_dependence_from",
@@ -207,7 +208,8 @@ class ThermoxelsTrainer(Trainer):
         kept: Any = deepcopy(self.config)
         pipeline: Any = getattr(self.pipeline, "module", self.pipeline)
         model, parser = kept.pipeline.model, kept.pipeline.datamanager.dataparser
-        model.resolutions, model.voxel_pixels = pipeline.model.config.resolutions, 0.0
+        found, model.voxel_pixels = pipeline.model.config, 0.0
+        model.resolutions, model.refine_at, model.prune_at = found.resolutions, found.refine_at, found.prune_at
         if (box := pipeline.datamanager.train_dataparser_outputs.metadata.get("input_box")) is not None:
             parser.scene_box = box
         with plain_os_errors(self.base_dir), replace_when_done(self.base_dir / "config.yml") as path:
