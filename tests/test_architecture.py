@@ -50,7 +50,7 @@ NEVER = {
     "radiometry": RADIANCE | DRAWING | HEAT,
     "data": DRAWING | HEAT,
     "capture": {"nerfstudio"} | DRAWING | HEAT,
-    "multiview": DRAWING | HEAT,
+    "multiview": {"nerfstudio"} | DRAWING | HEAT,
     "field": {"nerfstudio"} | DRAWING | HEAT,
     "render": {"nerfstudio"} | DRAWING | HEAT,
     "training": DRAWING | HEAT,

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from tests.support.plane_photographs import EYES, FOCAL, PLANE, SIZE, photographs, texture
 from thermoxels_ns.core.threads import set_num_threads
+from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.multiview import stereo
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs
 from thermoxels_ns.multiview.stereo import FEWEST_VIEWS, Depths, depths_of, feature_rays_to_depths
@@ -229,12 +231,12 @@ def test_depths_of_a_room_from_within_lie_on_its_walls():
     assert np.quantile(off, 0.9) < 0.05, np.quantile(off, [0.5, 0.9])
 
 
-class Frames:
+class Frames(ThermalDataset):
     """A dataset of pictures whose red and green say where a pixel's ray goes: x and y on the plane at depth 1."""
 
     def __init__(self, width: int, height: int, distortion: list[float] | None, masked: bool = False):
         focal, kinds = 0.8 * width, CameraType.PERSPECTIVE
-        self.thermal_cameras = object()  # of their own
+        self.thermal_cameras: Any = object()  # of their own
         poses = torch.eye(4)[None, :3].repeat(40, 1, 1)
         poses[:, 0, 3] = torch.arange(40.0)
         lens = None if distortion is None else torch.tensor([distortion])
@@ -245,6 +247,9 @@ class Frames:
         x, y = directions[..., 0] / -directions[..., 2], directions[..., 1] / -directions[..., 2]
         picture = torch.stack((0.5 + 0.4 * x, 0.5 + 0.4 * y, torch.zeros_like(x)), -1)
         self.picture, self.masked = (255 * picture).round().to(torch.uint8), masked
+
+    def __len__(self) -> int:
+        return len(self.cameras)
 
     def get_image_uint8(self, index: int) -> torch.Tensor:
         return self.picture

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.multiview.votes import FEWEST_POINTS, MARGIN_VOXELS, air_voxels, around_cameras, votes
 from thermoxels_ns.synthetic.camera_rings import look_at
 
@@ -135,10 +135,10 @@ def test_a_walk_meets_every_voxel_on_a_ray_and_no_other() -> None:
 def two_cameras(apart: float = 0.4, wall: float = 2.0, points: int = 200):
     """Side by side before a wall at x = `wall`, and what they see of it."""
     eyes = [np.array([0.0, y, 0.0]) for y in (-0.5 * apart, 0.5 * apart)]
-    camera = Camera(100, 100, 100.0, 100.0, 50.0, 50.0)  # 53 degrees wide
     shown = np.random.default_rng(0).uniform(-0.5, 0.5, (points, 3))
     shown[:, 0] = wall
-    return lines(eyes, shown), [(camera, look_at(eye, (1.0, eye[1], 0.0))) for eye in eyes]
+    poses = np.stack([look_at(eye, (1.0, eye[1], 0.0))[:3] for eye in eyes])
+    return lines(eyes, shown), Views(poses, *(np.full((2, 2), n) for n in (100.0, 50.0, 100)))
 
 
 def test_where_a_camera_was_held_is_air_but_where_two_photographs_look():

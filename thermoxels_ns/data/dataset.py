@@ -9,12 +9,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from jaxtyping import Bool, Float
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from torch import Tensor
 
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH
@@ -48,6 +49,22 @@ class ThermalDataset(InputDataset):
     def shares_camera(self) -> bool:
         """True where one ray carries a colour and a temperature."""
         return self.thermal_cameras is None
+
+    def camera(self, image_idx: int, thermal: bool = False) -> Camera | None:
+        """Camera of a photograph, or of its thermal image where that has one of its own; None unless perspective."""
+        cameras: Any = self.thermal_cameras if thermal else self.cameras
+        if int(cameras.camera_type[image_idx]) != CameraType.PERSPECTIVE.value:
+            return None
+        width, height = (int(getattr(cameras, name)[image_idx]) for name in ("width", "height"))
+        fx, fy, cx, cy = (float(getattr(cameras, name)[image_idx]) for name in ("fx", "fy", "cx", "cy"))
+        lens = [] if cameras.distortion_params is None else cameras.distortion_params[image_idx].tolist()
+        named: dict[str, Any] = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), lens))
+        return Camera(width, height, fx, fy, cx, cy, **named)
+
+    def pose(self, image_idx: int, thermal: bool = False) -> npt.NDArray[np.float64]:
+        """Pose of that camera, camera to world, OpenGL axes, shape (3, 4)."""
+        cameras: Any = self.thermal_cameras if thermal else self.cameras
+        return cameras.camera_to_worlds[image_idx].double().numpy()
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """Load a photograph at the resolution of its camera, shape (h, w, 3)."""

@@ -13,8 +13,6 @@ from PIL import Image
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.scene_file import Frame, SceneFile
-from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH
-from thermoxels_ns.radiometry.decoders import errors_name
 
 PoseSource = Literal["auto", "given"]
 
@@ -79,15 +77,10 @@ def refine_poses(
 
 def _picture(frame: Frame) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_] | None, Camera]:
     """A photograph in grey of at most `LONGEST_SIDE` pixels, its mask, and its camera at that size."""
-    with errors_name(frame.image, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(frame.image) as opened:
-        opened.draft("L", (LONGEST_SIDE, LONGEST_SIDE))  # a large JPEG is decoded at a part of its size
-        grey = opened.convert("L")
+    grey, mask = frame.read_picture("L", LONGEST_SIDE)
     factor = LONGEST_SIDE / max(grey.size)
     if factor < 1.0:
-        size = tuple(max(1, round(factor * side)) for side in grey.size)
-        grey = grey.resize((size[0], size[1]), Image.Resampling.BOX)
-    mask = None
-    if frame.mask is not None:
-        with errors_name(frame.mask, "a readable mask", "Write the mask again."), Image.open(frame.mask) as opened:
-            mask = np.array(opened.convert("L").resize(grey.size, Image.Resampling.NEAREST)) > 0
-    return np.array(grey), mask, frame.intrinsics.resized(*grey.size)
+        size = (max(1, round(factor * grey.size[0])), max(1, round(factor * grey.size[1])))
+        grey, mask = grey.resize(size, Image.Resampling.BOX), mask and mask.resize(size, Image.Resampling.NEAREST)
+    use = None if mask is None else np.array(mask) > 0
+    return np.array(grey), use, frame.intrinsics.resized(*grey.size)

@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.data.tracks import COLMAP_FOLDERS, read_model
-from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH, read_pose
-from thermoxels_ns.radiometry.decoders import errors_name
+from thermoxels_ns.data.transforms_json import read_pose
 
 FloatArray = npt.NDArray[np.float64]
 Box = FloatArray  # Lowest and highest corner, shape (2, 3)
@@ -126,15 +124,9 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
         return np.zeros((0, 3)), 0
     pinholes = []
     for frame in frames:
-        with errors_name(frame.image, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(frame.image) as opened:
-            opened.draft("RGB", (2 * _STEREO_SIDE, 2 * _STEREO_SIDE))  # a large JPEG is decoded at a part of its size
-            picture = np.array(opened.convert("RGB"))
-        mask = None
-        if frame.mask is not None:
-            with errors_name(frame.mask, "a readable mask", "Write the mask again."), Image.open(frame.mask) as opened:
-                mask = np.array(opened.convert("L").resize(picture.shape[1::-1], Image.Resampling.NEAREST)) > 0
-        camera = frame.intrinsics.resized(picture.shape[1], picture.shape[0])
-        pinholes.append(photographs.pinhole(picture, mask, camera, frame.pose, _STEREO_SIDE))
+        picture, shown = frame.read_picture("RGB", 2 * _STEREO_SIDE)
+        mask, camera = None if shown is None else np.array(shown) > 0, frame.intrinsics.resized(*picture.size)
+        pinholes.append(photographs.pinhole(np.array(picture), mask, camera, frame.pose, _STEREO_SIDE))
     seen = photographs.gathered(pinholes, [frame.pose[:3, 3] for frame in frames])
     depths = stereo.depths_of(seen, views_to_contradict=0)  # a stray costs the box more than a depth that is lacking
     depths = stereo.depths_before_backdrop(depths)[0]

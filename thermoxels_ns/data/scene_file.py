@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import is_number, plain_os_errors
@@ -16,7 +17,8 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.data.scene_scale import scale_from_scene_file, up_from_scene_file
-from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
+from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH, read_intrinsics, read_pose
+from thermoxels_ns.radiometry.decoders import errors_name
 from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES, ThermalUnit
 
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")
@@ -37,6 +39,22 @@ class Frame:
     thermal_pose: npt.NDArray[np.float64] | None  # pose of the thermal camera; None: the photograph's
     thermal_intrinsics: Camera | None
     """The thermal camera's own projection; None: the photograph's at the thermal image's resolution."""
+
+    def read_picture(self, mode: Literal["RGB", "L"], longest_side: int) -> tuple[Image.Image, Image.Image | None]:
+        """Read the photograph in colour or grey, and the mask at the photograph's size, None where there is none.
+
+        A large JPEG is decoded at a part of its size that is no smaller than `longest_side` [pixels].
+
+        Raises:
+            SceneError: A file cannot be read.
+        """
+        with errors_name(self.image, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(self.image) as opened:
+            opened.draft(mode, (longest_side, longest_side))
+            picture = opened.convert(mode)
+        if self.mask is None:
+            return picture, None
+        with errors_name(self.mask, "a readable mask", "Write the mask again."), Image.open(self.mask) as opened:
+            return picture, opened.convert("L").resize(picture.size, Image.Resampling.NEAREST)
 
 
 @dataclass(frozen=True)

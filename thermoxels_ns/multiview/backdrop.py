@@ -81,14 +81,11 @@ def backdrop_without_walls(
     origins, along = photographs.of_pixels(chosen)
     points = origins + depth[chosen, None] * along
     surface, empty = (np.zeros(len(chosen), dtype=np.int64) for _ in range(2))
-    for matrix, (width, height), first in zip(photographs.matrices, photographs.sizes, photographs.firsts):
-        x, y, z = matrix[:, :3] @ points.T + matrix[:, 3:]
-        scale = 1.0 / np.where(z > 0.0, z, np.inf)
-        shown = (z > 0.0) & (x >= 0.0) & (y >= 0.0) & (x * scale < width) & (y * scale < height)
-        pixel = first + ((y * scale).astype(np.int64) * width + (x * scale).astype(np.int64))[shown]
-        free = ~(depth[pixel] < z[shown] - tolerance)
-        surface[shown] += free & ~backdrop[pixel]
-        empty[shown] += free & backdrop[pixel]
+    for number in range(len(photographs)):
+        pixel, far, shown = photographs.shown(number, points)
+        free = shown & ~(depth[pixel] < far - tolerance)
+        surface += free & ~backdrop[pixel]
+        empty += free & backdrop[pixel]
     kept = backdrop.copy()
     kept[chosen[surface >= VOTES * empty]] = False
     return kept
@@ -182,15 +179,12 @@ def mean_colours(
     Where all photographs show the backdrop or none shows the point, it is the mean over all other pixels.
     """
     shown = np.isfinite(photographs.colours).all(1) & ~backdrop
-    colours = np.where(shown[:, None], photographs.colours, 0.0)
+    colours = photographs.colours
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))
-    for matrix, (width, height), first in zip(photographs.matrices, photographs.sizes, photographs.firsts):
-        seen = points @ matrix[:, :3].T + matrix[:, 3]
-        (front,) = np.nonzero(seen[:, 2] > photographs.near)
-        place = np.floor(seen[front, :2] / seen[front, 2:]).astype(np.int64)
-        inside = ((place >= 0) & (place < (width, height))).all(1)
-        front, pixel = front[inside], first + place[inside, 1] * width + place[inside, 0]
-        total[front] += colours[pixel]
-        count[front] += shown[pixel]
-    everywhere = colours.sum(0) / max(1, shown.sum())
+    for number in range(len(photographs)):
+        pixel, far, inside = photographs.shown(number, points)
+        inside &= (far > photographs.near) & shown[pixel]
+        total[inside] += colours[pixel[inside]]
+        count += inside
+    everywhere = colours[shown].mean(0) if shown.any() else np.zeros(3)
     return np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], everywhere).astype(np.float32)

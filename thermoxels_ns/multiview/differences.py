@@ -87,7 +87,7 @@ def photograph_differences(depths: Depths, thermal: npt.NDArray[np.float32]) -> 
         for b in range(count):
             if a == b:
                 continue
-            pixel, far, inside = _pixels(photographs, b, points)
+            pixel, far, inside = photographs.shown(b, points)
             with np.errstate(invalid="ignore"):
                 same = np.abs(depths.depth[pixel] - far) <= TOLERANCE * (depths.error[pixel] + depths.error[own])
             met = inside & same
@@ -109,19 +109,6 @@ def photograph_differences(depths: Depths, thermal: npt.NDArray[np.float32]) -> 
         for channel in range(4):
             solved[:, channel], error[:, channel] = _solve(pairs, off[:, channel], weights[:, channel], count)
     return Differences(solved[:, :3], error[:, :3], solved[:, 3], error[:, 3])
-
-
-def _pixels(
-    photographs: Photographs, number: int, points: FloatArray
-) -> tuple[npt.NDArray[np.int64], FloatArray, npt.NDArray[np.bool_]]:
-    """Pixels of a photograph that show points (n, 3), their depths, and whether they lie in the picture."""
-    matrix, (width, height) = photographs.matrices[number], photographs.sizes[number]
-    seen = points @ matrix[:, :3].T + matrix[:, 3]
-    far = seen[:, 2]
-    place = np.floor(seen[:, :2] / np.where(far > 0.0, far, np.inf)[:, None]).astype(np.int64)
-    inside = (far > 0.0) & ((place >= 0) & (place < (width, height))).all(1)
-    place = np.where(inside[:, None], place, 0)
-    return photographs.firsts[number] + place[:, 1] * width + place[:, 0], far, inside
 
 
 def _solve(

@@ -9,7 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from thermoxels_ns.core.camera import Camera
 
@@ -50,6 +49,20 @@ class Photographs:
         pixel = np.column_stack((place % width + 0.5, place // width + 0.5, np.ones(len(chosen))))
         return self.centres[number], np.einsum("nij,nj->ni", np.linalg.inv(self.matrices[:, :, :3])[number], pixel)
 
+    def shown(
+        self, number: int, points: npt.NDArray[np.float64]
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        """Pixels of one photograph that show points (n, 3), their depths there, and whether the photograph shows them.
+
+        A point that it does not show has the photograph's first pixel.
+        """
+        seen = points @ self.matrices[number, :, :3].T + self.matrices[number, :, 3]
+        depth = seen[:, 2]
+        place = np.floor(seen[:, :2] / np.where(depth > 0.0, depth, np.inf)[:, None]).astype(np.int64)
+        inside = (depth > 0.0) & ((place >= 0) & (place < self.sizes[number])).all(1)
+        place[~inside] = 0
+        return self.firsts[number] + place[:, 1] * self.sizes[number, 0] + place[:, 0], depth, inside
+
 
 def read_photographs(
     dataset: Any, near: float = 0.0, most: int = MOST_PHOTOGRAPHS, longest_side: int = LONGEST_SIDE
@@ -59,15 +72,13 @@ def read_photographs(
     Of more than `most`, that many are taken at equal distances in the list; those with a side longer than
     `longest_side` [pixels] are averaged down. None if there are none of perspective cameras.
     """
-    cameras = dataset.cameras.to("cpu")
-    usable = np.flatnonzero(cameras.camera_type.numpy().reshape(-1) == CameraType.PERSPECTIVE.value)
+    usable = np.flatnonzero([dataset.camera(index) is not None for index in range(len(dataset))])
     if len(usable) > most:
         usable = usable[np.linspace(0, len(usable) - 1, most).round().astype(int)]
     if not len(usable):
         return None
-    pinholes = [_photograph(dataset, cameras, int(index), longest_side) for index in usable]
-    seen = gathered(pinholes, cameras.camera_to_worlds[usable, :, 3].double().numpy(), near)
-    return replace(seen, index=usable)
+    pinholes = [_photograph(dataset, int(index), longest_side) for index in usable]
+    return replace(gathered(pinholes, [dataset.pose(index)[:, 3] for index in usable], near), index=usable)
 
 
 Pinhole = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.float64]]
@@ -89,11 +100,9 @@ def gathered(pinholes: Sequence[Pinhole], centres: npt.ArrayLike, near: float = 
     )
 
 
-def _photograph(dataset: Any, cameras: Cameras, index: int, longest_side: int) -> Pinhole:
+def _photograph(dataset: Any, index: int, longest_side: int) -> Pinhole:
     picture, mask = dataset.get_image_uint8(index).numpy(), dataset.get_mask(index)
-    camera = camera_at(cameras, index)
-    pose = np.asarray(cameras.camera_to_worlds[index], dtype=np.float64)
-    thermal = None
+    camera, pose, thermal = dataset.camera(index), dataset.pose(index), None
     if dataset.thermal_cameras is None:
         warm, valid = (values.numpy()[..., 0] for values in dataset.get_thermal(index))
         thermal = np.where(valid, warm, np.nan).astype(np.float32)
@@ -108,14 +117,14 @@ def thermal_at(dataset: Any, photographs: Photographs, depth: npt.NDArray[np.flo
     """
     if dataset.thermal_cameras is None:
         return photographs.thermal
-    cameras, found = dataset.thermal_cameras.to("cpu"), np.full(len(depth), np.nan, np.float32)
+    found = np.full(len(depth), np.nan, np.float32)
     (sure,) = np.nonzero(np.isfinite(depth))
     assert photographs.index is not None
     origins, along = photographs.of_pixels(sure)
     points, number = origins + depth[sure, None] * along, photographs.numbers[sure]
     for place, index in enumerate(photographs.index.tolist()):
-        camera, own = camera_at(cameras, index), number == place
-        pixels = camera.project_world(np.asarray(cameras.camera_to_worlds[index], dtype=np.float64), points[own])
+        camera, own = dataset.camera(index, thermal=True), number == place
+        pixels = camera.project_world(dataset.pose(index, thermal=True), points[own])
         warm, valid = (values.numpy()[..., 0] for values in dataset.get_thermal(index))
         shown = camera.contains(pixels)
         column, row = (
@@ -124,14 +133,6 @@ def thermal_at(dataset: Any, photographs: Photographs, depth: npt.NDArray[np.flo
         )
         found[sure[own]] = np.where(shown & valid[row, column], warm[row, column], np.nan)
     return found
-
-
-def camera_at(cameras: Cameras, index: int) -> Camera:
-    """One of nerfstudio's perspective cameras."""
-    distortion = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[index].double().tolist()
-    named: dict[str, Any] = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion))
-    fx, fy, cx, cy = (float(getattr(cameras, name)[index, 0]) for name in ("fx", "fy", "cx", "cy"))
-    return Camera(int(cameras.width[index, 0]), int(cameras.height[index, 0]), fx, fy, cx, cy, **named)
 
 
 def pinhole(

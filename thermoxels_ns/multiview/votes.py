@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.feature_rays import FeatureRays, FloatArray
 from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.core.voxel_walk import cells_crossed
 from thermoxels_ns.multiview.stereo import ERROR_PLANES, Depths
 
@@ -27,8 +25,6 @@ FEWEST_RAYS = 20  # Feature rays of a camera that tell what it shows
 _NEAREST = 1.0  # Percentile of their lengths that is the nearest: a few may be wrong
 REACH = 1.5  # Distance from a surface up to which a depth or a track's point lies on it, [voxels]
 REACH_ERRORS = 2.0  # Standard errors of a depth that are added
-
-View = tuple[Camera, FloatArray]  # A photograph's camera and pose (camera to world, OpenGL axes, (3, 4) or (4, 4))
 
 
 def air_voxels(lattice: Lattice, rays: FeatureRays) -> BoolArray:
@@ -45,7 +41,7 @@ def air_voxels(lattice: Lattice, rays: FeatureRays) -> BoolArray:
     return np.asarray(ndimage.binary_erosion(free, border_value=1), dtype=np.bool_)
 
 
-def around_cameras(points: FloatArray, rays: FeatureRays, views: Sequence[View]) -> BoolArray:
+def around_cameras(points: FloatArray, rays: FeatureRays, views: Views) -> BoolArray:
     """Which points (n, 3) are much nearer to a camera than what it shows, and in view of fewer than two photographs.
 
     What no second photograph shows, no training ray contradicts, and a lump there hides what stands behind it from
@@ -59,8 +55,10 @@ def around_cameras(points: FloatArray, rays: FeatureRays, views: Sequence[View])
         if len(own) >= FEWEST_RAYS:
             near |= np.linalg.norm(points - origin, axis=1) < CLEARANCE * np.percentile(own, _NEAREST)
     shown, (left,) = np.zeros(len(points), dtype=np.int64), np.nonzero(near)
-    for camera, pose in views:
-        shown[left] += camera.contains(camera.project_world(pose, points[left]))
+    for matrix, (width, height) in zip(views.matrices(), views.size):
+        column, row, depth = matrix[:, :3] @ points[left].T + matrix[:, 3:]
+        held = (depth > 0.0) & (column >= 0.0) & (column <= width * depth) & (row >= 0.0) & (row <= height * depth)
+        shown[left] += held
         left = left[shown[left] < 2]
     return near & (shown < 2)
 
@@ -116,13 +114,10 @@ def supporting_photographs(
         Whether each photograph supports each place, only where it sees it, shape (g, photographs).
     """
     photographs, result = depths.photographs, np.zeros(seen.shape, dtype=np.bool_)
-    for number, (matrix, (width, height)) in enumerate(zip(photographs.matrices, photographs.sizes)):
-        (places,) = np.nonzero(seen[:, number])
-        x, y, depth = matrix[:, :3] @ middle[places].T + matrix[:, 3:]
-        column, row = (np.clip(at / depth, 0, size - 1).astype(np.int64) for at, size in ((x, width), (y, height)))
-        pixel = photographs.firsts[number] + row * width + column
+    for number in range(len(photographs)):
+        pixel, depth, shown = photographs.shown(number, middle)
         reach = REACH * voxel_size + REACH_ERRORS * ERROR_PLANES * depths.error[pixel]
-        result[places, number] = np.abs(depths.depth[pixel] - depth) <= reach  # false where it is NaN
+        result[:, number] = shown & (np.abs(depths.depth[pixel] - depth) <= reach)  # false where it is NaN
     if tracks is not None and len(tracks.point) and len(middle):
         result |= _by_tracks(tracks, photographs.centres, middle, REACH * voxel_size)
     return result & seen

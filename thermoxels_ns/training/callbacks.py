@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 from threadpoolctl import threadpool_limits
@@ -17,14 +16,14 @@ from torch.nn import Parameter
 from thermoxels_ns.core.errors import PruningError
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.data.datamanager import views_of_cameras
 from thermoxels_ns.field.refine import RowChange, prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import backdrop_without_walls, mean_colours
 from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs, rays_through_backdrop
-from thermoxels_ns.multiview.photographs import camera_at
 from thermoxels_ns.multiview.planes import depths_on_planes
 from thermoxels_ns.multiview.stereo import rays_through
-from thermoxels_ns.multiview.votes import View, air_voxels, around_cameras
+from thermoxels_ns.multiview.votes import air_voxels, around_cameras
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
 from thermoxels_ns.training.ray_statistics import (
@@ -67,12 +66,13 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         found = [rays for rays in (model.feature_rays, evidence and evidence.feature_rays) if rays is not None]
         if model.config.carve == "off" or not found:
             return
+        assert attributes.pipeline is not None
+        dataset: Any = attributes.pipeline.datamanager.train_dataset
         voxels, lattice = model.grid.voxels, model.grid.voxels.lattice
         rays = found[0] if len(found) == 1 else found[0].joined_with(found[1])
         air = air_voxels(lattice, rays).reshape(-1)[voxels.cells]
-        if (views := views_of(attributes)) is not None:
-            centres = np.stack(np.unravel_index(voxels.cells, lattice.cell_shape), axis=1) + 0.5
-            air |= around_cameras(lattice.index_to_world(centres), rays, views)
+        centres = np.stack(np.unravel_index(voxels.cells, lattice.cell_shape), axis=1) + 0.5
+        air |= around_cameras(lattice.index_to_world(centres), rays, views_of_cameras([dataset.cameras]))
         if 0 < air.sum() < len(air):
             CONSOLE.log(f"step {step}: {air.sum():,} of {len(air):,} voxels are air, crossed by rays to what is seen")
             old = model.grid.row_parameters()
@@ -197,17 +197,6 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
         points = model.grid.voxels.corner_index() * lattice.voxel_size + np.asarray(lattice.lo)
         model.grid.paint(torch.from_numpy(mean_colours(found.photographs, found.backdrop, points)))
     return found
-
-
-def views_of(attributes: TrainingCallbackAttributes) -> list[View] | None:
-    """Cameras and poses of all photographs that train; None where one is no perspective camera."""
-    assert attributes.pipeline is not None
-    datamanager: Any = attributes.pipeline.datamanager
-    cameras = datamanager.train_dataset.cameras.to("cpu")
-    if not bool((cameras.camera_type == CameraType.PERSPECTIVE.value).all()):
-        return None
-    poses = cameras.camera_to_worlds.double().numpy()
-    return [(camera_at(cameras, number), pose) for number, pose in enumerate(poses)]
 
 
 def follow_walls(model: ThermoxelsModel, evidence: PhotographEvidence, step: int) -> None:
