@@ -12,7 +12,6 @@ from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.multiview import stereo
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs
 from thermoxels_ns.multiview.stereo import FEWEST_VIEWS, Depths, depths_of, feature_rays_to_depths
-from thermoxels_ns.multiview.stereo_kernels import other_views
 
 LO, HI = (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)
 TRUE_DEPTH = 1.6 - PLANE
@@ -130,11 +129,10 @@ def test_too_few_photographs_or_all_from_one_place_say_nothing(chosen):
 
 @pytest.mark.parametrize("asked, expected", [(True, [1, 0]), (False, [0, 0])])
 def test_only_depths_that_others_confirm_look_through_a_point(asked, expected):
-    matrices, inverses = np.tile(np.eye(3, 4), (2, 1, 1)), np.tile(np.eye(3), (2, 1, 1))
-    cameras = (matrices, inverses, np.zeros((2, 3)), np.ones((2, 2), np.int64), np.arange(2))
+    nothing = np.zeros((2, 3), np.float32), np.zeros(2, np.float32)
+    cameras = np.tile(np.eye(3, 4), (2, 1, 1)), np.zeros((2, 3)), np.ones((2, 2), int), np.arange(2)
     depth, error = np.array([1.0, 2.0], np.float32), np.array([0.1, 0.1], np.float32)
-    agreeing, behind = np.zeros(2, np.int32), np.zeros(2, np.int32)
-    other_views(0, 2, *cameras, depth, error, 0.3, np.full(2, asked), agreeing, behind)
+    agreeing, behind = stereo.other_views(Photographs(*cameras, *nothing), depth, error, np.full(2, asked))
     assert agreeing.tolist() == [0, 0] and behind.tolist() == expected
 
 

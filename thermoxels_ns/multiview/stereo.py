@@ -12,7 +12,7 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.threads import run_ranges
 from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.photographs import Photographs
-from thermoxels_ns.multiview.stereo_kernels import aggregate, correlate, other_views, refine_depths, weigh_patches
+from thermoxels_ns.multiview.stereo_kernels import aggregate, correlate, refine_depths, weigh_patches
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -115,10 +115,10 @@ def depths_of(
     def work(begin: int, end: int) -> None:
         for number in range(begin, end):
             view = views[number]
-            span = _overlap(number, views) if corners is None else _span(view, *corners, photographs.near)
+            span = _overlap(photographs, number) if corners is None else _span(view, *corners, photographs.near)
             if span is None:
                 continue
-            neighbours[number] = _neighbours(number, views, *span)
+            neighbours[number] = _neighbours(photographs, number, *span)
             if neighbours[number]:
                 first = int(photographs.firsts[number])
                 pixels = slice(first, first + view.shape[0] * view.shape[1])
@@ -126,26 +126,47 @@ def depths_of(
                 depth[pixels], error[pixels] = _sweep(view, near, *span, corners is not None)
 
     run_ranges(work, len(views), 1)
-    agreeing, behind = (np.zeros(total, dtype=np.int32) for _ in range(2))
-    matrices, inverses = photographs.matrices, np.stack([view.inverse for view in views])
-    cameras = (matrices, inverses, photographs.centres, photographs.sizes, photographs.firsts)
-
-    def compare(begin: int, end: int) -> None:
-        other_views(begin, end, *cameras, depth, error, TOLERANCE, confirmed, agreeing, behind)
-
-    confirmed = np.zeros(total, dtype=bool)
-    run_ranges(compare, total, 4096)
-    confirmed = agreeing >= views_to_contradict
-    run_ranges(compare, total, 4096)
+    confirmed = other_views(photographs, depth, error)[0] >= views_to_contradict
+    agreeing, behind = other_views(photographs, depth, error, confirmed)
     sure = (agreeing >= FEWEST_VIEWS) & (agreeing >= VIEWS_PER_CONTRADICTION * behind)
     depth[~sure] = np.nan
     for view, first in zip(views, photographs.firsts):
         pixels = slice(first, first + view.shape[0] * view.shape[1])
-        backed = _backed(depth[pixels].reshape(view.shape), error[pixels].reshape(view.shape))
-        depth[pixels][~backed.ravel()] = np.nan
+        agree = _neighbours_agree(depth[pixels].reshape(view.shape), error[pixels].reshape(view.shape))
+        depth[pixels][~agree.ravel()] = np.nan
     if larger is not None:
         _refine(photographs, larger, neighbours, depth, error)
     return Depths(photographs, depth, error)
+
+
+def other_views(
+    photographs: Photographs,
+    depth: npt.NDArray[np.float32],
+    error: npt.NDArray[np.float32],
+    confirmed: npt.NDArray[np.bool_] | None = None,
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Count for each pixel the other photographs whose depth lies where its own does, and those that look through it.
+
+    Depths agree if they differ by no more than `TOLERANCE` times the sum of both pixels' errors. A photograph looks
+    through the point if its own depth there is `confirmed` and farther by more than twice that sum. All are (pixels,).
+    """
+    agreeing, behind = (np.zeros(len(depth), dtype=np.int64) for _ in range(2))
+    (known,) = np.nonzero(np.isfinite(depth))
+
+    def compare(begin: int, end: int) -> None:
+        own = known[begin:end]
+        origins, along = photographs.of_pixels(own)
+        points, number = origins + depth[own, None] * along, np.searchsorted(photographs.firsts, own, side="right") - 1
+        for other in range(len(photographs)):
+            pixel, far, shown = photographs.shown(other, points)
+            farther, planes = depth[pixel] - far, error[pixel] + error[own]  # NaN is neither
+            shown &= number != other
+            agreeing[own] += shown & (np.abs(farther) <= TOLERANCE * planes)
+            if confirmed is not None:
+                behind[own] += shown & confirmed[pixel] & (farther > 2.0 * planes)
+
+    run_ranges(compare, len(known), 1 << 15)
+    return agreeing, behind
 
 
 def _refine(
@@ -228,22 +249,6 @@ class _View:
         """Variance of each channel that is noise."""
         return np.square(np.array(NOISE[: len(self.channels)], dtype=np.float32))
 
-    def points(self, pixels: FloatArray, depth: FloatArray) -> FloatArray:
-        """World points of pixels (n, 2), whose centres lie at halves, at depths (n,)."""
-        homogeneous = np.column_stack((pixels, np.ones(len(pixels))))
-        return self.centre + depth[:, None] * (homogeneous @ self.inverse.T)
-
-    def pixels(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixels (n, 2) and depths (n,) of world points."""
-        seen = points @ self.matrix[:, :3].T + self.matrix[:, 3]
-        depth = seen[:, 2]
-        return seen[:, :2] / np.where(depth > 0.0, depth, np.nan)[:, None], depth
-
-    def shows(self, pixels: FloatArray, depth: FloatArray) -> npt.NDArray[np.bool_]:
-        height, width = self.shape
-        with np.errstate(invalid="ignore"):
-            return (depth > 0.0) & (pixels >= 0.0).all(1) & (pixels[:, 0] <= width) & (pixels[:, 1] <= height)
-
 
 def _span(view: _View, low: FloatArray, high: FloatArray, near: float) -> tuple[float, float] | None:
     """Least and largest depth at which a photograph looks at the box; None if it does not."""
@@ -255,45 +260,43 @@ def _span(view: _View, low: FloatArray, high: FloatArray, near: float) -> tuple[
     return max(float(depth.min()), near, _NEAREST * far), far
 
 
-def _overlap(number: int, views: list[_View]) -> tuple[float, float] | None:
+def _overlap(photographs: Photographs, number: int) -> tuple[float, float] | None:
     """Least and largest depth at which enough others look at the same from useful directions; None: nowhere."""
-    centres = np.stack([view.centre for view in views])
+    centres = photographs.centres
     depths = np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()) * _DEPTHS_PER_SPREAD
-    points = _probes(views[number], depths)
-    others = sum(
-        (_usefully_seen(views[number], seen, points)[0].astype(int) for k, seen in enumerate(views) if k != number),
-        np.zeros(len(points), int),
-    )
+    points, others = _probes(photographs, number, depths), np.zeros(len(depths) * _PROBES[0] ** 2, int)
+    for other in range(len(photographs)):
+        others += (other != number) & _usefully_seen(photographs, number, other, points)[0]
     enough = (others >= 2).reshape(len(depths), -1).mean(1) >= _FEWEST_PROBES
     return (float(depths[enough][0]), float(depths[enough][-1])) if enough.sum() > 1 else None
 
 
-def _probes(view: _View, depths: FloatArray) -> FloatArray:
-    """Points that a photograph sees, spread over it at each of the depths."""
-    height, width = view.shape
-    columns, rows = ((np.arange(_PROBES[0]) + 0.5) * side / _PROBES[0] for side in (width, height))
-    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
-    return np.concatenate([view.points(pixels, np.full(len(pixels), depth)) for depth in depths])
+def _probes(photographs: Photographs, number: int, depths: FloatArray) -> FloatArray:
+    """Points that a photograph sees, spread over it at each of the depths, (depths * points, 3)."""
+    columns, rows = ((np.arange(_PROBES[0]) + 0.5) * side / _PROBES[0] for side in photographs.sizes[number])
+    pixels = np.stack(np.meshgrid(columns, rows, [1.0]), -1).reshape(-1, 3)
+    along = pixels @ np.linalg.inv(photographs.matrices[number, :, :3]).T
+    return (photographs.centres[number] + depths[:, None, None] * along).reshape(-1, 3)
 
 
-def _usefully_seen(view: _View, seen: _View, points: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:
+def _usefully_seen(
+    photographs: Photographs, number: int, other: int, points: FloatArray
+) -> tuple[npt.NDArray[np.bool_], FloatArray]:
     """Which points of one photograph another shows from a direction that tells how far they are; angles in degrees."""
-    towards, away = view.centre - points, seen.centre - points
+    towards, away = (photographs.centres[each] - points for each in (number, other))
     lengths = np.linalg.norm(towards, axis=1) * np.linalg.norm(away, axis=1)
     cosine = np.einsum("ni,ni->n", away, towards) / np.maximum(lengths, 1e-12)
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    return seen.shows(*seen.pixels(points)) & (angle > ANGLES_DEG[0]) & (angle < ANGLES_DEG[1]), angle
+    return photographs.shown(other, points)[2] & (angle > ANGLES_DEG[0]) & (angle < ANGLES_DEG[1]), angle
 
 
-def _neighbours(number: int, views: list[_View], near: float, far: float) -> list[int]:
+def _neighbours(photographs: Photographs, number: int, near: float, far: float) -> list[int]:
     """Photographs that see most of what one sees, from directions that tell how far it is."""
-    points = _probes(views[number], 1.0 / np.linspace(1.0 / far, 1.0 / near, _PROBES[1] + 2)[1:-1])
-    worth = np.zeros(len(views))
-    for other, seen in enumerate(views):
-        if other == number:
-            continue
-        useful, angle = _usefully_seen(views[number], seen, points)
-        if useful.mean() >= _FEWEST_PROBES:
+    points = _probes(photographs, number, 1.0 / np.linspace(1.0 / far, 1.0 / near, _PROBES[1] + 2)[1:-1])
+    worth = np.zeros(len(photographs))
+    for other in range(len(photographs)):
+        useful, angle = _usefully_seen(photographs, number, other, points)
+        if other != number and useful.mean() >= _FEWEST_PROBES:
             worth[other] = np.sum(useful * np.exp(-0.5 * (np.log(np.maximum(angle, 1e-3) / BEST_ANGLE_DEG)) ** 2))
     best = np.argsort(-worth, kind="stable")[:NEIGHBOURS]
     return [int(other) for other in best if worth[other] > 0.0]
@@ -310,7 +313,7 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
     moved = np.empty((len(others), *view.channels.shape), dtype=np.float32)
     for plane, inverse_depth in enumerate(inverse_depths):
         for number, other in enumerate(others):
-            _drawn(other, view, 1.0 / inverse_depth, moved[number])
+            _warped(other, view, 1.0 / inverse_depth, moved[number])
         half = -(-len(others) // 2)
         correlate(
             view.channels,
@@ -359,7 +362,7 @@ class _Patches:
         return cls(weights, means, variances)
 
 
-def _backed(depth: npt.NDArray[np.float32], error: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+def _neighbours_agree(depth: npt.NDArray[np.float32], error: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     """Which pixels have `FEWEST_AROUND` neighbours whose depths are the same to one plane, shape (h, w)."""
     height, width = depth.shape
     framed, count = np.pad(depth, 1, constant_values=np.nan), np.zeros(depth.shape, dtype=np.int64)
@@ -372,32 +375,29 @@ def _backed(depth: npt.NDArray[np.float32], error: npt.NDArray[np.float32]) -> n
 def _num_planes(view: _View, others: list[_View], near: float, far: float) -> int:
     """Planes such that the middle of the picture moves by a pixel in the neighbour where it moves most."""
     height, width = view.shape
-    middle = view.points(np.array([[0.5 * width, 0.5 * height]] * 2), np.array([near, far]))
+    middle = view.centre + np.outer((near, far), view.inverse @ (0.5 * width, 0.5 * height, 1.0))
     most = 0.0
     for other in others:
-        pixels, depth = other.pixels(middle)
+        x, y, depth = other.matrix[:, :3] @ middle.T + other.matrix[:, 3:]
         if (depth > 0.0).all():
-            most = max(most, float(np.linalg.norm(pixels[1] - pixels[0])))
+            most = max(most, float(np.hypot(np.diff(x / depth), np.diff(y / depth))[0]))
     return int(np.clip(np.ceil(most) + 1, *PLANES)) if most > 0.0 else PLANES[1]
 
 
-def _drawn(other: _View, view: _View, depth: float, drawn: npt.NDArray[np.float32]) -> None:
-    """Fill `drawn`, (channels, h, w), with what a photograph shows of the plane at a depth of another.
-
-    It is drawn as the other would see it.
-    """
+def _warped(other: _View, view: _View, depth: float, warped: npt.NDArray[np.float32]) -> None:
+    """Warp a photograph by the plane at a depth of another into what the other would see; fill `warped` (c, h, w)."""
     turn = depth * (other.matrix[:, :3] @ view.inverse)
     turn[:, 2] += other.matrix[:, :3] @ view.centre + other.matrix[:, 3]
     half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # pixel centres lie at halves, OpenCV's not
     height, width = view.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     to_other = np.linalg.inv(half) @ turn @ half
-    for channel, picture in zip(drawn, other.channels):
+    for channel, picture in zip(warped, other.channels):
         cv2.warpPerspective(picture, to_other, (width, height), channel, flags, cv2.BORDER_CONSTANT, (_OUTSIDE,))
     # What lies behind the other photograph would be drawn upside down. Depth in it is linear over the picture.
     if min(turn[2] @ (column, row, 1.0) for column in (0, width) for row in (0, height)) <= 0.0:
         columns, rows = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-        drawn[:, turn[2, 0] * columns + turn[2, 1] * rows + turn[2, 2] <= 0.0] = _OUTSIDE
+        warped[:, turn[2, 0] * columns + turn[2, 1] * rows + turn[2, 2] <= 0.0] = _OUTSIDE
 
 
 def _between(cost: npt.NDArray[np.float32], best: npt.NDArray[np.int64]) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Compiled loops over photographs that are compared: patches, costs along paths, and where depths agree."""
+"""Compiled loops over photographs that are compared: patches, costs along paths, and depths refined."""
 
 from __future__ import annotations
 
@@ -300,59 +300,3 @@ def refine_depths(
         place = top - steps + 0.5 * (scores[top - 1] - scores[top + 1]) / bend
         found = 1.0 / (inverse + 0.5 * place * apart)
         refined[n], spacing[n] = found, found * found * apart
-
-
-@kernel
-def other_views(
-    begin: int,
-    end: int,
-    matrices,
-    inverses,
-    centres,
-    sizes,
-    firsts,
-    depth,
-    error,
-    tolerance,
-    confirmed,
-    agreeing,
-    behind,
-):
-    """Count the other photographs whose own depth lies where that of a pixel does, and those where it lies behind.
-
-    Depths agree if they differ by no more than `tolerance` times the sum of both pixels' errors; a photograph looks
-    through the point if its own depth is farther by more than twice that sum. Only `confirmed` depths count as
-    looking through. Pixels `begin` to `end`; 0 where a depth is NaN.
-    """
-    number = len(firsts) - 1
-    while number > 0 and firsts[number] > begin:
-        number -= 1
-    for n in range(begin, end):
-        while number + 1 < len(firsts) and firsts[number + 1] <= n:
-            number += 1
-        agreeing[n], behind[n] = 0, 0
-        if np.isnan(depth[n]):
-            continue
-        u = (n - firsts[number]) % sizes[number, 0] + 0.5
-        v = (n - firsts[number]) // sizes[number, 0] + 0.5
-        m = inverses[number]
-        x = centres[number, 0] + depth[n] * (m[0, 0] * u + m[0, 1] * v + m[0, 2])
-        y = centres[number, 1] + depth[n] * (m[1, 0] * u + m[1, 1] * v + m[1, 2])
-        z = centres[number, 2] + depth[n] * (m[2, 0] * u + m[2, 1] * v + m[2, 2])
-        for k in range(len(firsts)):
-            if k == number:
-                continue
-            seen = matrices[k]
-            far = seen[2, 0] * x + seen[2, 1] * y + seen[2, 2] * z + seen[2, 3]
-            if not far > 0.0:
-                continue
-            column = np.floor((seen[0, 0] * x + seen[0, 1] * y + seen[0, 2] * z + seen[0, 3]) / far)
-            row = np.floor((seen[1, 0] * x + seen[1, 1] * y + seen[1, 2] * z + seen[1, 3]) / far)
-            if not (column >= 0.0 and column < sizes[k, 0] and row >= 0.0 and row < sizes[k, 1]):
-                continue
-            at = firsts[k] + int(row) * sizes[k, 0] + int(column)
-            farther, planes = depth[at] - far, error[at] + error[n]  # neither is true where they are NaN
-            if abs(farther) <= tolerance * planes:
-                agreeing[n] += 1
-            elif confirmed[at] and farther > 2.0 * planes:
-                behind[n] += 1

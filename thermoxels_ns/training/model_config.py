@@ -18,9 +18,9 @@ from thermoxels_ns.training.schedule import COARSEST, QUALITIES, schedule_for
 
 _STANDARD = schedule_for(*QUALITIES["standard"])
 MOST_VOXELS = 3.0
-"""Voxels along the longest side that a scene may ask for, relative to the last of the resolutions. wild-11, whose ground
-runs on, asks for 256 and has F 0.95 of what is seen, 0.59 with 192; a statue photographed at 12 megapixels asks for 512
-and gains nothing by 384 after 1500 steps (depths more than 2 % off: 15 %, 17 %)."""
+"""Voxels along the longest side that a scene may ask for, relative to the last of the resolutions. wild-11, whose
+ground runs on, asks for 256 and has F 0.95 of what is seen, 0.59 with 192; a statue photographed at 12 megapixels asks
+for 512 and gains nothing by 384 after 1500 steps (depths more than 2 % off: 15 %, 17 %)."""
 STEP_OF_COARSEST = 8  # Of so many voxels the coarsest resolution is a multiple
 
 

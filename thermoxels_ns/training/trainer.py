@@ -53,9 +53,9 @@ class ThermoxelsTrainerConfig(TrainerConfig):
     quality: Quality | None = None
     """Named setting of resolution and length: draft (voxels of 3.2 pixels, up to 192 along the longest side, 800
     steps: a first look, half a minute on two cores), standard (1.6 pixels, up to 384, 1500 steps, the default: one to
-    some minutes) or fine (1.6 pixels, up to 768, 4000 steps: many minutes); `thermoxels cost` measures what they give. It
-    replaces max-num-iterations, the lengths of the learning rate schedules, and the model's resolutions, voxel-pixels,
-    refine-at, prune-at, thin-at, distortion-ramp and view-dependence-from."""
+    some minutes) or fine (1.6 pixels, up to 768, 4000 steps: many minutes); `thermoxels cost` measures what they give.
+    It replaces max-num-iterations, the lengths of the learning rate schedules, and the model's resolutions, refine-at,
+    voxel-pixels, steps, prune-at, thin-at, distortion-ramp and view-dependence-from."""
     replaced: tyro.conf.Suppress[str] = ""
     """What the quality replaced, for the log."""
 
