@@ -66,19 +66,6 @@ def test_random_damage_ends_in_an_error_that_names_the_file(tmp_path, name, capf
     capfd.readouterr()  # the TIFF library writes to the process's own error stream
 
 
-def test_a_tag_that_cannot_be_read_is_a_damaged_file(tmp_path):
-    """A tag with more numbers than fit into the file is listed and cannot be read."""
-    content = counts(tmp_path / "c.tiff").read_bytes()
-    entry = struct.pack("<HHI", 262, 3, 1)
-    assert content.count(entry) == 1
-    path = tmp_path / "damaged.tiff"
-    path.write_bytes(content.replace(entry, struct.pack("<HHI", 262, 3, 255)))
-    with pytest.raises(SceneError, match=r"damaged\.tiff"):
-        identify(path, tmp_path)
-    with pytest.raises(ThermalFileError, match=r"damaged\.tiff"):
-        read_thermogram(path, RadiometryOptions(camera="workswell"))
-
-
 def test_a_picture_larger_than_the_decoder_opens_is_refused_by_its_size(tmp_path):
     for path in (tmp_path / "wide.png", tmp_path / "wide.jpg"):
         Image.new("L", (1, 1)).save(path)

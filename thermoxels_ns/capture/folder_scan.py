@@ -91,7 +91,10 @@ def scan_folder(
             others += 1
             continue
         try:
-            _check_name(path.relative_to(folder))
+            name = str(path.relative_to(folder))
+            if printable(name) != name:
+                got = "one with line breaks, control characters or bytes of no encoding"
+                raise SceneError(name, expected="a name that can be printed", got=got, remedy="Rename the file.")
             files.append(identify(path, folder))
         except ThermoxelsError as problem:
             unreadable[path] = str(problem)
@@ -121,41 +124,31 @@ def shown_name(path: Path) -> str:
     return printable(path.name)
 
 
-def _check_name(name: Path) -> None:
-    if printable(str(name)) != str(name):
-        got = "one with line breaks, control characters or bytes of no encoding"
-        raise SceneError(str(name), expected="a name that can be printed", got=got, remedy="Rename the file.")
-
-
 def identify(path: Path, folder: Path) -> CameraFile:
     """Tell by content what a file is, a thermal picture by its name; an error that names it where it is damaged."""
-    with errors_name(path, "a camera file"):
-        return _identify(path, folder)
-
-
-def _identify(path: Path, folder: Path) -> CameraFile:
-    check_file_size(path)
-    suffix = path.suffix.lower()
-    if suffix in (".npy", ".csv"):
-        return CameraFile(path, "thermal", None)
-    if suffix in (".jpg", ".jpeg"):
-        if is_flir_jpeg(path):
-            flir = read_flir_jpeg(path)
-            taken_at = flir.camera.taken_at
-            role: Role = "thermal" if flir.visible is None else "both"
-            return CameraFile(path, role, None if taken_at is None else taken_at.replace(tzinfo=None))
-        if is_dji_rjpeg(path):
-            return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
-    elif size_of_double_tiff(path) is not None:
-        return CameraFile(path, "thermal", None)
-    else:
-        with errors_name(path, "a TIFF or PNG that can be decoded"), Image.open(path) as image:
-            # One channel of more than 8 bits, which no photograph is.
-            if image.mode == "F" or image.mode.startswith("I"):
-                check_thermal_size(path, *image.size)
-                return CameraFile(path, "thermal", read_exif_facts(image).taken_at)
-    facts = read_photograph_facts(path)
-    return CameraFile(path, "thermal picture" if _named_thermal(path, folder) else "photograph", facts.taken_at)
+    with errors_name(path, "a camera file that can be decoded"):
+        check_file_size(path)
+        suffix = path.suffix.lower()
+        if suffix in (".npy", ".csv"):
+            return CameraFile(path, "thermal", None)
+        if suffix in (".jpg", ".jpeg"):
+            if is_flir_jpeg(path):
+                flir = read_flir_jpeg(path)
+                taken_at = flir.camera.taken_at
+                role: Role = "thermal" if flir.visible is None else "both"
+                return CameraFile(path, role, None if taken_at is None else taken_at.replace(tzinfo=None))
+            if is_dji_rjpeg(path):
+                return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
+        elif size_of_double_tiff(path) is not None:
+            return CameraFile(path, "thermal", None)
+        else:
+            with Image.open(path) as image:
+                # One channel of more than 8 bits, which no photograph is.
+                if image.mode == "F" or image.mode.startswith("I"):
+                    check_thermal_size(path, *image.size)
+                    return CameraFile(path, "thermal", read_exif_facts(image).taken_at)
+        facts = read_photograph_facts(path)
+        return CameraFile(path, "thermal picture" if _named_thermal(path, folder) else "photograph", facts.taken_at)
 
 
 def _named_thermal(path: Path, folder: Path) -> bool:

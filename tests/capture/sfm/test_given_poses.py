@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.support.posed_model import CAMERA, ring_model
 from thermoxels_ns.capture.sfm.colmap import model_of_colmap, read_colmap
-from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, read_given_poses
-from thermoxels_ns.capture.sfm.poses import Poses
+from thermoxels_ns.capture.sfm.poses import Poses, fitted_to_photographs, read_given_poses
 from thermoxels_ns.core.errors import SceneError
 
 MODEL = ring_model(5, points=60)

@@ -51,6 +51,11 @@ class SfmModel:
         pose = self.camera_to_world[frame]
         return (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3] @ OPENGL_FROM_OPENCV[:3, :3]
 
+    def ray(self, frame: int, pixel: npt.NDArray[np.floating]) -> FloatArray:
+        """Return the point, less the camera's place, that a pixel (2,) of a frame sees at depth 1, shape (3,)."""
+        pose = self.camera_to_world[frame]
+        return (self.camera.rays(pixel[None]) * (1.0, -1.0, -1.0))[0] @ pose[:3, :3].T
+
     def sighting_error_px(self) -> FloatArray:
         """Distance between where each point is seen and where it projects to, shape (s,), [pixels]."""
         errors = [np.zeros(0)]
