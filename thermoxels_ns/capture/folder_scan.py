@@ -25,7 +25,7 @@ Role = Literal["photograph", "thermal", "both", "thermal picture"]
 
 _PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 SUFFIXES = (*_PICTURES, ".npy", ".csv")
-"""Files that are looked at; what else lies on a card (videos, logs, thumbnails of other kinds) is none of ours."""
+"""Endings of the files that are read; other files on a card (videos, logs, thumbnails) are only counted."""
 
 _THERMAL_WORDS = frozenset({"thermal", "radiometric", "temperature", "temperatures", "celsius", "ir", "tir", "lwir"})
 _PHOTOGRAPH_WORDS = frozenset({"visible", "vis", "rgb", "colour", "color", "photo", "photos", "optical"})
@@ -54,7 +54,7 @@ class CameraFolder:
 
 
 def words_of(name: str) -> tuple[str, ...]:
-    """Cut a name into words of letters (of any alphabet) and digits, in small letters.
+    """Split a name into lower-case words of letters (of any alphabet) and digits.
 
     >>> words_of("10-58-15-636-Visible")
     ('10', '58', '15', '636', 'visible')
@@ -64,7 +64,7 @@ def words_of(name: str) -> tuple[str, ...]:
 
 
 def natural_key(path: Path) -> list[tuple[int, str, int]]:
-    """Sorts names as people do: 2 before 10.
+    """Return a sort key by which numbers in names sort by value: 2 before 10.
 
     >>> sorted([Path("b10"), Path("b2")], key=natural_key)[0].name
     'b2'
@@ -76,9 +76,10 @@ def natural_key(path: Path) -> list[tuple[int, str, int]]:
 def scan_folder(
     folder: Path, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None
 ) -> CameraFolder:
-    """Look at every picture and table in a folder (a `SceneError` if it is none) and the folders in it but `without`.
+    """Identify every picture and table in a folder and its subfolders, except the folders `without`.
 
-    Hidden files and folders, linked folders and what is no file are passed over; `say` is told of shut folders.
+    Hidden files and folders, linked folders and pipes are passed over; `say` is told of folders that cannot be opened.
+    A `SceneError` is raised where `folder` is no folder.
     """
     if not folder.is_dir():
         remedy = "Pass the folder that the memory card was copied to."
@@ -104,7 +105,7 @@ def scan_folder(
 
 
 def files_below(folder: Path, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None) -> list[Path]:
-    """Files of a folder and the folders in it but `without`, sorted as people do."""
+    """List the files of a folder and its subfolders, except the folders `without`, sorted by `natural_key`."""
     skipped, files = [path.resolve() for path in without], []
     shut = lambda problem: say(f"passed over: {problem.filename} ({problem.strerror})")  # noqa: E731
     for place, folders, names in os.walk(folder, onerror=shut):

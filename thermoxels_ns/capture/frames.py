@@ -167,7 +167,7 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
 def _without_stuck_pixels(
     frames: list[CaptureFrame], size: tuple[int, int], thermal_mask: Path | None
 ) -> tuple[int, list[CaptureFrame]]:
-    """Set stuck and masked pixels to NaN in all frames; return how many are stuck."""
+    """Set stuck and masked pixels to NaN in all frames; return the number of stuck pixels and the frames."""
     some = np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FOR_DEAD_PIXELS)).round().astype(int)
     bad = find_dead_pixels(np.stack([np.load(frames[i].thermal) for i in some]))
     dead = int(bad.sum())

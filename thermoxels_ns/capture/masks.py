@@ -48,13 +48,16 @@ class PhotographMasks:
 
 
 def find_masks(frames: Sequence[CaptureFrame], folder: Path | None, look_for_overlays: bool) -> PhotographMasks:
-    """Masks for photographs of the size that most of the frames have; a `SceneError` where one cannot be read."""
+    """Find the overlay and the user's masks for the size that most photographs have.
+
+    A `SceneError` is raised where a photograph or a mask cannot be read.
+    """
     sizes = [read_photograph_facts(frame.photograph).size for frame in frames]
     size = max(dict.fromkeys(sizes), key=sizes.count)
     same = [frame for frame, own in zip(frames, sizes) if own == size]
     some = np.unique(np.linspace(0, len(same) - 1, min(len(same), _LOOKED_AT)).round().astype(int))
-    drawn = find_overlay([same[i].photograph for i in some]) if look_for_overlays else None
-    return PhotographMasks(size, drawn, user_masks(same, folder))
+    overlay = find_overlay([same[i].photograph for i in some]) if look_for_overlays else None
+    return PhotographMasks(size, overlay, user_masks(same, folder))
 
 
 def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str, Path]:

@@ -128,7 +128,7 @@ def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: f
     ordered = sorted(pairs, key=lambda pair: natural_key(pair[0].path.relative_to(found.folder)))
     names = _names([photograph.path for photograph, _, _ in ordered], found.folder)
     return PairSearch(
-        tuple(Pair(name, photo.path, hot.path, how) for name, (photo, hot, how) in zip(names, ordered)),
+        tuple(Pair(name, photo.path, partner.path, how) for name, (photo, partner, how) in zip(names, ordered)),
         dict(sorted(unpaired.items(), key=lambda item: natural_key(item[0]))),
     )
 
@@ -229,17 +229,17 @@ def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], 
         several = max(roles["photograph"], roles["thermal"]) > 1
         for part in groups(group, place) if several else [group]:
             photos = [file for file in part if file.role == "photograph"]
-            hot = [file for file in part if file.role == "thermal"]
+            thermals = [file for file in part if file.role == "thermal"]
             pictures = [file for file in part if file.role == "thermal picture"]
-            for picture in pictures if hot else []:
-                explained[picture.path] = f"a picture for the eye; the temperatures are in {hot[0].path.name}"
-            hot = hot or pictures
-            if len(photos) == 1 and len(hot) == 1:
-                pairs.append((photos[0], hot[0], "equal names"))
-            elif photos and hot:
-                listed = ", ".join(file.path.name for file in (*photos, *hot))
-                why = f"ambiguous: {len(photos)} photographs and {len(hot)} thermal images share a name ({listed})"
-                explained |= {file.path: why for file in (*photos, *hot)}
+            for picture in pictures if thermals else []:
+                explained[picture.path] = f"a picture for the eye; the temperatures are in {thermals[0].path.name}"
+            thermals = thermals or pictures
+            if len(photos) == 1 and len(thermals) == 1:
+                pairs.append((photos[0], thermals[0], "equal names"))
+            elif photos and thermals:
+                listed = ", ".join(file.path.name for file in (*photos, *thermals))
+                why = f"ambiguous: {len(photos)} photographs and {len(thermals)} thermal images share a name ({listed})"
+                explained |= {file.path: why for file in (*photos, *thermals)}
     return pairs, explained
 
 
@@ -256,13 +256,16 @@ def _by_time(
     photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], limit_s: float, offset_s: float
 ) -> _Found:
     explained = {file.path: "no partner of this name, and no time in the file" for file in (*photographs, *thermal)}
-    photos, hot = ([file for file in side if file.taken_at is not None] for side in (photographs, thermal))
-    if not photos or not hot:
+    photos, thermals = ([file for file in side if file.taken_at is not None] for side in (photographs, thermal))
+    if not photos or not thermals:
         return [], explained
-    at = [np.array([(f.taken_at - datetime.min).total_seconds() for f in side if f.taken_at]) for side in (photos, hot)]
+    at = [
+        np.array([(f.taken_at - datetime.min).total_seconds() for f in side if f.taken_at])
+        for side in (photos, thermals)
+    ]
     apart = np.abs(at[0][:, None] - (at[1][None, :] - offset_s))
     chosen: dict[Path, tuple[CameraFile, float]] = {}
-    for files, others, table in ((photos, hot, apart), (hot, photos, apart.T)):
+    for files, others, table in ((photos, thermals, apart), (thermals, photos, apart.T)):
         for file, row in zip(files, table):
             order = np.argsort(row, kind="stable")[:2]
             (partner, *more), (nearest, *seconds) = [others[number] for number in order], row[order].tolist()
@@ -305,9 +308,5 @@ def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
 
 
 def _without_role(stem: str) -> str:
-    cut = re.split(r"([\W_]+)", stem)
-    words = cut[::2]
-    while len(words) > 1 and (words[-1].lower() in ROLE_WORDS or words[-1].lower() in _LAST_LETTERS):
-        words.pop()
-        cut = cut[:-2]
-    return "".join(cut)
+    """A name without the words at its end that say the kind of image."""
+    return re.sub(rf"(?:[\W_]+(?:{'|'.join(ROLE_WORDS | _LAST_LETTERS)}))+$", "", stem, flags=re.IGNORECASE)

@@ -38,7 +38,7 @@ class GpsFix:
 
 @dataclass(frozen=True)
 class PhotographFacts:
-    """None: the file does not say."""
+    """What the header of a photograph says; None where it does not say."""
 
     width: int
     height: int

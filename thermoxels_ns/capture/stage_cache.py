@@ -167,7 +167,7 @@ def load_json(path: Path) -> Any:
 
 
 def _value(array: np.ndarray, hint: Any) -> Any:
-    """What was kept as an array, in the type of its field."""
+    """Convert a stored array into the type of its field."""
     if hint is Camera:
         width, height, *numbers = array.tolist()
         return Camera(int(width), int(height), *numbers)

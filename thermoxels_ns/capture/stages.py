@@ -146,12 +146,11 @@ class _Capture:
         board = self.board_rig(model, read)
         rig, start = self.rig(model, frames, read, scale, scale_missing, board)
         drift = self.drift(model, frames, rig)
-        # What the stage of the poses found drawn over the photographs, and the user's masks.
         size, file = (model.camera.width, model.camera.height), self.output / CACHE_FOLDER / "poses" / _OVERLAY_FILE
-        drawn = np.load(file) if file.is_file() else None
-        if drawn is not None and drawn.shape != size[::-1]:
-            drawn = None
-        masks = PhotographMasks(size, drawn, user_masks(frames, self.settings.masks))
+        overlay = np.load(file) if file.is_file() else None
+        if overlay is not None and overlay.shape != size[::-1]:
+            overlay = None
+        masks = PhotographMasks(size, overlay, user_masks(frames, self.settings.masks))
         scene = Scene(frames, model, rig, drift, scale, up, masks)
         written = [self.output / name for name in SCENE_CONTENT if name != "masks" or masks.any]
         self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)

@@ -28,7 +28,7 @@ _BELIEVED_DEG = (3.0, 150.0)  # angles of view that are believed; some cameras s
 
 
 def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame]:
-    """Pairs with their poses and the scene points that they see, in the order of the model's frames."""
+    """Return photograph, thermal image, pose and visible scene points of each of the model's frames, in their order."""
     by_name = {frame.name: frame for frame in frames}
     good = model.point_error_px <= _MOST_ERROR_PX
     result = []
@@ -116,6 +116,6 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
 
 
 def kept_start(start: RigStart, why: str) -> RigEstimate:
-    """The start value as an estimate, where nothing can be compared."""
+    """Return the start value as an estimate that is not determined, with the reason."""
     text = f"{why} The start value is kept: {start.source}."
     return RigEstimate(start.thermal_camera, start.visible_to_thermal, False, text)

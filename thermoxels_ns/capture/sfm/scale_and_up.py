@@ -293,7 +293,7 @@ def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
 
 
 def _robust_mean(directions: FloatArray) -> FloatArray:
-    """Mean direction in which the farther half does not count."""
+    """Return the mean of the half of the directions that lies nearer to it, a unit vector (3,)."""
     mean = directions.sum(axis=0)
     for _ in range(5):
         mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
