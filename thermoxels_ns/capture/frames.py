@@ -26,7 +26,7 @@ _MOST_FOR_DEAD_PIXELS = 60  # frames that stuck pixels are looked for in: more n
 
 @dataclass(frozen=True)
 class CaptureFrame:
-    """One pair, read."""
+    """One pair of photograph and thermal image after reading."""
 
     name: str
     photograph: Path  # a file that holds the photograph alone

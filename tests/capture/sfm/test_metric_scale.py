@@ -140,12 +140,10 @@ def test_places_that_are_a_mirror_image_of_the_path_are_no_scale() -> None:
     assert mirrored is None or mirrored.metres_per_unit < 0.8 * 0.5
 
 
-@pytest.mark.parametrize(("places", "believed"), [([0.0] * 4, True), ([-0.3, 0.3, -0.3, 0.3], False)])
-def test_a_marker_that_moved_between_photographs_is_no_ruler(tmp_path, places, believed) -> None:
+def test_a_marker_that_moved_between_photographs_is_no_ruler(tmp_path) -> None:
     model = ring_model(count=4)
-    found, why = scale_from_markers(model, wall_photographs(model, places, tmp_path), 0.4)
-    assert (found is not None) == believed
-    assert believed or "[7] are in one photograph only, or moved between photographs" in why
+    found, why = scale_from_markers(model, wall_photographs(model, [-0.3, 0.3, -0.3, 0.3], tmp_path), 0.4)
+    assert found is None and "[7]" in why
 
 
 def test_a_few_points_far_from_the_wall_do_not_bend_it() -> None:

@@ -37,7 +37,7 @@ class MetricScale:
     """Metres per unit of the model."""
 
     metres_per_unit: float
-    standard_error: float | None  # [m per unit]; None where nobody knows it
+    standard_error: float | None  # [m per unit]; None where it is unknown
     source: str  # a sentence
 
 
@@ -237,7 +237,7 @@ class Up:
     direction: FloatArray  # unit vector in the model's coordinates, shape (3,)
     source: str  # a sentence
     spread_deg: float | None
-    """Median angle between it and what single photographs say, [degrees]; None where they say nothing."""
+    """Median angle between `direction` and those of single photographs, [degrees]; None where these say nothing."""
 
 
 def find_up(
@@ -276,7 +276,7 @@ def find_up(
 
 
 def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
-    """Rotation (3, 3) that turns `up` to z and `ahead`, as far as it is level, to y; to any level axis where it is not.
+    """Return the rotation (3, 3) that turns `up` to z and the level part of `ahead` to y; any level axis where it is 0.
 
     >>> level_rotation([0, 1, 0], [0, 0, -1]).round(9).tolist()
     [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]

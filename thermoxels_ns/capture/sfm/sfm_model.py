@@ -91,9 +91,8 @@ class SparseDepth:
     """Depth over the image plane at depth 1, from the nearest of the scene points around.
 
     The inverse depth of a plane is linear in the image, so a plane through the points gives the depth of a surface that
-    is seen at a slant. Where the points lie on two surfaces it is the one in front that counts: edges that both bands
-    show are mostly outlines, and an outline belongs to what stands in front. Single points that lie far too near do
-    not count.
+    is seen at a slant. Where the points lie on two surfaces, the one in front counts: edges that both bands show are
+    mostly outlines, and an outline belongs to the surface in front. Single points that lie far too near do not count.
     """
 
     def __init__(self, points: FloatArray) -> None:
