@@ -76,7 +76,8 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
     before_k = float(np.median(np.abs(difference_k[held_out])))
     after = []
     for terms in (0, _RADIAL_TERMS):
-        left = difference_k - design @ _fit(design, difference_k, np.where(held_out, 0.0, share), frames + terms)
+        some = design[:, : frames + terms]
+        left = difference_k - some @ _fit(some, difference_k, np.where(held_out, 0.0, share), frames + terms)
         after.append(float(np.median(np.abs(left[held_out]))))
     radial = after[1] < (1.0 - _GAIN_OF_RADIAL) * after[0]
     after_k = after[int(radial)]
@@ -86,7 +87,8 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
             "best correction, at points it was not fitted to."
         )
         return no_drift(frames, why, before_k)
-    best = _fit(design, difference_k, share, frames + _RADIAL_TERMS * radial)
+    unknowns = frames + _RADIAL_TERMS * radial
+    best = _fit(design[:, :unknowns], difference_k, share, unknowns)
     offsets_k, coefficients = best[:frames] - best[:frames].mean(), best[frames:] if radial else ()
     explanation = (
         f"Two images differ by {before_k:.3g} K at shared scene points (median), after the correction by {after_k:.3g} "
@@ -118,14 +120,13 @@ def _differences(samples: DriftSamples) -> tuple[npt.NDArray[np.int64], csr_matr
 
 
 def _fit(design: csr_matrix, difference_k: FloatArray, share: FloatArray, unknowns: int) -> FloatArray:
-    """Solve for the first `unknowns` columns by reweighted least squares, rows counted by `share`; the others are 0."""
-    solution, weight, used = np.zeros(design.shape[1]), share, share > 0.0
+    """Solve for the unknowns (columns) by reweighted least squares with Huber's loss, each row counted by its share."""
+    solution, weight, used = np.zeros(unknowns), share, share > 0.0
     for _ in range(_ITERATIONS):
         weighted = design.multiply(weight[:, None]).tocsr()
-        normal, right = (weighted.T @ design).toarray()[:unknowns, :unknowns], (weighted.T @ difference_k)[:unknowns]
-        before = solution.copy()
+        before = solution
         # Minimum norm: every group of frames that shares points gets mean offset 0.
-        solution[:unknowns] = np.linalg.lstsq(normal, right, rcond=_RIDGE)[0]
+        solution = np.linalg.lstsq((weighted.T @ design).toarray(), weighted.T @ difference_k, rcond=_RIDGE)[0]
         if float(np.abs(solution - before).max()) < _CONVERGED_K:
             break
         residual = np.abs(difference_k - design @ solution)

@@ -150,7 +150,7 @@ class SmoothThermal:
         filled = np.where(bad, 0.0, contrast).astype(np.float64)
         smooth = cv2.GaussianBlur(filled, (0, 0), THERMAL_BLUR_PX, borderType=cv2.BORDER_REFLECT)
         self._spline = np.asarray(ndimage.spline_filter(smooth, order=3, mode="mirror"))
-        good = ~ndimage.binary_dilation(bad, np.ones((5, 5)))
+        good = np.logical_not(ndimage.binary_dilation(bad, np.ones((5, 5))))
         self._good = np.pad(good[1:-1, 1:-1], 1).astype(np.float64)
         self.shape = contrast.shape
         """Height and width."""

@@ -60,13 +60,13 @@ def image_pairs(count: int, matching: Matching) -> npt.NDArray[np.int64]:
     [[0, 1], [0, 2], [1, 2]]
     """
     if matching == "exhaustive" or (matching == "auto" and count <= EXHAUSTIVE_UP_TO):
-        return np.stack(np.triu_indices(count, 1), axis=1)
+        return np.stack(np.triu_indices(count, 1), axis=1).astype(np.int64)
     steps = [*range(1, _NEIGHBOURS), *(_NEIGHBOURS * 2**power for power in range(count.bit_length()))]
     first, step = (grid.ravel() for grid in np.meshgrid(np.arange(count), steps, indexing="ij"))
     near = np.stack([first, first + step], axis=1)
     anchors = np.unique(np.linspace(0, count - 1, min(_ANCHORS, count)).round().astype(np.int64))
     far = anchors[np.stack(np.triu_indices(len(anchors), 1), axis=1)]
-    return np.unique(np.concatenate([near[near[:, 1] < count], far]), axis=0)
+    return np.unique(np.concatenate([near[near[:, 1] < count], far]).astype(np.int64), axis=0)
 
 
 def fill_database(
