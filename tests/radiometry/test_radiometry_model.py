@@ -190,13 +190,6 @@ def test_a_temperature_that_is_needed_is_asked_for(values, named):
         Conditions(**values)
 
 
-def test_overrides_replace_what_is_given_and_nothing_else():
-    after = ConditionOverrides(emissivity=0.8, distance_m=2.0).applied_to(ROOM)
-    assert (after.emissivity, after.distance_m) == (0.8, 2.0)
-    assert (after.reflected_c, after.air_c, after.relative_humidity) == (14.0, 18.0, 0.6)
-    assert ConditionOverrides().applied_to(ROOM) == ROOM
-
-
 def test_air_that_nothing_passes_is_refused():
     with pytest.raises(ThermoxelsError, match="distance_m"):
         RadiometricModel(Conditions(distance_m=1e5, relative_humidity=1.0, air_c=90.0), E60).signal(20.0)

@@ -188,13 +188,6 @@ def test_quiet_background_is_not_dead():
     assert not find_dead_pixels(np.full((8, 5, 5), 20.0, np.float32)).any()
 
 
-@pytest.mark.real_data
-def test_real_counts(shared_data):
-    read = read_thermal_file(sorted((shared_data / "arco" / "thermal").glob("*.tiff"))[0], COUNTS)
-    assert read.temperature_c.shape == (512, 640) and read.report.masked == 0
-    assert 0 < read.temperature_c.min() < np.median(read.temperature_c) < 25
-
-
 @pytest.mark.parametrize("big_endian", [False, True])
 def test_a_tiff_of_64_bit_numbers_is_celsius(tmp_path, big_endian):
     values = np.array([[1.25, -3.5, 20.0], [np.nan, 7.0, 8.0]])

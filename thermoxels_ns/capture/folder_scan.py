@@ -25,7 +25,7 @@ Role = Literal["photograph", "thermal", "both", "thermal picture"]
 
 _PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 SUFFIXES = (*_PICTURES, ".npy", ".csv")
-"""Files that are looked at; what else lies on a card (videos, logs, thumbnails of other kinds) is none of ours."""
+"""Endings of the files that are read; other files on a card (videos, logs, thumbnails) are only counted."""
 
 _THERMAL_WORDS = frozenset({"thermal", "radiometric", "temperature", "temperatures", "celsius", "ir", "tir", "lwir"})
 _PHOTOGRAPH_WORDS = frozenset({"visible", "vis", "rgb", "colour", "color", "photo", "photos", "optical"})
@@ -54,7 +54,7 @@ class CameraFolder:
 
 
 def words_of(name: str) -> tuple[str, ...]:
-    """Cut a name into words of letters (of any alphabet) and digits, in small letters.
+    """Split a name into lower-case words of letters (of any alphabet) and digits.
 
     >>> words_of("10-58-15-636-Visible")
     ('10', '58', '15', '636', 'visible')
@@ -64,7 +64,7 @@ def words_of(name: str) -> tuple[str, ...]:
 
 
 def natural_key(path: Path) -> list[tuple[int, str, int]]:
-    """Sorts names as people do: 2 before 10.
+    """Return a sort key by which numbers in names sort by value: 2 before 10.
 
     >>> sorted([Path("b10"), Path("b2")], key=natural_key)[0].name
     'b2'
@@ -76,9 +76,10 @@ def natural_key(path: Path) -> list[tuple[int, str, int]]:
 def scan_folder(
     folder: Path, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None
 ) -> CameraFolder:
-    """Look at every picture and table in a folder (a `SceneError` if it is none) and the folders in it but `without`.
+    """Identify every picture and table in a folder and its subfolders, except the folders `without`.
 
-    Hidden files and folders, linked folders and what is no file are passed over; `say` is told of shut folders.
+    Hidden files and folders, linked folders and pipes are passed over; `say` is told of folders that cannot be opened.
+    A `SceneError` is raised where `folder` is no folder.
     """
     if not folder.is_dir():
         remedy = "Pass the folder that the memory card was copied to."
@@ -91,7 +92,10 @@ def scan_folder(
             others += 1
             continue
         try:
-            _check_name(path.relative_to(folder))
+            name = str(path.relative_to(folder))
+            if printable(name) != name:
+                got = "one with line breaks, control characters or bytes of no encoding"
+                raise SceneError(name, expected="a name that can be printed", got=got, remedy="Rename the file.")
             files.append(identify(path, folder))
         except ThermoxelsError as problem:
             unreadable[path] = str(problem)
@@ -101,7 +105,7 @@ def scan_folder(
 
 
 def files_below(folder: Path, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None) -> list[Path]:
-    """Files of a folder and the folders in it but `without`, sorted as people do."""
+    """List the files of a folder and its subfolders, except the folders `without`, sorted by `natural_key`."""
     skipped, files = [path.resolve() for path in without], []
     shut = lambda problem: say(f"passed over: {problem.filename} ({problem.strerror})")  # noqa: E731
     for place, folders, names in os.walk(folder, onerror=shut):
@@ -121,41 +125,31 @@ def shown_name(path: Path) -> str:
     return printable(path.name)
 
 
-def _check_name(name: Path) -> None:
-    if printable(str(name)) != str(name):
-        got = "one with line breaks, control characters or bytes of no encoding"
-        raise SceneError(str(name), expected="a name that can be printed", got=got, remedy="Rename the file.")
-
-
 def identify(path: Path, folder: Path) -> CameraFile:
     """Tell by content what a file is, a thermal picture by its name; an error that names it where it is damaged."""
-    with errors_name(path, "a camera file"):
-        return _identify(path, folder)
-
-
-def _identify(path: Path, folder: Path) -> CameraFile:
-    check_file_size(path)
-    suffix = path.suffix.lower()
-    if suffix in (".npy", ".csv"):
-        return CameraFile(path, "thermal", None)
-    if suffix in (".jpg", ".jpeg"):
-        if is_flir_jpeg(path):
-            flir = read_flir_jpeg(path)
-            taken_at = flir.camera.taken_at
-            role: Role = "thermal" if flir.visible is None else "both"
-            return CameraFile(path, role, None if taken_at is None else taken_at.replace(tzinfo=None))
-        if is_dji_rjpeg(path):
-            return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
-    elif size_of_double_tiff(path) is not None:
-        return CameraFile(path, "thermal", None)
-    else:
-        with errors_name(path, "a TIFF or PNG that can be decoded"), Image.open(path) as image:
-            # One channel of more than 8 bits, which no photograph is.
-            if image.mode == "F" or image.mode.startswith("I"):
-                check_thermal_size(path, *image.size)
-                return CameraFile(path, "thermal", read_exif_facts(image).taken_at)
-    facts = read_photograph_facts(path)
-    return CameraFile(path, "thermal picture" if _named_thermal(path, folder) else "photograph", facts.taken_at)
+    with errors_name(path, "a camera file that can be decoded"):
+        check_file_size(path)
+        suffix = path.suffix.lower()
+        if suffix in (".npy", ".csv"):
+            return CameraFile(path, "thermal", None)
+        if suffix in (".jpg", ".jpeg"):
+            if is_flir_jpeg(path):
+                flir = read_flir_jpeg(path)
+                taken_at = flir.camera.taken_at
+                role: Role = "thermal" if flir.visible is None else "both"
+                return CameraFile(path, role, None if taken_at is None else taken_at.replace(tzinfo=None))
+            if is_dji_rjpeg(path):
+                return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
+        elif size_of_double_tiff(path) is not None:
+            return CameraFile(path, "thermal", None)
+        else:
+            with Image.open(path) as image:
+                # One channel of more than 8 bits, which no photograph is.
+                if image.mode == "F" or image.mode.startswith("I"):
+                    check_thermal_size(path, *image.size)
+                    return CameraFile(path, "thermal", read_exif_facts(image).taken_at)
+        facts = read_photograph_facts(path)
+        return CameraFile(path, "thermal picture" if _named_thermal(path, folder) else "photograph", facts.taken_at)
 
 
 def _named_thermal(path: Path, folder: Path) -> bool:

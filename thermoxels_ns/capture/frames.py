@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_mask, read_photograph_facts
@@ -27,7 +26,7 @@ _MOST_FOR_DEAD_PIXELS = 60  # frames that stuck pixels are looked for in: more n
 
 @dataclass(frozen=True)
 class CaptureFrame:
-    """One pair, read."""
+    """One pair of photograph and thermal image after reading."""
 
     name: str
     photograph: Path  # a file that holds the photograph alone
@@ -96,9 +95,9 @@ def read_frames(
     frames, dropped, sizes = [], dict[str, str](), []
     for number, pair in enumerate(pairs, start=1):
         try:
-            frame, shape = _read(pair, root, folder, radiometry)
+            frame, size = _read(pair, root, folder, radiometry)
             frames.append(frame)
-            sizes.append(shape)
+            sizes.append(size)
         except ThermoxelsError as problem:  # of the files that are read; a full disk is no bad file
             if not skip_bad:
                 raise
@@ -109,20 +108,21 @@ def read_frames(
         remedy = "Look at the files, or at the pairs that were found in capture.html."
         got = f"none of {len(pairs)}: " + (next(iter(dropped.values())) if dropped else "there are no pairs")
         raise SceneError("pairs", expected="at least one pair whose files can be read", got=got, remedy=remedy)
-    height, width = Counter(sizes).most_common(1)[0][0]
-    for frame, shape in zip(frames, sizes):
-        if shape != (height, width):
-            got, most = f"{shape[1]} x {shape[0]} pixels", f"{width} x {height}"
+    size = Counter(sizes).most_common(1)[0][0]
+    for frame, own in zip(frames, sizes):
+        if own != size:
+            got, most = f"{own[0]} x {own[1]} pixels", f"{size[0]} x {size[1]}"
             dropped[frame.name] = f"{frame.thermal_source} has {got}, most have {most}: another thermal camera"
     kept = [frame for frame in frames if frame.name not in dropped]
-    dead, kept = _without_stuck_pixels(kept, (height, width), thermal_mask)
-    result = CaptureFrames(tuple(kept), (width, height), dead, dropped)
+    dead, kept = _without_stuck_pixels(kept, size, thermal_mask)
+    result = CaptureFrames(tuple(kept), size, dead, dropped)
     bare = [replace(frame, photograph=frame.photograph.name, thermal=frame.thermal.name) for frame in kept]
     write_json(folder / _LIST, replace(result, frames=bare))
     return result
 
 
 def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -> tuple[CaptureFrame, tuple[int, int]]:
+    """Read one pair and write its files; return the frame with the width and height of its thermal image."""
     thermogram = read_thermogram(pair.thermal, radiometry)
     photograph, thermal_focal = pair.photograph, None
     if pair.in_one_file:
@@ -161,21 +161,18 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
         masked=thermogram.report.masked,
     )
     height, width = thermogram.temperature_c.shape
-    return frame, (height, width)
+    return frame, (width, height)
 
 
 def _without_stuck_pixels(
-    frames: list[CaptureFrame], shape: tuple[int, int], thermal_mask: Path | None
+    frames: list[CaptureFrame], size: tuple[int, int], thermal_mask: Path | None
 ) -> tuple[int, list[CaptureFrame]]:
-    """Set stuck and masked pixels to NaN in all frames; return how many are stuck."""
-    bad: npt.NDArray[np.bool_] = np.zeros(shape, dtype=bool)
-    dead = 0
-    if frames:
-        some = np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FOR_DEAD_PIXELS)).round().astype(int)
-        bad |= find_dead_pixels(np.stack([np.load(frames[i].thermal) for i in some]))
-        dead = int(bad.sum())
+    """Set stuck and masked pixels to NaN in all frames; return the number of stuck pixels and the frames."""
+    some = np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FOR_DEAD_PIXELS)).round().astype(int)
+    bad = find_dead_pixels(np.stack([np.load(frames[i].thermal) for i in some]))
+    dead = int(bad.sum())
     if thermal_mask is not None:
-        bad |= ~read_mask(thermal_mask, shape[1], shape[0])
+        bad = bad | ~read_mask(thermal_mask, *size)
     if not bad.any():
         return dead, frames
     changed = []

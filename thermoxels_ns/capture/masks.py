@@ -48,15 +48,16 @@ class PhotographMasks:
 
 
 def find_masks(frames: Sequence[CaptureFrame], folder: Path | None, look_for_overlays: bool) -> PhotographMasks:
-    """Masks for photographs of the size that most of the frames have; a `SceneError` where one cannot be read."""
+    """Find the overlay and the user's masks for the size that most photographs have.
+
+    A `SceneError` is raised where a photograph or a mask cannot be read.
+    """
     sizes = [read_photograph_facts(frame.photograph).size for frame in frames]
     size = max(dict.fromkeys(sizes), key=sizes.count)
     same = [frame for frame, own in zip(frames, sizes) if own == size]
-    drawn = None
-    if look_for_overlays:
-        some = np.linspace(0, len(same) - 1, min(len(same), _LOOKED_AT)).round().astype(int)
-        drawn = find_overlay([same[i].photograph for i in np.unique(some)])
-    return PhotographMasks(size, drawn, user_masks(same, folder))
+    some = np.unique(np.linspace(0, len(same) - 1, min(len(same), _LOOKED_AT)).round().astype(int))
+    overlay = find_overlay([same[i].photograph for i in some]) if look_for_overlays else None
+    return PhotographMasks(size, overlay, user_masks(same, folder))
 
 
 def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str, Path]:
@@ -89,16 +90,12 @@ def find_overlay(photographs: Sequence[Path]) -> npt.NDArray[np.bool_] | None:
     """
     if len(photographs) < MIN_FRAMES:
         return None
-    stack, size = [], (0, 0)
-    for path in photographs:
-        picture = open_photograph(path).convert("L")
-        size = picture.size
-        factor = min(1.0, _SIDE / max(size))
-        small = (max(1, round(size[0] * factor)), max(1, round(size[1] * factor)))
-        stack.append(np.asarray(picture.resize(small, Image.Resampling.BOX), dtype=np.float32))
-    if len({grey.shape for grey in stack}) != 1:
-        return None
-    spread = np.ptp(np.stack(stack), axis=0)
+    size = read_photograph_facts(photographs[0]).size
+    factor = min(1.0, _SIDE / max(size))
+    small = max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+    pictures = (open_photograph(path).convert("L").resize(small, Image.Resampling.BOX) for path in photographs)
+    stack = np.stack([np.asarray(picture, dtype=np.float32) for picture in pictures])
+    spread = np.ptp(stack, axis=0)
     mean = np.mean(stack, axis=0)
     width = int(_AROUND_SHARE * max(mean.shape)) | 1
     around = cv2.blur(spread, (width, width))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from itertools import chain, count
@@ -14,7 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoxels_ns.capture.folder_scan import ROLE_WORDS, CameraFile, CameraFolder, natural_key, shown_name, words_of
+from thermoxels_ns.capture.folder_scan import (
+    ROLE_WORDS,
+    CameraFile,
+    CameraFolder,
+    natural_key,
+    scan_folder,
+    shown_name,
+    words_of,
+)
+from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.transforms_json import path_inside
@@ -61,6 +70,38 @@ class PairSearch:
     unpaired: dict[Path, str] = field(default_factory=dict)  # why, by file
 
 
+def search_pairs(
+    folder: Path, settings: CaptureSettings, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None
+) -> PairSearch:
+    """Scan a folder without the folders `without` and pair its files; files that cannot be read are unpaired.
+
+    Raises:
+        SceneError: The folder holds no pair, or a file cannot be read and the settings do not skip it.
+    """
+    found = scan_folder(folder, without, say)
+    search = find_pairs(found, settings.time_limit_s, settings.clock_offset_s)
+    if found.unreadable and not settings.skip_bad:
+        first = next(iter(found.unreadable.values()))
+        more = f" {len(found.unreadable) - 1} more cannot be read." if len(found.unreadable) > 1 else ""
+        remedy = "" if "--skip-bad" in first else " To go on without such files, pass --skip-bad True."
+        raise SceneError(f"{first}{more}{remedy}")
+    if search.pairs:
+        return replace(search, unpaired=found.unreadable | search.unpaired)
+    roles = Counter(file.role for file in found.files)
+    parts = [
+        *((roles["photograph"], "photographs"), (roles["thermal"], "thermal images")),
+        (roles["thermal picture"], "pictures named thermal, without temperatures"),
+        *((len(found.unreadable), "unreadable files"), (found.others, "files of other kinds")),
+    ]
+    got = ", ".join(f"{number} {what}" for number, what in parts if number) or "no files"
+    for path, why in list(search.unpaired.items())[:1]:
+        got += f" ({shown_name(path)}: {why})"
+    remedy = _REMEDY
+    if any(file.dji for file in found.files) and settings.dji_library is None:
+        remedy += f" {_DJI_LIBRARY}"
+    raise SceneError(str(found.folder), expected="photographs with thermal images", got=got, remedy=remedy)
+
+
 def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: float = 0.0) -> PairSearch:
     """Pair photographs and thermal images: inside one file, by DJI's names, by equal names, by time.
 
@@ -87,7 +128,7 @@ def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: f
     ordered = sorted(pairs, key=lambda pair: natural_key(pair[0].path.relative_to(found.folder)))
     names = _names([photograph.path for photograph, _, _ in ordered], found.folder)
     return PairSearch(
-        tuple(Pair(name, photo.path, hot.path, how) for name, (photo, hot, how) in zip(names, ordered)),
+        tuple(Pair(name, photo.path, partner.path, how) for name, (photo, partner, how) in zip(names, ordered)),
         dict(sorted(unpaired.items(), key=lambda item: natural_key(item[0]))),
     )
 
@@ -138,22 +179,25 @@ def _by_dji_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFil
         match = _DJI.match(file.path.stem.lower())
         if match:
             taken[(file.path.parent, match["head"], match["number"], match["tail"])].append((match, file))
-    pairs, explained = [], dict[Path, str]()
+    pairs, others = [], []
     for group in taken.values():
-        hot = [(m, f) for m, f in group if m["role"] == "t" and f.role != "photograph"]
-        for match, file in hot:
-            near = [(m, f) for m, f in group if f.role == "photograph" and _seconds_apart(m, match) <= _DJI_LATE_S]
-            sides = [[f for m, f in near if m["role"] == letter] for letter in _DJI_PHOTOGRAPHS]
+        photos = [(match, file) for match, file in group if file.role == "photograph"]
+        for match, file in group:
+            if match["role"] != "t" or file.role == "photograph":
+                continue
+            near = [(m["role"], f) for m, f in photos if _seconds_apart(m, match) <= _DJI_LATE_S]
+            sides = [[f for letter, f in near if letter == each] for each in _DJI_PHOTOGRAPHS]
             best = next((side for side in sides if side), [])
-            if len(best) == 1 and best[0].path not in explained:
+            if len(best) == 1:
                 pairs.append((best[0], file, "DJI's names"))
-                chosen = best[0]
-                for _, other in near:
-                    if other is not chosen:
-                        explained[other.path] = f"{chosen.path.name} is the partner of {file.path.name}"
+                others.append([f.path for _, f in near if f is not best[0]])
     counted = Counter(photo.path for photo, _, _ in pairs)
-    clear = [pair for pair in pairs if counted[pair[0].path] == 1]
-    return clear, {path: why for path, why in explained.items() if path not in {p.path for p, _, _ in clear}}
+    clear, explained = [], dict[Path, str]()
+    for pair, rest in zip(pairs, others):
+        if counted[pair[0].path] == 1:
+            clear.append(pair)
+            explained |= {path: f"{pair[0].path.name} is the partner of {pair[1].path.name}" for path in rest}
+    return clear, {path: why for path, why in explained.items() if path not in counted}
 
 
 def _seconds_apart(first: re.Match[str], second: re.Match[str]) -> float:
@@ -167,45 +211,36 @@ def _seconds_apart(first: re.Match[str], second: re.Match[str]) -> float:
 
 
 def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], folder: Path) -> _Found:
-    pairs, explained = [], dict[Path, str]()
-    for group in _groups((*photographs, *thermal), lambda file: _shot(file.path.stem)):
-        for part in _parted(group, folder):
-            photos = [file for file in part if file.role == "photograph"]
-            hot = [file for file in part if file.role == "thermal"]
-            pictures = [file for file in part if file.role == "thermal picture"]
-            for picture in pictures if hot else []:
-                explained[picture.path] = f"a picture for the eye; the temperatures are in {hot[0].path.name}"
-            hot = hot or pictures
-            if len(photos) == 1 and len(hot) == 1:
-                pairs.append((photos[0], hot[0], "equal names"))
-            elif photos and hot:
-                listed = ", ".join(file.path.name for file in (*photos, *hot))
-                why = f"ambiguous: {len(photos)} photographs and {len(hot)} thermal images share a name ({listed})"
-                explained |= {file.path: why for file in (*photos, *hot)}
-    return pairs, explained
-
-
-def _groups(files: Iterable[CameraFile], key: Callable[[CameraFile], tuple]) -> list[list[CameraFile]]:
-    grouped: dict[tuple, list[CameraFile]] = defaultdict(list)
-    for file in files:
-        grouped[key(file)].append(file)
-    return list(grouped.values())
-
-
-def _parted(group: list[CameraFile], folder: Path) -> list[list[CameraFile]]:
-    """Files of one name, by the folder they lie in where one name occurs more than once."""
-    if _one_of_each(group):
-        return [group]
+    """Pair files whose names are equal, or whose names and folders are where one name occurs more than once."""
 
     def place(file: CameraFile) -> tuple[str, ...]:
-        parents = file.path.relative_to(folder).parts[:-1]
-        return tuple(word for part in parents for word in words_of(part) if word not in ROLE_WORDS)
+        folders = file.path.relative_to(folder).parts[:-1]
+        return tuple(word for part in folders for word in words_of(part) if word not in ROLE_WORDS)
 
-    return _groups(group, place)
+    def groups(files: Sequence[CameraFile], key: Callable[[CameraFile], tuple]) -> list[list[CameraFile]]:
+        grouped = defaultdict[tuple, list[CameraFile]](list)
+        for file in files:
+            grouped[key(file)].append(file)
+        return list(grouped.values())
 
-
-def _one_of_each(group: list[CameraFile]) -> bool:
-    return all(sum(file.role == role for file in group) <= 1 for role in ("photograph", "thermal"))
+    pairs, explained = [], dict[Path, str]()
+    for group in groups((*photographs, *thermal), lambda file: _shot(file.path.stem)):
+        roles = Counter(file.role for file in group)
+        several = max(roles["photograph"], roles["thermal"]) > 1
+        for part in groups(group, place) if several else [group]:
+            photos = [file for file in part if file.role == "photograph"]
+            thermals = [file for file in part if file.role == "thermal"]
+            pictures = [file for file in part if file.role == "thermal picture"]
+            for picture in pictures if thermals else []:
+                explained[picture.path] = f"a picture for the eye; the temperatures are in {thermals[0].path.name}"
+            thermals = thermals or pictures
+            if len(photos) == 1 and len(thermals) == 1:
+                pairs.append((photos[0], thermals[0], "equal names"))
+            elif photos and thermals:
+                listed = ", ".join(file.path.name for file in (*photos, *thermals))
+                why = f"ambiguous: {len(photos)} photographs and {len(thermals)} thermal images share a name ({listed})"
+                explained |= {file.path: why for file in (*photos, *thermals)}
+    return pairs, explained
 
 
 def _shot(stem: str) -> tuple[str, ...]:
@@ -221,13 +256,16 @@ def _by_time(
     photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], limit_s: float, offset_s: float
 ) -> _Found:
     explained = {file.path: "no partner of this name, and no time in the file" for file in (*photographs, *thermal)}
-    photos, hot = ([file for file in side if file.taken_at is not None] for side in (photographs, thermal))
-    if not photos or not hot:
+    photos, thermals = ([file for file in side if file.taken_at is not None] for side in (photographs, thermal))
+    if not photos or not thermals:
         return [], explained
-    at = [np.array([(f.taken_at - datetime.min).total_seconds() for f in side if f.taken_at]) for side in (photos, hot)]
+    at = [
+        np.array([(f.taken_at - datetime.min).total_seconds() for f in side if f.taken_at])
+        for side in (photos, thermals)
+    ]
     apart = np.abs(at[0][:, None] - (at[1][None, :] - offset_s))
     chosen: dict[Path, tuple[CameraFile, float]] = {}
-    for files, others, table in ((photos, hot, apart), (hot, photos, apart.T)):
+    for files, others, table in ((photos, thermals, apart), (thermals, photos, apart.T)):
         for file, row in zip(files, table):
             order = np.argsort(row, kind="stable")[:2]
             (partner, *more), (nearest, *seconds) = [others[number] for number in order], row[order].tolist()
@@ -270,26 +308,5 @@ def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
 
 
 def _without_role(stem: str) -> str:
-    cut = re.split(r"([\W_]+)", stem)
-    words = cut[::2]
-    while len(words) > 1 and (words[-1].lower() in ROLE_WORDS or words[-1].lower() in _LAST_LETTERS):
-        words.pop()
-        cut = cut[:-2]
-    return "".join(cut)
-
-
-def no_pairs(found: CameraFolder, unpaired: Mapping[Path, str], has_dji_library: bool) -> SceneError:
-    """Error for a folder without a pair: what there is, one file with its reason, and what helps."""
-    roles = Counter(file.role for file in found.files)
-    parts = [
-        *((roles["photograph"], "photographs"), (roles["thermal"], "thermal images")),
-        (roles["thermal picture"], "pictures named thermal, without temperatures"),
-        *((len(found.unreadable), "unreadable files"), (found.others, "files of other kinds")),
-    ]
-    got = ", ".join(f"{number} {what}" for number, what in parts if number) or "no files"
-    for path, why in list(unpaired.items())[:1]:
-        got += f" ({shown_name(path)}: {why})"
-    remedy = _REMEDY
-    if any(file.dji for file in found.files) and not has_dji_library:
-        remedy += f" {_DJI_LIBRARY}"
-    return SceneError(str(found.folder), expected="photographs with thermal images", got=got, remedy=remedy)
+    """A name without the words at its end that say the kind of image."""
+    return re.sub(rf"(?:[\W_]+(?:{'|'.join(ROLE_WORDS | _LAST_LETTERS)}))+$", "", stem, flags=re.IGNORECASE)

@@ -25,10 +25,6 @@ _ORIENTATION, _SUBSECOND = 274, (37521, 37520)
 _FOCAL_MM, _FOCAL_35MM, _PLANE_X, _PLANE_UNIT = 37386, 41989, 41486, 41488
 _MM_PER_PLANE_UNIT = {1: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FILM_WIDTH_MM = 36.0
-_XMP_ANGLE = {
-    "pitch": re.compile(rb"""GimbalPitchDegree(?:=["']|>)\s*([-+0-9.eE]+)"""),
-    "roll": re.compile(rb"""GimbalRollDegree(?:=["']|>)\s*([-+0-9.eE]+)"""),
-}
 
 
 @dataclass(frozen=True)
@@ -42,7 +38,7 @@ class GpsFix:
 
 @dataclass(frozen=True)
 class PhotographFacts:
-    """None: the file does not say."""
+    """What the header of a photograph says; None where it does not say."""
 
     width: int
     height: int
@@ -126,14 +122,9 @@ def _with_fraction(taken_at: datetime | None, tags: Mapping[int, Any]) -> dateti
 
 def _focal_px(tags: Mapping[int, Any], width: int, height: int) -> float | None:
     longest = max(width, height)
-    focal_mm, per_unit = _number(tags.get(_FOCAL_MM)), _number(tags.get(_PLANE_X))
-    unit_mm = _MM_PER_PLANE_UNIT.get(tags.get(_PLANE_UNIT, 2))
-    film_mm = _number(tags.get(_FOCAL_35MM))
-    candidates = []
-    if focal_mm and per_unit and unit_mm:
-        candidates.append(focal_mm * per_unit / unit_mm)
-    if film_mm:
-        candidates.append(film_mm / _FILM_WIDTH_MM * longest)
+    focal_mm, per_unit, film_mm = (_number(tags.get(tag)) or 0.0 for tag in (_FOCAL_MM, _PLANE_X, _FOCAL_35MM))
+    unit_mm = _MM_PER_PLANE_UNIT.get(tags.get(_PLANE_UNIT, 2), math.inf)
+    candidates = focal_mm * per_unit / unit_mm, film_mm / _FILM_WIDTH_MM * longest
     # A lens of 8 to 160 degrees; what is outside was written for another resolution, or is nonsense.
     return next((px for px in candidates if 0.1 * longest < px < 8.0 * longest), None)
 
@@ -161,9 +152,8 @@ def _degrees(parts: object, side: object, negative: str) -> float | None:
 
 
 def _gimbal(head: bytes) -> tuple[float, float] | None:
-    found = {name: pattern.search(head) for name, pattern in _XMP_ANGLE.items()}
-    values = {name: _number(match.group(1)) if match else None for name, match in found.items()}
-    pitch, roll = values["pitch"], values["roll"]
+    found = [re.search(rb"""Gimbal%sDegree(?:=["']|>)\s*([-+0-9.eE]+)""" % name, head) for name in (b"Pitch", b"Roll")]
+    pitch, roll = (_number(match.group(1)) if match else None for match in found)
     if pitch is None or abs(pitch) > 180.0:
         return None
     return pitch, roll if roll is not None and abs(roll) <= 180.0 else 0.0

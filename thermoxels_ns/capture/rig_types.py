@@ -69,7 +69,7 @@ class RigStart:
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:
-    """The rig as found, or the start where the images cannot tell."""
+    """The rig that was found, or the start value where the images do not determine the rig."""
 
     thermal_camera: Camera
     visible_to_thermal: FloatArray
@@ -176,7 +176,7 @@ class RigModel:
 
 @dataclass(frozen=True, eq=False)
 class DriftEstimate:
-    """How far each thermal image reads too high, and how that grows towards the image's corners."""
+    """How far each thermal image reads too high, and how the error grows towards the image's corners."""
 
     offsets_k: FloatArray
     """To be subtracted from each frame's temperatures, in the order of the frames, mean 0, shape (frames,) [K]."""

@@ -34,7 +34,8 @@ class StageCache:
     """Runs stages in order and keeps what they found in ``.capture/`` of the output folder.
 
     A stage's key is a hash of its name, its options, the files it reads and the key of the stage before it. A stage
-    whose key is the same as last time is not run again. One that was interrupted finds its folder as it left it.
+    whose key is the same as last time is not run again. An interrupted stage finds its folder as the interruption left
+    it.
     """
 
     folder: Path  # the capture's output folder
@@ -167,7 +168,7 @@ def load_json(path: Path) -> Any:
 
 
 def _value(array: np.ndarray, hint: Any) -> Any:
-    """What was kept as an array, in the type of its field."""
+    """Convert a stored array into the type of its field."""
     if hint is Camera:
         width, height, *numbers = array.tolist()
         return Camera(int(width), int(height), *numbers)

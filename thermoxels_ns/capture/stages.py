@@ -14,19 +14,17 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
 from thermoxels_ns.capture.masks import PhotographMasks, find_masks, mask_files, user_masks
-from thermoxels_ns.capture.pairs import Pair, PairSearch, find_pairs, no_pairs, read_pair_list
+from thermoxels_ns.capture.pairs import Pair, read_pair_list, search_pairs
 from thermoxels_ns.capture.rig.board import CheckerBoard, board_of, in_scene_units, rig_from_board_photos
-from thermoxels_ns.capture.rig.drift import estimate_drift
+from thermoxels_ns.capture.rig.drift import estimate_drift, no_drift
 from thermoxels_ns.capture.rig.search import estimate_rig
 from thermoxels_ns.capture.rig.start import kept_start, read_rig, rig_frames, rig_start
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.scene_writer import SCENE_CONTENT, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions
-from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, read_given_poses
-from thermoxels_ns.capture.sfm.poses import add_points, find_poses
+from thermoxels_ns.capture.sfm.poses import add_points, find_poses, fitted_to_photographs, read_given_poses
 from thermoxels_ns.capture.sfm.scale_and_up import (
-    MeasuredDistance,
     MetricScale,
     Up,
     find_up,
@@ -148,12 +146,11 @@ class _Capture:
         board = self.board_rig(model, read)
         rig, start = self.rig(model, frames, read, scale, scale_missing, board)
         drift = self.drift(model, frames, rig)
-        # What the stage of the poses found drawn over the photographs, and the user's masks.
         size, file = (model.camera.width, model.camera.height), self.output / CACHE_FOLDER / "poses" / _OVERLAY_FILE
-        drawn = np.load(file) if file.is_file() else None
-        if drawn is not None and drawn.shape != size[::-1]:
-            drawn = None
-        masks = PhotographMasks(size, drawn, user_masks(frames, self.settings.masks))
+        overlay = np.load(file) if file.is_file() else None
+        if overlay is not None and overlay.shape != size[::-1]:
+            overlay = None
+        masks = PhotographMasks(size, overlay, user_masks(frames, self.settings.masks))
         scene = Scene(frames, model, rig, drift, scale, up, masks)
         written = [self.output / name for name in SCENE_CONTENT if name != "masks" or masks.any]
         self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
@@ -184,13 +181,16 @@ class _Capture:
             "skip_bad": settings.skip_bad,
         }
 
+        def name_of(path: Path) -> str:
+            return Path(os.path.relpath(path, self.source)).as_posix()
+
         def work(folder: Path) -> None:
-            search, unreadable = self._searched_pairs()
-            rows = [
-                (pair.name, self.name_of(pair.photograph), self.name_of(pair.thermal), pair.how)
-                for pair in search.pairs
-            ]
-            left_out = {printable(self.name_of(path)): why for path, why in (unreadable | search.unpaired).items()}
+            if settings.pairs is None:
+                search = search_pairs(self.source, settings, [self.output], self.say)
+            else:
+                search = read_pair_list(settings.pairs, self.source)
+            rows = [(each.name, name_of(each.photograph), name_of(each.thermal), each.how) for each in search.pairs]
+            left_out = {printable(name_of(path)): why for path, why in search.unpaired.items()}
             write_json(folder / "pairs.json", {"pairs": rows, "left_out": left_out})
             self.say(f"pairs: {len(search.pairs)}, files without a partner: {len(search.unpaired)}")
             for name, why in list(left_out.items())[:_MOST_NAMED]:
@@ -201,26 +201,6 @@ class _Capture:
         content = load_json(self.cache.run("pairs", depends, work) / "pairs.json")
         self.dropped |= content["left_out"]
         return tuple(Pair(name, self.source / a, self.source / b, how) for name, a, b, how in content["pairs"])
-
-    def name_of(self, path: Path) -> str:
-        """A camera file's name from the capture's folder on."""
-        return Path(os.path.relpath(path, self.source)).as_posix()
-
-    def _searched_pairs(self) -> tuple[PairSearch, dict[Path, str]]:
-        """The pairs as listed or found, and why some files cannot be read."""
-        settings = self.settings
-        if settings.pairs is not None:
-            return read_pair_list(settings.pairs, self.source), {}
-        found = scan_folder(self.source, [self.output], self.say)
-        search = find_pairs(found, settings.time_limit_s, settings.clock_offset_s)
-        if found.unreadable and not settings.skip_bad:
-            first = next(iter(found.unreadable.values()))
-            more = f" {len(found.unreadable) - 1} more cannot be read." if len(found.unreadable) > 1 else ""
-            remedy = "" if "--skip-bad" in first else " To go on without such files, pass --skip-bad True."
-            raise SceneError(f"{first}{more}{remedy}")
-        if not search.pairs:
-            raise no_pairs(found, search.unpaired, settings.dji_library is not None)
-        return search, found.unreadable
 
     def temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
         """Read the pairs: degrees from thermal files, photographs out of files that hold both."""
@@ -311,9 +291,9 @@ class _Capture:
         """Metres per unit from the surest source that there is; where there is none, why."""
         settings = self.settings
         if settings.known_distance is not None:
-            name, x0, y0, x1, y1, metres = settings.known_distance
-            measured = MeasuredDistance(name, (x0, y0), (x1, y1), metres, settings.known_distance_error_m)
-            return scale_from_distance(model, measured, {f.name: f.photograph_source for f in frames}), ""
+            files = {frame.name: frame.photograph_source for frame in frames}
+            known, error_m = settings.known_distance, settings.known_distance_error_m
+            return scale_from_distance(model, known, files, error_m), ""
         if settings.marker_side_m is not None:
             photographs = {frame.name: frame.photograph for frame in frames}
             return scale_from_markers(model, photographs, settings.marker_side_m, settings.marker_error_m)
@@ -373,7 +353,7 @@ class _Capture:
         def work(folder: Path) -> None:
             if self.settings.drift == "off" or len(model.sighting_frame) < _LEAST_SIGHTINGS:
                 why = "Switched off." if self.settings.drift == "off" else "There are no scene points to compare at."
-                drift = DriftEstimate(np.zeros(len(frames)), (), np.nan, np.nan, False, why)
+                drift = no_drift(len(frames), why)
             else:
                 drift = estimate_drift(rig_frames(model, frames), rig.thermal_camera, rig.visible_to_thermal)
             save(folder / "drift.npz", drift)

@@ -86,7 +86,7 @@ def app_segments(path: Path, whole: bool = False) -> list[tuple[str, bytes]]:
 
 @dataclass(frozen=True)
 class ExifFacts:
-    """None: the file does not say."""
+    """What EXIF tags say of camera and time; None where they do not say."""
 
     make: str | None = None
     model: str | None = None

@@ -122,13 +122,12 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
     except ThermoxelsError as problem:
         expected, remedy = "possible measurement parameters", "Copy the file from the drone again, unedited."
         raise ThermalFileError(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
-    after = before
-    if overrides.given():
+    after = overrides.applied_to(before)
+    if after != before:
         if overrides.air_c is not None and not knows_air:
             remedy = "Use a newer DJI Thermal SDK, or leave --air-c out."
             got = "one that takes the reflected temperature for it"
             raise ThermalFileError("air_c", expected="a libdirp that knows the air temperature", got=got, remedy=remedy)
-        after = overrides.applied_to(before)
         if not knows_air:
             after = replace(after, air_c=after.reflected_c)
         for name in ("distance_m", "emissivity", "reflected_c", *(("air_c",) if knows_air else ())):

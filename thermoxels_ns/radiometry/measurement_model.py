@@ -75,18 +75,14 @@ class ConditionOverrides:
         # With temperatures for all that may need one, only wrong values raise.
         self.applied_to(Conditions(reflected_c=0.0, air_c=0.0))
 
-    def given(self) -> dict[str, float]:
-        """The settings that are not None, by name."""
-        names = [field.name for field in fields(ConditionOverrides)]
-        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-
     def applied_to(self, conditions: Conditions) -> Conditions:
         """Return `conditions` with the given settings in their place.
 
         >>> ConditionOverrides(emissivity=0.9, reflected_c=15.0).applied_to(Conditions()).emissivity
         0.9
         """
-        return replace(conditions, **self.given())
+        given = {field.name: getattr(self, field.name) for field in fields(ConditionOverrides)}
+        return replace(conditions, **{name: value for name, value in given.items() if value is not None})
 
 
 def conditions_text(conditions: Conditions) -> str:
@@ -170,12 +166,10 @@ class PlanckBand:
         inverse_k = np.linspace(1.0 / _HOTTEST_K, 1.0 / _COLDEST_K, _STEPS)
         nodes, weights = np.polynomial.legendre.leggauss(48)
         half = 0.5 * (self.longest_um - self.shortest_um)
-        wavelengths = self.shortest_um + half * (nodes + 1.0)
-        spectral = FIRST_RADIATION_W_UM4_M2_SR / wavelengths**5
-        radiance = np.zeros(_STEPS)
-        for wavelength, strength in zip(wavelengths, half * weights * spectral):
-            radiance += strength / np.expm1(SECOND_RADIATION_UM_K / wavelength * inverse_k)
-        return inverse_k, np.log(radiance)
+        wavelength = self.shortest_um + half * (nodes + 1.0)
+        strength = half * weights * FIRST_RADIATION_W_UM4_M2_SR / wavelength**5
+        radiance = 1.0 / np.expm1(SECOND_RADIATION_UM_K * inverse_k[:, None] / wavelength)
+        return inverse_k, np.log(radiance @ strength)
 
     def signal(self, temperature_k: npt.ArrayLike) -> Floats:
         """Radiance of a black body in the band, [W / (m2 sr)], from 50 to 6000 K, any shape, float64.
@@ -254,7 +248,8 @@ class RadiometricModel:
     def signal(self, temperature_c: npt.ArrayLike) -> Floats:
         """Counts that the sensor gives in front of objects of these temperatures, [degrees C], any shape, float64."""
         weight, background = self._weights()
-        return weight * self.sensor.signal(_kelvin(temperature_c)) + background
+        kelvin = celsius_to_kelvin(np.asarray(temperature_c, dtype=np.float64))
+        return weight * self.sensor.signal(kelvin) + background
 
     def temperature_c(self, signal: npt.ArrayLike) -> Floats:
         """Temperature [degrees C] of the objects that give these counts, any shape: the inverse of `signal`.
@@ -278,7 +273,7 @@ class RadiometricModel:
             (1.0 - optics, given.window_c),
         ):
             if share > 0 and celsius is not None:  # Conditions makes sure that there is one where it is needed
-                background += share * float(self.sensor.signal(_kelvin(celsius)))
+                background += share * float(self.sensor.signal(celsius_to_kelvin(celsius)))
         weight = given.emissivity * tau * optics
         if not weight > 0:
             expected = "a distance that some radiation passes"
@@ -289,22 +284,12 @@ class RadiometricModel:
 
 
 def corrected_temperature_c(
-    temperature_c: npt.ArrayLike,
-    before: Conditions,
-    after: Conditions,
-    sensor: SensorCurve = LONG_WAVE,
-    air: AirConstants = AirConstants(),
+    temperature_c: npt.ArrayLike, before: Conditions, after: Conditions, sensor: SensorCurve = LONG_WAVE
 ) -> Floats:
     """Temperatures [degrees C] as the camera would have shown them with other settings, any shape, float64.
 
     They are turned back into the signal that they were computed from with `before`, and read again with `after`. The
     sensor's offset and scale do not matter.
     """
-    if before == after:
-        return np.asarray(temperature_c, dtype=np.float64)
-    signal = RadiometricModel(before, sensor, air).signal(temperature_c)
-    return RadiometricModel(after, sensor, air).temperature_c(signal)
-
-
-def _kelvin(temperature_c: npt.ArrayLike) -> Floats:
-    return celsius_to_kelvin(np.asarray(temperature_c, dtype=np.float64))
+    signal = RadiometricModel(before, sensor).signal(temperature_c)
+    return RadiometricModel(after, sensor).temperature_c(signal)

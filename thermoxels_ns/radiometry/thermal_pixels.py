@@ -18,11 +18,19 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-THERMAL_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".csv")  # file types that `read_thermal_file` knows
+THERMAL_SUFFIXES = (
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".tif",
+    ".tiff",
+    ".npy",
+    ".csv",
+)  # file types that `read_thermal_file` knows
 
 _WIDTH, _HEIGHT, _SAMPLE_BITS, _SAMPLE_FORMAT = 256, 257, 258, 339  # tags of TIFF
 _FLOATING = 3  # a sample format
+VALID_RANGE_C = (-100.0, 2000.0)  # temperatures outside are no measurements, [degrees C]
 MIN_FRAMES = 5  # fewer frames than this cannot tell a stuck pixel from a quiet one
 _WINDOW = 2  # half width of the neighbourhood: 5 x 5, so that a dead column or row is still a minority of it
 _EXPECTED = "a readable thermal file"
@@ -101,17 +109,8 @@ class ThermalImage:
     report: PixelReport
 
 
-@dataclass(frozen=True)
-class _RawPixels:
-    """The numbers of a file before the unit: counts (with the type's ends) or plain values."""
-
-    values: npt.NDArray[Any]
-    no_data: npt.NDArray[np.bool_] | None = None
-    celsius: bool = False  # whether they are degrees whatever the unit says
-
-
 def read_thermal_file(
-    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = (-100.0, 2000.0), suffix: str | None = None
+    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = VALID_RANGE_C, suffix: str | None = None
 ) -> ThermalImage:
     """Read a thermal file: PNG, JPG or TIFF counts, float TIFF, FLIR R-JPEG, ``.npy`` or ``.csv``.
 
@@ -124,27 +123,29 @@ def read_thermal_file(
         ThermalFileError: The file is missing, damaged, a colour picture, or its counts have no unit.
     """
     suffix = (suffix or path.suffix).lower()
+    values: npt.NDArray[Any]
+    no_data = None
     with errors_name(path, _EXPECTED, _REMEDY, ThermalFileError):
-        raw = _read_raw(path, suffix)
-    if raw.values.ndim != 2 or 0 in raw.values.shape:
+        _check_there(path, suffix)
+        if suffix == ".npy":
+            values = _read_npy(path)
+        elif suffix == ".csv":
+            values = _read_csv(path)
+        elif is_flir_jpeg(path):
+            values, unit = read_flir_jpeg(path).temperature_c(), ThermalUnit.celsius()
+        else:
+            values, no_data = _read_image(path)
+    if values.ndim != 2 or 0 in values.shape:
         expected = "one temperature per pixel, shape (height, width)"
         remedy = "Export a single-channel thermal image."
-        raise ThermalFileError(str(path), expected=expected, got=f"shape {raw.values.shape}", remedy=remedy)
-    return _to_celsius(path, suffix, raw, unit, valid_range_c)
-
-
-def _to_celsius(
-    path: Path, suffix: str, raw: _RawPixels, unit: ThermalUnit, valid_range_c: tuple[float, float]
-) -> ThermalImage:
-    values = raw.values
-    plain = raw.celsius or values.dtype.kind == "f" or suffix in (".npy", ".csv")
+        raise ThermalFileError(str(path), expected=expected, got=f"shape {values.shape}", remedy=remedy)
     saturated = np.zeros(values.shape, dtype=bool)
-    if unit.kind == "linear" and not raw.celsius and (values.dtype.kind in "ui" or suffix in _TIFF_SUFFIXES):
+    if unit.kind == "linear" and (values.dtype.kind in "ui" or suffix in _TIFF_SUFFIXES):
         if values.dtype.kind in "ui":
             ends = np.iinfo(values.dtype)
             saturated = (values == ends.min) | (values == ends.max)
         celsius = values.astype(np.float64) * unit.scale + unit.offset_c
-    elif plain:
+    elif values.dtype.kind == "f" or suffix in (".npy", ".csv"):
         celsius = values.astype(np.float64)
     elif unit.kind == "bounds" and suffix not in _TIFF_SUFFIXES and values.dtype in (np.uint8, np.uint16):
         most = np.iinfo(values.dtype).max
@@ -159,8 +160,8 @@ def _to_celsius(
         if unit.kind == "bounds":
             got, remedy = f"{values.dtype} counts of a TIFF and temperature_bounds.json", _COUNTS_REMEDY
         raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
-    if raw.no_data is not None:
-        celsius[raw.no_data] = np.nan
+    if no_data is not None:
+        celsius[no_data] = np.nan
     saturated &= np.isfinite(celsius)
     return masked_image(celsius, (max(valid_range_c[0], -ZERO_CELSIUS_K), valid_range_c[1]), saturated)
 
@@ -182,32 +183,30 @@ def masked_image(
     return ThermalImage(masked, report)
 
 
-def _read_raw(path: Path, suffix: str) -> _RawPixels:
+def _check_there(path: Path, suffix: str) -> None:
+    """Raise a `ThermalFileError` where there is no file, an empty one, or one of an unknown type."""
     if not path.is_file():
         remedy = "Restore the file, or remove the frame or pass --missing-thermal skip."
         raise ThermalFileError("thermal file", expected=f"a file at {path}", got="nothing there", remedy=remedy)
     if path.stat().st_size == 0:
         raise _damaged(path, "a file of zero bytes")
-    if suffix == ".npy":
-        try:
-            values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: its size is checked before it is read
-        except ValueError as problem:  # whose text is the header itself
-            raise _damaged(path, "a header that is no array's, or fewer numbers than it says") from problem
-        if not isinstance(values, np.ndarray) or values.dtype.kind not in "fui":
-            raise _damaged(path, f"an array of type {getattr(values, 'dtype', type(values))}")
-        if values.ndim >= 2 and values.size:
-            check_thermal_size(path, values.shape[1], values.shape[0])
-        values = np.array(values)
-        return _RawPixels(values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values)
-    if suffix == ".csv":
-        return _RawPixels(_read_csv(path))
-    if suffix in IMAGE_SUFFIXES:
-        if is_flir_jpeg(path):
-            return _RawPixels(read_flir_jpeg(path).temperature_c(), celsius=True)
-        return _read_image(path)
-    expected = "a thermal file of type " + ", ".join(THERMAL_SUFFIXES)
-    remedy = "Convert the file to one of these."
-    raise ThermalFileError(str(path), expected=expected, got=f"suffix '{suffix}'", remedy=remedy)
+    if suffix not in THERMAL_SUFFIXES:
+        expected = "a thermal file of type " + ", ".join(THERMAL_SUFFIXES)
+        remedy = "Convert the file to one of these."
+        raise ThermalFileError(str(path), expected=expected, got=f"suffix '{suffix}'", remedy=remedy)
+
+
+def _read_npy(path: Path) -> npt.NDArray[Any]:
+    try:
+        values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: its size is checked before it is read
+    except ValueError as problem:  # whose text is the header itself
+        raise _damaged(path, "a header that is no array's, or fewer numbers than it says") from problem
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fui":
+        raise _damaged(path, f"an array of type {getattr(values, 'dtype', type(values))}")
+    if values.ndim >= 2 and values.size:
+        check_thermal_size(path, values.shape[1], values.shape[0])
+    values = np.array(values)
+    return values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
 
 
 def _read_csv(path: Path) -> npt.NDArray[np.float64]:
@@ -232,7 +231,8 @@ def _number(cell: str) -> float:
     return float("nan") if cell.lower() in ("", "nan", "na", "n/a", "null", "none", "-") else float(cell)
 
 
-def _read_image(path: Path) -> _RawPixels:
+def _read_image(path: Path) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_] | None]:
+    """Read the shades of a grey picture, and which of its pixels are transparent."""
     pixels = None
     size = size_of_double_tiff(path)  # of numbers of 64 bits, which Pillow does not open
     if size is not None:
@@ -255,14 +255,14 @@ def _read_image(path: Path) -> _RawPixels:
     if pixels is None:
         raise _damaged(path, "an image that cannot be decoded")
     if pixels.ndim == 2:
-        return _RawPixels(pixels)
+        return pixels, None
     has_alpha = pixels.shape[-1] in (2, 4)
     colours = pixels[..., :-1] if has_alpha else pixels
     if not (colours == colours[..., :1]).all():
         remedy = "Export the radiometric data (16-bit PNG or TIFF, .npy, .csv) or a grey palette."
         got = "a false-colour picture: its palette cannot be turned back into temperatures"
         raise ThermalFileError(str(path), expected="a grey image (all channels equal)", got=got, remedy=remedy)
-    return _RawPixels(np.ascontiguousarray(colours[..., 0]), pixels[..., -1] == 0 if has_alpha else None)
+    return np.ascontiguousarray(colours[..., 0]), pixels[..., -1] == 0 if has_alpha else None
 
 
 def size_of_double_tiff(path: Path) -> tuple[int, int] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -26,6 +26,7 @@ from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg, read_dji_rjpeg
 from thermoxels_ns.radiometry.flir_rjpeg import PictureInPicture, is_flir_jpeg, read_flir_jpeg
 from thermoxels_ns.radiometry.measurement_model import ConditionOverrides, Conditions, corrected_temperature_c
 from thermoxels_ns.radiometry.thermal_pixels import (
+    VALID_RANGE_C,
     PixelReport,
     ThermalImage,
     ThermalUnit,
@@ -50,28 +51,15 @@ _NUMBERS = re.compile(rb"(?:\xef\xbb\xbf)?[-+0-9.,;eE\s\"]|nan|na|n/a|null|none"
 _TEXT = re.compile(rb"[\t\n\r -~\xef\xbb\xbf]*")
 
 
-@dataclass(frozen=True)
-class CountScale:
-    """A camera's counts: degrees C = count * celsius_per_count + celsius_offset."""
-
-    celsius_per_count: float
-    celsius_offset: float
-    cameras: str  # which cameras write so, in words
-
-    @property
-    def unit(self) -> ThermalUnit:
-        """The same for `read_thermal_file`."""
-        return ThermalUnit.linear(self.celsius_per_count, self.celsius_offset)
-
-
-COUNT_SCALES: dict[CameraName, CountScale] = {
-    "workswell": CountScale(1.0 / 40.0, -100.0, "Workswell WIRIS Pro and later"),
-    "flir-high-gain": CountScale(0.04, -273.15, "FLIR Duo Pro R and Vue Pro R, range -25 to 135 C"),
-    "flir-low-gain": CountScale(0.4, -273.15, "FLIR Duo Pro R and Vue Pro R, range -40 to 550 C"),
-    "flir-duo": CountScale(0.01, -273.15, "FLIR Duo R (the first one)"),
-    "sensefly": CountScale(0.01, -100.0, "senseFly thermoMAP and Duet T"),
+COUNT_SCALES: dict[CameraName, tuple[ThermalUnit, str]] = {
+    "workswell": (ThermalUnit.linear(1.0 / 40.0, -100.0), "Workswell WIRIS Pro and later"),
+    "flir-high-gain": (ThermalUnit.linear(0.04, -273.15), "FLIR Duo Pro R and Vue Pro R, range -25 to 135 C"),
+    "flir-low-gain": (ThermalUnit.linear(0.4, -273.15), "FLIR Duo Pro R and Vue Pro R, range -40 to 550 C"),
+    "flir-duo": (ThermalUnit.linear(0.01, -273.15), "FLIR Duo R (the first one)"),
+    "sensefly": (ThermalUnit.linear(0.01, -100.0), "senseFly thermoMAP and Duet T"),
 }
-"""From the makers' manuals. FLIR's two gains cannot be told apart by the file, so the user says which."""
+"""What counts mean and which cameras write them so, from the makers' manuals. A file does not tell FLIR's two gains
+apart, so the user says which."""
 
 
 def recognised_camera(make: str | None, model: str | None) -> CameraName | None:
@@ -118,11 +106,8 @@ class RadiometryOptions(ConditionOverrides):
     celsius_per_count: float | None = None
     """Degrees per count of a TIFF, PNG or whole-number NPY, in place of a camera's."""
     celsius_offset: float | None = None  # Temperature of count zero, [degrees C]; goes with --celsius-per-count
-    stored: Conditions = field(default_factory=Conditions)
-    """What the temperatures of TIFF, PNG, NPY and CSV files were computed with (default: apparent temperatures)."""
     dji_library: Path | None = None
     """Path of DJI's libdirp.so or libdirp.dll, for DJI R-JPEG (from the DJI Thermal SDK)."""
-    valid_range_c: tuple[float, float] = (-100.0, 2000.0)  # Temperatures outside are no measurements, [degrees C]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -142,7 +127,7 @@ class RadiometryOptions(ConditionOverrides):
         """Meaning of counts as the user says it: a scale or a preset; None: not said."""
         if self.celsius_per_count is not None and self.celsius_offset is not None:
             return ThermalUnit.linear(self.celsius_per_count, self.celsius_offset)
-        return COUNT_SCALES[self.camera].unit if self.camera is not None else None
+        return COUNT_SCALES[self.camera][0] if self.camera is not None else None
 
 
 def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> Thermogram:
@@ -166,9 +151,15 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
     try:
         found = detect_format(path)
         if found == "FLIR R-JPEG":
-            image, metadata = _read_flir(path, options)
+            flir = read_flir_jpeg(path)
+            conditions = options.applied_to(flir.camera.conditions)
+            image = masked_image(flir.temperature_c(conditions), VALID_RANGE_C, flir.outside_calibration)
+            camera, angle = flir.camera.model, flir.camera.field_of_view_deg
+            metadata = ThermogramMetadata(found, camera, angle, conditions, flir.picture_in_picture)
         elif found == "DJI R-JPEG":
-            image, metadata = _read_dji(path, options)
+            dji = read_dji_rjpeg(path, options.dji_library, options)
+            image = masked_image(dji.temperature_c, VALID_RANGE_C)
+            metadata = ThermogramMetadata(found, dji.exif.camera, conditions=dji.conditions)
         else:
             image, metadata = _read_stored(path, found, options)
     except OSError as problem:
@@ -204,37 +195,10 @@ def detect_format(path: Path) -> ThermogramFormat:
     raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 
-def _read_flir(path: Path, options: RadiometryOptions) -> tuple[ThermalImage, ThermogramMetadata]:
-    flir = read_flir_jpeg(path)
-    camera = flir.camera
-    conditions = options.applied_to(camera.conditions)
-    image = masked_image(flir.temperature_c(conditions), options.valid_range_c, flir.outside_calibration)
-    metadata = ThermogramMetadata(
-        format="FLIR R-JPEG",
-        camera=camera.model,
-        field_of_view_deg=camera.field_of_view_deg,
-        conditions=conditions,
-        picture_in_picture=flir.picture_in_picture,
-    )
-    return image, metadata
-
-
-def _read_dji(path: Path, options: RadiometryOptions) -> tuple[ThermalImage, ThermogramMetadata]:
-    dji = read_dji_rjpeg(path, options.dji_library, options)
-    image = masked_image(dji.temperature_c, options.valid_range_c)
-    metadata = ThermogramMetadata(
-        format="DJI R-JPEG",
-        camera=dji.exif.camera,
-        conditions=dji.conditions,
-    )
-    return image, metadata
-
-
 def _read_stored(
     path: Path, found: ThermogramFormat, options: RadiometryOptions
 ) -> tuple[ThermalImage, ThermogramMetadata]:
-    """Formats that hold temperatures (or counts linear in them) and not what they were computed with."""
-    before, after = options.stored, options.applied_to(options.stored)
+    """Read a format that holds apparent temperatures, or counts linear in them."""
     unit, exif = options.given_unit, ExifFacts()
     if found in ("TIFF", "PNG"):
         unit, exif = _unit_of_image(path, options)
@@ -246,15 +210,13 @@ def _read_stored(
             remedy = "Pass --camera, or --celsius-per-count and --celsius-offset."
             raise ThermalFileError(str(path), expected=expected, got="whole numbers and no unit", remedy=remedy)
     unit = ThermalUnit.celsius() if unit is None or found == "CSV" else unit
-    image = read_thermal_file(path, unit, options.valid_range_c, f".{found.lower()}")
-    metadata = ThermogramMetadata(
-        format=found,
-        camera=exif.camera,
-        conditions=after,
-        celsius_per_count=unit.scale if found in ("TIFF", "PNG") and unit.kind == "linear" else None,
-    )
-    if before != after:  # pixels that are no temperature under other conditions count as out of range
-        again = masked_image(corrected_temperature_c(image.temperature_c, before, after), options.valid_range_c)
+    image = read_thermal_file(path, unit, suffix=f".{found.lower()}")
+    conditions = options.applied_to(Conditions())
+    per_count = unit.scale if found in ("TIFF", "PNG") and unit.kind == "linear" else None
+    metadata = ThermogramMetadata(found, exif.camera, conditions=conditions, celsius_per_count=per_count)
+    if conditions != Conditions():  # pixels that are no temperature under other conditions count as out of range
+        corrected_c = corrected_temperature_c(image.temperature_c, Conditions(), conditions)
+        again = masked_image(corrected_c, VALID_RANGE_C)
         lost = again.report.masked - image.report.masked
         report = replace(image.report, out_of_range=image.report.out_of_range + lost)
         image = ThermalImage(again.temperature_c, report)
@@ -283,8 +245,8 @@ def _unit_of_image(path: Path, options: RadiometryOptions) -> tuple[ThermalUnit,
     if unit is not None or mode == "F":
         return unit or ThermalUnit.celsius(), exif
     if camera is None:
-        known = ", ".join(f"{name} ({scale.cameras})" for name, scale in COUNT_SCALES.items())
+        known = ", ".join(f"{name} ({cameras})" for name, (_, cameras) in COUNT_SCALES.items())
         remedy = f"Pass --camera with one of {known}; or --celsius-per-count and --celsius-offset."
         got = f"counts of {exif.camera or 'an unnamed camera'}, which may mean several things"
         raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
-    return COUNT_SCALES[camera].unit, exif
+    return COUNT_SCALES[camera][0], exif

@@ -94,11 +94,6 @@ def test_files_give_focal_length_and_place_in_metres_and_then_in_units(folder: P
     assert units.standard_errors["rx"] == rig.standard_errors["rx"]
 
 
-def test_without_a_scale_metres_cannot_be_used(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match=r"known scale.*no GPS.*--known-distance"):
-        in_scene_units(found(folder, tmp_path / "work"), None, "no GPS")
-
-
 def test_pictures_that_do_not_serve_are_refused(
     folder: Path, tmp_path: Path, pairs: list[tuple[np.ndarray, np.ndarray]]
 ) -> None:

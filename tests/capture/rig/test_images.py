@@ -24,16 +24,13 @@ def test_a_pattern_that_stays_is_taken_out_and_the_scene_is_kept() -> None:
     draw = np.random.default_rng(1)
     scenes = [step(angle) for angle in np.linspace(0.0, 170.0, 12)]
     pattern = 0.5 * draw.standard_normal((64, 64)).astype(np.float32)
-    cleaned, agreement = without_fixed_pattern([scene + pattern for scene in scenes])
-    assert agreement > 0.8
+    cleaned = without_fixed_pattern([scene + pattern for scene in scenes])
     left = np.array([image - local_contrast(scene) for image, scene in zip(cleaned, scenes)])
     assert left[:, :20, :20].std() < 0.1 * pattern.std()
     assert np.corrcoef(cleaned[4].ravel(), local_contrast(scenes[4]).ravel())[0, 1] > 0.8
 
 
 def test_images_without_a_pattern_stay_as_they_are() -> None:
-    draw = np.random.default_rng(2)
-    images = [draw.standard_normal((48, 64)).astype(np.float32) for _ in range(10)]
-    cleaned, agreement = without_fixed_pattern(images)
-    assert abs(agreement) < 0.1
+    images = [np.random.default_rng(seed).standard_normal((48, 64)).astype(np.float32) for seed in range(10)]
+    cleaned = without_fixed_pattern(images)
     assert all(np.array_equal(image, local_contrast(raw)) for image, raw in zip(cleaned, images))

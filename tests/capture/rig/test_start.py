@@ -25,16 +25,7 @@ def test_lengths_follow_the_scales(tmp_path, ours, shift):
     assert ("converted" in rig.explanation) == (ours is not None)
 
 
-@pytest.mark.parametrize(
-    "rig",
-    [
-        np.diag([1.0, 1.0, -1.0, 1.0]),
-        np.diag([1.0, 1.0, 1.0, 5.0]),
-        np.diag([2.0, 2.0, 2.0, 1.0]),
-        np.full((4, 4), np.nan),
-        np.eye(3),
-    ],
-)
+@pytest.mark.parametrize("rig", [np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(3)])
 def test_mirrors_and_other_matrices_are_refused(tmp_path, rig):
     with pytest.raises(SceneError, match="rig: expected"):
         read_rig(rig_file(tmp_path, rig=rig.tolist()), (64, 48))

@@ -12,11 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from thermoxels_ns.capture.folder_scan import scan_folder
 from thermoxels_ns.capture.frames import read_frames
-from thermoxels_ns.capture.pairs import find_pairs, no_pairs
+from thermoxels_ns.capture.pairs import search_pairs
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.rig.start import BASELINE_SIGMA_M, rig_start
+from thermoxels_ns.capture.rig.start import BASELINE_SIGMA_M, kept_start, rig_start
 from thermoxels_ns.capture.rig_types import PARAMETERS, FloatArray, RigEstimate, RigModel, RigStart, prior_sigmas
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.scale_and_up import MetricScale
@@ -97,40 +96,30 @@ def rig_from_boards(
         _, turn, shift = cv2.solvePnP(board.corners, plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
         points.append(board.corners @ cv2.Rodrigues(turn)[0].T + shift.ravel())
         seen.append(here)
-    depth = float(np.median(np.concatenate(points)[:, 2])) if points else 1.0
-    rig = RigModel(start.thermal_camera, np.asarray(start.visible_to_thermal, dtype=np.float64))
-    sigmas = prior_sigmas(start, depth)
     if len(points) < _FEWEST_BOARDS:
-        reason = f"the board is seen by both cameras in {len(points)} of {len(pairs)} pairs ({_FEWEST_BOARDS} needed)"
-        text = f"Not determined, the start value is kept ({start.source}): {reason}."
-        return RigEstimate(rig.camera, rig.transform, False, text, PARAMETERS, np.diag(sigmas**2))
-    free = np.flatnonzero(sigmas > 0.0)
+        why = f"The board is seen by both cameras in {len(points)} of {len(pairs)} pairs ({_FEWEST_BOARDS} needed)."
+        return kept_start(start, why)
     every, target = np.concatenate(points), np.concatenate(seen)
-
-    def change(z: FloatArray) -> FloatArray:
-        full = np.zeros(len(sigmas))
-        full[free] = z * sigmas[free]
-        return full
+    rig = RigModel(start.thermal_camera, np.asarray(start.visible_to_thermal, dtype=np.float64))
+    sigmas = prior_sigmas(start, float(np.median(every[:, 2])))
 
     def misfit(z: FloatArray) -> FloatArray:
-        errors = np.nan_to_num(rig.project(change(z), every) - target, nan=1e3).ravel()
+        errors = np.nan_to_num(rig.project(z * sigmas, every) - target, nan=1e3).ravel()
         return np.concatenate([errors / _CORNER_SIGMA_PX, z])
 
-    best = least_squares(misfit, np.zeros(len(free)), loss="huber", x_scale="jac")
-    covariance = np.zeros((len(sigmas),) * 2)
-    scatter = max(float(np.mean(best.fun[: target.size] ** 2)), 1e-6)
-    inverse = np.linalg.inv(best.jac.T @ best.jac) * max(scatter, 1.0)
-    covariance[np.ix_(free, free)] = inverse * np.outer(sigmas[free], sigmas[free])
-    errors_px = np.linalg.norm(best.fun[: target.size].reshape(-1, 2), axis=1) * _CORNER_SIGMA_PX
-    camera, transform = rig.changed(change(best.x))
-    error_px = float(np.median(errors_px))
+    best = least_squares(misfit, np.zeros(len(sigmas)), loss="huber", x_scale="jac")
+    corners = slice(target.size)
+    scatter = max(float(np.mean(best.fun[corners] ** 2)), 1.0)
+    inverse = np.linalg.inv(best.jac.T @ best.jac) * scatter
+    camera, transform = rig.changed(best.x * sigmas)
+    error_px = np.median(np.linalg.norm(best.fun[corners].reshape(-1, 2), axis=1)) * _CORNER_SIGMA_PX
     text = (
         f"Found from {len(points)} pictures of a checker board: focal length {camera.fl_x:.1f} pixels, "
         f"{np.linalg.norm(transform[:3, 3]):.3f} m from the visible camera; corners fall {error_px:.2f} thermal pixels "
         f"from where they are seen (median)."
     )
-    uncertain_px = float(np.sqrt(np.trace(best.jac[: target.size] @ inverse @ best.jac[: target.size].T) / len(every)))
-    sigma_px = uncertain_px * _CORNER_SIGMA_PX
+    variance = np.einsum("ij,jk,ik->", best.jac[corners], inverse, best.jac[corners]) / len(every)
+    sigma_px, covariance = float(np.sqrt(variance)) * _CORNER_SIGMA_PX, inverse * np.outer(sigmas, sigmas)
     return RigEstimate(camera, transform, True, text, PARAMETERS, covariance, projection_sigma_px=sigma_px)
 
 
@@ -164,13 +153,8 @@ def rig_from_board_photos(
     Its files are paired and read like those of the capture, into `folder`. A `SceneError` is raised where there are no
     pairs, they come from another camera, or fewer than three show the board to both cameras.
     """
-    found = scan_folder(source)
-    if found.unreadable and not settings.skip_bad:
-        raise SceneError(next(iter(found.unreadable.values())))
-    search = find_pairs(found, settings.time_limit_s, settings.clock_offset_s)
-    if not search.pairs:
-        raise no_pairs(found, search.unpaired, settings.dji_library is not None)
-    read = read_frames(search.pairs, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
+    found = search_pairs(source, settings).pairs
+    read = read_frames(found, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
     pairs, size = [], (visible.width, visible.height)
     for frame in read.frames:
         photograph = open_photograph(frame.photograph)

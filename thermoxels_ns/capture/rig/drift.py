@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,10 +23,10 @@ _ITERATIONS = 30
 _CONVERGED_K = 1e-5
 _HELD_OUT_EVERY = 5
 _MOST_LAG = 6
+"""How many readings before it, of the same point, each reading is compared with."""
 _FEWEST_POINTS = 50
 _GAIN_OF_OFFSETS, _GAIN_OF_RADIAL = 0.05, 0.01
 _RIDGE = 1e-9
-IntArray = npt.NDArray[np.int64]
 
 _FEWEST_PER_FRAME, _SHARE_PER_FRAME = 1000, 0.5
 """Points of each frame that are read, those that most frames share first. These lie together and can all be wrong: of
@@ -45,133 +45,105 @@ def estimate_drift(
     An uncooled camera reads some kelvin too high or too low from image to image, and warmer or colder towards the
     corners. A scene point has one temperature, so what its readings differ by shows both.
 
-    Reading of point i in frame f = temperature_i + offset_f + c1 r^2 + c2 r^4 + error. Robust least squares (Huber's
-    loss, reweighted), the points' temperatures eliminated, mean offset 0. The correction is fitted to four fifths of
-    the points and kept only if it lowers the disagreement at the others.
+    Reading of point i in frame f = temperature_i + offset_f + c1 r^2 + c2 r^4 + error. Offsets and coefficients are
+    fitted to the differences of two readings of one point by robust least squares (Huber's loss, reweighted), mean
+    offset 0. The correction is fitted to four fifths of the points and kept only if it lowers the differences at the
+    others; without that gain it is all zeros, with `used` False and the reason.
 
-    Without anything to gain the correction is all zeros, with `used` False and the reason. A `SceneError` is raised
-    where a thermal image cannot be read or has not the camera's size.
+    Raises:
+        SceneError: A thermal image cannot be read or has not the camera's size.
     """
     if len(frames) < 2:
-        return _nothing(len(frames), np.nan, f"{len(frames)} frame: there is nothing to compare it with")
+        return no_drift(len(frames), f"No correction: {len(frames)} frame: there is nothing to compare it with.")
     return drift_of_samples(sample_shared_points(frames, thermal_camera, np.asarray(visible_to_thermal, np.float64)))
+
+
+def no_drift(frames: int, why: str, before_k: float = np.nan) -> DriftEstimate:
+    """No correction, and a sentence that says why."""
+    return DriftEstimate(np.zeros(frames), (), before_k, before_k, False, why)
 
 
 def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
     """Find the drift from readings of scene points; see `estimate_drift`."""
     frames = samples.num_frames
-    if samples.num_points < _FEWEST_POINTS:
-        reason = f"only {samples.num_points} scene points are seen by two thermal images (at least {_FEWEST_POINTS})"
-        return _nothing(frames, np.nan, reason)
-    held_out = np.arange(samples.num_points) % _HELD_OUT_EVERY == _HELD_OUT_EVERY - 1
-    fit_to, test_on = samples.of_points(~held_out), samples.of_points(held_out)
-    before_k = _disagreement_k(test_on, np.zeros(len(test_on.point)))
-    plain, full = _fit(fit_to, 0), _fit(fit_to, _RADIAL_TERMS)
-    plain_k, full_k = (_disagreement_k(test_on, fit.at(test_on)) for fit in (plain, full))
-    radial = full_k < (1.0 - _GAIN_OF_RADIAL) * plain_k
-    after_k = full_k if radial else plain_k
+    points = int(samples.point[-1]) + 1 if len(samples.point) else 0
+    if points < _FEWEST_POINTS:
+        seen = f"only {points} scene points are seen by two thermal images (at least {_FEWEST_POINTS})"
+        return no_drift(frames, f"No correction: {seen}.")
+    point, design, difference_k = _differences(samples)
+    share = 1.0 / np.bincount(samples.point)[point]  # a point with many readings has more differences than it knows
+    held_out = point % _HELD_OUT_EVERY == _HELD_OUT_EVERY - 1
+    before_k = float(np.median(np.abs(difference_k[held_out])))
+    after = []
+    for terms in (0, _RADIAL_TERMS):
+        some = design[:, : frames + terms]
+        left = difference_k - some @ _fit(some, difference_k, np.where(held_out, 0.0, share), frames + terms)
+        after.append(float(np.median(np.abs(left[held_out]))))
+    radial = after[1] < (1.0 - _GAIN_OF_RADIAL) * after[0]
+    after_k = after[int(radial)]
     if not after_k < (1.0 - _GAIN_OF_OFFSETS) * before_k:
-        after = f"{after_k:.3g} K with the best correction, at points it was not fitted to"
-        return _nothing(frames, before_k, f"two images differ by {before_k:.3g} K at shared points, and by {after}")
-    best = _fit(samples, _RADIAL_TERMS if radial else 0)
-    corner_k = sum(best.radial)
+        why = (
+            f"No correction: two images differ by {before_k:.3g} K at shared points, and by {after_k:.3g} K with the "
+            "best correction, at points it was not fitted to."
+        )
+        return no_drift(frames, why, before_k)
+    unknowns = frames + _RADIAL_TERMS * radial
+    best = _fit(design[:, :unknowns], difference_k, share, unknowns)
+    offsets_k, coefficients = best[:frames] - best[:frames].mean(), best[frames:] if radial else ()
     explanation = (
         f"Two images differ by {before_k:.3g} K at shared scene points (median), after the correction by {after_k:.3g} "
-        f"K at points it was not fitted to; offsets from {best.offsets_k.min():+.2f} to {best.offsets_k.max():+.2f} K"
-        + (f", image corners read {corner_k:+.2f} K" if radial else ", no radial term")
+        f"K at points it was not fitted to; offsets from {offsets_k.min():+.2f} to {offsets_k.max():+.2f} K"
+        + (f", image corners read {sum(coefficients):+.2f} K" if radial else ", no radial term")
         + "."
     )
-    return DriftEstimate(best.offsets_k, tuple(map(float, best.radial)), before_k, after_k, True, explanation)
+    return DriftEstimate(offsets_k, tuple(map(float, coefficients)), before_k, after_k, True, explanation)
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    offsets_k: FloatArray
-    radial: FloatArray
+def _differences(samples: DriftSamples) -> tuple[npt.NDArray[np.int64], csr_matrix, FloatArray]:
+    """Differences of two readings of one point: the point, what drift adds as a row of a matrix, and the kelvin.
 
-    def at(self, samples: DriftSamples) -> FloatArray:
-        """What readings are too high by, shape (n,) [K]."""
-        powers = samples.radius2[:, None] ** np.arange(1, len(self.radial) + 1)
-        return self.offsets_k[samples.frame] + powers @ self.radial
-
-
-def _fit(samples: DriftSamples, radial_terms: int) -> _Fit:
-    """Iteratively reweighted least squares with the points' temperatures eliminated (Schur complement)."""
-    count, frames = len(samples.point), samples.num_frames
-    row = np.arange(count)
-    design = np.zeros((count, radial_terms))
-    for power in range(radial_terms):
-        design[:, power] = samples.radius2 ** (power + 1)
-    incidence = csr_matrix((np.ones(count), (row, samples.point)), shape=(count, samples.num_points))
-    in_frame = csr_matrix((np.ones(count), (row, samples.frame)), shape=(count, frames))
-    weight = np.ones(count)
-    solution = np.zeros(frames + radial_terms)
-    for _ in range(_ITERATIONS):
-        mass = np.maximum(incidence.T @ weight, 1e-12)
-
-        def centred(values: FloatArray, mass: FloatArray = mass, weight: FloatArray = weight) -> FloatArray:
-            return values - incidence @ ((incidence.T @ (weight[:, None] * values)) / mass[:, None])
-
-        shared = incidence.T @ in_frame.multiply(weight[:, None]).tocsr()  # weight of frame f in point i
-        normal = np.zeros((frames + radial_terms,) * 2)
-        explained = (shared.T @ shared.multiply(1 / mass[:, None])).toarray()
-        normal[:frames, :frames] = np.diag(in_frame.T @ weight) - explained
-        flat = centred(np.column_stack([design, samples.temperature_c]))
-        side = in_frame.T @ (weight[:, None] * flat)
-        normal[:frames, frames:], normal[frames:, :frames] = side[:, :-1], side[:, :-1].T
-        within = flat.T @ (weight[:, None] * flat)
-        normal[frames:, frames:] = within[:-1, :-1]
-        right = np.concatenate([side[:, -1], within[:-1, -1]])
-        # Minimum norm: every group of frames that shares points gets mean offset 0.
-        updated = np.linalg.lstsq(normal, right, rcond=_RIDGE)[0]
-        moved = float(np.abs(updated - solution).max())
-        solution = updated
-        wrong = solution[samples.frame] + design @ solution[frames:]
-        residual = centred((samples.temperature_c - wrong)[:, None])[:, 0]
-        sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-9)
-        weight = np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(residual), 1e-12))
-        if moved < _CONVERGED_K:
-            break
-    offsets = solution[:frames]
-    return _Fit(offsets - offsets.mean(), solution[frames:])
-
-
-def _disagreement_k(samples: DriftSamples, wrong: FloatArray) -> float:
-    """Median difference of two readings of one point, over pairs of frames that see it [K]."""
-    reading = samples.temperature_c - wrong
-    differences = [np.zeros(0)]
+    The columns of the matrix, shape (n, frames + radial terms), belong to the offsets and the radial coefficients.
+    """
+    pairs = []
     for lag in range(1, _MOST_LAG + 1):
-        same = samples.point[lag:] == samples.point[:-lag]
-        differences.append(np.abs(reading[lag:] - reading[:-lag])[same])
-    every = np.concatenate(differences)
-    return float(np.median(every)) if len(every) else float("nan")
+        first = np.flatnonzero(samples.point[lag:] == samples.point[:-lag])
+        pairs.append(np.stack([first, first + lag]))
+    first, second = np.concatenate(pairs, axis=1)
+    frames, count = samples.num_frames, len(first)
+    powers = samples.radius2[:, None] ** np.arange(1, _RADIAL_TERMS + 1)
+    radial = np.broadcast_to(np.arange(frames, frames + _RADIAL_TERMS), (count, _RADIAL_TERMS))
+    columns = np.column_stack([samples.frame[second], samples.frame[first], radial])
+    values = np.column_stack([np.ones(count), -np.ones(count), powers[second] - powers[first]])
+    starts = np.arange(0, columns.size + 1, columns.shape[1])
+    design = csr_matrix((values.ravel(), columns.ravel(), starts), (count, frames + _RADIAL_TERMS))
+    return samples.point[first], design, samples.temperature_c[second] - samples.temperature_c[first]
 
 
-def _nothing(frames: int, before_k: float, reason: str) -> DriftEstimate:
-    return DriftEstimate(np.zeros(frames), (), before_k, before_k, False, f"No correction: {reason}.")
+def _fit(design: csr_matrix, difference_k: FloatArray, share: FloatArray, unknowns: int) -> FloatArray:
+    """Solve for the unknowns (columns) by reweighted least squares with Huber's loss, each row counted by its share."""
+    solution, weight, used = np.zeros(unknowns), share, share > 0.0
+    for _ in range(_ITERATIONS):
+        weighted = design.multiply(weight[:, None]).tocsr()
+        before = solution
+        # Minimum norm: every group of frames that shares points gets mean offset 0.
+        solution = np.linalg.lstsq((weighted.T @ design).toarray(), weighted.T @ difference_k, rcond=_RIDGE)[0]
+        if float(np.abs(solution - before).max()) < _CONVERGED_K:
+            break
+        residual = np.abs(difference_k - design @ solution)
+        sigma = max(_MAD_TO_SIGMA * float(np.median(residual[used])), 1e-9)
+        weight = share * np.minimum(1.0, _HUBER * sigma / np.maximum(residual, 1e-12))
+    return solution
 
 
 @dataclass(frozen=True, eq=False)
 class DriftSamples:
     """Readings of scene points, sorted by point, then by frame. Only points with at least two readings."""
 
-    point: IntArray  # number of the point, 0 to points - 1, shape (n,)
-    frame: IntArray  # number of the frame, shape (n,)
+    point: npt.NDArray[np.int64]  # number of the point, 0 to points - 1, shape (n,)
+    frame: npt.NDArray[np.int64]  # number of the frame, shape (n,)
     temperature_c: FloatArray  # reading [degrees C], shape (n,)
     radius2: FloatArray  # squared distance from the image's centre, 1 in the corner, shape (n,)
     num_frames: int
-
-    @property
-    def num_points(self) -> int:
-        """Number of different points."""
-        return int(self.point[-1]) + 1 if len(self.point) else 0
-
-    def of_points(self, keep: npt.NDArray[np.bool_]) -> DriftSamples:
-        """Only the readings of some points (by number), which are numbered anew."""
-        stays = keep[self.point]
-        number = np.cumsum(keep) - 1
-        frame, temperature_c, radius2 = self.frame[stays], self.temperature_c[stays], self.radius2[stays]
-        return DriftSamples(number[self.point[stays]], frame, temperature_c, radius2, self.num_frames)
 
 
 def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_thermal: FloatArray) -> DriftSamples:
@@ -182,10 +154,9 @@ def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_
     pixel's error in place is a large error in degrees.
     """
     world, tracked = _chosen_points(frames)
-    columns: list[tuple[IntArray, IntArray, FloatArray, FloatArray]] = []
+    columns = []
     for number, frame in enumerate(frames):
-        pose = np.asarray(frame.camera_to_world, dtype=np.float64)
-        visible = ((world - pose[:3, 3]) @ pose[:3, :3]) * (1.0, -1.0, -1.0)
+        visible = replace(frame, points_world=world).points_visible()
         pixels = camera.project(visible @ visible_to_thermal[:3, :3].T + visible_to_thermal[:3, 3])
         near = np.flatnonzero(camera.contains(pixels, _BORDER_PX) & (visible[:, 2] > 0.0))
         ahead = visible[near]
@@ -202,8 +173,9 @@ def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_
         columns.append((near, np.full(len(near), number), reading, radius2))
     point, frame_number, reading, radius2 = (np.concatenate(parts) for parts in zip(*columns))
     order = np.lexsort((frame_number, point))
-    samples = DriftSamples(point[order], frame_number[order], reading[order], radius2[order], len(frames))
-    return samples.of_points(np.bincount(samples.point, minlength=len(world)) >= 2)
+    order = order[np.bincount(point, minlength=len(world))[point[order]] >= 2]
+    number = np.unique(point[order], return_inverse=True)[1].ravel()
+    return DriftSamples(number, frame_number[order], reading[order], radius2[order], len(frames))
 
 
 def _chosen_points(frames: Sequence[RigFrame]) -> tuple[FloatArray, npt.NDArray[np.bool_]]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig_types import FloatArray, RigFrame, RigModel
@@ -38,6 +39,7 @@ _FEWEST_FOR_PATTERN = 8
 _PATTERN_CORRELATION = 0.25
 _BORDER_PX, _BORDER_SHARE = 2.0, 0.05
 _TINY = 1e-12
+_PADDING = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,23 +55,18 @@ class ThermalEdges:
 
     def __init__(self, field: npt.NDArray[np.complex64]) -> None:
         """Take edge values, shape (height, width)."""
-        height, width = field.shape
         self.field = field
-        self.weight: npt.NDArray[np.float32] = np.minimum.outer(_ramp(height), _ramp(width)).astype(np.float32)
-        # Zeros around, so that everything outside reads 0.
-        values = np.pad(np.dstack([field.real, field.imag]).astype(np.float32), ((2, 2), (2, 2), (0, 0)))
-        self._planes = np.zeros((height + 4, width + 4, 6), np.float32)
-        self._planes[..., :2] = values
-        self._planes[:, 1:-1, 2:4] = 0.5 * (values[:, 2:] - values[:, :-2])
-        self._planes[1:-1, :, 4:] = 0.5 * (values[2:] - values[:-2])
+        self.weight: npt.NDArray[np.float32] = np.minimum.outer(*map(_ramp, field.shape)).astype(np.float32)
+        padded = np.pad(field, _PADDING)  # zeros around, so that everything outside reads 0
+        self._planes = padded, np.gradient(padded, axis=1), np.gradient(padded, axis=0)
 
-    def sample(self, pixels: FloatArray) -> npt.NDArray[np.float32]:
-        """Edge values at pixels (n, 2), and their derivatives along x and y: complex as pairs (n, 6); 0 outside."""
-        return _bilinear(self._planes, pixels + 2.0)
+    def sample(self, pixels: FloatArray, *, slopes: bool = False) -> npt.NDArray[np.complex64]:
+        """Edge values at pixels (n, 2) and, if asked for, their slopes along x and y, shape (1 or 3, n); 0 outside."""
+        return np.stack([_bilinear(plane, pixels) for plane in self._planes[: 3 if slopes else 1]])
 
     def weight_at(self, pixels: FloatArray) -> FloatArray:
         """How much points at pixel positions (n, 2) count, shape (n,); 0 outside the image."""
-        return _bilinear(np.pad(self.weight, 2)[..., None], pixels + 2.0)[:, 0].astype(np.float64)
+        return _bilinear(np.pad(self.weight, _PADDING), pixels).astype(np.float64)
 
 
 class RigScore:
@@ -92,7 +89,7 @@ class RigScore:
         self.edges, self.thermal, self.rig = edges, thermal, rig
         self._weights = [t.weight_at(rig.project(around, e.points)) for e, t in zip(edges, thermal)]
         self._own = sum(float(w @ np.abs(e.value) ** 2) for e, w in zip(edges, self._weights))
-        self._scale = 1.0 / np.sqrt(max(self._own * self._sums(around)[1], _TINY))
+        self._norm = self._sums(around)[1]
 
     def around(self, change: FloatArray) -> RigScore:
         """Same images, the points' weights taken at another place."""
@@ -100,27 +97,26 @@ class RigScore:
 
     def value(self, change: FloatArray) -> float:
         """Score of all frames together."""
-        product, other = self._sums(change)
-        return product / np.sqrt(max(self._own * other, _TINY))
+        product, norm = self._sums(change)
+        return product / norm
 
     def _sums(self, change: FloatArray) -> tuple[float, float]:
-        """Weighted sums of Re a* b and |b|^2."""
+        """Weighted sum of Re a* b, and sqrt(sum(w |a|^2) sum(w |b|^2))."""
         product, other = 0.0, 0.0
         for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
-            sampled = thermal.sample(self.rig.project(change, one.points))
-            product += float(weight @ (one.value.real * sampled[:, 0] + one.value.imag * sampled[:, 1]))
-            other += float(weight @ (sampled[:, 0] ** 2 + sampled[:, 1] ** 2))
-        return product, other
+            (value,) = thermal.sample(self.rig.project(change, one.points))
+            product += float(weight @ (one.value.conj() * value).real)
+            other += float(weight @ np.abs(value) ** 2)
+        return product, float(np.sqrt(max(self._own * other, _TINY)))
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
         """What is maximised, and its derivative split by the frames that it comes from, shape (frames, 10)."""
         total, rows = 0.0, []
         for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
-            values = thermal.sample(self.rig.project(change, one.points))
-            by_real, by_imaginary = (self._scale * weight * part for part in (one.value.real, one.value.imag))
-            total += float(by_real @ values[:, 0] + by_imaginary @ values[:, 1])
-            slope = np.column_stack([by_real * values[:, k] + by_imaginary * values[:, k + 1] for k in (2, 4)])
-            rows.append(self.rig.pull_back(change, one.points, slope))
+            sampled = thermal.sample(self.rig.project(change, one.points), slopes=True)
+            value, *slope = weight / self._norm * (one.value.conj() * sampled).real
+            total += float(value.sum())
+            rows.append(self.rig.pull_back(change, one.points, np.stack(slope, axis=1)))
         return total, np.array(rows)
 
 
@@ -167,46 +163,33 @@ class PreparedFrames:
         size = max(round(width * scale), 8), max(round(height * scale), 8)
         small = cv2.resize(frame.grey, size, interpolation=cv2.INTER_AREA)
         field = edge_field(small.astype(np.float32), blur_px, scale / same)
-        rows, columns = np.nonzero(np.abs(field) > _WEAKEST_EDGE)
-        rays = self.visible.resized(*size).rays(np.column_stack([columns + 0.5, rows + 0.5]))
+        place = np.argwhere(np.abs(field) > _WEAKEST_EDGE)  # rows and columns
+        rays = self.visible.resized(*size).rays(place[:, ::-1] + 0.5)
         seen = level.project(change, rays * self.median_depth)
-        margin = _MARGIN_SHARE * level.camera.width
-        near = level.camera.contains(seen, -margin)
-        rows, columns, rays = rows[near], columns[near], rays[near]
-        value = field[rows, columns]
-        most = min(_MOST_POINTS, int(_STRONGEST_SHARE * field.size))
-        if len(value) > most:
-            keep = np.sort(np.argsort(-np.abs(value), kind="stable")[:most])
-            value, rays, rows, columns = value[keep], rays[keep], rows[keep], columns[keep]
+        near = level.camera.contains(seen, -_MARGIN_SHARE * level.camera.width)
+        strength = np.where(near, np.abs(field[tuple(place.T)]), 0.0)
+        most = min(_MOST_POINTS, int(_STRONGEST_SHARE * field.size), np.count_nonzero(near))
+        keep = np.sort(np.argsort(-strength, kind="stable")[:most])
+        rays, (rows, columns) = rays[keep], place[keep].T
         depth, distance = frame.depth.at(rays)
         known = distance < FARTHEST_FROM_POINT
+        # An edge's weight is the same across its width: where only one side of an outline has scene points, a weight
+        # that falls across the outline would move it.
+        trust = np.zeros(field.shape, np.float32)
+        trust[rows, columns] = 1.0 / (1.0 + (distance / SURE_DISTANCE) ** 4)
+        reach = 2 * int(np.ceil(_EDGE_REACH * (blur_px * scale / same + 1.0))) + 1
+        trust = cv2.dilate(trust, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
         turn = level.transform[:3, :3]
-        roll = np.exp(2j * np.arctan2(turn[1, 0], turn[0, 0])).astype(np.complex64)
-        trust = edge_weights(rows, columns, distance, field.shape, blur_px * scale / same)[known]
-        return EdgePoints(rays[known] * depth[known, None], value[known] * trust * roll)
-
-
-def edge_weights(
-    rows: npt.NDArray, columns: npt.NDArray, distance: npt.NDArray, shape: tuple[int, ...], blur_px: float
-) -> FloatImage:
-    """How much edges count by their distance to the next scene point, shape (n,).
-
-    The same across the width of an edge: where only one side of an outline has scene points, a weight that falls across
-    it would move the edge.
-    """
-    trust = np.zeros(shape, np.float32)
-    trust[rows, columns] = 1.0 / (1.0 + (distance / SURE_DISTANCE) ** 4)
-    reach = 2 * int(np.ceil(_EDGE_REACH * (blur_px + 1.0))) + 1
-    widened = cv2.dilate(trust, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
-    return widened[rows, columns].astype(np.float32)
+        roll = np.exp(2j * np.arctan2(turn[1, 0], turn[0, 0]))
+        value = (field * trust)[rows, columns] * roll
+        return EdgePoints(rays[known] * depth[known, None], value[known].astype(np.complex64))
 
 
 def prepare_frames(frames: Sequence[RigFrame], visible: Camera, thermal: Camera) -> PreparedFrames:
     """Read the images of all frames, take out the thermal camera's fixed pattern and check sizes (`SceneError`)."""
     temperatures = [read_temperatures(frame, thermal) for frame in frames]
-    contrasts, _ = without_fixed_pattern(temperatures)
     prepared, depths = [], []
-    for frame, contrast in zip(frames, contrasts):
+    for frame, contrast in zip(frames, without_fixed_pattern(temperatures)):
         points = frame.points_visible()
         depths.append(points[points[:, 2] > 0.0, 2])
         prepared.append(PreparedFrame(read_photograph(frame, visible), contrast, SparseDepth(points)))
@@ -271,49 +254,36 @@ def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0)
     return (parts[0] + 1j * parts[1]).astype(np.complex64)
 
 
-def without_fixed_pattern(images: Sequence[FloatImage]) -> tuple[list[FloatImage], float]:
-    """Local contrasts without what stays in place while the camera moves, and how far two halves of the frames agree.
+def without_fixed_pattern(images: Sequence[FloatImage]) -> list[FloatImage]:
+    """Local contrasts of images without what stays in place while the camera moves.
 
-    Rows, columns and single pixels may read differently. The pattern is the median local contrast over the frames. It
-    is taken out only if two halves of the frames agree.
+    Rows, columns and single pixels may read differently. The pattern is the median local contrast over the images. It
+    is taken out only where two halves of the images agree on it.
     """
     contrast = [local_contrast(image) for image in images]
     if len(contrast) < _FEWEST_FOR_PATTERN:
-        return contrast, 0.0
+        return contrast
     stack = np.nan_to_num(np.stack(contrast), nan=0.0)
-    halves = (np.median(stack[start::2], axis=0) for start in (0, 1))
-    a, b = (half.ravel().astype(np.float64) - float(half.mean(dtype=np.float64)) for half in halves)
-    scale = np.sqrt(float(a @ a) * float(b @ b))
-    agreement = float(a @ b) / scale if scale > 0.0 else 0.0
-    if not agreement > _PATTERN_CORRELATION:
-        return contrast, agreement
-    return [*(stack - np.median(stack, axis=0))], agreement
+    halves = [np.median(stack[start::2], axis=0).ravel() for start in (0, 1)]
+    if not all(half.any() for half in halves) or not np.corrcoef(halves)[0, 1] > _PATTERN_CORRELATION:
+        return contrast
+    return [*(stack - np.median(stack, axis=0))]
 
 
 def local_contrast(image: FloatImage) -> FloatImage:
-    """Difference of each pixel to its surroundings; drift and vignetting do not show in it."""
-    bad = ~np.isfinite(image)
-    known = (~bad).astype(np.float32)
-    filled = np.where(bad, np.float32(0.0), image).astype(np.float32)
-    mean = filled.sum() / max(float(known.sum()), 1.0)
-    filled = np.where(bad, np.float32(0.0), filled - mean)
+    """Difference of each pixel to its surroundings, in which drift and vignetting do not show; NaN stays NaN."""
+    known = np.isfinite(image)
+    filled = np.where(known, image - image[known].mean(dtype=np.float64), 0.0) if known.any() else image
     reach = max(_CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE * image.shape[1])
-    weight = cv2.GaussianBlur(known, (0, 0), reach)
-    around = cv2.GaussianBlur(filled, (0, 0), reach) / np.maximum(weight, 1e-6)
-    return np.where(bad, np.float32(np.nan), filled - around).astype(np.float32)
+    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), reach)
+    around = cv2.GaussianBlur(filled.astype(np.float32), (0, 0), reach) / np.maximum(weight, 1e-6)
+    return np.where(known, filled - around, np.nan).astype(np.float32)
 
 
-def _bilinear(planes: npt.NDArray[np.float32], pixels: FloatArray) -> npt.NDArray[np.float32]:
-    """Sample planes (height, width, k) at pixel positions (n, 2); NaN and what is far off reads the corner."""
-    rows, columns, depth = planes.shape
-    place = np.nan_to_num(pixels, nan=-9.0, posinf=-9.0, neginf=-9.0) - 0.5
-    x, y = np.clip(place[:, 0], 0.0, columns - 1.001), np.clip(place[:, 1], 0.0, rows - 1.001)
-    left, top = x.astype(np.int64), y.astype(np.int64)
-    u, v = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
-    flat, first = planes.reshape(rows * columns, depth), top * columns + left
-    above = flat[first] * (1 - u) + flat[first + 1] * u
-    below = flat[first + columns] * (1 - u) + flat[first + columns + 1] * u
-    return above * (1 - v) + below * v
+def _bilinear(padded: npt.NDArray, pixels: FloatArray) -> npt.NDArray:
+    """Sample a plane with zeros around at pixel positions (n, 2) of the plane without them; NaN reads 0."""
+    place = np.nan_to_num(pixels, nan=-9.0)[:, ::-1].T + (_PADDING - 0.5)
+    return ndimage.map_coordinates(padded, place, order=1, mode="nearest")
 
 
 def _ramp(length: int) -> npt.NDArray[np.float64]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
 from scipy import fft
+from scipy.optimize import approx_fprime
 
 from thermoxels_ns.capture.rig.images import EdgePoints, PreparedFrames, RigScore, prepare_frames
-from thermoxels_ns.capture.rig.refinement import RigFit, RigMaximizer, refine
+from thermoxels_ns.capture.rig.refinement import RigPosterior, refine
 from thermoxels_ns.capture.rig_types import (
     PARAMETERS,
     FloatArray,
@@ -32,7 +34,6 @@ _FARTHEST_SIGMAS = 5.0
 _WORTH_TRYING = 0.8
 _SMALLEST_ERROR_PX, _LARGEST_ERROR_SHARE = 1.5, 0.005
 _PROBE_STEP = 1e-4
-_Spectra = tuple[npt.NDArray, ...]
 _REACH_SIGMAS = 2.5
 _STEP_PX = 2.5
 _COARSE_FRAMES = 16
@@ -41,14 +42,9 @@ _APART_PX = 3.0
 _SMALLEST_OVERLAP = 0.3
 _PADDING = 1.6
 _CHANCE_DRAWS = 3
-_WORDS = (
-    *("the tilt up or down", "the turn left or right", "the roll", "the shift to the side", "the shift up or down"),
-    *("the shift ahead", "the focal length", "the principal point's column", "the principal point's row"),
-    "the distortion",
-)
-_SAME = 0.8
-"""Correlation from which on two numbers stand for each other: knowing one would make the other 1.7 times as sure."""
-_NOTHING_LEARNT = 0.8  # share of the first standard deviation that is left where the images say next to nothing
+
+_Spectra = tuple[npt.NDArray, ...]
+_Found = tuple[float, FloatArray]  # a score and the ten changes that reach it
 
 
 def estimate_rig(
@@ -76,130 +72,94 @@ def estimate_rig(
     chosen = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, min(len(usable), _MOST_FRAMES)).astype(int))]
     say("Reading the frames")
     prepared = prepare_frames(chosen, visible, start.thermal_camera)
-    return _RigSearch(prepared, start, say).run()
+    depth, sizes = prepared.median_depth, prepared.sizes()
+    sigmas = prior_sigmas(start, depth)
+    rig = RigModel(start.thermal_camera, np.asarray(start.visible_to_thermal, dtype=np.float64))
+    unchanged = np.zeros(len(PARAMETERS))
+    coarse = prepared.score(rig, unchanged, sizes[0], _COARSE_BLUR_PX)
+    before = coarse.value(unchanged)
 
+    def kept(reason: str) -> RigEstimate:
+        covariance = np.diag(sigmas**2)
+        error_px = _projection_sigma(prepared, rig, unchanged, covariance)
+        text = f"Not determined, the start value is kept ({start.source}): {reason}."
+        return RigEstimate(rig.camera, rig.transform, False, text, PARAMETERS, covariance, before, before, error_px)
 
-@dataclass(frozen=True, eq=False)
-class _RigSearch:
-    prepared: PreparedFrames
-    start: RigStart
-    say: Callable[[str], None]
-
-    def run(self) -> RigEstimate:
-        depth = self.prepared.median_depth
-        sigmas = prior_sigmas(self.start, depth)
-        rig = RigModel(self.start.thermal_camera, np.asarray(self.start.visible_to_thermal, dtype=np.float64))
-        unchanged = np.zeros(len(PARAMETERS))
-        sizes = self.prepared.sizes()
-        coarse = self.prepared.score(rig, unchanged, sizes[0], _COARSE_BLUR_PX)
-        before = coarse.value(unchanged)
-        if len(self.prepared.frames) < _FEWEST_FRAMES:
-            reason = f"{len(self.prepared.frames)} frames are too few to tell; at least {_FEWEST_FRAMES} are needed"
-            return self._kept(rig, sigmas, before, reason)
-        coarse_rigs: list[RigFit] = []
-        chance, level = 0.0, 0
-        for level, size in enumerate(sizes[:_SEARCHED_SIZES]):  # small things show in the second size only
-            self.say(f"Comparing edges, all directions, {size[0]} x {size[1]} pixels")
-            coarse = self.prepared.score(rig, unchanged, size, _COARSE_BLUR_PX) if level else coarse
-            search = CoarseSearch(coarse, sigmas, depth)
-            coarse_rigs, chance = search.best(), search.best_by_chance()
-            if coarse_rigs[0].score > _ABOVE_CHANCE * chance:
-                break
-        else:
-            reason = (
-                f"the thermal edges agree with those of the photographs no better ({coarse_rigs[0].score:.3f}) than "
-                f"chance ({chance:.3f}): the thermal images are too flat or show other things"
-            )
-            return self._kept(rig, sigmas, before, reason)
-        maxima = []
-        for one in coarse_rigs:
-            if one.score >= _WORTH_TRYING * coarse_rigs[0].score:
-                maxima.append(RigMaximizer(coarse.around(one.change), sigmas, depth).maximize(one.change))
-        change = max(maxima, key=lambda fit: fit.score).change
-        finer = sizes[level + 1 :] or sizes[-1:]
-        score, maximizer = coarse, RigMaximizer(coarse, sigmas, depth)
-        for size in finer:
-            self.say(f"Comparing edges, {size[0]} x {size[1]} pixels")
-            blur_px = _FINE_BLUR_PX if size == sizes[-1] else _COARSE_BLUR_PX
-            score = self.prepared.score(rig, change, size, blur_px)
-            maximizer = RigMaximizer(score, sigmas, depth)
-            change = maximizer.maximize(change).change
-        covariance = maximizer.covariance(change)
-        before, after = score.value(unchanged), score.value(change)
-        error_px = self._projection_sigma(rig, change, covariance)
-        reason = self._rejection(change, sigmas, before, after, error_px)
-        if reason is not None:
-            return self._kept(rig, sigmas, before, reason)
-        self.say("Comparing windows")
-        better = refine(self.prepared, rig, change, sigmas)
-        windows = ""
-        if better is not None:
-            error_px = self._projection_sigma(rig, better.change, better.covariance)
-            reason = self._rejection(better.change, sigmas, before, after, error_px)
-            if reason is None:
-                change, covariance = better.change, better.covariance
-                after = score.value(change)
-                windows = f" and {better.windows} windows of them that agree"
-            error_px = self._projection_sigma(rig, change, covariance)
-        camera, transform = rig.changed(change)
-        found = RigEstimate(camera, transform, True, "", PARAMETERS, covariance, before, after, error_px)
-        explanation = (
-            f"Found from {len(self.prepared.frames)} frames{windows}: focal length {camera.fl_x:.1f} pixels, turned by "
-            f"{found.turn_deg:.2f} ± {found.turn_error_deg:.2f} degrees and {np.linalg.norm(transform[:3, 3]):.3g} "
-            f"units from the visible camera; scene points fall within {error_px:.2f} thermal pixels (standard error). "
-            f"Start: {self.start.source}.{_unsure(covariance, sigmas)}"
+    if len(chosen) < _FEWEST_FRAMES:
+        return kept(f"{len(chosen)} frames are too few to tell; at least {_FEWEST_FRAMES} are needed")
+    candidates: list[_Found] = []
+    chance, level = 0.0, 0
+    for level, size in enumerate(sizes[:_SEARCHED_SIZES]):  # small things show in the second size only
+        say(f"Comparing edges, all directions, {size[0]} x {size[1]} pixels")
+        coarse = prepared.score(rig, unchanged, size, _COARSE_BLUR_PX) if level else coarse
+        search = CoarseSearch(coarse, sigmas, depth)
+        candidates, chance = search.best(), search.best_by_chance()
+        if candidates[0][0] > _ABOVE_CHANCE * chance:
+            break
+    else:
+        return kept(
+            f"the thermal edges agree with those of the photographs no better ({candidates[0][0]:.3f}) than "
+            f"chance ({chance:.3f}): the thermal images are too flat or show other things"
         )
-        return replace(found, explanation=explanation)
+    maxima = []
+    for value, candidate in candidates:
+        if value >= _WORTH_TRYING * candidates[0][0]:
+            around = coarse.around(candidate)
+            change = RigPosterior(around, sigmas, depth).maximum(candidate)
+            maxima.append((around.value(change), change))
+    change = max(maxima, key=lambda found: found[0])[1]
+    score = coarse
+    for size in sizes[level + 1 :] or sizes[-1:]:
+        say(f"Comparing edges, {size[0]} x {size[1]} pixels")
+        score = prepared.score(rig, change, size, _FINE_BLUR_PX if size == sizes[-1] else _COARSE_BLUR_PX)
+        change = RigPosterior(score, sigmas, depth).maximum(change)
+    before, covariance = score.value(unchanged), RigPosterior(score, sigmas, depth).covariance(change)
 
-    def _rejection(
-        self, change: FloatArray, sigmas: FloatArray, before: float, after: float, error_px: float
-    ) -> str | None:
-        """Why the result is not to be trusted; None if nothing speaks against it."""
+    def rejection(change: FloatArray, covariance: FloatArray) -> str | None:
+        """Say why a rig is not to be trusted; None if nothing speaks against it."""
         free = sigmas > 0.0
         far = np.abs(change[free]) / sigmas[free]
         if far.max() > _FARTHEST_SIGMAS:
             name = np.array(PARAMETERS)[free][int(far.argmax())]
             return f"the best agreement needs {name} {far.max():.0f} standard deviations from the start"
-        if after < before:
-            return "the start agrees better than all that was tried"
-        limit = max(_SMALLEST_ERROR_PX, _LARGEST_ERROR_SHARE * self.prepared.thermal.width)
+        limit = max(_SMALLEST_ERROR_PX, _LARGEST_ERROR_SHARE * prepared.thermal.width)
+        error_px = _projection_sigma(prepared, rig, change, covariance)
         if error_px > limit:
             return f"scene points would be uncertain by {error_px:.1f} thermal pixels (limit {limit:.1f})"
         return None
 
-    def _kept(self, rig: RigModel, sigmas: FloatArray, score: float, reason: str) -> RigEstimate:
-        """The start as the result."""
-        covariance = np.diag(sigmas**2)
-        error_px = self._projection_sigma(rig, np.zeros(len(sigmas)), covariance)
-        text = f"Not determined, the start value is kept ({self.start.source}): {reason}."
-        return RigEstimate(rig.camera, rig.transform, False, text, PARAMETERS, covariance, score, score, error_px)
+    reason = rejection(change, covariance)
+    if score.value(change) < before:
+        reason = "the start agrees better than all that was tried"
+    if reason is not None:
+        return kept(reason)
+    say("Comparing windows")
+    better = refine(prepared, rig, change, sigmas)
+    windows = ""
+    if better is not None and rejection(*better[:2]) is None:
+        change, covariance, count = better
+        windows = f" and {count} windows of them that agree"
+    camera, transform = rig.changed(change)
+    after, error_px = score.value(change), _projection_sigma(prepared, rig, change, covariance)
+    found = RigEstimate(camera, transform, True, "", PARAMETERS, covariance, before, after, error_px)
+    explanation = (
+        f"Found from {len(chosen)} frames{windows}: focal length {camera.fl_x:.1f} pixels, turned by "
+        f"{found.turn_deg:.2f} ± {found.turn_error_deg:.2f} degrees and {np.linalg.norm(transform[:3, 3]):.3g} "
+        f"units from the visible camera; scene points fall within {error_px:.2f} thermal pixels (standard error). "
+        f"Start: {start.source}."
+    )
+    return replace(found, explanation=explanation)
 
-    def _projection_sigma(self, rig: RigModel, change: FloatArray, covariance: FloatArray) -> float:
-        """Median standard error of where scene points fall [thermal pixels], both axes together."""
-        camera = self.prepared.thermal
-        across, down = np.meshgrid(np.linspace(0.05, 0.95, 12), np.linspace(0.05, 0.95, 12))
-        rays = camera.rays(np.column_stack([across.ravel() * camera.width, down.ravel() * camera.height]))
-        points = rays * self.prepared.median_depth
-        here = rig.project(change, points)
-        slopes = np.empty((len(PARAMETERS), *here.shape))
-        for number in range(len(PARAMETERS)):
-            moved = change.copy()
-            moved[number] += _PROBE_STEP
-            slopes[number] = (rig.project(moved, points) - here) / _PROBE_STEP
-        variance = np.einsum("inx,ij,jnx->n", slopes, covariance, slopes)
-        return float(np.sqrt(np.nanmedian(variance)))
 
-
-def _unsure(covariance: FloatArray, sigmas: FloatArray) -> str:
-    """Say which of the ten numbers of a rig are not to be trusted alone; empty where all are."""
-    errors = np.sqrt(np.diag(covariance))
-    alike = np.triu(np.abs(covariance) > _SAME * np.outer(errors, errors), 1)
-    pairs = [f"{_WORDS[first]} and {_WORDS[second]}" for first, second in zip(*np.nonzero(alike))]
-    unknown = [
-        word for word, error, sigma in zip(_WORDS, errors, sigmas) if sigma > 0 and error > _NOTHING_LEARNT * sigma
-    ]
-    text = f" The images hardly tell apart {'; '.join(pairs)}." if pairs else ""
-    return text + (f" They say next to nothing about {', '.join(unknown)}." if unknown else "")
+def _projection_sigma(prepared: PreparedFrames, rig: RigModel, change: FloatArray, covariance: FloatArray) -> float:
+    """Median standard error of where scene points fall [thermal pixels], both axes together."""
+    camera = prepared.thermal
+    grid = np.linspace(0.05, 0.95, 12)
+    pixels = np.array(list(product(grid, grid))) * (camera.width, camera.height)
+    points = camera.rays(pixels) * prepared.median_depth
+    slopes = np.asarray(approx_fprime(change, lambda moved: rig.project(moved, points).ravel(), _PROBE_STEP))
+    variance = np.einsum("ni,ij,nj->n", slopes, covariance, slopes).reshape(-1, 2).sum(axis=1)
+    return float(np.sqrt(np.nanmedian(variance)))
 
 
 class CoarseSearch:
@@ -226,17 +186,15 @@ class CoarseSearch:
         self._focals = _steps(_REACH_SIGMAS * float(sigmas[6]), _STEP_PX / (0.5 * camera.width))
         self._rolls = _steps(_REACH_SIGMAS * float(sigmas[2]), _STEP_PX / corner_px)
 
-    def best(self) -> list[RigFit]:
-        """Find the best few places that differ, best first."""
+    def best(self) -> list[_Found]:
+        """Find the best few places that differ, best first, as scores and the ten changes."""
         found = self._found([self._spectra(edges.field, edges.weight) for edges in self._thermal])
-        kept: list[RigFit] = []
-        for rig in sorted(found, key=lambda rig: -rig.score):
-            apart = [np.abs((rig.change - other.change)[:2]).max() * self._rig.camera.fl_x for other in kept]
-            if not apart or min(apart) >= _APART_PX:
-                kept.append(rig)
-            if len(kept) == _CANDIDATES:
-                break
-        return kept
+        kept: list[_Found] = []
+        for score, change in sorted(found, key=lambda each: -each[0]):
+            apart = [np.abs((change - other)[:2]).max() * self._rig.camera.fl_x for _, other in kept]
+            if min(apart, default=np.inf) >= _APART_PX:
+                kept.append((score, change))
+        return kept[:_CANDIDATES]
 
     def best_by_chance(self) -> float:
         """Highest score that the same search finds if edges of the same scales lie anywhere (noise, random phases)."""
@@ -248,38 +206,32 @@ class CoarseSearch:
                 phases = np.exp(2j * np.pi * draw.random(edges.field.shape))
                 noise = np.asarray(fft.ifft2(np.asarray(fft.fft2(edges.field)) * phases))
                 spectra.append(self._spectra(noise, edges.weight))
-            highest = max(highest, *(rig.score for rig in self._found(spectra)))
+            highest = max(highest, *(score for score, _ in self._found(spectra)))
         return highest
 
     def _spectra(self, field: npt.NDArray, weight: npt.NDArray) -> _Spectra:
         """Fourier transforms of a thermal image's edge values, weights and edge strengths."""
-        weighted = fft.fft2((field * weight).astype(np.complex64), s=self._shape)
-        planes = weight, (np.abs(field) ** 2 * weight).astype(np.float32)
-        return (np.asarray(weighted), *(np.asarray(fft.rfft2(plane, s=self._shape)) for plane in planes))
+        planes = field * weight, weight, np.abs(field) ** 2 * weight
+        return tuple(np.asarray(fft.fft2(plane.astype(np.complex64), s=self._shape)) for plane in planes)
 
-    def _found(self, spectra: Sequence[_Spectra]) -> list[RigFit]:
-        found: list[RigFit] = []
-        for log_focal in self._focals:
-            for roll in self._rolls:
-                change = np.zeros(10)
-                change[2], change[6] = roll, log_focal
-                found += self._best_shifts(self._surface(spectra, change), change)
+    def _found(self, spectra: Sequence[_Spectra]) -> list[_Found]:
+        """The best shifts for every focal length and roll."""
+        found: list[_Found] = []
+        for log_focal, roll in product(self._focals, self._rolls):
+            change = np.zeros(len(PARAMETERS))
+            change[2], change[6] = roll, log_focal
+            found += self._best_shifts(self._surface(spectra, change), change)
         return found
 
     def _surface(self, spectra: Sequence[_Spectra], change: FloatArray) -> FloatArray:
         """Score for every whole shift of the thermal image, shape (rows, columns), shift 0 at [0, 0]."""
-        product: npt.NDArray = np.zeros(self._shape, np.complex64)
-        own: npt.NDArray = np.zeros((self._shape[0], self._shape[1] // 2 + 1), np.complex64)
-        other = own.copy()
-        for edges, (field, weight, strength) in zip(self._edges, spectra):
-            value, power, count = self._splat(edges, change)
-            product += np.conj(np.asarray(fft.fft2(value))) * field
-            own += np.conj(np.asarray(fft.rfft2(power))) * weight
-            other += np.conj(np.asarray(fft.rfft2(count))) * strength
-        overlap, strengths = np.asarray(fft.irfft2(own, s=self._shape)), np.asarray(fft.irfft2(other, s=self._shape))
+        sums = np.zeros((3, *self._shape), np.complex64)
+        for edges, thermal in zip(self._edges, spectra):
+            for total, plane, spectrum in zip(sums, self._splat(edges, change), thermal):
+                total += np.conj(np.asarray(fft.fft2(plane))) * spectrum
+        agreement, overlap, strengths = np.asarray(fft.ifft2(sums)).real
         enough = overlap > _SMALLEST_OVERLAP * max(float(overlap.max()), 1e-12)
-        norm = np.where(enough, np.maximum(overlap * strengths, 1e-12), np.inf)
-        return np.asarray(fft.ifft2(product)).real / np.sqrt(norm)
+        return agreement / np.sqrt(np.where(enough, np.maximum(overlap * strengths, 1e-12), np.inf))
 
     def _splat(self, edges: EdgePoints, change: FloatArray) -> tuple[npt.NDArray, npt.NDArray, npt.NDArray]:
         """Edge values, their power and their number in each pixel of the padded image, around which shifts wrap."""
@@ -295,17 +247,17 @@ class CoarseSearch:
         )
         return real + np.complex64(1j) * imaginary, power, count
 
-    def _best_shifts(self, surface: FloatArray, change: FloatArray) -> list[RigFit]:
+    def _best_shifts(self, surface: FloatArray, change: FloatArray) -> list[_Found]:
         """The highest places of one surface within reach, as turns of the camera."""
         across, down = (int(np.ceil(reach)) for reach in self._reach_px)
         window = np.roll(surface, (down, across), axis=(0, 1))[: 2 * down + 1, : 2 * across + 1]
         focal = np.array([self._rig.camera.fl_x, self._rig.camera.fl_y]) * np.exp(change[6])
-        found = []
+        found: list[_Found] = []
         for place in np.argsort(-window, axis=None, kind="stable")[:_CANDIDATES]:
             row, column = divmod(int(place), window.shape[1])
             shifted = change.copy()
             shifted[:2] = -(row - down) / focal[1], (column - across) / focal[0]
-            found.append(RigFit(shifted, float(window[row, column])))
+            found.append((float(window[row, column]), shifted))
         return found
 
 

@@ -28,7 +28,7 @@ _BELIEVED_DEG = (3.0, 150.0)  # angles of view that are believed; some cameras s
 
 
 def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame]:
-    """Pairs with their poses and the scene points that they see, in the order of the model's frames."""
+    """Return photograph, thermal image, pose and visible scene points of each of the model's frames, in their order."""
     by_name = {frame.name: frame for frame in frames}
     good = model.point_error_px <= _MOST_ERROR_PX
     result = []
@@ -53,6 +53,10 @@ def rig_start(
     """
     width, height = thermal_size
     transform = np.eye(4)
+
+    def centred(focal_px: float) -> Camera:
+        return Camera(width, height, focal_px, focal_px, width / 2, height / 2)
+
     lens = [frame.thermal_focal_px for frame in frames if frame.thermal_focal_px]
     flir = [frame.picture_in_picture for frame in frames if frame.picture_in_picture]
     angles = [frame.thermal_field_of_view_deg for frame in frames if frame.thermal_field_of_view_deg]
@@ -62,12 +66,11 @@ def rig_start(
         sigma, source = _FROM_USER, f"the angle of view that was given, {field_of_view_deg:g} degrees"
     elif lens:
         focal = median(lens)
-        camera = Camera(width, height, focal, focal, width / 2, height / 2)
+        camera = centred(focal)
         sigma, source = _FROM_LENS, f"the thermal files' focal length and pixel pitch, {focal:.1f} pixels"
     elif flir:
         ratio = median(each.real_to_thermal for each in flir)
-        focal = visible.fl_x * width / visible.width * ratio
-        camera = Camera(width, height, focal, focal, width / 2, height / 2)
+        camera = centred(visible.fl_x * width / visible.width * ratio)
         x, y = (median(getattr(each, name) for each in flir) for name in ("offset_x", "offset_y"))
         # The thermal image's centre lies at the photograph's centre plus the offset.
         ahead = np.array([x / visible.fl_x, y / visible.fl_y, 1.0])
@@ -81,8 +84,7 @@ def rig_start(
         camera = Camera.from_field_of_view(width, height, angle)
         sigma, source = _FROM_ANGLE, f"the thermal files' angle of view, {angle:g} degrees"
     else:
-        focal = visible.fl_x * width / visible.width
-        camera = Camera(width, height, focal, focal, width / 2, height / 2)
+        camera = centred(visible.fl_x * width / visible.width)
         sigma, source = _GUESSED, "a guess: the photographs' angle of view"
     shift = None if metres_per_unit is None else BASELINE_SIGMA_M / metres_per_unit
     return RigStart(camera, transform, focal_sigma=sigma, translation_sigma=shift, source=source)
@@ -114,6 +116,6 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
 
 
 def kept_start(start: RigStart, why: str) -> RigEstimate:
-    """The start value as an estimate, where nothing can be compared."""
+    """Return the start value as an estimate that is not determined, with the reason."""
     text = f"{why} The start value is kept: {start.source}."
     return RigEstimate(start.thermal_camera, start.visible_to_thermal, False, text)

@@ -43,14 +43,14 @@ def run_in_process(
 ) -> _Result:
     """Call ``work(*arguments, say)`` in a new process, wait for its end and return what it returned.
 
-    What ends COLMAP from inside, such as a thread that cannot write, then does not end this process. The new one ends
-    with this one, also where this one is killed. `work` is a function at the top of a module; pickle must be able to
-    hold what goes in and out.
+    On some errors, such as a thread that cannot write, COLMAP aborts its process; the caller's process survives that.
+    The new process ends with the caller's, also where the caller's is killed. `work` is a function at the top of a
+    module; its arguments and its result can be pickled.
 
     Raises:
-        OutputError: It ended because the disk of `folder` is full.
-        ThermoxelsError: It raised one, or ended without a word.
-        OSError: It raised one.
+        OutputError: The process ended because the disk of `folder` is full.
+        ThermoxelsError: `work` raised one, or the process ended without a result.
+        OSError: `work` raised one.
     """
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe(duplex=False)
@@ -87,7 +87,7 @@ def run_in_process(
 
 
 def _serve(pipe: Connection, log: Path, work: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Do what `run_in_process` of the process that started this one asks for; COLMAP's words go into a file."""
+    """Call `work` in the new process and send its result or error; what COLMAP prints goes into the file `log`."""
     with log.open("ab") as file:
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)

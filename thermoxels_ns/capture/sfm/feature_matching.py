@@ -60,19 +60,13 @@ def image_pairs(count: int, matching: Matching) -> npt.NDArray[np.int64]:
     [[0, 1], [0, 2], [1, 2]]
     """
     if matching == "exhaustive" or (matching == "auto" and count <= EXHAUSTIVE_UP_TO):
-        return _all_pairs(count)
-    steps = [*range(1, _NEIGHBOURS + 1)]
-    while steps[-1] * 2 < count:
-        steps.append(steps[-1] * 2)
+        return np.stack(np.triu_indices(count, 1), axis=1).astype(np.int64)
+    steps = [*range(1, _NEIGHBOURS), *(_NEIGHBOURS * 2**power for power in range(count.bit_length()))]
     first, step = (grid.ravel() for grid in np.meshgrid(np.arange(count), steps, indexing="ij"))
     near = np.stack([first, first + step], axis=1)
     anchors = np.unique(np.linspace(0, count - 1, min(_ANCHORS, count)).round().astype(np.int64))
-    far = anchors[_all_pairs(len(anchors))]
+    far = anchors[np.stack(np.triu_indices(len(anchors), 1), axis=1)]
     return np.unique(np.concatenate([near[near[:, 1] < count], far]).astype(np.int64), axis=0)
-
-
-def _all_pairs(count: int) -> npt.NDArray[np.int64]:
-    return np.stack(np.triu_indices(count, 1), axis=1).astype(np.int64)
 
 
 def fill_database(
@@ -90,14 +84,9 @@ def fill_database(
 def _find_and_match(
     photographs: ReducedPhotographs, camera: Camera, known_focal: bool, options: PoseOptions, say: Callable[[str], None]
 ) -> None:
-    _add_images(photographs, camera, options.lens, known_focal)
-    _find_features(photographs, options, say)
-    _match(photographs, image_pairs(len(photographs.frame_of_image), options.matching), options, say)
-
-
-def _find_features(photographs: ReducedPhotographs, options: PoseOptions, say: Callable[[str], None]) -> None:
     import pycolmap
 
+    _add_images(photographs, camera, options.lens, known_focal)
     database, names = photographs.database, list(photographs.frame_of_image)
     reader = pycolmap.ImageReaderOptions(camera_model=options.lens, existing_camera_id=1)
     if photographs.masks is not None:
@@ -109,24 +98,17 @@ def _find_features(photographs: ReducedPhotographs, options: PoseOptions, say: C
         given: dict[str, Any] = {"reader_options": reader, "extraction_options": extraction}
         pycolmap.extract_features(database, photographs.images, some, **given)
         say(f"features: {start + len(some)} of {len(names)} photographs")
-
-
-def _match(
-    photographs: ReducedPhotographs, pairs: npt.NDArray[np.int64], options: PoseOptions, say: Callable[[str], None]
-) -> None:
-    import pycolmap
-
-    names = list(photographs.frame_of_image)
+    pairs = image_pairs(len(names), options.matching)
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=options.threads)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = options.seed
-    listed = photographs.database.with_name("pairs.txt")
+    listed = database.with_name("pairs.txt")
     for start in range(0, len(pairs), _PAIR_CHUNK):
         some = pairs[start : start + _PAIR_CHUNK]
         listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some), encoding="utf-8")
         pairing: Any = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = str(listed)
-        pycolmap.match_image_pairs(photographs.database, matching, pairing, verification)
+        pycolmap.match_image_pairs(database, matching, pairing, verification)
         say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
 
 

@@ -1,11 +1,11 @@
-"""Where the camera stood: structure from motion on the photographs."""
+"""Where the camera stood: structure from motion on the photographs, or poses that the user gives."""
 
 from __future__ import annotations
 
-import math
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,13 @@ from PIL import Image
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
-from thermoxels_ns.capture.sfm.colmap import model_of_colmap, run_in_process
+from thermoxels_ns.capture.sfm.colmap import model_of_colmap, read_colmap, run_in_process
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, as_colmap, fill_database
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.data.transforms_json import path_inside, read_intrinsics, read_pose
 
 MIN_FRAMES = 3  # fewer photographs are no reconstruction
 _SAID_EVERY = 10
@@ -54,13 +56,12 @@ def find_poses(
     options = options or PoseOptions()
     if len(photographs) < MIN_FRAMES:
         raise _too_few(len(photographs), "photographs")
-    size, other = common_size(photographs)
-    dropped = why_other_size(size, other)
+    size, dropped = common_size(photographs)
     names = [name for name in photographs if name not in dropped]
     if len(names) < MIN_FRAMES:
         raise _too_few(len(names), "photographs of one size")
-    small = _reduced_size(size, options.image_size)
-    reduced = _reduced({name: photographs[name] for name in names}, folder, size, small, masks)
+    some = {name: photographs[name] for name in names}
+    reduced, small = _reduced(some, folder, size, options.image_size, masks)
     # The photographs' own focal length or a usual one, the principal point at the centre.
     focal = focal_px or _GUESSED_FOCAL * max(size)
     start = Camera(*size, focal, focal, size[0] / 2.0, size[1] / 2.0).resized(*small)
@@ -89,45 +90,74 @@ def add_points(
     The photographs have the size of their camera.
     """
     options = options or PoseOptions()
-    size = given.camera.width, given.camera.height
-    small = _reduced_size(size, options.image_size)
-    reduced = _reduced({name: photographs[name] for name in given.frames}, folder, size, small, masks)
+    size, posed = (given.camera.width, given.camera.height), {name: photographs[name] for name in given.frames}
+    reduced, small = _reduced(posed, folder, size, options.image_size, masks)
     fill_database(reduced, given.camera.resized(*small), True, replace(options, lens="OPENCV"), say)
     return run_in_process(_triangulate, (reduced, given, options.seed), folder, say)
 
 
-def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, tuple[int, int]]]:
-    """Find the size that most photographs have, and the frames of another size with theirs."""
+def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
+    """Read poses from a COLMAP model's folder or a transforms.json; their world stays as it is.
+
+    `photographs` are the camera's files, relative to the capture, by the frame's name. The model of a transforms.json
+    has no points; the frames without a pose are named. A `SceneError` is raised where nothing readable is there, no
+    photograph is in it, it has several cameras, or a name in it leads out of its folder.
+    """
+    if path.is_dir():
+        reconstruction = read_colmap(path)
+        names = [image.name for image in reconstruction.images.values()]
+        model = model_of_colmap(reconstruction, _frames_of(names, photographs, path))
+    elif path.is_file():
+        model = _read_transforms(path, photographs)
+    else:
+        expected, got = "a COLMAP model's folder or a transforms.json", f"nothing at {path}"
+        raise SceneError("poses", expected=expected, got=got, remedy="Check the path.")
+    missing = {name: f"{path.name} has no pose of it" for name in photographs if name not in model.frames}
+    return Poses(model, missing)
+
+
+def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Poses:
+    """Express given poses in the pixels of the photographs; they may come from photographs that were reduced.
+
+    Frames whose photographs have another size than most are left out; other proportions are a `SceneError`.
+    """
+    size, other = common_size({name: photographs[name] for name in poses.model.frames})
+    dropped = dict(poses.dropped) | other
+    model, camera = poses.model.without(list(other)), poses.model.camera
+    if size == (camera.width, camera.height):
+        return Poses(model, dropped)
+    factors = np.array([size[0] / camera.width, size[1] / camera.height])
+    # The sides of a reduced image are rounded to whole pixels.
+    if abs(factors[0] / factors[1] - 1.0) > 1.0 / min(*size, camera.width, camera.height):
+        expected = f"photographs with the proportions of {camera.width} x {camera.height} pixels, as their camera has"
+        remedy = "Use the photographs that the poses were computed from, neither cropped nor turned."
+        raise SceneError("given poses", expected=expected, got=f"{size[0]} x {size[1]}", remedy=remedy)
+    error_px, pixel = model.point_error_px * float(factors.mean()), model.sighting_pixel * factors
+    return Poses(replace(model, camera=camera.resized(*size), point_error_px=error_px, sighting_pixel=pixel), dropped)
+
+
+def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, str]]:
+    """Find the width and height that most photographs have, and why frames of another size are left out."""
     sizes = {name: read_photograph_facts(path).size for name, path in photographs.items()}
     if not sizes:
         raise _too_few(0, "photographs")
-    counted = list(sizes.values())
-    common = max(dict.fromkeys(counted), key=counted.count)
-    return common, {name: size for name, size in sizes.items() if size != common}
-
-
-def why_other_size(size: tuple[int, int], other: Mapping[str, tuple[int, int]]) -> dict[str, str]:
-    """Why frames of another size than most are left out."""
+    size = Counter(sizes.values()).most_common(1)[0][0]
     most = f"the others {size[0]} x {size[1]}: another camera or mode"
-    return {name: f"{width} x {height} pixels, {most}" for name, (width, height) in other.items()}
-
-
-def _reduced_size(size: tuple[int, int], longest: int) -> tuple[int, int]:
-    factor = min(1.0, longest / max(size))
-    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+    return size, {name: f"{own[0]} x {own[1]} pixels, {most}" for name, own in sizes.items() if own != size}
 
 
 def _reduced(
-    photographs: Mapping[str, Path],
-    folder: Path,
-    size: tuple[int, int],
-    small: tuple[int, int],
-    masks: PhotographMasks | None,
-) -> ReducedPhotographs:
-    """Write the photographs for COLMAP, smaller and without EXIF, by which it would turn them; and their masks."""
+    photographs: Mapping[str, Path], folder: Path, size: tuple[int, int], longest: int, masks: PhotographMasks | None
+) -> tuple[ReducedPhotographs, tuple[int, int]]:
+    """Write the photographs for COLMAP, smaller and without EXIF, by which it would turn them; and their masks.
+
+    The photographs' width and height become `longest` pixels at most; the second part of the result has them.
+    """
+    factor = min(1.0, longest / max(size))
+    small = max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
     images, mask_folder = folder / "images", folder / "masks"
     images.mkdir(exist_ok=True)
-    digits = max(4, int(math.log10(max(len(photographs), 1))) + 1)
+    digits = max(4, len(str(len(photographs))))
     files = {f"{index:0{digits}d}.jpg": name for index, name in enumerate(photographs)}
     for file, name in files.items():
         if not (images / file).is_file():
@@ -138,14 +168,67 @@ def _reduced(
             temporary = images / f".{file}"
             picture.save(temporary, format="JPEG", quality=_JPEG_QUALITY)
             temporary.replace(images / file)
-    if masks is None or not masks.any:
-        return ReducedPhotographs(folder / _DATABASE, images, files, size)
-    mask_folder.mkdir(exist_ok=True)
-    for file, frame in files.items():
-        use = Image.fromarray(np.where(masks.of(frame), np.uint8(255), np.uint8(0)))
-        # COLMAP looks for the photograph's name with .png behind it.
-        use.resize(small, Image.Resampling.NEAREST).save(mask_folder / f"{file}.png")
-    return ReducedPhotographs(folder / _DATABASE, images, files, size, mask_folder)
+    masked = masks is not None and masks.any
+    if masks is not None and masked:
+        mask_folder.mkdir(exist_ok=True)
+        for file, frame in files.items():
+            # COLMAP looks for the photograph's name with .png behind it.
+            use = Image.fromarray(np.where(masks.of(frame), np.uint8(255), np.uint8(0)))
+            use.resize(small, Image.Resampling.NEAREST).save(mask_folder / f"{file}.png")
+    return ReducedPhotographs(folder / _DATABASE, images, files, size, mask_folder if masked else None), small
+
+
+def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
+    content: Any = read_json(path)
+    entries = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise SceneError(str(path), expected="a list 'frames'", got="none", remedy="Pass another transforms.json.")
+    numbers = {}
+    for index, entry in enumerate(entries):
+        name = str(entry.get("file_path", ""))
+        path_inside(path.parent, name, f"{path.name}: frame {index}")
+        numbers[name] = index
+    frames, poses, cameras = [], [], set()
+    for name, frame in _frames_of(list(numbers), photographs, path).items():
+        entry, where = entries[numbers[name]], f"{path.name}: frame {numbers[name]}"
+        camera = read_intrinsics(content, entry, None, where)
+        if camera.k3 or camera.k4 or camera.lens != "perspective":
+            expected = "a perspective lens with distortion k1, k2, p1, p2"
+            got = f"{camera.lens}, k3 {camera.k3}, k4 {camera.k4}"
+            raise SceneError(where, expected=expected, got=got, remedy="Undistort first.")
+        cameras.add(camera)
+        frames.append(frame)
+        poses.append(read_pose(entry.get("transform_matrix"), f"{where}: transform_matrix"))
+    if len(cameras) != 1:
+        remedy = "Give one set of intrinsics for all frames, or let thermoxels capture find the poses."
+        got = f"{len(frames)} photographs of {len(cameras)} cameras"
+        raise SceneError(str(path), expected="photographs of one camera", got=got, remedy=remedy)
+    none, sightings = np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
+    points = none, none.astype(np.uint8), none[:, 0]
+    return SfmModel(tuple(frames), cameras.pop(), np.stack(poses), *points, sightings, sightings, none[:, :2])
+
+
+def _frames_of(names: list[str], photographs: Mapping[str, str], path: Path) -> dict[str, str]:
+    """Frame by name in a file of poses, in the photographs' order; a stem will do where it is clear."""
+    by_file: dict[str, list[str]] = {}
+    for frame, source in photographs.items():
+        for key in {source, PurePosixPath(source).name, PurePosixPath(source).stem, frame}:
+            by_file.setdefault(key.lower(), []).append(frame)
+    found: dict[str, str] = {}
+    for name in names:
+        plain = PureWindowsPath(name).as_posix()
+        for key in (plain, PurePosixPath(plain).name, PurePosixPath(plain).stem):
+            frames = by_file.get(key.lower(), [])
+            if len(frames) == 1:
+                found[name] = frames[0]
+                break
+    twice = {frame for frame, count in Counter(found.values()).items() if count > 1}
+    if not found or twice:
+        remedy = "Pass the poses of these photographs; they are recognised by their file names."
+        got = f"{sorted(twice)[0]} twice" if twice else f"{names[0] if names else 'no name'} and no known one"
+        raise SceneError(str(path), expected="names of the capture's photographs", got=got, remedy=remedy)
+    order = list(photographs)
+    return dict(sorted(found.items(), key=lambda item: order.index(item[1])))
 
 
 def _too_few(got: int, what: str) -> SceneError:

@@ -37,19 +37,8 @@ class MetricScale:
     """Metres per unit of the model."""
 
     metres_per_unit: float
-    standard_error: float | None  # [m per unit]; None where nobody knows it
+    standard_error: float | None  # [m per unit]; None where it is unknown
     source: str  # a sentence
-
-
-@dataclass(frozen=True)
-class MeasuredDistance:
-    """Two pixels of one photograph, and how far apart the points that they show are."""
-
-    photograph: str  # name of the frame, or of its photograph
-    first: tuple[float, float]  # [pixels], x to the right and y down from the upper left corner
-    second: tuple[float, float]
-    distance_m: float
-    standard_error_m: float | None = None
 
 
 def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple[MetricScale | None, str]:
@@ -103,32 +92,43 @@ def local_metres(fixes: Sequence[GpsFix]) -> FloatArray:
     return np.stack([east, north_radius * (latitude - middle), altitude - altitude.mean()], axis=1)
 
 
-def scale_from_distance(model: SfmModel, measured: MeasuredDistance, photograph_of: Mapping[str, str]) -> MetricScale:
+def scale_from_distance(
+    model: SfmModel,
+    known: tuple[str, float, float, float, float, float],
+    photograph_of: Mapping[str, str],
+    standard_error_m: float | None = None,
+) -> MetricScale:
     """Find the scale from a length that was measured between two points that one photograph shows.
 
     The depth at a pixel is that of a plane through the scene points around it: inverse depth is linear in the pixel,
-    fitted by weighted least squares. `photograph_of` names the photograph's file by frame.
+    fitted by weighted least squares.
+
+    Args:
+        model: Poses and scene points.
+        known: Name of the photograph or its frame, x and y of the one end and of the other [pixels], and metres.
+        photograph_of: The photograph's file by frame.
+        standard_error_m: Standard error of the length [m]; None counts as 0.
 
     Raises:
         ThermoxelsError: The photograph has no pose, a pixel lies outside or has no scene points around it, or the
             distance is no length.
     """
-    check_positive("known distance", measured.distance_m, "Pass the measured length in metres.")
-    index = _frame_named(model, measured.photograph, photograph_of)
-    ends, errors = [], []
-    for pixel in (measured.first, measured.second):
-        end, error = _surface_point(model, index, pixel)
-        ends.append(end)
-        errors.append(error)
-    apart = float(np.linalg.norm(ends[0] - ends[1]))
+    name, x0, y0, x1, y1, metres = known
+    check_positive("known distance", metres, "Pass the measured length in metres.")
+    files = {frame: photograph_of.get(frame, frame) for frame in model.frames}
+    named = [frame for frame, file in files.items() if name in (frame, file, Path(file).name, Path(file).stem)]
+    if not named:
+        remedy = f"Pass one of them, such as {files[model.frames[0]]}."
+        raise SceneError("known distance", expected="a photograph whose pose was found", got=name, remedy=remedy)
+    index = model.frames.index(named[0])
+    (first, error), (second, other_error) = (_surface_point(model, index, pixel) for pixel in ((x0, y0), (x1, y1)))
+    apart = float(np.linalg.norm(second - first))
     if not apart > 0:
         raise SceneError("known distance", expected="two different points", got="one", remedy="Pass two pixels.")
-    along = (ends[1] - ends[0]) / apart
-    of_points = math.hypot(*(float(np.abs(error @ along)) for error in errors)) / apart
-    of_tape = (measured.standard_error_m or 0.0) / measured.distance_m
-    scale = measured.distance_m / apart
-    source = f"From {measured.distance_m:g} m measured between two points in {measured.photograph}."
-    return MetricScale(scale, scale * math.hypot(of_points, of_tape), source)
+    along = (second - first) / apart
+    relative = math.hypot(error @ along / apart, other_error @ along / apart, (standard_error_m or 0.0) / metres)
+    source = f"From {metres:g} m measured between two points in {name}."
+    return MetricScale(metres / apart, metres / apart * relative, source)
 
 
 def scale_from_markers(
@@ -183,21 +183,9 @@ def _similarity(model: FloatArray, metres: FloatArray, weight: FloatArray) -> tu
     a, b = model - share @ model, metres - share @ metres
     left, size, right = np.linalg.svd((b * share[:, None]).T @ a)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    variance = float(share @ (a * a).sum(axis=1))
-    if not variance > 0:
-        return 0.0, np.zeros(len(model))
-    scale = float(size @ sign) / variance
+    scale = float(size @ sign) / max(float(share @ (a * a).sum(axis=1)), 1e-300)
     rotated = a @ (left * sign @ right).T
     return scale, np.linalg.norm(b - scale * rotated, axis=1)
-
-
-def _frame_named(model: SfmModel, name: str, photograph_of: Mapping[str, str]) -> int:
-    for index, frame in enumerate(model.frames):
-        file = photograph_of.get(frame, frame)
-        if name in (frame, file, Path(file).name, Path(file).stem):
-            return index
-    remedy = f"Pass one of them, such as {photograph_of.get(model.frames[0], model.frames[0])}."
-    raise SceneError("known distance", expected="a photograph whose pose was found", got=name, remedy=remedy)
 
 
 def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
@@ -214,37 +202,31 @@ def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> t
     if len(near) < 4:
         remedy = "Measure between points with texture around them."
         raise SceneError("known distance", expected=f"scene points around pixel {pixel}", got=len(near), remedy=remedy)
-    depth = model.in_camera(index, model.points[points[near]])[:, 2]
+    inverse = 1.0 / model.in_camera(index, model.points[points[near]])[:, 2]
     weight = 1.0 / (1.0 + apart[near] / (np.median(apart[near]) + 1e-9))
     table = np.column_stack([np.ones(len(near)), (pixels[near] - pixel) / camera.width])
-    inverse, keep, plane = 1.0 / depth, np.ones(len(near), dtype=bool), np.zeros(3)
-    for _ in range(3):
-        w = (weight * keep)[:, None]
-        plane = np.linalg.lstsq(table * w, inverse * w[:, 0], rcond=1e-6)[0]
+    plane, off, keep = np.zeros(3), np.zeros(len(near)), np.ones(len(near), dtype=bool)
+    for _ in range(3):  # points far off the plane through the others do not count
+        used = (weight * keep)[:, None]
+        plane = np.linalg.lstsq(table * used, inverse * used[:, 0], rcond=1e-6)[0]
         off = np.abs(table @ plane - inverse)
         keep = off <= 3.0 * 1.4826 * float(np.median(off)) + 1e-12
-    at, scatter = float(plane[0]), float(np.sqrt(np.mean((table @ plane - inverse)[keep] ** 2)))
-    if not at > 0.25 * float(np.median(inverse)):
-        at = float(np.median(inverse))
-    pose = model.camera_to_world[index]
-    ray = camera.rays(np.array([pixel]))[0] * (1.0, -1.0, -1.0) @ pose[:3, :3].T
-    error = scatter / at**2 / math.sqrt(max(int(keep.sum()) - 3, 1))
-    return pose[:3, 3] + ray / at, ray * error
+    at = max(float(plane[0]), 0.25 * float(np.median(inverse)))
+    ray = model.ray(index, np.asarray(pixel))
+    error = float(np.sqrt(np.mean(off[keep] ** 2))) / at**2 / math.sqrt(max(int(keep.sum()) - 3, 1))
+    return model.centres[index] + ray / at, ray * error
 
 
 def _triangulate(model: SfmModel, views: Sequence[tuple[int, npt.NDArray]]) -> tuple[FloatArray, FloatArray]:
     """Point nearest to all rays, shape (3,), and how far it projects from each pixel, shape (views,), [pixels]."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for index, pixel in views:
-        pose = model.camera_to_world[index]
-        ray = model.camera.rays(pixel[None])[0] * (1.0, -1.0, -1.0) @ pose[:3, :3].T
-        ray /= np.linalg.norm(ray)
-        across = np.eye(3) - np.outer(ray, ray)
+        ray = model.ray(index, pixel)
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
         normal += across
-        right += across @ pose[:3, 3]
+        right += across @ model.centres[index]
     point = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
-    views_px = ((model.camera.project(model.in_camera(index, point[None]))[0], pixel) for index, pixel in views)
-    off = [np.linalg.norm(projected - pixel) for projected, pixel in views_px]
+    off = [np.linalg.norm(model.camera.project(model.in_camera(i, point[None]))[0] - pixel) for i, pixel in views]
     return point, np.nan_to_num(np.array(off), nan=np.inf)
 
 
@@ -255,7 +237,7 @@ class Up:
     direction: FloatArray  # unit vector in the model's coordinates, shape (3,)
     source: str  # a sentence
     spread_deg: float | None
-    """Median angle between it and what single photographs say, [degrees]; None where they say nothing."""
+    """Median angle between `direction` and those of single photographs, [degrees]; None where these say nothing."""
 
 
 def find_up(
@@ -294,7 +276,7 @@ def find_up(
 
 
 def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
-    """Rotation (3, 3) that turns `up` to z and `ahead`, as far as it is level, to y; to any level axis where it is not.
+    """Return the rotation (3, 3) that turns `up` to z and the level part of `ahead` to y; any level axis where it is 0.
 
     >>> level_rotation([0, 1, 0], [0, 0, -1]).round(9).tolist()
     [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
@@ -311,7 +293,7 @@ def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
 
 
 def _robust_mean(directions: FloatArray) -> FloatArray:
-    """Mean direction in which the farther half does not count."""
+    """Return the mean of the half of the directions that lies nearer to it, a unit vector (3,)."""
     mean = directions.sum(axis=0)
     for _ in range(5):
         mean = mean / max(float(np.linalg.norm(mean)), 1e-12)

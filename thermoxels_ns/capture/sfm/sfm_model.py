@@ -51,6 +51,11 @@ class SfmModel:
         pose = self.camera_to_world[frame]
         return (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3] @ OPENGL_FROM_OPENCV[:3, :3]
 
+    def ray(self, frame: int, pixel: npt.NDArray[np.floating]) -> FloatArray:
+        """Return the point, less the camera's place, that a pixel (2,) of a frame sees at depth 1, shape (3,)."""
+        pose = self.camera_to_world[frame]
+        return (self.camera.rays(pixel[None]) * (1.0, -1.0, -1.0))[0] @ pose[:3, :3].T
+
     def sighting_error_px(self) -> FloatArray:
         """Distance between where each point is seen and where it projects to, shape (s,), [pixels]."""
         errors = [np.zeros(0)]
@@ -86,9 +91,8 @@ class SparseDepth:
     """Depth over the image plane at depth 1, from the nearest of the scene points around.
 
     The inverse depth of a plane is linear in the image, so a plane through the points gives the depth of a surface that
-    is seen at a slant. Where the points lie on two surfaces it is the one in front that counts: edges that both bands
-    show are mostly outlines, and an outline belongs to what stands in front. Single points that lie far too near do
-    not count.
+    is seen at a slant. Where the points lie on two surfaces, the one in front counts: edges that both bands show are
+    mostly outlines, and an outline belongs to the surface in front. Single points that lie far too near do not count.
     """
 
     def __init__(self, points: FloatArray) -> None:
