@@ -5,8 +5,8 @@ import torch
 from torch import nn
 
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
 from thermoxels_ns.field.harmonics import harmonics, harmonics_with_unit_mean
+from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, seen_behind
 
 
 def sphere_quadrature(rows: int = 64) -> tuple[torch.Tensor, torch.Tensor]:

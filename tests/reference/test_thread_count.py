@@ -9,7 +9,7 @@ from tests.support.boxed_scene import write_boxed_scene
 from tests.support.short_training import train_with_optimizers
 from thermoxels_ns.core import threads
 from thermoxels_ns.core.threads import num_threads
-from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
+from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, seen_behind
 from thermoxels_ns.synthetic.scene_folder import make_scene
 
 

@@ -49,8 +49,8 @@ def raw_density(density: float, kind: DensityActivation) -> float:
 class VoxelGrid(nn.Module):
     """The parameters of the field, one row per corner of a kept voxel.
 
-    Refinement and pruning make new parameters (autograd remembers the shape of a leaf), so optimisers must be pointed
-    to them. Loading a checkpoint exchanges only the data: optimisers that were built before stay valid.
+    Refinement and pruning make new parameters (autograd remembers the shape of a leaf), to which optimisers must be
+    pointed. Loading a checkpoint exchanges only the data, so that optimisers that were built before stay valid.
 
     Args:
         lattice: Start lattice; all its voxels are kept at first.
@@ -84,11 +84,9 @@ class VoxelGrid(nn.Module):
         temperature = torch.zeros(n, num_coefficients(temperature_degree))
         temperature[:, 0] = 0.5
         self.temperature = nn.Parameter(temperature)
-        self.register_buffer("lo", torch.tensor(lattice.lo, dtype=torch.float64))
-        self.register_buffer("voxel_size", torch.tensor(lattice.voxel_size, dtype=torch.float64))
-        self.register_buffer("corner_shape", torch.tensor(lattice.shape))
         self.register_buffer("activation_index", torch.tensor(get_args(DensityActivation).index(activation)))
-        self.register_buffer("cells", torch.from_numpy(self._voxels.cells))
+        for name, values in _described(self._voxels).items():
+            self.register_buffer(name, values)
 
     @property
     def sh_degree(self) -> int | None:
@@ -138,36 +136,27 @@ class VoxelGrid(nn.Module):
                 parameter.data, parameter.grad = data, None
             else:
                 setattr(self, name, nn.Parameter(data))
-        device, lattice = self.lo.device, voxels.lattice
         self._voxels = voxels
-        self.lo = torch.tensor(lattice.lo, dtype=torch.float64, device=device)
-        self.voxel_size = torch.tensor(lattice.voxel_size, dtype=torch.float64, device=device)
-        self.corner_shape = torch.tensor(lattice.shape, device=device)
-        self.cells = torch.from_numpy(voxels.cells).to(device)
+        for name, values in _described(voxels).items():
+            setattr(self, name, values.to(self.lo.device))
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs):
         """Take over the checkpoint's kept voxels and its degree of colour before its rows are copied."""
         names = ("lo", "voxel_size", "corner_shape", "cells")
-        if all(prefix + name in state_dict for name in names):
+        if all(prefix + name in state_dict for name in (*names, *self.row_parameters())):
             lo, size, shape, cells = (state_dict[prefix + name] for name in names)
-            nx, ny, nz = (int(n) for n in shape)
-            x, y, z = (float(v) for v in lo)
+            (x, y, z), (nx, ny, nz) = lo.tolist(), shape.tolist()
             voxels = KeptVoxels(Lattice((x, y, z), float(size), (nx, ny, nz)), cells.cpu().numpy().copy())
-            rows = {
-                name: state_dict[prefix + name]
-                for name in self.row_parameters()
-                if prefix + name in state_dict and self._fits(name, state_dict[prefix + name])
+            rows = {name: state_dict[prefix + name].clone() for name in self.row_parameters()}
+            columns = {name: [values.shape[1]] for name, values in self.row_parameters().items()} | {
+                "sh": COLOUR_CHANNELS
             }
-            fits = all(len(values) == voxels.num_rows for values in rows.values())
-            if fits and len(rows) == len(self.row_parameters()):
-                self.replace_voxels(voxels, {k: v.clone() for k, v in rows.items()}, keep_identity=True)
+            if all(
+                values.ndim == 2 and len(values) == voxels.num_rows and values.shape[1] in columns[name]
+                for name, values in rows.items()
+            ):
+                self.replace_voxels(voxels, rows, keep_identity=True)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-    def _fits(self, name: str, rows: Tensor) -> bool:
-        """Whether rows of a checkpoint have the columns of a parameter; of colour, those of any degree."""
-        if name == "sh":
-            return rows.ndim == 2 and rows.shape[1] in COLOUR_CHANNELS
-        return rows.shape[1:] == getattr(self, name).shape[1:]
 
     def locate(self, points: Float[Tensor, "n 3"]) -> TrilinearPoints:
         """Find the voxels and trilinear weights of world positions."""
@@ -212,3 +201,14 @@ class VoxelGrid(nn.Module):
         values = torch.zeros(self.lattice.cell_shape, dtype=centre.dtype, device=centre.device)
         values.view(-1)[self.cells] = centre
         return values
+
+
+def _described(voxels: KeptVoxels) -> dict[str, Tensor]:
+    """What a checkpoint keeps of a lattice and its kept voxels."""
+    lattice = voxels.lattice
+    return {
+        "lo": torch.tensor(lattice.lo, dtype=torch.float64),
+        "voxel_size": torch.tensor(lattice.voxel_size, dtype=torch.float64),
+        "corner_shape": torch.tensor(lattice.shape),
+        "cells": torch.from_numpy(voxels.cells),
+    }

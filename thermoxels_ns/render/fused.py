@@ -15,10 +15,9 @@ from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.threads import num_threads, run_ranges, run_tasks
 from thermoxels_ns.field.interpolation import TrilinearPoints
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.render import kernels, kernels_backward, kernels_rows, kernels_shading
+from thermoxels_ns.render import kernels, kernels_backward
 from thermoxels_ns.render.kernels import Rays, RecordedSamples, Records, SampleGradients, Settings, Sums, Volume
-from thermoxels_ns.render.kernels_backward import RayGradients
-from thermoxels_ns.render.kernels_rows import Blocks, Order, RowGradients
+from thermoxels_ns.render.kernels_backward import Blocks, Order, RayGradients, RowGradients
 from thermoxels_ns.render.ray_render import GridSamples, RayRender, RayRequest, RenderOptions
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
@@ -110,7 +109,7 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
             begin, end = ((room + kernels.AHEAD) * ray for ray in (first, last))
             wrong, behind = kernels.march_rays(first, last, rays, volume, settings, records, sums, begin, end)
             if wrong == 0:
-                kernels_shading.shade(first, last, rays, volume, settings, records, sums)
+                kernels.shade(first, last, rays, volume, settings, records, sums)
             return begin, behind, wrong
 
         found: Any = run_ranges(work, count)
@@ -214,7 +213,7 @@ def _total_variation(values: np.ndarray, voxel_rows: np.ndarray, first: int, las
     bounds = [*range(first, last, VOXELS_AT_ONCE), last]
     parts: Any = run_tasks(
         [
-            lambda a=a, b=b: kernels_rows.total_variation(values, voxel_rows, a, b, SMALLEST_VARIATION)
+            lambda a=a, b=b: kernels_backward.total_variation(values, voxel_rows, a, b, SMALLEST_VARIATION)
             for a, b in itertools.pairwise(bounds)
         ]
     )
@@ -242,22 +241,23 @@ def row_gradients(rays: Rays, volume: Volume, of_samples: SampleGradients, block
     order = _ordered(of_samples, len(volume.voxel_rows))
     bounds = _row_ranges(volume.voxel_rows, num_rows, order, blocks, [p.shape[1] for p in parameters])
     ranges, uses = list(itertools.pairwise(bounds)), np.empty(num_rows, np.uint8)
-    counts: Any = run_tasks(
-        [lambda a=a, b=b: kernels_rows.use_rows(a, b, volume, of_samples, order, blocks, uses) for a, b in ranges]
+    run_tasks(
+        [lambda a=a, b=b: kernels_backward.use_rows(a, b, volume, of_samples, order, blocks, uses) for a, b in ranges]
     )
-    places = np.concatenate((np.zeros((1, 3), np.int64), np.cumsum(np.asarray(counts).reshape(-1, 3), axis=0)))
-    lists = [np.empty(int(total), np.int64) for total in places[-1]]
-    values = [np.empty((int(total), p.shape[1]), p.dtype) for total, p in zip(places[-1], parameters)]
-    pairs: list[Any] = [each for pair in zip(lists, values) for each in pair]
-    rows = RowGradients(uses, np.empty((num_rows, 3), np.int32), *pairs)
+    counts = [[np.count_nonzero(uses[a:b] & (1 << kind)) for kind in range(3)] for a, b in ranges]
+    places = np.concatenate((np.zeros((1, 3), np.int64), np.cumsum(counts, axis=0)))
+    lists = [np.empty(total, np.int64) for total in places[-1]]
+    values = [np.empty((total, p.shape[1]), p.dtype) for total, p in zip(places[-1], parameters)]
+    rows = RowGradients(uses, np.empty((num_rows, 3), np.int32), *values)
 
     def add(first: int, last: int, start: list[int]) -> None:
-        kernels_rows.list_rows(first, last, *start, rows)
-        kernels_rows.add_samples(first, last, rays, volume, of_samples, order, rows)
+        for kind in range(3):
+            kernels_backward.list_rows(first, last, kind, start[kind], rows, lists[kind], values[kind])
+        kernels_backward.add_samples(first, last, rays, volume, of_samples, order, rows)
         for kind, parameter in enumerate(parameters):
             if blocks.last[kind] > blocks.first[kind]:
                 inputs = parameter, volume.voxel_rows, kind, blocks, rows.place, values[kind]
-                kernels_rows.add_variation(first, last, *inputs)
+                kernels_backward.add_variation(first, last, *inputs)
 
     run_tasks([lambda a=a, b=b, at=at: add(a, b, at) for (a, b), at in zip(ranges, places.tolist())])
     return [
@@ -280,7 +280,7 @@ def _ordered(samples: SampleGradients, voxels: int) -> Order:
     shift = max(0, (voxels - 1).bit_length() - MOST_GROUPS.bit_length() + 1)
     groups = (voxels >> shift) + 1
     order = Order(shift, np.zeros(groups + 1, np.int64), np.empty(total, np.int32), np.empty(total, np.int32))
-    kernels_rows.order_samples(samples, order)
+    kernels_backward.order_samples(samples, order)
     return order
 
 

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.field.background import seen_behind
-from thermoxels_ns.field.surroundings import Surroundings
+from thermoxels_ns.field.surroundings import Surroundings, seen_behind
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render import reference
 from thermoxels_ns.render.ray_render import GridSamples, RayRender, RayRequest, RenderOptions

@@ -115,6 +115,11 @@ def plain(rgb: Sequence[float]) -> Callable[[npt.ArrayLike], Float32Array]:
     return lambda directions: np.tile(colour, (len(np.asarray(directions)), 1))
 
 
+def everywhere(degrees_c: float) -> Callable[[npt.ArrayLike], FloatArray]:
+    """A background of one temperature [C] in every direction."""
+    return lambda directions: np.full(len(np.asarray(directions)), degrees_c)
+
+
 def sky_rgb(directions: npt.ArrayLike) -> Float32Array:
     """Pale haze at the horizon, blue above, grey green below: unit directions (n, 3) to colours (n, 3)."""
     z = np.asarray(directions, dtype=np.float64)[:, 2:]

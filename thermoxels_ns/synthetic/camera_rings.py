@@ -50,6 +50,11 @@ class CameraRing:
         return look_at((x, y, self.height_m), self.target)
 
 
+def rings_around(middle: tuple[float, float], *rings: Vector, **arc: float) -> tuple[CameraRing, ...]:
+    """Rings about one vertical axis, each from the height of its aim, its radius and its height [m]."""
+    return tuple(CameraRing((*middle, aim), radius, height, **arc) for aim, radius, height in rings)
+
+
 @dataclass(frozen=True)
 class CameraWalk:
     """A straight line of cameras, each of which looks at a point of another line."""
