@@ -42,6 +42,12 @@ _SHOWN = ("psnr", "psnr_fitted", "thermal_mae_debiased_c", "fscore_128", "fscore
 _FEWER_F, _FEWER_DB, _MOST_C = {"all": 0.06}, 1.5, 0.45
 
 
+def doubled(flaws: Imperfections) -> Imperfections:
+    """The same flaws, twice as large; shares and JPEG stay."""
+    same = ("jpeg_quality", "pose_correlation", "dead_pixels", "passers_by")
+    return replace(flaws, **{name: 2.0 * value for name, value in vars(flaws).items() if name not in same})
+
+
 @dataclass
 class ImperfectCameras:
     """Train on scenes with flaws. `--options ...`, last, goes to ns-train as it is."""
@@ -79,7 +85,7 @@ class ImperfectCameras:
     def measure(self, name: str, flaw: str, options: list[str]) -> tuple[float, dict[str, float], str]:
         folder = self.output / f"{name}-{flaw}"
         kind = flaw.removesuffix("-x2")
-        imperfections = FLAWS[kind].times(2.0) if kind != flaw else FLAWS[kind]
+        imperfections = FLAWS[kind] if kind == flaw else doubled(FLAWS[kind])
         if not (folder / "scene" / "transforms.json").is_file():
             write_scene(make_scene(name), folder / "scene", seed=self.seed, imperfections=imperfections, progress=False)
         seconds, figures = train_and_evaluate(folder / "scene", folder, options)

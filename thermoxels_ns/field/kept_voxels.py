@@ -20,10 +20,9 @@ BLOCK = 8  # Voxels along the side of a block
 class KeptVoxels:
     """The kept voxels of a lattice and the rows of their corners.
 
-    Rows exist for corners of kept voxels only (the link table and compact rows of Plenoxels, Fridovich-Keil et al.
-    2022), in the order of their flat corner index. Corners k and k + 1 of a kept voxel then stand in neighbouring rows,
-    so four row numbers per voxel find all eight. The voxel under a point is found through blocks of 8^3 voxels: an
-    empty block costs one look-up and four bytes, whatever the resolution.
+    Rows exist for corners of kept voxels only (Plenoxels, Fridovich-Keil et al. 2022), in the order of their flat
+    corner index. Corners k and k + 1 of a kept voxel stand in neighbouring rows, so four row numbers per voxel find all
+    eight. The voxel under a point is found through blocks of 8^3 voxels; an empty block costs four bytes.
 
     Args:
         lattice: The lattice.

@@ -31,10 +31,10 @@ class Segments:
 class Surroundings(nn.Module):
     """Density, colour and temperature from the faces of the box to infinity.
 
-    Through each face one looks into a frustum that widens without end. With q the coordinate across the face (1 on it;
-    the box is -1 to 1) and p, r those along it, 1/q, p/q and r/q are coordinates in which the frustum is a box that
-    ends at infinity, where 1/q = 0, and in which straight lines are straight. So the renderer of the box serves here
-    too: the six boxes stand one behind the other in one lattice, with an empty layer of voxels between.
+    Each face opens into a frustum. With q the coordinate across the face (1 on it; the box is -1 to 1) and p, r those
+    along it, 1/q, p/q and r/q are coordinates in which the frustum is a box that ends at infinity, where 1/q = 0, and
+    straight lines are straight. The six boxes stand one behind the other in one lattice, with an empty layer of voxels
+    between, so that the renderer of the box serves here too.
 
     The box, (2, 3), is in world units; a face is `across` voxels wide, infinity `deep` voxels away; density is
     [1 / voxel].

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,12 @@ from thermoxels_ns.core.threads import num_threads, run_ranges, run_tasks
 from thermoxels_ns.field.interpolation import TrilinearPoints
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render import kernels, kernels_backward
-from thermoxels_ns.render.kernels import Rays, RecordedSamples, Records, SampleGradients, Settings, Sums, Volume
+from thermoxels_ns.render.kernels import Rays, Records, SampleGradients, Settings, Sums, Volume
 from thermoxels_ns.render.kernels_backward import Blocks, Order, RayGradients, RowGradients
 from thermoxels_ns.render.ray_render import GridSamples, RayRender, RayRequest, RenderOptions
+from thermoxels_ns.render.reference import SMALLEST_VARIATION
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
-SMALLEST_VARIATION = 1e-10  # Added under the root of the total variation; the reference's value
 VOXELS_AT_ONCE = 1 << 14  # Voxels whose total variation is one task
 FEWEST_SAMPLES = 24  # Samples per ray, averaged over a range of rays, that the first batch on a lattice has memory for
 MOST_GROUPS = 1 << 12  # Groups of voxels that samples are put in order by
@@ -32,6 +33,18 @@ _room: dict[int, int] = {}
 NAMES = ("density", "sh", "temperature")
 
 
+@dataclass(frozen=True)
+class RecordedSamples:
+    """What was recorded of the samples of a batch of rays."""
+
+    rays: Rays
+    volume: Volume
+    settings: Settings
+    records: Records
+    sums: Sums
+    spans: list[tuple[int, int]]  # The first and one behind the last record of each range of rays
+
+
 def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> GridSamples:
     """March rays and list their samples; neither colour nor temperature is read.
 
@@ -39,22 +52,21 @@ def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> Gri
         ThermoxelsError: A density on the way is NaN.
     """
     nothing = torch.zeros(len(request.origins), dtype=torch.bool)
-    request = RayRequest(request.origins, request.directions, request.near, request.far, nothing, nothing)
-    recorded, spans = _recorded_samples(grid, None, request, options)
+    recorded = _recorded_samples(grid, None, replace(request, rgb_rays=nothing, thermal_rays=nothing), options)
     records = recorded.records
     number, fraction, weight, left = (
-        torch.from_numpy(np.concatenate([values[:0], *(values[a:b] for a, b in spans)]))
+        torch.from_numpy(np.concatenate([values[:0], *(values[a:b] for a, b in recorded.spans)]))
         for values in (records.number, records.fraction, records.weight, records.transmittance)
     )
     ray = torch.repeat_interleave(torch.from_numpy(records.used))
-    at = TrilinearPoints.placed(grid.voxels, number.long(), fraction)
+    at = TrilinearPoints(grid.voxels, number.long(), fraction)
     return GridSamples(ray, at, weight, 1.0 - left - weight, torch.from_numpy(recorded.sums.transmittance))
 
 
 def _recorded_samples(
     grid: VoxelGrid, sh: Tensor | None, request: RayRequest, options: RenderOptions
-) -> tuple[RecordedSamples, list[tuple[int, int]]]:
-    """March rays and record their samples; also give the first and one behind the last record of each range of rays."""
+) -> RecordedSamples:
+    """March rays and record their samples."""
     density = grid.density.detach().numpy()
     voxels, dtype, lattice = grid.voxels, density.dtype, grid.lattice
     volume = Volume(
@@ -71,11 +83,9 @@ def _recorded_samples(
         ACTIVATIONS[grid.activation],
     )
     count = len(request.origins)
-    wants = torch.full((count,), 3, dtype=torch.uint8)
-    if request.rgb_rays is not None:
-        wants &= 2 + request.rgb_rays.to(torch.uint8)
-    if request.thermal_rays is not None:
-        wants &= 1 + 2 * request.thermal_rays.to(torch.uint8)
+    wants = torch.zeros(count, dtype=torch.uint8)
+    for bit, rays_that_want in ((1, request.rgb_rays), (2, request.thermal_rays)):
+        wants += bit if rays_that_want is None else bit * rays_that_want.to(torch.uint8)
     near, far = request.near_and_far()
     rays = Rays(_array(request.origins), _array(request.directions), _array(near), _array(far), wants.numpy())
     settings = Settings(
@@ -89,11 +99,10 @@ def _recorded_samples(
     sizes = [(count if volume.sh.shape[1] else 0, 3), (count, 1), *[count] * 3]
     sizes += [count if options.distortion_scale else 0, count if options.sparsity else 0]
     sums = Sums(*[np.empty(size, dtype) for size in sizes])
-    records, spans = _record(rays, volume, settings, sums)
-    return RecordedSamples(rays, volume, settings, records, sums), spans
+    return RecordedSamples(rays, volume, settings, *_record(rays, volume, settings, sums))
 
 
-def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple[Records, list[tuple[int, int]]]:
+def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple[Records, Sums, list[tuple[int, int]]]:
     """Fill `sums` and record the samples; where these are more than there is memory for, with twice as much again."""
     count, rows, dtype = len(rays.origins), len(volume.density), volume.density.dtype
     while True:
@@ -122,7 +131,7 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
     if sum(wrong):
         remedy = "Lower the density learning rate and resume from the last checkpoint."
         raise ThermoxelsError("density", expected="numbers >= 0", got=f"NaN in {sum(wrong)} places", remedy=remedy)
-    return records, [(begin, end) for begin, end, _ in found]
+    return records, sums, [(begin, end) for begin, end, _ in found]
 
 
 def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
@@ -150,7 +159,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx, density, sh, temperature, grid: VoxelGrid, request: RayRequest, options: RenderOptions):
         # `density`, `sh` and `temperature` are the grid's: autograd differentiates only by what it is handed.
-        recorded, _ = _recorded_samples(grid, grid.sh, request, options)
+        recorded = _recorded_samples(grid, grid.sh, request, options)
         variation = [
             _total_variation(_parameters(recorded.volume)[name], recorded.volume.voxel_rows, *block) / divisor + missing
             for name, block, divisor, missing in _blocks(options, recorded.volume)
@@ -229,14 +238,7 @@ def _gradient(gradient: Tensor | None, like: np.ndarray) -> np.ndarray:
 
 
 def row_gradients(rays: Rays, volume: Volume, of_samples: SampleGradients, blocks: Blocks) -> list[Tensor | None]:
-    """Gradients of density, colour and temperature as row-sparse tensors; None for one that no row has.
-
-    Args:
-        rays: The rays.
-        volume: Kept voxels and parameters.
-        of_samples: Gradients of the samples.
-        blocks: Total variation to add.
-    """
+    """Gradients of density, colour and temperature as row-sparse tensors; None for one that no row has."""
     parameters, num_rows = list(_parameters(volume).values()), len(volume.density)
     order = _ordered(of_samples, len(volume.voxel_rows))
     bounds = _row_ranges(volume.voxel_rows, num_rows, order, blocks, [p.shape[1] for p in parameters])

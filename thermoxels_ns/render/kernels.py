@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,13 +17,7 @@ from thermoxels_ns.core.kernel_cache import kernel
 def _prefetch(typing_context: Any, array: Any, row: Any, column: Any):
     """Start to load ``array[row, column]``, or ``array[row]`` of a list, into the cache; for compiled code.
 
-    A hint and nothing else: no result depends on it, and an index outside the array does no harm.
-
-    Args:
-        typing_context: Numba's; not passed by the caller.
-        array: Array of one or two dimensions.
-        row: First index.
-        column: Second index; of a list it is ignored.
+    It is a hint: no result depends on it, and an index outside the array does no harm.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -35,20 +28,16 @@ def _prefetch(typing_context: Any, array: Any, row: Any, column: Any):
             for value, kind in zip(arguments[1:], signature.args[1:], strict=True)
         ][: array_type.ndim]
         place = cgutils.get_item_pointer(context, builder, array_type, made, index, wraparound=False, boundscheck=False)
-        address = builder.bitcast(place, cgutils.voidptr_t)
-        number = ir.IntType(32)
+        address, number = builder.bitcast(place, cgutils.voidptr_t), ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [address.type, number, number, number])
         hint = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
-        # To be read; to be kept in all caches; data.
-        builder.call(hint, [address, number(0), number(3), number(1)])
+        builder.call(hint, [address, number(0), number(3), number(1)])  # to be read; for all caches; data
         return context.get_dummy_value()
 
     return types.void(array, row, column), generate
 
 
-prefetch: Any = intrinsic(_prefetch)
-"""Called as ``prefetch(array, row, column)``, see `_prefetch`; numba brings the first argument."""
-
+prefetch: Any = intrinsic(_prefetch)  # called as prefetch(array, row, column)
 
 Floats = npt.NDArray[np.floating]
 Ints = Any  # arrays of integers; numba knows which
@@ -145,17 +134,6 @@ class Sums(NamedTuple):
     sparsity: Floats
 
 
-@dataclass(frozen=True)
-class RecordedSamples:
-    """Samples of a batch of rays: `records` and how to read them."""
-
-    rays: Rays
-    volume: Volume
-    settings: Settings
-    records: Records
-    sums: Sums
-
-
 @kernel
 def chord(rays: Rays, r: int, volume: Volume):
     """Entry and exit distance of a ray, both 0 for a miss; each axis guarded as in `reference.intersect_box`."""
@@ -180,38 +158,20 @@ def chord(rays: Rays, r: int, volume: Volume):
 
 @kernel
 def path_of(rays: Rays, r: int, volume: Volume):
-    """Where a ray begins, its direction, and the distance it takes per world unit along each axis.
-
-    Across its direction the latter is so large that the ray gets nowhere, and finite, so that no
-    product with it is NaN.
-    """
+    """Where a ray begins, its direction, and its distance per world unit along each axis; finite where it is level."""
     never = 1e200
     dx, dy, dz = float(rays.directions[r, 0]), float(rays.directions[r, 1]), float(rays.directions[r, 2])
-    return (
-        (float(rays.origins[r, 0]), float(rays.origins[r, 1]), float(rays.origins[r, 2])),
-        (dx, dy, dz),
-        (
-            1.0 / dx if abs(dx) > 1e-100 else never,
-            1.0 / dy if abs(dy) > 1e-100 else never,
-            1.0 / dz if abs(dz) > 1e-100 else never,
-        ),
-    )
+    ix, iy = 1.0 / dx if abs(dx) > 1e-100 else never, 1.0 / dy if abs(dy) > 1e-100 else never
+    origin = (float(rays.origins[r, 0]), float(rays.origins[r, 1]), float(rays.origins[r, 2]))
+    return origin, (dx, dy, dz), (ix, iy, 1.0 / dz if abs(dz) > 1e-100 else never)
 
 
 @kernel
 def next_sample(i: int, enter: float, length: float, step: float, path, volume: Volume):
     """The first sample from step `i` on that lies in a kept voxel.
 
-    Args:
-        i: Step to begin with.
-        enter: Distance at which the ray enters the box.
-        length: Length of the ray in the box.
-        step: Length of a step.
-        path: The ray, see `path_of`.
-        volume: The kept voxels.
-
-    Returns:
-        Its step, the voxel's number, distance, step length and place in the voxel; step -1 if there is none.
+    The ray, see `path_of`, enters the box at the distance `enter` and is `length` long in it. Gives the sample's step,
+    the voxel's number, distance, step length and place in the voxel; step -1 if there is none.
     """
     (ox, oy, oz), (dx, dy, dz), (ix, iy, iz) = path
     lx, ly, lz = volume.lo[0], volume.lo[1], volume.lo[2]
@@ -331,13 +291,10 @@ def march_rays(
     """Weigh the samples of rays `first` to `last` (paper, eq. 1) and record them from `begin` to before `end`.
 
     Ranges of rays write to places of their own, so that threads can share a batch. Sums are in double precision.
-
-    Samples are found, read and weighed a few at a time: reading does not wait for weighing then, and a memory that
-    answers late is asked for several of them at once.
+    Samples are found, read and weighed a few at a time, so that several of them are asked of the memory at once.
 
     Returns:
-        Number of samples whose density is NaN, or -1 if there are more samples than places; place behind the last
-        record.
+        Number of samples with NaN density, or -1 if there are more samples than places; place behind the last record.
     """
     distance, length_of, raw = np.empty(AHEAD), np.empty(AHEAD), np.empty(AHEAD)
     wrong = 0
@@ -407,14 +364,13 @@ def march_rays(
 
 @kernel
 def prefetch_colours(values: Floats, rows: Ints, number: int):
-    """Ask for the colours of a voxel's corners, whose rows are longer than a cache line unless there is one colour."""
+    """Ask for the colours of a voxel's corners; with harmonics, rows of two corners take several cache lines."""
     channels = values.shape[1]
     if channels == 3:
         prefetch_corners(values, rows, number)
         return
     for corner in range(4):
         row = np.int64(rows[number, corner])
-        # The two rows of a corner and the next one stand one behind the other.
         prefetch(values, row, 0)
         prefetch(values, row, 16)
         prefetch(values, row + 1, 0)
@@ -423,10 +379,9 @@ def prefetch_colours(values: Floats, rows: Ints, number: int):
 
 @kernel
 def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, sums: Sums):
-    """Read and sum colour and temperature of rays `first` to `last` (paper, eq. 1 and 2).
+    """Read and sum colour and temperature of rays `first` to `last` (paper, eq. 1 and 2), as far as rays want them.
 
-    Samples of at most the smallest weight are left out, and what their ray does not want. Values are asked for some
-    samples ahead.
+    Samples of at most the smallest weight are left out. Values are asked for some samples ahead.
     """
     channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
     count = channels // 3

@@ -275,10 +275,9 @@ def add_samples(
     order: Order,
     rows: RowGradients,
 ):
-    """Add the gradients of samples to rows `first_row` to `last_row` and to no other.
+    """Add the gradients of samples to rows `first_row` to `last_row`, in the order of their voxels.
 
-    Each thread owns a range of rows and adds samples in the order of their voxels: no two add to the same row, and the
-    sums are the same bits for any number of threads.
+    Each thread owns a range of rows: the sums are the same bits for any number of threads.
     """
     count, thermal_channels = volume.sh.shape[1] // 3, volume.temperature.shape[1]
     dtype = volume.density.dtype

@@ -21,11 +21,10 @@ _CHANNELS_TO_RGB = np.array([[0.8, 0.3, 0.0], [0.8, -0.1, 0.25], [0.8, -0.15, -0
 
 
 class SolidTexture:
-    """Value noise in three channels, defined at every point of space.
+    """Value noise in three channels, defined at every point of space, that does not repeat within the box.
 
     Random values on cubic lattices, interpolated with a smoothstep, are added at three scales. The finest lattice
-    is two voxels wide when 64 voxels span the box's longest side, so a voxel field of that size can hold it. The
-    pattern does not repeat within the box.
+    is two voxels wide where 64 voxels span the box's longest side.
     """
 
     def __init__(self, box: Box, seed: int) -> None:
@@ -95,8 +94,7 @@ def painted(
     Points [m] and normals have shape (n, 3), `part` indexes `paints` for each, shape (n,); red, green, blue in [0, 1],
     shape (n, 3).
     """
-    base = np.array([p.base for p in paints], dtype=np.float32)[part]
-    contrast = np.array([p.contrast for p in paints], dtype=np.float32)[part]
+    base, contrast = (np.array(one, dtype=np.float32)[part] for one in zip(*((p.base, p.contrast) for p in paints)))
     colour = (base + contrast[:, None] * texture(points)) * light.brightness(normals)
     return np.clip(colour, 0.0, 1.0).astype(np.float32, copy=False)
 

@@ -74,9 +74,8 @@ def ring_poses(
 ) -> tuple[FloatArray, FloatArray]:
     """Spread training cameras evenly over rings and put evaluation cameras half-way between neighbours.
 
-    Cameras go to the rings in turn; each ring starts a fraction of a step later than the one before, so that
-    cameras of different rings do not stand above each other. More evaluation cameras than there are gaps share a gap
-    evenly. Poses have shapes (num_train, 4, 4) and (num_eval, 4, 4).
+    Cameras go to the rings in turn; each ring starts a fraction of a step later than the one before. More evaluation
+    cameras than there are gaps share a gap evenly. Poses have shapes (num_train, 4, 4) and (num_eval, 4, 4).
     """
     if num_train < 1 or num_eval < 0:
         expected, got = "at least 1 for training and at least 0 for evaluation", f"{num_train} and {num_eval}"

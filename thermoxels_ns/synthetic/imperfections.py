@@ -31,16 +31,14 @@ class Imperfections:
     jpeg_quality: int = 92
     """Quality of JPEG files, 1 to 95."""
     motion_blur_px: float = 0.0
-    """Length of the line that each point of the photographs draws while the shutter is open, [pixels], in a direction
-    of its own in each."""
+    """Length of the line, in a direction of its own in each photograph, along which pixels are blurred, [pixels]."""
     rolling_shutter_px: float = 0.0
     """How far the photograph moves between its first and its last row, [pixels]; the pose is that of the middle row."""
     pose_error_deg: float = 0.0
     """Standard deviation of the angle, about each axis, by which the poses given are turned, [degrees]; they are also
     moved, by as much as that turn moves what the scene's middle shows."""
     pose_correlation: float = 0.0
-    """Share of a pose's error that the next photograph has too, below 1: 0 for poses found one by one, 0.95 for those
-    of a walk."""
+    """Share of a pose's error that the next photograph has too, below 1: 0.95 for a walk."""
     focal_error: float = 0.0
     """How much longer the focal length given is than the true one, relative."""
     noise_k: float = 0.0
@@ -72,11 +70,6 @@ class Imperfections:
         limits |= {"pose_correlation": (0.0, 0.999, "from 0 to 0.999"), "focal_error": (-0.5, 1.0, "from -0.5 to 1")}
         limits |= {"jpeg_quality": (1, 95, "from 1 to 95"), "white_balance": (0.0, 0.3, "from 0 to 0.3")}
         check_ranges("--", {name: (getattr(self, name), *limit) for name, limit in limits.items()})
-
-    def times(self, factor: float) -> Imperfections:
-        """The same flaws, so many times as large; shares, counts of pixels that are dead and JPEG stay."""
-        same = ("jpeg_quality", "pose_correlation", "dead_pixels", "passers_by")
-        return replace(self, **{f.name: factor * getattr(self, f.name) for f in fields(self) if f.name not in same})
 
 
 PERFECT = Imperfections()
