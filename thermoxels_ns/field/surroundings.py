@@ -104,7 +104,7 @@ and then the last bits of gradients and of some functions depend on how many the
 def seen_behind(
     background: nn.Module, directions: Float[Tensor, "n 3"], wanted: Bool[Tensor, " n"] | None
 ) -> Float[Tensor, "n c"]:
-    """What is behind the box along unit directions; 0 for rays that do not want it, which are not asked for."""
+    """Colour or temperature of a background along unit directions; 0 for rays that do not want it."""
     if wanted is None or bool(wanted.all()):
         if len(directions) <= RAYS_AT_ONCE:
             return background(directions)

@@ -100,8 +100,9 @@ def painted(
 
 
 def sky_temperature_c(directions: npt.ArrayLike, horizon_c: float, drop_k: float) -> FloatArray:
-    """Apparent temperature [C] of the sky along unit directions (n, 3), linear in the sine of the elevation; of the far
-    ground below the horizon. The zenith is `drop_k` colder than the horizon, the ground straight below 2 K warmer.
+    """Apparent temperature [C] of sky and far ground along unit directions (n, 3), linear in the sine of the elevation.
+
+    The zenith is `drop_k` colder than the horizon, and the ground straight below is 2 K warmer.
     """
     z = np.asarray(directions, dtype=np.float64)[:, 2]
     return horizon_c - drop_k * _rise(z) + _GROUND_RISE_K * _rise(-z)

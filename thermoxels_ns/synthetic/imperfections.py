@@ -122,13 +122,13 @@ class DrawnFlaws:
         return given
 
     def given_rig_turn(self) -> FloatArray:
-        """By what (4, 4) all poses of a thermal camera of its own are turned."""
+        """Transform (4, 4) by which all poses of a thermal camera of its own are turned."""
         turn = np.eye(4)
         turn[:3, :3] = _turned(self._rig_turn_rad)
         return turn
 
     def bounds_c(self, lowest_c: float, highest_c: float) -> tuple[float, float]:
-        """Between which thermal images of a scene read [degrees Celsius] that has temperatures between two."""
+        """Lowest and highest reading [degrees Celsius] of thermal images of a scene with these temperatures."""
         flaws = self.flaws
         margin = _NOISE_SIGMAS * float(np.hypot(flaws.noise_k, flaws.fixed_pattern_k))
         low = min(float(self.drifts_k.min()), 0.0) - margin - flaws.thermal_vignetting_k

@@ -232,7 +232,7 @@ def _spots(plan: Plan, boxes: tuple[Box, ...], high: float) -> None:
 
 
 def _put_ground(plan: Plan, size_x: float, size_y: float, thickest: float, paint: int | None, warmest: float) -> None:
-    """Put a slab below z = 0, 4 to so many voxels thick."""
+    """Put a slab below z = 0 that is between 4 and `thickest` voxels thick."""
     half_x, half_y, thick = 0.5 * size_x, 0.5 * size_y, plan.u(4, thickest)
     paint = plan.paint("ground") if paint is None else paint
     plan.put(((-half_x, -half_y, -thick), (half_x, half_y, 0.0)), paint, plan.u(0.0, warmest))

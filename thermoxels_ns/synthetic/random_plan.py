@@ -183,7 +183,7 @@ class Plan:
         return warmth
 
     def add_glows(self, values: FloatArray, points: FloatArray) -> None:
-        """Change warmth, or temperatures, (n,) at points (n, 3) to those of the glows, near these."""
+        """Blend the glows into warmth, or into temperatures, (n,) at points (n, 3)."""
         for glow in self.glows:
             fade_towards(values, points, glow.core, glow.warmth, glow.reach)
 

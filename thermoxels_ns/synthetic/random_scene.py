@@ -150,7 +150,7 @@ def warm_scene(
 def painted_scene(
     plan: Plan, texture_seed: int, light: SunLight, *, scene_box: Box, solid: Solid | None = None, **rest: Any
 ) -> SyntheticScene:
-    """Make a scene of a plan in metres; all but its solid, colour and mirrors is passed by name."""
+    """Make a scene of a plan in metres, whose paints are textured; the scene's other fields are passed by name."""
     texture = SolidTexture(scene_box, texture_seed)
     mirrors = np.array([paint.mirror for paint in plan.paints], dtype=np.float32)
     return SyntheticScene(
@@ -315,9 +315,9 @@ def _place(scene: SyntheticScene, seed: int) -> tuple[Plan, tuple[float, float],
 def surrounded(
     scene: SyntheticScene, plan: Plan, seed: int, range_k: float, windows: tuple[range, float, float] | None = None
 ) -> SyntheticScene:
-    """Put a plan around a scene, from the temperature at the horizon to so much warmer [K].
+    """Put a plan around a scene, whose warmth 0 to 1 is up to `range_k` above the temperature at the horizon.
 
-    `windows`: paints of walls that have them, where storeys begin [m] and their height [m].
+    `windows`: the paints of walls that have windows, the height at which storeys begin [m], and that of a storey [m].
     """
     lo = np.asarray(scene.scene_box[0])
     texture, light = SolidTexture(box_between(lo, lo + 3.0 * scene.size), seed), SunLight()
