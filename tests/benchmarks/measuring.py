@@ -1,4 +1,4 @@
-"""Runs in turns, csv files and logarithmic panels for the other benchmarks, which may then import tests.support."""
+"""Runs, tables and logarithmic panels for the other benchmarks, which may then import tests.support."""
 
 import csv
 import json
@@ -112,6 +112,17 @@ def run_with_options(benchmark: Callable[[], Any]) -> None:
         at = words.index("--options")
         words, passed_on = words[:at], words[at + 1 :]
     tyro.cli(benchmark, args=words).main(passed_on)
+
+
+def print_row(*cells: Any) -> None:
+    """Print a line of a Markdown table at once."""
+    print(f"| {' | '.join(map(str, cells))} |", flush=True)
+
+
+def print_head(*columns: str) -> None:
+    """Print the head of a Markdown table."""
+    print_row(*columns)
+    print(len(columns) * "|---" + "|", flush=True)
 
 
 def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from measuring import synthetic_scene
+from measuring import print_head, print_row, synthetic_scene
 
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
@@ -37,13 +37,11 @@ class PhotographDepths:
     """Synthetic scenes by name."""
 
     def main(self) -> None:
-        print("| scene | body | known | median error | over 3 % off | sky | beside | seconds |")
-        print("|---|---:|---:|---:|---:|---:|---:|---:|", flush=True)
+        print_head("scene", "body", "known", "median error", "over 3 % off", "sky", "beside", "seconds")
         for name in self.scenes:
             scene = synthetic_scene(name, self.output / name / "scene")
-            box = tuple(map(tuple, np.asarray(scene.scene_box).tolist()))
-            outputs = ThermalDataParserConfig(data=self.output / name / "scene", scene_box=box).setup()
-            parsed = outputs.get_dataparser_outputs("train")
+            config = ThermalDataParserConfig(data=self.output / name / "scene", scene_box=scene.scene_box)
+            parsed = config.setup().get_dataparser_outputs("train")
             lo, hi = parsed.scene_box.aabb.double().numpy()
             began = time.perf_counter()
             found = depths_of_dataset(ThermalDataset(parsed), 0.0, lo, hi)
@@ -51,7 +49,7 @@ class PhotographDepths:
             assert found is not None
             centre = parsed.dataparser_transform.double().numpy()
             truth = true_depths(scene, found.photographs, centre, float(parsed.dataparser_scale))
-            print(row(name, found, truth, seconds), flush=True)
+            print_row(name, *(f"{share:.2%}" for share in shares(found, truth)), f"{seconds:.0f}")
 
 
 def true_depths(scene: SyntheticScene, photographs: Photographs, transform: np.ndarray, scale: float) -> np.ndarray:
@@ -63,13 +61,13 @@ def true_depths(scene: SyntheticScene, photographs: Photographs, transform: np.n
     return np.where(own, distance * scale / length, np.nan)
 
 
-def row(name: str, found: Depths, truth: np.ndarray, seconds: float) -> str:
+def shares(found: Depths, truth: np.ndarray) -> tuple[float, ...]:
+    """The columns of the table from `body` to `beside`."""
     body, before = np.isfinite(truth), np.isfinite(found.depth)
     known = np.isfinite(depths_before_backdrop(found)[0].depth)
     off = np.abs(found.depth / truth - 1.0)[known & body]
-    shares = body.mean(), known[body].mean(), np.median(off), np.mean(off > 0.03), 1 - body[known].mean()
-    cells = [f"{share:.2%}" for share in (*shares, 1 - body[before].mean())]
-    return f"| {name} | {' | '.join(cells)} | {seconds:.0f} |"
+    errors = float(np.median(off)), float(np.mean(off > 0.03))
+    return body.mean(), known[body].mean(), *errors, 1 - body[known].mean(), 1 - body[before].mean()
 
 
 if __name__ == "__main__":

@@ -18,15 +18,17 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+from unittest import mock
 
 import torch
 import tyro
 from dense_torch_step import dense_step_seconds
-from measuring import take_turns  # noqa: F401 (finds tests.support)
+from measuring import print_head, print_row, take_turns
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from tests.support.short_training import Training
@@ -59,34 +61,31 @@ class StepSpeed:
     """The lattice on which a dense step in plain torch is timed too, once; 0: none."""
 
     def main(self) -> None:
-        rows = []
         with tempfile.TemporaryDirectory() as folder:
             scene = write_scene(
                 make_scene(self.scene), Path(folder) / "scene", own_thermal_camera=True, thermal_width=320
             )
-            for resolution in self.resolutions:
-                rows.append(self.measure(scene, resolution))
+            rows = [self.measure(scene, resolution) for resolution in self.resolutions]
         print(
             f"\n{self.scene}, {self.rays} RGB + {self.rays} thermal rays, {num_threads()} threads, "
             f"medians of {self.repeats}, {self.clock} time\n"
         )
-        print(
-            "| voxels | kept | fused step | against the lattice before | reference step | reference / fused "
-            "| dense torch step | dense / fused | 320 x 240 view | beside the kernels |"
+        print_head(
+            *("voxels", "kept", "fused step", "against the lattice before", "reference step", "reference / fused"),
+            *("dense torch step", "dense / fused", "320 x 240 view", "beside the kernels"),
         )
-        print("|---|---|---|---|---|---|---|---|---|---|")
         before = None
         for row in rows:
-            fused, reference, dense = row["fused"], row["reference"], row["dense"]
-            print(
-                f"| {row['resolution']} | {row['kept']:.1%} | {1e3 * fused:.0f} ms "
-                f"| {'' if before is None else f'{fused / before:.2f}'} "
-                f"| {'' if reference is None else f'{reference:.2f} s'} "
-                f"| {'' if reference is None else f'{reference / fused:.0f}'} "
-                f"| {'' if dense is None else f'{dense:.1f} s'} "
-                f"| {'' if dense is None else f'{dense / fused:.0f}'} "
-                f"| {1e3 * row['view']:.0f} ms | {row['overhead']:.0%} |"
-            )
+            fused = row["fused"]
+            baselines = [
+                cell
+                for name in ("reference", "dense")
+                for cell in ((f"{row[name]:.2f} s", f"{row[name] / fused:.0f}") if row[name] else ("", ""))
+            ]
+            growth = "" if before is None else f"{fused / before:.2f}"
+            beside, view = f"{1.0 - row['kernels'] / fused:.0%}", f"{1e3 * row['view']:.0f} ms"
+            kept = f"{row['kept']:.1%}"
+            print_row(row["resolution"], kept, f"{1e3 * fused:.0f} ms", growth, *baselines, view, beside)
             before = fused
 
     def measure(self, scene: Path, resolution: int) -> dict:
@@ -105,38 +104,25 @@ class StepSpeed:
         datamanager: Any = run.pipeline.datamanager
         with CONSOLE.status(f"{resolution} voxels"):
             run.advance((max((*schedule.prune_at, *schedule.refine_at)) + schedule.thin_at[0]) // 2)
-            config, model = run.pipeline.model.config, run.pipeline.model
-            fused = self.median(run.take_step)
-            kernels = self.median_of_kernels(run)
-            reference = None
+            model, few, all_threads = run.pipeline.model, torch.get_num_threads(), num_threads()
+            figures = {"fused": self.median(run.take_step), "kernels": self.median_of_kernels(run)}
+            figures |= {"reference": 0.0, "dense": 0.0}
+            torch.set_num_threads(all_threads)
             if resolution <= self.reference_up_to:
-                config.backend = "reference"
-                torch.set_num_threads(num_threads())
-                reference = self.median(run.take_step)
-                config.backend = "auto"
-                torch.set_num_threads(max(1, num_threads() // 2))
-            dense = None
+                model.config.backend = "reference"
+                figures["reference"] = self.median(run.take_step)
+                model.config.backend = "auto"
             if resolution == self.dense:
-                torch.set_num_threads(num_threads())
-                rays, _ = datamanager.next_train(run.step)
                 whole = deepcopy(model.grid)  # published code stores all harmonics from the start
-                assert config.sh_degree is not None
-                widen_colour(whole, config.sh_degree)
-                dense = dense_step_seconds(whole, rays, config.steps_per_voxel)
-                torch.set_num_threads(max(1, num_threads() // 2))
+                widen_colour(whole, model.config.sh_degree)
+                batch, _ = datamanager.next_train(run.step)
+                figures["dense"] = dense_step_seconds(whole, batch, model.config.steps_per_voxel)
+            torch.set_num_threads(few)
             run.pipeline.eval()
             camera = datamanager.eval_dataset.cameras[0:1]
-            view = self.median(lambda: model.get_outputs_for_camera(camera))
+            figures["view"] = self.median(lambda: model.get_outputs_for_camera(camera))
         voxels = model.grid.voxels
-        return {
-            "resolution": resolution,
-            "kept": len(voxels) / voxels.mask().size,
-            "fused": fused,
-            "reference": reference,
-            "dense": dense,
-            "view": view,
-            "overhead": (fused - kernels) / fused,
-        }
+        return {"resolution": resolution, "kept": len(voxels) / voxels.mask().size, **figures}
 
     def now(self) -> float:
         """The clock of choice, [s]."""
@@ -144,13 +130,7 @@ class StepSpeed:
 
     def median(self, work: Callable[[], object]) -> float:
         """Median time of one call, after one that does not count."""
-        work()
-        times = []
-        for _ in range(self.repeats):
-            start = self.now()
-            work()
-            times.append(self.now() - start)
-        return statistics.median(times)
+        return statistics.median(take_turns({"": work}, self.repeats, self.now)[0][""])
 
     def median_of_kernels(self, run: Training) -> float:
         """Time per step that is spent in compiled kernels: renderer forward and backward, and row optimisers."""
@@ -165,27 +145,21 @@ class StepSpeed:
                 try:
                     return function(*args, **kwargs)
                 finally:
-                    spent[0] += self.now() - start
+                    spent[-1] += self.now() - start
 
             return call
 
-        forward, backward = fused._Render.forward, fused._Render.backward
-        rows = [o for o in run.optimizers.optimizers.values() if isinstance(o, RowOptimizer)]
-        updates = [o.update_rows for o in rows]
-        fused._Render.forward, fused._Render.backward = staticmethod(timed(forward)), staticmethod(timed(backward))
-        for optimizer, update in zip(rows, updates):
-            optimizer.update_rows = timed(update)  # type: ignore[method-assign]
-        times = []
-        try:
+        optimizers = [one for one in run.optimizers.optimizers.values() if isinstance(one, RowOptimizer)]
+        with ExitStack() as stack:
+            for name in ("forward", "backward"):
+                replaced = staticmethod(timed(getattr(fused._Render, name)))
+                stack.enter_context(mock.patch.object(fused._Render, name, replaced))
+            for optimizer in optimizers:
+                stack.enter_context(mock.patch.object(optimizer, "update_rows", timed(optimizer.update_rows)))
             for _ in range(self.repeats + 1):
-                spent[0] = 0.0
+                spent.append(0.0)
                 run.take_step()
-                times.append(spent[0])
-        finally:
-            fused._Render.forward, fused._Render.backward = staticmethod(forward), staticmethod(backward)
-            for optimizer, update in zip(rows, updates):
-                optimizer.update_rows = update  # type: ignore[method-assign]
-        return statistics.median(times[1:])
+        return statistics.median(spent[2:])
 
 
 if __name__ == "__main__":

@@ -11,45 +11,22 @@ mean anything. F-scores are those at 1.5 voxels of 128 along the exact box.
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from measuring import run_with_options, synthetic_scene, train_and_evaluate
+from measuring import print_head, print_row, run_with_options, synthetic_scene, train_and_evaluate
 
 from thermoxels_ns.synthetic.random_scene import FAMILIES
-from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 _TARGETS = {"psnr_box": (">=", 30.0), "thermal_mae_box_c": ("<=", 0.4), "fscore_128": (">=", 0.85)}
 
 
-@dataclass(frozen=True)
-class Outcome:
-    scene: SyntheticScene
-    """The exact scene."""
-    family: str
-    """Kind of arrangement."""
-    seconds: float
-    """Wall time of `ns-train`."""
-    figures: dict[str, float]
-    """What `ns-eval` reports; of the whole image where it does not say what the box covers."""
-
-    def met(self, name: str) -> bool:
-        value, (relation, bound) = self.figures.get(name, math.nan), _TARGETS[name]
-        return value >= bound if relation == ">=" else value <= bound
-
-    @property
-    def row(self) -> str:
-        coldest, hottest = self.scene.temperature_bounds_c
-        shown = {name: f"{value:.2f}" for name, value in self.figures.items()}
-        bold = {name: f"**{shown[name]}**" for name in _TARGETS if name in shown and not self.met(name)}
-        cells = [
-            *(self.scene.name, self.family, f"{self.seconds:.0f}", f"{hottest - coldest:.0f} K"),
-            *((shown | bold).get(name, "none") for name in (*_TARGETS, "precision", "recall")),
-            f"{self.figures.get('half_transparent', math.nan):.1%}",
-        ]
-        return f"| {' | '.join(cells)} |"
+def met(name: str, figures: dict[str, float]) -> bool:
+    relation, bound = _TARGETS[name]
+    return figures[name] >= bound if relation == ">=" else figures[name] <= bound
 
 
 @dataclass
@@ -66,23 +43,27 @@ class UnseenScenes:
 
     def main(self, options: Sequence[str]) -> None:
         """Print a line per scene as it is done, then how many meet the targets."""
-        print("| scene | shows | seconds | range | box PSNR, dB | box MAE, °C | F-score | precision | recall | half |")
-        print("|---|---|---|---|---|---|---|---|---|---|", flush=True)
-        outcomes = []
+        print_head(
+            *("scene", "shows", "seconds", "range", "box PSNR, dB", "box MAE, °C", "F-score", "precision", "recall"),
+            "half",
+        )
+        found = []
         for seed in self.seeds:
-            outcomes.append(self.measure(seed, options))
-            print(outcomes[-1].row, flush=True)
+            folder = self.output / f"{self.family}-{seed}"
+            scene = synthetic_scene(folder.name, folder / "scene")
+            seconds, figures = train_and_evaluate(folder / "scene", folder, options)
+            for name, whole in (("psnr_box", "psnr"), ("thermal_mae_box_c", "thermal_mae_c")):
+                figures.setdefault(name, figures.get(whole, math.nan))  # the whole image where nothing says the box
+            found.append(defaultdict(lambda: math.nan, figures))
+            coldest, hottest = scene.temperature_bounds_c
+            shown = [f"{found[-1][name]:.2f}" for name in (*_TARGETS, "precision", "recall")]
+            for place, name in enumerate(_TARGETS):
+                shown[place] = shown[place] if met(name, found[-1]) else f"**{shown[place]}**"
+            family, half = FAMILIES[seed % len(FAMILIES)].name, found[-1]["half_transparent"]
+            print_row(scene.name, family, f"{seconds:.0f}", f"{hottest - coldest:.0f} K", *shown, f"{half:.1%}")
         for name, (relation, bound) in _TARGETS.items():
-            print(f"{name} {relation} {bound:g}: {sum(one.met(name) for one in outcomes)} of {len(outcomes)}")
-        print(f"all three: {sum(all(map(one.met, _TARGETS)) for one in outcomes)} of {len(outcomes)}")
-
-    def measure(self, seed: int, options: Sequence[str]) -> Outcome:
-        folder = self.output / f"{self.family}-{seed}"
-        scene = synthetic_scene(folder.name, folder / "scene")
-        seconds, figures = train_and_evaluate(folder / "scene", folder, options)
-        for name, whole in (("psnr_box", "psnr"), ("thermal_mae_box_c", "thermal_mae_c")):
-            figures.setdefault(name, figures.get(whole, math.nan))
-        return Outcome(scene, FAMILIES[seed % len(FAMILIES)].name, seconds, figures)
+            print(f"{name} {relation} {bound:g}: {sum(met(name, one) for one in found)} of {len(found)}")
+        print(f"all three: {sum(all(met(name, one) for name in _TARGETS) for one in found)} of {len(found)}")
 
 
 if __name__ == "__main__":

@@ -44,10 +44,10 @@ def photographs() -> Photographs:
     pixels = np.stack([*np.meshgrid(side, side), np.ones((WIDTH, WIDTH))], -1).reshape(-1, 3)
     for matrix, centre in zip(matrices, centres):
         rays = pixels @ np.linalg.inv(matrix[:, :3]).T
-        hits = SOLID.intersect(centre, rays)
+        distance, normal = SOLID.intersect(centre, rays)
         picture = np.tile(SKY, (len(rays), 1))
-        met = hits.hit
-        picture[met] = colours(centre + hits.distance[met, None] * rays[met], hits.normal[met])
+        met = np.isfinite(distance)
+        picture[met] = colours(centre + distance[met, None] * rays[met], normal[met])
         pictures.append(picture + rng.normal(0.0, 0.006, picture.shape))
     firsts = np.arange(len(EYES)) * WIDTH * WIDTH
     shown = np.concatenate(pictures).astype(np.float32)

@@ -66,7 +66,7 @@ def test_huge_density_is_opaque_with_finite_gradients(renderer, sigma):
 def test_nan_density_is_refused_not_made_transparent(renderer, activation):
     grid = random_grid(0, 0, activation, 1.0, CUBE)
     grid.density.data[len(grid.density) // 2] = float("nan")
-    with pytest.raises(ThermoxelsError, match=r"density: expected numbers >= 0, got .*NaN"):
+    with pytest.raises(ThermoxelsError, match=r"^density: "):
         RENDERERS[renderer](grid, random_request(grid), RenderOptions())
 
 
@@ -137,11 +137,8 @@ def test_axis_parallel_rays(axis, sign, slope):
     full = filled(0.25)
     for renderer in RENDERERS:
         seen = RENDERERS[renderer](full, rays, RenderOptions())
-        torch.testing.assert_close(
-            seen.accumulation, torch.full((5,), 1 - np.exp(-0.5)), check_dtype=False, rtol=1e-5, atol=0
-        )
-    sparse = random_grid(1, 0, "relu", 0.05, CUBE)
-    assert_twins_agree(sparse, rays)
+        assert seen.accumulation.tolist() == pytest.approx([1 - np.exp(-0.5)] * 5, rel=1e-5)
+    assert_twins_agree(random_grid(1, 0, "relu", 0.05, CUBE), rays)
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
@@ -163,35 +160,29 @@ def test_a_ray_that_is_nearly_parallel_enters_through_the_side_it_crosses(render
     assert float(seen.accumulation) == pytest.approx(1.0 - np.exp(-0.25), rel=1e-6)
 
 
-@pytest.mark.parametrize("corner", [(1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (1.0, 1.0, 1.0), (-1.0, 1.0, -1.0)])
-def test_camera_on_a_face_an_edge_and_a_corner(corner):
-    origins = torch.tensor([corner])
-    inward, outward = request(origins, -origins), request(origins, origins)
-    for renderer in RENDERERS:
-        grid = filled(0.25)
-        seen = RENDERERS[renderer](grid, inward, RenderOptions())
-        chord = 2.0 * float(origins.norm())
-        assert float(seen.accumulation) == pytest.approx(1.0 - np.exp(-0.25 * chord), rel=1e-5)
-        assert float(RENDERERS[renderer](grid, outward, RenderOptions()).accumulation) == pytest.approx(0.0, abs=1e-6)
-    assert_twins_agree(random_grid(1, 0, "relu", 0.3, CUBE), inward)
-
-
-def test_camera_inside_starts_at_itself_and_a_box_behind_is_missed():
-    rays = request([[0.2, 0.01, 0.02], [3.0, 0.01, 0.02]], [1.0, 0.0, 0.0])
-    for renderer in RENDERERS:
-        seen = RENDERERS[renderer](filled(0.5), rays, RenderOptions())
-        torch.testing.assert_close(
-            seen.accumulation, torch.tensor([1.0 - np.exp(-0.4), 0.0]).float(), rtol=1e-5, atol=0
-        )
-
-
 @pytest.mark.parametrize("renderer", RENDERERS)
-def test_a_miss_sees_nothing_and_has_depth_infinite(renderer):
-    rays = request([[0.0, 0.0, 5.0], [3.0, 3.0, 0.0], [-3.0, 0.0, 0.0]], [[0, 0, 1.0], [1.0, -1.0, 0], [0, 1.0, 0]])
-    seen = RENDERERS[renderer](filled(50.0), rays, RenderOptions())
-    assert not bool(seen.rgb.any()) and not bool(seen.thermal.any())
-    assert bool((seen.accumulation == 0).all()) and bool((seen.transmittance == 1).all())
-    assert bool(torch.isinf(seen.depth).all())
+@pytest.mark.parametrize(
+    ("origin", "towards", "chord"),
+    [
+        *(  # on a face, an edge and a corner: inwards and outwards
+            (corner, [way * side for side in corner], length)
+            for corner in ([1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0], [-1.0, 1.0, -1.0])
+            for way, length in ((-1.0, 2.0 * float(np.linalg.norm(corner))), (1.0, 0.0))
+        ),
+        ([0.2, 0.01, 0.02], [1.0, 0.0, 0.0], 0.8),  # inside, where the ray starts at the camera
+        ([3.0, 0.01, 0.02], [1.0, 0.0, 0.0], 0.0),  # the box lies behind
+        ([0.0, 0.0, 5.0], [0.0, 0.0, 1.0], 0.0),
+        ([3.0, 3.0, 0.0], [1.0, -1.0, 0.0], 0.0),
+        ([-3.0, 0.0, 0.0], [0.0, 1.0, 0.0], 0.0),
+    ],
+)
+def test_the_chord_of_a_camera_on_in_or_beside_the_box(renderer, origin, towards, chord):
+    seen = RENDERERS[renderer](filled(0.5), request([origin], towards), RenderOptions())
+    assert float(seen.accumulation) == pytest.approx(1.0 - np.exp(-0.5 * chord), rel=1e-5, abs=1e-6)
+    if origin[0] in (0.0, 3.0, -3.0):  # a miss sees nothing at all
+        assert not bool(seen.rgb.any()) and not bool(seen.thermal.any())
+        assert float(seen.accumulation) == 0.0 and float(seen.transmittance) == 1.0 and bool(torch.isinf(seen.depth))
+    assert_twins_agree(random_grid(1, 0, "relu", 0.3, CUBE), request([origin], towards))
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
@@ -216,11 +207,8 @@ def test_rays_through_nothing_see_nothing_and_pull_at_no_temperature(renderer, a
     grid.density.data.fill_(raw)
     rays = random_request(grid, 50, mixed=False)
     seen = RENDERERS[renderer](grid, rays, EVERYTHING)
-    assert (
-        bool((seen.transmittance == 1).all())
-        and bool((seen.accumulation == 0).all())
-        and bool(torch.isinf(seen.depth).all())
-    )
+    assert bool((seen.transmittance == 1).all()) and bool((seen.accumulation == 0).all())
+    assert bool(torch.isinf(seen.depth).all())
     assert float(seen.distortion.abs().max()) == 0.0 and float(seen.sparsity.abs().max()) == 0.0
     (seen.rgb.sum() + seen.thermal.sum()).backward()
     for parameter in grid.row_parameters().values():

@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ from tests.support.boxed_scene import write_boxed_scene
 from tests.support.short_training import train_with_optimizers
 from thermoxels_ns.core import threads
 from thermoxels_ns.core.threads import num_threads
-from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
+from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, seen_behind
 from thermoxels_ns.synthetic.scene_folder import make_scene
 
 
@@ -54,28 +55,30 @@ def assert_same_bits(results: list[dict[str, torch.Tensor]]) -> None:
         assert differing == []
 
 
-def test_a_training_that_refines_and_prunes(tmp_path):
-    """What a checkpoint holds, model and optimisers, after steps on both sides of refinement, pruning and thinning."""
-    scene = write_boxed_scene(make_scene("sphere"), tmp_path / "scene", 6, 1, width=40, height=30)
-    schedule = {
-        "resolutions": [8, 16],
-        "voxel_pixels": 0.0,
-        "refine_at": [6],
-        "prune_at": [9],
-        "thin_at": [11],
-        "distortion_ramp": [2, 4],
-    }
+def after_training(scene: Path, count: int, steps: int, settings: dict[str, Any], rays: int) -> dict[str, torch.Tensor]:
+    """What a checkpoint holds, model and optimisers, after some steps on so many threads."""
+    torch.set_num_threads(count)
+    pipeline, optimizers = train_with_optimizers(scene, steps, settings, rays=rays, threads=count)
+    assert num_threads() == count
+    states = {name: optimizer.state_dict()["state"] for name, optimizer in optimizers.optimizers.items()}
+    return flat({"model": dict(pipeline.state_dict()), "optimizers": states})
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    return write_boxed_scene(make_scene("sphere"), tmp_path_factory.mktemp("threads"), 6, 1, width=40, height=30)
+
+
+def test_a_training_that_refines_and_prunes(scene):
+    """Steps on both sides of refinement, pruning and thinning."""
+    schedule = {"resolutions": [8, 16], "voxel_pixels": 0.0, "refine_at": [6], "prune_at": [9], "thin_at": [11]}
     # So few steps form no surface: rays end in a fog, of which pruning and thinning take the thinnest parts.
-    schedule |= {"start_density": 3.0, "prune_threshold": 0.02, "thin_threshold": 0.04, "prune_dilation": 0}
-    results = []
-    for count in COUNTS:
-        torch.set_num_threads(count)
-        pipeline, optimizers = train_with_optimizers(scene, 14, schedule, rays=700, threads=count)
-        assert num_threads() == count
-        grid = pipeline.model.grid
-        assert grid.lattice.cell_shape[0] == 16 and not grid.voxels.all_kept
-        states = {name: optimizer.state_dict()["state"] for name, optimizer in optimizers.optimizers.items()}
-        results.append(flat({"model": dict(pipeline.state_dict()), "optimizers": states}))
+    schedule |= {"distortion_ramp": [2, 4], "start_density": 3.0, "prune_threshold": 0.02, "thin_threshold": 0.04}
+    results = [after_training(scene, count, 14, schedule | {"prune_dilation": 0}, 700) for count in COUNTS]
+    shape, cells = (
+        next(v for k, v in results[0].items() if k.endswith(end)) for end in ("grid.corner_shape", "grid.cells")
+    )
+    assert int(shape[0]) == 17 and len(cells) < int((shape - 1).prod())
     assert any("optimizers.sh.0.exp_avg" in name for name in results[0])
     assert_same_bits(results)
 
@@ -113,26 +116,11 @@ class NoProductOfLongVectors(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def test_a_training_with_large_batches(tmp_path):
+def test_a_training_with_large_batches(scene):
     """Every tensor with a row per ray is one that torch splits among its threads."""
-    scene = write_boxed_scene(make_scene("sphere"), tmp_path / "scene", 6, 1, width=40, height=30)
-    settings = {
-        "resolutions": [8],
-        "voxel_pixels": 0.0,
-        "refine_at": [],
-        "start_density": 3.0,
-        "prune_at": [3],
-        "prune_threshold": 0.02,
-    }
-    settings |= {"per_image_offset": "on", "thermal_background": "learned", "background": "on"}
-    results = []
-    for count in COUNTS:
-        torch.set_num_threads(count)
-        with NoProductOfLongVectors():
-            pipeline, optimizers = train_with_optimizers(
-                scene, 5, settings, rays=TOO_MANY_FOR_ONE_THREAD, threads=count
-            )
-        states = {name: optimizer.state_dict()["state"] for name, optimizer in optimizers.optimizers.items()}
-        results.append(flat({"model": dict(pipeline.state_dict()), "optimizers": states}))
+    settings = {"resolutions": [8], "voxel_pixels": 0.0, "refine_at": [], "start_density": 3.0, "prune_at": [3]}
+    settings |= {"prune_threshold": 0.02, "per_image_offset": "on", "thermal_background": "learned", "background": "on"}
+    with NoProductOfLongVectors():
+        results = [after_training(scene, count, 5, settings, TOO_MANY_FOR_ONE_THREAD) for count in COUNTS]
     assert any("thermal_offset" in name for name in results[0])
     assert_same_bits(results)

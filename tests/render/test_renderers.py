@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from tests.reference.two_renderers import random_grid
-from thermoxels_ns.field.background import SkyTemperature, SphereImage
-from thermoxels_ns.field.surroundings import Surroundings
+from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, Surroundings
 from thermoxels_ns.field.voxel_grid import raw_density
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import Scene, render_scene

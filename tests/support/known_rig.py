@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV, RigEstimate, RigFrame, RigStart, radius_squared
 from thermoxels_ns.core.camera import Camera
@@ -62,11 +63,8 @@ def projection_difference_px(
 
 
 def turned(x_deg: float, y_deg: float, z_deg: float) -> FloatArray:
-    x, y, z = np.radians([x_deg, y_deg, z_deg])
-    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
-    about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
-    about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
+    """Turn about x, then y, then z."""
+    return Rotation.from_euler("xyz", [x_deg, y_deg, z_deg], degrees=True).as_matrix()
 
 
 def known_capture(

@@ -57,16 +57,10 @@ def main(resolution: int, share: float, sh_degree: int = 2, start: int = 64) -> 
         origins = torch.nn.functional.normalize(torch.randn(2 * count, 3, generator=generator), dim=-1) * 3.0
         aims = torch.randn(2 * count, 3, generator=generator) * 0.3
         wants_rgb = torch.arange(2 * count) < count
-        rays = RayRequest(
-            origins, torch.nn.functional.normalize(aims - origins, dim=-1), 0.0, None, wants_rgb, ~wants_rgb
-        )
-        voxels = len(grid.voxels)
-        options = RenderOptions(
-            distortion_scale=2.0,
-            early_stop=1e-5,
-            variation={name: (0, max(1, voxels // 10)) for name in grid.row_parameters()},
-        )
-        seen = fused_render(grid, rays, options)
+        directions = torch.nn.functional.normalize(aims - origins, dim=-1)
+        variation = {name: (0, max(1, len(grid.voxels) // 10)) for name in grid.row_parameters()}
+        options = RenderOptions(distortion_scale=2.0, early_stop=1e-5, variation=variation)
+        seen = fused_render(grid, RayRequest(origins, directions, 0.0, None, wants_rgb, ~wants_rgb), options)
         loss = seen.rgb.sum() + seen.thermal.sum() + seen.distortion.sum() + sum(seen.variation.values())
         loss.backward()
         gradients = 0
@@ -89,22 +83,10 @@ def main(resolution: int, share: float, sh_degree: int = 2, start: int = 64) -> 
     stays = sum(array.nbytes for array in tables) + gradients
     for name, parameter in grid.row_parameters().items():
         stays += parameter.nbytes + sum(values.nbytes for values in optimizers[name].state[parameter].values())
-    need = prediction()
-    print(
-        json.dumps(
-            {
-                "imports": imports,
-                "peak": resident("VmHWM"),
-                "stays": stays,
-                "predicted": need.gigabytes * 1e9,
-                "rows": voxels.num_rows,
-                "most_predicted": most * 1e9,
-                "predicted_rows": need.rows,
-                "share": len(voxels) / float(np.prod(grid.lattice.cell_shape)),
-                "resolution": grid.lattice.cell_shape[0],
-            }
-        )
-    )
+    need, shape = prediction(), grid.lattice.cell_shape
+    figures = {"imports": imports, "peak": resident("VmHWM"), "stays": stays, "predicted": need.gigabytes * 1e9}
+    figures |= {"rows": voxels.num_rows, "most_predicted": most * 1e9, "predicted_rows": need.rows}
+    print(json.dumps(figures | {"share": len(voxels) / float(np.prod(shape)), "resolution": shape[0]}))
 
 
 if __name__ == "__main__":

@@ -1,23 +1,17 @@
-"""Scenes from a seed: exact, the same everywhere, nothing thinner than three voxels, and photographed from outside."""
+"""Scenes from a seed: the same everywhere, nothing thinner than three voxels; what a plan is made of."""
 
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
 import tyro
 
-from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.catalogue import SceneWord, make_scene
 from thermoxels_ns.synthetic.random_plan import SMALLEST, Plan
 from thermoxels_ns.synthetic.random_scene import FAMILIES, random_scene
-from thermoxels_ns.synthetic.raycast import visible_surface_points
-from thermoxels_ns.synthetic.scene_folder import load_truth, write_scene
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solids import BoxSolid, SolidUnion, distance_to_box
 
-MANY = range(15)
-ONE_OF_EACH = range(len(FAMILIES))
 # Things that rest on something are this close to it, found by the nearest of random points [voxels of the plan].
 _CONTACT = 0.06
 
@@ -29,29 +23,7 @@ def laid_out(number: int, seed: int) -> Plan:
 
 
 def boxes_of(scene: SyntheticScene) -> BoxSolid:
-    part = scene.solid.parts[0] if isinstance(scene.solid, SolidUnion) else scene.solid
-    assert isinstance(part, BoxSolid)
-    return part
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "random",
-        "random-",
-        "random-017",
-        "random--1",
-        "random-1.5",
-        "random-x",
-        "Random-1",
-        "random-1 ",
-        "random-²",
-        "random-" + "9" * 5000,
-    ],
-)
-def test_other_names_are_refused(name: str) -> None:
-    with pytest.raises(SceneError):
-        make_scene(name)
+    return scene.solid.parts[0] if isinstance(scene.solid, SolidUnion) else scene.solid
 
 
 def test_the_command_line_takes_names_and_seeds_and_refuses_others(capsys: pytest.CaptureFixture[str]) -> None:
@@ -61,13 +33,6 @@ def test_the_command_line_takes_names_and_seeds_and_refuses_others(capsys: pytes
         tyro.cli(SceneWord, args=["random-03"])  # type: ignore[call-overload]
     assert stop.value.code == 2
     assert "random-N" in capsys.readouterr().err
-
-
-def test_truth_comes_back_from_the_folder(tmp_path: Path) -> None:
-    write_scene(make_scene("random-4"), tmp_path, num_train=2, num_eval=1, width=16, height=12, progress=False)
-    truth = load_truth(tmp_path)
-    assert truth is not None and truth.name == "random-4"
-    assert (truth.solid.volume, truth.solid.area) == (random_scene(4).solid.volume, random_scene(4).solid.area)
 
 
 # Volume [m3], area [m2], height of the first camera [m], temperature at the first of the surface points [C].
@@ -80,57 +45,12 @@ PINNED = {
 }
 
 
-@pytest.mark.parametrize("seed", ONE_OF_EACH)
+@pytest.mark.parametrize("seed", PINNED)
 def test_a_seed_means_the_same_scene_on_every_machine(seed: int) -> None:
     scene = random_scene(seed)
     height = scene.poses(42, 6)[0][0][2, 3]
     temperature = scene.surface_temperature_c(scene.solid.surface_points(10)[0])[0]
     assert (scene.solid.volume, scene.solid.area, height, temperature) == pytest.approx(PINNED[seed], rel=1e-6)
-
-
-@pytest.mark.parametrize("seed", MANY)
-def test_every_seed_makes_a_scene_that_lies_in_its_box_with_room_around_it(seed: int) -> None:
-    scene = make_scene(f"random-{seed}")
-    (lo, hi), (solid_lo, solid_hi) = np.array(scene.scene_box), np.array(scene.solid.bounds)
-    voxel = scene.size / 64
-    assert (solid_lo - lo >= 2 * voxel).all() and (hi - solid_hi >= 2 * voxel).all()
-    assert (solid_hi - solid_lo).max() > 0.9 * scene.size
-    points, normals = scene.solid.surface_points(2000, seed=3)
-    assert np.abs(scene.solid.signed_distance(points)).max() < 1e-12 * scene.size
-    assert not scene.solid.contains(points + 1e-6 * scene.size * normals).any()
-    assert scene.solid.contains(points - 1e-6 * scene.size * normals).all()
-
-
-@pytest.mark.parametrize("seed", MANY)
-def test_every_camera_stands_outside_and_has_the_scene_in_half_of_its_picture(seed: int) -> None:
-    scene = make_scene(f"random-{seed}")
-    camera, points = scene.camera(320, 240), scene.solid.surface_points(2000)[0]
-    poses = np.concatenate(scene.poses(42, 6))
-    assert scene.solid.signed_distance(poses[:, :3, 3]).min() > 0.3 * scene.size and poses[:, 2, 3].min() > 0.0
-    shares = []
-    for pose in poses:
-        pixel = camera.project_world(pose, points)
-        inside = camera.contains(pixel)
-        assert inside.all()
-        shares.append(np.prod(np.ptp(pixel, axis=0)) / (320 * 240))
-    assert np.mean(shares) > 0.4 and min(shares) > 0.2
-
-
-@pytest.mark.parametrize("seed", range(20, 35))
-def test_wild_scenes_stand_free_before_each_kind_of_surroundings_and_fill_the_picture(seed: int) -> None:
-    scene = make_scene(f"wild-{seed}")
-    camera, points = scene.camera(320, 240), scene.solid.surface_points(1000)[0]
-    poses = np.concatenate(scene.poses(42, 6))
-    assert scene.solid.signed_distance(poses[:, :3, 3]).min() > 0.3 * scene.size
-    assert all(camera.contains(camera.project_world(pose, points)).all() for pose in poses)
-    inside = np.random.default_rng(1).uniform(*scene.solid.bounds, (2000, 3))
-    if scene.around is not None:
-        assert min(scene.around.solid.signed_distance(at).min() for at in (poses[:, :3, 3], inside)) > 0.0
-    sky = scene.background_rgb([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-    kind = "around" if scene.around else "plain" if (sky[0] == sky[1]).all() else "smooth"
-    assert kind == ("smooth", "plain", "around")[seed % 3]
-    points, normals = scene.solid.surface_points(2000)
-    assert scene.colour(points, normals).std(axis=0).max() > 0.05
 
 
 def test_wild_scenes_have_plain_walls_mirrors_and_railings_and_random_ones_have_not() -> None:
@@ -147,7 +67,7 @@ def test_wild_scenes_have_plain_walls_mirrors_and_railings_and_random_ones_have_
     )
 
 
-@pytest.mark.parametrize("seed", MANY)
+@pytest.mark.parametrize("seed", range(15))
 def test_nothing_is_thinner_or_closer_than_three_voxels_of_128(seed: int) -> None:
     scene = make_scene(f"random-{seed}")
     boxes, voxel = boxes_of(scene), scene.size / 127
@@ -173,29 +93,7 @@ def test_round_things_keep_their_distance_or_rest_on_something(number: int, seed
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_temperatures_fill_their_bounds_and_are_continuous(seed: int) -> None:
-    scene = make_scene(f"random-{seed}")
-    lowest, highest = scene.temperature_bounds_c
-    points, normals = scene.solid.surface_points(20_000, seed=5)
-    surface = scene.surface_temperature_c(points)
-    directions = np.random.default_rng(0).standard_normal((3000, 3))
-    directions = np.concatenate([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
-    behind = scene.background_temperature_c(directions)
-    both = np.concatenate([surface, behind])
-    assert 15.0 <= highest - lowest <= 60.0
-    assert lowest <= both.min() and both.max() <= highest and np.ptp(both) > 0.9 * (highest - lowest)
-    along = np.cross(normals, [0.31, 0.55, 0.77])
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    beside = scene.surface_temperature_c(points + 0.01 * scene.size / 127 * along)
-    assert np.abs(beside - surface).max() < 0.02 * (highest - lowest)
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_paints_go_from_textured_to_plain_and_tell_pieces_apart(seed: int) -> None:
-    scene = make_scene(f"random-{seed}")
-    points, normals = scene.solid.surface_points(4000, seed=6)
-    colour = scene.colour(points, normals)
-    assert colour.shape == (4000, 3) and colour.min() >= 0.0 and colour.max() <= 1.0 and colour.std() > 0.05
+def test_paints_go_from_textured_to_plain(seed: int) -> None:
     contrasts = [paint.contrast for paint in laid_out(seed % len(FAMILIES), seed).paints]
     assert len(contrasts) >= 5 and min(contrasts) >= 0.08 and max(contrasts) <= 0.35 and np.ptp(contrasts) > 0.05
 
@@ -221,14 +119,3 @@ def test_a_plan_in_another_unit_is_the_same_plan() -> None:
     points, normals = plan.solid().surface_points(3000, seed=1)
     np.testing.assert_allclose(larger.warmth(2.5 * points), plan.warmth(points), atol=1e-12)
     assert (larger.part(2.5 * points, normals) == plan.part(points, normals)).mean() > 0.999
-
-
-@pytest.mark.parametrize("seed", ONE_OF_EACH)
-def test_most_of_what_can_be_seen_is_seen_by_three_cameras(seed: int) -> None:
-    scene = make_scene(f"random-{seed}")
-    points, normals = scene.solid.surface_points(3000)
-    seen = visible_surface_points(scene, scene.poses(42, 6)[0], scene.camera(320, 240), points, normals)
-    if FAMILIES[seed].arc_deg is None:
-        assert seen[normals[:, 2] > -0.5].mean() > 0.9
-    else:
-        assert seen[normals[:, 1] < -0.5].mean() > 0.95 and not seen[normals[:, 1] > 0.5].any()

@@ -110,17 +110,8 @@ def test_own_thermal_camera_has_the_keys_of_real_data(tmp_path: Path, shared_dat
 
 def test_noise_and_drift_have_the_size_asked_for_and_are_not_clipped(tmp_path: Path) -> None:
     scene = make_scene("sphere")
-    write_scene(
-        scene,
-        tmp_path,
-        num_train=8,
-        num_eval=0,
-        width=40,
-        height=30,
-        imperfections=Imperfections(noise_k=0.5, drift_k=2.0),
-        seed=3,
-        progress=False,
-    )
+    flaws = Imperfections(noise_k=0.5, drift_k=2.0)
+    write_scene(scene, tmp_path, **{**SMALL, "num_train": 8, "num_eval": 0}, imperfections=flaws, seed=3)
     content = transforms(tmp_path)
     drifts = json.loads((tmp_path / "truth.json").read_text())["drift_k"]
     assert 0.8 < np.std(drifts) < 4.0
@@ -135,13 +126,8 @@ def test_noise_and_drift_have_the_size_asked_for_and_are_not_clipped(tmp_path: P
 
 def test_same_seed_same_bytes(tmp_path: Path) -> None:
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        write_scene(
-            make_scene("sphere"),
-            tmp_path / name,
-            imperfections=Imperfections(noise_k=0.1, drift_k=0.1),
-            seed=seed,
-            **SMALL,
-        )
+        flaws = Imperfections(noise_k=0.1, drift_k=0.1)
+        write_scene(make_scene("sphere"), tmp_path / name, imperfections=flaws, seed=seed, **SMALL)
     assert all_bytes(tmp_path / "a") == all_bytes(tmp_path / "b")
     assert all_bytes(tmp_path / "a") != all_bytes(tmp_path / "c")
 

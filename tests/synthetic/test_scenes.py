@@ -1,4 +1,4 @@
-"""The scenes by name: sizes, temperatures, cameras, pictures, and what stands around them."""
+"""All scenes by name: laws that each keeps, and for single ones sizes, temperatures, pictures and surroundings."""
 
 import dataclasses
 import itertools
@@ -13,7 +13,8 @@ from thermoxels_ns.synthetic.catalogue import DEVELOPMENT_NAMES, SCENE_NAMES, ma
 from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
 from thermoxels_ns.synthetic.solids import BoxSolid
 
-ALL = (*DEVELOPMENT_NAMES, "house-corner+street", "hot-object+room")
+RANDOM = tuple(f"random-{seed}" for seed in range(15))
+AROUND = (*DEVELOPMENT_NAMES, "house-corner+street", "hot-object+room")
 
 
 @pytest.fixture(params=SCENE_NAMES)
@@ -21,22 +22,38 @@ def scene(request: pytest.FixtureRequest):
     return make_scene(request.param)
 
 
-def test_solid_lies_in_the_scene_box_with_room_for_two_voxels(scene) -> None:
-    lo, hi = np.array(scene.scene_box)
-    voxel = (hi - lo).max() / 64
-    solid_lo, solid_hi = np.array(scene.solid.bounds)
+def unit_directions() -> np.ndarray:
+    drawn = np.random.default_rng(0).standard_normal((3000, 3))
+    return np.concatenate([drawn / np.linalg.norm(drawn, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
+
+
+@pytest.mark.parametrize("name", (*SCENE_NAMES, *RANDOM))
+def test_solid_lies_in_the_scene_box_with_room_for_two_voxels(name: str) -> None:
+    scene = make_scene(name)
+    (lo, hi), (solid_lo, solid_hi) = np.array(scene.scene_box), np.array(scene.solid.bounds)
+    voxel = scene.size / 64
     assert (solid_lo - lo >= 2 * voxel).all() and (hi - solid_hi >= 2 * voxel).all()
+    assert name not in RANDOM or (solid_hi - solid_lo).max() > 0.9 * scene.size
 
 
-def test_temperatures_stay_within_the_bounds(scene) -> None:
+@pytest.mark.parametrize("name", (*SCENE_NAMES, *RANDOM[:10]))
+def test_temperatures_fill_their_bounds_and_are_continuous(name: str) -> None:
+    scene = make_scene(name)
     lowest, highest = scene.temperature_bounds_c
-    points, _ = scene.solid.surface_points(20_000)
+    points, normals = scene.solid.surface_points(20_000, seed=5)
     surface = scene.surface_temperature_c(points)
-    directions = np.random.default_rng(0).standard_normal((5000, 3))
-    directions = np.concatenate([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
-    sky = scene.background_temperature_c(directions)
-    assert min(surface.min(), sky.min()) >= lowest and max(surface.max(), sky.max()) <= highest
-    assert max(surface.max(), sky.max()) - min(surface.min(), sky.min()) > 0.9 * (highest - lowest)
+    both = np.concatenate([surface, scene.background_temperature_c(unit_directions())])
+    assert lowest <= both.min() and both.max() <= highest and np.ptp(both) > 0.9 * (highest - lowest)
+    if name not in RANDOM:  # parts of the others stand side by side
+        return
+    assert 15.0 <= highest - lowest <= 60.0
+    beside = scene.surface_temperature_c(points + 0.01 * scene.size / 127 * along_surface(normals))
+    assert np.abs(beside - surface).max() < 0.02 * (highest - lowest)
+
+
+def along_surface(normals: np.ndarray) -> np.ndarray:
+    along = np.cross(normals, [0.31, 0.55, 0.77])
+    return along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
 def test_exact_sizes() -> None:
@@ -96,32 +113,77 @@ def test_the_sky_is_colder_above(name: str, zenith: float, horizon: float) -> No
     np.testing.assert_allclose(sky, [zenith, horizon], atol=0.5)
 
 
-@pytest.mark.parametrize("name", ["courtyard", "pipes"])
-def test_most_of_what_can_be_seen_is_seen_by_three_cameras(name: str) -> None:
+def seen_by_three(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     scene = make_scene(name)
     points, normals = scene.solid.surface_points(6000)
-    seen = visible_surface_points(scene, scene.poses(42, 6)[0], scene.camera(320, 240), points, normals)
-    if name == "pipes":
-        before_the_wall = points[:, 1] < -0.01
-        on_its_front = np.abs(points[:, 1]) < 1e-9
-        assert seen[on_its_front].all() and seen[before_the_wall & (normals[:, 1] < 0)].mean() > 0.98
-        assert not seen[normals[:, 1] > 0.99].any()
+    return (
+        points,
+        normals,
+        visible_surface_points(scene, scene.poses(42, 6)[0], scene.camera(320, 240), points, normals),
+    )
+
+
+@pytest.mark.parametrize("name", RANDOM[:5])
+def test_most_of_what_can_be_seen_is_seen_by_three_cameras(name: str) -> None:
+    _, normals, seen = seen_by_three(name)
+    if name == "random-4":  # the facade, in front of which they stand
+        assert seen[normals[:, 1] < -0.5].mean() > 0.95 and not seen[normals[:, 1] > 0.5].any()
     else:
-        assert seen[normals[:, 2] > -0.5].mean() > 0.97
-        yard = (np.abs(points[:, 0]) < 1.7) & (points[:, 1] > -0.9) & (points[:, 1] < 1.6) & (points[:, 2] == 0.0)
-        columns = (np.abs(points[:, 1] + 2.16) < 0.15) & (points[:, 2] > 0) & (points[:, 2] < 2.4)
-        assert yard.sum() > 50 and seen[yard].mean() > 0.95
-        assert columns.sum() > 100 and seen[columns].mean() > 0.9
+        assert seen[normals[:, 2] > -0.5].mean() > 0.9
 
 
-def test_every_view_frames_the_scene_from_outside(scene) -> None:
-    camera = scene.camera(320, 240)
-    points, _ = scene.solid.surface_points(5000)
-    for pose in np.concatenate(scene.poses(42, 6)):
-        pixel = camera.project_world(pose, points)
-        inside = camera.contains(pixel)
-        assert inside.all() and not scene.solid.contains(pose[None, :3, 3])[0]
-        assert np.ptp(pixel, axis=0).max() > 0.4 * 320
+def test_three_cameras_see_the_front_of_the_pipes_and_not_their_back() -> None:
+    points, normals, seen = seen_by_three("pipes")
+    before_the_wall, on_its_front = points[:, 1] < -0.01, np.abs(points[:, 1]) < 1e-9
+    assert seen[on_its_front].all() and seen[before_the_wall & (normals[:, 1] < 0)].mean() > 0.98
+    assert not seen[normals[:, 1] > 0.99].any()
+
+
+def test_three_cameras_see_the_yard_and_the_columns_of_the_courtyard() -> None:
+    points, normals, seen = seen_by_three("courtyard")
+    assert seen[normals[:, 2] > -0.5].mean() > 0.97
+    yard = (np.abs(points[:, 0]) < 1.7) & (points[:, 1] > -0.9) & (points[:, 1] < 1.6) & (points[:, 2] == 0.0)
+    columns = (np.abs(points[:, 1] + 2.16) < 0.15) & (points[:, 2] > 0) & (points[:, 2] < 2.4)
+    assert yard.sum() > 50 and seen[yard].mean() > 0.95
+    assert columns.sum() > 100 and seen[columns].mean() > 0.9
+
+
+def test_cameras_above_the_table_never_see_its_bottom() -> None:
+    points, normals, seen = seen_by_three("hot-object")
+    assert not seen[(normals[:, 2] < -0.999) & (points[:, 2] < -0.07)].any()
+    assert seen[(normals[:, 2] > 0.999) & (points[:, 2] > 0.2)].all() and 0.5 < seen.mean() < 0.75
+
+
+@pytest.mark.parametrize("name", (*SCENE_NAMES, *AROUND, *RANDOM, *(f"wild-{seed}" for seed in range(20, 35))))
+def test_cameras_stand_free_and_frame_the_scene(name: str) -> None:
+    scene = make_scene(name)
+    camera, points = scene.camera(320, 240), scene.solid.surface_points(2000)[0]
+    poses = np.concatenate(scene.poses(42, 6))
+    assert scene.solid.signed_distance(poses[:, :3, 3]).min() > 0.3 * scene.size
+    inside = np.random.default_rng(1).uniform(*scene.solid.bounds, (2000, 3))
+    if scene.around is not None:
+        assert min(scene.around.solid.signed_distance(at).min() for at in (poses[:, :3, 3], inside)) > 0.0
+    pixels = np.array([camera.project_world(pose, points) for pose in poses])
+    spread = np.ptp(pixels, axis=1) / (320, 240)
+    if name not in ("facade", "street"):  # cameras walk past these
+        assert camera.contains(pixels.reshape(-1, 2)).all()
+    if name in SCENE_NAMES:
+        assert (spread * (320, 240)).max(axis=1).min() > 0.4 * 320
+    if name in RANDOM:
+        assert spread.prod(axis=1).mean() > 0.4 and spread.prod(axis=1).min() > 0.2 and poses[:, 2, 3].min() > 0.0
+    elif name.startswith("wild"):
+        sky = scene.background_rgb([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+        kind = "around" if scene.around else "plain" if (sky[0] == sky[1]).all() else "smooth"
+        assert kind == ("smooth", "plain", "around")[int(name[5:]) % 3]
+
+
+@pytest.mark.parametrize("name", AROUND)
+def test_surroundings_are_seen_within_the_bounds_of_temperature(name: str) -> None:
+    scene = make_scene(name)
+    lowest, highest = scene.temperature_bounds_c
+    view = render_view(scene, scene.poses(3, 0)[0][1], scene.camera(64, 48))
+    assert lowest <= view.temperature_c.min() and view.temperature_c.max() <= highest
+    assert 0.15 < view.hit.mean() < 0.95 and view.rgb.std() > 0.05
 
 
 @pytest.mark.parametrize(("num_train", "num_eval"), [(42, 6), (1, 1), (2, 3), (7, 0), (4, 9)])
@@ -172,20 +234,22 @@ def test_supersampling_is_the_mean_of_a_finer_image(scene) -> None:
     assert (coarse.hit == np.isfinite(coarse.depth_m)).all()
 
 
-def test_colours_are_textured_within_range_and_smoother_than_two_voxels(scene) -> None:
+def test_colours_are_textured_and_smoother_than_two_voxels(scene) -> None:
     points, normals = scene.solid.surface_points(4000)
-    colour = scene.colour(points, normals)
-    assert colour.shape == (4000, 3) and colour.min() >= 0.0 and colour.max() <= 1.0
-    up = normals[:, 2] > 0.7
-    assert colour[up].std(axis=0).min() > 0.05
+    colour, along, voxel = scene.colour(points, normals), along_surface(normals), scene.size / 64
+    assert colour[normals[:, 2] > 0.7].std(axis=0).min() > 0.05
     # A hundredth of a voxel along the surface changes little; two voxels change about as much as anything does.
-    voxel = np.subtract(*scene.scene_box[::-1]).max() / 64
-    along = np.cross(normals, [0.31, 0.55, 0.77])
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
     near = np.abs(scene.colour(points + 0.01 * voxel * along, normals) - colour).mean()
     far = np.abs(scene.colour(points + 2.0 * voxel * along, normals) - colour).mean()
     # Most of the pipes' scene is a wall that shows little texture on purpose.
     assert near < 0.02 and near < 0.05 * far and far > (0.012 if scene.name == "pipes" else 0.03)
+
+
+@pytest.mark.parametrize("name", (*SCENE_NAMES, *RANDOM[:10], *(f"wild-{seed}" for seed in range(20, 25))))
+def test_colours_are_in_range_and_differ(name: str) -> None:
+    scene = make_scene(name)
+    colour = scene.colour(*scene.solid.surface_points(4000, seed=6))
+    assert colour.shape == (4000, 3) and colour.min() >= 0.0 and colour.max() <= 1.0 and colour.std() > 0.05
 
 
 def test_a_camera_inside_the_solid_is_an_error() -> None:
@@ -195,18 +259,6 @@ def test_a_camera_inside_the_solid_is_an_error() -> None:
         render_view(scene, pose, scene.camera(8, 6))
     with pytest.raises(SceneError):
         visible_surface_points(scene, [pose], scene.camera(8, 6), *scene.solid.surface_points(10))
-
-
-def test_cameras_above_the_table_never_see_its_bottom() -> None:
-    scene = make_scene("hot-object")
-    train, _ = scene.poses(42, 6)
-    points, normals = scene.solid.surface_points(4000)
-    seen = visible_surface_points(scene, train, scene.camera(320, 240), points, normals)
-    bottom = normals[:, 2] < -0.999
-    assert not seen[bottom & (points[:, 2] < -0.07)].any()
-    top_free = (normals[:, 2] > 0.999) & (points[:, 2] > 0.2)
-    assert seen[top_free].all()
-    assert 0.5 < seen.mean() < 0.75
 
 
 def test_visibility_counts_views() -> None:
@@ -232,26 +284,15 @@ def test_names_say_what_stands_behind() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["castle", "sphere+", "sphere+moon", "sphere+sky=1,1", "sphere+sky=1,1,2", "sphere+street+room", "pipes+white"],
+    [
+        *("castle", "sphere+", "sphere+moon", "sphere+sky=1,1", "sphere+sky=1,1,2", "sphere+street+room"),
+        *("pipes+white", "random", "random-", "random-017", "random--1", "random-1.5", "random-x", "Random-1"),
+        *("random-1 ", "random-²", "random-" + "9" * 5000),
+    ],
 )
-def test_other_variants_are_refused_with_those_there_are(name: str) -> None:
+def test_other_names_are_refused(name: str) -> None:
     with pytest.raises(SceneError):
         make_scene(name)
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_cameras_stand_outside_of_everything_and_surroundings_reach_no_farther_than_the_body(name: str) -> None:
-    scene = make_scene(name)
-    lo, hi = np.array(scene.scene_box)
-    eyes = np.concatenate(scene.poses(42, 6))[:, :3, 3]
-    assert scene.solid.signed_distance(eyes).min() > 0.3 * (hi - lo).max()
-    inside = np.random.default_rng(0).uniform(*scene.solid.bounds, (4000, 3))
-    if scene.around is not None:
-        assert min(scene.around.solid.signed_distance(at).min() for at in (eyes, inside)) > 0.0
-    lowest, highest = scene.temperature_bounds_c
-    view = render_view(scene, scene.poses(3, 0)[0][1], scene.camera(64, 48))
-    assert lowest <= view.temperature_c.min() and view.temperature_c.max() <= highest
-    assert 0.15 < view.hit.mean() < 0.95 and view.rgb.std() > 0.05
 
 
 def test_what_stands_behind_has_parallax_and_hides_what_is_farther() -> None:

@@ -8,8 +8,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from thermoxels_ns.core.errors import ThermoxelsError
-
 MAX_DEGREE = 2
 
 _Y00 = 0.28209479177387814  # 1 / (2 sqrt(pi))
@@ -25,8 +23,7 @@ def num_coefficients(degree: int) -> int:
     >>> num_coefficients(2)
     9
     """
-    if not 0 <= degree <= MAX_DEGREE:
-        raise ThermoxelsError("SH degree", expected=f"0 to {MAX_DEGREE}", got=degree, remedy="Lower the degree.")
+    assert 0 <= degree <= MAX_DEGREE
     return (degree + 1) ** 2
 
 
@@ -36,9 +33,7 @@ def degree_of(coefficients: int) -> int:
     >>> degree_of(9)
     2
     """
-    degree = math.isqrt(coefficients) - 1
-    assert num_coefficients(degree) == coefficients
-    return degree
+    return math.isqrt(coefficients) - 1
 
 
 def harmonics(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:

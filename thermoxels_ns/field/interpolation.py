@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int64
@@ -10,37 +12,24 @@ from torch import Tensor
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 
 
+@dataclass(frozen=True)
 class TrilinearPoints:
-    """Where points lie in a lattice: their voxel, the rows of its eight corners and the trilinear weights.
+    """Where points lie in a lattice, made once per set of points and used for density, colour and temperature alike."""
 
-    Made once per set of points and used for density, colour and temperature alike.
+    voxels: KeptVoxels
+    number: Int64[Tensor, " n"]
+    """Number of the kept voxel that each point lies in; -1 where that voxel is not kept, and no value can be read."""
+    fraction: Float[Tensor, "n 3"]  # Place in the voxel, 0 to 1
 
-    Args:
-        voxels: The kept voxels.
-        points: World positions, shape (n, 3). Points outside the lattice take the value of the nearest face.
-
-    Attributes:
-        number: Number of the kept voxel each point lies in; -1 where that voxel is not kept. Values can be
-            interpolated only where it is not -1.
-        fraction: Place in the voxel, 0 to 1, shape (n, 3).
-    """
-
-    def __init__(self, voxels: KeptVoxels, points: Float[Tensor, "n 3"]):
+    @classmethod
+    def of(cls, voxels: KeptVoxels, points: Float[Tensor, "n 3"]) -> TrilinearPoints:
+        """Find the voxels of world positions; points outside the lattice take the value of the nearest face."""
         lattice = voxels.lattice
         lo = torch.tensor(lattice.lo, dtype=points.dtype, device=points.device)
         cells = torch.tensor(lattice.cell_shape, dtype=points.dtype, device=points.device)
         position = torch.clamp((points - lo) / lattice.voxel_size, min=torch.zeros_like(cells), max=cells)
         corner = torch.minimum(position.floor(), cells - 1)
-        self.voxels = voxels
-        self.fraction: Float[Tensor, "n 3"] = position - corner
-        self.number: Int64[Tensor, " n"] = voxels.number_at(corner.long())
-
-    @classmethod
-    def placed(cls, voxels: KeptVoxels, number: Int64[Tensor, " n"], fraction: Float[Tensor, "n 3"]) -> TrilinearPoints:
-        """Points whose voxel and place in it are known already."""
-        points = object.__new__(cls)
-        points.voxels, points.number, points.fraction = voxels, number, fraction
-        return points
+        return cls(voxels, voxels.number_at(corner.long()), position - corner)
 
     def kept(self) -> Bool[Tensor, " n"]:
         """Whether each point lies in a kept voxel."""
@@ -58,16 +47,14 @@ class TrilinearPoints:
 
     def select(self, chosen: Tensor | slice) -> TrilinearPoints:
         """The same for a subset of the points (boolean mask, indices or slice)."""
-        return TrilinearPoints.placed(self.voxels, self.number[chosen], self.fraction[chosen])
+        return TrilinearPoints(self.voxels, self.number[chosen], self.fraction[chosen])
 
 
 def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Float[Tensor, "n channels"]:
-    """Interpolate `rows` at points: f(p) = sum over the voxel's corners of w_c(p) rows[c].
+    """Interpolate `rows` at points in kept voxels: f(p) = sum over the voxel's corners of w_c(p) rows[c].
 
-    All points lie in kept voxels; the result is differentiable with respect to `rows`.
-
-    The gradient sums each voxel's points in their order and adds rows without duplicates, so that it does not depend on
-    thread count or on a race.
+    The gradient with respect to `rows` sums each voxel's points in their order and adds rows without duplicates, so
+    that it does not depend on thread count or on a race.
     """
     return _Interpolate.apply(rows, at)  # type: ignore[return-value]
 

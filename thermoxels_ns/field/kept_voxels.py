@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.ndimage import maximum_filter
 from torch import Tensor
 
+from thermoxels_ns.core.arrays import BoolArray, IntArray
 from thermoxels_ns.core.errors import MemoryBudgetError
-from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
+from thermoxels_ns.core.lattice import Lattice
 
 BLOCK = 8  # Voxels along the side of a block
-
-IntArray = npt.NDArray[np.int64]
 
 
 class KeptVoxels:
     """The kept voxels of a lattice and the rows of their corners.
 
-    Rows exist for corners of kept voxels only (the link table and compact rows of Plenoxels, Fridovich-Keil et al.
-    2022), in the order of their flat corner index. Corners k and k + 1 of a kept voxel then stand in neighbouring rows,
-    so four row numbers per voxel find all eight. The voxel under a point is found through blocks of 8^3 voxels: an
-    empty block costs one look-up and four bytes, whatever the resolution.
+    Rows exist for corners of kept voxels only (Plenoxels, Fridovich-Keil et al. 2022), in the order of their flat
+    corner index. Corners k and k + 1 of a kept voxel stand in neighbouring rows, so four row numbers per voxel find all
+    eight. The voxel under a point is found through blocks of 8^3 voxels; an empty block costs four bytes.
 
     Args:
         lattice: The lattice.
@@ -42,37 +40,32 @@ class KeptVoxels:
 
     def __init__(self, lattice: Lattice, cells: npt.ArrayLike | None = None):
         self.lattice = lattice
-        _, ny, nz = lattice.cell_shape
         total = int(np.prod(lattice.cell_shape))
         self.cells: IntArray = np.arange(total) if cells is None else np.ascontiguousarray(cells, dtype=np.int64)
         self.all_kept = len(self.cells) == total
-        first = self._first_corners()
+        place = np.unravel_index(self.cells, lattice.cell_shape)
+        first = np.ravel_multi_index(place, lattice.shape)
         _, cy, cz = lattice.shape
-        steps = [0, cz, cy * cz, cy * cz + cz]
-        if self.all_kept:
-            self.corners: IntArray = np.arange(lattice.num_corners)
-            self.voxel_rows = np.stack([first + step for step in steps], axis=1).astype(np.int32)
-        else:
-            used = np.zeros(lattice.num_corners, dtype=bool)
-            for step in steps:
-                used[first + step] = True
-                used[first + step + 1] = True
-            self.corners = np.flatnonzero(used)
-            del used
-            self.voxel_rows = np.empty((len(first), 4), dtype=np.int32)
-            for column, step in enumerate(steps):
-                self.voxel_rows[:, column] = np.searchsorted(self.corners, first + step)
+        steps = (0, cz, cy * cz, cy * cz + cz)
+        used = np.zeros(lattice.num_corners, dtype=bool)
+        for step in steps:
+            used[first + step] = True
+            used[first + step + 1] = True
+        self.corners: IntArray = np.flatnonzero(used)
+        del used
+        self.voxel_rows = np.empty((len(first), 4), dtype=np.int32)
+        for column, step in enumerate(steps):
+            self.voxel_rows[:, column] = np.searchsorted(self.corners, first + step)
         self.block_shape = tuple(-(-n // BLOCK) for n in lattice.cell_shape)
-        x, y, z = self.cells // (ny * nz), self.cells // nz % ny, self.cells % nz
-        _, by, bz = self.block_shape
-        block = ((x // BLOCK) * by + y // BLOCK) * bz + z // BLOCK
+        block = np.ravel_multi_index(tuple(along // BLOCK for along in place), self.block_shape)
         self.block_slot = np.full(int(np.prod(self.block_shape)), -1, dtype=np.int32)
         self.block_slot[block] = 0
         occupied = np.flatnonzero(self.block_slot == 0)
         self.block_slot[occupied] = np.arange(len(occupied), dtype=np.int32)
         self.voxel_number = np.full(len(occupied) * BLOCK**3, -1, dtype=np.int32)
-        within = ((x % BLOCK) * BLOCK + y % BLOCK) * BLOCK + z % BLOCK
+        within = np.ravel_multi_index(tuple(along % BLOCK for along in place), (BLOCK,) * 3)
         self.voxel_number[self.block_slot[block].astype(np.int64) * BLOCK**3 + within] = np.arange(len(self.cells))
+        self._tables: dict[torch.device, tuple[Tensor, Tensor, Tensor]] = {}
 
     @property
     def num_rows(self) -> int:
@@ -82,12 +75,7 @@ class KeptVoxels:
     def __len__(self) -> int:
         return len(self.cells)
 
-    def _first_corners(self) -> IntArray:
-        _, ny, nz = self.lattice.cell_shape
-        x, y, z = self.cells // (ny * nz), self.cells // nz % ny, self.cells % nz
-        return (x * self.lattice.shape[1] + y) * self.lattice.shape[2] + z
-
-    def mask(self) -> npt.NDArray[np.bool_]:
+    def mask(self) -> BoolArray:
         """Kept voxels as a dense array, shape of the lattice's voxels."""
         kept = np.zeros(self.lattice.cell_shape, dtype=bool)
         kept.reshape(-1)[self.cells] = True
@@ -95,36 +83,16 @@ class KeptVoxels:
 
     def corner_index(self) -> IntArray:
         """Lattice index (i, j, k) of every stored corner, shape (rows, 3)."""
-        _, ny, nz = self.lattice.shape
-        return np.stack((self.corners // (ny * nz), self.corners // nz % ny, self.corners % nz), axis=1)
+        return np.stack(np.unravel_index(self.corners, self.lattice.shape), axis=1)
 
-    def dilated(self, chosen: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
-        """Grow a subset of the kept voxels by `by` voxels in all 26 directions, within the kept ones.
+    def dilated(self, chosen: BoolArray, by: int) -> BoolArray:
+        """Grow a subset of the kept voxels by `by` voxels in all 26 directions, one boolean per kept voxel.
 
-        Args:
-            chosen: One boolean per kept voxel.
-            by: Voxels; growth may pass through voxels that are not kept.
-
-        Returns:
-            One boolean per kept voxel.
+        Growth may pass through voxels that are not kept.
         """
-        if by <= 0:
-            return chosen
         grown = np.zeros(self.lattice.cell_shape, dtype=bool)
         grown.reshape(-1)[self.cells[chosen]] = True
-        for axis in range(3):
-            spread = np.zeros_like(grown)
-            for shift in range(1, by + 1):
-                near, far = [slice(None)] * 3, [slice(None)] * 3
-                near[axis], far[axis] = slice(shift, None), slice(None, -shift)
-                spread[tuple(near)] |= grown[tuple(far)]
-                spread[tuple(far)] |= grown[tuple(near)]
-            grown |= spread
-        return grown.reshape(-1)[self.cells]
-
-    @cached_property
-    def _tables(self) -> dict[torch.device, tuple[Tensor, Tensor, Tensor]]:
-        return {}
+        return np.asarray(maximum_filter(grown, 2 * by + 1, mode="constant"), dtype=bool).reshape(-1)[self.cells]
 
     def tables(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
         """`voxel_rows` of all eight corners (voxels, 8), `block_slot` and `voxel_number` as int64 tensors."""
@@ -148,9 +116,6 @@ class KeptVoxels:
         return torch.where(at >= 0, number[at.clamp(min=0) * BLOCK**3 + place], at)
 
 
-assert CORNER_OFFSETS[1].tolist() == [0, 0, 1], "rows of neighbours along z follow each other"
-
-
 _ROWS_PER_VOXEL = 1.5  # Corners per kept voxel of a body a few voxels thick (1 in the bulk, 2 for a single layer)
 _BYTES_PER_VOXEL = 4 * 4 + 8 + 2 * 4  # Row numbers, index, and the voxel's part of its block (which is about half full)
 
@@ -170,8 +135,7 @@ class MemoryNeed:
 def memory_need(lattice: Lattice, voxels: int, channels: int) -> MemoryNeed:
     """Predict what training on `voxels` kept voxels of a lattice needs.
 
-    Each stored corner has a value, two moments and at most one gradient per channel in single precision, and each is
-    there twice for a moment while voxels are split.
+    Each stored corner has a value, two moments and at most one gradient per channel in single precision.
     """
     total = int(np.prod([float(n) for n in lattice.cell_shape]))
     rows = lattice.num_corners if voxels >= total else min(lattice.num_corners, int(_ROWS_PER_VOXEL * voxels))
@@ -182,11 +146,7 @@ def memory_need(lattice: Lattice, voxels: int, channels: int) -> MemoryNeed:
 
 
 def check_memory(lattice: Lattice, voxels: int, channels: int, budget_gb: float) -> MemoryNeed:
-    """Predict the memory of a lattice and refuse one that exceeds the budget.
-
-    Raises:
-        MemoryBudgetError: It does.
-    """
+    """Predict the memory of a lattice; raises `MemoryBudgetError` if it exceeds the budget."""
     need = memory_need(lattice, voxels, channels)
     if need.gigabytes > budget_gb:
         raise MemoryBudgetError(

@@ -23,13 +23,10 @@ ROWS_AT_ONCE = 1 << 17  # Rows interpolated at once: corner numbers and weights 
 
 def split_voxels(voxels: KeptVoxels, factor: int) -> KeptVoxels:
     """Split every kept voxel into `factor`^3 kept ones."""
-    _, ny, nz = voxels.lattice.cell_shape
-    index = np.stack((voxels.cells // (ny * nz), voxels.cells // nz % ny, voxels.cells % nz), axis=1) * factor
     fine = voxels.lattice.refined(factor)
-    _, fy, fz = fine.cell_shape
-    first = (index[:, 0] * fy + index[:, 1]) * fz + index[:, 2]
-    within = np.arange(factor)
-    steps = ((within[:, None, None] * fy + within[None, :, None]) * fz + within).reshape(-1)
+    index = np.unravel_index(voxels.cells, voxels.lattice.cell_shape)
+    first = np.ravel_multi_index(tuple(along * factor for along in index), fine.cell_shape)
+    steps = np.ravel_multi_index(tuple(np.indices((factor,) * 3).reshape(3, -1)), fine.cell_shape)
     cells = (first[:, None] + steps).reshape(-1)
     cells.sort()
     return KeptVoxels(fine, cells)
@@ -53,21 +50,20 @@ def parents_of_corners(old: KeptVoxels, new: KeptVoxels, factor: int) -> Triline
         place = torch.from_numpy(index[missing] / factor - voxel)
         fraction[missing] = torch.where((found >= 0)[:, None], place, fraction[missing])
     assert bool((number >= 0).all()), "every corner of a split voxel lies in its parent"
-    return TrilinearPoints.placed(old, number, fraction)
+    return TrilinearPoints(old, number, fraction)
 
 
 @torch.no_grad()
 def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
-    """Split every kept voxel into factor^3 without changing the field (what is interpolated stays trilinear).
+    """Split every kept voxel into factor^3 without changing the field; return how rows change: by interpolation.
 
-    Density is per world unit, so nothing is rescaled. Rows change by trilinear interpolation; old corners keep theirs
-    exactly.
+    Density is per world unit, so nothing is rescaled. Old corners keep their rows exactly.
     """
     new = split_voxels(grid.voxels, factor)
     at = parents_of_corners(grid.voxels, new, factor)
 
     def change(rows: Tensor) -> Tensor:
-        moved = TrilinearPoints.placed(at.voxels, at.number.to(rows.device), at.fraction.to(rows.device))
+        moved = TrilinearPoints(at.voxels, at.number.to(rows.device), at.fraction.to(rows.device))
         split = rows.new_empty((len(at.number), rows.shape[1]))
         for first in range(0, len(split), ROWS_AT_ONCE):
             part = slice(first, first + ROWS_AT_ONCE)
@@ -94,11 +90,9 @@ def prune(grid: VoxelGrid, keep: npt.NDArray[np.bool_]) -> RowChange:
 
 @torch.no_grad()
 def widen_colour(grid: VoxelGrid, degree: int) -> ColumnChange:
-    """Store colour up to a higher degree without changing the field.
+    """Store colour up to a higher degree without changing the field: columns that were not stored are 0.
 
-    While colour is the same from all sides its further harmonics are 0 and no gradient moves them, so they need not be
-    stored, nor passed over by optimisers, total variation, refinement, pruning and checkpoints. Columns that were not
-    stored are 0.
+    While colour is the same from all sides, its further harmonics are 0 and no gradient moves them.
     """
     assert grid.sh is not None and grid.sh_degree is not None and grid.sh_degree < degree
     few, many = num_coefficients(grid.sh_degree), num_coefficients(degree)

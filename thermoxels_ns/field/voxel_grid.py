@@ -41,16 +41,14 @@ def raw_density(density: float, kind: DensityActivation) -> float:
     -2.2522
     """
     value = torch.tensor(density, dtype=torch.float64)
-    if kind == "relu":
-        return float(value)
-    return float(torch.log(torch.expm1(value)) if kind == "softplus" else torch.log(value))
+    return float({"relu": value, "softplus": torch.log(torch.expm1(value)), "exp": torch.log(value)}[kind])
 
 
 class VoxelGrid(nn.Module):
     """The parameters of the field, one row per corner of a kept voxel.
 
-    Refinement and pruning make new parameters (autograd remembers the shape of a leaf), so optimisers must be pointed
-    to them. Loading a checkpoint exchanges only the data: optimisers that were built before stay valid.
+    Refinement and pruning make new parameters (autograd remembers the shape of a leaf), to which optimisers must be
+    pointed. Loading a checkpoint exchanges only the data, so that optimisers that were built before stay valid.
 
     Args:
         lattice: Start lattice; all its voxels are kept at first.
@@ -76,7 +74,7 @@ class VoxelGrid(nn.Module):
         super().__init__()
         self.temperature_degree = temperature_degree
         self.activation: DensityActivation = activation
-        self._voxels = KeptVoxels(lattice)
+        self.voxels = KeptVoxels(lattice)
         n = lattice.num_corners
         self.density = nn.Parameter(torch.full((n, 1), raw_density(start_density, activation)))
         channels = 0 if sh_degree is None else 3 * num_coefficients(sh_degree)
@@ -84,11 +82,9 @@ class VoxelGrid(nn.Module):
         temperature = torch.zeros(n, num_coefficients(temperature_degree))
         temperature[:, 0] = 0.5
         self.temperature = nn.Parameter(temperature)
-        self.register_buffer("lo", torch.tensor(lattice.lo, dtype=torch.float64))
-        self.register_buffer("voxel_size", torch.tensor(lattice.voxel_size, dtype=torch.float64))
-        self.register_buffer("corner_shape", torch.tensor(lattice.shape))
         self.register_buffer("activation_index", torch.tensor(get_args(DensityActivation).index(activation)))
-        self.register_buffer("cells", torch.from_numpy(self._voxels.cells))
+        for name, values in _described(self.voxels).items():
+            self.register_buffer(name, values)
 
     @property
     def sh_degree(self) -> int | None:
@@ -98,17 +94,12 @@ class VoxelGrid(nn.Module):
     @property
     def lattice(self) -> Lattice:
         """The corner lattice."""
-        return self._voxels.lattice
-
-    @property
-    def voxels(self) -> KeptVoxels:
-        """The kept voxels and the rows of their corners."""
-        return self._voxels
+        return self.voxels.lattice
 
     @property
     def kept(self) -> Bool[Tensor, "x y z"]:
         """Kept voxels as a dense mask, on the CPU."""
-        return torch.from_numpy(self._voxels.mask())
+        return torch.from_numpy(self.voxels.mask())
 
     def row_parameters(self) -> dict[str, nn.Parameter]:
         """The parameters that have one row per stored corner, by name."""
@@ -125,12 +116,9 @@ class VoxelGrid(nn.Module):
         by_channel[..., 0] = torch.logit(colours.to(self.sh), _PALEST) / constant
 
     def replace_voxels(self, voxels: KeptVoxels, rows: dict[str, Tensor], keep_identity: bool = False) -> None:
-        """Exchange the kept voxels and the rows of every parameter.
+        """Exchange the kept voxels, of this lattice or another, and the rows of every parameter by its name.
 
-        Args:
-            voxels: New kept voxels, of this lattice or another.
-            rows: New rows by parameter name.
-            keep_identity: Exchange the data of the parameters that exist; only while no graph uses them.
+        `keep_identity`: exchange the data of the parameters that exist; only while no graph uses them.
         """
         for name, parameter in self.row_parameters().items():
             data = rows[name].to(parameter.device, parameter.dtype).contiguous()
@@ -138,40 +126,30 @@ class VoxelGrid(nn.Module):
                 parameter.data, parameter.grad = data, None
             else:
                 setattr(self, name, nn.Parameter(data))
-        device, lattice = self.lo.device, voxels.lattice
-        self._voxels = voxels
-        self.lo = torch.tensor(lattice.lo, dtype=torch.float64, device=device)
-        self.voxel_size = torch.tensor(lattice.voxel_size, dtype=torch.float64, device=device)
-        self.corner_shape = torch.tensor(lattice.shape, device=device)
-        self.cells = torch.from_numpy(voxels.cells).to(device)
+        self.voxels = voxels
+        for name, values in _described(voxels).items():
+            setattr(self, name, values.to(self.lo.device))
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs):
         """Take over the checkpoint's kept voxels and its degree of colour before its rows are copied."""
         names = ("lo", "voxel_size", "corner_shape", "cells")
-        if all(prefix + name in state_dict for name in names):
+        if all(prefix + name in state_dict for name in (*names, *self.row_parameters())):
             lo, size, shape, cells = (state_dict[prefix + name] for name in names)
-            nx, ny, nz = (int(n) for n in shape)
-            x, y, z = (float(v) for v in lo)
+            (x, y, z), (nx, ny, nz) = lo.tolist(), shape.tolist()
             voxels = KeptVoxels(Lattice((x, y, z), float(size), (nx, ny, nz)), cells.cpu().numpy().copy())
-            rows = {
-                name: state_dict[prefix + name]
-                for name in self.row_parameters()
-                if prefix + name in state_dict and self._fits(name, state_dict[prefix + name])
-            }
-            fits = all(len(values) == voxels.num_rows for values in rows.values())
-            if fits and len(rows) == len(self.row_parameters()):
-                self.replace_voxels(voxels, {k: v.clone() for k, v in rows.items()}, keep_identity=True)
+            rows = {name: state_dict[prefix + name].clone() for name in self.row_parameters()}
+            if all(
+                values.ndim == 2
+                and len(values) == voxels.num_rows
+                and values.shape[1] in (COLOUR_CHANNELS if name == "sh" else getattr(self, name).shape[1:])
+                for name, values in rows.items()
+            ):
+                self.replace_voxels(voxels, rows, keep_identity=True)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-    def _fits(self, name: str, rows: Tensor) -> bool:
-        """Whether rows of a checkpoint have the columns of a parameter; of colour, those of any degree."""
-        if name == "sh":
-            return rows.ndim == 2 and rows.shape[1] in COLOUR_CHANNELS
-        return rows.shape[1:] == getattr(self, name).shape[1:]
 
     def locate(self, points: Float[Tensor, "n 3"]) -> TrilinearPoints:
         """Find the voxels and trilinear weights of world positions."""
-        return TrilinearPoints(self._voxels, points)
+        return TrilinearPoints.of(self.voxels, points)
 
     def density_at(self, at: TrilinearPoints) -> Float[Tensor, " n"]:
         """Density, [1 / world unit], >= 0."""
@@ -196,7 +174,7 @@ class VoxelGrid(nn.Module):
     def corner_values(self, rows: Float[Tensor, " rows"], fill: float = 0.0) -> Float[Tensor, "x y z"]:
         """Spread one value per stored corner over the whole lattice; `fill` at the corners of no kept voxel."""
         values = torch.full((self.lattice.num_corners,), fill, dtype=rows.dtype, device=rows.device)
-        values[torch.from_numpy(self._voxels.corners).to(rows.device)] = rows
+        values[torch.from_numpy(self.voxels.corners).to(rows.device)] = rows
         return values.view(self.lattice.shape)
 
     @torch.no_grad()
@@ -207,8 +185,19 @@ class VoxelGrid(nn.Module):
     @torch.no_grad()
     def voxel_density(self) -> Float[Tensor, "x y z"]:
         """Density at every voxel centre, 0 in voxels that are not kept."""
-        corners, _, _ = self._voxels.tables(self.density.device)
+        corners, _, _ = self.voxels.tables(self.density.device)
         centre = activate_density(self.density[:, 0][corners].mean(-1), self.activation)
         values = torch.zeros(self.lattice.cell_shape, dtype=centre.dtype, device=centre.device)
         values.view(-1)[self.cells] = centre
         return values
+
+
+def _described(voxels: KeptVoxels) -> dict[str, Tensor]:
+    """What a checkpoint keeps of a lattice and its kept voxels."""
+    lattice = voxels.lattice
+    return {
+        "lo": torch.tensor(lattice.lo, dtype=torch.float64),
+        "voxel_size": torch.tensor(lattice.voxel_size, dtype=torch.float64),
+        "corner_shape": torch.tensor(lattice.shape),
+        "cells": torch.from_numpy(voxels.cells),
+    }

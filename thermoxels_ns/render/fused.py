@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,13 @@ from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.threads import num_threads, run_ranges, run_tasks
 from thermoxels_ns.field.interpolation import TrilinearPoints
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.render import kernels, kernels_backward, kernels_rows, kernels_shading
-from thermoxels_ns.render.kernels import Rays, RecordedSamples, Records, SampleGradients, Settings, Sums, Volume
-from thermoxels_ns.render.kernels_backward import RayGradients
-from thermoxels_ns.render.kernels_rows import Blocks, Order, RowGradients
+from thermoxels_ns.render import kernels, kernels_backward
+from thermoxels_ns.render.kernels import Rays, Records, SampleGradients, Settings, Sums, Volume
+from thermoxels_ns.render.kernels_backward import Blocks, Order, RayGradients, RowGradients
 from thermoxels_ns.render.ray_render import GridSamples, RayRender, RayRequest, RenderOptions
+from thermoxels_ns.render.reference import SMALLEST_VARIATION
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
-SMALLEST_VARIATION = 1e-10  # Added under the root of the total variation; the reference's value
 VOXELS_AT_ONCE = 1 << 14  # Voxels whose total variation is one task
 FEWEST_SAMPLES = 24  # Samples per ray, averaged over a range of rays, that the first batch on a lattice has memory for
 MOST_GROUPS = 1 << 12  # Groups of voxels that samples are put in order by
@@ -33,6 +33,18 @@ _room: dict[int, int] = {}
 NAMES = ("density", "sh", "temperature")
 
 
+@dataclass(frozen=True)
+class RecordedSamples:
+    """What was recorded of the samples of a batch of rays."""
+
+    rays: Rays
+    volume: Volume
+    settings: Settings
+    records: Records
+    sums: Sums
+    spans: list[tuple[int, int]]  # The first and one behind the last record of each range of rays
+
+
 def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> GridSamples:
     """March rays and list their samples; neither colour nor temperature is read.
 
@@ -40,22 +52,21 @@ def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> Gri
         ThermoxelsError: A density on the way is NaN.
     """
     nothing = torch.zeros(len(request.origins), dtype=torch.bool)
-    request = RayRequest(request.origins, request.directions, request.near, request.far, nothing, nothing)
-    recorded, spans = _recorded_samples(grid, None, request, options)
+    recorded = _recorded_samples(grid, None, replace(request, rgb_rays=nothing, thermal_rays=nothing), options)
     records = recorded.records
     number, fraction, weight, left = (
-        torch.from_numpy(np.concatenate([values[:0], *(values[a:b] for a, b in spans)]))
+        torch.from_numpy(np.concatenate([values[:0], *(values[a:b] for a, b in recorded.spans)]))
         for values in (records.number, records.fraction, records.weight, records.transmittance)
     )
     ray = torch.repeat_interleave(torch.from_numpy(records.used))
-    at = TrilinearPoints.placed(grid.voxels, number.long(), fraction)
+    at = TrilinearPoints(grid.voxels, number.long(), fraction)
     return GridSamples(ray, at, weight, 1.0 - left - weight, torch.from_numpy(recorded.sums.transmittance))
 
 
 def _recorded_samples(
     grid: VoxelGrid, sh: Tensor | None, request: RayRequest, options: RenderOptions
-) -> tuple[RecordedSamples, list[tuple[int, int]]]:
-    """March rays and record their samples; also give the first and one behind the last record of each range of rays."""
+) -> RecordedSamples:
+    """March rays and record their samples."""
     density = grid.density.detach().numpy()
     voxels, dtype, lattice = grid.voxels, density.dtype, grid.lattice
     volume = Volume(
@@ -72,11 +83,9 @@ def _recorded_samples(
         ACTIVATIONS[grid.activation],
     )
     count = len(request.origins)
-    wants = torch.full((count,), 3, dtype=torch.uint8)
-    if request.rgb_rays is not None:
-        wants &= 2 + request.rgb_rays.to(torch.uint8)
-    if request.thermal_rays is not None:
-        wants &= 1 + 2 * request.thermal_rays.to(torch.uint8)
+    wants = torch.zeros(count, dtype=torch.uint8)
+    for bit, rays_that_want in ((1, request.rgb_rays), (2, request.thermal_rays)):
+        wants += bit if rays_that_want is None else bit * rays_that_want.to(torch.uint8)
     near, far = request.near_and_far()
     rays = Rays(_array(request.origins), _array(request.directions), _array(near), _array(far), wants.numpy())
     settings = Settings(
@@ -90,11 +99,10 @@ def _recorded_samples(
     sizes = [(count if volume.sh.shape[1] else 0, 3), (count, 1), *[count] * 3]
     sizes += [count if options.distortion_scale else 0, count if options.sparsity else 0]
     sums = Sums(*[np.empty(size, dtype) for size in sizes])
-    records, spans = _record(rays, volume, settings, sums)
-    return RecordedSamples(rays, volume, settings, records, sums), spans
+    return RecordedSamples(rays, volume, settings, *_record(rays, volume, settings, sums))
 
 
-def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple[Records, list[tuple[int, int]]]:
+def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple[Records, Sums, list[tuple[int, int]]]:
     """Fill `sums` and record the samples; where these are more than there is memory for, with twice as much again."""
     count, rows, dtype = len(rays.origins), len(volume.density), volume.density.dtype
     while True:
@@ -110,7 +118,7 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
             begin, end = ((room + kernels.AHEAD) * ray for ray in (first, last))
             wrong, behind = kernels.march_rays(first, last, rays, volume, settings, records, sums, begin, end)
             if wrong == 0:
-                kernels_shading.shade(first, last, rays, volume, settings, records, sums)
+                kernels.shade(first, last, rays, volume, settings, records, sums)
             return begin, behind, wrong
 
         found: Any = run_ranges(work, count)
@@ -123,7 +131,7 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
     if sum(wrong):
         remedy = "Lower the density learning rate and resume from the last checkpoint."
         raise ThermoxelsError("density", expected="numbers >= 0", got=f"NaN in {sum(wrong)} places", remedy=remedy)
-    return records, [(begin, end) for begin, end, _ in found]
+    return records, sums, [(begin, end) for begin, end, _ in found]
 
 
 def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
@@ -151,7 +159,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx, density, sh, temperature, grid: VoxelGrid, request: RayRequest, options: RenderOptions):
         # `density`, `sh` and `temperature` are the grid's: autograd differentiates only by what it is handed.
-        recorded, _ = _recorded_samples(grid, grid.sh, request, options)
+        recorded = _recorded_samples(grid, grid.sh, request, options)
         variation = [
             _total_variation(_parameters(recorded.volume)[name], recorded.volume.voxel_rows, *block) / divisor + missing
             for name, block, divisor, missing in _blocks(options, recorded.volume)
@@ -214,7 +222,7 @@ def _total_variation(values: np.ndarray, voxel_rows: np.ndarray, first: int, las
     bounds = [*range(first, last, VOXELS_AT_ONCE), last]
     parts: Any = run_tasks(
         [
-            lambda a=a, b=b: kernels_rows.total_variation(values, voxel_rows, a, b, SMALLEST_VARIATION)
+            lambda a=a, b=b: kernels_backward.total_variation(values, voxel_rows, a, b, SMALLEST_VARIATION)
             for a, b in itertools.pairwise(bounds)
         ]
     )
@@ -230,34 +238,28 @@ def _gradient(gradient: Tensor | None, like: np.ndarray) -> np.ndarray:
 
 
 def row_gradients(rays: Rays, volume: Volume, of_samples: SampleGradients, blocks: Blocks) -> list[Tensor | None]:
-    """Gradients of density, colour and temperature as row-sparse tensors; None for one that no row has.
-
-    Args:
-        rays: The rays.
-        volume: Kept voxels and parameters.
-        of_samples: Gradients of the samples.
-        blocks: Total variation to add.
-    """
+    """Gradients of density, colour and temperature as row-sparse tensors; None for one that no row has."""
     parameters, num_rows = list(_parameters(volume).values()), len(volume.density)
     order = _ordered(of_samples, len(volume.voxel_rows))
     bounds = _row_ranges(volume.voxel_rows, num_rows, order, blocks, [p.shape[1] for p in parameters])
     ranges, uses = list(itertools.pairwise(bounds)), np.empty(num_rows, np.uint8)
-    counts: Any = run_tasks(
-        [lambda a=a, b=b: kernels_rows.use_rows(a, b, volume, of_samples, order, blocks, uses) for a, b in ranges]
+    run_tasks(
+        [lambda a=a, b=b: kernels_backward.use_rows(a, b, volume, of_samples, order, blocks, uses) for a, b in ranges]
     )
-    places = np.concatenate((np.zeros((1, 3), np.int64), np.cumsum(np.asarray(counts).reshape(-1, 3), axis=0)))
-    lists = [np.empty(int(total), np.int64) for total in places[-1]]
-    values = [np.empty((int(total), p.shape[1]), p.dtype) for total, p in zip(places[-1], parameters)]
-    pairs: list[Any] = [each for pair in zip(lists, values) for each in pair]
-    rows = RowGradients(uses, np.empty((num_rows, 3), np.int32), *pairs)
+    counts = [[np.count_nonzero(uses[a:b] & (1 << kind)) for kind in range(3)] for a, b in ranges]
+    places = np.concatenate((np.zeros((1, 3), np.int64), np.cumsum(counts, axis=0)))
+    lists = [np.empty(total, np.int64) for total in places[-1]]
+    values = [np.empty((total, p.shape[1]), p.dtype) for total, p in zip(places[-1], parameters)]
+    rows = RowGradients(uses, np.empty((num_rows, 3), np.int32), *values)
 
     def add(first: int, last: int, start: list[int]) -> None:
-        kernels_rows.list_rows(first, last, *start, rows)
-        kernels_rows.add_samples(first, last, rays, volume, of_samples, order, rows)
+        for kind in range(3):
+            kernels_backward.list_rows(first, last, kind, start[kind], rows, lists[kind], values[kind])
+        kernels_backward.add_samples(first, last, rays, volume, of_samples, order, rows)
         for kind, parameter in enumerate(parameters):
             if blocks.last[kind] > blocks.first[kind]:
                 inputs = parameter, volume.voxel_rows, kind, blocks, rows.place, values[kind]
-                kernels_rows.add_variation(first, last, *inputs)
+                kernels_backward.add_variation(first, last, *inputs)
 
     run_tasks([lambda a=a, b=b, at=at: add(a, b, at) for (a, b), at in zip(ranges, places.tolist())])
     return [
@@ -280,7 +282,7 @@ def _ordered(samples: SampleGradients, voxels: int) -> Order:
     shift = max(0, (voxels - 1).bit_length() - MOST_GROUPS.bit_length() + 1)
     groups = (voxels >> shift) + 1
     order = Order(shift, np.zeros(groups + 1, np.int64), np.empty(total, np.int32), np.empty(total, np.int32))
-    kernels_rows.order_samples(samples, order)
+    kernels_backward.order_samples(samples, order)
     return order
 
 

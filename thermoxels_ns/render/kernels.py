@@ -1,9 +1,8 @@
-"""Compiled march: follow rays, skip empty voxels, read density and weigh samples."""
+"""Compiled forward pass: follow rays through kept voxels, weigh samples by density, sum colour and temperature."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,13 +17,7 @@ from thermoxels_ns.core.kernel_cache import kernel
 def _prefetch(typing_context: Any, array: Any, row: Any, column: Any):
     """Start to load ``array[row, column]``, or ``array[row]`` of a list, into the cache; for compiled code.
 
-    A hint and nothing else: no result depends on it, and an index outside the array does no harm.
-
-    Args:
-        typing_context: Numba's; not passed by the caller.
-        array: Array of one or two dimensions.
-        row: First index.
-        column: Second index; of a list it is ignored.
+    It is a hint: no result depends on it, and an index outside the array does no harm.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -35,20 +28,16 @@ def _prefetch(typing_context: Any, array: Any, row: Any, column: Any):
             for value, kind in zip(arguments[1:], signature.args[1:], strict=True)
         ][: array_type.ndim]
         place = cgutils.get_item_pointer(context, builder, array_type, made, index, wraparound=False, boundscheck=False)
-        address = builder.bitcast(place, cgutils.voidptr_t)
-        number = ir.IntType(32)
+        address, number = builder.bitcast(place, cgutils.voidptr_t), ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [address.type, number, number, number])
         hint = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
-        # To be read; to be kept in all caches; data.
-        builder.call(hint, [address, number(0), number(3), number(1)])
+        builder.call(hint, [address, number(0), number(3), number(1)])  # to be read; for all caches; data
         return context.get_dummy_value()
 
     return types.void(array, row, column), generate
 
 
-prefetch: Any = intrinsic(_prefetch)
-"""Called as ``prefetch(array, row, column)``, see `_prefetch`; numba brings the first argument."""
-
+prefetch: Any = intrinsic(_prefetch)  # called as prefetch(array, row, column)
 
 Floats = npt.NDArray[np.floating]
 Ints = Any  # arrays of integers; numba knows which
@@ -58,6 +47,8 @@ BLOCK = 8  # Voxels along the side of a block; the rule is that of `KeptVoxels`
 OPAQUE = 100.0  # Optical depth of a step from which it counts as opaque
 EXP_LIMIT = 15.0  # Raw density from which `exp` stays constant
 AHEAD = 8  # Samples of a ray that are read before they are weighed
+NEAR, FAR = 8, 24
+"""Samples ahead of the one that is shaded whose values, and whose row numbers, are asked for."""
 RELU, SOFTPLUS, EXP = 0, 1, 2
 DENSITY, COLOUR, TEMPERATURE = 1, 2, 4
 """Bits: which parameters a sample has a gradient for."""
@@ -143,17 +134,6 @@ class Sums(NamedTuple):
     sparsity: Floats
 
 
-@dataclass(frozen=True)
-class RecordedSamples:
-    """Samples of a batch of rays: `records` and how to read them."""
-
-    rays: Rays
-    volume: Volume
-    settings: Settings
-    records: Records
-    sums: Sums
-
-
 @kernel
 def chord(rays: Rays, r: int, volume: Volume):
     """Entry and exit distance of a ray, both 0 for a miss; each axis guarded as in `reference.intersect_box`."""
@@ -178,38 +158,20 @@ def chord(rays: Rays, r: int, volume: Volume):
 
 @kernel
 def path_of(rays: Rays, r: int, volume: Volume):
-    """Where a ray begins, its direction, and the distance it takes per world unit along each axis.
-
-    Across its direction the latter is so large that the ray gets nowhere, and finite, so that no
-    product with it is NaN.
-    """
+    """Where a ray begins, its direction, and its distance per world unit along each axis; finite where it is level."""
     never = 1e200
     dx, dy, dz = float(rays.directions[r, 0]), float(rays.directions[r, 1]), float(rays.directions[r, 2])
-    return (
-        (float(rays.origins[r, 0]), float(rays.origins[r, 1]), float(rays.origins[r, 2])),
-        (dx, dy, dz),
-        (
-            1.0 / dx if abs(dx) > 1e-100 else never,
-            1.0 / dy if abs(dy) > 1e-100 else never,
-            1.0 / dz if abs(dz) > 1e-100 else never,
-        ),
-    )
+    ix, iy = 1.0 / dx if abs(dx) > 1e-100 else never, 1.0 / dy if abs(dy) > 1e-100 else never
+    origin = (float(rays.origins[r, 0]), float(rays.origins[r, 1]), float(rays.origins[r, 2]))
+    return origin, (dx, dy, dz), (ix, iy, 1.0 / dz if abs(dz) > 1e-100 else never)
 
 
 @kernel
 def next_sample(i: int, enter: float, length: float, step: float, path, volume: Volume):
     """The first sample from step `i` on that lies in a kept voxel.
 
-    Args:
-        i: Step to begin with.
-        enter: Distance at which the ray enters the box.
-        length: Length of the ray in the box.
-        step: Length of a step.
-        path: The ray, see `path_of`.
-        volume: The kept voxels.
-
-    Returns:
-        Its step, the voxel's number, distance, step length and place in the voxel; step -1 if there is none.
+    The ray, see `path_of`, enters the box at the distance `enter` and is `length` long in it. Gives the sample's step,
+    the voxel's number, distance, step length and place in the voxel; step -1 if there is none.
     """
     (ox, oy, oz), (dx, dy, dz), (ix, iy, iz) = path
     lx, ly, lz = volume.lo[0], volume.lo[1], volume.lo[2]
@@ -329,13 +291,10 @@ def march_rays(
     """Weigh the samples of rays `first` to `last` (paper, eq. 1) and record them from `begin` to before `end`.
 
     Ranges of rays write to places of their own, so that threads can share a batch. Sums are in double precision.
-
-    Samples are found, read and weighed a few at a time: reading does not wait for weighing then, and a memory that
-    answers late is asked for several of them at once.
+    Samples are found, read and weighed a few at a time, so that several of them are asked of the memory at once.
 
     Returns:
-        Number of samples whose density is NaN, or -1 if there are more samples than places; place behind the last
-        record.
+        Number of samples with NaN density, or -1 if there are more samples than places; place behind the last record.
     """
     distance, length_of, raw = np.empty(AHEAD), np.empty(AHEAD), np.empty(AHEAD)
     wrong = 0
@@ -401,3 +360,80 @@ def march_rays(
         if settings.sparsity:
             sums.sparsity[r] = sparsity
     return wrong, n
+
+
+@kernel
+def prefetch_colours(values: Floats, rows: Ints, number: int):
+    """Ask for the colours of a voxel's corners; with harmonics, rows of two corners take several cache lines."""
+    channels = values.shape[1]
+    if channels == 3:
+        prefetch_corners(values, rows, number)
+        return
+    for corner in range(4):
+        row = np.int64(rows[number, corner])
+        prefetch(values, row, 0)
+        prefetch(values, row, 16)
+        prefetch(values, row + 1, 0)
+        prefetch(values, row + 1, channels - 1)
+
+
+@kernel
+def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, sums: Sums):
+    """Read and sum colour and temperature of rays `first` to `last` (paper, eq. 1 and 2), as far as rays want them.
+
+    Samples of at most the smallest weight are left out. Values are asked for some samples ahead.
+    """
+    channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
+    count = channels // 3
+    one = volume.density.dtype.type
+    coefficients = np.empty(channels, volume.sh.dtype)
+    thermal_coefficients = np.empty(thermal_channels, volume.temperature.dtype)
+    basis, thermal_basis = np.empty(9), np.empty(9)
+    end = records.offset[last - 1] + records.used[last - 1]
+    for r in range(first, last):
+        wants_rgb, wants_thermal = (rays.wants[r] & 1) != 0 and channels > 0, (rays.wants[r] & 2) != 0
+        if wants_rgb:
+            basis_of(rays.directions, r, count, 1.0, basis)
+        if wants_thermal and thermal_channels > 1:
+            basis_of(rays.directions, r, thermal_channels, 1.0 / Y00, thermal_basis)
+        red, green, blue, thermal = 0.0, 0.0, 0.0, 0.0
+        wanted = records.used[r] if wants_rgb or wants_thermal else 0
+        for n in range(records.offset[r], records.offset[r] + wanted):
+            if n + FAR < end:
+                prefetch(volume.voxel_rows, records.number[n + FAR], 0)
+            if n + NEAR < end and records.weight[n + NEAR] > settings.smallest_weight:
+                # What this ray wants is a good guess of what the next one wants.
+                if wants_rgb:
+                    prefetch_colours(volume.sh, volume.voxel_rows, records.number[n + NEAR])
+                if wants_thermal:
+                    prefetch_corners(volume.temperature, volume.voxel_rows, records.number[n + NEAR])
+            if not records.weight[n] > settings.smallest_weight:  # as rounded: the backward pass asks the same
+                continue
+            number, (fx, fy, fz), weight = records.number[n], place_of(records, n), float(records.weight[n])
+            if wants_rgb:
+                if count > 1:
+                    gather(volume.sh, volume.voxel_rows, number, fx, fy, fz, coefficients)
+                for c in range(3):
+                    logit = 0.0
+                    if count == 1:
+                        logit = Y00 * gather_one(volume.sh, volume.voxel_rows, number, fx, fy, fz, c)
+                    else:
+                        for k in range(count):
+                            logit += coefficients[c * count + k] * basis[k]
+                    records.rgb[n, c] = one(1.0) / (one(1.0) + math.exp(one(-logit)))
+                red += weight * records.rgb[n, 0]
+                green += weight * records.rgb[n, 1]
+                blue += weight * records.rgb[n, 2]
+            if wants_thermal:
+                value = 0.0
+                if thermal_channels == 1:
+                    value = gather_one(volume.temperature, volume.voxel_rows, number, fx, fy, fz, 0)
+                else:
+                    gather(volume.temperature, volume.voxel_rows, number, fx, fy, fz, thermal_coefficients)
+                    for k in range(thermal_channels):
+                        value += thermal_coefficients[k] * thermal_basis[k]
+                records.thermal[n] = value
+                thermal += weight * records.thermal[n]
+        if channels > 0:
+            sums.rgb[r, 0], sums.rgb[r, 1], sums.rgb[r, 2] = red, green, blue
+        sums.thermal[r, 0] = thermal

@@ -1,9 +1,11 @@
-"""Compiled backward pass: gradients of each ray's sums become those of its samples."""
+"""Compiled backward pass: gradients of rays become those of their samples, and these are summed for each row."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
+
+import numpy as np
 
 from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.render.kernels import (
@@ -14,17 +16,23 @@ from thermoxels_ns.render.kernels import (
     RELU,
     SOFTPLUS,
     TEMPERATURE,
+    Y00,
     Floats,
+    Ints,
     Rays,
     Records,
     SampleGradients,
     Settings,
     Volume,
+    basis_of,
     chord,
+    prefetch,
 )
 
 _FLAT_EXP = math.exp(EXP_LIMIT) * (1.0 - 1e-6)
 """Density from which `exp` is constant; a little less, so that rounding to single precision does not hide it."""
+NEAR, FAR = 8, 16
+"""Samples ahead whose sums, and whose places of sums, are asked for; records are asked for at twice the latter."""
 
 
 class RayGradients(NamedTuple):
@@ -122,3 +130,259 @@ def find_sample_gradients(
             if seen:
                 uses |= (COLOUR if wants_rgb else 0) | (TEMPERATURE if wants_thermal else 0)
             samples.uses[n] = uses
+
+
+class Order(NamedTuple):
+    """Samples with a gradient in the order of their voxels; of those in one group of voxels, in the order of rays."""
+
+    shift: int  # A group is 2^shift voxels
+    group: Ints  # First of each group in the lists below and one behind the last, (groups + 1,) int64
+    record: Ints  # Record, int32
+    ray: Ints  # Its ray, int32
+
+
+class Blocks(NamedTuple):
+    """Total variation to add: one entry per parameter, in the order density, colour, temperature."""
+
+    first: Ints  # First voxel, (3,) int64
+    last: Ints  # One behind the last voxel; the first where there is no block
+    push: Floats  # Gradient of the sum of the block's total variation, (3,) float64
+    smallest: float  # Added under the root
+
+
+class RowGradients(NamedTuple):
+    """Gradients of the rows that have one."""
+
+    uses: Ints  # Which parameters each row has a gradient for (bits), (rows,) uint8
+    place: Ints  # Where, in the sums below, (rows, 3) int32; for density, colour, temperature
+    density: Floats
+    sh: Floats
+    temperature: Floats
+
+
+@kernel
+def order_samples(samples: SampleGradients, order: Order):
+    """Fill `order` by counting; `order.group` holds zeros before."""
+    group = order.group
+    for r in range(len(samples.used)):
+        for n in range(samples.offset[r], samples.offset[r] + samples.used[r]):
+            if samples.uses[n]:
+                group[(samples.number[n] >> order.shift) + 1] += 1
+    for g in range(1, len(group)):
+        group[g] += group[g - 1]
+    for r in range(len(samples.used)):
+        for n in range(samples.offset[r], samples.offset[r] + samples.used[r]):
+            if samples.uses[n]:
+                g = samples.number[n] >> order.shift
+                order.record[group[g]], order.ray[group[g]] = n, r
+                group[g] += 1
+    for g in range(len(group) - 1, 0, -1):
+        group[g] = group[g - 1]
+    group[0] = 0
+
+
+@kernel
+def first_voxel(voxel_rows: Ints, corner: int, row: int):
+    """The first voxel whose row of a corner is at least `row`; such rows ascend."""
+    low, high = 0, len(voxel_rows)
+    while low < high:
+        middle = (low + high) >> 1
+        if voxel_rows[middle, corner] < row:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@kernel
+def use_rows(
+    first_row: int, last_row: int, volume: Volume, samples: SampleGradients, order: Order, blocks: Blocks, uses: Ints
+):
+    """Mark in `uses` which parameters rows `first_row` to `last_row` have a gradient for."""
+    rows = volume.voxel_rows
+    uses[first_row:last_row] = 0
+    begin, end = first_voxel(rows, 3, first_row - 1), first_voxel(rows, 0, last_row)
+    for at in range(order.group[begin >> order.shift], order.group[_groups_before(end, order)]):
+        n = order.record[at]
+        number, bits = samples.number[n], samples.uses[n]
+        for corner in range(8):
+            row = rows[number, corner >> 1] + (corner & 1)
+            if first_row <= row < last_row:
+                uses[row] |= bits
+    for kind in range(3):
+        bit = np.uint8(1 << kind)
+        for number in range(max(begin, blocks.first[kind]), min(end, blocks.last[kind])):
+            a, b, c = np.int64(rows[number, 0]), np.int64(rows[number, 1]), np.int64(rows[number, 2])
+            for row in (a, a + 1, b, c):
+                if first_row <= row < last_row:
+                    uses[row] |= bit
+
+
+@kernel
+def _groups_before(number: int, order: Order):
+    """Number of groups that reach the voxels before `number`."""
+    return (number + (1 << order.shift) - 1) >> order.shift
+
+
+@kernel
+def list_rows(first_row: int, last_row: int, kind: int, at: int, rows: RowGradients, listed: Ints, sums: Floats):
+    """List the rows of a range that have a gradient of a parameter, from place `at` on, and set their sums to 0."""
+    for row in range(first_row, last_row):
+        if rows.uses[row] & (1 << kind):
+            rows.place[row, kind], listed[at] = at, row
+            sums[at, :] = 0.0
+            at += 1
+
+
+@kernel
+def prefetch_sample(samples: SampleGradients, n: int):
+    """Ask for what is needed of a sample."""
+    prefetch(samples.number, n, 0)
+    prefetch(samples.fraction, n, 0)
+    prefetch(samples.raw_density, n, 0)
+    prefetch(samples.temperature, n, 0)
+    prefetch(samples.logits, n, 0)
+
+
+@kernel
+def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
+    """Ask for the sums of a voxel's corners, as far as they are in the range whose places are known."""
+    for corner in range(4):
+        row = voxel_rows[number, corner]
+        prefetch(rows.density, rows.place[row, 0], 0)
+        prefetch(rows.sh, rows.place[row, 1], 0)
+        prefetch(rows.temperature, rows.place[row, 2], 0)
+
+
+@kernel
+def corner_shares(samples: SampleGradients, n: int, shares: Floats):
+    """Trilinear weights of a sample's corners, in the order of `lattice.CORNER_OFFSETS`."""
+    one = shares.dtype.type(1.0)
+    fx, fy, fz = samples.fraction[n, 0], samples.fraction[n, 1], samples.fraction[n, 2]
+    gx, gy, gz = one - fx, one - fy, one - fz
+    a, b, c, d = gx * gy, gx * fy, fx * gy, fx * fy
+    shares[0], shares[1], shares[2], shares[3] = a * gz, a * fz, b * gz, b * fz
+    shares[4], shares[5], shares[6], shares[7] = c * gz, c * fz, d * gz, d * fz
+
+
+@kernel(fastmath={"contract"})
+def add_samples(
+    first_row: int,
+    last_row: int,
+    rays: Rays,
+    volume: Volume,
+    samples: SampleGradients,
+    order: Order,
+    rows: RowGradients,
+):
+    """Add the gradients of samples to rows `first_row` to `last_row`, in the order of their voxels.
+
+    Each thread owns a range of rows: the sums are the same bits for any number of threads.
+    """
+    count, thermal_channels = volume.sh.shape[1] // 3, volume.temperature.shape[1]
+    dtype = volume.density.dtype
+    basis, thermal_basis = np.empty(9), np.empty(9)
+    colour, shares = np.zeros(3 * count, dtype), np.empty(8, dtype)
+    flat = count == 1
+    begin, end = first_voxel(volume.voxel_rows, 3, first_row - 1), first_voxel(volume.voxel_rows, 0, last_row)
+    stop = order.group[_groups_before(end, order)]
+    for at in range(order.group[begin >> order.shift], stop):
+        if at + 2 * FAR < stop:
+            prefetch_sample(samples, order.record[at + 2 * FAR])
+        if at + FAR < stop:
+            number = samples.number[order.record[at + FAR]]
+            for corner in range(4):
+                prefetch(rows.place, volume.voxel_rows[number, corner], 0)
+        if at + NEAR < stop:
+            number = samples.number[order.record[at + NEAR]]
+            prefetch_sums(rows, volume.voxel_rows, number)
+        n, r = order.record[at], order.ray[at]
+        number, bits = samples.number[n], samples.uses[n]
+        if volume.voxel_rows[number, 3] + 1 < first_row or volume.voxel_rows[number, 0] >= last_row:
+            continue
+        inside = volume.voxel_rows[number, 0] >= first_row and volume.voxel_rows[number, 3] + 1 < last_row
+        slope, heat = samples.raw_density[n], samples.temperature[n]
+        if bits & COLOUR:
+            basis_of(rays.directions, r, count, 1.0, basis)
+            for c in range(3):
+                for k in range(count):
+                    colour[c * count + k] = samples.logits[n, c] * basis[k]
+        if bits & TEMPERATURE and thermal_channels > 1:
+            basis_of(rays.directions, r, thermal_channels, 1.0 / Y00, thermal_basis)
+        corner_shares(samples, n, shares)
+        for corner in range(8):
+            row = volume.voxel_rows[number, corner >> 1] + (corner & 1)
+            if not (inside or first_row <= row < last_row):
+                continue
+            share = shares[corner]
+            if bits & DENSITY:
+                rows.density[rows.place[row, 0], 0] += share * slope
+            if bits & COLOUR:
+                place = rows.place[row, 1]
+                if flat:
+                    rows.sh[place, 0] += share * colour[0]
+                    rows.sh[place, 1] += share * colour[1]
+                    rows.sh[place, 2] += share * colour[2]
+                else:
+                    for k in range(3 * count):
+                        rows.sh[place, k] += share * colour[k]
+            if bits & TEMPERATURE:
+                place = rows.place[row, 2]
+                if thermal_channels == 1:
+                    rows.temperature[place, 0] += share * heat
+                else:
+                    for k in range(thermal_channels):
+                        rows.temperature[place, k] += share * heat * thermal_basis[k]
+
+
+@kernel(fastmath={"contract"})
+def total_variation(values: Floats, voxel_rows: Ints, first: int, last: int, smallest: float):
+    """Sum over voxels `first` to `last` and channels of sqrt(dx^2 + dy^2 + dz^2) (Plenoxels, eq. 4)."""
+    channels = values.shape[1]
+    tiny = values.dtype.type(smallest)
+    totals = np.zeros(channels)
+    for number in range(first, last):
+        a = voxel_rows[number, 0]
+        here, along_z = values[a], values[a + 1]
+        along_y, along_x = values[voxel_rows[number, 1]], values[voxel_rows[number, 2]]
+        for k in range(channels):
+            dx, dy, dz = along_x[k] - here[k], along_y[k] - here[k], along_z[k] - here[k]
+            totals[k] += np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
+    total = 0.0
+    for k in range(channels):
+        total += totals[k]
+    return total
+
+
+@kernel(fastmath={"contract"})
+def add_variation(
+    first_row: int,
+    last_row: int,
+    values: Floats,
+    voxel_rows: Ints,
+    kind: int,
+    blocks: Blocks,
+    place: Ints,
+    gradient: Floats,
+):
+    """Add the gradient of the total variation of a parameter's block to rows `first_row` to `last_row`."""
+    channels = values.shape[1]
+    first, last = blocks.first[kind], blocks.last[kind]
+    one = values.dtype.type
+    tiny = one(blocks.smallest)
+    scale = one(blocks.push[kind])
+    shares = np.empty((4, channels), values.dtype)
+    begin, end = first_voxel(voxel_rows, 2, first_row), first_voxel(voxel_rows, 0, last_row)
+    for number in range(max(begin, first), min(end, last)):
+        a, b, c = np.int64(voxel_rows[number, 0]), np.int64(voxel_rows[number, 1]), np.int64(voxel_rows[number, 2])
+        here, along_z, along_y, along_x = values[a], values[a + 1], values[b], values[c]
+        for k in range(channels):
+            dx, dy, dz = along_x[k] - here[k], along_y[k] - here[k], along_z[k] - here[k]
+            push = scale / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
+            shares[1, k], shares[2, k], shares[3, k] = push * dz, push * dy, push * dx
+            shares[0, k] = -(shares[3, k] + shares[2, k] + shares[1, k])
+        for corner, row in enumerate((a, a + 1, b, c)):
+            if first_row <= row < last_row:
+                into = gradient[place[row, kind]]
+                for k in range(channels):
+                    into[k] += shares[corner, k]

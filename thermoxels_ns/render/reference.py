@@ -33,12 +33,11 @@ def intersect_box(
     near: float | Float[Tensor, " rays"] = 0.0,
     far: Float[Tensor, " rays"] | None = None,
 ) -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"], Bool[Tensor, " rays"]]:
-    """Intersect rays with an axis-aligned box by slabs (Kay and Kajiya 1986), each axis guarded.
+    """Intersect rays with an axis-aligned box by slabs (Kay and Kajiya 1986): entry, exit, and whether a ray hits.
 
     An axis along which the direction is 0 (below 1e-20, whose inverse would overflow) constrains nothing if the
-    origin lies in the closed slab and misses otherwise; no direction is ever shifted away from 0. A camera inside
-    the box starts at `near`. Gives entry, exit and whether there is a length
-    above 0 between them; a miss has both distances 0.
+    origin lies in the closed slab and misses otherwise. A camera inside the box starts at `near`; a miss has both
+    distances 0.
     """
     parallel = directions.abs() < 1e-20
     inverse = 1.0 / torch.where(parallel, torch.ones_like(directions), directions)
@@ -74,6 +73,7 @@ def sample_box(
 
 OPAQUE_OPTICAL_DEPTH = 100.0
 """Optical depth of one step from which it counts as opaque: exp(-100) is 0 in float32, 4e-44 in float64."""
+SMALLEST_VARIATION = 1e-10  # Added under the root of the total variation, whose gradient is finite then
 
 
 @dataclass(frozen=True)
@@ -86,18 +86,11 @@ class RayWeights:
 
 
 def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> RayWeights:
-    """Turn densities into weights: w_i = exp(-sum_{j<i} s_j d_j) (1 - exp(-s_i d_i)) (paper, eq. 1).
+    """Turn densities [1 / world unit] into weights: w_i = exp(-sum_{j<i} s_j d_j) (1 - exp(-s_i d_i)) (paper, eq. 1).
 
-    Optical depths are summed, never multiplied as transmittances, so that deep rays keep their digits;
-    1 - exp(-x) is computed as -expm1(-x), so that vanishing density keeps its value and its gradient; an
-    infinite density is opaque, also over a tiny step.
-
-    Args:
-        density: >= 0, may be infinite, [1 / world unit].
-        deltas: Step lengths, [world unit]; a step of length 0 has no weight whatever its density.
-
-    Returns:
-        Weights and what is left for the background; they sum to 1.
+    Optical depths are summed, so that deep rays keep their digits; 1 - exp(-x) is computed as -expm1(-x), so that
+    vanishing density keeps its value and its gradient. Infinite density is opaque, but a step of length 0 has no
+    weight. Weights and transmittance sum to 1.
 
     Raises:
         ThermoxelsError: A density is NaN.
@@ -223,19 +216,15 @@ def total_variation(
     rows: Float[Tensor, "rows c"],
     corners: Int64[Tensor, "voxels 8"],
     channels: int | None = None,
-    smallest: float = 1e-10,
 ) -> Float[Tensor, ""]:
     """Mean over voxels and channels of sqrt(dx^2 + dy^2 + dz^2), differences from corner 0 (Plenoxels, eq. 4).
 
-    Args:
-        rows: Corner values.
-        corners: Rows of the corners of the voxels to look at, in the order of `lattice.CORNER_OFFSETS`.
-        channels: Channels of which the mean is taken, those without a column being 0; None: the columns.
-        smallest: Added under the root so that its gradient is finite where the field is flat.
+    `corners` are rows of voxels in the order of `lattice.CORNER_OFFSETS`; `channels` are those of which the mean is
+    taken, 0 where they have no column, by default the columns.
     """
     columns = rows.shape[1]
     channels = columns if channels is None else channels
     here = rows[corners[:, 0]]
     dz, dy, dx = rows[corners[:, 1]] - here, rows[corners[:, 2]] - here, rows[corners[:, 4]] - here
-    total = torch.sum(torch.sqrt(dx * dx + dy * dy + dz * dz + smallest)) / (len(corners) * channels)
-    return total + (1.0 - columns / channels) * math.sqrt(smallest)
+    total = torch.sum(torch.sqrt(dx * dx + dy * dy + dz * dz + SMALLEST_VARIATION)) / (len(corners) * channels)
+    return total + (1.0 - columns / channels) * math.sqrt(SMALLEST_VARIATION)

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.field.background import seen_behind
-from thermoxels_ns.field.surroundings import Surroundings
+from thermoxels_ns.field.surroundings import Surroundings, seen_behind
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render import reference
 from thermoxels_ns.render.ray_render import GridSamples, RayRender, RayRequest, RenderOptions
@@ -24,11 +23,7 @@ LEAST_LIGHT = 0.003  # Share of a ray's light that leaves the box from which its
 
 
 def choose_backend(backend: Backend, device: torch.device) -> Literal["reference", "fused"]:
-    """Turn auto into the fastest backend of a device: the compiled kernels on a CPU, else the reference.
-
-    Raises:
-        ThermoxelsError: The compiled kernels are asked for on another device than the CPU.
-    """
+    """Turn auto into the fastest backend of a device; raises `ThermoxelsError` for the compiled one beside a CPU."""
     if backend == "fused" and device.type != "cpu":
         remedy = "Pass --pipeline.model.backend auto, or --machine.device-type cpu."
         got = "fused, whose kernels run on the CPU"
@@ -95,14 +90,9 @@ def render_scene(
     backend: Backend,
     variation: dict[str, tuple[int, int]] | None = None,
 ) -> SceneRender:
-    """Render rays through box and surroundings to infinity.
+    """Render rays through box and surroundings to infinity; rays that do not want a value get 0.
 
-    Args:
-        scene: What there is.
-        request: The rays; those that do not want a value get 0.
-        options: Those of the box.
-        backend: Renderer of both grids.
-        variation: Total variation to compute of the surroundings.
+    `options` are those of the box, `variation` is the total variation to compute of the surroundings.
     """
     box = render_rays(scene.grid, request, options, backend)
     around = None

@@ -21,11 +21,10 @@ _CHANNELS_TO_RGB = np.array([[0.8, 0.3, 0.0], [0.8, -0.1, 0.25], [0.8, -0.15, -0
 
 
 class SolidTexture:
-    """Value noise in three channels, defined at every point of space.
+    """Value noise in three channels, defined at every point of space, that does not repeat within the box.
 
     Random values on cubic lattices, interpolated with a smoothstep, are added at three scales. The finest lattice
-    is two voxels wide when 64 voxels span the box's longest side, so a voxel field of that size can hold it. The
-    pattern does not repeat within the box.
+    is two voxels wide where 64 voxels span the box's longest side.
     """
 
     def __init__(self, box: Box, seed: int) -> None:
@@ -95,15 +94,15 @@ def painted(
     Points [m] and normals have shape (n, 3), `part` indexes `paints` for each, shape (n,); red, green, blue in [0, 1],
     shape (n, 3).
     """
-    base = np.array([p.base for p in paints], dtype=np.float32)[part]
-    contrast = np.array([p.contrast for p in paints], dtype=np.float32)[part]
+    base, contrast = (np.array(one, dtype=np.float32)[part] for one in zip(*((p.base, p.contrast) for p in paints)))
     colour = (base + contrast[:, None] * texture(points)) * light.brightness(normals)
     return np.clip(colour, 0.0, 1.0).astype(np.float32, copy=False)
 
 
 def sky_temperature_c(directions: npt.ArrayLike, horizon_c: float, drop_k: float) -> FloatArray:
-    """Apparent temperature [C] of the sky along unit directions (n, 3), linear in the sine of the elevation; of the far
-    ground below the horizon. The zenith is `drop_k` colder than the horizon, the ground straight below 2 K warmer.
+    """Apparent temperature [C] of sky and far ground along unit directions (n, 3), linear in the sine of the elevation.
+
+    The zenith is `drop_k` colder than the horizon, and the ground straight below is 2 K warmer.
     """
     z = np.asarray(directions, dtype=np.float64)[:, 2]
     return horizon_c - drop_k * _rise(z) + _GROUND_RISE_K * _rise(-z)
@@ -113,6 +112,11 @@ def plain(rgb: Sequence[float]) -> Callable[[npt.ArrayLike], Float32Array]:
     """A sky or backdrop of one colour, red, green and blue 0 to 1, in every direction."""
     colour = np.asarray(rgb, dtype=np.float32)
     return lambda directions: np.tile(colour, (len(np.asarray(directions)), 1))
+
+
+def everywhere(degrees_c: float) -> Callable[[npt.ArrayLike], FloatArray]:
+    """A background of one temperature [C] in every direction."""
+    return lambda directions: np.full(len(np.asarray(directions)), degrees_c)
 
 
 def sky_rgb(directions: npt.ArrayLike) -> Float32Array:

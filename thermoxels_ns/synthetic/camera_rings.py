@@ -50,6 +50,11 @@ class CameraRing:
         return look_at((x, y, self.height_m), self.target)
 
 
+def rings_around(middle: tuple[float, float], *rings: Vector, **arc: float) -> tuple[CameraRing, ...]:
+    """Rings about one vertical axis, each from the height of its aim, its radius and its height [m]."""
+    return tuple(CameraRing((*middle, aim), radius, height, **arc) for aim, radius, height in rings)
+
+
 @dataclass(frozen=True)
 class CameraWalk:
     """A straight line of cameras, each of which looks at a point of another line."""
@@ -69,9 +74,8 @@ def ring_poses(
 ) -> tuple[FloatArray, FloatArray]:
     """Spread training cameras evenly over rings and put evaluation cameras half-way between neighbours.
 
-    Cameras go to the rings in turn; each ring starts a fraction of a step later than the one before, so that
-    cameras of different rings do not stand above each other. More evaluation cameras than there are gaps share a gap
-    evenly. Poses have shapes (num_train, 4, 4) and (num_eval, 4, 4).
+    Cameras go to the rings in turn; each ring starts a fraction of a step later than the one before. More evaluation
+    cameras than there are gaps share a gap evenly. Poses have shapes (num_train, 4, 4) and (num_eval, 4, 4).
     """
     if num_train < 1 or num_eval < 0:
         expected, got = "at least 1 for training and at least 0 for evaluation", f"{num_train} and {num_eval}"

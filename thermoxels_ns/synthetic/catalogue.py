@@ -12,21 +12,25 @@ from typing import Annotated
 from tyro.constructors import PrimitiveConstructorSpec
 
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.synthetic import drawn_scenes
 from thermoxels_ns.synthetic.appearance import plain
-from thermoxels_ns.synthetic.development_scenes import facade, street, wall_object
-from thermoxels_ns.synthetic.drawn_scenes import HOUSE, courtyard, hot_object, house_corner, pipes, sphere
-from thermoxels_ns.synthetic.random_scene import RANDOM_NAMES, random_scene, random_seed
+from thermoxels_ns.synthetic.drawn_scenes import HOUSE
+from thermoxels_ns.synthetic.random_scene import RANDOM_NAMES, random_scene, random_seed, with_room, with_street
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
-from thermoxels_ns.synthetic.surroundings import with_room, with_street
 
-_Builders = dict[str, Callable[..., SyntheticScene]]
-_BUILDERS: _Builders = {"hot-object": hot_object, HOUSE: house_corner, "sphere": sphere}
-_BUILDERS |= {"courtyard": courtyard, "pipes": pipes}
-_DEVELOPMENT: _Builders = {"wall-object": wall_object, "facade": facade, "street": street}
-
-SCENE_NAMES = tuple(_BUILDERS)
+_BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
+    "hot-object": drawn_scenes.hot_object,
+    HOUSE: drawn_scenes.house_corner,
+    "sphere": drawn_scenes.sphere,
+    "courtyard": drawn_scenes.courtyard,
+    "pipes": drawn_scenes.pipes,
+    "wall-object": drawn_scenes.wall_object,
+    "facade": drawn_scenes.facade,
+    "street": drawn_scenes.street,
+}
+DEVELOPMENT_NAMES = ("wall-object", "facade", "street")  # names of scenes that are hard to reconstruct, for development
+SCENE_NAMES = tuple(name for name in _BUILDERS if name not in DEVELOPMENT_NAMES)
 """Names of the scenes that were built by hand; `make_scene` also knows `DEVELOPMENT_NAMES`, `random-N` and `wild-N`."""
-DEVELOPMENT_NAMES = tuple(_DEVELOPMENT)  # names of scenes that are hard to reconstruct, for development
 
 VARIANTS = "+sky=R,G,B, +white, +street, +room"
 """What a name may end in, in any order: a sky of one colour (0 to 1); white plaster under a white sky (house-corner);
@@ -42,11 +46,10 @@ def check_scene_name(name: str) -> str:
     """
     base, *variants = name.split("+")
     kinds = {variant.split("=")[0] for variant in variants}
-    known = base in _BUILDERS or base in _DEVELOPMENT or random_seed(base) is not None
+    known = base in _BUILDERS or random_seed(base) is not None
     known &= all(variant in ("white", "street", "room") or _SKY.fullmatch(variant) for variant in variants)
     if not known or len(kinds) < len(variants) or kinds >= {"street", "room"} or ("white" in kinds and base != HOUSE):
-        every = ", ".join((*_BUILDERS, *_DEVELOPMENT))
-        seeded = " or ".join(RANDOM_NAMES)
+        every, seeded = ", ".join(_BUILDERS), " or ".join(RANDOM_NAMES)
         expected = f"{seeded} with a whole number N from 0 on, or one of {every}; with {VARIANTS} if you like"
         remedy = f"Choose one of these names, or write random-17 or {HOUSE}+sky=0.55,0.57,0.60."
         raise SceneError("synthetic scene", expected=expected, got=repr(name), remedy=remedy)
@@ -80,12 +83,10 @@ def make_scene(name: str) -> SyntheticScene:
     (10.0, 40.0)
     """
     base, *variants = check_scene_name(name).split("+")
-    seed = random_seed(base)
-    white = {"white": True} if "white" in variants else {}
-    if seed is not None:
-        scene = random_scene(seed, wild=base.startswith("wild"))
+    if base in _BUILDERS:
+        scene = _BUILDERS[base](**({"white": True} if "white" in variants else {}))
     else:
-        scene = (_BUILDERS | _DEVELOPMENT)[base](**white)
+        scene = random_scene(int(base.split("-")[1]), wild=base.startswith("wild"))
     for variant in sorted(variants):
         if sky := _SKY.fullmatch(variant):
             scene = dataclasses.replace(scene, background_rgb=plain([float(c) for c in sky[1].split(",")]))

@@ -1,48 +1,42 @@
-"""Synthetic scenes that were drawn by hand: `hot-object`, `house-corner`, `sphere`, `courtyard` and `pipes`."""
+"""Synthetic scenes that were drawn by hand: to demonstrate on, and to develop on what photographs leave open."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import Float32Array, FloatArray, IntArray
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.synthetic.appearance import (
     Paint,
-    SolidTexture,
     SunLight,
-    painted,
+    everywhere,
     plain,
     room_rgb,
     sky_rgb,
     sky_temperature_c,
 )
-from thermoxels_ns.synthetic.camera_rings import CameraRing
+from thermoxels_ns.synthetic.camera_rings import CameraRing, CameraWalk, rings_around
+from thermoxels_ns.synthetic.random_plan import HAIR, Plan, Range, Wall, distance_to
+from thermoxels_ns.synthetic.random_scene import painted_scene, surrounded, warm_scene, with_street
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
-from thermoxels_ns.synthetic.solids import (
-    Box,
-    BoxSolid,
-    Cylinder,
-    Solid,
-    SolidUnion,
-    Sphere,
-    box_beside,
-    distance_to_box,
-    fade_towards,
-)
+from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, Vector
 
 HOUSE = "house-corner"
 _HOUSE_AIR_C, _HOUSE_ROOM_C, _HOUSE_COEFFICIENT = 0.0, 20.0, 8.0
 """The coefficient is that between surface and air, [W/(m2 K)]: 5.8 + 3.8054 v (Dall'O, Sarto and Panza 2013) in a wind
 of 0.578 m/s. A surface is warmer than the air by U (Ti - Te) / h."""
 _KELVIN_PER_U = (_HOUSE_ROOM_C - _HOUSE_AIR_C) / _HOUSE_COEFFICIENT
-_HOUSE_WALL_U, _BRIDGE_U, _BRIDGE_WIDTH_M = 2.0, 1.2, 0.35  # Of the wall, and what the slab's band adds, [W/(m2 K)]
+_HOUSE_WALL_U, _BRIDGE_U, _BRIDGE_WIDTH_M = 2.0, 1.2, 0.35  # of the wall, and what the slab's band adds, [W/(m2 K)]
 BRIDGE_PSI_W_MK = _BRIDGE_U * _BRIDGE_WIDTH_M * float(np.sqrt(np.pi))
 """Extra loss of the band, 1.2 exp(-(z / 0.35 m)^2) W/(m2 K) over the height, per metre and kelvin, [W/(m K)]."""
 
-_GLASS_PAINT, _DOOR_PAINT = Paint((0.22, 0.30, 0.40), 0.16), Paint((0.42, 0.22, 0.14), 0.18)
+_GLASS, _DOOR = Paint((0.22, 0.30, 0.40), 0.16), Paint((0.42, 0.22, 0.14), 0.18)
+_PANE_M = 0.1
+_Openings = tuple[tuple[Wall, Range, Range, float, Paint], ...]
+"""The wall; from and to along it and in z [m]; the pane's temperature [C]; its paint."""
 
 
 def hot_object() -> SyntheticScene:
@@ -51,46 +45,44 @@ def hot_object() -> SyntheticScene:
     lower: Box = ((-0.36, -0.2, 0.0), (-0.02, 0.12, 0.14))
     upper: Box = ((-0.36, -0.2, 0.14), (-0.18, 0.12, 0.28))
     ball = Sphere((0.24, -0.04, 0.12), 0.12)
-    bodies = ([table], [lower, upper], [ball])
+    plan = _plan(
+        (Paint((0.62, 0.47, 0.31), 0.26), table),
+        (Paint((0.30, 0.50, 0.62), 0.28), lower, upper),
+        (Paint((0.78, 0.34, 0.28), 0.26), ball),
+    )
 
     def temperature_c(points: npt.ArrayLike) -> FloatArray:
         x, y, z = np.asarray(points, dtype=np.float64).T
-        from_block = distance_to_box(points, *lower) / 0.10
+        from_block = distance_to(lower, points) / 0.10
         from_contact = (np.hypot(x - ball.centre[0], y - ball.centre[1])) / 0.09
         table_c = 20.5 - 3.0 * x + 10.0 * np.exp(-from_block * from_block) + 7.0 * np.exp(-(from_contact**2))
-        return np.choose(_nearest(points, bodies), [table_c, 68.0 - 25.0 * z, 52.0 - 40.0 * (z - ball.centre[2])])
+        block_c, ball_c = 68.0 - 25.0 * z, 52.0 - 40.0 * (z - ball.centre[2])
+        return _of_nearest(points, (table_c, table), (block_c, lower, upper), (ball_c, ball))
 
-    return _scene(
+    return _in_a_room(
+        plan,
+        texture_seed=11,
         name="hot-object",
-        solid=SolidUnion((BoxSolid((table, lower, upper)), ball)),
         scene_box=((-0.55, -0.45, -0.14), (0.55, 0.45, 0.34)),
         temperature_bounds_c=(18.0, 70.0),
-        paints=(Paint((0.62, 0.47, 0.31), 0.26), Paint((0.30, 0.50, 0.62), 0.28), Paint((0.78, 0.34, 0.28), 0.26)),
-        part=lambda points, normals: _nearest(points, bodies),
-        texture_seed=11,
         surface_temperature_c=temperature_c,
-        rings=tuple(
-            CameraRing((0.0, 0.0, aim), radius, height)
-            for aim, radius, height in ((0.05, 1.45, 0.36), (-0.02, 1.34, 0.80), (-0.07, 1.03, 1.38))
-        ),
+        rings=rings_around((0.0, 0.0), (0.05, 1.45, 0.36), (-0.02, 1.34, 0.80), (-0.07, 1.03, 1.38)),
         focal_share=1.0,
     )
 
 
 def sphere() -> SyntheticScene:
     """Build one textured ball whose temperature is linear in height, before a uniform background."""
-    return _scene(
-        name="sphere",
-        solid=Sphere((0.0, 0.0, 0.0), 0.5),
-        scene_box=((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6)),
-        temperature_bounds_c=(10.0, 40.0),
-        paints=(Paint((0.66, 0.60, 0.50), 0.32),),
-        part=lambda points, normals: np.zeros(len(np.asarray(points)), dtype=np.int64),
+    return _in_a_room(
+        _plan((Paint((0.66, 0.60, 0.50), 0.32), Sphere((0.0, 0.0, 0.0), 0.5))),
         texture_seed=23,
         light=SunLight(ambient=0.75),
+        name="sphere",
+        scene_box=((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6)),
+        temperature_bounds_c=(10.0, 40.0),
         surface_temperature_c=lambda points: np.clip(30.0 + 20.0 * np.asarray(points)[:, 2], 20.0, 40.0),
         background_rgb=plain((0.75, 0.75, 0.75)),
-        rings=tuple(CameraRing((0.0, 0.0, 0.0), *ring) for ring in ((1.75, -0.75), (1.90, 0.15), (1.60, 1.05))),
+        rings=rings_around((0.0, 0.0), (0.0, 1.75, -0.75), (0.0, 1.90, 0.15), (0.0, 1.60, 1.05)),
         focal_share=1.15,
     )
 
@@ -101,40 +93,35 @@ def pipes() -> SyntheticScene:
     The room is 16 C everywhere. The thick pipe falls from 65 to 59 C along its height, the crossing one from 50 to
     38 C along its length, the thin one rises from 26 to 34 C, and the wall glows behind the two that stand near it.
     """
-    room_c, wall = 16.0, BoxSolid((((-1.3, 0.0, -0.9), (1.3, 0.16, 0.9)),))
+    room_c, wall = 16.0, ((-1.3, 0.0, -0.9), (1.3, 0.16, 0.9))
     thick = Cylinder((-0.55, -0.28, 0.0), radius=0.13, length=1.6, axis=2)
     middle = Cylinder((0.05, -0.60, 0.3), radius=0.075, length=2.3, axis=0)
     thin = Cylinder((0.5, -0.2, 0.0), radius=0.04, length=1.7, axis=2)
-    solid = SolidUnion((wall, thick, middle, thin))
-
-    def part(points: npt.ArrayLike, normals: npt.ArrayLike = ()) -> IntArray:
-        return np.argmin([one.signed_distance(points) for one in solid.parts], axis=0)
+    plan = _plan(
+        (Paint((0.62, 0.61, 0.57), 0.10), wall),
+        (Paint((0.58, 0.36, 0.26), 0.24), thick),
+        (Paint((0.42, 0.50, 0.56), 0.24), middle),
+        (Paint((0.66, 0.55, 0.30), 0.22), thin),
+    )
 
     def temperature_c(points: npt.ArrayLike) -> FloatArray:
         x, y, z = np.asarray(points, dtype=np.float64).T
         front = np.exp(-np.maximum(y, 0.0) / 0.08)
         by_thick, by_thin = (x - thick.centre[0]) / 0.28, (x - thin.centre[0]) / 0.16
         wall_c = room_c + 1.0 + front * (9.0 * np.exp(-by_thick * by_thick) + 2.5 * np.exp(-by_thin * by_thin))
-        return np.choose(part(points), [wall_c, 62.0 + 3.75 * z, 44.0 - 5.2 * (x - 0.05), 30.0 + 4.7 * z])
+        rods = ((62.0 + 3.75 * z, thick), (44.0 - 5.2 * (x - 0.05), middle), (30.0 + 4.7 * z, thin))
+        return _of_nearest(points, (wall_c, wall), *rods)
 
-    return _scene(
-        name="pipes",
-        solid=solid,
-        scene_box=((-1.42, -0.85, -1.05), (1.42, 0.30, 1.05)),
-        temperature_bounds_c=(room_c, 66.0),
-        paints=(
-            Paint((0.62, 0.61, 0.57), 0.10),  # wall
-            Paint((0.58, 0.36, 0.26), 0.24),
-            Paint((0.42, 0.50, 0.56), 0.24),
-            Paint((0.66, 0.55, 0.30), 0.22),
-        ),
-        part=part,
+    return _in_a_room(
+        plan,
         texture_seed=41,
         light=SunLight(towards=(0.4, -0.8, 0.5), ambient=0.6),
+        name="pipes",
+        scene_box=((-1.42, -0.85, -1.05), (1.42, 0.30, 1.05)),
+        temperature_bounds_c=(room_c, 66.0),
         surface_temperature_c=temperature_c,
-        rings=tuple(
-            CameraRing((0.0, -0.15, aim), radius, height, start_deg=-160.0, span_deg=140.0)
-            for aim, radius, height in ((0.13, 3.5, -0.7), (-0.04, 3.6, 0.25), (-0.15, 3.35, 1.4))
+        rings=rings_around(
+            (0.0, -0.15), (0.13, 3.5, -0.7), (-0.04, 3.6, 0.25), (-0.15, 3.35, 1.4), start_deg=-160.0, span_deg=140.0
         ),
         focal_share=0.87,
     )
@@ -154,57 +141,53 @@ def house_corner(white: bool = False) -> SyntheticScene:
     ground: Box = ((-3.3, -4.2, -0.45), (4.3, 2.9, 0.0))
     roof: Box = ((-3.3, -2.8, 5.0), (3.3, 2.8, 5.35))
     balcony: Box = ((-1.6, -3.8, 2.45), (1.4, -2.5, 2.8))
-    paints = (
-        Paint((0.93, 0.93, 0.92), 0.0) if white else Paint((0.74, 0.64, 0.47), 0.22),  # plaster
-        Paint((0.36, 0.42, 0.27), 0.24),  # grass
-        Paint((0.45, 0.27, 0.24), 0.20),  # roof
-        Paint((0.58, 0.58, 0.57), 0.22),  # balcony
-        _GLASS_PAINT,
-        _DOOR_PAINT,
+    front: Wall = (1, -1, building[0][1])
+    side: Wall = (0, +1, building[1][0])
+    panes = (  # the last is the U-value
+        (front, (-2.4, -1.2), (0.9, 2.0), 5.6),
+        (front, (0.9, 2.3), (0.9, 2.0), 5.2),
+        (front, (-1.1, 0.0), (2.8, 4.5), 5.8),
+        (front, (1.6, 2.5), (3.3, 4.4), 4.8),
+        (side, (0.5, 1.8), (0.9, 2.0), 5.4),
+        (side, (-1.6, 0.2), (3.2, 4.4), 5.6),
+        (side, (1.0, 1.9), (3.2, 4.4), 5.0),
     )
-    front, side, glass, door, recess_m = building[0][1], building[1][0], 4, 5, 0.35
-    openings = (  # plane's axis, outward sign and position; (along the wall from, to); (z from, to); U; paint
-        (1, -1, front, (-2.4, -1.2), (0.9, 2.0), 5.6, glass),
-        (1, -1, front, (0.9, 2.3), (0.9, 2.0), 5.2, glass),
-        (1, -1, front, (-1.1, 0.0), (2.8, 4.5), 5.8, glass),
-        (1, -1, front, (1.6, 2.5), (3.3, 4.4), 4.8, glass),
-        (0, +1, side, (-1.7, -0.6), (0.0, 2.1), 3.6, door),
-        (0, +1, side, (0.5, 1.8), (0.9, 2.0), 5.4, glass),
-        (0, +1, side, (-1.6, 0.2), (3.2, 4.4), 5.6, glass),
-        (0, +1, side, (1.0, 1.9), (3.2, 4.4), 5.0, glass),
+    door = (side, (-1.7, -0.6), (0.0, 2.1), _HOUSE_AIR_C + _KELVIN_PER_U * 3.6, _DOOR)
+    plan = _plan(
+        (Paint((0.93, 0.93, 0.92), 0.0) if white else Paint((0.74, 0.64, 0.47), 0.22), building),
+        (Paint((0.36, 0.42, 0.27), 0.24), ground),
+        (Paint((0.45, 0.27, 0.24), 0.20), roof),
+        (Paint((0.58, 0.58, 0.57), 0.22), balcony),
+        openings=(*((wall, along, z, _HOUSE_AIR_C + _KELVIN_PER_U * u, _GLASS) for wall, along, z, u in panes), door),
+        recess_m=0.35,
     )
-    cut, panes = _recesses(openings, recess_m)
     wall_c, bridge_k = _HOUSE_AIR_C + _KELVIN_PER_U * _HOUSE_WALL_U, _KELVIN_PER_U * _BRIDGE_U
 
     def temperature_c(points: npt.ArrayLike) -> FloatArray:
         points = np.asarray(points, dtype=np.float64)
         z = points[:, 2]
         lift = (z - 0.5 * (balcony[0][2] + balcony[1][2])) / _BRIDGE_WIDTH_M
-        degrees = wall_c + 0.3 * (z - 2.5) / 2.5 + bridge_k * np.exp(-lift * lift)
-        for pane, opening in zip(panes, openings):
-            fade_towards(degrees, points, pane, _HOUSE_AIR_C + _KELVIN_PER_U * opening[5], recess_m)
-        from_house = distance_to_box(points, *building)
+        house_c = wall_c + 0.3 * (z - 2.5) / 2.5 + bridge_k * np.exp(-lift * lift)
+        plan.add_glows(house_c, points)
+        from_house = distance_to(building, points)
         fin_c = _HOUSE_AIR_C + 1.0 + (wall_c + bridge_k - 1.0) * np.exp(-from_house / 0.6)
         ground_c = _HOUSE_AIR_C + 1.5 + 2.5 * np.exp(-from_house / 0.7)
         roof_c = 3.0 - 2.0 * np.minimum(from_house / 0.6, 1.0)
-        nearest = 1 + _nearest(points, ([balcony], [ground], [roof]))
-        return np.choose(np.where(from_house > 1e-6, nearest, 0), [degrees, fin_c, ground_c, roof_c])
+        others_c = _of_nearest(points, (fin_c, balcony), (ground_c, ground), (roof_c, roof))
+        return np.where(from_house > 1e-6, others_c, house_c)
 
-    return _scene(
-        name=HOUSE,
-        solid=BoxSolid((ground, building, roof, balcony), removed=cut),
-        scene_box=((-3.7, -4.6, -0.8), (4.7, 3.3, 5.8)),
-        temperature_bounds_c=(-20.0, 15.0),
-        paints=paints,
-        part=_last_of([(ground, 1), (roof, 2), (balcony, 3), *((p, o[6]) for p, o in zip(panes, openings))]),
+    return painted_scene(
+        plan,
         texture_seed=7,
         light=SunLight(towards=(0.75, -0.45, 0.5), ambient=0.88 if white else SunLight.ambient),
+        name=HOUSE,
+        scene_box=((-3.7, -4.6, -0.8), (4.7, 3.3, 5.8)),
+        temperature_bounds_c=(-20.0, 15.0),
         surface_temperature_c=temperature_c,
         background_rgb=plain((0.94, 0.94, 0.94)) if white else sky_rgb,
         background_temperature_c=lambda directions: sky_temperature_c(directions, _HOUSE_AIR_C, 20.0),
-        rings=tuple(
-            CameraRing((0.4, -0.7, aim), radius, height, start_deg=-145.0, span_deg=200.0)
-            for aim, radius, height in ((2.4, 11.8, 1.7), (1.7, 12.1, 4.8), (1.3, 11.6, 9.0))
+        rings=rings_around(
+            (0.4, -0.7), (2.4, 11.8, 1.7), (1.7, 12.1, 4.8), (1.3, 11.6, 9.0), start_deg=-145.0, span_deg=200.0
         ),
         focal_share=0.86,
     )
@@ -236,134 +219,214 @@ def courtyard() -> SyntheticScene:
     chimney: Box = ((0.4, 2.9, 3.7), (0.9, 3.4, 4.6))
     # A pergola across the mouth of the yard: a beam on columns 2.5 % as thick as the scene is wide.
     x, y, thick, top = (-0.75, 0.25, 1.25, 2.25), -2.3, 0.28, 2.4
-    columns: list[Box] = [((at, y, 0.0), (at + thick, y + thick, top)) for at in x]
-    pergola: list[Box] = [*columns, ((west[1][0], y, top), (x[-1] + thick, y + thick, top + thick))]
+    pergola: list[Box] = [((at, y, 0.0), (at + thick, y + thick, top)) for at in x]
+    pergola.append(((west[1][0], y, top), (x[-1] + thick, y + thick, top + thick)))
     # A free-standing wall, 1.8 voxels thick where 128 of them span the scene.
     garden_wall: Box = ((1.2, -4.4, 0.0), (4.8, -4.24, 1.6))
     flue: Box = ((3.9, 0.3, 1.2), (4.25, 0.65, 1.55))
-    flue_c, recess_m, glass, door = 39.5, 0.3, 7, 8
-    openings = (  # plane's axis, outward sign and position; (along the wall from, to); (z from, to); pane [C]; paint
-        (1, -1, 2.0, (-1.1, -0.1), (0.0, 2.1), 22.0, door),
-        (1, -1, 2.0, (0.5, 1.3), (1.0, 2.2), 17.0, glass),
-        (0, +1, -1.7, (-1.2, 0.3), (0.9, 2.2), 18.0, glass),
-        (0, +1, 3.9, (2.4, 3.6), (1.1, 2.3), 16.0, glass),
-        (1, +1, 4.2, (-2.6, -1.2), (1.1, 2.3), 17.0, glass),
-        (1, -1, -0.9, (2.3, 3.4), (0.9, 2.0), 19.0, glass),
+    plan = _plan(
+        (Paint((0.52, 0.50, 0.44), 0.24), ground),
+        (Paint((0.78, 0.74, 0.66), 0.025), west),
+        (Paint((0.60, 0.38, 0.29), 0.24), north),
+        (Paint((0.70, 0.62, 0.42), 0.22), east),
+        (Paint((0.36, 0.33, 0.34), 0.20), *roofs),
+        (Paint((0.72, 0.70, 0.67), 0.16), *pergola),
+        (Paint((0.62, 0.56, 0.50), 0.20), garden_wall),
+        (Paint((0.34, 0.34, 0.38), 0.16), chimney, flue),
+        openings=(
+            ((1, -1, 2.0), (-1.1, -0.1), (0.0, 2.1), 22.0, _DOOR),
+            ((1, -1, 2.0), (0.5, 1.3), (1.0, 2.2), 17.0, _GLASS),
+            ((0, +1, -1.7), (-1.2, 0.3), (0.9, 2.2), 18.0, _GLASS),
+            ((0, +1, 3.9), (2.4, 3.6), (1.1, 2.3), 16.0, _GLASS),
+            ((1, +1, 4.2), (-2.6, -1.2), (1.1, 2.3), 17.0, _GLASS),
+            ((1, -1, -0.9), (2.3, 3.4), (0.9, 2.0), 19.0, _GLASS),
+        ),
+        recess_m=0.3,
     )
-    cut, panes = _recesses(openings, recess_m)
-    wings = (west, north, east)
-    painted_boxes = [(west, 1), (north, 2), (east, 3), *((roof, 4) for roof in roofs), *((box, 5) for box in pergola)]
-    painted_boxes += [(garden_wall, 6), (chimney, 9), (flue, 9), *((p, o[6]) for p, o in zip(panes, openings))]
 
     def temperature_c(points: npt.ArrayLike) -> FloatArray:
         points = np.asarray(points, dtype=np.float64)
         x, y, z = points.T
+        flue_c = np.full_like(x, 39.5)
         house_c = 8.0 + 0.6 * np.clip(x, -3.9, 3.9) + 0.3 * (np.clip(z, 0.0, 3.4) - 1.7)
-        for pane, opening in zip(panes, openings):
-            fade_towards(house_c, points, pane, opening[5], recess_m)
-        from_flue = distance_to_box(points, *flue) / 0.35
+        plan.add_glows(house_c, points)
+        from_flue = distance_to(flue, points) / 0.35
         house_c += (flue_c - house_c) * np.exp(-from_flue * from_flue)
-        from_house = np.min([distance_to_box(points, *box) for box in wings], axis=0)
+        from_house = np.min([distance_to(wing, points) for wing in (west, north, east)], axis=0)
         sunny = np.clip((garden_wall[1][1] - y) / (garden_wall[1][1] - garden_wall[0][1]), 0.0, 1.0)
-        temperatures = [
-            house_c,
-            2.5 + 0.25 * x + 3.0 * np.exp(-from_house / 0.7),  # ground
-            -1.0 + 0.45 * np.clip(y, -3.3, 4.6),  # roofs
-            3.0 + 1.5 * np.clip(z, 0.0, 2.7),  # pergola
-            5.0 + 10.0 * sunny + 0.4 * (np.clip(x, 1.2, 4.8) - 3.0),  # garden wall
-            np.full_like(x, flue_c),
-            12.0 + 20.0 * (np.clip(z, 3.7, 4.6) - 3.7),  # chimney
-        ]
-        groups = (wings, [ground], roofs, pergola, [garden_wall], [flue], [chimney])
-        return np.choose(_nearest(points, groups), temperatures)
+        return _of_nearest(
+            points,
+            (house_c, west, north, east),
+            (2.5 + 0.25 * x + 3.0 * np.exp(-from_house / 0.7), ground),
+            (-1.0 + 0.45 * np.clip(y, -3.3, 4.6), *roofs),
+            (3.0 + 1.5 * np.clip(z, 0.0, 2.7), *pergola),
+            (5.0 + 10.0 * sunny + 0.4 * (np.clip(x, 1.2, 4.8) - 3.0), garden_wall),
+            (flue_c, flue),
+            (12.0 + 20.0 * (np.clip(z, 3.7, 4.6) - 3.7), chimney),
+        )
 
-    return _scene(
-        name="courtyard",
-        solid=BoxSolid((ground, *wings, *roofs, chimney, *pergola, garden_wall, flue), removed=cut),
-        scene_box=((-5.7, -5.7, -0.8), (5.7, 5.7, 5.1)),
-        temperature_bounds_c=(-10.0, 40.0),
-        paints=(
-            Paint((0.52, 0.50, 0.44), 0.24),  # ground
-            Paint((0.78, 0.74, 0.66), 0.025),  # west wing, nearly plain
-            Paint((0.60, 0.38, 0.29), 0.24),  # north wing
-            Paint((0.70, 0.62, 0.42), 0.22),  # east wing
-            Paint((0.36, 0.33, 0.34), 0.20),  # roofs
-            Paint((0.72, 0.70, 0.67), 0.16),  # pergola
-            Paint((0.62, 0.56, 0.50), 0.20),  # garden wall
-            _GLASS_PAINT,
-            _DOOR_PAINT,
-            Paint((0.34, 0.34, 0.38), 0.16),  # chimney and flue
-        ),
-        part=_last_of(painted_boxes),
+    return painted_scene(
+        plan,
         texture_seed=31,
         light=SunLight(towards=(0.5, -0.7, 0.6)),
+        name="courtyard",
+        scene_box=((-5.7, -5.7, -0.8), (5.7, 5.7, 5.1)),
+        temperature_bounds_c=(-10.0, 40.0),
         surface_temperature_c=temperature_c,
         background_rgb=sky_rgb,
         background_temperature_c=lambda directions: sky_temperature_c(directions, 2.0, 12.0),
         rings=(
             CameraRing((0.0, -0.3, 1.5), 15.0, 1.9, start_deg=-200.0, span_deg=220.0),
-            CameraRing((0.0, 0.0, 0.1), 14.0, 7.2),
-            CameraRing((0.0, 0.0, -0.4), 11.0, 12.6),
+            *rings_around((0.0, 0.0), (0.1, 14.0, 7.2), (-0.4, 11.0, 12.6)),
         ),
         focal_share=0.79,
     )
 
 
-def _scene(
-    *,
-    scene_box: Box,
-    temperature_bounds_c: tuple[float, float],
-    paints: Sequence[Paint],
-    part: Callable[[npt.ArrayLike, npt.ArrayLike], IntArray],
-    texture_seed: int,
-    light: SunLight = SunLight(),  # noqa: B008 - frozen
-    **rest: Any,
-) -> SyntheticScene:
-    """Make a scene whose parts are painted, by default in a room as cold as its coldest surface."""
-    texture, coldest = SolidTexture(scene_box, texture_seed), temperature_bounds_c[0]
+def _plan(*painted: tuple[Any, ...], openings: _Openings = (), recess_m: float = 0.0) -> Plan:
+    """A plan in metres: each paint and the shapes that have it, then openings with panes as far back as `recess_m`."""
+    plan = Plan(np.random.default_rng(0), unit=_PANE_M)
+    for paint, *shapes in painted:
+        number = plan.add_paint(paint)
+        for shape in shapes:
+            plan.put(shape, number)
+    for wall, along, height, degrees_c, paint in openings:
+        plan.recess(wall, along, height, recess_m, plan.add_paint(paint), degrees_c)
+    return plan
 
-    def colour(points: npt.ArrayLike, normals: npt.ArrayLike) -> Float32Array:
-        return painted(points, normals, part(points, normals), paints, texture, light)
 
-    room = {"background_rgb": room_rgb, "background_temperature_c": lambda d: np.full(len(np.asarray(d)), coldest)}
-    return SyntheticScene(
-        scene_box=scene_box, temperature_bounds_c=temperature_bounds_c, colour=colour, **(room | rest)
+def _in_a_room(plan: Plan, *, light: SunLight = SunLight(), **fields: Any) -> SyntheticScene:  # noqa: B008 - frozen
+    """Make a scene, by default in a room as cold as its coldest surface."""
+    room = {
+        "background_rgb": room_rgb,
+        "background_temperature_c": everywhere(fields["temperature_bounds_c"][0]),
+    }
+    return painted_scene(plan, light=light, **(room | fields))
+
+
+def _of_nearest(points: npt.ArrayLike, *bodies: tuple[Any, ...]) -> FloatArray:
+    """Temperatures (n,) at points (n, 3) of the nearest body; a body is its temperatures (n,) and its shapes."""
+    far = [np.min([distance_to(shape, points) for shape in shapes], axis=0) for _, *shapes in bodies]
+    return np.choose(np.argmin(far, axis=0), [degrees for degrees, *_ in bodies])
+
+
+_ROOM_C, _AIR_C, _SKY_DROP_K = 20.0, 4.0, 25.0
+
+
+def wall_object() -> SyntheticScene:
+    """Build an object of a few connected shapes on a small stand, before a plain grey wall.
+
+    The object is textured and 22 to 45 C warm, the wall and the room are 20 C; cameras stand in a half ring in front.
+    """
+    plan = Plan(np.random.default_rng(5))
+    stand, body, arm, metal = (
+        plan.add_paint(Paint(base, 0.28))
+        for base in ((0.50, 0.42, 0.34), (0.66, 0.40, 0.28), (0.36, 0.50, 0.58), (0.70, 0.60, 0.32))
+    )
+    trunk: Box = ((-24.0, -10.0, 20.0), (12.0, 10.0, 52.0))
+    plan.put(((-28.0, -20.0, 0.0), (34.0, 20.0, 8.0)), stand, 0.0)
+    plan.put(((-14.0, -12.0, 8.0), (10.0, 12.0, 20.0)), stand, 0.2)
+    plan.put(trunk, body, 0.6)
+    plan.put(((12.0, -6.0, 34.0), (32.0, 6.0, 44.0)), arm, 0.4)
+    plan.put(Cylinder((22.0, 0.0, 53.0 + HAIR), 9.0, 16.0, 1), metal, 1.0)
+    plan.put(Cylinder((-8.0, 0.0, 59.0 + HAIR), 7.0, 14.0, 2), arm, 0.5)
+    plan.put(Sphere((-8.0, 0.0, 77.0 + 2.0 * HAIR), 11.0), metal, 0.9)
+    plan.spot(trunk, 1.0, 14.0)
+    paint = Paint((0.55, 0.55, 0.55), 0.0)
+    scene = warm_scene(
+        plan.scaled(0.012),
+        texture_seed=23,
+        light=SunLight((0.3, -0.8, 0.6), ambient=0.7),
+        surface_c=(_ROOM_C + 2.0, 45.0),
+        name="wall-object",
+        temperature_bounds_c=(_ROOM_C, 45.0),
+        background_rgb=plain(paint.base),
+        background_temperature_c=everywhere(_ROOM_C),
+        rings=rings_around(
+            (0.04, 0.0), (0.52, 1.75, 0.25), (0.52, 1.85, 0.8), (0.5, 1.65, 1.45), start_deg=-160.0, span_deg=140.0
+        ),
+        focal_share=0.98,
+    )
+    # A large upright wall behind, of the air's temperature; what is seen past its edges has its colour too.
+    behind_m, half_m = 0.7, 25.0
+    wall = Plan(np.random.default_rng(0), paints=[paint])
+    wall.put(((-half_m, behind_m, -half_m), (half_m, behind_m + 0.1, half_m)), 0)
+    scene = surrounded(scene, wall, seed=0, range_k=0.0)
+    assert scene.around is not None
+    seen = scene.around.colour([[0.0, behind_m, 0.0]], [[0.0, -1.0, 0.0]])[0]
+    return dataclasses.replace(scene, background_rgb=plain(seen.tolist()))
+
+
+def facade() -> SyntheticScene:
+    """Build one front of a house, textured, with windows, ledges, a door and a strip of ground, under a plain sky.
+
+    Cameras walk along in front of it; none stands behind.
+    """
+    return _front("facade", Paint((0.70, 0.60, 0.46), 0.25), mirror=0.0, sky=(0.62, 0.72, 0.84), railing=False)
+
+
+def street() -> SyntheticScene:
+    """Build a front of plain plaster with mirroring panes and a balcony with a railing of 2 cm bars, in a street.
+
+    Textured houses stand opposite, behind the cameras, and farther away beside the front; panes show them mirrored.
+    """
+    scene = _front("street", Paint((0.80, 0.76, 0.68), 0.0), mirror=0.6, sky=None, railing=True)
+    return with_street(scene, seed=1)
+
+
+def _front(name: str, wall: Paint, mirror: float, sky: Vector | None, railing: bool) -> SyntheticScene:
+    """Build a front of 10.4 x 7.6 m, in decimetres, and walk past it in three lines of cameras."""
+    plan = Plan(np.random.default_rng(8))
+    glass_paint = Paint((0.22, 0.30, 0.40), 0.0 if railing else 0.16, mirror)
+    ground_paint, stone_paint = Paint((0.46, 0.45, 0.42), 0.26), Paint((0.58, 0.55, 0.50), 0.22)
+    paints = (
+        wall,
+        ground_paint,
+        stone_paint,
+        glass_paint,
+        Paint((0.42, 0.24, 0.16), 0.2),
+        Paint((0.30, 0.32, 0.34), 0.1),
+    )
+    plaster, ground, stone, glass, door, metal = map(plan.add_paint, paints)
+    plan.put(((-60.0, -32.0, -4.0), (60.0, 14.0, 0.0)), ground, 0.0)
+    plan.put(((-52.0, 0.0, 0.0), (52.0, 14.0, 76.0)), plaster, 0.35)
+    for out, low, high in ((3.5, 0.0, 7.0), (5.0, 71.0, 76.0), (3.2, 36.0, 40.0)):
+        plan.put(((-52.0, -out, low), (52.0, 0.0, high)), stone, 0.2)
+    for column in range(5):
+        for low in (12.0, 46.0):
+            x = -40.0 + 20.0 * column
+            if (column, low) == (2, 12.0):
+                plan.recess((1, -1, 0.0), (-7.0, 7.0), (7.0, 31.0), 3.5, door, 0.6)
+                continue
+            plan.recess((1, -1, 0.0), (x - 6.0, x + 6.0), (low, low + 18.0), 3.5, glass, 0.7 + 0.05 * column)
+            if not railing:
+                plan.put(((x - 8.0, -3.2, low - 3.2), (x + 8.0, 0.0, low)), stone, 0.25)
+    if railing:
+        _balcony(plan, stone, metal)
+    return warm_scene(
+        plan.scaled(0.1),
+        texture_seed=29,
+        light=SunLight((0.4, -0.7, 0.6)),
+        surface_c=(_AIR_C, 18.0),
+        name=name,
+        temperature_bounds_c=(_AIR_C - _SKY_DROP_K, 18.0),
+        background_rgb=sky_rgb if sky is None else plain(sky),
+        background_temperature_c=lambda directions: sky_temperature_c(directions, _AIR_C, _SKY_DROP_K),
+        rings=tuple(
+            CameraWalk(((-x, y, z), (x, y, z)), ((-aim, 0.0, 3.4), (aim, 0.0, 3.4)))
+            for x, y, z, aim in ((6.5, -12.0, 1.7, 1.0), (7.5, -11.0, 4.2, 2.0), (5.0, -9.5, 2.6, 2.8))
+        ),
+        focal_share=0.8,
     )
 
 
-def _nearest(points: npt.ArrayLike, bodies: Sequence[Sequence[Box | Solid]]) -> IntArray:
-    """Number of the body, made of boxes or solids, that is nearest to each point (n, 3), shape (n,)."""
-    distances = [
-        np.min(
-            [
-                distance_to_box(points, *one) if isinstance(one, tuple) else np.maximum(one.signed_distance(points), 0)
-                for one in body
-            ],
-            axis=0,
-        )
-        for body in bodies
-    ]
-    return np.argmin(distances, axis=0)
-
-
-def _last_of(painted_boxes: Sequence[tuple[Box, int]]) -> Callable[[npt.ArrayLike, npt.ArrayLike], IntArray]:
-    """The paint of the last box that holds the point just below a surface, (points, normals) to (n,); 0 where none."""
-
-    def part(points: npt.ArrayLike, normals: npt.ArrayLike) -> IntArray:
-        inner = np.asarray(points) - 1e-4 * np.asarray(normals)
-        number = np.zeros(len(inner), dtype=np.int64)
-        for (lo, hi), paint in painted_boxes:
-            number[np.all((inner > lo) & (inner < hi), axis=1)] = paint
-        return number
-
-    return part
-
-
-def _recesses(openings: Sequence[tuple[Any, ...]], depth_m: float) -> tuple[list[Box], list[Box]]:
-    """Boxes cut out of walls for openings, and the boxes of the panes, 0.1 m thick, behind them."""
-    cut, panes = [], []
-    for axis, sign, plane, along, height, *_ in openings:
-        back = plane - sign * depth_m
-        cut.append(box_beside(axis, (plane, back), along, height))
-        panes.append(box_beside(axis, (back, back - sign * 0.1), along, height))
-    return cut, panes
+def _balcony(plan: Plan, stone: int, metal: int) -> None:
+    """A slab over the door with bars 2 cm thick, 12 cm apart, and a rail on top of them [decimetres]."""
+    x, out, low, top, thick = 18.0, 13.0, 39.0, 50.0, 0.2
+    plan.put(((-x, -out, low - 3.0), (x, 0.0, low)), stone, 0.3)
+    across, along = np.arange(-x + 0.2, x - 0.2, 1.2).tolist(), np.arange(-out + 1.4, -1.0, 1.2).tolist()
+    rails: list[Box] = [((-x, -out, top), (x, -out + thick, top + 0.4))]
+    bars = [(at, -out) for at in across] + [(side, at) for side in (-x, x - thick) for at in along]
+    rails += [((side, -out, top), (side + thick, 0.0, top + 0.4)) for side in (-x, x - thick)]
+    for box in rails + [((bx, by, low), (bx + thick, by + thick, top)) for bx, by in bars]:
+        plan.put(box, metal, 0.1)

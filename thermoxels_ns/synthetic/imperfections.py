@@ -7,10 +7,9 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import check_ranges
-
-FloatArray = npt.NDArray[np.float64]
 
 _NOISE_SIGMAS = 6.0  # Noise that thermal files leave room for
 _PASSER_BY = ((0.09, 0.03, 0.03), 31.0)  # Colour and temperature, [degrees Celsius], of somebody in dark clothes
@@ -32,16 +31,14 @@ class Imperfections:
     jpeg_quality: int = 92
     """Quality of JPEG files, 1 to 95."""
     motion_blur_px: float = 0.0
-    """Length of the line that each point of the photographs draws while the shutter is open, [pixels], in a direction
-    of its own in each."""
+    """Length of the line, in a direction of its own in each photograph, along which pixels are blurred, [pixels]."""
     rolling_shutter_px: float = 0.0
     """How far the photograph moves between its first and its last row, [pixels]; the pose is that of the middle row."""
     pose_error_deg: float = 0.0
     """Standard deviation of the angle, about each axis, by which the poses given are turned, [degrees]; they are also
     moved, by as much as that turn moves what the scene's middle shows."""
     pose_correlation: float = 0.0
-    """Share of a pose's error that the next photograph has too, below 1: 0 for poses found one by one, 0.95 for those
-    of a walk."""
+    """Share of a pose's error that the next photograph has too, below 1: 0.95 for a walk."""
     focal_error: float = 0.0
     """How much longer the focal length given is than the true one, relative."""
     noise_k: float = 0.0
@@ -74,144 +71,121 @@ class Imperfections:
         limits |= {"jpeg_quality": (1, 95, "from 1 to 95"), "white_balance": (0.0, 0.3, "from 0 to 0.3")}
         check_ranges("--", {name: (getattr(self, name), *limit) for name, limit in limits.items()})
 
-    def times(self, factor: float) -> Imperfections:
-        """The same flaws, so many times as large; shares, counts of pixels that are dead and JPEG stay."""
-        same = ("jpeg_quality", "pose_correlation", "dead_pixels", "passers_by")
-        return replace(self, **{f.name: factor * getattr(self, f.name) for f in fields(self) if f.name not in same})
-
 
 PERFECT = Imperfections()
 
 
-@dataclass(frozen=True, eq=False)
 class DrawnFlaws:
-    """What was drawn for the photographs of one scene: the truth that corrections are to find."""
+    """What was drawn for the photographs of one scene: the truth that corrections are to find.
 
-    flaws: Imperfections
-    seed: int
-    gains: FloatArray  # Of each photograph and channel, (photographs, 3)
-    drifts_k: FloatArray  # Offset of each thermal image, (photographs,)
-    turns_rad: FloatArray  # Turn of each pose given about its camera's axes, (photographs, 3)
-    moves: FloatArray  # Move of each camera's centre given, [m], (photographs, 3)
-    rig_turn_rad: FloatArray  # The same turn of all thermal cameras, (3,)
-    passing: npt.NDArray[np.bool_]  # Pairs in which somebody walks by, (photographs,)
-    range_c: tuple[float, float]  # Between which dead thermal pixels read, [degrees Celsius]
+    Args:
+        flaws: How large the flaws are.
+        seed: Seed of all that is drawn.
+        poses: True poses of the photographs (n, 4, 4), camera to world.
+        middle: Middle of the scene (3,) [m], by whose distance poses are moved.
+        range_c: Between which dead thermal pixels read [degrees Celsius].
+    """
 
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         flaws: Imperfections,
         seed: int,
         poses: FloatArray,
         middle: npt.ArrayLike,
         range_c: tuple[float, float],
-    ) -> DrawnFlaws:
-        """Draw the flaws of photographs from true camera poses (n, 4, 4) of a scene around `middle` (3,), [m]."""
-        count = len(poses)
-
-        def normal(stream: int, *shape: int) -> FloatArray:
-            return np.random.default_rng([seed, stream]).standard_normal(shape)
-
-        gains = 2.0 ** (flaws.exposure_stops * normal(2, count, 1)) * (1.0 + flaws.white_balance * normal(3, count, 3))
-        errors = normal(4, count, 6)
-        keep = flaws.pose_correlation
+    ):
+        self.flaws, self._seed, self._poses, self._range_c = flaws, seed, poses, range_c
+        count, keep = len(poses), flaws.pose_correlation
+        stops, balance = self._normal(count, 1, stream=2), self._normal(count, 3, stream=3)
+        self.gains = 2.0 ** (flaws.exposure_stops * stops) * (1.0 + flaws.white_balance * balance)  # (n, 3)
+        self.drifts_k = flaws.drift_k * np.random.default_rng([seed, 0]).standard_normal(count)
+        errors = self._normal(count, 6, stream=4)
         for number in range(1, count):
             errors[number] = keep * errors[number - 1] + np.sqrt(1.0 - keep * keep) * errors[number]
         errors *= np.deg2rad(flaws.pose_error_deg)
         far = np.linalg.norm(poses[:, :3, 3] - np.asarray(middle, dtype=np.float64), axis=1)
-        return cls(
-            flaws,
-            seed,
-            gains,
-            flaws.drift_k * np.random.default_rng([seed, 0]).standard_normal(count),
-            errors[:, :3],
-            errors[:, 3:] * far[:, None],
-            np.deg2rad(flaws.rig_error_deg) * normal(5, 3),
-            np.random.default_rng([seed, 6]).random(count) < flaws.passers_by,
-            range_c,
-        )
+        self.turns_rad, self._moves = errors[:, :3], errors[:, 3:] * far[:, None]  # about, and along, each axis
+        self._rig_turn_rad = np.deg2rad(flaws.rig_error_deg) * self._normal(3, stream=5)
+        self._passing: BoolArray = np.random.default_rng([seed, 6]).random(count) < flaws.passers_by
 
-    def given_poses(self, poses: FloatArray) -> FloatArray:
-        """The poses (n, 4, 4) that a scene folder gives for true ones (n, 4, 4)."""
-        from scipy.spatial.transform import Rotation  # not loaded by --help
+    def _normal(self, *shape: int, stream: int, number: int | None = None) -> FloatArray:
+        """Normal deviates of a stream, of one photograph of it or of all."""
+        return np.random.default_rng(
+            [self._seed, stream] if number is None else [self._seed, stream, number]
+        ).standard_normal(shape)
 
-        given = poses.copy()
-        given[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(self.turns_rad).as_matrix()
-        given[:, :3, 3] += self.moves
+    def given_poses(self) -> FloatArray:
+        """The poses (n, 4, 4) that a scene folder gives in place of the true ones."""
+        given = self._poses.copy()
+        given[:, :3, :3] = given[:, :3, :3] @ _turned(self.turns_rad)
+        given[:, :3, 3] += self._moves
         return given
 
-    @property
     def given_rig_turn(self) -> FloatArray:
-        """By what (4, 4) all poses of a thermal camera of its own are turned."""
-        from scipy.spatial.transform import Rotation  # not loaded by --help
-
+        """Transform (4, 4) by which all poses of a thermal camera of its own are turned."""
         turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_rotvec(self.rig_turn_rad).as_matrix()
+        turn[:3, :3] = _turned(self._rig_turn_rad)
         return turn
 
-    @property
-    def added_k(self) -> tuple[float, float]:
-        """By how much thermal images read less and more than the scene has, at most, [K]."""
+    def bounds_c(self, lowest_c: float, highest_c: float) -> tuple[float, float]:
+        """Lowest and highest reading [degrees Celsius] of thermal images of a scene with these temperatures."""
         flaws = self.flaws
         margin = _NOISE_SIGMAS * float(np.hypot(flaws.noise_k, flaws.fixed_pattern_k))
         low = min(float(self.drifts_k.min()), 0.0) - margin - flaws.thermal_vignetting_k
-        return low, max(float(self.drifts_k.max()), 0.0) + margin
+        return lowest_c + low, highest_c + (max(float(self.drifts_k.max()), 0.0) + margin)
 
     def given_camera(self, camera: Camera) -> Camera:
         """The intrinsics that a scene folder gives."""
         stretch = 1.0 + self.flaws.focal_error
         return replace(camera, fl_x=stretch * camera.fl_x, fl_y=stretch * camera.fl_y)
 
-    def photograph(self, number: int, rgb: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    def photograph(self, number: int, rgb: Float32Array) -> npt.NDArray[np.uint8]:
         """What the camera stores of a view (h, w, 3) in [0, 1]: counts (h, w, 3)."""
-        flaws, draw = self.flaws, np.random.default_rng([self.seed, 7, number])
+        flaws, draw = self.flaws, np.random.default_rng([self._seed, 7, number])
         angle, side, place = draw.uniform(0.0, 2.0 * np.pi), draw.random(), draw.random()
         seen = rgb.astype(np.float64)
-        if self.passing[number]:
+        if self._passing[number]:
             seen[_passer_by(seen.shape[:2], place)] = _PASSER_BY[0]
         if flaws.rolling_shutter_px > 0.0:
             seen = _sheared(seen, flaws.rolling_shutter_px * (1.0 if side < 0.5 else -1.0))
         if flaws.motion_blur_px > 0.0:
             seen = _moved_along(seen, flaws.motion_blur_px, angle)
-        if flaws.vignetting > 0.0:
-            seen *= 1.0 - flaws.vignetting * _corner_distance(seen.shape[:2])[..., None] ** 2
-        counts = 255.0 * seen * self.gains[number]
-        if flaws.noise_counts > 0.0:
-            counts += flaws.noise_counts * draw.standard_normal(counts.shape)
+        seen *= 1.0 - flaws.vignetting * _corner_distance(seen.shape[:2])[..., None] ** 2
+        counts = 255.0 * seen * self.gains[number] + flaws.noise_counts * draw.standard_normal(seen.shape)
         return np.clip(np.round(counts), 0, 255).astype(np.uint8)
 
     def thermogram(self, number: int, temperature_c: FloatArray) -> FloatArray:
         """What the thermal camera reads of true apparent temperatures (h, w), [degrees Celsius]."""
         from scipy import ndimage
 
-        flaws, shape = self.flaws, temperature_c.shape
-        seen = temperature_c.copy()
-        if self.passing[number]:
-            seen[_passer_by(shape, np.random.default_rng([self.seed, 7, number]).random(3)[2])] = _PASSER_BY[1]
-        if flaws.thermal_blur_px > 0.0:
-            seen = ndimage.gaussian_filter(seen, flaws.thermal_blur_px, mode="nearest")
-        seen += self.drifts_k[number]
-        if flaws.thermal_vignetting_k > 0.0:
-            seen -= flaws.thermal_vignetting_k * _corner_distance(shape) ** 2
-        if flaws.noise_k > 0.0:
-            seen += flaws.noise_k * np.random.default_rng([self.seed, 1, number]).standard_normal(shape)
-        if flaws.fixed_pattern_k > 0.0:
-            seen += flaws.fixed_pattern_k * np.random.default_rng([self.seed, 8]).standard_normal(shape)
-        if flaws.dead_pixels > 0.0:
-            draw = np.random.default_rng([self.seed, 9])
-            seen = np.where(draw.random(shape) < flaws.dead_pixels, draw.uniform(*self.range_c, shape), seen)
-        return seen
+        flaws, shape, seen = self.flaws, temperature_c.shape, temperature_c.copy()
+        if self._passing[number]:
+            place = np.random.default_rng([self._seed, 7, number]).random(3)[2]
+            seen[_passer_by(shape, place)] = _PASSER_BY[1]
+        seen = ndimage.gaussian_filter(seen, flaws.thermal_blur_px, mode="nearest") + self.drifts_k[number]
+        seen -= flaws.thermal_vignetting_k * _corner_distance(shape) ** 2
+        seen += flaws.noise_k * self._normal(*shape, stream=1, number=number)
+        seen += flaws.fixed_pattern_k * self._normal(*shape, stream=8)
+        draw = np.random.default_rng([self._seed, 9])
+        return np.where(draw.random(shape) < flaws.dead_pixels, draw.uniform(*self._range_c, shape), seen)
 
-    def truth(self, poses: FloatArray) -> dict[str, object]:
-        """What ``truth.json`` says of it; `poses` (n, 4, 4) are the true ones."""
+    def truth(self) -> dict[str, object]:
+        """What ``truth.json`` says of the flaws."""
         return {
             "imperfections": vars(self.flaws),
             "gains": self.gains.tolist(),
             "drift_k": self.drifts_k.tolist(),
-            "rig_turn_deg": np.rad2deg(self.rig_turn_rad).tolist(),
-            "passers_by": np.flatnonzero(self.passing).tolist(),
-            "poses": poses.tolist(),
+            "rig_turn_deg": np.rad2deg(self._rig_turn_rad).tolist(),
+            "passers_by": np.flatnonzero(self._passing).tolist(),
+            "poses": self._poses.tolist(),
         }
+
+
+def _turned(rotation_vectors: FloatArray) -> FloatArray:
+    """Matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    from scipy.spatial.transform import Rotation  # not loaded by --help
+
+    return Rotation.from_rotvec(rotation_vectors).as_matrix()
 
 
 def _corner_distance(shape: tuple[int, ...]) -> FloatArray:
@@ -220,7 +194,7 @@ def _corner_distance(shape: tuple[int, ...]) -> FloatArray:
     return np.sqrt(0.5 * (y[:, None] ** 2 + x**2))
 
 
-def _passer_by(shape: tuple[int, ...], place: float) -> npt.NDArray[np.bool_]:
+def _passer_by(shape: tuple[int, ...], place: float) -> BoolArray:
     """Pixels (h, w) of somebody who walks by at a share of the width: an upright ellipse."""
     height, width = shape
     rows, columns = np.mgrid[:height, :width] + 0.5

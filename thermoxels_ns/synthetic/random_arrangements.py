@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from thermoxels_ns.synthetic.random_plan import HAIR, SMALLEST, WIDEST, Plan, Range
+from thermoxels_ns.synthetic.random_plan import HAIR, SMALLEST, WIDEST, Plan, Range, Wall
 from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, box_beside
 
-Wall = tuple[int, int, float]
-
-_CORNER = 8.5
-_PIER = 3.6
-_OPENING = 6.0
-_LEDGE = 3.2
-_RIDGE = 13.0
-_AISLE = 4.0
+_CORNER = 8.5  # least wall between the corner of a house and an opening [voxels of the plan], as all lengths here
+_PIER = 3.6  # least wall beside an opening
+_OPENING = 6.0  # least side of an opening
+_LEDGE = 3.2  # least roof beside a chimney
+_RIDGE = 13.0  # least width of a roof's last step
+_AISLE = 4.0  # half the least gap between machines
 
 
 def detached_house(plan: Plan) -> None:
@@ -22,7 +20,7 @@ def detached_house(plan: Plan) -> None:
     u = plan.u
     ground, wall, roof, stone, glass = (plan.paint(m) for m in ("ground", "wall", "roof", "stone", "glass"))
     size_x, size_y = u(104, WIDEST), u(94, 112)
-    plan.put(_slab(size_x, size_y, u(4, 7)), ground, u(0.0, 0.15))
+    _put_ground(plan, size_x, size_y, 7, ground, 0.15)
     width, depth, high = u(56, 68), u(40, 50), u(36, 48)
     side, out = int(plan.draw.integers(4)), u(14, 20)
     axis, sign = side // 2, 1 if side % 2 else -1
@@ -31,8 +29,7 @@ def detached_house(plan: Plan) -> None:
     lo = (shift[0] - 0.5 * width, shift[1] - 0.5 * depth)
     hi = (shift[0] + 0.5 * width, shift[1] + 0.5 * depth)
     body: Box = ((*lo, 0.0), (*hi, high))
-    warm = u(0.25, 0.45)
-    plan.put(body, wall, warm)
+    plan.put(body, wall, u(0.25, 0.45))
     plinth = u(6, 9)
     plan.put(_grown((*lo, 0.0), (*hi, plinth), u(SMALLEST, 4.5)), stone, u(0.15, 0.5))
     (ridge_x0, ridge_y0, _), (ridge_x1, ridge_y1, top) = _stepped_roof(plan, body, roof)
@@ -44,21 +41,19 @@ def detached_house(plan: Plan) -> None:
     length = (depth, width)[axis]
     along = u(16, length - 18)
     middle = shift[1 - axis] + u(-1, 1) * max(0.5 * (length - along) - 9.5, 0.0)
-    plane = (lo, hi)[sign > 0][axis]
-    annex_wall: Wall = (axis, sign, plane + sign * out)
-    annex_high = u(0.45, 0.62) * high
-    annex = _against((axis, sign, plane), out, (middle - 0.5 * along, middle + 0.5 * along), (0.0, annex_high))
+    plane, annex_high = (lo, hi)[sign > 0][axis], u(0.45, 0.62) * high
+    stretch = (middle - 0.5 * along, middle + 0.5 * along)
+    annex = _against((axis, sign, plane), out, stretch, (0.0, annex_high))
     plan.put(annex, plan.paint("wall"), u(0.15, 0.6))
     eaves = u(SMALLEST, 4.5)
-    beside = (middle - 0.5 * along - eaves, middle + 0.5 * along + eaves)
+    beside = (stretch[0] - eaves, stretch[1] + eaves)
     cover = _against((axis, sign, plane), out + eaves, beside, (annex_high, annex_high + u(3.4, 5)))
     plan.put(cover, roof if plan.chance(0.5) else plan.paint("roof"), u(0.05, 0.3))
-    _windows(plan, annex_wall, (middle - 0.5 * along, middle + 0.5 * along), (4.0, annex_high - 4.0), glass)
+    _windows(plan, (axis, sign, plane + sign * out), stretch, (4.0, annex_high - 4.0), glass)
     for other in range(4):
         if other != side:
             a, s = other // 2, 1 if other % 2 else -1
-            face: Wall = (a, s, (lo, hi)[s > 0][a])
-            _windows(plan, face, (lo[1 - a], hi[1 - a]), (plinth + 4.0, high - 4.0), glass)
+            _windows(plan, (a, s, (lo, hi)[s > 0][a]), (lo[1 - a], hi[1 - a]), (plinth + 4.0, high - 4.0), glass)
     _spots(plan, (body, annex), high)
 
 
@@ -67,7 +62,7 @@ def wings(plan: Plan) -> None:
     u = plan.u
     ground, wall, roof, stone, glass = (plan.paint(m) for m in ("ground", "wall", "roof", "stone", "glass"))
     size_x, size_y = u(106, WIDEST), u(102, WIDEST)
-    plan.put(_slab(size_x, size_y, u(4, 6)), ground, u(0.0, 0.15))
+    _put_ground(plan, size_x, size_y, 6, ground, 0.15)
     width, depth, high = u(64, 78), u(20, 26), u(34, 46)
     reach, wing = u(26, 38), u(19, 25)
     left, right, back = -0.5 * width, 0.5 * width, 0.5 * (depth + reach)
@@ -100,25 +95,22 @@ def wings(plan: Plan) -> None:
                 plan.put(edges[edge], roof, u(0.05, 0.25))
 
     middle, half, out, floor = u(-0.2, 0.2) * width, 0.5 * u(20, 32), u(9, 13), u(0.45, 0.55) * high
-    thick, rise = u(SMALLEST, 4.2), u(4, 6)
-    paint, warm = stone, u(0.1, 0.4)
-    far = back + out
-    plan.put(((middle - half, back, floor), (middle + half, far, floor + thick)), paint, warm)
+    thick, rise, warm, far = u(SMALLEST, 4.2), u(4, 6), u(0.1, 0.4), back + out
+    plan.put(((middle - half, back, floor), (middle + half, far, floor + thick)), stone, warm)
     for x0, x1, y0 in (
         (middle - half, middle + half, far - SMALLEST),
         (middle - half, middle - half + SMALLEST, back),
         (middle + half - SMALLEST, middle + half, back),
     ):
-        plan.put(((x0, y0, floor), (x1, far, floor + thick + rise)), paint, warm)
+        plan.put(((x0, y0, floor), (x1, far, floor + thick + rise)), stone, warm)
     behind: Wall = (1, 1, back)
     door = u(4, 6)
     plan.recess(behind, (middle - door, middle + door), (floor + thick, high - 5.0), u(SMALLEST, 4.2), glass, u(0.7, 1))
     _windows(plan, behind, (left, right), (4.0, floor - 3.6), glass)
 
     jut, from_z = u(8, 13), max(0.5 * low, 9.0)
-    outer: Wall = (0, -1, left)
     span = (front + 5.0, front + 5.0 + u(16, reach - 6))
-    storey = _against(outer, jut, span, (from_z, low - 4.0))
+    storey = _against((0, -1, left), jut, span, (from_z, low - 4.0))
     plan.put(storey, plan.paint("wall"), u(0.25, 0.6))
     if plan.chance(0.5):
         post = u(3.3, 5)
@@ -128,8 +120,7 @@ def wings(plan: Plan) -> None:
     _windows(plan, (0, 1, left + wing), (front, inner + 3.0), (4.0, low - 4.0), glass)
     _windows(plan, (1, -1, front), (left, left + wing), (4.0, low - 4.0), glass)
 
-    y = front - u(9, 13)
-    x = u(-0.42, -0.1) * size_x
+    y, x = front - u(9, 13), u(-0.42, -0.1) * size_x
     garden: Box = ((x, y, 0.0), (x + u(34, 0.46 * size_x - x), y + u(SMALLEST, 4.0), u(12, 22)))
     plan.put(garden, plan.paint("stone"), u(0.1, 0.5))
     _spots(plan, (main, storey, garden), high)
@@ -149,12 +140,10 @@ def facade(plan: Plan) -> None:
     plan.put(((-half_x, -jut, high - crown), (half_x, 0.0, high)), stone, u(0.05, 0.3))
     if plan.chance(0.5):
         plan.put(((-half_x, -u(SMALLEST, 4), 0.0), (half_x, 0.0, plinth)), stone, u(0.2, 0.5))
-    face: Wall = (1, -1, 0.0)
     columns, rows = int(plan.draw.integers(3, 5)), int(plan.draw.integers(2, 4))
     sill, tall = u(SMALLEST, 4.5), u(SMALLEST, 4.0)
-    stretch = (-half_x + 3.0, half_x - 3.0)
-    rise = (plinth + 6.0, high - crown - 1.0)
-    for (x0, x1), (z0, _) in _windows(plan, face, stretch, rise, glass, columns, rows, 5.2):
+    stretch, rise = (-half_x + 3.0, half_x - 3.0), (plinth + 6.0, high - crown - 1.0)
+    for (x0, x1), (z0, _) in _windows(plan, (1, -1, 0.0), stretch, rise, glass, columns, rows, 5.2):
         plan.put(((x0 - 3.2, -sill, z0 - tall), (x1 + 3.2, 0.0, z0)), stone, u(0.15, 0.5))
     if plan.chance(0.5):
         x, broad, tread, step = u(-0.6, 0.3) * half_x, u(14, 22), u(4, 5.5), u(SMALLEST, 3.9)
@@ -242,9 +231,11 @@ def _spots(plan: Plan, boxes: tuple[Box, ...], high: float) -> None:
     plan.spot(boxes[0], plan.u(0.1, 0.2), plan.u(0.2, 0.5) * high)
 
 
-def _slab(size_x: float, size_y: float, thick: float) -> Box:
-    """Ground below z = 0."""
-    return (-0.5 * size_x, -0.5 * size_y, -thick), (0.5 * size_x, 0.5 * size_y, 0.0)
+def _put_ground(plan: Plan, size_x: float, size_y: float, thickest: float, paint: int | None, warmest: float) -> None:
+    """Put a slab below z = 0 that is between 4 and `thickest` voxels thick."""
+    half_x, half_y, thick = 0.5 * size_x, 0.5 * size_y, plan.u(4, thickest)
+    paint = plan.paint("ground") if paint is None else paint
+    plan.put(((-half_x, -half_y, -thick), (half_x, half_y, 0.0)), paint, plan.u(0.0, warmest))
 
 
 def _grown(lo: tuple[float, float, float], hi: tuple[float, float, float], by: float) -> Box:
@@ -262,7 +253,7 @@ def machinery(plan: Plan) -> None:
     """Tanks, drums, balls, blocks and frames on a floor slab, at least one of each."""
     u = plan.u
     size_x, size_y = u(102, WIDEST), u(84, 108)
-    _floor(plan, size_x, size_y, 0.2)
+    _put_ground(plan, size_x, size_y, 6, None, 0.2)
     kinds: list[Callable[[Plan, Range, Range], None]] = [_tank, _drum, _ball, _block, _frame]
     kinds.append(kinds[int(plan.draw.integers(len(kinds)))])
     if plan.chance(0.3):
@@ -278,7 +269,7 @@ def pipes_and_radiators(plan: Plan) -> None:
     """A wall on a floor, radiators and standing pipes close to both of its sides, lying pipes on posts before them."""
     u = plan.u
     size_x, size_y = u(102, WIDEST), u(86, 100)
-    _floor(plan, size_x, size_y, 0.15)
+    _put_ground(plan, size_x, size_y, 6, None, 0.15)
     half, thick, high = 0.5 * u(84, size_x - 8.0), u(4, 8), u(56, 76)
     wall: Box = ((-half, -0.5 * thick, 0.0), (half, 0.5 * thick, high))
     plan.put(wall, plan.paint("wall"), u(0.1, 0.35))
@@ -304,35 +295,28 @@ def pipes_and_radiators(plan: Plan) -> None:
             _lying_pipe(plan, sign, plane + reach + 4.0, half, high)
 
 
-def _floor(plan: Plan, size_x: float, size_y: float, warmest: float) -> None:
-    """A slab whose top is at height 0."""
-    lo, hi = (-0.5 * size_x, -0.5 * size_y, -plan.u(4, 6)), (0.5 * size_x, 0.5 * size_y, 0.0)
-    plan.put((lo, hi), plan.paint("ground"), plan.u(0.0, warmest))
-
-
 def _radiator(plan: Plan, sign: int, plane: float, along: Range) -> float:
     """A panel, or columns between two rails, on brackets; returns how far it reaches from the wall's plane."""
     u = plan.u
     gap, thick, low, tall = u(4, 6), u(4, 6), u(6, 12), u(20, 28)
     paint, warm = plan.paint("metal"), u(0.75, 1.0)
-    near, far = sign * (plane + gap), sign * (plane + gap + thick)
-    y0, y1 = min(near, far), max(near, far)
+    near = sign * (plane + gap)
+    across, top = (near, sign * (plane + gap + thick)), low + tall
     if plan.chance(0.5):
-        plan.put(((along[0], y0, low), (along[1], y1, low + tall)), paint, warm)
+        plan.put(box_beside(1, across, along, (low, top)), paint, warm)
     else:
         rail, wide, space = u(3.5, 4.5), u(3.6, 4.8), u(3.3, 4.2)
         count = int((along[1] - along[0] + space) / (wide + space))
-        end = along[0] + count * (wide + space) - space
-        for z in (low, low + tall - rail):
-            plan.put(((along[0], y0, z), (end, y1, z + rail)), paint, warm)
+        along = (along[0], along[0] + count * (wide + space) - space)
+        for z in (low, top - rail):
+            plan.put(box_beside(1, across, along, (z, z + rail)), paint, warm)
         for number in range(count):
             x = along[0] + number * (wide + space)
-            plan.put(((x, y0, low), (x + wide, y1, low + tall)), paint, warm)
-        along = (along[0], end)
+            plan.put(box_beside(1, across, (x, x + wide), (low, top)), paint, warm)
     bracket = u(3.3, 3.6)
-    y0, y1 = min(sign * plane, near), max(sign * plane, near)
     for x in (along[0], along[1] - bracket):
-        plan.put(((x, y0, low + tall - bracket), (x + bracket, y1, low + tall)), paint, u(0.4, 0.6))
+        box = box_beside(1, (sign * plane, near), (x, x + bracket), (top - bracket, top))
+        plan.put(box, paint, u(0.4, 0.6))
     return gap + thick
 
 
@@ -343,16 +327,15 @@ def _lying_pipe(plan: Plan, sign: int, near: float, half: float, high: float) ->
     x, y = u(-1, 1) * (half - 0.5 * length), sign * (near + radius)
     plan.put(Cylinder((x, y, z), radius, length, 0), plan.paint("metal"), u(0.3, 1.0))
     paint, thick = plan.paint("stone"), 0.5 * u(3.4, 4.6)
-    for middle in (x - 0.4 * length, x + 0.4 * length):
-        post: Box = ((middle - thick, y - thick, 0.0), (middle + thick, y + thick, z - radius - HAIR))
-        plan.put(post, paint, u(0.1, 0.3))
+    for at in (x - 0.4 * length, x + 0.4 * length):
+        plan.put(_upright((at, y), (thick, thick), 0.0, z - radius - HAIR), paint, u(0.1, 0.3))
 
 
 def _tank(plan: Plan, middle: Range, half: Range) -> None:
     """An upright cylinder on a foot."""
     u = plan.u
     radius, length, foot = u(7, 0.95 * min(half)), u(22, 48), u(3.4, 6)
-    plan.put(_pillar(middle, 0.55 * radius, foot), plan.paint("stone"), u(0.2, 0.4))
+    plan.put(_upright(middle, (0.55 * radius, 0.55 * radius), 0.0, foot), plan.paint("stone"), u(0.2, 0.4))
     centre = (*middle, foot + HAIR + 0.5 * length)
     plan.put(Cylinder(centre, radius, length, 2), plan.paint("metal"), u(0.4, 1.0))
 
@@ -365,13 +348,9 @@ def _drum(plan: Plan, middle: Range, half: Range) -> None:
     centre = (*middle, saddle + HAIR + radius)
     plan.put(Cylinder(centre, radius, length, axis), plan.paint("metal"), u(0.4, 1.0))
     paint, thick = plan.paint("stone"), u(3.6, 5)
+    sides = (0.5 * thick, 0.5 * radius) if axis == 0 else (0.5 * radius, 0.5 * thick)
     for share in (-0.3, 0.3):
-        at = list(middle)
-        at[axis] += share * length
-        sides = [0.5 * radius] * 2
-        sides[axis] = 0.5 * thick
-        lo, hi = (at[0] - sides[0], at[1] - sides[1], 0.0), (at[0] + sides[0], at[1] + sides[1], saddle)
-        plan.put((lo, hi), paint, u(0.2, 0.5))
+        plan.put(_upright(_moved(middle, axis, share * length), sides, 0.0, saddle), paint, u(0.2, 0.5))
 
 
 def _ball(plan: Plan, middle: Range, half: Range) -> None:
@@ -380,7 +359,7 @@ def _ball(plan: Plan, middle: Range, half: Range) -> None:
     radius, foot = u(8, 0.95 * min(half)), 0.0
     if plan.chance(0.6):
         foot = u(4, 14)
-        plan.put(_pillar(middle, 0.45 * radius, foot), plan.paint("stone"), u(0.2, 0.4))
+        plan.put(_upright(middle, (0.45 * radius, 0.45 * radius), 0.0, foot), plan.paint("stone"), u(0.2, 0.4))
     plan.put(Sphere((*middle, foot + radius), radius), plan.paint("metal"), u(0.4, 1.0))
 
 
@@ -388,12 +367,11 @@ def _block(plan: Plan, middle: Range, half: Range) -> None:
     """A housing with a smaller one on top and a hatch in one of its sides."""
     u = plan.u
     (x, y), sides, high = middle, (u(0.7, 1) * half[0], u(0.7, 1) * half[1]), u(14, 28)
-    body: Box = ((x - sides[0], y - sides[1], 0.0), (x + sides[0], y + sides[1], high))
+    body = _upright(middle, sides, 0.0, high)
     plan.put(body, plan.paint("metal"), u(0.3, 0.7))
-    smaller = tuple(u(0.4, 1.0 - 3.4 / side) * side for side in sides)
+    smaller = (u(0.4, 1.0 - 3.4 / sides[0]) * sides[0], u(0.4, 1.0 - 3.4 / sides[1]) * sides[1])
     dx, dy = (u(-1, 1) * (side - less - SMALLEST) for side, less in zip(sides, smaller))
-    lo, hi = (x + dx - smaller[0], y + dy - smaller[1], high), (x + dx + smaller[0], y + dy + smaller[1], high)
-    plan.put((lo, (hi[0], hi[1], high + u(6, 20))), plan.paint("metal"), u(0.4, 0.9))
+    plan.put(_upright((x + dx, y + dy), smaller, high, high + u(6, 20)), plan.paint("metal"), u(0.4, 0.9))
     axis, sign = int(plan.draw.integers(2)), 1 if plan.chance(0.5) else -1
     across, wide = middle[axis] + sign * sides[axis], 0.5 * sides[1 - axis]
     along = (middle[1 - axis] - wide, middle[1 - axis] + wide)
@@ -406,19 +384,20 @@ def _frame(plan: Plan, middle: Range, half: Range) -> None:
     u = plan.u
     axis = int(plan.draw.integers(2))
     thick, high, beam, reach = u(4.5, 7), u(24, 44), u(4, 6), u(0.75, 1.0) * half[axis]
-    paint = plan.paint("metal")
-    ends = []
+    paint, side = plan.paint("metal"), 0.5 * thick
+    posts = []
     for sign in (-1, 1):
-        at = list(middle)
-        at[axis] += sign * (reach - 0.5 * thick)
-        ends.append(at)
-        plan.put(_pillar((at[0], at[1]), 0.5 * thick, high), paint, u(0.2, 0.7))
-    (x0, y0), (x1, y1) = ends
-    side = 0.5 * thick
-    plan.put(((x0 - side, y0 - side, high), (x1 + side, y1 + side, high + beam)), paint, u(0.3, 0.8))
+        posts.append(_upright(_moved(middle, axis, sign * (reach - side)), (side, side), 0.0, high))
+        plan.put(posts[-1], paint, u(0.2, 0.7))
+    (x0, y0, _), (x1, y1, _) = posts[0][0], posts[1][1]
+    plan.put(((x0, y0, high), (x1, y1, high + beam)), paint, u(0.3, 0.8))
 
 
-def _pillar(middle: Range, half: float, high: float) -> Box:
-    """A square box around a vertical axis."""
-    x, y = middle
-    return (x - half, y - half, 0.0), (x + half, y + half, high)
+def _upright(middle: Range, sides: Range, low: float, high: float) -> Box:
+    """A box around a vertical axis, with half of its sides along x and y."""
+    (x, y), (half_x, half_y) = middle, sides
+    return (x - half_x, y - half_y, low), (x + half_x, y + half_y, high)
+
+
+def _moved(middle: Range, axis: int, by: float) -> Range:
+    return (middle[0] + by, middle[1]) if axis == 0 else (middle[0], middle[1] + by)

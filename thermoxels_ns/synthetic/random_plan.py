@@ -1,8 +1,9 @@
-"""The plan of a random scene: pieces, openings and warm spots, in voxels."""
+"""The plan of a scene: pieces, openings and warm spots, of random scenes in voxels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,7 @@ from thermoxels_ns.synthetic.solids import (
     Box,
     BoxSolid,
     Cylinder,
+    Solid,
     SolidUnion,
     Sphere,
     Vector,
@@ -24,8 +26,10 @@ from thermoxels_ns.synthetic.solids import (
 
 Shape = Box | Sphere | Cylinder
 Range = tuple[float, float]
+Wall = tuple[int, int, float]
+"""The axis that a wall's plane is at right angles to (0 or 1), its outward sign, and the plane's coordinate."""
 
-SMALLEST = 3.1  # lower bound of every thickness, gap and step of a plan [voxels of the plan]
+SMALLEST = 3.1  # lower bound of every thickness, gap and step of a random plan [voxels of the plan]
 WIDEST = 116.0  # upper bound of a plan's extent [voxels of the plan]: with the margins of the scene box it is below 127
 HAIR = 0.002
 """How far a cylinder stays off what carries it [voxels of the plan], since exact solids side by side share no face."""
@@ -64,7 +68,7 @@ class Glow:
 
 @dataclass(eq=False)
 class Plan:
-    """What an arrangement consists of; a point has the paint of the last piece that holds it."""
+    """What a scene consists of; a point has the paint of the last piece that holds it."""
 
     draw: np.random.Generator
     pieces: list[Piece] = field(default_factory=list)
@@ -72,7 +76,7 @@ class Plan:
     removed: list[Box] = field(default_factory=list)  # boxes cut out of all others
     glows: list[Glow] = field(default_factory=list)  # what is warmer, or colder, than the piece it lies on
     paints: list[Paint] = field(default_factory=list)
-    unit: float = 1.0  # length of a voxel of the plan in the unit that the plan is in
+    unit: float = 1.0  # length of a voxel of the plan, as thick as a pane, in the unit that the plan is in
     plain_walls: bool = False  # whether walls that are painted from now on are plain plaster, without texture
     mirror: float = 0.0  # share of light that panes painted from now on reflect as mirrors do
 
@@ -99,23 +103,21 @@ class Plan:
         self.paints.append(paint)
         return len(self.paints) - 1
 
-    def put(self, shape: Shape, paint: int, warmth: float) -> None:
+    def put(self, shape: Shape, paint: int, warmth: float = 0.0) -> None:
         """Add a piece, with a gentle slope of its warmth."""
         lo, hi = bounds_of(shape)
         slope = self.draw.uniform(-0.12, 0.12, 3) / max(float(np.subtract(hi, lo).max()), 1.0)
         self.pieces.append(Piece(shape, paint, warmth, slope))
 
-    def recess(
-        self, wall: tuple[int, int, float], along: Range, height: Range, depth: float, paint: int, warmth: float
-    ) -> None:
+    def recess(self, wall: Wall, along: Range, height: Range, depth: float, paint: int, warmth: float) -> None:
         """Cut an opening, a stretch along a wall and in z, and put a pane as far behind the wall's plane as it is deep.
 
-        The wall is the axis that its plane is at right angles to (0 or 1), its outward sign and its coordinate.
+        The pane's warmth fades into the wall over that depth.
         """
         axis, sign, plane = wall
         back = plane - sign * depth
         self.removed.append(box_beside(axis, (plane, back), along, height))
-        pane = box_beside(axis, (back, back - sign), along, height)
+        pane = box_beside(axis, (back, back - sign * self.unit), along, height)
         self.pieces.append(Piece(pane, paint, warmth, np.zeros(3)))
         self.glows.append(Glow(pane, warmth, depth))
 
@@ -126,38 +128,31 @@ class Plan:
         side = int(self.draw.integers(5))
         axis, upper = (2, True) if side == 4 else (side // 2, bool(side % 2))
         point[axis] = hi[axis] if upper else lo[axis]
-        x, y, z = point.tolist()
-        self.glows.append(Glow(((x, y, z), (x, y, z)), warmth, reach))
+        self.glows.append(Glow(box_between(point, point), warmth, reach))
 
     def scaled(self, factor: float) -> Plan:
-        """The same plan in another unit of length; it shares the source of choices."""
+        """The same plan in another unit of length; it shares the source of choices and the paints."""
 
-        def box(corners: Box) -> Box:
-            return box_between(*(np.array(corners) * factor))
+        def scale(shape: Any) -> Any:
+            if isinstance(shape, tuple):
+                return box_between(*(np.array(shape) * factor))
+            lengths = {name: value * factor for name, value in vars(shape).items() if name in ("radius", "length")}
+            return replace(shape, centre=tuple(c * factor for c in shape.centre), **lengths)
 
-        def shape(old: Shape) -> Shape:
-            if isinstance(old, tuple):
-                return box(old)
-            x, y, z = (c * factor for c in old.centre)
-            if isinstance(old, Sphere):
-                return Sphere((x, y, z), old.radius * factor)
-            return Cylinder((x, y, z), old.radius * factor, old.length * factor, old.axis)
-
-        return Plan(
-            self.draw,
-            [Piece(shape(p.shape), p.paint, p.warmth, p.slope / factor) for p in self.pieces],
-            [box(cut) for cut in self.removed],
-            [Glow(box(glow.core), glow.warmth, glow.reach * factor) for glow in self.glows],
-            list(self.paints),
-            self.unit * factor,
+        return replace(
+            self,
+            pieces=[replace(p, shape=scale(p.shape), slope=p.slope / factor) for p in self.pieces],
+            removed=[scale(cut) for cut in self.removed],
+            glows=[replace(glow, core=scale(glow.core), reach=glow.reach * factor) for glow in self.glows],
+            unit=self.unit * factor,
         )
 
-    def solid(self) -> BoxSolid | SolidUnion:
+    def solid(self) -> Solid:
         """The exact solid: all boxes joined (panes lie within), less what is cut out, beside the round things."""
         boxes = [piece.shape for piece in self.pieces if isinstance(piece.shape, tuple)]
-        round_things = [piece.shape for piece in self.pieces if not isinstance(piece.shape, tuple)]
-        joined = BoxSolid(boxes, self.removed)
-        return SolidUnion((joined, *round_things)) if round_things else joined
+        parts: list[Solid] = [BoxSolid(boxes, self.removed)] if boxes else []
+        parts += [piece.shape for piece in self.pieces if not isinstance(piece.shape, tuple)]
+        return parts[0] if len(parts) == 1 else SolidUnion(tuple(parts))
 
     def part(self, points: npt.ArrayLike, normals: npt.ArrayLike) -> IntArray:
         """Paint of the last piece that holds a point just below the surface: points and normals (n, 3) to (n,)."""
@@ -180,13 +175,17 @@ class Plan:
         touch pass into each other as heat makes them; glows lie over this.
         """
         points = np.asarray(points, dtype=np.float64)
-        far = np.array([_distance(points, piece.shape) for piece in self.pieces])
+        far = np.array([distance_to(piece.shape, points) for piece in self.pieces])
         share = np.exp((far.min(axis=0) - far) / (_BLEND * self.unit))
         own = np.array([p.warmth + (points - np.mean(bounds_of(p.shape), axis=0)) @ p.slope for p in self.pieces])
         warmth = np.einsum("pn,pn->n", share, own) / share.sum(axis=0)
-        for glow in self.glows:
-            fade_towards(warmth, points, glow.core, glow.warmth, glow.reach)
+        self.add_glows(warmth, points)
         return warmth
+
+    def add_glows(self, values: FloatArray, points: FloatArray) -> None:
+        """Blend the glows into warmth, or into temperatures, (n,) at points (n, 3)."""
+        for glow in self.glows:
+            fade_towards(values, points, glow.core, glow.warmth, glow.reach)
 
 
 def bounds_of(shape: Shape) -> Box:
@@ -194,7 +193,8 @@ def bounds_of(shape: Shape) -> Box:
     return shape if isinstance(shape, tuple) else shape.bounds
 
 
-def _distance(points: FloatArray, shape: Shape) -> FloatArray:
+def distance_to(shape: Shape, points: npt.ArrayLike) -> FloatArray:
+    """Distance of points (n, 3) to a shape, 0 inside it."""
     if isinstance(shape, tuple):
         return distance_to_box(points, *shape)
     return np.maximum(shape.signed_distance(points), 0.0)

@@ -1,4 +1,4 @@
-"""Synthetic scenes from a seed, `random-17` and `wild-17`: arrangements that nobody chose."""
+"""Synthetic scenes from a seed, `random-17` and `wild-17`, and streets and rooms around any scene."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.synthetic.appearance import (
     SolidTexture,
     SunLight,
+    everywhere,
     painted,
     plain,
     room_rgb,
@@ -34,58 +33,8 @@ from thermoxels_ns.synthetic.random_arrangements import (
     wings,
 )
 from thermoxels_ns.synthetic.random_plan import Plan, bounds_of
-from thermoxels_ns.synthetic.scene_truth import RgbFunction, SyntheticScene
-from thermoxels_ns.synthetic.solids import Box, box_between
-from thermoxels_ns.synthetic.surroundings import with_room, with_street
-
-_PICTURE_ASPECT = 0.75
-_RIM = 0.95
-_AZIMUTHS = 73
-_AIMS = 9
-_ELEVATIONS_DEG = {2: ((10.0, 20.0), (38.0, 50.0)), 3: ((7.0, 15.0), (24.0, 36.0), (46.0, 60.0))}
-_FARTHEST_SHARE = 1.10
-
-
-def random_rings(
-    draw: np.random.Generator, boxes: Sequence[Box], focal_share: float, arc_deg: tuple[float, float]
-) -> tuple[CameraRing, ...]:
-    """Draw two or three rings, or arcs (begin and length, [degrees]), around boxes [m] that every picture shows.
-
-    The focal length is a share of the width of a 4:3 image. Rings come from the lowest to the highest, at most a tenth
-    farther than the nearest at which all boxes show.
-    """
-    corners = np.array([corner for box in boxes for corner in itertools.product(*zip(*box))], dtype=np.float64)
-    lo, hi = corners.min(axis=0), corners.max(axis=0)
-    middle, aims = 0.5 * (lo + hi), np.linspace(max(lo[2], 0.0), 0.6 * hi[2], _AIMS)
-    elevations = _ELEVATIONS_DEG[3 if draw.random() < 0.75 else 2]
-    rings = []
-    for low, high in elevations:
-        elevation = math.radians(draw.uniform(low, high))
-        aim_z, distance = min(
-            (_nearest(corners - (middle[0], middle[1], aim), elevation, focal_share, arc_deg), round(float(aim), 4))
-            for aim in aims
-        )[::-1]
-        distance *= draw.uniform(1.0, _FARTHEST_SHARE)
-        radius, height = distance * math.cos(elevation), aim_z + distance * math.sin(elevation)
-        aim = (round(float(middle[0]), 4), round(float(middle[1]), 4), aim_z)
-        rings.append(CameraRing(aim, round(radius, 4), round(height, 4), *arc_deg))
-    return tuple(rings)
-
-
-def _nearest(relative: FloatArray, elevation: float, focal_share: float, arc_deg: tuple[float, float]) -> float:
-    """Least distance from the origin at which an arc of cameras that look at it has all points (n, 3) in the picture.
-
-    A point is in it if its distances from the view axis, sideways and upwards, are within the picture's half width and
-    half height at the point's depth: beside <= half (distance - nearer), and likewise above.
-    """
-    azimuth = np.radians(arc_deg[0] + arc_deg[1] * np.linspace(0.0, 1.0, _AZIMUTHS))
-    back = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(_AZIMUTHS, math.tan(elevation))], axis=1)
-    back *= math.cos(elevation)
-    right = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(_AZIMUTHS)], axis=1)
-    beside, above = np.abs(relative @ right.T), np.abs(relative @ np.cross(back, right).T)
-    half = 0.5 * _RIM / focal_share
-    return float((relative @ back.T + np.maximum(beside, above / _PICTURE_ASPECT) / half).max())
-
+from thermoxels_ns.synthetic.scene_truth import Body, DegreesFunction, RgbFunction, SyntheticScene
+from thermoxels_ns.synthetic.solids import Box, Solid, Sphere, box_beside, box_between, distance_to_box
 
 RANDOM_NAMES = ("random-N", "wild-N")
 """How the names of these scenes are written where all names are listed; N is the seed."""
@@ -100,8 +49,7 @@ _SURFACE_SAMPLES = 20_000
 _RANGE_K = (15.0, 60.0)
 
 
-@dataclass(frozen=True)
-class Family:
+class Family(NamedTuple):
     """A kind of arrangement."""
 
     name: str
@@ -125,8 +73,8 @@ FAMILIES = (
 def random_seed(name: str) -> int | None:
     """Seed of a scene's name; None if it is not the name of a random or a wild scene.
 
-    >>> random_seed("random-17"), random_seed("wild-3"), random_seed("random-017"), random_seed("house-corner")
-    (17, 3, None, None)
+    >>> random_seed("random-17"), random_seed("wild-3"), random_seed("random-017")
+    (17, 3, None)
     """
     found = _NAME.fullmatch(name)
     return int(found[1]) if found else None
@@ -138,14 +86,9 @@ def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
     Random scenes have textured walls before smooth gradients. Some wild ones have plain walls, mirroring panes or a
     thin railing; behind a third of them each lie smooth gradients, one plain colour, and a street or a room.
 
-    Raises:
-        SceneError: The seed is below 0.
-
     >>> random_scene(3).name
     'random-3'
     """
-    if seed < 0:
-        raise SceneError("seed", expected="a whole number from 0 on", got=seed, remedy="Pass a seed such as 17.")
     draw = np.random.default_rng([_WILD_STREAM if wild else _STREAM, seed])
     family = FAMILIES[seed % len(FAMILIES)]
     plan = Plan(draw)
@@ -163,15 +106,13 @@ def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
     towards = (float(np.cos(azimuth)), float(np.sin(azimuth)), float(height))
     light = SunLight(towards, ambient=float(draw.uniform(0.5, 0.75)))
     outdoors = draw.random() < family.outdoors
-    background_rgb, background_c, surface_c, bounds_c = _surroundings(draw, outdoors)
+    surface_c, weather = _weather(draw, outdoors)
     focal_share = round(float(draw.uniform(0.78, 1.05)), 3)
     span = 360.0 if family.arc_deg is None else round(float(draw.uniform(*family.arc_deg)), 1)
     start = round(float(draw.uniform(0.0, 360.0)), 1) if family.arc_deg is None else -90.0 - 0.5 * span
     rings = random_rings(draw, [bounds_of(piece.shape) for piece in plan.pieces], focal_share, (start, span))
-    rest: dict[str, Any] = {"background_rgb": background_rgb, "background_temperature_c": background_c}
-    rest |= {"temperature_bounds_c": bounds_c, "rings": rings, "focal_share": focal_share}
     name = f"{'wild' if wild else 'random'}-{seed}"
-    scene = scene_of_plan(name, plan, texture_seed, light, surface_c, **rest)
+    scene = warm_scene(plan, texture_seed, light, surface_c, name=name, rings=rings, focal_share=focal_share, **weather)
     kind = seed % 3  # beside seed % 5 of the families: 15 seeds in a row show every pair
     if not wild or kind == 0:
         return scene
@@ -183,8 +124,8 @@ def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
     return (with_street if outdoors else with_room)(scene, int(draw.integers(2**31)))
 
 
-def scene_of_plan(
-    name: str, plan: Plan, texture_seed: int, light: SunLight, surface_c: tuple[float, float], **rest: Any
+def warm_scene(
+    plan: Plan, texture_seed: int, light: SunLight, surface_c: tuple[float, float], **rest: Any
 ) -> SyntheticScene:
     """Make a scene of a plan in metres, whose warmth becomes temperatures from its coldest to its hottest surface [C].
 
@@ -194,7 +135,6 @@ def scene_of_plan(
     lo, hi = np.asarray(solid.bounds)  # to reconstruct: with a margin of 4 % of the longest side all round
     margin = float((hi - lo).max()) * _MARGIN_SHARE / (1.0 - 2.0 * _MARGIN_SHARE)
     box = box_between(np.round(lo - margin, 3), np.round(hi + margin, 3))
-    texture = SolidTexture(box, seed=texture_seed)
     sampled = plan.warmth(solid.surface_points(_SURFACE_SAMPLES, seed=1)[0])
     coldest, hottest = round(float(sampled.min()), 6), round(float(sampled.max()), 6)
 
@@ -202,33 +142,45 @@ def scene_of_plan(
         share = np.clip((plan.warmth(points) - coldest) / (hottest - coldest), 0.0, 1.0)
         return (1.0 - share) * surface_c[0] + share * surface_c[1]
 
+    return painted_scene(
+        plan, texture_seed, light, solid=solid, scene_box=box, surface_temperature_c=temperature_c, **rest
+    )
+
+
+def painted_scene(
+    plan: Plan, texture_seed: int, light: SunLight, *, scene_box: Box, solid: Solid | None = None, **rest: Any
+) -> SyntheticScene:
+    """Make a scene of a plan in metres, whose paints are textured; the scene's other fields are passed by name."""
+    texture = SolidTexture(scene_box, texture_seed)
     mirrors = np.array([paint.mirror for paint in plan.paints], dtype=np.float32)
-    look = plan.paints, texture, light
     return SyntheticScene(
-        name=name,
-        solid=solid,
-        scene_box=box,
-        colour=lambda points, normals: painted(points, normals, plan.part(points, normals), *look),
-        surface_temperature_c=temperature_c,
+        solid=solid or plan.solid(),
+        scene_box=scene_box,
+        colour=lambda points, normals: painted(
+            points, normals, plan.part(points, normals), plan.paints, texture, light
+        ),
         mirror=(lambda points, normals: mirrors[plan.part(points, normals)]) if mirrors.any() else None,
         **rest,
     )
 
 
-def _surroundings(
-    draw: np.random.Generator, outdoors: bool
-) -> tuple[RgbFunction, Callable[[npt.ArrayLike], FloatArray], tuple[float, float], tuple[float, float]]:
-    """Colour and temperature of what lies behind, the surface's coldest and hottest, and the bounds of it all [C]."""
-    brightness, spread = float(draw.uniform(0.75, 1.0)), _degrees(draw.uniform(*_RANGE_K))
+def _weather(draw: np.random.Generator, outdoors: bool) -> tuple[tuple[float, float], dict[str, Any]]:
+    """The surface's coldest and hottest temperature [C], and the fields of the scene that say what lies behind."""
+    brightness, spread = np.float32(draw.uniform(0.75, 1.0)), _degrees(draw.uniform(*_RANGE_K))
+    behind: RgbFunction = sky_rgb if outdoors else room_rgb
     if outdoors:
         air, drop = _degrees(draw.uniform(-10.0, 18.0)), _degrees(draw.uniform(0.2, 0.45) * spread)
-        bounds = (air - drop, air - drop + spread)
-        surface = (air + float(draw.uniform(-0.5, 2.0)), bounds[1])
-        return _dimmed(sky_rgb, brightness), lambda d: sky_temperature_c(d, air, drop), surface, bounds
-    room = _degrees(draw.uniform(12.0, 25.0))
-    surface = (room + float(draw.uniform(0.0, 1.5)), room + spread)
-    bounds = (room, room + spread)
-    return _dimmed(room_rgb, brightness), lambda d: np.full(len(np.asarray(d)), room), surface, bounds
+        coldest, surface = air - drop, air + float(draw.uniform(-0.5, 2.0))
+        degrees: DegreesFunction = lambda directions: sky_temperature_c(directions, air, drop)  # noqa: E731
+    else:
+        coldest = room = _degrees(draw.uniform(12.0, 25.0))
+        surface = room + float(draw.uniform(0.0, 1.5))
+        degrees = everywhere(room)
+    return (surface, coldest + spread), {
+        "background_rgb": lambda directions: np.asarray(behind(directions) * brightness, dtype=np.float32),
+        "background_temperature_c": degrees,
+        "temperature_bounds_c": (coldest, coldest + spread),
+    }
 
 
 def _degrees(value: float) -> float:
@@ -236,6 +188,151 @@ def _degrees(value: float) -> float:
     return 0.25 * round(4.0 * float(value))
 
 
-def _dimmed(colours: RgbFunction, brightness: float) -> RgbFunction:
-    factor = np.float32(brightness)
-    return lambda directions: np.asarray(colours(directions) * factor, dtype=np.float32)
+_PICTURE_ASPECT = 0.75
+_RIM = 0.95  # share of the picture within which everything shows
+_AZIMUTHS = 73
+_AIMS = 9
+_ELEVATIONS_DEG = {2: ((10.0, 20.0), (38.0, 50.0)), 3: ((7.0, 15.0), (24.0, 36.0), (46.0, 60.0))}
+_FARTHEST_SHARE = 1.10
+
+
+def random_rings(
+    draw: np.random.Generator, boxes: Sequence[Box], focal_share: float, arc_deg: tuple[float, float]
+) -> tuple[CameraRing, ...]:
+    """Draw two or three rings, or arcs (begin and length, [degrees]), around boxes [m] that every picture shows.
+
+    The focal length is a share of the width of a 4:3 image. Rings come from the lowest to the highest, at most a tenth
+    farther than the nearest at which all boxes show.
+    """
+    corners = np.array([corner for box in boxes for corner in itertools.product(*zip(*box))], dtype=np.float64)
+    lo, hi = corners.min(axis=0), corners.max(axis=0)
+    (x, y, _), rings = (0.5 * (lo + hi)).tolist(), []
+    aims = np.linspace(max(lo[2], 0.0), 0.6 * hi[2], _AIMS)
+    for low, high in _ELEVATIONS_DEG[3 if draw.random() < 0.75 else 2]:
+        elevation = math.radians(draw.uniform(low, high))
+        distance, aim_z = min(
+            (_nearest(corners - (x, y, aim), elevation, focal_share, arc_deg), round(float(aim), 4)) for aim in aims
+        )
+        distance *= draw.uniform(1.0, _FARTHEST_SHARE)
+        radius, height = distance * math.cos(elevation), aim_z + distance * math.sin(elevation)
+        rings.append(CameraRing((round(x, 4), round(y, 4), aim_z), round(radius, 4), round(height, 4), *arc_deg))
+    return tuple(rings)
+
+
+def _nearest(relative: FloatArray, elevation: float, focal_share: float, arc_deg: tuple[float, float]) -> float:
+    """Least distance from the origin at which an arc of cameras that look at it has all points (n, 3) in the picture.
+
+    A point is in the picture if its distances from the view axis, sideways and upwards, are within the half width and
+    half height at the point's depth: beside <= half (distance - nearer), and likewise above.
+    """
+    azimuth = np.radians(arc_deg[0] + arc_deg[1] * np.linspace(0.0, 1.0, _AZIMUTHS))
+    back = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(_AZIMUTHS, math.tan(elevation))], axis=1)
+    back *= math.cos(elevation)
+    right = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(_AZIMUTHS)], axis=1)
+    beside, above = np.abs(relative @ right.T), np.abs(relative @ np.cross(back, right).T)
+    half = 0.5 * _RIM / focal_share
+    return float((relative @ back.T + np.maximum(beside, above / _PICTURE_ASPECT) / half).max())
+
+
+_HOUSES, _TREES, _CUPBOARDS = 18, 14, 7
+_FARTHEST = 20.0
+_GAP = 1.2
+_GLASS_SHARE, _GLASS_DIM = (0.32, 0.68), 0.35
+
+
+def with_street(scene: SyntheticScene, seed: int) -> SyntheticScene:
+    """Put ground, houses with windows and trees around a scene and its cameras, near the temperature of the air.
+
+    They stand all round, between the cameras and 20 times the scene's size away.
+    """
+    plan, middle, size, reach, floor = _place(scene, seed)
+    x, y = middle
+    half = 1.3 * _FARTHEST * size
+    ground: Box = ((x - half, y - half, floor - 0.2 * size), (x + half, y + half, floor))
+    plan.put(ground, plan.paint("ground"), 0.3)
+    houses: list[Box] = []
+    for number in range(_HOUSES):
+        sides, high = (plan.u(0.35, 0.9) * size, plan.u(0.35, 0.9) * size), plan.u(0.5, 1.5) * size
+        near = reach + float(np.hypot(*sides))
+        away, turn = near * (0.7 * _FARTHEST * size / near) ** plan.u(0.0, 1.0) ** 2, 2.0 * np.pi * number / _HOUSES
+        hx, hy = x + away * np.cos(turn), y + away * np.sin(turn)
+        houses.append(((hx - sides[0], hy - sides[1], floor), (hx + sides[0], hy + sides[1], floor + high)))
+        plan.put(houses[-1], plan.paint("wall"), plan.u(0.4, 1.0))
+    windowed = len(plan.paints)
+    for (x0, y0, _), (x1, y1, top) in houses:
+        over = 0.05 * size
+        roof: Box = ((x0 - over, y0 - over, top), (x1 + over, y1 + over, top + plan.u(0.1, 0.3) * size))
+        plan.put(roof, plan.paint("roof"), plan.u(0.0, 0.4))
+    leaves = plan.paint("ground")
+    crowns: list[Sphere] = []
+    while len(crowns) < _TREES:
+        radius, away, turn = plan.u(0.1, 0.35) * size, reach * plan.u(1.2, 4.0), plan.u(0.0, 2.0 * np.pi)
+        at = np.array([x + away * np.cos(turn), y + away * np.sin(turn), floor + plan.u(1.5, 3.0) * radius])
+        clear = [distance_to_box(at[None], h[0], np.add(h[1], (0.0, 0.0, size)))[0] for h in houses]
+        clear += [float(np.linalg.norm(at - other.centre)) - other.radius for other in crowns]
+        if min(clear) > 1.1 * radius + 0.05 * size:
+            tx, ty, tz = at.tolist()
+            crowns.append(Sphere((tx, ty, tz), radius))
+            plan.put(crowns[-1], leaves, plan.u(0.0, 0.3))
+            thick, top = 0.12 * radius, tz - 1.001 * radius
+            plan.put(((tx - thick, ty - thick, floor), (tx + thick, ty + thick, top)), plan.paint("stone"), 0.3)
+    return surrounded(scene, plan, seed, range_k=2.5, windows=(range(1, windowed), floor, 0.32 * size))
+
+
+def with_room(scene: SyntheticScene, seed: int) -> SyntheticScene:
+    """Put a scene and its cameras into a room of its temperature: walls, floor, ceiling, cupboards along the walls."""
+    plan, (x, y), size, reach, floor = _place(scene, seed)
+    half = (max(reach, 2.0 * size) * plan.u(1.2, 2.2), max(reach, 2.0 * size) * plan.u(1.2, 2.2))
+    top = max(scene.poses(48, 0)[0][:, 2, 3].max(), floor + 1.2 * size) + plan.u(0.3, 1.0) * size
+    thick, along_x, along_y = 0.3 * size, (x - half[0], x + half[0]), (y - half[1], y + half[1])
+    for z in (floor - thick, top):
+        box: Box = ((along_x[0], along_y[0], z), (along_x[1], along_y[1], z + thick))
+        plan.put(box, plan.paint("stone"), plan.u(0.0, 0.5))
+    for axis, middle, along in ((0, x, along_y), (1, y, along_x)):
+        for sign in (-1, 1):
+            plane = middle + sign * half[axis]
+            wall = box_beside(axis, (plane, plane + sign * thick), along, (floor, top))
+            plan.put(wall, plan.paint("wall"), plan.u(0.0, 0.5))
+            for _ in range(_CUPBOARDS // 2):
+                deep, wide = plan.u(0.3, 0.9) * (half[axis] - 1.1 * reach), plan.u(0.15, 0.5) * size
+                at, high = plan.u(along[0] + wide, along[1] - wide), plan.u(0.2, 0.9) * (top - floor)
+                box = box_beside(axis, (plane, plane - sign * deep), (at - wide, at + wide), (floor, floor + high))
+                plan.put(box, plan.paint("metal"), plan.u(0.3, 1.0))
+    return surrounded(scene, plan, seed, range_k=0.75)
+
+
+def _place(scene: SyntheticScene, seed: int) -> tuple[Plan, tuple[float, float], float, float, float]:
+    """An empty plan, the middle (x, y) and size of the scene, how far from it its cameras stand, and a floor below."""
+    lo, hi = np.array(scene.scene_box)
+    size, middle = scene.size, 0.5 * (lo + hi)
+    cameras = scene.poses(48, 6)[0][:, :3, 3]
+    reach = _GAP * max(float(np.linalg.norm((cameras - middle)[:, :2], axis=1).max()), size)
+    floor = min(float(scene.solid.bounds[0][2]), float(cameras[:, 2].min()) - 0.1 * size)
+    plan = Plan(np.random.default_rng([7412, seed]), unit=0.02 * size)
+    return plan, (float(middle[0]), float(middle[1])), size, reach, floor
+
+
+def surrounded(
+    scene: SyntheticScene, plan: Plan, seed: int, range_k: float, windows: tuple[range, float, float] | None = None
+) -> SyntheticScene:
+    """Put a plan around a scene, whose warmth 0 to 1 is up to `range_k` above the temperature at the horizon.
+
+    `windows`: the paints of walls that have windows, the height at which storeys begin [m], and that of a storey [m].
+    """
+    lo = np.asarray(scene.scene_box[0])
+    texture, light = SolidTexture(box_between(lo, lo + 3.0 * scene.size), seed), SunLight()
+    air_c = float(scene.background_temperature_c([[1.0, 0.0, 0.0]])[0])
+
+    def colour(points: npt.ArrayLike, normals: npt.ArrayLike) -> Float32Array:
+        points, normals, part = np.asarray(points), np.asarray(normals), plan.part(points, normals)
+        rgb = painted(points, normals, part, plan.paints, texture, light)
+        if windows is not None:
+            walls, floor, storey = windows
+            along = np.where(np.abs(normals[:, 0]) > 0.5, points[:, 1], points[:, 0])
+            share = np.mod(np.stack([along, points[:, 2] - floor]) / storey, 1.0)
+            glass = np.all((share > _GLASS_SHARE[0]) & (share < _GLASS_SHARE[1]), axis=0)
+            rgb[glass & np.isin(part, walls) & (np.abs(normals[:, 2]) < 0.5)] *= _GLASS_DIM
+        return rgb
+
+    around = Body(plan.solid(), colour, lambda points: air_c + range_k * np.clip(plan.warmth(points), 0.0, 1.0))
+    return dataclasses.replace(scene, around=around)

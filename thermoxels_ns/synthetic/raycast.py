@@ -11,22 +11,20 @@ from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntAr
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
-from thermoxels_ns.synthetic.solids import Hits
 
 _VISIBLE_TOLERANCE = 1e-7
 _GRAZING_COSINE = 1e-6
-_RAYS_PER_CHUNK = 16_384  # about what stays in a processor's cache
+_RAYS_AT_ONCE = 16_384  # about what stays in a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """What one camera sees."""
+    """What one camera sees: colour and temperature are means over each pixel, depth is that of its centre."""
 
-    rgb: Float32Array  # mean colour of each pixel's samples, 0 to 1, shape (height, width, 3)
-    temperature_c: FloatArray  # mean temperature of each pixel's samples [degrees Celsius], shape (height, width)
+    rgb: Float32Array  # 0 to 1, shape (height, width, 3)
+    temperature_c: FloatArray  # [degrees Celsius], shape (height, width)
     depth_m: FloatArray
-    """Distance along the ray through the pixel's centre [m], infinite where it does not meet the solid first, shape
-    (height, width)."""
+    """Distance along the ray [m], infinite where the ray does not meet the solid first, shape (height, width)."""
 
     @property
     def hit(self) -> BoolArray:
@@ -35,10 +33,9 @@ class RenderedView:
 
 
 def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samples_per_axis: int = 2) -> RenderedView:
-    """Render both bands of one view from a camera to world, shape (3, 4) or (4, 4) [m].
+    """Render both bands of one view from a camera-to-world pose, shape (3, 4) or (4, 4) [m].
 
-    Colour and temperature are means over a grid of `samples_per_axis` rays along each axis of a pixel; depth and hit
-    are those of its centre.
+    Colour and temperature are means over a grid of `samples_per_axis` rays along each axis of a pixel.
 
     Raises:
         SceneError: The camera stands inside the solid.
@@ -58,8 +55,8 @@ def first_surface(scene: SyntheticScene, origins: FloatArray, directions: FloatA
     Returns:
         Distances (n,) [m], infinite where nothing is met, and whether it is the scene's own solid (n,).
     """
-    hits, first = _first_hits(scene, origins, directions)
-    return np.min([one.distance for one in hits], axis=0), first == 0
+    distance, _, body = _first_hits(scene, origins, directions)
+    return distance, body == 0
 
 
 def visible_surface_points(
@@ -90,12 +87,14 @@ def visible_surface_points(
     return views >= min_views
 
 
-def _first_hits(scene: SyntheticScene, origins: FloatArray, directions: FloatArray) -> tuple[list[Hits], IntArray]:
-    """Where rays enter the scene and what is around it, and the number of what they meet first (n,); -1: nothing."""
-    bodies = (scene,) if scene.around is None else (scene, scene.around)
-    hits = [body.solid.intersect(origins, directions) for body in bodies]
-    distance = np.array([one.distance for one in hits])
-    return hits, np.where(np.isfinite(distance.min(axis=0)), distance.argmin(axis=0), -1)
+def _first_hits(
+    scene: SyntheticScene, origins: FloatArray, directions: FloatArray
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Distances (n,) and normals (n, 3) of what rays meet first, and its number among the bodies (n,); -1: nothing."""
+    distance, normal = map(np.array, zip(*(body.solid.intersect(origins, directions) for body in scene.bodies)))
+    first, every = distance.argmin(axis=0), np.arange(distance.shape[1])
+    nearest = distance[first, every]
+    return nearest, normal[first, every], np.where(np.isfinite(nearest), first, -1)
 
 
 def _look(
@@ -106,22 +105,19 @@ def _look(
     A mirroring surface adds the colour along the reflected ray, on which mirrors show their paint only.
     """
     rgb, temperature_c = np.empty(directions.shape, dtype=np.float32), np.empty(len(directions))
-    for start in range(0, len(directions), _RAYS_PER_CHUNK):
-        part = slice(start, start + _RAYS_PER_CHUNK)
-        ray = directions[part]
-        origin = np.broadcast_to(origins if origins.ndim == 1 else origins[part], ray.shape)
-        hits, first = _first_hits(scene, origin, ray)
-        for number, body in enumerate((scene, scene.around)[: len(hits)]):
-            assert body is not None
+    for start in range(0, len(directions), _RAYS_AT_ONCE):
+        part = slice(start, start + _RAYS_AT_ONCE)
+        origin, ray = np.broadcast_to(origins, directions.shape)[part], directions[part]
+        distance, normal, first = _first_hits(scene, origin, ray)
+        for number, body in enumerate(scene.bodies):
             met = np.flatnonzero(first == number)
-            normals = hits[number].normal[met]
-            points = origin[met] + hits[number].distance[met, None] * ray[met]
+            points, normals = origin[met] + distance[met, None] * ray[met], normal[met]
             colour = body.colour(points, normals)
-            if mirrors and body is scene and scene.mirror is not None:
+            if mirrors and number == 0 and scene.mirror is not None:
                 share = scene.mirror(points, normals)
                 shiny = np.flatnonzero(share)
-                towards, normal = ray[met[shiny]], normals[shiny]
-                reflected = towards - 2.0 * np.einsum("ij,ij->i", towards, normal)[:, None] * normal
+                towards, outward = ray[met[shiny]], normals[shiny]
+                reflected = towards - 2.0 * np.einsum("ij,ij->i", towards, outward)[:, None] * outward
                 seen, _ = _look(scene, points[shiny], reflected, mirrors=False)
                 colour[shiny] += share[shiny, None] * (seen - colour[shiny])
             rgb[start + met], temperature_c[start + met] = colour, body.surface_temperature_c(points)
@@ -133,8 +129,11 @@ def _look(
 
 def _position_outside(scene: SyntheticScene, pose: FloatArray) -> FloatArray:
     origin = pose[:3, 3]
-    if float(scene.solid.signed_distance(origin[None])[0]) < 0.0:
-        expected, got = f"a point outside the solid of scene {scene.name}", f"{origin.tolist()}, which is inside it"
-        remedy = "Move the camera out of the solid."
-        raise SceneError("camera position", expected=expected, got=got, remedy=remedy)
+    if scene.solid.signed_distance(origin[None])[0] < 0.0:
+        raise SceneError(
+            "camera position",
+            expected=f"a point outside the solid of scene {scene.name}",
+            got=f"{origin.tolist()}, which is inside it",
+            remedy="Move the camera out of the solid.",
+        )
     return origin

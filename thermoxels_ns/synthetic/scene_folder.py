@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -68,42 +69,32 @@ def write_scene(
         SceneError: An option is out of range, or the folder holds somebody else's scene.
         OutputError: The folder cannot be written to.
     """
-    thermal_size = _thermal_size(width, height, thermal_width, own_thermal_camera)
+    thermal_camera, offset = _thermal_camera(scene, width, height, thermal_width, own_thermal_camera)
     for name, text, known in (
         ("photo_format", photo_format, _PHOTO_SUFFIXES),
         ("thermal_format", thermal_format, _SUFFIXES),
     ):
         if text not in known:
-            remedy = "Choose one of these formats."
-            raise SceneError(name, expected=f"one of {', '.join(known)}", got=repr(text), remedy=remedy)
+            expected = f"one of {', '.join(known)}"
+            raise SceneError(name, expected=expected, got=repr(text), remedy="Choose one of these formats.")
     imperfections.check()
     camera = scene.camera(width, height)
-    thermal_camera = scene.camera(*thermal_size)
-    if own_thermal_camera:  # a slightly different field of view and an off-centre principal point
-        plain, (dx, dy) = thermal_camera, (thermal_size[0] * shift for shift in _THERMAL_CENTRE_SHIFT)
-        focal = plain.fl_x * _THERMAL_ZOOM
-        thermal_camera = Camera(*thermal_size, focal, focal, plain.cx + dx, plain.cy + dy)
     train, held_out = scene.poses(num_train, num_eval)
     names = [f"frame_{kind}_{i + 1:05d}" for kind, n in (("train", num_train), ("eval", num_eval)) for i in range(n)]
     poses = np.concatenate([train, held_out])
-    offset = _second_camera_offset(scene) if own_thermal_camera else np.eye(4)
-    lowest, highest = scene.temperature_bounds_c
-    flaws = DrawnFlaws.of(imperfections, seed, poses, np.mean(scene.scene_box, axis=0), (lowest, highest))
-    given_poses, given_offset = flaws.given_poses(poses), offset @ flaws.given_rig_turn
-    # Drifting, noisy images stay within these.
-    low, high = flaws.added_k
-    bounds = lowest + low, highest + high
-    # How counts become degrees: Celsius = count * celsius_per_count + celsius_offset; None for floats.
-    unit: dict[str, float] | None = {"celsius_per_count": (bounds[1] - bounds[0]) / _LARGEST_COUNT}
-    unit = {"tiff": _CENTIKELVIN, "npy": None}.get(thermal_format, unit | {"celsius_offset": bounds[0]})
+    flaws = DrawnFlaws(imperfections, seed, poses, np.mean(scene.scene_box, axis=0), scene.temperature_bounds_c)
+    given_poses, given_offset = flaws.given_poses(), offset @ flaws.given_rig_turn()
+    bounds = flaws.bounds_c(*scene.temperature_bounds_c)
+    # Counts become degrees by: Celsius = count * celsius_per_count + celsius_offset.
+    unit = {"celsius_per_count": (bounds[1] - bounds[0]) / _LARGEST_COUNT, "celsius_offset": bounds[0]}
+    if thermal_format == "tiff":
+        unit = _CENTIKELVIN
 
     target = _prepared_folder(folder)
     frames: list[dict[str, Any]] = []
-    for number in track(range(len(names)), description=f"Photographing {scene.name}", disable=not progress):
-        name = names[number]
-        view = render_view(scene, poses[number], camera)
-        thermal_view = view
-        if thermal_camera != camera or own_thermal_camera:
+    for number, name in enumerate(track(names, description=f"Photographing {scene.name}", disable=not progress)):
+        view = thermal_view = render_view(scene, poses[number], camera)
+        if thermal_camera != camera:
             thermal_view = render_view(scene, poses[number] @ offset, thermal_camera)
         measured_c = flaws.thermogram(number, thermal_view.temperature_c)
         frame: dict[str, Any] = {
@@ -116,15 +107,15 @@ def write_scene(
         with replace_when_done(target / frame["file_path"]) as path:
             Image.fromarray(flaws.photograph(number, view.rgb)).save(path, quality=imperfections.jpeg_quality)
         with replace_when_done(target / frame["thermal_file_path"]) as path:
-            if unit is None:
+            if thermal_format == "npy":
                 np.save(path, measured_c.astype(np.float32))
             else:
                 counts = np.round((measured_c - unit["celsius_offset"]) / unit["celsius_per_count"])
                 Image.fromarray(np.clip(counts, 0, _LARGEST_COUNT).astype(np.uint16)).save(path)
         frames.append(frame)
 
-    names_of_bounds = ("absolute_min_temperature", "absolute_max_temperature")
-    _write_json(target / "temperature_bounds.json", dict(zip(names_of_bounds, bounds)))
+    named = {"absolute_min_temperature": bounds[0], "absolute_max_temperature": bounds[1]}
+    _write_json(target / "temperature_bounds.json", named)
     transforms: dict[str, Any] = _intrinsics(flaws.given_camera(camera))
     if own_thermal_camera:
         transforms["thermal_camera"] = _intrinsics(thermal_camera)
@@ -132,7 +123,7 @@ def write_scene(
         transforms["thermal_unit"] = unit
     transforms |= {"metres_per_unit": 1.0, "up": [0, 0, 1], "frames": frames}
     truth = {"synthetic_scene": scene.name, "scene_box": scene.scene_box, "seed": seed}
-    _write_json(target / TRUTH, truth | flaws.truth(poses))
+    _write_json(target / TRUTH, truth | flaws.truth())
     _write_json(target / "transforms.json", transforms)
     return target
 
@@ -153,20 +144,30 @@ def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
     return make_scene(truth["synthetic_scene"])
 
 
-def _thermal_size(width: int, height: int, thermal_width: int | None, own_camera: bool) -> tuple[int, int]:
-    """Width and height of the thermal images; one camera for both bands needs the same aspect exactly."""
-    sizes = {"width": width, "height": height, "thermal_width": width if thermal_width is None else thermal_width}
+def _thermal_camera(
+    scene: SyntheticScene, width: int, height: int, thermal_width: int | None, own: bool
+) -> tuple[Camera, FloatArray]:
+    """Camera of the thermal images and its pose (4, 4) in the frame of the photographs' camera.
+
+    A camera of its own has a slightly different field of view and an off-centre principal point; one camera for both
+    bands needs the same aspect exactly.
+    """
+    chosen = thermal_width if thermal_width is not None else max(width // 2, 1) if own else width
+    sizes = {"width": width, "height": height, "thermal_width": chosen}
     check_ranges("--", {name: (value, 1, _MOST_SIDE, f"1 to {_MOST_SIDE} pixels") for name, value in sizes.items()})
-    if own_camera:
-        chosen = thermal_width or max(width // 2, 1)
-        return chosen, max(round(chosen * _THERMAL_ASPECT), 1)
-    chosen = thermal_width or width
+    if own:
+        plain = scene.camera(chosen, max(round(chosen * _THERMAL_ASPECT), 1))
+        focal, (dx, dy) = plain.fl_x * _THERMAL_ZOOM, (chosen * shift for shift in _THERMAL_CENTRE_SHIFT)
+        offset = np.eye(4)
+        offset[:3, :3] = Rotation.from_euler("xyz", _RIG_ROTATION_RAD).as_matrix()
+        offset[:3, 3] = np.multiply(_RIG_SHIFT_SHARE, scene.size)
+        return replace(plain, fl_x=focal, fl_y=focal, cx=plain.cx + dx, cy=plain.cy + dy), offset
     if height * chosen % width:
         expected = f"a width that keeps the aspect {width}:{height} in whole pixels"
         got = f"{chosen}, for a height of {height * chosen / width:.2f}"
         remedy = f"Pass a divisor of {width} such as {width // 2}, or give the thermal images their own camera."
         raise SceneError("thermal_width", expected=expected, got=got, remedy=remedy)
-    return chosen, height * chosen // width
+    return scene.camera(chosen, height * chosen // width), np.eye(4)
 
 
 def _prepared_folder(folder: Path | str) -> Path:
@@ -182,14 +183,6 @@ def _prepared_folder(folder: Path | str) -> Path:
     for name in ("images", "thermal"):
         writable_folder(target / name)
     return target
-
-
-def _second_camera_offset(scene: SyntheticScene) -> FloatArray:
-    """Pose (4, 4) of the thermal camera in the frame of the first one; the shift is a share of the scene's size."""
-    offset = np.eye(4)
-    offset[:3, :3] = Rotation.from_euler("xyz", _RIG_ROTATION_RAD).as_matrix()
-    offset[:3, 3] = np.multiply(_RIG_SHIFT_SHARE, scene.size)
-    return offset
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:

@@ -14,39 +14,42 @@ from thermoxels_ns.synthetic.camera_rings import CameraRing, CameraWalk, ring_po
 from thermoxels_ns.synthetic.solids import Box, Solid
 
 RgbFunction = Callable[..., Float32Array]
+DegreesFunction = Callable[[npt.ArrayLike], FloatArray]
 
 _ASPECT = 4.0 / 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
-    """Solid things outside the scene box that photographs show too: houses opposite, trees, a room's walls."""
+class Body:
+    """Solid things, their colour and their temperature."""
 
-    solid: Solid  # all of them [m]; not part of what is scored
+    solid: Solid  # everything that is not air [m]
     colour: RgbFunction  # (points (n, 3), normals (n, 3)) to red, green, blue in [0, 1] (n, 3)
-    surface_temperature_c: Callable[[npt.ArrayLike], FloatArray]  # points (n, 3) to temperatures (n,)
+    surface_temperature_c: DegreesFunction
+    """Points (n, 3) to temperatures (n,); the same from every direction. Off the surface it continues smoothly."""
 
 
 @dataclass(frozen=True, eq=False)
-class SyntheticScene:
+class SyntheticScene(Body):
     """A scene whose every answer is exact. Lengths in metres, temperatures in degrees Celsius, z up."""
 
     name: str
-    solid: Solid  # everything that is not air
     scene_box: Box  # lower and upper corner of the exact box [m]: the solid lies inside it, the surroundings outside
     temperature_bounds_c: tuple[float, float]
     """No surface and no background is colder than the first or hotter than the second."""
-    colour: RgbFunction  # (points (n, 3), normals (n, 3)) to red, green, blue in [0, 1] (n, 3)
-    surface_temperature_c: Callable[[npt.ArrayLike], FloatArray]
-    """Points (n, 3) to temperatures (n,); the same from every direction. Off the surface it continues smoothly."""
     background_rgb: RgbFunction  # unit directions (n, 3), away from the camera, to red, green, blue in [0, 1] (n, 3)
-    background_temperature_c: Callable[[npt.ArrayLike], FloatArray]
-    """Unit directions (n, 3), away from the camera, to apparent temperatures (n,)."""
+    background_temperature_c: DegreesFunction  # such directions to apparent temperatures (n,)
     rings: tuple[CameraRing | CameraWalk, ...]
     focal_share: float  # focal length over the image width, for a 4:3 image
-    around: Surroundings | None = None  # what stands between the scene and what lies at infinity (`background_rgb`)
-    mirror: Callable[[npt.ArrayLike, npt.ArrayLike], Float32Array] | None = None
+    around: Body | None = None
+    """What photographs show between the scene and infinity, such as houses opposite; it is not scored."""
+    mirror: RgbFunction | None = None
     """(points (n, 3), normals (n, 3)) to the share of light (n,) that a surface reflects as a mirror does."""
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """The scene's own body, then what stands around it."""
+        return (self,) if self.around is None else (self, self.around)
 
     @property
     def size(self) -> float:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -21,38 +21,15 @@ _EDGE_TOLERANCE = 1e-9
 _PARALLEL_SINE_SQUARED = 1e-30
 
 
-@dataclass(frozen=True, eq=False)
-class Hits:
-    """Where rays first enter a solid."""
-
-    distance: FloatArray
-    """Distance along the ray in multiples of its direction's length (metres for unit directions); infinite for a
-    miss. Shape (n,)."""
-    normal: FloatArray  # outward unit normal at the hit, zero for a miss. Shape (n, 3).
-
-    @property
-    def hit(self) -> BoolArray:
-        """Which rays hit, shape (n,)."""
-        return np.isfinite(self.distance)
-
-
 class Solid(Protocol):
     """A closed set, lengths in metres; all that it tells is exact."""
 
-    @property
-    def bounds(self) -> Box:
-        """Lower and upper corner of the smallest box around the solid [m]."""
-        ...
-
-    @property
-    def volume(self) -> float:
-        """Volume [m3]."""
-        ...
-
-    @property
-    def area(self) -> float:
-        """Area of the surface [m2]."""
-        ...
+    bounds: Box
+    """Lower and upper corner of the smallest box around the solid [m]."""
+    volume: float
+    """Volume [m3]."""
+    area: float
+    """Area of the surface [m2]."""
 
     def contains(self, points: npt.ArrayLike, /) -> BoolArray:
         """Which of the points (n, 3) lie in the solid or on its surface."""
@@ -62,11 +39,15 @@ class Solid(Protocol):
         """Distance of the points (n, 3) to the surface [m], negative inside."""
         ...
 
-    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> Hits:
+    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """First entry of rays: origins (n, 3) or one shared (3,), directions (n, 3).
 
         Only passing from outside to inside counts: a ray that starts within does not see walls from behind. Touching
         an edge counts as a hit.
+
+        Returns:
+            Distances (n,) in multiples of the direction's length, infinite for a miss, and outward unit normals (n, 3),
+            zero for a miss.
         """
         ...
 
@@ -75,40 +56,30 @@ class Solid(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Sphere(Solid):
     """A ball; radius above 0 [m]."""
 
     centre: Vector
     radius: float
 
-    @property
-    def bounds(self) -> Box:
-        """See `Solid`."""
-        return box_between(np.subtract(self.centre, self.radius), np.add(self.centre, self.radius))
-
-    @property
-    def volume(self) -> float:
-        """See `Solid`."""
-        return 4.0 / 3.0 * math.pi * self.radius**3
-
-    @property
-    def area(self) -> float:
-        """See `Solid`."""
-        return 4.0 * math.pi * self.radius**2
+    def __post_init__(self) -> None:
+        self.bounds = box_between(np.subtract(self.centre, self.radius), np.add(self.centre, self.radius))
+        self.volume = 4.0 / 3.0 * math.pi * self.radius**3
+        self.area = 4.0 * math.pi * self.radius**2
 
     def signed_distance(self, points: npt.ArrayLike, /) -> FloatArray:
         """See `Solid`."""
         return np.linalg.norm(np.subtract(points, self.centre), axis=-1) - self.radius
 
-    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> Hits:
+    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """See `Solid`."""
         directions = np.asarray(directions, dtype=np.float64)
         start = np.broadcast_to(np.subtract(origins, self.centre), directions.shape)
         enter, _ = _through_circle(start, directions, self.radius)
         hit = np.isfinite(enter) & (enter >= 0.0)
         normal = (start + np.where(hit, enter, 0.0)[:, None] * directions) / self.radius
-        return Hits(np.where(hit, enter, np.inf), np.where(hit[:, None], normal, 0.0))
+        return np.where(hit, enter, np.inf), np.where(hit[:, None], normal, 0.0)
 
     def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
         """See `Solid`."""
@@ -117,7 +88,7 @@ class Sphere(Solid):
         return np.asarray(self.centre) + self.radius * normals, normals
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Cylinder(Solid):
     """A closed circular cylinder with flat ends whose axis is parallel to x, y or z.
 
@@ -130,21 +101,12 @@ class Cylinder(Solid):
     length: float  # middle of the axis, radius and length along the axis [m], above 0
     axis: int  # direction of the axis: 0 for x, 1 for y, 2 for z
 
-    @property
-    def bounds(self) -> Box:
-        """See `Solid`."""
+    def __post_init__(self) -> None:
         half = np.where(np.arange(3) == self.axis, 0.5 * self.length, self.radius)
-        return box_between(np.subtract(self.centre, half), np.add(self.centre, half))
-
-    @property
-    def volume(self) -> float:
-        """See `Solid`."""
-        return math.pi * self.radius**2 * self.length
-
-    @property
-    def area(self) -> float:
-        """See `Solid`."""
-        return 2.0 * math.pi * self.radius * (self.radius + self.length)
+        self.bounds = box_between(np.subtract(self.centre, half), np.add(self.centre, half))
+        self.volume = math.pi * self.radius**2 * self.length
+        self.area = 2.0 * math.pi * self.radius * (self.radius + self.length)
+        self._across = [a for a in range(3) if a != self.axis]
 
     def signed_distance(self, points: npt.ArrayLike, /) -> FloatArray:
         """See `Solid`."""
@@ -154,7 +116,7 @@ class Cylinder(Solid):
         outside = np.hypot(np.maximum(beside, 0.0), np.maximum(beyond, 0.0))
         return np.asarray(outside + np.minimum(np.maximum(beside, beyond), 0.0), dtype=np.float64)
 
-    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> Hits:
+    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """See `Solid`. A ray enters where it is both between the planes of the ends and in the endless cylinder."""
         directions = np.asarray(directions, dtype=np.float64)
         start = np.broadcast_to(np.subtract(origins, self.centre), directions.shape)
@@ -173,7 +135,7 @@ class Cylinder(Solid):
         at = (start[side] + entry[side, None] * directions[side]) / self.radius
         at[:, self.axis] = 0.0
         normal[side] = at
-        return Hits(np.where(hit, entry, np.inf), normal)
+        return np.where(hit, entry, np.inf), normal
 
     def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
         """See `Solid`."""
@@ -189,18 +151,13 @@ class Cylinder(Solid):
         points[:, self.axis] = 0.5 * self.length * np.where(on_side, share, end)
         return points + self.centre, normals
 
-    @property
-    def _across(self) -> list[int]:
-        """The two axes at right angles to the cylinder's."""
-        return [a for a in range(3) if a != self.axis]
 
-
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class BoxSolid(Solid):
     """The union of axis-aligned boxes, minus other axis-aligned boxes.
 
     All `boxes` are joined first, then all `removed` ones are cut out. The coordinates of all faces span a small
-    non-uniform grid whose cells are filled or empty; the surface is the list of rectangles between the two kinds.
+    non-uniform grid whose cells are filled or empty; rectangles between the two kinds are the surface.
 
     >>> notched = BoxSolid([((0, 0, 0), (2, 1, 1))], removed=[((1, 0, 0.5), (2, 1, 1))])
     >>> notched.volume, notched.area
@@ -211,99 +168,67 @@ class BoxSolid(Solid):
     """Lower and upper corners [m] of the boxes to join; rounded to 1e-12 m so that touching faces coincide."""
     removed: Sequence[Box] = ()  # lower and upper corners [m] of the boxes to cut out
 
-    @cached_property
-    def _edges(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Coordinates of all faces along each axis, sorted and unique."""
+    def __post_init__(self) -> None:
         corners = np.round(np.array([*self.boxes, *self.removed], dtype=np.float64), _COORDINATE_DECIMALS)
-        x, y, z = (np.unique(corners[..., a]) for a in range(3))
-        return x, y, z
+        self._edges = [np.unique(corners[..., axis]) for axis in range(3)]
+        self._cells = np.zeros([len(edge) - 1 for edge in self._edges], dtype=bool)
+        for number, box in enumerate(corners):
+            within = tuple(slice(*np.searchsorted(edge, ends)) for edge, ends in zip(self._edges, box.T))
+            self._cells[within] = number < len(self.boxes)
+        assert self._cells.any(), "nothing is left of the boxes"
+        self._find_rectangles()
+        widths = [np.diff(edge) for edge in self._edges]
+        self.volume = float(np.einsum("ijk,i,j,k->", self._cells, *widths))
+        self._areas = np.prod(np.where(self._normals == 0.0, self._hi - self._lo, 1.0), axis=1)
+        self.area = float(self._areas.sum())
+        self.bounds = box_between(self._lo.min(axis=0), self._hi.max(axis=0))
 
-    @cached_property
-    def _cells(self) -> BoolArray:
-        """Which cells of the grid between the faces are filled."""
-        cells = np.zeros([len(e) - 1 for e in self._edges], dtype=bool)
-        for boxes, value in ((self.boxes, True), (self.removed, False)):
-            for lo, hi in np.round(np.array(boxes, dtype=np.float64).reshape(-1, 2, 3), _COORDINATE_DECIMALS):
-                cells[tuple(slice(*np.searchsorted(e, (lo[a], hi[a]))) for a, e in enumerate(self._edges))] = value
-        assert cells.any(), "nothing is left of the boxes"
-        return cells
+    def _find_rectangles(self) -> None:
+        """Cover the surface once by rectangles, as large as neighbouring faces of cells allow.
 
-    @cached_property
-    def rectangles(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Lower corners, upper corners [m] and outward unit normals of rectangles that cover the surface once, (m, 3).
-
-        They are large: neighbouring faces of cells are joined.
+        Lower corners, upper corners [m] and outward unit normals have shape (m, 3); a plane is its axis, the side that
+        it faces, its coordinate [m] and the numbers of its rectangles.
         """
         filled, found = np.pad(self._cells, 1).astype(np.int8), []
+        self._planes: list[tuple[int, int, float, range]] = []
         for axis in range(3):
             u, v = (a for a in range(3) if a != axis)
             rise = np.moveaxis(np.diff(filled, axis=axis), axis, 0)[:, 1:-1, 1:-1]
             for sign in (1, -1):
-                for plane, faces in enumerate(rise == -sign):
+                for coordinate, faces in zip(self._edges[axis], rise == -sign):
+                    first = len(found)
                     for u0, u1, v0, v1 in _merged_blocks(faces):
                         one = np.zeros((3, 3))
-                        one[:2, axis], one[2, axis] = self._edges[axis][plane], sign
+                        one[:2, axis], one[2, axis] = coordinate, sign
                         one[:2, u], one[:2, v] = self._edges[u][[u0, u1]], self._edges[v][[v0, v1]]
                         found.append(one)
-        lo, hi, normals = np.stack(found, axis=1)
-        return lo, hi, normals
-
-    @cached_property
-    def _planes(self) -> list[tuple[int, float, float, npt.NDArray[np.int64]]]:
-        """Rectangles that share a plane and a side: axis, sign, coordinate [m] and the rectangles' numbers."""
-        lo, _, normals = self.rectangles
-        axis = np.abs(normals).argmax(axis=1)
-        keys = np.stack([axis, normals.sum(axis=1), lo[np.arange(len(lo)), axis]], axis=1)
-        planes, group = np.unique(keys, axis=0, return_inverse=True)
-        return [(int(p[0]), p[1], p[2], np.flatnonzero(group.reshape(-1) == n)) for n, p in enumerate(planes)]
-
-    @cached_property
-    def _areas(self) -> FloatArray:
-        lo, hi, normals = self.rectangles
-        return np.prod(np.where(normals == 0.0, hi - lo, 1.0), axis=1)
-
-    @property
-    def bounds(self) -> Box:
-        """See `Solid`."""
-        return box_between(self.rectangles[0].min(axis=0), self.rectangles[1].max(axis=0))
-
-    @property
-    def volume(self) -> float:
-        """See `Solid`."""
-        x, y, z = (np.diff(edges) for edges in self._edges)
-        return float(np.einsum("ijk,i,j,k->", self._cells, x, y, z))
-
-    @property
-    def area(self) -> float:
-        """See `Solid`."""
-        return float(self._areas.sum())
+                    if len(found) > first:
+                        self._planes.append((axis, sign, coordinate, range(first, len(found))))
+        self._planes.sort(key=lambda plane: plane[:3])
+        self._lo, self._hi, self._normals = np.stack(found, axis=1)
 
     def contains(self, points: npt.ArrayLike, /) -> BoolArray:
         """See `Solid`; a point on a plane of the grid belongs to the cells on both sides."""
-        padded, inside = np.pad(self._cells, 1), np.zeros(len(np.asarray(points)), dtype=bool)
-        x, y, z = (
-            [np.searchsorted(e, at, side="left"), np.searchsorted(e, at, side="right")]
-            for e, at in zip(self._edges, np.asarray(points, dtype=np.float64).T)
+        padded, columns = np.pad(self._cells, 1), np.asarray(points, dtype=np.float64).T
+        sides = (
+            [np.searchsorted(edge, at, side="left"), np.searchsorted(edge, at, side="right")]
+            for edge, at in zip(self._edges, columns)
         )
-        for i in x:
-            for j in y:
-                for k in z:
-                    inside |= padded[i, j, k]
-        return inside
+        return np.any([padded[cell] for cell in itertools.product(*sides)], axis=0)
 
     def signed_distance(self, points: npt.ArrayLike, /) -> FloatArray:
         """See `Solid`."""
         nearest = np.full(len(np.asarray(points)), np.inf)
-        for lo, hi in zip(*self.rectangles[:2]):
+        for lo, hi in zip(self._lo, self._hi):
             nearest = np.minimum(nearest, distance_to_box(points, lo, hi))
         return np.where(self.contains(points), -nearest, nearest)
 
-    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> Hits:
+    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """See `Solid`. Rectangles are a billionth of the solid's size wider, so that no ray slips between two."""
         direction = np.ascontiguousarray(np.asarray(directions, dtype=np.float64).T)
         origin = np.ascontiguousarray(np.broadcast_to(origins, direction.T.shape).T, dtype=np.float64)
-        lo, hi, normals = self.rectangles
         slack = _EDGE_TOLERANCE * float(np.subtract(self.bounds[1], self.bounds[0]).max())
+        lo, hi = self._lo - slack, self._hi + slack
         best, index = np.full(direction.shape[1], np.inf), np.full(direction.shape[1], -1)
         # A nearly parallel ray may reach its plane at infinity; the comparisons below then are false, as they must.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -315,52 +240,40 @@ class BoxSolid(Solid):
                 front &= t < best
                 u, v = (a for a in range(3) if a != axis)
                 at_u, at_v = origin[u] + t * direction[u], origin[v] + t * direction[v]
-                for number in numbers:
-                    low, high = lo[number] - slack, hi[number] + slack
-                    entered = front & (at_u >= low[u]) & (at_u <= high[u]) & (at_v >= low[v]) & (at_v <= high[v])
-                    best[entered], index[entered] = t[entered], number
-        return Hits(best, np.concatenate([normals, np.zeros((1, 3))])[index])
+                for n in numbers:
+                    entered = front & (at_u >= lo[n, u]) & (at_u <= hi[n, u]) & (at_v >= lo[n, v]) & (at_v <= hi[n, v])
+                    best[entered], index[entered] = t[entered], n
+        return best, np.concatenate([self._normals, np.zeros((1, 3))])[index]
 
     def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
         """See `Solid`."""
-        draw, (lo, hi, normals) = np.random.default_rng(seed), self.rectangles
+        draw, lo, hi = np.random.default_rng(seed), self._lo, self._hi
         chosen = draw.choice(len(lo), size=count, p=self._areas / self._areas.sum())
-        return lo[chosen] + draw.random((count, 3)) * (hi[chosen] - lo[chosen]), normals[chosen]
+        return lo[chosen] + draw.random((count, 3)) * (hi[chosen] - lo[chosen]), self._normals[chosen]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class SolidUnion(Solid):
     """Solids side by side that share no volume and no face; round ones may touch others in a point or a line."""
 
     parts: tuple[Solid, ...]
     """The solids. Boxes that touch belong into one `BoxSolid`, which knows that the shared face is not exposed."""
 
-    @property
-    def bounds(self) -> Box:
-        """See `Solid`."""
+    def __post_init__(self) -> None:
         corners = np.array([part.bounds for part in self.parts])
-        return box_between(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))
-
-    @property
-    def volume(self) -> float:
-        """See `Solid`."""
-        return sum(part.volume for part in self.parts)
-
-    @property
-    def area(self) -> float:
-        """See `Solid`."""
-        return sum(part.area for part in self.parts)
+        self.bounds = box_between(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))
+        self.volume = sum(part.volume for part in self.parts)
+        self.area = sum(part.area for part in self.parts)
 
     def signed_distance(self, points: npt.ArrayLike, /) -> FloatArray:
         """See `Solid`."""
         return np.min([part.signed_distance(points) for part in self.parts], axis=0)
 
-    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> Hits:
+    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """See `Solid`."""
-        hits = [part.intersect(origins, directions) for part in self.parts]
-        distance, every = np.array([one.distance for one in hits]), np.arange(len(hits[0].distance))
-        first = distance.argmin(axis=0)
-        return Hits(distance[first, every], np.array([one.normal for one in hits])[first, every])
+        distance, normal = map(np.array, zip(*(part.intersect(origins, directions) for part in self.parts)))
+        first, every = distance.argmin(axis=0), np.arange(distance.shape[1])
+        return distance[first, every], normal[first, every]
 
     def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
         """See `Solid`."""
@@ -368,7 +281,7 @@ class SolidUnion(Solid):
         shares = np.random.default_rng(seed).multinomial(count, areas / areas.sum())
         parts = enumerate(zip(self.parts, shares), start=seed + 1)
         drawn = zip(*(part.surface_points(int(share), own_seed) for own_seed, (part, share) in parts))
-        points, normals = (np.concatenate(each) for each in drawn)
+        points, normals = map(np.concatenate, drawn)
         return points, normals
 
 

@@ -22,11 +22,10 @@ from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM, FeatureR
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.core.units import TemperatureRange
-from thermoxels_ns.field.background import SkyTemperature, SphereImage
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.kept_voxels import check_memory
 from thermoxels_ns.field.refine import ColumnChange, RowChange, refine, widen_colour
-from thermoxels_ns.field.surroundings import Surroundings
+from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, Surroundings
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.reference import intersect_box
