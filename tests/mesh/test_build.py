@@ -140,6 +140,12 @@ def test_what_is_no_similarity_is_refused(bad):
         check_similarity("world_to_metres", bad)
 
 
+@pytest.mark.parametrize("bad", [{"coarsest_cell": n} for n in (0, 3, -2, 2.0, None)] + [{"boundary": "smooth"}])
+def test_wrong_options_are_refused(bad):
+    with pytest.raises(MeshError, match=next(iter(bad))):
+        MeshOptions(**bad)
+
+
 def ball(snapshot_of, seen_side: bool = False):
     """A ball of radius 5.3 voxels of 0.5 in a lattice of 14, its density exponential in the distance to its surface."""
     corner = np.stack(np.meshgrid(*[np.arange(15.0)] * 3, indexing="ij"), axis=-1)

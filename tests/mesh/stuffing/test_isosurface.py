@@ -114,10 +114,10 @@ def test_angles_of_every_stencil_at_the_ends_of_all_ranges(signs):
         positions = positions[~facing]
         towards = {u: t[~facing] for u, t in towards.items()}
 
-    table = stencil_table()
+    tets, start = stencil_table()
     # The face's other two corners are outside: only this tetrahedron of the bundle is asked about.
     code = int(CODE_WEIGHTS @ (np.array([*signs, -1, -1]) + 1))
-    tets = table.tets[table.tet_start[code] : table.tet_start[code + 1]]
+    tets = tets[start[code] : start[code + 1]]
     outside = set(range(19)) - {0, 1, 2, 3, 6, 7, 8, 11, 12, 15}
     tets = np.array([tet for tet in tets if not outside & set(tet)])
     assert len(tets) >= 1
