@@ -31,8 +31,7 @@ def interpolate_corners(
     """Interpolate between corners that know a value, leaving out those that do not (normalised convolution).
 
     value(x) = sum_c t_c w_c v_c / sum_c t_c w_c with the trilinear weights t_c of the eight corners around x and the
-    weight w_c of what is known there (Knutsson and Westin, CVPR 1993). The result lies within the range of the values
-    it is made of.
+    weight w_c of what is known there (Knutsson and Westin, CVPR 1993).
 
     Args:
         points_index: Positions as fractional corner indices, shape (n, 3), within the lattice.
@@ -96,7 +95,15 @@ def extend_harmonically(
     links = sparse.coo_array((weights, (start, end)), shape=(num_nodes, num_nodes)).tocsr()
     links = (links + links.T).tocsr()
     links.data = np.maximum(links.data, _LEAST_CONDUCTANCE * float(np.abs(links.data).mean()))
-    component = _measured_components(links, observed)
+    count, component = connected_components(links, directed=False)
+    blind = np.flatnonzero(np.bincount(component[observed], minlength=count) == 0)
+    if len(blind):
+        sizes, first = np.bincount(component), np.unique(component, return_index=True)[1]
+        shown = ", ".join(f"part {p} ({sizes[p]} nodes, the first is node {first[p]})" for p in blind[:3])
+        expected = "at least one node seen by a thermal ray in each connected part of the mesh"
+        got = f"none in {len(blind)} of {count} parts: {shown}{', ...' if len(blind) > 3 else ''}"
+        remedy = "Train with thermal images that show this part."
+        raise MeshError("observed temperatures", expected=expected, got=got, remedy=remedy)
 
     free, fixed = np.flatnonzero(~observed), np.flatnonzero(observed)
     middle = 0.5 * (temperature[fixed].min() + temperature[fixed].max())
@@ -111,7 +118,7 @@ def extend_harmonically(
         expected, got = f"convergence in {_MOST_ROUNDS} iterations", f"none with {len(free)} unobserved nodes"
         raise MeshError("harmonic extension of the temperature", expected=expected, got=got, remedy=remedy)
 
-    labels = np.arange(component.max() + 1)
+    labels = np.arange(count)
     low, high = (
         np.asarray(extreme(temperature[fixed], component[fixed], labels))[component[free]]
         for extreme in (ndimage.minimum, ndimage.maximum)
@@ -130,18 +137,3 @@ def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, Floa
     for which, shapes in shapes_in_chunks(points, tets):
         conductances[which] = -shapes.stiffness(shapes.dihedral_cosines()).T
     return tets[:, TET_EDGES].reshape(-1, 2), conductances.ravel()
-
-
-def _measured_components(links: sparse.csr_array, observed: BoolArray) -> IntArray:
-    """Return the connected component of every node, shape (n,), or raise `MeshError` if one has no observed node."""
-    count, component = connected_components(links, directed=False)
-    measured = np.bincount(component[observed], minlength=count)
-    blind = np.flatnonzero(measured == 0)
-    if len(blind):
-        sizes, first = np.bincount(component, minlength=count), np.unique(component, return_index=True)[1]
-        shown = ", ".join(f"part {p} ({sizes[p]} nodes, the first is node {first[p]})" for p in blind[:3])
-        expected = "at least one node seen by a thermal ray in each connected part of the mesh"
-        got = f"none in {len(blind)} of {count} parts: {shown}{', ...' if len(blind) > 3 else ''}"
-        remedy = "Train with thermal images that show this part."
-        raise MeshError("observed temperatures", expected=expected, got=got, remedy=remedy)
-    return component.astype(np.int64)

@@ -31,6 +31,8 @@ def test_vtk_reads_body_and_boundary(tmp_path, tagged_mesh):
     assert np.array_equal(boundary.cells_dict[pv.CellType.TRIANGLE], tagged_mesh.facets)
     assert np.array_equal(body.cell_data["region"], tagged_mesh.region + 1)
     assert np.array_equal(boundary.cell_data["patch"], tagged_mesh.boundary.patch + 1)
+    assert np.array_equal(boundary.cell_data["area_factor"], tagged_mesh.boundary.area_factor)
+    assert np.array_equal(boundary.cell_data["normal"], tagged_mesh.boundary.normal)
     for grid in grids.values():
         assert np.array_equal(grid.point_data["temperature_c"], tagged_mesh.temperature_c)
         assert np.array_equal(grid.point_data["temperature_k"], tagged_mesh.temperature_c + 273.15)
@@ -64,10 +66,3 @@ def test_an_index_never_points_at_data_of_another_mesh(tmp_path, box_mesh, tagge
     with pytest.raises(OutputError, match="no space"):
         write_xdmf(path, tagged_mesh)
     assert [file.name for file in tmp_path.iterdir()] == ["mesh.h5"]
-
-
-def test_the_boundary_carries_true_areas_and_normals(tmp_path, tagged_mesh):
-    write_xdmf(tmp_path / "house.xdmf", tagged_mesh)
-    boundary = read_grids(tmp_path / "house.xdmf")[FACET_GRID]
-    assert np.array_equal(boundary.cell_data["area_factor"], tagged_mesh.boundary.area_factor)
-    assert np.array_equal(boundary.cell_data["normal"], tagged_mesh.boundary.normal)

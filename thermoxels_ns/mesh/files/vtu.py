@@ -19,13 +19,7 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values
-from thermoxels_ns.mesh.files.content import (
-    checked_mesh,
-    colour_bytes,
-    node_arrays,
-    surface_of,
-    write_bytes,
-)
+from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays, surface_of, write_bytes
 from thermoxels_ns.mesh.quality.checks import count_wrong_facets, facet_areas, group_faces
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
 
@@ -39,11 +33,9 @@ _MOST_COMPRESSION = 1040  # Bytes that zlib can make of one: 1032, and a little
 def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None) -> None:
     """Write a mesh as a VTK unstructured grid (.vtu, read by ParaView, pyvista and meshio).
 
-    Point arrays: `temperature_c` [degrees Celsius], `temperature_k` [K], `observed` (1: measured, 0: extended) and,
-    if the mesh has colours, `colour` (red, green, blue as bytes). Cell array: `region`; field
-    arrays `region:NAME` hold the number of each region.
-
-    `temperature_c` takes the place of the mesh's own.
+    Point arrays are `temperature_c` [degrees Celsius], `temperature_k` [K], `observed` (1: measured, 0: extended) and,
+    if the mesh has colours, `colour` (red, green, blue as bytes). The cell array is `region`; field arrays
+    `region:NAME` hold the number of each region. `temperature_c` takes the place of the mesh's own.
 
     Raises:
         MeshError: An array does not fit the mesh or is not finite.
@@ -83,7 +75,7 @@ def write_vtk(writer: Any, path: Path, data: Any) -> None:
 
 @contextmanager
 def silent_vtk() -> Iterator[Any]:
-    """Keep VTK from writing to the terminal; gives what collects its complaints as `events`."""
+    """Keep VTK from writing to the terminal; yields what collects its complaints as `events`."""
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkLogger
 
@@ -102,17 +94,16 @@ def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
     Raises:
         MeshError: A number is NaN or infinite (json has neither), or a value has no place in json.
     """
-    path = Path(path)
-    write_bytes(path, [summary_text(summary).encode()])
+    write_bytes(Path(path), [summary_text(summary).encode()])
 
 
 def summary_text(summary: Mapping[str, Any]) -> str:
-    """Text of the file that `write_summary` writes; raises the same `MeshError`."""
+    """Return the text of the file that `write_summary` writes; raises the same `MeshError`."""
     return json.dumps(plain_values(summary, "summary", MeshError), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def boundary_path(path: Path | str) -> Path:
-    """Name the file of the boundary that belongs to a mesh file.
+    """Return the path of the boundary that belongs to a mesh file.
 
     >>> boundary_path("house/mesh.vtu").as_posix()
     'house/mesh-boundary.vtp'
@@ -153,11 +144,10 @@ def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
         arrays["photographs_seen"], arrays["photographs_supporting"] = tags.photographs.T.astype(np.int32)
 
     data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
-    data.point_data["temperature_c"] = mesh.temperature_c[surface.nodes]
-    data.point_data["observed"] = mesh.observed[surface.nodes].astype(np.uint8)
     data.point_data["node"] = surface.nodes
-    if mesh.colour is not None:
-        data.point_data["colour"] = colour_bytes(mesh.colour[surface.nodes])
+    for name, values in node_arrays(mesh).items():
+        if name != "temperature_k":
+            data.point_data[name] = values[surface.nodes]
     for name, values in arrays.items():
         data.cell_data[name] = values
     names = vtkStringArray()  # pyvista itself takes ASCII only

@@ -19,8 +19,8 @@ LEAST_SHARE = 0.25  # smoothing leaves at least this share of a voxel's level, w
 LEAST_SHARE_THIN = 0.5  # the same in walls and gaps one voxel thick; they keep their thickness
 MARGIN = 4  # voxels farther from the solid than this, along an axis, have level -1 without a look at their density
 UNNOTICED = 0.12
-"""Up to this share of the solid (for gaps: of the empty space) within a voxel may be lost to smoothing. To that much,
-edges of large bodies and single bumps of noise are rounded off, which is what smoothing is for."""
+"""Up to this share of the solid (for gaps: of the empty space) within a voxel may be lost to smoothing, as edges of
+large bodies and single bumps of noise."""
 
 _ROUNDS = 5  # how often what is missing is looked for and made up
 _RATE = 1.5  # share of what is missing that each round makes up, if all of the surface moves alike
@@ -107,14 +107,11 @@ def _beside(cells: BoolArray, axis: int, step: int) -> BoolArray:
 def _keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, cells: BoolArray) -> Float32Array:
     """Shift a smoothed level until around every voxel about as much is solid as the level before smoothing has it.
 
-    A level of -1 and 1 smoothed over three voxels has its zero where it should be on flat walls, but inside it at
-    convex edges; of a bar one voxel thick a third would be left.
-
-    Of each voxel near the surface, the solid share is taken from the trilinear level, and from where the sharp level
-    changes its sign along the axes. Their differences, averaged with weights 1 4 6 4 1 along each axis and divided by
-    the surface around, say how far the surface should move. Differences below `UNNOTICED` of what is there are left
-    alone, so that this acts on bars, corners, specks and pits, not on the faces and long edges of a body of many
-    voxels. Signs stay, and no level comes nearer to 0 than `least`.
+    Of a bar one voxel thick, smoothing would leave a third. Of each voxel near the surface, the solid share is taken
+    from the trilinear level, and from where the sharp level changes its sign along the axes. Their differences,
+    averaged with weights 1 4 6 4 1 along each axis and divided by the surface around, say how far the surface should
+    move. Differences below `UNNOTICED` of what is there are left alone, so that faces and long edges of a body of many
+    voxels stay. Signs stay, and no level comes nearer to 0 than `least`.
     """
     some, every = (look(cells, 3, mode="nearest") for look in (ndimage.maximum_filter, ndimage.minimum_filter))
     near = np.pad(np.not_equal(some, every), 1)

@@ -33,9 +33,7 @@ class BccLattice:
     that a step along an edge is a constant offset of the flat index.
     """
 
-    level: npt.NDArray[np.floating]
-    """Level of every point: the padded centres, then the padded corners; above 0 is solid. Points above 0 have all
-    their neighbours in the array and lie strictly inside the box."""
+    level: npt.NDArray[np.floating]  # level of every point; above 0 is solid, strictly inside of the array and the box
     shape: tuple[int, int, int]  # shape of each of the two padded blocks
     first_cell: IntArray  # index of the voxel whose centre has index (1, 1, 1) in its block
 
@@ -299,8 +297,7 @@ class CoarseInterior:
     """Tetrahedra that take the place of those of the uniform lattice inside a solid."""
 
     covered: BoolArray  # True for the centres of voxels inside a larger cube, in the order of the lattice's centres
-    tets: IntArray
-    """Flat lattice indices, shape (t, 4), positively oriented: everything that the larger cubes share a face with."""
+    tets: IntArray  # flat lattice indices, shape (t, 4), positively oriented: all that larger cubes share a face with
 
     def buried(self, lattice: BccLattice) -> BoolArray:
         """Return True for points of the lattice around which there are only voxels in larger cubes.
@@ -358,8 +355,7 @@ class _Cubes:
 
     size: int  # edge of a cube, [voxels]
     whole: BoolArray  # True where nothing inside the cube is smaller
-    joined: BoolArray
-    """True where the cube is part of a larger one, which is twice as large wherever a single one touches it."""
+    joined: BoolArray  # True where the cube is part of a larger one, twice as large wherever a single one touches it
     single: BoolArray  # True where the cube is one of the octree: whole, but not joined
 
 
@@ -404,7 +400,10 @@ class _Points:
 
 def _between_equals(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntArray]:
     """Yield the tetrahedra between each cube and the one ahead, if both are single."""
-    pairs, whole = (_both(mask, axis) for mask in (cubes.single, cubes.whole))
+    # A filter of 2 takes a cube and the one ahead.
+    pairs, whole = (
+        ndimage.minimum_filter1d(mask, 2, axis=axis, mode="constant", origin=-1) for mask in (cubes.single, cubes.whole)
+    )
     pair = np.flatnonzero(pairs)
     lowest = points.of(np.stack(np.unravel_index(pair, pairs.shape), axis=-1) - 1)
     steps = np.array([pairs.shape[1] * pairs.shape[2], pairs.shape[2], 1])
@@ -445,12 +444,3 @@ def _between_sizes(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntArr
             for a, b, c in ((middle, first, opposite), (middle, opposite, last)):
                 yield here + np.array([a, b, c, above])
                 yield here + np.array([a, c, b, below])
-
-
-def _both(mask: BoolArray, axis: int) -> BoolArray:
-    """Return True where a cube and the one ahead are in the set."""
-    both = mask.copy()
-    row = np.moveaxis(both, axis, 0)
-    row[:-1] &= row[1:]
-    row[-1] = False
-    return both

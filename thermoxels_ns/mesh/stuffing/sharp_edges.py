@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
@@ -71,12 +70,11 @@ def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
 
 @dataclass(frozen=True)
 class _Moves:
-    """Where nodes could move to, those to be tried first in front."""
+    """Where nodes could move to, those to be tried first in front; a node may have several places to go to."""
 
-    node: IntArray  # node numbers, shape (m,); a node may have several places to go to
+    node: IntArray  # node numbers, shape (m,)
     to: FloatArray  # positions, shape (m, 3)
-    corner: IntArray
-    """Moves with the same number, if it is not negative, lead to the same corner of the body; shape (m,)."""
+    corner: IntArray  # number of the body's corner that a move leads to, -1 for none, shape (m,)
 
     def keep(self, which: npt.NDArray) -> _Moves:
         """Return some of the moves, by mask or number."""
@@ -122,7 +120,6 @@ def _clear(surface: Surface, moves: _Moves) -> BoolArray:
         return clear
     start = surface.points[moves.node]
     others = np.flatnonzero(np.any(surface.node_normals != 0.0, axis=1))
-    others = others[is_near(surface.points[others], start, _CLEARANCE)]
     pairs = KDTree(start).sparse_distance_matrix(KDTree(surface.points[others]), _CLEARANCE, output_type="ndarray")
     move, other = pairs["i"], others[pairs["j"]]  # type: ignore[index]
     normal = surface.node_normals[moves.node]
@@ -169,16 +166,25 @@ def _move_nodes(points, tets, around, first, node, to, corner, bounds):
 @kernel
 def _is_sound(corners, bounds):
     """Whether a tetrahedron (4, 3) has a volume above 0 and cosines of its dihedral angles within the bounds."""
-    a, b, c = corners[1] - corners[0], corners[2] - corners[0], corners[3] - corners[0]
-    normals = np.empty((4, 3))
-    normals[1], normals[2], normals[3] = np.cross(b, c), np.cross(c, a), np.cross(a, b)
-    normals[0] = -(normals[1] + normals[2] + normals[3])
-    lengths = np.sqrt((normals * normals).sum(axis=1))
-    if (a * normals[1]).sum() <= 0.0:
+    normals, volume = np.zeros((4, 3)), 0.0
+    for axis in range(3):
+        one, two = (axis + 1) % 3, (axis + 2) % 3
+        for n in range(1, 4):  # the face opposite node n has the nodes 0, p and q
+            p, q = n % 3 + 1, (n + 1) % 3 + 1
+            normals[n, axis] = (corners[p, one] - corners[0, one]) * (corners[q, two] - corners[0, two])
+            normals[n, axis] -= (corners[p, two] - corners[0, two]) * (corners[q, one] - corners[0, one])
+            normals[0, axis] -= normals[n, axis]
+        volume += (corners[1, axis] - corners[0, axis]) * normals[1, axis]
+    if volume <= 0.0:
         return False
     for i in range(4):
         for j in range(i):
-            cosine = -(normals[i] * normals[j]).sum() / (lengths[i] * lengths[j])
+            product, square_i, square_j = 0.0, 0.0, 0.0
+            for axis in range(3):
+                product += normals[i, axis] * normals[j, axis]
+                square_i += normals[i, axis] ** 2
+                square_j += normals[j, axis] ** 2
+            cosine = -product / np.sqrt(square_i * square_j)
             if cosine > bounds[0] or cosine < bounds[1]:
                 return False
     return True
@@ -243,8 +249,6 @@ def edge_planes(surface: Surface) -> Planes:
         return Planes(nodes, np.empty((0, 3), dtype=bool), none, np.empty((0, 3)), none)
     facets = np.flatnonzero(flat)
     centroids = surface.points[surface.facets[facets]].mean(axis=1)
-    close = is_near(centroids, surface.points[nodes], _REACH)
-    facets, centroids = facets[close], centroids[close]
     tree = KDTree(centroids)
     parts = [
         _planes_beside(surface, nodes[start : start + _CHUNK], tree, centroids, facets)
@@ -314,17 +318,6 @@ def _planes_beside(surface: Surface, nodes: IntArray, tree: KDTree, centroids: F
 def _products(vectors: FloatArray, others: FloatArray) -> FloatArray:
     """Return the inner products of vectors (m, k, 3) with others (m, 3), shape (m, k)."""
     return (vectors @ others[:, :, None])[:, :, 0]
-
-
-def is_near(points: FloatArray, others: FloatArray, distance: float) -> BoolArray:
-    """Return True at least for points (n, 3) within `distance` of one of the others (m, 3), shape (n,)."""
-    low = others.min(axis=0) - 2.0 * distance
-    inside = np.all((points > low) & (points < others.max(axis=0) + 2.0 * distance), axis=1)
-    marked = np.zeros(np.floor((others.max(axis=0) - low) / distance).astype(int) + 3, dtype=bool)
-    marked[tuple(np.floor((others - low) / distance).astype(int).T)] = True
-    marked = binary_dilation(marked, np.ones((3, 3, 3)))
-    inside[inside] = marked[tuple(np.floor((points[inside] - low) / distance).astype(int).T)]
-    return inside
 
 
 def _sum_at_nodes(facets: IntArray, values: FloatArray, count: int) -> FloatArray:
