@@ -89,7 +89,8 @@ def build_mesh(
     scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
     solid = select_solid(snapshot, selection, scale, transform[:3] / metres_per_unit, makes_up_volume=not voxel)
     if voxel:
-        (points, tets), facets = kuhn_tets(solid.cells), voxel_facets(solid.cells)
+        (corners, tets), facets = kuhn_tets(solid.cells), voxel_facets(solid.cells)
+        points = corners.astype(np.float64)
     else:
         stuffed = sharpen(stuff(solid.level, options.coarsest_cell), solid.level.shape)
         points, tets, facets = stuffed.points, stuffed.tets, stuffed.facets

@@ -36,7 +36,9 @@ def connected(cells: BoolArray, connectivity: int = 3) -> npt.NDArray[np.int32]:
     """Number the bodies whose voxels touch by faces, edges or corners, as `face_connected` does."""
     # Only where something is solid: a lattice is mostly empty.
     labels, box = np.zeros(cells.shape, dtype=np.int32), bounding_box(cells)
-    labels[box] = ndimage.label(cells[box], ndimage.generate_binary_structure(3, connectivity))[0]
+    inside = np.zeros(cells[box].shape, dtype=np.int32)
+    ndimage.label(cells[box], ndimage.generate_binary_structure(3, connectivity), output=inside)
+    labels[box] = inside
     return labels
 
 
@@ -57,7 +59,18 @@ def grow(cells: BoolArray, by: int) -> BoolArray:
     >>> grow(np.array([[[False, False, False, True]]]), 2)[0, 0].tolist()
     [False, True, True, True]
     """
-    return ndimage.maximum_filter(cells, 2 * by + 1, mode="constant")
+    return np.asarray(ndimage.maximum_filter(cells, 2 * by + 1, mode="constant"), dtype=bool)
+
+
+def shrink(cells: BoolArray, size: int | tuple[int, ...], origin: int | tuple[int, ...] = 0) -> BoolArray:
+    """Keep the voxels around which a box of `size` voxels lies in the set; nothing beyond the array does.
+
+    A box of an even size lies half a voxel lower, with an origin of -1 half a voxel higher.
+
+    >>> shrink(np.array([[[True, True, True, True]]]), (1, 1, 3))[0, 0].tolist()
+    [False, True, True, False]
+    """
+    return np.asarray(ndimage.minimum_filter(cells, size, mode="constant", origin=origin), dtype=bool)
 
 
 def close_gaps(cells: BoolArray, by: int) -> BoolArray:

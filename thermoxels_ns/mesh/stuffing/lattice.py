@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.mesh.solid.morphology import bounding_box, repeated
+from thermoxels_ns.mesh.solid.morphology import bounding_box, repeated, shrink
 
 _AXES = np.eye(3)[[0, 0, 1, 1, 2, 2]] * np.array([1.0, -1.0] * 3)[:, None]
 _DIAGONALS = (np.arange(8)[:, None] >> np.array([2, 1, 0]) & 1) - 0.5
@@ -276,7 +276,7 @@ def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
     size, whole = 1, cells
     while size < largest:
         # A cube of one voxel touches any cube of two; larger ones need neighbours of at least half their size.
-        halves = whole if size == 1 else ndimage.minimum_filter(whole, 3, mode="constant")
+        halves = whole if size == 1 else shrink(whole, 3)
         halves = np.pad(halves, [(0, n % 2) for n in halves.shape])
         nx, ny, nz = (n // 2 for n in halves.shape)
         whole = halves.reshape(nx, 2, ny, 2, nz, 2).all(axis=(1, 3, 5))
@@ -304,7 +304,7 @@ class CoarseInterior:
 
         They and all their neighbours are inside the solid, and none of these neighbours is moved or has a cut.
         """
-        corners = ndimage.minimum_filter(self.covered.reshape(lattice.shape), 2, mode="constant", origin=-1)
+        corners = shrink(self.covered.reshape(lattice.shape), 2, -1)
         return np.concatenate([self.covered, corners.reshape(-1)])
 
 
@@ -341,12 +341,9 @@ def _far_from_surface(lattice: BccLattice) -> BoolArray:
     # next to it, and no centre at one of its own corners.
     centres, corners = lattice.level.reshape(2, *lattice.shape)
     inside = centres > 0.0
-    deep = ndimage.binary_erosion(inside, iterations=2)
-    deep &= ndimage.minimum_filter(inside, 3, mode="constant")
-    # A filter of 2 takes a corner and the one below it along each axis.
-    deep &= ndimage.binary_erosion(ndimage.minimum_filter(corners >= 0.0, 2, mode="constant"))
-    deep &= ndimage.minimum_filter(corners > 0.0, 2, mode="constant")
-    return deep
+    deep = shrink(inside, 3) & shrink(corners > 0.0, 2)
+    deep &= np.asarray(ndimage.binary_erosion(inside, iterations=2), dtype=bool)
+    return deep & np.asarray(ndimage.binary_erosion(shrink(corners >= 0.0, 2)), dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -400,10 +397,9 @@ class _Points:
 
 def _between_equals(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntArray]:
     """Yield the tetrahedra between each cube and the one ahead, if both are single."""
-    # A filter of 2 takes a cube and the one ahead.
-    pairs, whole = (
-        ndimage.minimum_filter1d(mask, 2, axis=axis, mode="constant", origin=-1) for mask in (cubes.single, cubes.whole)
-    )
+    two, ahead = [1, 1, 1], [0, 0, 0]  # a cube and the one ahead
+    two[axis], ahead[axis] = 2, -1
+    pairs, whole = (shrink(mask, tuple(two), tuple(ahead)) for mask in (cubes.single, cubes.whole))
     pair = np.flatnonzero(pairs)
     lowest = points.of(np.stack(np.unravel_index(pair, pairs.shape), axis=-1) - 1)
     steps = np.array([pairs.shape[1] * pairs.shape[2], pairs.shape[2], 1])
