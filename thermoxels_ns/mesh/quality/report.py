@@ -72,7 +72,7 @@ class Criterion:
 def angle_edges(boundary_mode: BoundaryMode) -> FloatArray:
     """Return the edges of bins about 5 degrees wide that cover 0 to 180 degrees, none of them across a bound.
 
-    >>> angle_edges("voxel")[[0, 1, -1]].round(3)
+    >>> angle_edges("voxel")[[0, 1, -1]].round(2)
     array([ -0. ,   4.5, 180. ])
     """
     low, high = DIHEDRAL_BOUNDS_DEG[boundary_mode]
