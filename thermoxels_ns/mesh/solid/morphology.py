@@ -70,7 +70,7 @@ def shrink(cells: BoolArray, size: int | tuple[int, ...], origin: int | tuple[in
     >>> shrink(np.array([[[True, True, True, True]]]), (1, 1, 3))[0, 0].tolist()
     [False, True, True, False]
     """
-    return np.asarray(ndimage.minimum_filter(cells, size, mode="constant", origin=origin), dtype=bool)
+    return np.asarray(ndimage.minimum_filter(cells, size, mode="constant", origin=origin), dtype=bool)  # type: ignore[arg-type]
 
 
 def close_gaps(cells: BoolArray, by: int) -> BoolArray:
