@@ -2,21 +2,14 @@
 
     python tests/benchmarks/mesh_cost.py --csv mesh-cost.csv --plot docs/mesh-cost.png
     python tests/benchmarks/mesh_cost.py --bodies hot-object --modes voxel --resolutions 128 --csv mesh-cost.csv
-    python tests/benchmarks/mesh_cost.py --bodies --csv mesh-cost.csv --plot docs/mesh-cost.png
-    python tests/benchmarks/mesh_cost.py --speed
 
 The fields are exact: at voxel centres the logarithm of the density is the signed distance to a body whose area and
 volume are known. Each case runs in a process of its own, so that its peak memory is its own; the seconds are those of
 `build_mesh` with all tags, 40 cameras on a sphere around the body, the median of `--repeats` runs.
 
-Every case is put into the csv file as soon as it is measured, in the place of an earlier one of the same body, lattice
-and boundary, and the plot shows all that the file holds: parts can be measured apart (second line), or nothing (third).
-
-`--speed` times a lattice of 128^3 voxels, 5 % of them solid, beside a plain Python loop over the same voxels.
+The csv file is written again after every case.
 """
 
-import csv
-import json
 import multiprocessing
 import resource
 import statistics
@@ -33,15 +26,14 @@ import tyro
 from measuring import logarithmic_panels, save, write_rows
 
 from tests.support.demo_mesh import exact_snapshot
-from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
 from thermoxels_ns.evaluation.truth_comparison import sample_facets
-from thermoxels_ns.mesh.build import BuiltMesh, MeshOptions, build_mesh
+from thermoxels_ns.mesh.build import MeshOptions, build_mesh
 from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
-from thermoxels_ns.mesh.voxel_tets import KUHN_PATTERN
+from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.synthetic.camera_rings import look_at
 from thermoxels_ns.synthetic.scene_folder import make_scene
 
@@ -104,21 +96,17 @@ def cameras_around(centre: Vector, reach: float, count: int) -> Views:
     return Views(poses, np.full((count, 2), 500.0), np.full((count, 2), 320.0), np.full((count, 2), 640))
 
 
-def timed_build(snapshot: GridSnapshot, selection: SolidSelection, mode: Mode, repeats: int) -> tuple[BuiltMesh, float]:
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        built = build_mesh(snapshot, selection, np.eye(4), MeshOptions(mode))
-        seconds.append(time.perf_counter() - start)
-    return built, statistics.median(seconds)
-
-
 def measure(name: str, voxels: int, mode: Mode, repeats: int) -> dict[str, Any]:
     """One case; runs in a process of its own."""
     body = body_named(name)
     snapshot = snapshot_of(body, voxels)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    built, seconds = timed_build(snapshot, SolidSelection(density_threshold=1.0, close_gaps=0), mode, repeats)
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        selection = SolidSelection(density_threshold=1.0, close_gaps=0)
+        built = build_mesh(snapshot, selection, np.eye(4), MeshOptions(mode))
+        seconds.append(time.perf_counter() - start)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     mesh, quality = built.mesh, check_mesh(built.mesh)
     assert mesh.boundary is not None
@@ -137,7 +125,7 @@ def measure(name: str, voxels: int, mode: Mode, repeats: int) -> dict[str, Any]:
         "voxels": voxels,
         "mode": mode,
         "tets": quality.num_tets,
-        "seconds": seconds,
+        "seconds": statistics.median(seconds),
         "peak_mb": peak / 1024,
         "area_error": area / body.area - 1.0,
         "area_error_of_triangles": quality.area_m2 / body.area - 1.0,
@@ -148,44 +136,6 @@ def measure(name: str, voxels: int, mode: Mode, repeats: int) -> dict[str, Any]:
         "dihedral_min": quality.dihedral_range_deg[0],
         "dihedral_max": quality.dihedral_range_deg[1],
     }
-
-
-def plain_loop(cells: npt.NDArray[np.bool_]) -> list[list[int]]:
-    """Six tetrahedra per voxel in plain Python, as one would write it down; no tags, no temperatures."""
-    offsets, pattern = CORNER_OFFSETS.tolist(), KUHN_PATTERN.tolist()
-    numbers: dict[tuple[int, int, int], int] = {}
-    tets = []
-    nx, ny, nz = cells.shape
-    for i in range(nx):
-        for j in range(ny):
-            for k in range(nz):
-                if cells[i, j, k]:
-                    corners = [numbers.setdefault((i + x, j + y, k + z), len(numbers)) for x, y, z in offsets]
-                    tets.extend([corners[c] for c in tet] for tet in pattern)
-    return tets
-
-
-def speed(repeats: int) -> None:
-    """Seconds for a spherical shell of 5 % of 128^3 voxels, as trained fields have it, and as many of 256^3."""
-    selection = SolidSelection(density_threshold=1.0, close_gaps=0, interior="hollow")
-    for voxels, share in ((128, 0.05), (256, 0.05 / 8)):
-        middle, thickness = 0.5 * voxels, 3.0
-        radius = float(np.sqrt(share * voxels**3 / (4.0 * np.pi * thickness)))
-        shell = Body(
-            lambda p, m=middle, r=radius, t=thickness: np.abs(np.linalg.norm(p - m, axis=1) - r) - 0.5 * t,
-            0.0,
-            0.0,
-            ((0.0, 0.0, 0.0), (float(voxels),) * 3),
-        )
-        snapshot = snapshot_of(shell, voxels)
-        cells = select_solid(snapshot, selection).cells
-        start = time.perf_counter()
-        tets = plain_loop(cells)
-        loop = time.perf_counter() - start
-        print(f"{voxels}^3, {cells.mean():.2%} solid: plain loop {loop:.2f} s, {len(tets)} tetrahedra")
-        for mode in MODES:
-            built, median = timed_build(snapshot, selection, mode, repeats)
-            print(f"  {mode}: {median:.2f} s with tags, {len(built.mesh.tets)} tetrahedra, {median / loop:.2f} x loop")
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
@@ -210,21 +160,12 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     save(figure, path, dpi=130)
 
 
-def read_rows(path: Path | None) -> list[dict[str, Any]]:
-    """What an earlier run measured; nothing without a file."""
-    if path is None or not path.is_file():
-        return []
-    kinds = {"body": str, "mode": str, "voxels": int, "tets": int}
-    with path.open(newline="", encoding="utf-8") as file:
-        return [{key: kinds.get(key, float)(value) for key, value in row.items()} for row in csv.DictReader(file)]
-
-
 @dataclass
 class MeshCost:
     resolutions: tuple[int, ...] = (16, 32, 64, 128)
     """Voxels along the longest side."""
     bodies: tuple[BodyName, ...] = BODIES
-    """Bodies; none: only plot what the csv file holds."""
+    """Bodies."""
     modes: tuple[Mode, ...] = MODES
     """Boundaries."""
     repeats: int = 5
@@ -233,35 +174,28 @@ class MeshCost:
     """File of all cases."""
     plot: Path | None = None
     """Where the picture goes."""
-    speed: bool = False
-    """Only time 128^3 and 256^3 voxels beside a plain loop."""
 
     def main(self) -> None:
-        if self.speed:
-            speed(self.repeats)
-            return
-        rows = {(row["body"], row["voxels"], row["mode"]): row for row in read_rows(self.csv)}
+        rows = []
         spawn = multiprocessing.get_context("spawn")
         print("| body | voxels | boundary | tets | s | MB | area | volume | Hausdorff | IoU |")
         print("|---|---:|---|---:|---:|---:|---:|---:|---:|---:|")
         for case in product(self.bodies, self.resolutions, self.modes):
             with spawn.Pool(1) as pool:
-                row = rows[case] = pool.apply(measure, (*case, self.repeats))
-            rows = dict(sorted(rows.items(), key=lambda r: (BODIES.index(r[0][0]), r[0][1], MODES.index(r[0][2]))))
+                row = pool.apply(measure, (*case, self.repeats))
+            rows.append(row)
             if self.csv:
-                write_rows(self.csv, list(rows.values()))
+                write_rows(self.csv, rows)
             print(
                 f"| {row['body']} | {row['voxels']} | {row['mode']} | {row['tets']:,} | {row['seconds']:.2f} "
                 f"| {row['peak_mb']:.0f} | {100 * row['area_error']:+.2f} % | {100 * row['volume_error']:+.2f} % "
                 f"| {row['hausdorff_voxels']:.2f} | {row['iou']:.4f} |",
                 flush=True,
             )
-        if not rows:
-            raise SystemExit("nothing was measured and the csv file holds nothing: name --bodies or a --csv")
         if self.plot:
-            plot(list(rows.values()), self.plot)
-        angles = [[row[f"dihedral_{end}"] for row in rows.values()] for end in ("min", "max")]
-        print(json.dumps({"worst_angles": [min(angles[0]), max(angles[1])]}))
+            plot(rows, self.plot)
+        lowest, highest = min(row["dihedral_min"] for row in rows), max(row["dihedral_max"] for row in rows)
+        print(f"dihedral angles from {lowest:.2f} to {highest:.2f} degrees")
 
 
 if __name__ == "__main__":

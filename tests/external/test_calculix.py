@@ -9,7 +9,7 @@ from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_matrices import HeatMatrices, assemble
 from thermoxels_ns.fem.implicit_equation import LinearSolver
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
+from thermoxels_ns.mesh.files.solvers import HeatStep, write_inp
 from thermoxels_ns.mesh.quality.checks import facet_areas
 
 pytestmark = pytest.mark.external

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.mesh.files.formats import write_xdmf
+from thermoxels_ns.mesh.files.solvers import write_xdmf
 from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 

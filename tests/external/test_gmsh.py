@@ -4,7 +4,7 @@ import meshio
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.files.gmsh import write_msh
+from thermoxels_ns.mesh.files.solvers import write_msh
 
 pytestmark = pytest.mark.external
 

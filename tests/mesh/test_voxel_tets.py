@@ -3,7 +3,6 @@ import pytest
 
 from thermoxels_ns.mesh.quality.checks import boundary_facets, facet_areas
 from thermoxels_ns.mesh.quality.report import check_mesh
-from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, lattice_edges, voxel_facets
 
@@ -62,21 +61,6 @@ def turned(facets: np.ndarray) -> list:
 def test_voxel_faces_give_the_boundary_of_the_tetrahedra(name):
     cells = pattern(name)
     assert turned(voxel_facets(cells)) == turned(boundary_facets(kuhn_tets(cells)[1]))
-
-
-def test_single_voxel_by_hand():
-    corners, tets = kuhn_tets(np.ones((1, 1, 1), dtype=bool))
-    assert corners.tolist() == np.argwhere(np.ones((2, 2, 2))).tolist()
-    assert (corners.dtype, tets.dtype) == (np.int64, np.int64)
-    assert sorted(sorted(t) for t in tets.tolist()) == [
-        [0, 1, 3, 7],
-        [0, 1, 5, 7],
-        [0, 2, 3, 7],
-        [0, 2, 6, 7],
-        [0, 4, 5, 7],
-        [0, 4, 6, 7],
-    ]
-    assert np.allclose(signed_volumes(corners.astype(float), tets), 1 / 6)
 
 
 def test_box_facets_are_those_on_the_lattice_border(mesh_of_cells):

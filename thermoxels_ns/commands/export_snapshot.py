@@ -28,12 +28,12 @@ from thermoxels_ns.heat.solving import Goals, solve_problem
 from thermoxels_ns.heat.vtk_series import STEP_PATTERN, heat_series_paths, remove_heat_series, write_heat_series
 from thermoxels_ns.mesh.boundary.visibility import facet_views
 from thermoxels_ns.mesh.build import BuiltMesh, MeshOptions, apply_transform, build_mesh
-from thermoxels_ns.mesh.files.abaqus import HeatStep
-from thermoxels_ns.mesh.files.formats import MESH_FORMATS, check_format, mesh_file_paths, write_mesh
+from thermoxels_ns.mesh.files.formats import MESH_FORMATS, mesh_file_paths, write_mesh
+from thermoxels_ns.mesh.files.solvers import HeatStep
+from thermoxels_ns.mesh.files.surface import check_stl
 from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
 from thermoxels_ns.mesh.quality.checks import facet_areas
-from thermoxels_ns.mesh.quality.picture import picture_of_quality
-from thermoxels_ns.mesh.quality.report import QualityReport, check_mesh
+from thermoxels_ns.mesh.quality.report import QualityReport, check_mesh, picture_of_quality
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection
 from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, support_of_facets
@@ -117,8 +117,8 @@ def export_snapshot(
         built = _with_support(built, depths, tracks, snapshot.lattice, to_mesh)
     mesh = built.mesh
     suffixes = [f".{name}" for name in options.formats]
-    for suffix in suffixes:
-        check_format(f"{_MESH_STEM}{suffix}", mesh)
+    if ".stl" in suffixes:
+        check_stl(mesh)
     voxel_size = snapshot.lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(to_mesh[:3, :3]))))
     unit = "input unit" if scale is None else "m"
     report = check_mesh(mesh, options.boundary, built.observed_range_c, length_unit=unit)

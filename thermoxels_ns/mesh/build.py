@@ -17,7 +17,7 @@ from thermoxels_ns.mesh.quality.checks import component_of, facet_normals
 from thermoxels_ns.mesh.quality.report import BoundaryMode
 from thermoxels_ns.mesh.solid.morphology import face_connected
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
-from thermoxels_ns.mesh.stuffing.isosurface import check_coarsest, stuff
+from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.stuffing.sharp_edges import sharpen
 from thermoxels_ns.mesh.temperature import (
     MIN_OBSERVED_WEIGHT,
@@ -25,7 +25,7 @@ from thermoxels_ns.mesh.temperature import (
     interpolate_corners,
     tet_conductances,
 )
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets, voxel_surface
 
 
@@ -40,7 +40,10 @@ class MeshOptions:
     rules: PatchRules = field(default_factory=PatchRules)  # Patches and regions of the user
 
     def __post_init__(self) -> None:
-        check_coarsest("coarsest_cell", self.coarsest_cell, "Pass --coarsest-cell 4.")
+        coarsest = self.coarsest_cell
+        if not (isinstance(coarsest, int) and coarsest >= 1 and coarsest & (coarsest - 1) == 0):
+            expected, remedy = "1, 2, 4, 8 or another power of two, [voxels]", "Pass --coarsest-cell 4."
+            raise MeshError("coarsest_cell", expected=expected, got=repr(coarsest), remedy=remedy)
         if self.boundary not in ("conforming", "voxel"):
             raise MeshError("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")
 
@@ -59,16 +62,6 @@ class BuiltMesh:
     """The user's rules for patches and regions that nothing in the mesh follows, such as "patch roof (entry 2)"."""
 
 
-@dataclass(frozen=True)
-class _Shape:
-    """Nodes and elements before they have temperatures."""
-
-    points: FloatArray  # nodes as fractional corner indices, shape (n, 3)
-    tets: IntArray
-    facets: IntArray
-    facet_tags: IntArray
-
-
 def build_mesh(
     snapshot: GridSnapshot,
     selection: SolidSelection,
@@ -78,7 +71,7 @@ def build_mesh(
 ) -> BuiltMesh:
     """Cut the solid part of a trained field into tetrahedra with nodal temperatures and boundary tags.
 
-    Parts of it that no thermal ray saw have no temperature at all and are left out.
+    Parts that no thermal ray saw have no temperature at all and are left out.
 
     Args:
         snapshot: The trained field on its corner lattice.
@@ -94,37 +87,41 @@ def build_mesh(
     """
     transform = check_similarity("world_to_metres", world_to_metres)
     scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
-    of_scene = scale, transform[:3] / metres_per_unit
-    solid = select_solid(snapshot, selection, *of_scene, makes_up_volume=not voxel)
+    solid = select_solid(snapshot, selection, scale, transform[:3] / metres_per_unit, makes_up_volume=not voxel)
     if voxel:
         (corners, tets), facets = kuhn_tets(solid.cells), voxel_facets(solid.cells)
-        tags = boundary_tags(facets, corners, tuple(n + 1 for n in solid.cells.shape))
-        shape = _Shape(corners.astype(np.float64), tets, facets, tags)
+        points = corners.astype(np.float64)
     else:
         stuffed = sharpen(stuff(solid.level, options.coarsest_cell), solid.level.shape)
-        tags = np.where(stuffed.on_box, FACET_BOX, FACET_SURFACE).astype(np.int64)
-        shape = _Shape(stuffed.points, stuffed.tets, stuffed.facets, tags)
+        points, tets, facets = stuffed.points, stuffed.tets, stuffed.facets
     # From measured corners alone.
     measured = np.where(snapshot.observed_weight >= MIN_OBSERVED_WEIGHT, snapshot.observed_weight, 0.0)
-    temperature_c, weight = interpolate_corners(shape.points, snapshot.temperature_c, measured)
-    stays, num_parts = _with_a_measurement(shape, weight >= MIN_OBSERVED_WEIGHT)
+    temperature_c, weight = interpolate_corners(points, snapshot.temperature_c, measured)
+    observed = weight >= MIN_OBSERVED_WEIGHT
+
+    body = component_of(len(points), tets[:, :3].ravel(), tets[:, 1:].ravel())
+    unseen = np.bincount(body, observed) == 0
+    parts = int(np.count_nonzero(unseen)) if observed.any() else 0
     num_voxels = 0
-    if num_parts:
-        goes = _voxels_of(solid, shape, ~stays, voxel)
+    if parts:
+        stays = ~unseen[body]
+        goes = _voxels_of(solid.cells, points, tets, ~stays, voxel)
         num_voxels = int(np.count_nonzero(goes))
         solid = replace(solid, cells=solid.cells & ~goes, level=np.where(goes, -np.abs(solid.level), solid.level))
-        shape, temperature_c, weight = _kept(shape, stays), temperature_c[stays], weight[stays]
-    edges, conductance = lattice_edges(solid.cells) if voxel else tet_conductances(shape.points, shape.tets)
-    observed = weight >= MIN_OBSERVED_WEIGHT
+        number = np.cumsum(stays) - 1
+        tets, facets = number[tets[stays[tets[:, 0]]]], number[facets[stays[facets[:, 0]]]]
+        points, temperature_c, observed = points[stays], temperature_c[stays], observed[stays]
+    edges, conductance = lattice_edges(solid.cells) if voxel else tet_conductances(points, tets)
     temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
 
-    tets, facets = shape.tets, shape.facets
+    on_border = boundary_tags(facets, points, snapshot.lattice.shape)
+    facet_tags = np.where(_cut_by_region(points, facets, solid.within), FACET_BOX, on_border)
     if np.linalg.det(transform[:3, :3]) < 0.0:
         tets, facets = tets[:, [0, 2, 1, 3]], facets[:, ::-1]
-    points_m = apply_transform(transform, snapshot.lattice.index_to_world(shape.points))
+    points_m = apply_transform(transform, snapshot.lattice.index_to_world(points))
     colour = None
     if snapshot.colour is not None:  # from corners with density, grey where there is none around
-        found, known = interpolate_corners(shape.points, snapshot.colour, snapshot.density > 0.0)
+        found, known = interpolate_corners(points, snapshot.colour, snapshot.density > 0.0)
         colour = np.where(known[:, None] > 0.0, found, 0.5).astype(np.float32)
     of_tets = points_m[tets].mean(axis=1), None if colour is None else colour[tets].mean(axis=1)
     region, region_names, idle_regions = apply_regions(options.rules, *of_tets)
@@ -134,17 +131,40 @@ def build_mesh(
         temperature_c=temperature_c,
         observed=observed,
         facets=np.ascontiguousarray(facets),
-        facet_tags=np.where(_cut(shape, solid.within), FACET_BOX, shape.facet_tags),
+        facet_tags=facet_tags,
         region=region,
         region_names=region_names,
         colour=colour,
     )
-    boundary, idle_patches = _tagged(mesh, shape.points, solid, snapshot, transform[:3, :3] / scale, options)
+    boundary, idle_patches = _tagged(mesh, points, solid, snapshot, transform[:3, :3] / scale, options)
     measured_c = snapshot.temperature_c[snapshot.observed_weight >= MIN_OBSERVED_WEIGHT]
     observed_range_c = float(measured_c.min()), float(measured_c.max())
     return BuiltMesh(
-        replace(mesh, boundary=boundary), solid, num_parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
+        replace(mesh, boundary=boundary), solid, parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
     )
+
+
+def _voxels_of(cells: BoolArray, points: FloatArray, tets: IntArray, nodes: BoolArray, voxel: bool) -> BoolArray:
+    """Return the solid voxels that the bodies of a mesh with some of its nodes were made from."""
+    if voxel:
+        inside = points[tets[nodes[tets[:, 0]]]].mean(axis=1)
+    else:  # centres of solid voxels near the surface are nodes, and voxels that share a face are in one body
+        inside = points[nodes][np.all(points[nodes] % 1.0 == 0.5, axis=1)]
+    body = face_connected(cells)
+    goes = np.zeros(int(body.max()) + 1, dtype=bool)
+    goes[body[tuple(np.floor(inside).astype(np.int64).T)]] = True
+    goes[0] = False
+    return goes[body]
+
+
+def _cut_by_region(points: FloatArray, facets: IntArray, within: BoolArray) -> BoolArray:
+    """Return the boundary triangles that look out of the region: the solid may go on behind them."""
+    # A smoothed surface between two voxels lies at most half a voxel before their common face.
+    beside = np.floor(points[facets].mean(axis=1) + 0.75 * facet_normals(points, facets)).astype(np.int64)
+    inside = np.all((beside >= 0) & (beside < within.shape), axis=1)
+    cut = np.zeros(len(beside), dtype=bool)
+    cut[inside] = ~within[tuple(beside[inside].T)]
+    return cut
 
 
 def _tagged(
@@ -155,10 +175,7 @@ def _tagged(
     rotation: FloatArray,
     options: MeshOptions,
 ) -> tuple[Boundary, tuple[str, ...]]:
-    """Normal, area factor, visibility and patch of every boundary triangle, and the rules that no triangle follows.
-
-    Without cameras every triangle counts as seen.
-    """
+    """Return the tags of every boundary triangle, and the rules that none follows; without cameras all are seen."""
     if options.boundary == "voxel":
         in_world, factor = voxel_surface(solid.level, points_index, mesh.facets)
         normal = in_world @ rotation.T
@@ -181,55 +198,8 @@ def _tagged(
     return Boundary(normal=normal, area_factor=factor, seen=seen, patch=patch, patch_names=names), idle
 
 
-def _cut(shape: _Shape, within: BoolArray) -> BoolArray:
-    """Boundary triangles that look out of the region: the solid may go on behind them, as it may behind the box."""
-    corners = shape.points[shape.facets]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    # A smoothed surface between two voxels lies at most half a voxel before their common face.
-    beside = np.floor(corners.mean(axis=1) + 0.75 * normal).astype(np.int64)
-    inside = np.all((beside >= 0) & (beside < within.shape), axis=1)
-    cut = np.zeros(len(beside), dtype=bool)
-    cut[inside] = ~within[tuple(beside[inside].T)]
-    return cut
-
-
-def _with_a_measurement(shape: _Shape, observed: BoolArray) -> tuple[BoolArray, int]:
-    """Nodes (mask) of the components of a mesh that have an observed node, or all if none has; number left out."""
-    component = component_of(len(shape.points), shape.tets[:, :3].ravel(), shape.tets[:, 1:].ravel())
-    seen = np.bincount(component[observed], minlength=int(component.max()) + 1) > 0
-    if not seen.any():
-        seen[:] = True
-    return seen[component], int(np.count_nonzero(~seen))
-
-
-def _kept(shape: _Shape, stays: BoolArray) -> _Shape:
-    """The components of a mesh whose nodes stay."""
-    number = np.cumsum(stays, dtype=np.int64) - 1
-    facet_stays = stays[shape.facets[:, 0]]
-    return _Shape(
-        shape.points[stays],
-        number[shape.tets[stays[shape.tets[:, 0]]]],
-        number[shape.facets[facet_stays]],
-        shape.facet_tags[facet_stays],
-    )
-
-
-def _voxels_of(solid: SolidCells, shape: _Shape, nodes: BoolArray, voxel: bool) -> BoolArray:
-    """The solid voxels that the components of a mesh with these nodes were made from."""
-    if voxel:
-        inside = shape.points[shape.tets[nodes[shape.tets[:, 0]]]].mean(axis=1)
-    else:  # centres of solid voxels near the surface are nodes, and voxels that share a face are in one component
-        inside = shape.points[nodes][np.all(shape.points[nodes] % 1.0 == 0.5, axis=1)]
-    component = face_connected(solid.cells)
-    goes = np.zeros(int(component.max()) + 1, dtype=bool)
-    goes[component[tuple(np.floor(inside).astype(np.int64).T)]] = True
-    goes[0] = False
-    return goes[component]
-
-
 def check_similarity(name: str, matrix: npt.ArrayLike) -> FloatArray:
-    """Return `matrix` as float64 if it is a 4x4 similarity (mirrors allowed), else raise `MeshError`."""
+    """Return `matrix` as float64 if it is a similarity, shape (4, 4), mirrors allowed, else raise `MeshError`."""
     remedy = "Pass a 4x4 matrix made of a rotation, one scale above 0 and a shift, with last row 0 0 0 1."
     transform = check_shape(name, np.asarray(matrix, dtype=np.float64), (4, 4), remedy, MeshError)
     check_finite(name, transform, remedy, MeshError)

@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import cg
+from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite
@@ -18,8 +19,7 @@ from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 MIN_OBSERVED_WEIGHT = 0.5
 """A node counts as measured if thermal rays, all together, gave it at least half of one fully absorbed ray; less is
 leakage through a surface or the tail of an interpolation."""
-_DIRECT_SOLVE_UNKNOWNS = 4000
-_RELATIVE_RESIDUAL = 1e-7
+_RELATIVE_RESIDUAL = 1e-9
 _MOST_ROUNDS = 100_000
 _LEAST_CONDUCTANCE = 1e-6
 """Least conductance of an edge, as a share of the mean: keeps the matrix an M-matrix, and components connected."""
@@ -31,8 +31,7 @@ def interpolate_corners(
     """Interpolate between corners that know a value, leaving out those that do not (normalised convolution).
 
     value(x) = sum_c t_c w_c v_c / sum_c t_c w_c with the trilinear weights t_c of the eight corners around x and the
-    weight w_c of what is known there (Knutsson and Westin, CVPR 1993). The result lies within the range of the values
-    it is made of.
+    weight w_c of what is known there (Knutsson and Westin, CVPR 1993).
 
     Args:
         points_index: Positions as fractional corner indices, shape (n, 3), within the lattice.
@@ -46,28 +45,15 @@ def interpolate_corners(
     shape = weights.shape
     low = np.clip(np.floor(points_index).astype(np.int64), 0, np.array(shape) - 2)
     fraction = np.clip(points_index - low, 0.0, 1.0)
-    flat_values = values.reshape(-1, *values.shape[3:])
-    flat_weights = weights.ravel()
-    total = np.zeros((len(low), *values.shape[3:]))
-    weight = np.zeros(len(low))
+    flat_values, flat_weights = values.reshape(-1, *values.shape[3:]), weights.ravel()
     trailing = (slice(None), *[None] * (values.ndim - 3))
-    # Chosen as the origin of the sum so that equal values come out as they are.
-    first: FloatArray | None = None
-    known = np.zeros(len(low), dtype=bool)
+    total, weight = np.zeros((len(low), *values.shape[3:])), np.zeros(len(low))
     for offset in CORNER_OFFSETS:
-        at = ((low[:, 0] + offset[0]) * shape[1] + low[:, 1] + offset[1]) * shape[2] + low[:, 2] + offset[2]
+        at = np.ravel_multi_index(tuple((low + offset).T), shape)
         share = np.prod(np.where(offset == 1, fraction, 1.0 - fraction), axis=1) * flat_weights[at]
         weight += share
-        here = flat_values[at].astype(np.float64)
-        if first is None:
-            first = np.zeros_like(here)
-        fresh = ~known & (share > 0.0)
-        first[fresh] = here[fresh]
-        known |= fresh
-        total += share[trailing] * (here - first)
-    assert first is not None
-    divisor = np.where(weight > 0.0, weight, 1.0)[trailing]
-    return first + total / divisor, weight
+        total += share[trailing] * flat_values[at]
+    return total / np.where(weight > 0.0, weight, 1.0)[trailing], weight
 
 
 def extend_harmonically(
@@ -79,8 +65,8 @@ def extend_harmonically(
     """Fill in the temperature of unobserved nodes by the graph Laplace equation, shape (n,), [degrees Celsius].
 
     Observed nodes keep their value. Every other node i solves sum_j w_ij (T_i - T_j) = 0 over its edges: steady heat
-    conduction in an insulated body. No filled-in value leaves the observed range of its connected component: an edge
-    whose weights add up to 0 or less gets next to none, and what rounding adds beyond the range is clipped.
+    conduction in an insulated body, by conjugate gradients. No value leaves the observed range of its connected
+    component, because an edge whose weights add up to 0 or less gets next to none.
 
     Args:
         edges: Node pairs, shape (e, 2); the weights of a pair that comes more than once add up.
@@ -109,85 +95,45 @@ def extend_harmonically(
     links = sparse.coo_array((weights, (start, end)), shape=(num_nodes, num_nodes)).tocsr()
     links = (links + links.T).tocsr()
     links.data = np.maximum(links.data, _LEAST_CONDUCTANCE * float(np.abs(links.data).mean()))
-    component = _measured_components(links, observed)
-
-    free = np.flatnonzero(~observed)
-    fixed = np.flatnonzero(observed)
-    middle = 0.5 * (temperature[fixed].min() + temperature[fixed].max())
-    rows = links[free]
-    degree = np.asarray(rows.sum(axis=1)).ravel()
-    matrix = (sparse.diags_array(degree) - rows[:, free]).tocsr()
-    load = rows[:, fixed] @ (temperature[fixed] - middle)
-    temperature[free] = middle + _solve(matrix, load, degree)
-
-    labels = np.arange(component.max() + 1)
-    low = np.asarray(ndimage.minimum(temperature[fixed], component[fixed], labels))
-    high = np.asarray(ndimage.maximum(temperature[fixed], component[fixed], labels))
-    temperature[free] = np.clip(temperature[free], low[component[free]], high[component[free]])
-    return temperature
-
-
-def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, FloatArray]:
-    """Edges of tetrahedra, shape (6 t, 2), and what each adds to their conductance: minus its linear stiffness entries.
-
-    With them a temperature that is linear in space is extended exactly, but for edges between angles so obtuse that
-    their entries add up to less than 0. An edge comes once for each tetrahedron around it.
-    """
-    conductances = np.empty((len(tets), 6))
-    for which, shapes in shapes_in_chunks(points, tets):
-        conductances[which] = -shapes.stiffness(shapes.dihedral_cosines()).T
-    return tets[:, TET_EDGES].reshape(-1, 2), conductances.ravel()
-
-
-def _measured_components(links: sparse.csr_array, observed: BoolArray) -> IntArray:
-    """Connected component of every node, shape (n,); raise if one has no observed node."""
     count, component = connected_components(links, directed=False)
-    measured = np.bincount(component[observed], minlength=count)
-    blind = np.flatnonzero(measured == 0)
+    blind = np.flatnonzero(np.bincount(component[observed], minlength=count) == 0)
     if len(blind):
-        sizes, first = np.bincount(component, minlength=count), np.unique(component, return_index=True)[1]
+        sizes, first = np.bincount(component), np.unique(component, return_index=True)[1]
         shown = ", ".join(f"part {p} ({sizes[p]} nodes, the first is node {first[p]})" for p in blind[:3])
         expected = "at least one node seen by a thermal ray in each connected part of the mesh"
         got = f"none in {len(blind)} of {count} parts: {shown}{', ...' if len(blind) > 3 else ''}"
         remedy = "Train with thermal images that show this part."
         raise MeshError("observed temperatures", expected=expected, got=got, remedy=remedy)
-    return component.astype(np.int64)
 
-
-def _conjugate_gradients(
-    matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray, tolerance: float
-) -> FloatArray:
-    """Conjugate gradients with Jacobi, from 0 until the residual is at most `tolerance` of the load."""
-    # Sums are numpy's own: those of BLAS depend in the last digits on how many threads it has.
-    solution, residual = np.zeros(len(load)), np.array(load, dtype=np.float64)
-    enough = tolerance**2 * np.sum(residual * residual)
-    direction = residual / degree
-    fall = np.sum(residual * direction)
-    for _ in range(_MOST_ROUNDS):
-        if not np.sum(residual * residual) > enough:
-            break
-        image = matrix @ direction
-        step = fall / np.sum(direction * image)
-        solution += step * direction
-        residual -= step * image
-        scaled = residual / degree
-        fall, before = np.sum(residual * scaled), fall
-        direction *= fall / before
-        direction += scaled
-    return solution
-
-
-def _solve(matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray) -> FloatArray:
-    """Solve the symmetric positive definite system: directly if small, else conjugate gradients with Jacobi."""
-    if len(load) <= _DIRECT_SOLVE_UNKNOWNS:
-        solution = np.asarray(spsolve(matrix.tocsc(), load)).reshape(-1)
-    else:
-        solution = _conjugate_gradients(matrix, load, degree, 0.01 * _RELATIVE_RESIDUAL)
-    residual = float(np.linalg.norm(load - matrix @ solution))
-    scale = float(np.linalg.norm(load)) or 1.0
-    if not residual <= _RELATIVE_RESIDUAL * scale:
-        expected = f"a relative residual of at most {_RELATIVE_RESIDUAL:g}"
-        got = f"{residual / scale:.3g} with {len(load)} unobserved nodes"
+    free, fixed = np.flatnonzero(~observed), np.flatnonzero(observed)
+    middle = 0.5 * (temperature[fixed].min() + temperature[fixed].max())
+    rows = links[free]
+    degree = np.asarray(rows.sum(axis=1)).ravel()
+    matrix, load = sparse.diags_array(degree) - rows[:, free], rows[:, fixed] @ (temperature[fixed] - middle)
+    with threadpool_limits(1, "blas"):  # same bits for any number of threads
+        jacobi = sparse.diags_array(1.0 / degree)
+        found, missed = cg(matrix.tocsr(), load, rtol=_RELATIVE_RESIDUAL, maxiter=_MOST_ROUNDS, M=jacobi)
+    if missed:
         remedy = "Train at a lower resolution, or with thermal images that show more of the scene."
+        expected, got = f"convergence in {_MOST_ROUNDS} iterations", f"none with {len(free)} unobserved nodes"
         raise MeshError("harmonic extension of the temperature", expected=expected, got=got, remedy=remedy)
-    return solution
+
+    labels = np.arange(count)
+    low, high = (
+        np.asarray(extreme(temperature[fixed], component[fixed], labels))[component[free]]
+        for extreme in (ndimage.minimum, ndimage.maximum)
+    )
+    temperature[free] = np.clip(middle + found, low, high)
+    return temperature
+
+
+def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, FloatArray]:
+    """Return the edges of tetrahedra, shape (6 t, 2), and their conductances: minus the linear stiffness entries.
+
+    An edge comes once for each tetrahedron around it. A temperature that is linear in space is then extended exactly,
+    but for edges between angles so obtuse that their entries add up to less than 0.
+    """
+    conductances = np.empty((len(tets), 6))
+    for which, shapes in shapes_in_chunks(points, tets):
+        conductances[which] = -shapes.stiffness(shapes.dihedral_cosines()).T
+    return tets[:, TET_EDGES].reshape(-1, 2), conductances.ravel()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +20,6 @@ SUPPORT = {
     "filled": "seen by no photograph",
 }
 """Classes of boundary triangles by the photographs that support them, see `Boundary.photographs`."""
-
-_REMEDY = "Build the mesh with thermoxels_ns.mesh.build."
 
 
 @dataclass(frozen=True)
@@ -60,62 +57,58 @@ class TetMesh:
     colour: Float32Array | None = None
     """Colour of each node, red, green, blue in [0, 1], shape (n, 3); None if it is not known."""
 
-    def check(self) -> None:
+    def check(self, name: str = "mesh", remedy: str = "Build the mesh with thermoxels_ns.mesh.build.") -> None:
         """Check that the arrays fit each other; whether the tetrahedra do, `quality.report.check_mesh` says.
+
+        Messages begin with `name` and end with `remedy`.
 
         Raises:
             MeshError: An array has another shape than the others ask for, is not finite or points at what is not there,
                 there is no tetrahedron, or two patches or regions have one name.
         """
         nodes, tets, facets, tags = len(self.points_m), len(self.tets), len(self.facets), self.boundary
-        _check_array("points_m", self.points_m, (None, 3))
-        _check_array("tets", self.tets, (None, 4), below=nodes)
-        _check_array("temperature_c", self.temperature_c, (nodes,))
-        _check_array("observed", self.observed, (nodes,))
-        _check_array("facets", self.facets, (None, 3), below=nodes)
-        _check_array("facet_tags", self.facet_tags, (facets,))
-        if tets == 0:
-            raise MeshError("mesh tets", expected="at least one tetrahedron", got="none", remedy=_REMEDY)
-        _check_names("region_names", self.region_names)
-        _check_array("region", self.region, (tets,), below=len(self.region_names))
+        arrays: list[tuple[str, npt.NDArray, tuple[int | None, ...], int | None]] = [
+            ("points_m", self.points_m, (None, 3), None),
+            ("tets", self.tets, (None, 4), nodes),
+            ("temperature_c", self.temperature_c, (nodes,), None),
+            ("observed", self.observed, (nodes,), None),
+            ("facets", self.facets, (None, 3), nodes),
+            ("facet_tags", self.facet_tags, (facets,), None),
+            ("region", self.region, (tets,), len(self.region_names)),
+        ]
+        names = {"region_names": self.region_names}
         if self.colour is not None:
-            _check_array("colour", self.colour, (nodes, 3))
-        if tags is None:
-            return
-        _check_array("boundary.normal", tags.normal, (facets, 3))
-        _check_array("boundary.area_factor", tags.area_factor, (facets,))
-        _check_array("boundary.seen", tags.seen, (facets,))
-        _check_names("boundary.patch_names", tags.patch_names)
-        _check_array("boundary.patch", tags.patch, (facets,), below=len(tags.patch_names))
-        if tags.photographs is not None:
-            _check_array("boundary.photographs", tags.photographs, (facets, 2))
-
-
-def _check_array(name: str, values: npt.NDArray, shape: Sequence[int | None], below: int | None = None) -> None:
-    """Check a shape, and finite numbers; with `below` whole numbers from 0 up to it."""
-    values = check_shape(f"mesh {name}", np.asarray(values), shape, _REMEDY, MeshError)
-    check_finite(f"mesh {name}", values, _REMEDY, MeshError)
-    whole = np.issubdtype(values.dtype, np.integer)
-    if below is not None and not (whole and (not len(values) or (values.min() >= 0 and values.max() < below))):
-        got = f"{values.min()} to {values.max()} ({values.dtype})" if len(values) else f"nothing ({values.dtype})"
-        expected = f"whole numbers from 0 to {below - 1}"
-        raise MeshError(f"mesh {name}", expected=expected, got=got, remedy=_REMEDY)
-
-
-def _check_names(name: str, names: Sequence[str]) -> None:
-    for entry in names:
-        if not (isinstance(entry, str) and entry.strip() and entry.isprintable() and '"' not in entry):
-            expected = "names of printable characters without a double quote"
-            raise MeshError(f"mesh {name}", expected=expected, got=repr(entry), remedy="Rename it.")
-    if len(set(names)) != len(names) or not names:
-        expected = "at least one name, all different"
-        raise MeshError(f"mesh {name}", expected=expected, got=list(names), remedy="Rename them.")
+            arrays.append(("colour", self.colour, (nodes, 3), None))
+        if tags is not None:
+            names["boundary.patch_names"] = tags.patch_names
+            arrays += [
+                ("boundary.normal", tags.normal, (facets, 3), None),
+                ("boundary.area_factor", tags.area_factor, (facets,), None),
+                ("boundary.seen", tags.seen, (facets,), None),
+                ("boundary.patch", tags.patch, (facets,), len(tags.patch_names)),
+            ]
+            if tags.photographs is not None:
+                arrays.append(("boundary.photographs", tags.photographs, (facets, 2), None))
+        if tets == 0:
+            raise MeshError(f"{name} tets", expected="at least one tetrahedron", got="none", remedy=remedy)
+        for what, entries in names.items():
+            good = all(isinstance(one, str) and one.strip() and one.isprintable() and '"' not in one for one in entries)
+            if not good or not entries or len(set(entries)) != len(entries):
+                expected = "at least one name, all different, of printable characters without a double quote"
+                raise MeshError(f"{name} {what}", expected=expected, got=list(entries), remedy="Rename them.")
+        for what, array, shape, below in arrays:
+            values = check_shape(f"{name} {what}", np.asarray(array), shape, remedy, MeshError)
+            check_finite(f"{name} {what}", values, remedy, MeshError)
+            low, high = (values.min(), values.max()) if values.size else (0, -1)
+            if below is not None and not (np.issubdtype(values.dtype, np.integer) and low >= 0 and high < below):
+                expected, got = f"whole numbers from 0 to {below - 1}", f"{low} to {high} ({values.dtype})"
+                raise MeshError(f"{name} {what}", expected=expected, got=got, remedy=remedy)
 
 
 def support_of_facets(mesh: TetMesh) -> IntArray | None:
-    """Place in `SUPPORT` of each boundary triangle, -1 where the scene box cuts the solid, shape (f,).
+    """Return the place in `SUPPORT` of each boundary triangle, -1 where the scene box cuts the solid, shape (f,).
 
-    None if photographs were not compared.
+    The result is None if photographs were not compared.
     """
     if mesh.boundary is None or mesh.boundary.photographs is None:
         return None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
+from thermoxels_ns.mesh.files.solvers import HeatStep, write_inp
 from thermoxels_ns.mesh.quality.checks import facet_areas
 
 STEP = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)

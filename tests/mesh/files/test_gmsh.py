@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.files.gmsh import TEMPERATURE_VIEW, write_msh
+from thermoxels_ns.mesh.files.solvers import TEMPERATURE_VIEW, write_msh
 
 
 def test_groups_carry_names_numbers_and_elements(tmp_path, tagged_mesh):

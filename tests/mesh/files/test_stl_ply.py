@@ -7,8 +7,8 @@ import trimesh
 
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import surface_of
-from thermoxels_ns.mesh.files.formats import check_format, write_mesh
-from thermoxels_ns.mesh.files.surface import write_ply, write_stl
+from thermoxels_ns.mesh.files.formats import write_mesh
+from thermoxels_ns.mesh.files.surface import check_stl, write_ply, write_stl
 from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 
@@ -36,8 +36,8 @@ def test_stl_far_from_the_origin_is_refused_and_ply_holds_it(tmp_path, tagged_me
     with pytest.raises(MeshError, match=r"\.stl: expected coordinates near the origin.*5\.2e\+06.*Write \.ply"):
         write_mesh(tmp_path / "far.stl", far)
     with pytest.raises(MeshError, match="near the origin"):
-        check_format("far.stl", far)
-    check_format("near.stl", tagged_mesh)
+        check_stl(far)
+    check_stl(tagged_mesh)
     assert not list(tmp_path.iterdir())
     write_ply(tmp_path / "far.ply", far)
     assert np.array_equal(meshio.read(tmp_path / "far.ply").points, surface_of(far.points_m, far.facets).points_m)

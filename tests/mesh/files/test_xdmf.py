@@ -7,8 +7,8 @@ import pytest
 import pyvista as pv
 
 from thermoxels_ns.core.errors import OutputError
-from thermoxels_ns.mesh.files import formats
-from thermoxels_ns.mesh.files.formats import BODY_GRID, FACET_GRID, write_xdmf
+from thermoxels_ns.mesh.files import solvers
+from thermoxels_ns.mesh.files.solvers import BODY_GRID, FACET_GRID, write_xdmf
 
 
 def read_grids(path) -> dict[str, pv.UnstructuredGrid]:
@@ -31,6 +31,8 @@ def test_vtk_reads_body_and_boundary(tmp_path, tagged_mesh):
     assert np.array_equal(boundary.cells_dict[pv.CellType.TRIANGLE], tagged_mesh.facets)
     assert np.array_equal(body.cell_data["region"], tagged_mesh.region + 1)
     assert np.array_equal(boundary.cell_data["patch"], tagged_mesh.boundary.patch + 1)
+    assert np.array_equal(boundary.cell_data["area_factor"], tagged_mesh.boundary.area_factor)
+    assert np.array_equal(boundary.cell_data["normal"], tagged_mesh.boundary.normal)
     for grid in grids.values():
         assert np.array_equal(grid.point_data["temperature_c"], tagged_mesh.temperature_c)
         assert np.array_equal(grid.point_data["temperature_k"], tagged_mesh.temperature_c + 273.15)
@@ -59,15 +61,8 @@ def test_an_index_never_points_at_data_of_another_mesh(tmp_path, box_mesh, tagge
             raise OutputError("no space")
         return replace_when_done(final)
 
-    replace_when_done = formats.replace_when_done
-    monkeypatch.setattr(formats, "replace_when_done", full_disk)
+    replace_when_done = solvers.replace_when_done
+    monkeypatch.setattr(solvers, "replace_when_done", full_disk)
     with pytest.raises(OutputError, match="no space"):
         write_xdmf(path, tagged_mesh)
     assert [file.name for file in tmp_path.iterdir()] == ["mesh.h5"]
-
-
-def test_the_boundary_carries_true_areas_and_normals(tmp_path, tagged_mesh):
-    write_xdmf(tmp_path / "house.xdmf", tagged_mesh)
-    boundary = read_grids(tmp_path / "house.xdmf")[FACET_GRID]
-    assert np.array_equal(boundary.cell_data["area_factor"], tagged_mesh.boundary.area_factor)
-    assert np.array_equal(boundary.cell_data["normal"], tagged_mesh.boundary.normal)

@@ -6,9 +6,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from tests.support.heat_meshes import mesh_from
-from thermoxels_ns.core.errors import OutputError
-from thermoxels_ns.mesh.quality.picture import picture_of_quality
-from thermoxels_ns.mesh.quality.report import quality_report
+from thermoxels_ns.mesh.quality.report import picture_of_quality, quality_report
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 
@@ -38,9 +36,3 @@ def test_the_picture_says_what_is_met_and_nothing_overlaps(tmp_path, monkeypatch
         assert not any(box.overlaps(other) for other in boxes[:number]), words[number]
     heights = [bar.get_height() for bar in drawn[0].axes[0].patches]
     assert heights == list(report.dihedral_counts)
-
-
-def test_another_ending_is_refused(tmp_path):
-    corners, tets = kuhn_tets(np.ones((1, 1, 1), dtype=bool))
-    with pytest.raises(OutputError):
-        picture_of_quality(tmp_path / "quality.jpg", quality_report(mesh_from(corners * 1.0, tets), "voxel"))

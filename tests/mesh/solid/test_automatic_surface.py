@@ -11,7 +11,7 @@ from nerfstudio.cameras.rays import RayBundle
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.mesh.solid.voxels import automatic_threshold
+from thermoxels_ns.mesh.solid.voxels import SolidSelection, dense_voxels
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import GridSamples, sample_rays
 from thermoxels_ns.training.ray_statistics import field_evidence
@@ -60,7 +60,7 @@ class Layers:
 
 def surface_of(snapshot: GridSnapshot) -> float:
     """Where density crosses the automatic threshold between voxel centres, [voxels] along x; from outside."""
-    chosen = automatic_threshold(snapshot, snapshot.centre_density())
+    chosen = dense_voxels(snapshot, snapshot.centre_density(), SolidSelection())
     row = np.log(np.maximum(snapshot.centre_density()[:, 4, 4], 1e-30))
     level = np.log(chosen.density)
     first = int(np.flatnonzero(row >= level - 1e-6).max())
@@ -94,6 +94,6 @@ def test_what_a_surface_lets_through_makes_nothing_solid_behind_it():
     field = Layers(logarithm)
     snapshot = field.snapshot()
     assert abs(surface_of(snapshot) - field.half_way()) <= 0.5
-    cells = automatic_threshold(snapshot, snapshot.centre_density()).cells
+    cells = dense_voxels(snapshot, snapshot.centre_density(), SolidSelection()).cells
     assert cells.any(axis=(1, 2)).nonzero()[0].tolist() == [9] and cells[9].all()
     assert snapshot.evidence is not None and snapshot.evidence.voxel_weight[4].sum() > 40.0  # of 1,600 rays

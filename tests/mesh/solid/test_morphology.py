@@ -4,15 +4,7 @@ from scipy import ndimage
 from scipy.spatial import Delaunay
 
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
-from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, fill_enclosed, grow
-
-
-@pytest.mark.parametrize("by", [1, 2, 3, 5])
-@pytest.mark.parametrize("shape", [(12, 9, 7), (1, 14, 3), (2, 1, 1)])
-def test_growing_is_dilation_by_a_cube(by, shape):
-    cells = np.random.default_rng(by).random(shape) < 0.05
-    expected = ndimage.binary_dilation(cells, np.ones((3, 3, 3)), iterations=by)
-    assert np.array_equal(grow(cells, by), expected)
+from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, fill_enclosed
 
 
 @pytest.mark.parametrize("share", [0.03, 0.3, 0.7])

@@ -8,8 +8,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-from thermoxels_ns.mesh.solid.region import where_cameras_look
-from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
+from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid, where_cameras_look
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX
 
 

@@ -11,8 +11,7 @@ from thermoxels_ns.mesh.solid.voxels import (
     OPTICAL_DEPTH_BOUNDS,
     SHARE_OF_RAYS,
     SolidSelection,
-    automatic_threshold,
-    optical_depth_threshold,
+    dense_voxels,
     select_solid,
 )
 
@@ -41,7 +40,7 @@ def field(
 
 
 def automatic(snapshot: GridSnapshot):
-    return automatic_threshold(snapshot, snapshot.centre_density())
+    return dense_voxels(snapshot, snapshot.centre_density(), SolidSelection())
 
 
 def wall_in_fog(fog: float = 0.0) -> np.ndarray:
@@ -103,7 +102,7 @@ def test_without_evidence_the_rule_is_an_optical_depth_and_says_so():
     few = field(wall_in_fog(), np.ones(FEWEST_RAYS - 1))
     for snapshot, why in ((replace(few, evidence=None), "nothing is known of"), (few, "only 99 rays end")):
         chosen = automatic(snapshot)
-        fixed = optical_depth_threshold(snapshot, snapshot.centre_density(), 0.5)
+        fixed = dense_voxels(snapshot, snapshot.centre_density(), SolidSelection(voxel_optical_depth=0.5))
         assert chosen.density == fixed.density == 2.0 and np.array_equal(chosen.cells, fixed.cells)
         assert why in chosen.explanation and "optical depth 0.5" in chosen.explanation
         assert select_solid(snapshot, SolidSelection()).explanation == chosen.explanation

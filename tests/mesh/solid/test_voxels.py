@@ -7,7 +7,6 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.mesh.solid.morphology import close_gaps
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, SolidStep, select_solid
 
 
@@ -67,13 +66,6 @@ def test_gaps_are_closed_and_wide_ones_are_not(snapshot_of):
     snapshot = snapshot_of(cells_along_x([5, 0, 0, 5, 0, 0, 0, 5]))
     one = select_solid(snapshot, SolidSelection(density_threshold=1.0))
     assert np.flatnonzero(one.cells).tolist() == [0, 1, 2, 3, 7] and step_of(one, "close gaps").added == 2
-    wall = np.ones((9, 9, 1), dtype=bool)
-    wall[2, 3] = wall[5, 6] = False
-    assert close_gaps(wall, 1).all() and close_gaps(wall, 0) is wall
-    room = np.ones((9, 9, 9), dtype=bool)
-    room[2:7, 2:7, 2:7] = False
-    kept = close_gaps(room, 1)
-    assert kept[2:7, 2:7, 2:7].sum() < 125 and not kept[3:6, 3:6, 3:6].any() and (kept >= room).all()
 
 
 def test_cavities_are_filled_unless_the_body_is_to_stay_hollow(snapshot_of):
@@ -119,24 +111,6 @@ def test_a_wall_thickness_needs_a_scale_and_cameras(facade):
         select_solid(facade, SolidSelection(wall_thickness=50.0), 0.2)
     with pytest.raises(MeshError, match=r"wall_thickness.*training cameras.*leave out --wall-thickness"):
         select_solid(replace(facade, views=None), selection, 1.0)
-
-
-def test_what_the_cameras_cannot_look_into_is_filled(snapshot_of):
-    """A box without a floor, photographed from above and all around."""
-    density = np.zeros((21, 21, 21), dtype=np.float32)
-    field = snapshot_of(density)
-    shell = np.zeros((20, 20, 20), dtype=np.float32)
-    shell[4:16, 4:16, 4:16] = 50.0
-    shell[6:14, 6:14, 4:14] = 0.0
-    angle = 2 * np.pi * np.arange(12) / 12
-    eyes = np.column_stack((5 + 25 * np.cos(angle), 5 + 25 * np.sin(angle), np.full(12, 15.0)))
-    field = replace(field, voxel_density=shell, views=looking_at((5.0, 5.0, 5.0), eyes))
-    solid = select_solid(field, SolidSelection(close_gaps=0, seal_openings=0))
-    assert solid.cells[4:16, 4:16, 4:16].all() and solid.cells.sum() == 12**3
-    assert solid.level[10, 10, 10] == 1.0
-    step = step_of(solid, "interior")
-    assert step.added == 8 * 8 * 10 and "640 voxels that cameras cannot look into" in step.remark
-    assert (select_solid(field, SolidSelection(close_gaps=0, interior="hollow")).cells == (shell > 0)).all()
 
 
 @pytest.mark.parametrize(

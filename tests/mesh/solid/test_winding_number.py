@@ -26,14 +26,3 @@ def test_a_cube_without_one_of_its_sides_surrounds_its_middle_five_sixths():
     assert below == pytest.approx(rectangle(12, 12, 6), abs=0.04)
     # A film across the hole is where it is one half.
     assert found[23:25, 23:25, 11:13].mean() == pytest.approx(0.5, abs=0.04)
-
-
-def test_a_plate_seen_from_one_side_subtends_its_solid_angle():
-    solid = box((48, 48, 48), (14, 14, 22), (34, 34, 24))
-    air = np.zeros_like(solid)
-    air[:, :, 24:] = True
-    found = winding_number(solid, air)
-    for away in (4, 8):
-        expected = rectangle(10, 10, away)
-        assert found[23:25, 23:25, 23 - away : 25 - away].mean() == pytest.approx(expected, abs=0.04)
-        assert found[23:25, 23:25, 23 + away : 25 + away].mean() == pytest.approx(-expected, abs=0.04)

@@ -1,23 +1,19 @@
 import numpy as np
 import pytest
 from scipy import ndimage
-from scipy.sparse.linalg import spsolve
 
 from tests.support.stuffed_shapes import (
     ANGLE_BOUNDS_DEG,
     box_distance,
     centres,
-    stiffness,
     tet_mesh,
     turn,
     volumes_and_angles,
 )
-from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.stuffing.coarse_interior import coarse_interior
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
-from thermoxels_ns.mesh.stuffing.lattice import bcc_lattice
+from thermoxels_ns.mesh.stuffing.lattice import bcc_lattice, coarse_interior
 
 
 def ball(cells: int, radius: float, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
@@ -88,26 +84,11 @@ def test_the_inside_changes_and_the_surface_does_not(kind, seed):
 def test_angles_of_the_coarse_part(coarsest):
     lattice = bcc_lattice(ball(64, 31.0))
     interior = coarse_interior(lattice, coarsest)
-    assert interior is not None
     points, tets = lattice.positions(np.arange(len(lattice.level))), interior.tets
     edges = np.linalg.norm(points[tets[:, 1:]] - points[tets[:, :1]], axis=-1)
     assert min(8, coarsest) <= edges.max() <= coarsest
     assert signed_volumes(points, tets).min() > 0.0
     assert volumes_and_angles(points, tets)[1:] == pytest.approx((45.0, 120.0), abs=1e-9)
-
-
-def test_full_box_by_hand():
-    """A box of 8 voxels with eight cubes of two in its middle, and nothing larger."""
-    solid, uniform = stuff(np.ones((8, 8, 8))), stuff(np.ones((8, 8, 8)), coarsest=1)
-    quality = check_mesh(tet_mesh(solid))
-    # Gone: four around each face of the 4^3 voxels. New: four at each outer face of them, and between the cubes, at
-    # each of 12 faces, one at two sides inside and two at the other two.
-    assert len(uniform.tets) - len(solid.tets) == 4 * (3 * 4 * 4 * 5) - 4 * 6 * 4 * 4 - 12 * 6
-    # Gone: the voxels' centres, and the voxel corners in the middle of the 12 faces between the cubes and of their 6
-    # common edges. The middles of the cubes are voxel corners too and stay.
-    assert len(uniform.points) - len(solid.points) == 4**3 + 12 + 6
-    assert quality.volume_m3 == pytest.approx(512.0, rel=1e-14)
-    assert solid.on_box.all() and same_surface(solid, uniform)
 
 
 def test_place_in_the_lattice_does_not_matter():
@@ -117,23 +98,3 @@ def test_place_in_the_lattice_does_not_matter():
     assert len(here.tets) < 0.7 * len(stuff(level, coarsest=1).tets)
     assert np.array_equal(here.tets, moved.tets) and np.array_equal(here.facets, moved.facets)
     assert np.allclose(here.points, moved.points - np.array([5, 1, 0]), rtol=0.0, atol=1e-13)
-
-
-@pytest.mark.parametrize("level", [ball(23, 10.0), np.ones((15, 16, 17))], ids=["ball", "box"])
-def test_linear_temperature_is_reproduced(level):
-    """Steady conduction between nodes of the surface at linear temperatures: the patch test of conforming elements."""
-    solid = stuff(level)
-    assert len(solid.tets) < len(stuff(level, coarsest=1).tets)
-    exact = solid.points @ [1.0, -2.0, 0.5] + 3.0
-    matrix = stiffness(solid.points, solid.tets)
-    free, fixed = np.flatnonzero(~solid.on_surface), np.flatnonzero(solid.on_surface)
-    found = spsolve(matrix[free][:, free].tocsc(), -matrix[free][:, fixed] @ exact[fixed])
-    assert np.abs(found - exact[free]).max() < 1e-10
-
-
-@pytest.mark.parametrize("bad", [0, 3, 6, -2, 2.0, True, None, "4"])
-def test_edges_that_are_no_power_of_two(bad):
-    with pytest.raises(
-        MeshError, match=r"coarsest: expected 1, 2, 4, 8 or another power of two, \[voxels\], got .* Pass 4, or 1"
-    ):
-        stuff(np.ones((3, 3, 3)), coarsest=bad)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_direction, check_finite, check_shape
+from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, wrong
 
@@ -80,7 +80,7 @@ class Colour:
             raise wrong("max_distance", "a number above 0, on the scale of rgb", self.max_distance)
 
     def distance(self, colours: npt.NDArray) -> FloatArray:
-        """Root of the summed squared differences to colours in [0, 1], infinite beyond the longest; (n, 3) to (n,)."""
+        """Return the Euclidean distance of colours (n, 3) in [0, 1], infinite beyond the longest, shape (n,)."""
         whole = all(isinstance(part, int) for part in self.rgb) or max(map(float, self.rgb)) > 1.0
         scale = 255.0 if whole else 1.0
         distance = np.linalg.norm(colours - np.array(self.rgb, dtype=np.float64) / scale, axis=1)
@@ -157,7 +157,7 @@ class Applied(NamedTuple):
 
 
 def facing(normals: FloatArray, up: npt.ArrayLike) -> IntArray:
-    """Where unit normals (f, 3) point: index into `FACINGS`, shape (f,).
+    """Return where unit normals (f, 3) point: index into `FACINGS`, shape (f,).
 
     Up is less than 45 degrees off the up direction, down more than 135 degrees, all else is side.
 
@@ -175,9 +175,9 @@ def facing(normals: FloatArray, up: npt.ArrayLike) -> IntArray:
 def default_patches(
     normals: FloatArray, up: npt.ArrayLike, seen: BoolArray, on_box: BoolArray
 ) -> tuple[IntArray, tuple[str, ...]]:
-    """Patches that need no rules: cut by the scene box, else exterior (seen) or interior, facing up, sideways or down.
+    """Return each triangle's patch without rules, and all names: cut, else exterior (seen) or interior, and its facing.
 
-    Arguments are those of `apply_patches`; also the names of all patches, `DEFAULT_PATCHES`.
+    Arguments are those of `apply_patches`.
     """
     patch = np.where(seen, 0, len(FACINGS)) + facing(normals, up)
     return np.where(on_box, DEFAULT_PATCHES.index("cut"), patch).astype(np.int64), DEFAULT_PATCHES
@@ -193,7 +193,7 @@ def apply_patches(
     on_box: BoolArray,
     colours: npt.NDArray | None = None,
 ) -> Applied:
-    """Each triangle's patch: default patches with a user's rules over them; the default names come first.
+    """Return each triangle's patch: the default ones with a user's rules over them; the default names come first.
 
     Args:
         rules: The user's rules; without any, the default patches come back.
@@ -205,47 +205,46 @@ def apply_patches(
         colours: Red, green, blue in [0, 1] of each triangle, shape (f, 3); None if not known.
 
     Raises:
-        MeshError: A rule asks for colours and there are none, `up` is no direction, or shapes do not fit.
+        MeshError: A rule asks for colours and there are none, or `up` is no direction.
     """
     patch, names = default_patches(normals, up, seen, on_box)
     direction = facing(normals, up)
+    everywhere = np.ones(len(patch), dtype=bool)
     parts = {"exterior": ~on_box & seen, "interior": ~on_box & ~seen, "cut": on_box}
+    facings = {name: direction == number for number, name in enumerate(FACINGS)}
     allowed = [
-        parts.get(rule.only or "all", True)
-        & (True if rule.facing in (None, "any") else direction == FACINGS.index(rule.facing))
+        parts.get(rule.only or "all", everywhere) & facings.get(rule.facing or "any", everywhere)
         for rule in rules.patches
     ]
     return _applied(rules.patches, "patch", allowed, patch, names, centroids_m, colours)
 
 
 def apply_regions(rules: PatchRules, tet_centroids: FloatArray, tet_colours: npt.NDArray | None = None) -> Applied:
-    """Regions of tetrahedra by a user's rules; what no rule claims is region 0, "solid".
+    """Return the regions of tetrahedra by a user's rules; what no rule claims is region 0, "solid".
 
-    Centroids (t, 3) are in metres, colours (t, 3) red, green, blue in [0, 1]; None if not known.
-
-    Raises:
-        MeshError: A rule asks for colours and there are none, or shapes do not fit.
+    Centroids (t, 3) are in metres, colours (t, 3) red, green, blue in [0, 1]. Without colours (None) a rule that asks
+    for them raises `MeshError`.
     """
-    start, everywhere = np.zeros(len(tet_centroids), dtype=np.int64), [True] * len(rules.regions)
-    return _applied(rules.regions, "region", everywhere, start, (DEFAULT_REGION,), tet_centroids, tet_colours)
+    count = len(tet_centroids)
+    allowed = [np.ones(count, dtype=bool)] * len(rules.regions)
+    start = np.zeros(count, dtype=np.int64)
+    return _applied(rules.regions, "region", allowed, start, (DEFAULT_REGION,), tet_centroids, tet_colours)
 
 
 def _applied(
     rules: Sequence[RegionRule],
     kind: str,
-    allowed: Sequence[BoolArray | bool],
+    allowed: Sequence[BoolArray],
     start: IntArray,
     names: tuple[str, ...],
     centroids: FloatArray,
     colours: npt.NDArray | None,
 ) -> Applied:
     """Overwrite `start` where a rule holds, and append the rules' names; `allowed` says where other conditions do."""
-    count, remedy = len(start), f"Pass one centroid and one colour per element that gets a {kind}."
-    check_shape("centroids", centroids, (count, 3), remedy, MeshError)
-    check_finite("centroids", centroids, remedy, MeshError)
+    count = len(start)
     closest, winner, matches = np.full(count, np.inf), np.full(count, -1), []
     for number, (rule, mask) in enumerate(zip(rules, allowed)):
-        inside = np.full(count, True) & mask
+        inside = mask.copy()
         if rule.box is not None:
             inside &= np.all((centroids >= rule.box.lower) & (centroids <= rule.box.upper), axis=1)
         if rule.plane is not None:
@@ -253,9 +252,8 @@ def _applied(
         if rule.nearest_colour is not None:
             if colours is None:
                 expected = "a mesh with colours, because its rule is by nearest_colour"
-                other = "Use box or plane, or a model that was trained on colour photographs."
-                raise MeshError(f"{kind} {rule.name}", expected=expected, got="a mesh without", remedy=other)
-            check_shape("colours", colours, (count, 3), remedy, MeshError)
+                remedy = "Use box or plane, or a model that was trained on colour photographs."
+                raise MeshError(f"{kind} {rule.name}", expected=expected, got="a mesh without", remedy=remedy)
             distance = np.where(inside, rule.nearest_colour.distance(colours), np.inf)
             wins = np.isfinite(distance) & (distance <= closest)
             closest[wins], winner[wins] = distance[wins], number

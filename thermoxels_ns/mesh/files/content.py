@@ -1,4 +1,4 @@
-"""What every file format writes of a mesh, checked once for all of them."""
+"""What every mesh writer needs: a checked mesh with tags, the nodes of a surface, values per node, whole files."""
 
 from __future__ import annotations
 
@@ -11,36 +11,13 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
-from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.mesh.quality.checks import facet_normals
-from thermoxels_ns.mesh.tetrahedra import TetMesh
-
-UNTAGGED_PATCH = "boundary"  # name of the one patch that a mesh without tags is written with
-COLOUR_MAP = "inferno"  # colour map of temperatures: perceptually uniform, readable in grey
-_DARKEST = 0.1  # share of the colour map left out at its dark end, where shading could not be told from cold
-_FAR_SIZES = 16.0
-"""Farther from the origin than this many times their own size, points lose in single precision what is seen of them."""
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 
 
-@dataclass(frozen=True)
-class FileContent:
-    """A mesh's arrays, checked, with a temperature for every node and a name for every patch and region."""
-
-    points_m: FloatArray  # nodes, shape (n, 3), [m]
-    tets: IntArray  # node indices, shape (t, 4)
-    temperature_c: FloatArray  # nodal temperature, shape (n,), [degrees Celsius]
-    region: IntArray  # index into `region_names`, shape (t,)
-    region_names: tuple[str, ...]  # names of the regions, all different; some may have no tetrahedron
-    facets: IntArray  # boundary triangles, shape (f, 3), right-hand normals outwards
-    patch: IntArray  # index into `patch_names`, shape (f,)
-    patch_names: tuple[str, ...]  # names of the patches, all different; some may have no triangle
-    normal: FloatArray  # outward unit normal of the true surface at each boundary triangle, shape (f, 3)
-    area_factor: FloatArray  # True area that each boundary triangle stands for, over its own, shape (f,)
-
-
-def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None = None) -> FileContent:
-    """Check the mesh; one without boundary tags gets one patch, `UNTAGGED_PATCH`, of all triangles.
+def checked_mesh(mesh: TetMesh, temperature_c: FloatArray | None = None) -> tuple[TetMesh, Boundary]:
+    """Return a mesh that passed `TetMesh.check` and its tags; without tags all triangles are one patch, "boundary".
 
     `temperature_c` takes the place of the mesh's own, shape (n,), [degrees Celsius].
 
@@ -48,34 +25,23 @@ def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None =
         MeshError: What `TetMesh.check` raises.
     """
     if temperature_c is not None:
-        mesh = replace(mesh, temperature_c=temperature_c)
+        mesh = replace(mesh, temperature_c=np.asarray(temperature_c, dtype=np.float64))
     mesh.check()
-    points, tags = np.asarray(mesh.points_m, dtype=np.float64), mesh.boundary
-    if tags is None:
-        count = len(mesh.facets)
-        patch, names = np.zeros(count, dtype=np.int64), (UNTAGGED_PATCH,)
-        normal, factor = facet_normals(points, mesh.facets), np.ones(count)
-    else:
-        patch, names, normal, factor = tags.patch, tuple(tags.patch_names), tags.normal, tags.area_factor
-    return FileContent(
-        points_m=points,
-        tets=mesh.tets,
-        temperature_c=np.asarray(mesh.temperature_c, dtype=np.float64),
-        region=mesh.region,
-        region_names=tuple(mesh.region_names),
-        facets=mesh.facets,
-        patch=patch,
-        patch_names=names,
-        normal=normal,
-        area_factor=factor,
+    count = len(mesh.facets)
+    return mesh, mesh.boundary or Boundary(
+        normal=facet_normals(mesh.points_m, mesh.facets),
+        area_factor=np.ones(count),
+        seen=np.ones(count, dtype=bool),
+        patch=np.zeros(count, dtype=np.int64),
+        patch_names=("boundary",),
     )
 
 
-def node_arrays(mesh: TetMesh, content: FileContent) -> dict[str, npt.NDArray]:
-    """Values per node that files of the body hold, colours only if the mesh has them."""
+def node_arrays(mesh: TetMesh) -> dict[str, npt.NDArray]:
+    """Return the values per node that files of the body hold; colours only if the mesh has them."""
     arrays: dict[str, npt.NDArray] = {
-        "temperature_c": content.temperature_c,
-        "temperature_k": celsius_to_kelvin(content.temperature_c),
+        "temperature_c": mesh.temperature_c,
+        "temperature_k": celsius_to_kelvin(mesh.temperature_c),
         "observed": mesh.observed.astype(np.uint8),
     }
     if mesh.colour is not None:
@@ -88,15 +54,6 @@ def write_bytes(path: Path, chunks: Iterable[bytes]) -> None:
     writable_folder(path.parent)
     with replace_when_done(path) as temporary, open(temporary, "wb") as file:
         file.writelines(chunks)
-
-
-def check_suffix(path: Path | str, suffix: str) -> Path:
-    """Return `path` if its name ends in `suffix`, else raise `OutputError`."""
-    path = Path(path)
-    if path.suffix != suffix:
-        expected = f"a name that ends in {suffix}"
-        raise OutputError("mesh file", expected=expected, got=path.name, remedy="Rename the file.")
-    return path
 
 
 def colour_bytes(colour: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
@@ -118,42 +75,12 @@ class Surface:
 
 
 def surface_of(points_m: FloatArray, facets: IntArray) -> Surface:
-    """Leave out the nodes that no triangle uses.
+    """Return triangles without the nodes that none of them uses.
 
     >>> surface_of(np.arange(12.0).reshape(4, 3), np.array([[3, 0, 2]])).triangles.tolist()
     [[2, 0, 1]]
     """
     used = np.zeros(len(points_m), dtype=bool)
     used[facets.ravel()] = True
-    number = np.cumsum(used) - 1
     nodes = np.flatnonzero(used)
-    return Surface(points_m[nodes], number[facets], nodes)
-
-
-def far_origin(points_m: FloatArray) -> FloatArray | None:
-    """Where to count positions from so that single precision holds them: the middle of the nodes in whole units.
-
-    None where the origin will do. Five million metres from it single precision has steps of half a metre.
-
-    >>> far_origin(np.array([[4.0e6, 0.2, 0.0], [4.0e6 + 9.0, 2.6, 1.0]]))
-    array([4.000004e+06, 1.000000e+00, 0.000000e+00])
-    """
-    low, high = points_m.min(axis=0), points_m.max(axis=0)
-    far = float(np.abs(points_m).max()) > _FAR_SIZES * float((high - low).max())
-    return np.round(0.5 * (low + high)) if far else None
-
-
-def temperature_colours(surface: Surface, temperature_c: FloatArray) -> FloatArray:
-    """Colours of a surface's nodes in [0, 1] (sRGB), shape (m, 3), from a map that spans the surface's temperatures."""
-    import matplotlib
-
-    low, high = surface_range_c(surface, temperature_c)
-    values = temperature_c[surface.nodes]
-    share = (values - low) / (high - low) if high > low else np.full(len(values), 0.5)
-    return matplotlib.colormaps[COLOUR_MAP](_DARKEST + (1.0 - _DARKEST) * share)[:, :3]
-
-
-def surface_range_c(surface: Surface, temperature_c: FloatArray) -> tuple[float, float]:
-    """Lowest and highest temperature on a surface, the ends of its colour map, [degrees Celsius]."""
-    values = temperature_c[surface.nodes]
-    return (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+    return Surface(points_m[nodes], (np.cumsum(used) - 1)[facets], nodes)

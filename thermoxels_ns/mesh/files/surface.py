@@ -12,21 +12,14 @@ import numpy as np
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.files.content import (
-    COLOUR_MAP,
-    check_suffix,
-    colour_bytes,
-    far_origin,
-    file_content,
-    surface_of,
-    surface_range_c,
-    temperature_colours,
-    write_bytes,
-)
+from thermoxels_ns.mesh.files.content import checked_mesh, colour_bytes, surface_of, write_bytes
 from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _ROUNDING_NOTICED = 0.01  # share of a triangle's side by which rounding may move its corners
+_COLOUR_MAP = "inferno"  # perceptually uniform, readable in grey
+_DARKEST = 0.1  # share of the colour map left out at its dark end, where shading could not be told from cold
+_FAR_SIZES = 16.0  # nodes farther from the origin than this many sizes of the body count from its middle in .glb files
 _UNLIT = "KHR_materials_unlit"
 
 
@@ -35,10 +28,10 @@ def write_stl(path: Path | str, mesh: TetMesh) -> None:
     from trimesh import Trimesh
     from trimesh.exchange.stl import export_stl
 
-    path = check_suffix(path, ".stl")
-    content = file_content(mesh)
+    path = Path(path)
+    mesh.check()
     check_stl(mesh)
-    write_bytes(path, [export_stl(Trimesh(content.points_m, content.facets, process=False))])
+    write_bytes(path, [export_stl(Trimesh(mesh.points_m, mesh.facets, process=False))])
 
 
 def check_stl(mesh: TetMesh) -> None:
@@ -66,19 +59,20 @@ def write_ply(path: Path | str, mesh: TetMesh) -> None:
     those of the photographs, of temperatures where the mesh has none; a comment says which. trimesh and VTK write
     positions in single precision, meshio the time of day.
     """
-    path = check_suffix(path, ".ply")
-    content = file_content(mesh)
-    surface = surface_of(content.points_m, content.facets)
+    path = Path(path)
+    mesh, _ = checked_mesh(mesh)
+    surface = surface_of(mesh.points_m, mesh.facets)
+    temperature_c = mesh.temperature_c[surface.nodes]
     if mesh.colour is None:
-        low, high = surface_range_c(surface, content.temperature_c)
-        shown = f"{COLOUR_MAP} from {low:.6g} to {high:.6g} degrees Celsius"
-        colours = colour_bytes(temperature_colours(surface, content.temperature_c))
+        low, high = _range_c(temperature_c)
+        shown = f"{_COLOUR_MAP} from {low:.6g} to {high:.6g} degrees Celsius"
+        colours = colour_bytes(_temperature_colours(temperature_c))
     else:
         shown, colours = "photographs", colour_bytes(np.asarray(mesh.colour, dtype=np.float64)[surface.nodes])
     columns = {
         **{name: ("double", "<f8", values) for name, values in zip("xyz", surface.points_m.T)},
         **{name: ("uchar", "u1", values) for name, values in zip(("red", "green", "blue"), colours.T)},
-        "temperature_c": ("float", "<f4", content.temperature_c[surface.nodes]),
+        "temperature_c": ("float", "<f4", temperature_c),
         "observed": ("uchar", "u1", mesh.observed[surface.nodes]),
     }
     vertices = np.empty(len(surface.nodes), dtype=[(name, kind) for name, (_, kind, _) in columns.items()])
@@ -113,9 +107,10 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
     import trimesh
     from trimesh.exchange.gltf import export_glb
 
-    path = check_suffix(path, ".glb")
-    content = file_content(mesh)
-    surface = surface_of(content.points_m, content.facets)
+    path = Path(path)
+    mesh, _ = checked_mesh(mesh)
+    surface = surface_of(mesh.points_m, mesh.facets)
+    temperature_c = mesh.temperature_c[surface.nodes]
     if not len(surface.triangles):
         remedy = "Build the mesh with its boundary."
         raise MeshError("facets", expected="at least one triangle", got="none", remedy=remedy)
@@ -123,23 +118,39 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
     # The smallest turn to +y: about up x y, or any level axis where up is +y or -y itself.
     level = math.hypot(x, z)
     turn = trimesh.transformations.rotation_matrix(math.atan2(level, y), (-z, 0.0, x) if level else (1.0, 0.0, 0.0))
-    origin = far_origin(surface.points_m)
-    if origin is not None:
-        turn = turn @ trimesh.transformations.translation_matrix(origin)
-    low, high = surface_range_c(surface, content.temperature_c)
+    # Five million metres from the origin single precision has steps of half a metre.
+    lower, upper = surface.points_m.min(axis=0), surface.points_m.max(axis=0)
+    far = np.abs(surface.points_m).max() > _FAR_SIZES * (upper - lower).max()
+    origin = np.round(0.5 * (lower + upper)) if far else np.zeros(3)
+    turn = turn @ trimesh.transformations.translation_matrix(origin)
+    low, high = _range_c(temperature_c)
     triangles = trimesh.Trimesh(
-        surface.points_m if origin is None else surface.points_m - origin,
+        surface.points_m - origin,
         surface.triangles,
         process=False,
         metadata={"colours": "temperature", "lowest_c": low, "highest_c": high},
         vertex_attributes={
-            "_COLOR_0": _light(temperature_colours(surface, content.temperature_c)),
-            "_TEMPERATURE_C": content.temperature_c[surface.nodes].astype(np.float32),
+            "_COLOR_0": _light(_temperature_colours(temperature_c)),
+            "_TEMPERATURE_C": temperature_c.astype(np.float32),
         },
     )
     scene = trimesh.Scene()
     scene.add_geometry(triangles, node_name="surface", geom_name="surface", transform=turn)
     write_bytes(path, [export_glb(scene, tree_postprocessor=_finish)])
+
+
+def _range_c(temperature_c: FloatArray) -> tuple[float, float]:
+    """Return the ends of the colour map of a surface's nodes, [degrees Celsius]."""
+    return (float(temperature_c.min()), float(temperature_c.max())) if len(temperature_c) else (0.0, 0.0)
+
+
+def _temperature_colours(temperature_c: FloatArray) -> FloatArray:
+    """Return colours (sRGB) in [0, 1] from a map that spans the temperatures, shape (m, 3)."""
+    import matplotlib
+
+    low, high = _range_c(temperature_c)
+    share = (temperature_c - low) / (high - low) if high > low else np.full(len(temperature_c), 0.5)
+    return matplotlib.colormaps[_COLOUR_MAP](_DARKEST + (1.0 - _DARKEST) * share)[:, :3]
 
 
 def _light(colours: FloatArray) -> np.ndarray:

@@ -16,17 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_shape, plain_os_errors, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values
-from thermoxels_ns.mesh.files.content import (
-    check_suffix,
-    colour_bytes,
-    file_content,
-    node_arrays,
-    surface_of,
-    write_bytes,
-)
+from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays, surface_of, write_bytes
 from thermoxels_ns.mesh.quality.checks import count_wrong_facets, facet_areas, group_faces
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
 
@@ -40,11 +33,9 @@ _MOST_COMPRESSION = 1040  # Bytes that zlib can make of one: 1032, and a little
 def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None) -> None:
     """Write a mesh as a VTK unstructured grid (.vtu, read by ParaView, pyvista and meshio).
 
-    Point arrays: `temperature_c` [degrees Celsius], `temperature_k` [K], `observed` (1: measured, 0: extended) and,
-    if the mesh has colours, `colour` (red, green, blue as bytes). Cell array: `region`; field
-    arrays `region:NAME` hold the number of each region.
-
-    `temperature_c` takes the place of the mesh's own.
+    Point arrays are `temperature_c` [degrees Celsius], `temperature_k` [K], `observed` (1: measured, 0: extended) and,
+    if the mesh has colours, `colour` (red, green, blue as bytes). The cell array is `region`; field arrays
+    `region:NAME` hold the number of each region. `temperature_c` takes the place of the mesh's own.
 
     Raises:
         MeshError: An array does not fit the mesh or is not finite.
@@ -53,14 +44,14 @@ def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
     import pyvista as pv
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-    path = check_suffix(path, ".vtu")
-    content = file_content(mesh, temperature_c)
-    grid = pv.UnstructuredGrid({pv.CellType.TETRA: content.tets}, content.points_m)
-    for name, values in node_arrays(mesh, content).items():
+    path = Path(path)
+    mesh, _ = checked_mesh(mesh, temperature_c)
+    grid = pv.UnstructuredGrid({pv.CellType.TETRA: mesh.tets}, mesh.points_m)
+    for name, values in node_arrays(mesh).items():
         grid.point_data[name] = values
-    grid.cell_data["region"] = content.region
+    grid.cell_data["region"] = mesh.region
     # As numbers: meshio refuses a file that holds text.
-    for number, name in enumerate(content.region_names):
+    for number, name in enumerate(mesh.region_names):
         grid.field_data[f"region:{name}"] = [number]
     grid.set_active_scalars("temperature_c")
     write_vtk(vtkXMLUnstructuredGridWriter(), path, grid)
@@ -84,7 +75,7 @@ def write_vtk(writer: Any, path: Path, data: Any) -> None:
 
 @contextmanager
 def silent_vtk() -> Iterator[Any]:
-    """Keep VTK from writing to the terminal; gives what collects its complaints as `events`."""
+    """Keep VTK from writing to the terminal; yields what collects its complaints as `events`."""
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkLogger
 
@@ -103,17 +94,16 @@ def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
     Raises:
         MeshError: A number is NaN or infinite (json has neither), or a value has no place in json.
     """
-    path = Path(path)
-    write_bytes(path, [summary_text(summary).encode()])
+    write_bytes(Path(path), [summary_text(summary).encode()])
 
 
 def summary_text(summary: Mapping[str, Any]) -> str:
-    """Text of the file that `write_summary` writes; raises the same `MeshError`."""
+    """Return the text of the file that `write_summary` writes; raises the same `MeshError`."""
     return json.dumps(plain_values(summary, "summary", MeshError), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def boundary_path(path: Path | str) -> Path:
-    """Name the file of the boundary that belongs to a mesh file.
+    """Return the path of the boundary that belongs to a mesh file.
 
     >>> boundary_path("house/mesh.vtu").as_posix()
     'house/mesh-boundary.vtp'
@@ -138,32 +128,31 @@ def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
     from vtkmodules.vtkCommonCore import vtkStringArray
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    path = check_suffix(path, ".vtp")
-    content = file_content(mesh)
-    surface = surface_of(content.points_m, content.facets)
+    path = Path(path)
+    mesh, tags = checked_mesh(mesh)
+    surface = surface_of(mesh.points_m, mesh.facets)
     arrays: dict[str, npt.NDArray] = {
-        "area_factor": content.area_factor,
-        "area_m2": facet_areas(content.points_m, content.facets) * content.area_factor,
-        "normal": content.normal,
+        "area_factor": tags.area_factor,
+        "area_m2": facet_areas(mesh.points_m, mesh.facets) * tags.area_factor,
+        "normal": tags.normal,
         "on_box": (mesh.facet_tags == FACET_BOX).astype(np.uint8),
-        "patch": content.patch,
+        "patch": tags.patch,
     }
     if mesh.boundary is not None:
-        arrays["seen"] = mesh.boundary.seen.astype(np.uint8)
-        if mesh.boundary.photographs is not None:
-            arrays["photographs_seen"], arrays["photographs_supporting"] = mesh.boundary.photographs.T.astype(np.int32)
+        arrays["seen"] = tags.seen.astype(np.uint8)
+    if tags.photographs is not None:
+        arrays["photographs_seen"], arrays["photographs_supporting"] = tags.photographs.T.astype(np.int32)
 
     data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
-    data.point_data["temperature_c"] = content.temperature_c[surface.nodes]
-    data.point_data["observed"] = mesh.observed[surface.nodes].astype(np.uint8)
     data.point_data["node"] = surface.nodes
-    if mesh.colour is not None:
-        data.point_data["colour"] = colour_bytes(mesh.colour[surface.nodes])
+    for name, values in node_arrays(mesh).items():
+        if name != "temperature_k":
+            data.point_data[name] = values[surface.nodes]
     for name, values in arrays.items():
         data.cell_data[name] = values
     names = vtkStringArray()  # pyvista itself takes ASCII only
     names.SetName("patch_names")
-    for name in content.patch_names:
+    for name in tags.patch_names:
         names.InsertNextValue(name)
     data.GetFieldData().AddArray(names)
     data.set_active_scalars("temperature_c")
@@ -181,47 +170,40 @@ def read_mesh(path: Path | str) -> TetMesh:
     path = Path(path)
     if path.suffix != ".vtu":
         raise _wrong("mesh file", "a name that ends in .vtu", path.name, "Pass the mesh.vtu of an export.")
-    body, surface = _read(path), _read(boundary_path(path))
-    points = check_finite(f"{path.name}: points", np.array(body.points, dtype=np.float64), _REMEDY, MeshError)
+    beside = boundary_path(path)
+    body, surface = _read(path), _read(beside)
     others = np.count_nonzero(body.celltypes != _TETRAHEDRON)
     if others:
         raise _wrong(path.name, "tetrahedra only", f"{others} cells of other kinds")
-    tets = np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4)
-    names = _region_names(body, path.name)
-    region = _cell_numbers(body, "region", path.name, len(names))
+    points = np.array(body.points, dtype=np.float64)
     colour = body.point_data.get("colour")
-    facets, tags = _boundary(surface, points, boundary_path(path).name)
-    on_box = _array(surface.cell_data, "on_box", boundary_path(path).name) != 0
+    facets, tags = _boundary(surface, points, beside.name)
+    on_box = _array(surface.cell_data, "on_box", beside.name) != 0
     mesh = TetMesh(
         points_m=points,
-        tets=tets,
+        tets=np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4),
         temperature_c=_array(body.point_data, "temperature_c", path.name).astype(np.float64),
         observed=_array(body.point_data, "observed", path.name) != 0,
         facets=facets,
         facet_tags=np.where(on_box, FACET_BOX, FACET_SURFACE).astype(np.int64),
-        region=region,
-        region_names=names,
+        region=_array(body.cell_data, "region", path.name).astype(np.int64),
+        region_names=_region_names(body, path.name),
         boundary=tags,
         colour=None if colour is None else (np.asarray(colour) / 255.0).astype(np.float32),
     )
-    _check_boundary(mesh, path)
-    return mesh
-
-
-def _check_boundary(mesh: TetMesh, path: Path) -> None:
-    """Refuse tetrahedra that are listed twice, and triangles that are not the faces of one tetrahedron each."""
+    mesh.check(path.name, _REMEDY)
     faces = group_faces(mesh.tets)
     wrong = count_wrong_facets(mesh, faces)
-    if not wrong and faces.sizes.max() <= 2:
-        return
     doubled = len(mesh.tets) - len(np.unique(np.sort(mesh.tets, axis=1), axis=0))
     if doubled:
         raise _wrong(path.name, "every tetrahedron once", f"{doubled} of {len(mesh.tets)} listed again")
-    if not wrong:
+    if wrong:
+        expected, got = "every face of one tetrahedron alone, and no other", f"{wrong} missing, inside or turned over"
+        raise _wrong(beside.name, expected, got)
+    if faces.sizes.max() > 2:
         remedy = "Remove tetrahedra that lie in each other, or export the mesh again."
         raise _wrong(path.name, "faces of one or two tetrahedra each", "faces of more", remedy)
-    expected, got = "every face of one tetrahedron alone, and no other", f"{wrong} missing, inside or turned over"
-    raise _wrong(boundary_path(path).name, expected, got)
+    return mesh
 
 
 def _read(path: Path) -> Any:
@@ -246,7 +228,7 @@ def _read(path: Path) -> Any:
 
 
 def _sizes_fit(content: bytes) -> bool:
-    """Whether the arrays of a VTK file, as `write_mesh` writes them, claim no more than its bytes can hold.
+    """Tell whether the arrays of a VTK file, as `write_vtk` writes them, claim no more than its bytes can hold.
 
     VTK ends the process where a damaged size is too large for the memory. Files written otherwise are not checked.
     """
@@ -255,22 +237,20 @@ def _sizes_fit(content: bytes) -> bool:
     if header is None or begin is None:
         return True
     width = int(header[1]) // 8
-    most = _MOST_COMPRESSION * len(content)
     for offset in re.findall(rb'offset="(\d+)', content[: begin.start()]):
         start = begin.end() + int(offset)
         # An array begins with the number of its blocks, the size of a block, that of the last one, those compressed.
         blocks, size, last = _numbers(content[start : start + 4 * width], width, 3)
-        if blocks * width > len(content) or max(blocks * size, last) > most:
+        if blocks * width > len(content) or max(blocks * size, last) > _MOST_COMPRESSION * len(content):
             return False
         letters = -(-(3 + blocks) * width // 3) * 4
-        packed = _numbers(content[start : start + letters], width, 3 + blocks)[3:]
-        if sum(packed) > len(content):
+        if sum(_numbers(content[start : start + letters], width, 3 + blocks)[3:]) > len(content):
             return False
     return True
 
 
 def _numbers(letters: bytes, width: int, count: int) -> list[int]:
-    """Little-endian numbers of `width` bytes in base64; what is not there or no base64 is as large as can be."""
+    """Decode little-endian numbers of `width` bytes in base64; what is no base64 or missing is as large as can be."""
     try:
         found = base64.b64decode(letters + b"=" * (-len(letters) % 4), validate=True)
     except binascii.Error:
@@ -280,7 +260,7 @@ def _numbers(letters: bytes, width: int, count: int) -> list[int]:
 
 
 def _region_names(body: Any, name: str) -> tuple[str, ...]:
-    """Names by their numbers, which the file holds one by one."""
+    """Return the regions' names by their numbers, each of which is a field array."""
     arrays = body.GetFieldData()
     numbers = {}
     for place in range(arrays.GetNumberOfArrays()):
@@ -293,37 +273,32 @@ def _region_names(body: Any, name: str) -> tuple[str, ...]:
 
 
 def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Boundary | None]:
+    """Return the boundary triangles and their tags, None for a mesh that was not tagged."""
+
+    def array(of: str) -> npt.NDArray:
+        return _array(surface.cell_data, of, name)
+
     node = _array(surface.point_data, "node", name).astype(np.int64)
-    if node.min() < 0 or node.max() >= len(points) or not np.array_equal(points[node], surface.points):
+    if node.min() < 0 or node.max() >= len(points) or not np.array_equal(points[node], surface.points, equal_nan=True):
         raise _wrong(name, "the boundary of the mesh beside it", "that of another one")
     if not surface.is_all_triangles:
         raise _wrong(name, "triangles only", "other polygons")
     facets = node[np.asarray(surface.regular_faces, dtype=np.int64)]
     if "seen" not in surface.cell_data:
         return facets, None
-    array = surface.GetFieldData().GetAbstractArray("patch_names")
-    if array is None:
+    names = surface.GetFieldData().GetAbstractArray("patch_names")
+    if names is None:
         raise _wrong(name, "the field array patch_names", "none")
-    names = tuple(str(array.GetValue(number)) for number in range(array.GetNumberOfValues()))
-    normal = np.array(_array(surface.cell_data, "normal", name), dtype=np.float64)
-    counts, photographs = [f"photographs_{what}" for what in ("seen", "supporting")], None
-    if any(count in surface.cell_data for count in counts):
-        photographs = np.stack([_array(surface.cell_data, n, name).astype(np.int64) for n in counts], axis=1)
+    counts = [f"photographs_{what}" for what in ("seen", "supporting")]
+    counted = any(count in surface.cell_data for count in counts)
     return facets, Boundary(
-        normal=check_shape("normal", normal, (len(facets), 3), _REMEDY, MeshError),
-        area_factor=np.array(_array(surface.cell_data, "area_factor", name), dtype=np.float64),
-        seen=_array(surface.cell_data, "seen", name) != 0,
-        patch=_cell_numbers(surface, "patch", name, len(names)),
-        patch_names=names,
-        photographs=photographs,
+        normal=array("normal").astype(np.float64),
+        area_factor=array("area_factor").astype(np.float64),
+        seen=array("seen") != 0,
+        patch=array("patch").astype(np.int64),
+        patch_names=tuple(str(names.GetValue(number)) for number in range(names.GetNumberOfValues())),
+        photographs=np.stack([array(count) for count in counts], axis=1).astype(np.int64) if counted else None,
     )
-
-
-def _cell_numbers(data: Any, array: str, name: str, count: int) -> IntArray:
-    numbers = _array(data.cell_data, array, name).astype(np.int64)
-    if numbers.min() < 0 or numbers.max() >= count:
-        raise _wrong(f"{name}: {array}", f"0 to {count - 1}", f"{numbers.min()} to {numbers.max()}")
-    return numbers
 
 
 def _array(data: Any, array: str, name: str) -> npt.NDArray:

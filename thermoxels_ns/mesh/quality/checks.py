@@ -21,18 +21,18 @@ TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]],
 
 
 def facet_area_vectors(points: FloatArray, facets: IntArray) -> FloatArray:
-    """Area times unit normal of triangles (right-hand rule), shape (f, 3), [m^2]."""
+    """Return the area times the unit normal of triangles (right-hand rule), shape (f, 3), [m^2]."""
     origin = points[facets[:, 0]]
     return 0.5 * np.cross(points[facets[:, 1]] - origin, points[facets[:, 2]] - origin)
 
 
 def facet_areas(points: FloatArray, facets: IntArray) -> FloatArray:
-    """Areas of triangles, shape (f,), [m^2]."""
+    """Return the areas of triangles, shape (f,), [m^2]."""
     return np.linalg.norm(facet_area_vectors(points, facets), axis=1)
 
 
 def facet_normals(points: FloatArray, facets: IntArray) -> FloatArray:
-    """Unit normals of triangles (right-hand rule), 0 for one without area, shape (f, 3)."""
+    """Return the unit normals of triangles (right-hand rule), 0 for one without area, shape (f, 3)."""
     vectors = facet_area_vectors(points, facets)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)
@@ -40,28 +40,27 @@ def facet_normals(points: FloatArray, facets: IntArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Groups:
-    """Rows put together by equality; group g is `order[start[g]:start[g + 1]]`, the last one ends with `order`."""
+    """Equal rows of a table put together: group g is `order[start[g]:start[g + 1]]`, the last one ends with `order`."""
 
-    order: IntArray  # row numbers, those of a group in a row; within a group in no particular order. Shape (rows,).
-    start: IntArray
-    """Where each group starts in `order`, shape (groups,); groups go by their first and then their second number."""
+    order: IntArray  # row numbers, group after group, shape (rows,)
+    start: IntArray  # where each group starts in `order`, shape (groups,); groups are sorted by what they share
 
     @property
     def sizes(self) -> IntArray:
-        """Number of rows in each group, shape (groups,)."""
+        """Return the number of rows in each group, shape (groups,)."""
         return np.diff(np.append(self.start, len(self.order)))
 
     @property
     def first(self) -> IntArray:
-        """Smallest row number of each group, shape (groups,)."""
+        """Return the smallest row number of each group, shape (groups,)."""
         return np.minimum.reduceat(self.order, self.start) if len(self.start) else self.start
 
     def sums(self, values: npt.NDArray) -> npt.NDArray:
-        """Sum of a value per row over each group, shape (groups,)."""
+        """Return the sum of a value per row over each group, shape (groups,)."""
         return np.add.reduceat(values[self.order], self.start) if len(self.start) else values[:0]
 
     def pairs(self) -> tuple[IntArray, IntArray]:
-        """Rows that follow each other inside a group."""
+        """Return the rows that follow each other inside a group, before and after."""
         follows = np.ones(len(self.order), dtype=bool)
         follows[self.start] = False
         at = np.flatnonzero(follows)
@@ -69,10 +68,10 @@ class Groups:
 
 
 def group_pairs(first: IntArray, second: IntArray) -> Groups:
-    """Find the rows in which a pair of whole numbers of at least 0 is the same.
+    """Return the groups of rows in which a pair of whole numbers of at least 0 is the same.
 
-    Two stages, both linear in memory: a counting sort by the first number (a sparse row turned into columns), then a
-    sort of the few rows that share it. On a million tetrahedra this is several times faster than one sort of all rows.
+    A counting sort by the first number (a sparse row turned into columns) and a sort of the few rows that share it are
+    several times faster on a million tetrahedra than one sort of all rows.
 
     >>> groups = group_pairs(np.array([5, 2, 5, 2]), np.array([1, 9, 1, 0]))
     >>> groups.sizes, groups.first
@@ -92,7 +91,7 @@ def group_pairs(first: IntArray, second: IntArray) -> Groups:
 
 
 def group_faces(tets: IntArray) -> Groups:
-    """Find the faces that tetrahedra share; row 4 t + f is the face of tetrahedron t opposite its node f."""
+    """Return the faces that tetrahedra share; row 4 t + f is the face of tetrahedron t opposite its node f."""
     node = [np.ascontiguousarray(tets[:, n]) for n in range(4)]
     # Sorted element by element with five comparisons.
     a, b = np.minimum(node[0], node[1]), np.maximum(node[0], node[1])
@@ -108,24 +107,24 @@ def group_faces(tets: IntArray) -> Groups:
 
 
 def group_sides(facets: IntArray) -> Groups:
-    """Find the edges that triangles share; row 3 f + s is the side of triangle f from its node s to the next."""
+    """Return the edges that triangles share; row 3 f + s is the side of triangle f from its node s to the next."""
     ends = np.roll(facets, -1, axis=1)
     return group_pairs(np.minimum(facets, ends).ravel(), np.maximum(facets, ends).ravel())
 
 
 def triangles_across_edges(sides: Groups) -> IntArray:
-    """Pairs of triangles that share an edge, shape (p, 2), from `group_sides`."""
+    """Return pairs of triangles that share an edge, shape (p, 2), from `group_sides`."""
     return np.stack(sides.pairs(), axis=1) // 3
 
 
 def component_of(num: int, first: IntArray, second: IntArray) -> IntArray:
-    """Number of the connected component that each of `num` things is in, shape (num,)."""
+    """Return the number of the connected component that each of `num` things is in, shape (num,)."""
     links = sparse.coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
     return connected_components(links, directed=False)[1].astype(np.int64) if num else np.zeros(0, dtype=np.int64)
 
 
 def boundary_facets(tets: IntArray, faces: Groups | None = None) -> IntArray:
-    """Triangles that belong to exactly one tetrahedron, outwards, shape (f, 3), ordered by their sorted node numbers.
+    """Return the triangles of exactly one tetrahedron, outwards, shape (f, 3), ordered by their sorted node numbers.
 
     `faces` is `group_faces(tets)` where that is already known.
 
@@ -138,7 +137,7 @@ def boundary_facets(tets: IntArray, faces: Groups | None = None) -> IntArray:
 
 
 def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
-    """Tetrahedron of every boundary triangle, and which of its four nodes lies opposite to it, each shape (f,).
+    """Return the tetrahedron of every boundary triangle and which of its nodes lies opposite to it, each shape (f,).
 
     Only faces whose nodes all lie on the boundary are looked at, so the sort follows the surface, not the volume.
 
@@ -171,14 +170,16 @@ def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def count_twin_nodes(points: FloatArray) -> int:
-    """Number of nodes at the place of an earlier one."""
+    """Return the number of nodes at the place of an earlier one."""
     ordered = points[np.lexsort(points.T)]
     return int(np.count_nonzero(np.all(ordered[1:] == ordered[:-1], axis=1)))
 
 
 def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
-    """Number of triangles to take from and add to `mesh.facets` (one turned over counts twice) to get the faces of one
-    owner, normals outwards. `faces` is `group_faces(mesh.tets)`."""
+    """Return how many triangles are wrong or missing in `mesh.facets`, which should be all faces of one tetrahedron.
+
+    A triangle that is turned over counts twice. `faces` is `group_faces(mesh.tets)`.
+    """
     wanted = boundary_facets(mesh.tets, faces)
     both = np.concatenate([wanted, mesh.facets]).astype(np.int64)
     turn = (np.argmin(both, axis=1)[:, None] + np.arange(3)) % 3  # the smallest node first, so orientation stays
@@ -188,10 +189,10 @@ def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
 
 
 def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
-    """Number of pairs of triangles that share an edge and lie on the same side of it in the same plane.
+    """Return the number of pairs of triangles that share an edge and lie on the same side of it in the same plane.
 
-    This is how a crack looks: the faces of neighbours that do not match are boundary triangles, one upon the other.
-    `sides` is `group_sides(facets)`.
+    This is how a crack looks: faces of neighbours that do not match are boundary triangles, one upon the other. `sides`
+    is `group_sides(facets)`.
     """
     normals = facet_normals(points, facets)
     facet, side = np.divmod(sides.order, 3)
@@ -209,7 +210,7 @@ def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
 
 
 def count_tets_in_other_bodies(mesh: TetMesh) -> int:
-    """Number of tetrahedra whose centre lies in a body that they share no node with."""
+    """Return the number of tetrahedra whose centre lies in a body that they share no node with."""
     import pyvista as pv
 
     points, tets = mesh.points_m, mesh.tets
@@ -240,54 +241,51 @@ class SurfaceComponent:
 def surface_topology(points: FloatArray, facets: IntArray, sides: Groups) -> dict[str, Any]:
     """Count the components of a triangulated surface, their handles, and where it is no manifold.
 
-    Nodes (n, 3), [m]; triangles (f, 3), right-hand normal out of the body; `sides` is `group_sides(facets)`. The
-    figures have the names that they have in `report.QualityReport`.
+    The figures have the names that they have in `report.QualityReport`; `sides` is `group_sides(facets)`.
     """
     uses, (left, right) = sides.sizes, sides.pairs()
-    start, rows = facets.ravel(), np.arange(facets.size)
-    next_corner = rows - rows % 3 + (rows + 1) % 3
-    upwards = start < start[next_corner]
+    node, row = facets.ravel(), np.arange(facets.size)
+    following = row - row % 3 + (row + 1) % 3
     component = component_of(len(facets), left // 3, right // 3)
-    # Corner 3 f + s of triangle f lies at its node s. Two corners at one node are in one fan if an edge with just two
-    # triangles lies between them.
-    two_only = np.zeros(len(rows), dtype=bool)
-    two_only[sides.order] = np.repeat(uses == 2, uses)
-    left, right = left[two_only[left]], right[two_only[left]]
-    low, high = np.where(upwards, rows, next_corner), np.where(upwards, next_corner, rows)
-    fan = component_of(len(rows), np.concatenate([low[left], high[left]]), np.concatenate([low[right], high[right]]))
-    a_corner = np.zeros(int(fan.max(initial=-1)) + 1, dtype=np.int64)
-    a_corner[fan] = rows
-    fans_at_node = np.bincount(start[a_corner], minlength=1)
+    # Row 3 f + s is also the corner of triangle f at its node s. Two corners at one node belong to one fan if an edge
+    # with just two triangles lies between them.
+    of_two = np.zeros(len(row), dtype=bool)
+    of_two[sides.order] = np.repeat(uses == 2, uses)
+    left, right = left[of_two[left]], right[of_two[left]]
+    upwards = node < node[following]
+    low, high = np.where(upwards, row, following), np.where(upwards, following, row)
+    fan = component_of(len(row), np.concatenate([low[left], high[left]]), np.concatenate([low[right], high[right]]))
+    corner_of_fan = np.unique(fan, return_index=True)[1]
+    fans_at_node = np.bincount(node[corner_of_fan], minlength=1)
 
     count = int(component.max(initial=-1)) + 1
 
-    def per_component(triangle: IntArray, weights: npt.NDArray | None = None) -> npt.NDArray:
-        return np.bincount(component[triangle], weights, minlength=count)
+    def per_component(rows: IntArray, weights: npt.NDArray | None = None) -> npt.NDArray:
+        return np.bincount(component[rows // 3], weights, minlength=count)
 
-    edge_triangle = sides.first // 3
-    triangles = per_component(rows[::3] // 3)
-    vertices = per_component(group_pairs(component[rows // 3], start).first // 3)
-    euler = vertices - per_component(edge_triangle) + triangles
-    closed = (per_component(edge_triangle, uses != 2) == 0) & (per_component(a_corner // 3) == vertices)
-    is_open = per_component(edge_triangle, uses % 2) > 0
+    triangles, vertices = per_component(row[::3]), per_component(group_pairs(component[row // 3], node).first)
+    euler = vertices - per_component(sides.first) + triangles
+    closed = (per_component(sides.first, uses != 2) == 0) & (per_component(corner_of_fan) == vertices)
     # Signed volumes between triangles and the middle of the nodes.
     corner = (points - points.mean(axis=0))[facets]
     cones = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6.0
-    cavity = ~is_open & (per_component(rows[::3] // 3, cones) < 0.0)
-    components = []
-    for n in np.argsort(-triangles, kind="stable"):
-        genus = (2 - int(euler[n])) // 2 if closed[n] else None
-        components.append(SurfaceComponent(int(triangles[n]), int(euler[n]), genus, bool(cavity[n])))
+    cavity = (per_component(sides.first, uses % 2) == 0) & (per_component(row[::3], cones) < 0.0)
+    components = tuple(
+        SurfaceComponent(
+            int(triangles[n]), int(euler[n]), (2 - int(euler[n])) // 2 if closed[n] else None, bool(cavity[n])
+        )
+        for n in np.argsort(-triangles, kind="stable")
+    )
     return {
         "num_non_manifold_edges": int(np.count_nonzero(uses > 2)),
         "num_non_manifold_vertices": int(np.count_nonzero(fans_at_node > 1)),
         "euler_characteristic": int(np.count_nonzero(fans_at_node)) - len(uses) + len(facets),
         "genus": sum(one.genus or 0 for one in components) if closed.all() else None,
-        "components": tuple(components),
+        "components": components,
     }
 
 
 def count_open_edges(facets: IntArray, sides: Groups) -> int:
-    """Number of edges whose triangles do not pass them equally often in both directions; 0: the surface is closed."""
+    """Return the number of edges that triangles do not pass equally often in both directions; 0: it is closed."""
     upwards = facets < np.roll(facets, -1, axis=1)
     return int(np.count_nonzero(sides.sums(np.where(upwards.ravel(), 1, -1))))

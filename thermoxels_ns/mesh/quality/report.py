@@ -1,16 +1,18 @@
-"""All figures of a mesh's quality: shapes, sizes, topology, and the criteria it meets."""
+"""All figures of a mesh's quality (shapes, sizes, topology), the criteria it meets, and a picture of both."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import (
     TET_EDGES,
@@ -25,19 +27,32 @@ from thermoxels_ns.mesh.quality.checks import (
     group_sides,
     surface_topology,
 )
-from thermoxels_ns.mesh.quality.tet_shapes import angle_rounding, node_rounding, shapes_in_chunks
+from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 BoundaryMode = Literal["conforming", "voxel"]
 """How the boundary of a mesh runs: along the level set of the density, or along voxel faces."""
 DIHEDRAL_BOUNDS_DEG: dict[BoundaryMode, tuple[float, float]] = {"voxel": (45.0, 90.0), "conforming": (10.7, 164.8)}
 """Bounds of the angles between two faces of a tetrahedron, [degrees]: six equal tetrahedra per voxel have angles of 45,
 60 and 90 degrees; for isosurface stuffing see Labelle and Shewchuk (2007)."""
-ANGLE_TOLERANCE_DEG = 1e-6  # what rounding may add to an angle, [degrees]
+ANGLE_TOLERANCE_DEG = 1e-4  # what rounding of the nodes may add to an angle, [degrees]
 TEMPERATURE_TOLERANCE_K = 1e-6  # what rounding may add to a temperature, [K]
-SOLVABLE = ("volumes_positive", "conforming", "boundary_closed")  # criteria without which no solver takes a mesh
 RATIO_EDGES = np.linspace(0.0, 1.0, 21)  # edges of the bins of the radius ratio
 
+_CRITERIA = {
+    "volumes_positive": "Every tetrahedron has a volume above 0.",
+    "conforming": "Neighbours share whole faces: no crack, no face with three owners, no twin or unused node.",
+    "boundary_closed": "The boundary is closed: just the faces with one owner, normals outwards.",
+    "dihedral_within_bounds": "Angles between two faces of a tetrahedron lie within {:g} to {:g} degrees.",
+    "temperatures_in_range": "No node is colder than the coldest or hotter than the hottest observation.",
+    "non_obtuse": "No obtuse angle between faces: heat with lumped mass keeps the maximum principle.",
+    "stiffness_monotone": "No stiffness entry of an edge is positive: all that the maximum principle needs.",
+}
+"""What a mesh should be, by name. The last two are for voxel meshes, as no cut along a level set meets them; none asks
+that a boundary nowhere touches itself, because bodies may."""
 _BINS_WITHIN_BOUNDS: dict[BoundaryMode, int] = {"voxel": 10, "conforming": 30}
 _MOST_COMPONENTS = 20
 _CANCELLED = 1e-9  # sums over an edge below this share of their terms' sizes are 0
@@ -55,11 +70,9 @@ class Criterion:
 
 
 def angle_edges(boundary_mode: BoundaryMode) -> FloatArray:
-    """Edges of bins about 5 degrees wide from 0 to 180 degrees such that none lies on both sides of a bound.
+    """Return the edges of bins about 5 degrees wide that cover 0 to 180 degrees, none of them across a bound.
 
-    The first may begin below 0 and the last end above 180; rounding carries no angle across a bound.
-
-    >>> angle_edges("voxel")[[0, 1, -1]].round(3)
+    >>> angle_edges("voxel")[[0, 1, -1]].round(2)
     array([ -0. ,   4.5, 180. ])
     """
     low, high = DIHEDRAL_BOUNDS_DEG[boundary_mode]
@@ -71,7 +84,7 @@ def angle_edges(boundary_mode: BoundaryMode) -> FloatArray:
 
 
 def in_percent(share: float) -> str:
-    """A share in percent that does not look like none, or all, unless it is."""
+    """Write a share in percent such that it looks like none, or all, only if it is."""
     if share in (0.0, 1.0):
         return f"{100 * share:.0f} %"
     return "< 0.01 %" if share < 1e-4 else f"{min(100.0 * share, 99.99):.2f} %"
@@ -81,7 +94,7 @@ def in_percent(share: float) -> str:
 class QualityReport:
     """Figures of a mesh and the criteria it meets."""
 
-    boundary_mode: BoundaryMode  # how the boundary was made, by which the criteria differ
+    boundary_mode: BoundaryMode  # how the boundary was made
     length_unit: str  # unit of the nodes' positions; if it is not "m", [m] below stands for it
     num_nodes: int
     num_tets: int
@@ -91,53 +104,43 @@ class QualityReport:
     volume_m3: float  # sum of the signed volumes, [m^3]
     area_m2: float  # sum of the boundary triangles' areas, [m^2]
     true_area_m2: float | None
-    """Area of the surface that the boundary triangles stand for: each times its area factor, [m^2]; None for a mesh
-    whose boundary was not tagged."""
+    """Area of the surface that the boundary triangles stand for, [m^2]; None for a mesh whose boundary has no tags."""
     edge_length_m: tuple[float, float, float]  # shortest, mean and longest edge, [m]
     dihedral_range_deg: tuple[float, float]  # smallest and largest angle between two faces of a tetrahedron, [degrees]
-    dihedral_counts: tuple[int, ...]
-    """Number of these angles, six per tetrahedron, in the bins of `angle_edges`."""
-    radius_ratio_range: tuple[float, float]
-    """Smallest and largest of 3 r / R with the radii of the inscribed and the circumscribed sphere, 1 at best; 0 where
-    the volume is not above 0."""
+    dihedral_counts: tuple[int, ...]  # number of these angles, six per tetrahedron, in the bins of `angle_edges`
+    radius_ratio_range: tuple[float, float]  # smallest and largest of `TetShapes.radius_ratios`, 1 at best
     radius_ratio_mean: float
-    radius_ratio_counts: tuple[int, ...]
-    """Number of tetrahedra by radius ratio in bins of 0.05 from 0 to 1; the last includes 1."""
+    radius_ratio_counts: tuple[int, ...]  # number of tetrahedra by radius ratio in the bins of `RATIO_EDGES`
     share_obtuse: float  # share of tetrahedra with an obtuse angle between two faces, 0 to 1
     share_positive_edges: float
     """Share of edges whose off-diagonal entry of the linear stiffness matrix, summed over the tetrahedra around the
     edge at conductivity 1, is positive: there the discrete maximum principle can fail, 0 to 1."""
     bodies_by_node: int  # parts of the mesh that share no node
-    bodies_by_face: int
-    """Parts of the mesh between which no heat is conducted through a face: they share nodes or edges at most."""
+    bodies_by_face: int  # parts of the mesh that share no face, so that no heat is conducted between them
     euler_characteristic: int  # vertices - edges + triangles of the boundary
     genus: int | None  # handles of all boundary components together; None if one of them is not a closed manifold
-    components: tuple[SurfaceComponent, ...]
-    """Connected components of the boundary (triangles that share edges), largest first."""
+    components: tuple[SurfaceComponent, ...]  # of the boundary (triangles that share edges), largest first
     num_non_manifold_edges: int  # boundary edges with more than two boundary triangles
     num_non_manifold_vertices: int  # boundary vertices whose triangles are not one fan
     criteria: tuple[Criterion, ...]  # quality criteria of such a boundary, and whether this mesh meets them
 
     @property
     def num_cavities(self) -> int:
-        """Boundary components around a hole inside a body."""
+        """Return the number of boundary components around a hole inside a body."""
         return sum(component.is_cavity for component in self.components)
 
     @property
     def unmet(self) -> tuple[str, ...]:
-        """Names of the criteria that this mesh does not meet."""
+        """Return the names of the criteria that this mesh does not meet."""
         return tuple(criterion.name for criterion in self.criteria if not criterion.kept)
 
     def as_mapping(self) -> dict[str, Any]:
-        """The report as json can hold it; of the boundary's components the 20 largest are listed."""
+        """Return the report as json can hold it, with the 20 largest of the boundary's components."""
         mapping = asdict(self)
         listed, criteria = mapping.pop("components"), mapping.pop("criteria")
-        for name, edges in (
-            ("dihedral_counts", angle_edges(self.boundary_mode)),
-            ("radius_ratio_counts", RATIO_EDGES),
-        ):
-            width = float(edges[1] - edges[0])
-            counts = list(mapping[name])
+        bins = {"dihedral_counts": angle_edges(self.boundary_mode), "radius_ratio_counts": RATIO_EDGES}
+        for name, edges in bins.items():
+            width, counts = float(edges[1] - edges[0]), list(mapping[name])
             mapping[name] = {"first_centre": float(edges[0]) + 0.5 * width, "bin_width": width, "counts": counts}
         for name in ("dihedral_range_deg", "radius_ratio_range"):
             mapping[name] = dict(zip(("min", "max"), mapping[name]))
@@ -162,8 +165,8 @@ def check_mesh(
             lies where another is, or the boundary is not closed; or what `quality_report` raises.
     """
     report = quality_report(mesh, boundary_mode, observed_range_c, length_unit)
-    for criterion in report.criteria:
-        if criterion.name in SOLVABLE and not criterion.kept:
+    for criterion in report.criteria[:3]:
+        if not criterion.kept:
             remedy = "The mesh is damaged: build it again, and report this if it persists."
             expected, got = criterion.sentence.rstrip("."), criterion.found
             raise MeshError(f"mesh {criterion.name}", expected=expected, got=got, remedy=remedy)
@@ -176,7 +179,7 @@ def quality_report(
     observed_range_c: tuple[float, float] | None = None,
     length_unit: str = "m",
 ) -> QualityReport:
-    """Measure a mesh and hold it against its quality criteria. One that is not met is reported, it does not raise.
+    """Measure a mesh and hold it against its quality criteria; one that is not met does not raise.
 
     Args:
         mesh: The mesh, damaged or not.
@@ -188,34 +191,31 @@ def quality_report(
     Raises:
         MeshError: The arrays do not fit each other or are not finite.
     """
-    if boundary_mode not in get_args(BoundaryMode):
-        modes = " or ".join(get_args(BoundaryMode))
-        raise MeshError("boundary_mode", expected=modes, got=repr(boundary_mode), remedy="Pass one of these.")
     mesh.check()
     points, tets, temperature = mesh.points_m, mesh.tets, mesh.temperature_c
-    seen = np.asarray(mesh.observed, dtype=bool)
-    observed_c = temperature[seen] if seen.any() else temperature
+    observed_c = temperature[mesh.observed] if mesh.observed.any() else temperature
     low_c, high_c = observed_range_c or (float(observed_c.min()), float(observed_c.max()))
-    shapes, volumes, stiffness = _measure_shapes(mesh, angle_edges(boundary_mode))
-    links, share_positive = _edges(mesh, stiffness)
-    lengths = np.linalg.norm(points[links.row] - points[links.col], axis=1)
+    figures, volumes, stiffness = _measure_shapes(mesh, angle_edges(boundary_mode))
+    ends = tets[:, TET_EDGES].reshape(-1, 2).T
+    place, shape = (np.minimum(*ends), np.maximum(*ends)), (len(points),) * 2
+    links, sizes = (sparse.coo_array((values, place), shape).tocsr() for values in (stiffness, np.abs(stiffness)))
+    figures["share_positive_edges"] = float(np.mean(links.data > _CANCELLED * sizes.data))
+    edges = links.tocoo()
+    lengths = np.linalg.norm(points[edges.row] - points[edges.col], axis=1)
     faces, sides = group_faces(tets), group_sides(mesh.facets)
-    first, second = faces.pairs()
-    surface = surface_topology(points, mesh.facets, sides)
     areas = facet_areas(points, mesh.facets)
     unused = len(points) - np.count_nonzero(np.bincount(tets.ravel()))
     mismatches = int(np.count_nonzero(faces.sizes > 2)) + count_overlaps(points, mesh.facets, sides)
     criteria = _criteria(
         boundary_mode,
-        shapes,
-        share_positive,
-        volumes,
+        figures,
+        float(volumes.min()),
+        int(np.count_nonzero(~(volumes > 0.0))),
         length_unit,
         mismatches=mismatches + count_twin_nodes(points) + unused,
         open_edges=count_open_edges(mesh.facets, sides),
         wrong_facets=count_wrong_facets(mesh, faces),
-        excess=float(max(low_c - temperature.min(), temperature.max() - high_c, 0.0)),
-        rounding_deg=float(np.degrees(angle_rounding(node_rounding(points), float(lengths.min()) or 1.0))),
+        excess_k=float(max(low_c - temperature.min(), temperature.max() - high_c, 0.0)),
     )
     return QualityReport(
         boundary_mode=boundary_mode,
@@ -228,99 +228,51 @@ def quality_report(
         area_m2=float(areas.sum()),
         true_area_m2=None if mesh.boundary is None else float((areas * mesh.boundary.area_factor).sum()),
         edge_length_m=(float(lengths.min()), float(lengths.mean()), float(lengths.max())),
-        **shapes,
-        share_positive_edges=share_positive,
+        **figures,
         # Nodes without a tetrahedron are no bodies.
         bodies_by_node=int(connected_components(links, directed=False)[0]) - unused,
-        bodies_by_face=int(component_of(len(tets), first >> 2, second >> 2).max()) + 1,
-        **surface,
-        criteria=criteria if boundary_mode == "voxel" else criteria[:5],
+        bodies_by_face=int(component_of(len(tets), *(rows // 4 for rows in faces.pairs())).max()) + 1,
+        **surface_topology(points, mesh.facets, sides),
+        criteria=criteria,
     )
 
 
 def _criteria(
-    boundary_mode: BoundaryMode,
-    shapes: dict[str, Any],
-    share_positive: float,
-    volumes: FloatArray,
-    length_unit: str,
+    mode: BoundaryMode,
+    figures: dict[str, Any],
+    smallest_m3: float,
+    turned: int,
+    unit: str,
     *,
     mismatches: int,
     open_edges: int,
     wrong_facets: int,
-    excess: float,
-    rounding_deg: float,
+    excess_k: float,
 ) -> tuple[Criterion, ...]:
-    """All criteria. The last two, on obtuse angles, are for voxel meshes alone: no cut along a level set meets them.
-
-    None asks that a boundary nowhere touches itself, because bodies may.
-    """
-    (smallest, largest), (low, high) = shapes["dihedral_range_deg"], DIHEDRAL_BOUNDS_DEG[boundary_mode]
-    inside, obtuse = min(smallest - low, high - largest), shapes["share_obtuse"]
-    turned, smallest_volume = int(np.count_nonzero(~(volumes > 0.0))), float(volumes.min())
-    return (
-        Criterion(
-            "volumes_positive",
-            "Every tetrahedron has a volume above 0.",
-            turned == 0,
-            smallest_volume,
-            f"{turned:,} at or below 0" if turned else f"smallest {smallest_volume:.3g} {length_unit}³",
-        ),
-        Criterion(
-            "conforming",
-            "Neighbours share whole faces: no crack, no face with three owners, no twin or unused node.",
-            mismatches == 0,
-            float(mismatches),
-            f"{mismatches:,} mismatches",
-        ),
-        Criterion(
-            "boundary_closed",
-            "The boundary is closed: just the faces with one owner, normals outwards.",
-            open_edges + wrong_facets == 0,
-            float(open_edges + wrong_facets),
-            f"{open_edges:,} open edges, {wrong_facets:,} triangles wrong",
-        ),
-        Criterion(
-            "dihedral_within_bounds",
-            f"Angles between two faces of a tetrahedron lie within {low:g} to {high:g} degrees.",
-            inside >= -(ANGLE_TOLERANCE_DEG + rounding_deg),
-            inside,
-            f"{smallest:.2f}° to {largest:.2f}°",
-        ),
-        Criterion(
-            "temperatures_in_range",
-            "No node is colder than the coldest or hotter than the hottest observation.",
-            excess <= TEMPERATURE_TOLERANCE_K,
-            excess,
-            f"{excess:.2g} K outside" if excess > TEMPERATURE_TOLERANCE_K else "none outside",
-        ),
-        Criterion(
-            "non_obtuse",
-            "No obtuse angle between faces: heat with lumped mass keeps the maximum principle.",
-            obtuse == 0.0,
-            obtuse,
-            f"{in_percent(obtuse)} of tetrahedra obtuse",
-        ),
-        Criterion(
-            "stiffness_monotone",
-            "No stiffness entry of an edge is positive: all that the maximum principle needs.",
-            share_positive == 0.0,
-            share_positive,
-            f"{in_percent(share_positive)} of edges positive",
-        ),
+    """Return all criteria of a boundary; `turned` is the number of tetrahedra whose volume is not above 0."""
+    (smallest, largest), (low, high) = figures["dihedral_range_deg"], DIHEDRAL_BOUNDS_DEG[mode]
+    inside, bad = min(smallest - low, high - largest), open_edges + wrong_facets
+    obtuse, positive, warm = (
+        figures["share_obtuse"],
+        figures["share_positive_edges"],
+        excess_k > TEMPERATURE_TOLERANCE_K,
     )
-
-
-def _edges(mesh: TetMesh, stiffness: FloatArray) -> tuple[Any, float]:
-    """Edges as entries of a sparse matrix, and the share of them whose stiffness, summed over the tets, is above 0."""
-    ends = mesh.tets[:, TET_EDGES].reshape(-1, 2).T
-    place, shape = (np.minimum(*ends), np.maximum(*ends)), (len(mesh.points_m),) * 2
-    sums, sizes = (sparse.coo_array((values, place), shape).tocsr() for values in (stiffness, np.abs(stiffness)))
-    return sums.tocoo(), float(np.mean(sums.data > _CANCELLED * sizes.data))
+    smallest_volume = f"{turned:,} at or below 0" if turned else f"smallest {smallest_m3:.3g} {unit}³"
+    found = (
+        (turned == 0, smallest_m3, smallest_volume),
+        (mismatches == 0, float(mismatches), f"{mismatches:,} mismatches"),
+        (bad == 0, float(bad), f"{open_edges:,} open edges, {wrong_facets:,} triangles wrong"),
+        (inside >= -ANGLE_TOLERANCE_DEG, inside, f"{smallest:.2f}° to {largest:.2f}°"),
+        (not warm, excess_k, f"{excess_k:.2g} K outside" if warm else "none outside"),
+        (obtuse == 0.0, obtuse, f"{in_percent(obtuse)} of tetrahedra obtuse"),
+        (positive == 0.0, positive, f"{in_percent(positive)} of edges positive"),
+    )
+    criteria = (Criterion(name, text.format(low, high), *one) for (name, text), one in zip(_CRITERIA.items(), found))
+    return tuple(criteria)[: None if mode == "voxel" else 5]
 
 
 def _measure_shapes(mesh: TetMesh, edges_deg: FloatArray) -> tuple[dict[str, Any], FloatArray, FloatArray]:
-    """Figures by their names in `QualityReport`, volumes (t,), and stiffness of the six edges of each in a row."""
+    """Return figures by their names in `QualityReport`, volumes (t,), and stiffness of the six edges of each (6 t,)."""
     num = len(mesh.tets)
     volumes, ratios, stiffness = np.empty(num), np.empty(num), np.empty((num, 6))
     angle_counts = np.zeros(len(edges_deg) - 1, dtype=np.int64)
@@ -343,3 +295,91 @@ def _measure_shapes(mesh: TetMesh, edges_deg: FloatArray) -> tuple[dict[str, Any
         "radius_ratio_counts": tuple(np.histogram(ratios, RATIO_EDGES)[0].tolist()),
     }
     return figures, volumes, stiffness.ravel()
+
+
+def picture_of_quality(path: Path | str, report: QualityReport) -> None:
+    """Draw a report as a PNG: two histograms above, figures and criteria below."""
+    from matplotlib.figure import Figure
+
+    path = Path(path)
+    figure = Figure(figsize=(12.5, 9.0), dpi=110, facecolor="white", layout="constrained")
+    title = f"Mesh quality, {report.boundary_mode} boundary: {report.num_tets:,} tetrahedra"
+    figure.suptitle(title, fontsize=14, color=_INK)
+    grid = figure.add_gridspec(2, 2, height_ratios=(1.0, 1.05))
+    angles, ratios, figures, criteria = (figure.add_subplot(grid[row, column]) for row in (0, 1) for column in (0, 1))
+
+    _draw_bars(angles, report.dihedral_counts, angle_edges(report.boundary_mode))
+    for bound, side, shift in zip(DIHEDRAL_BOUNDS_DEG[report.boundary_mode], ("left", "right"), (4, -4)):
+        angles.axvline(bound, color=_BOUND, linestyle="--", linewidth=1.3)
+        place = {"xycoords": angles.get_xaxis_transform(), "textcoords": "offset points"}
+        text = angles.annotate(f"{bound:g}°", (bound, 0.97), (shift, 0), **place)
+        text.set(ha=side, va="top", color=_BOUND, fontsize=10)
+    smallest, largest = report.dihedral_range_deg
+    angles.set(xlim=(0.0, 180.0), xticks=range(0, 181, 30), ylabel="angles")
+    angles.set_xlabel(f"angle between two faces of a tetrahedron [degrees]; found {smallest:.1f} to {largest:.1f}")
+    angles.set_title("Dihedral angles, and their bounds", fontsize=11)
+
+    _draw_bars(ratios, report.radius_ratio_counts, RATIO_EDGES)
+    worst, mean = report.radius_ratio_range[0], report.radius_ratio_mean
+    ratios.axvline(mean, color=_PALE, linestyle=":", linewidth=1.3)
+    ratios.set(xlim=(0.0, 1.0), ylabel="tetrahedra")
+    ratios.set_xlabel(f"3 r / R (1: regular, 0: flat); worst {worst:.3f}, mean {mean:.3f} (dotted)")
+    ratios.set_title("Inscribed over circumscribed radius", fontsize=11)
+
+    _write(figures, 0.0, 0.98, "Figures", _INK, size=12.0, weight="bold")
+    for number, (name, value) in enumerate(_figures(report).items()):
+        _write(figures, 0.0, 0.89 - 0.07 * number, name, _PALE)
+        _write(figures, 0.55, 0.89 - 0.07 * number, value, _INK)
+    met = len(report.criteria) - len(report.unmet)
+    heading = f"Criteria of a {report.boundary_mode} boundary: {met} of {len(report.criteria)} met"
+    _write(criteria, 0.0, 0.98, heading, _INK, size=12.0, weight="bold")
+    for number, criterion in enumerate(report.criteria):
+        y = 0.89 - 0.113 * number
+        _write(criteria, 0.0, y, *(("yes", "#2a7f3f") if criterion.kept else ("no", "#b3261e")), weight="bold")
+        _write(criteria, 0.07, y, criterion.name.replace("_", " "), _INK)
+        _write(criteria, 0.48, y, criterion.found, _INK)
+        _write(criteria, 0.07, y - 0.048, criterion.sentence, _PALE, size=8.0)
+    with replace_when_done(writable_folder(path.parent) / path.name) as temporary:
+        figure.savefig(temporary)
+
+
+_BARS, _BOUND, _INK, _PALE = "#4a78b0", "#b8571b", "#202020", "#606060"
+
+
+def _draw_bars(axis: Axes, counts: tuple[int, ...], edges: FloatArray) -> None:
+    """Draw a histogram on a logarithmic axis, because a solver stumbles over the few worst tetrahedra."""
+    axis.bar(edges[:-1], counts, np.diff(edges), align="edge", color=_BARS, edgecolor="white", linewidth=0.6)
+    axis.set(yscale="log", ylim=(0.7, 4.0 * max(counts)), axisbelow=True)
+    axis.grid(axis="y", alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _write(axis: Axes, x: float, y: float, words: str, colour: str, size: float = 10.0, weight: str = "normal") -> None:
+    """Write a line; it takes no room away from the histograms, however long it is."""
+    axis.set_axis_off()
+    line = axis.text(x, y, words, fontsize=size, weight=weight, color=colour, va="top", transform=axis.transAxes)
+    line.set_in_layout(False)
+
+
+def _figures(report: QualityReport) -> dict[str, str]:
+    """Return the figures that a person asks for first, by name."""
+    unit = report.length_unit
+    shortest, mean, longest = report.edge_length_m
+    true_area = "not known" if report.true_area_m2 is None else f"{report.true_area_m2:.6g} {unit}²"
+    return {
+        "nodes, tetrahedra": f"{report.num_nodes:,}, {report.num_tets:,}",
+        "boundary triangles": f"{report.num_facets:,} ({report.num_box_facets:,} cut by the box or the region)",
+        "volume": f"{report.volume_m3:.6g} {unit}³",
+        "area of triangles": f"{report.area_m2:.6g} {unit}²",
+        "area of the surface they stand for": true_area,
+        "edge length: shortest, mean, longest": f"{shortest:.4g}, {mean:.4g}, {longest:.4g} {unit}",
+        "bodies: sharing faces; sharing nodes": f"{report.bodies_by_face:,}; {report.bodies_by_node:,}",
+        "boundary components; cavities": f"{len(report.components):,}; {report.num_cavities:,}",
+        "genus (handles)": "none: not a manifold" if report.genus is None else f"{report.genus:,}",
+        "Euler characteristic of the boundary": f"{report.euler_characteristic:,}",
+        "edges, points where it touches itself": (
+            f"{report.num_non_manifold_edges:,}, {report.num_non_manifold_vertices:,}"
+        ),
+        "tetrahedra with an obtuse angle": in_percent(report.share_obtuse),
+        "edges with a positive stiffness entry": in_percent(report.share_positive_edges),
+    }

@@ -12,22 +12,20 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 _CHUNK = 1 << 14  # tetrahedra at a time: what is worked on stays in the processor's cache
 _FACE_PAIRS = ((2, 3), (1, 3), (1, 2), (0, 3), (0, 2), (0, 1))
 """Faces (by the node opposite) that meet in edge e of `checks.TET_EDGES`."""
-_RIGHT_ANGLE = 1e-9  # cosines below this are those of a right angle, up to rounding
-_FAR_SIZES = 16.0  # farther from the origin than this many times its own size, a mesh has nodes whose rounding counts
-_ANGLE_PER_ROUNDING = 4.0
-"""How far rounding turns an angle at most, [rad], over the share of a side that it moves nodes by."""
+_RIGHT_ANGLE = 1e-6
+"""Cosines below this are those of a right angle: five million metres from the origin, as in national coordinates, nodes
+have steps of a nanometre, which turn the angles of voxels of 1 cm by less."""
 
 
 @dataclass(frozen=True)
 class TetShapes:
-    """Tetrahedra in the form from which all figures of their shape follow, one column per tetrahedron."""
+    """Sides and face normals of tetrahedra, from which all figures of their shape follow; one column each."""
 
     sides: tuple[FloatArray, FloatArray, FloatArray]
     """Vectors from node 0 to nodes 1, 2 and 3, each of shape (3, t), [m]."""
     normals: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
     """Inward normal of the face opposite each node, twice the face's area long, each of shape (3, t), [m^2]."""
     six_volumes: FloatArray  # six times the signed volume, shape (t,), [m^3]
-    rounding: float = 0.0  # how far rounding may have moved nodes, see `node_rounding`, [m]
 
     @property
     def volumes(self) -> FloatArray:
@@ -35,10 +33,9 @@ class TetShapes:
         return self.six_volumes / 6.0
 
     def dihedral_cosines(self) -> FloatArray:
-        """Cosines of the inner angles between two faces, shape (6, t), at the edges of `checks.TET_EDGES`.
+        """Return the cosines of the inner angles between two faces, shape (6, t), at the edges of `checks.TET_EDGES`.
 
-        The angle at a face without area counts as 0 degrees; those of right angles, as far as rounding of the nodes
-        lets one tell, are exactly 0.
+        The angle at a face without area counts as 0 degrees; cosines of right angles are exactly 0.
         """
         lengths = [np.sqrt(_dot(normal, normal)) for normal in self.normals]
         cosines = np.empty((6, len(self.six_volumes)))
@@ -46,18 +43,14 @@ class TetShapes:
             scale = lengths[i] * lengths[j]
             cosine = np.divide(-_dot(self.normals[i], self.normals[j]), scale, out=cosines[edge], where=scale > 0.0)
             cosine[scale == 0.0] = 1.0
-        right: float | FloatArray = _RIGHT_ANGLE
-        if self.rounding != 0.0:
-            shortest = np.sqrt(np.minimum.reduce([_dot(side, side) for side in self.sides]))
-            right = np.maximum(angle_rounding(self.rounding, np.maximum(shortest, self.rounding)), _RIGHT_ANGLE)
-        cosines[np.abs(cosines) < right] = 0.0
+        cosines[np.abs(cosines) < _RIGHT_ANGLE] = 0.0
         return np.clip(cosines, -1.0, 1.0, out=cosines)
 
     def radius_ratios(self) -> FloatArray:
-        """Three times the radius of the inscribed over that of the circumscribed sphere, shape (t,).
+        """Return three times the radius of the inscribed over that of the circumscribed sphere, shape (t,).
 
-        1 for the regular tetrahedron, towards 0 for a degenerate one; 0 where the volume is not above 0. The radii are
-        r = 3 V / A and R = | |a|^2 b x c + |b|^2 c x a + |c|^2 a x b | / (12 V), with sides a, b, c and area A.
+        It is 1 for the regular tetrahedron, and 0 where the volume is not above 0. The radii are r = 3 V / A and
+        R = | |a|^2 b x c + |b|^2 c x a + |c|^2 a x b | / (12 V), with sides a, b, c and area A.
         """
         double_areas = np.sum([np.sqrt(_dot(normal, normal)) for normal in self.normals], axis=0)
         centre = np.sum([_dot(side, side) * normal for side, normal in zip(self.sides, self.normals[1:])], axis=0)
@@ -67,11 +60,11 @@ class TetShapes:
         return np.minimum(ratios, 1.0, out=ratios)
 
     def stiffness(self, cosines: FloatArray) -> FloatArray:
-        """What each tetrahedron adds to the stiffness of its edges at conductivity 1, shape (6, t), [m].
+        """Return what each tetrahedron adds to the stiffness of its edges at conductivity 1, shape (6, t), [m].
 
-        V grad(lambda_i) . grad(lambda_j) = n_i . n_j / (36 V) for the linear element, which is the cotangent of the
-        angle at the opposite edge times minus a sixth of that edge's length. Positive where that angle is obtuse; 0
-        where the volume is. `cosines` are those of `dihedral_cosines`.
+        The entry of the linear element is V grad(lambda_i) . grad(lambda_j) = n_i . n_j / (36 V): the cotangent of the
+        angle at the opposite edge times minus a sixth of that edge's length. It is positive where that angle is obtuse,
+        and 0 where the volume is. `cosines` are those of `dihedral_cosines`.
         """
         entries = np.empty_like(cosines)
         weight = np.zeros_like(self.six_volumes)
@@ -83,26 +76,8 @@ class TetShapes:
         return entries
 
 
-def node_rounding(points: FloatArray) -> float:
-    """How far rounding may have moved nodes (n, 3), [m]; 0 where a mesh is so near the origin that it does not count.
-
-    Nodes five million metres from the origin, as in national coordinates, have steps of a nanometre.
-    """
-    if len(points) == 0:
-        return 0.0
-    low, high = points.min(axis=0), points.max(axis=0)
-    farthest = float(max(-low.min(), high.max()))
-    return float(np.spacing(farthest)) if farthest > _FAR_SIZES * float((high - low).max()) else 0.0
-
-
-def angle_rounding(rounding: float, side: float | FloatArray) -> float | FloatArray:
-    """How far rounding of the nodes turns the angle between two faces at most, [rad]; `side` is the shortest, [m]."""
-    return _ANGLE_PER_ROUNDING * rounding / side
-
-
 def shapes_in_chunks(points: FloatArray, tets: IntArray) -> Iterator[tuple[slice, TetShapes]]:
     """Yield chunks of the tetrahedra (t, 4) and their shapes, so that memory does not grow with their number."""
-    rounding = node_rounding(points)
     columns = np.ascontiguousarray(np.asarray(points, dtype=np.float64).T)
     for start in range(0, len(tets), _CHUNK):
         which = slice(start, min(start + _CHUNK, len(tets)))
@@ -110,11 +85,11 @@ def shapes_in_chunks(points: FloatArray, tets: IntArray) -> Iterator[tuple[slice
         origin = columns.take(nodes[0], axis=1)
         a, b, c = (columns.take(nodes[n], axis=1) - origin for n in (1, 2, 3))
         one, two, three = _cross(b, c), _cross(c, a), _cross(a, b)
-        yield which, TetShapes((a, b, c), (-(one + two + three), one, two, three), _dot(a, one), rounding)
+        yield which, TetShapes((a, b, c), (-(one + two + three), one, two, three), _dot(a, one))
 
 
 def signed_volumes(points: FloatArray, tets: IntArray) -> FloatArray:
-    """Volumes det(p1 - p0, p2 - p0, p3 - p0) / 6, shape (t,), [m^3]; negative if a tetrahedron is turned over."""
+    """Return det(p1 - p0, p2 - p0, p3 - p0) / 6, shape (t,), [m^3]: the volume, negative for one turned over."""
     volumes = np.empty(len(tets))
     for which, shapes in shapes_in_chunks(points, tets):
         volumes[which] = shapes.volumes

@@ -45,15 +45,11 @@ def interior(
 ) -> Interior:
     """Find the inside, apart from `cells`, of bodies of which only a shell was reconstructed.
 
-    Only what lies `within` a region is filled, and bodies end where it does; what stands beside it still hides.
-
-    A body is what touches once openings of up to twice `seal` voxels are closed. Its inside are cavities of the sealed
-    shell and, if the cameras are known, the space within its convex hull that they should see but do not, because the
-    shell stands in front of it (`free_space`), and that the backs of seen surfaces surround (`winding_number`).
-
-    Through holes of the shell a few cameras look past it onto what others know to be inside. Such lines of sight end
-    where that begins, and the cameras are asked again; crevices that are hidden now are filled where surfaces surround
-    them well.
+    Only what lies `within` a region is filled; what stands beside it still hides. A body is what touches once openings
+    of up to twice `seal` voxels are closed. Its inside are cavities of the sealed shell and, if the cameras are known,
+    the space within its convex hull that they should see but do not, because the shell stands in front of it
+    (`free_space`), and that the backs of seen surfaces surround (`winding_number`). Lines of sight through holes of the
+    shell then end at what was filled, and crevices that are hidden now are filled where surfaces surround them well.
     """
     sealed, within = close_gaps(cells, seal), np.ones_like(cells) if within is None else within
     enclosed, room = _enclosed(cells, sealed, lattice, views, seal)
@@ -69,7 +65,7 @@ def interior(
 def _enclosed(
     cells: BoolArray, sealed: BoolArray, lattice: Lattice, views: Views | None, seal: int
 ) -> tuple[BoolArray, BoolArray]:
-    """Cavities without a camera, of the shell and of the sealed shell, and those with one."""
+    """Return the cavities without a camera, of the shell and of the sealed shell, and those with one."""
     everywhere = np.ones((3, 3, 3), dtype=bool)
     cameras = _camera_voxels(cells, lattice, views)
     # Sealing takes the alcoves and corridors of a cavity, where cameras may stand as well.
@@ -96,7 +92,7 @@ def _camera_voxels(cells: BoolArray, lattice: Lattice, views: Views | None) -> B
 
 
 def _cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Empty voxels without a way out through voxel faces, in cavities without a camera and with one."""
+    """Return the empty voxels without a way out through voxel faces, in cavities without a camera and with one."""
     labels = face_connected(np.pad(~shell, 1, constant_values=True))
     kept = np.ones(int(labels.max()) + 1, dtype=bool)
     kept[[0, labels[0, 0, 0]]] = False
@@ -108,7 +104,7 @@ def _cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArra
 
 
 def _hidden(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, seal: int) -> BoolArray:
-    """Voxels that are not seen, behind the surface and within the convex hull of a body."""
+    """Return the voxels that are not seen, behind the surface and within the convex hull of a body."""
     block = 1
     while sealed.size > LARGEST_PASS * block**3:
         block *= 2
@@ -126,7 +122,7 @@ def _hidden(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views
 
 
 def _behind(cells: BoolArray, lattice: Lattice, views: Views, surrounded: float) -> BoolArray:
-    """Voxels that are not seen and whose winding number in the seen surfaces is at least `surrounded`."""
+    """Return the voxels that are not seen and whose winding number in seen surfaces is at least `surrounded`."""
     counts = count_cameras(cells, lattice, views)
     return counts.hidden & (winding_number(cells, counts.seen & ~cells) >= surrounded)
 
@@ -134,7 +130,7 @@ def _behind(cells: BoolArray, lattice: Lattice, views: Views, surrounded: float)
 def _hidden_in_blocks(
     sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, seal: int, block: int
 ) -> BoolArray:
-    """The same, where a block of voxels has one answer."""
+    """Return what `_hidden` does, with one answer for a block of voxels."""
     shape = sealed.shape
     padded = np.pad((sealed, within), [(0, 0), *((0, -n % block) for n in shape)])
     cx, cy, cz = (n // block for n in padded.shape[1:])
@@ -152,7 +148,7 @@ def _hidden_in_blocks(
 
 
 def _without_strays(body: BoolArray) -> BoolArray:
-    """A body without the outermost layers that hold at most `STRAY_SHARE` of its voxels, on each side."""
+    """Return a body without the outermost layers that hold at most `STRAY_SHARE` of its voxels, on each side."""
     most, kept = STRAY_SHARE * np.count_nonzero(body), body
     for axis in range(3):
         layers = np.count_nonzero(body, axis=tuple(other for other in range(3) if other != axis))
@@ -162,13 +158,13 @@ def _without_strays(body: BoolArray) -> BoolArray:
 
 
 def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
-    """Find how far the voxel faces between solid and air surround each voxel, those faces taken from their back.
+    """Return the winding number of each voxel in the voxel faces between solid and air, taken from their back.
 
     It is 1 within a closed surface and 0 outside of it; where the surface has a hole, one half is a film across it.
-    Faces with solid on both sides, or next to voxels that are neither, are no surface. For triangles: Jacobson, Kavan
-    and Sorkine-Hornung 2013, Robust inside-outside segmentation using generalized winding numbers, equation 5. Here it
-    is the function that jumps by one across the surface and is harmonic elsewhere, solved for with sine transforms in
-    blocks of 2^3 voxels: Lap w = div J, where J holds the jumps.
+    Faces with solid on both sides, or next to voxels that are neither, are no surface. For triangles see Jacobson,
+    Kavan and Sorkine-Hornung 2013, Robust inside-outside segmentation using generalized winding numbers, equation 5.
+    Here it is the function that jumps by one across the surface and is harmonic elsewhere: Lap w = div J with the jumps
+    J, solved by sine transforms in blocks of 2^3 voxels.
     """
     shape = solid.shape
     # Lengths for which the transforms are fast, with the lattice about in the middle.
@@ -190,7 +186,7 @@ def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
 
 
 def _jumps(side: npt.NDArray[np.int8], axis: int) -> Float32Array:
-    """Jump from each block to the next along an axis: 1 where all faces are solid before air, -1 air before solid."""
+    """Return the jump from each block to the next along an axis: 1 where solid is before air, -1 air before solid."""
     # A face in the middle of a block counts half at each of the block's ends.
     row, jump = np.moveaxis(side, axis, 0), np.zeros_like(side)
     np.moveaxis(jump, axis, 0)[:-1] = np.where(row[:-1] * row[1:] == -1, row[:-1], 0)

@@ -19,8 +19,8 @@ LEAST_SHARE = 0.25  # smoothing leaves at least this share of a voxel's level, w
 LEAST_SHARE_THIN = 0.5  # the same in walls and gaps one voxel thick; they keep their thickness
 MARGIN = 4  # voxels farther from the solid than this, along an axis, have level -1 without a look at their density
 UNNOTICED = 0.12
-"""Up to this share of the solid (for gaps: of the empty space) within a voxel may be lost to smoothing. To that much,
-edges of large bodies and single bumps of noise are rounded off, which is what smoothing is for."""
+"""Up to this share of the solid (for gaps: of the empty space) within a voxel may be lost to smoothing, as edges of
+large bodies and single bumps of noise."""
 
 _ROUNDS = 5  # how often what is missing is looked for and made up
 _RATE = 1.5  # share of what is missing that each round makes up, if all of the surface moves alike
@@ -58,10 +58,15 @@ def level_of(
             volume. Not for voxels, which hold it as they are.
     """
     result = np.full(cells.shape, -1.0, dtype=np.float32)
-    near, logarithm = bounding_box(cells, MARGIN), _logarithm_of_deep(density[dense], threshold)
+    near, threshold = bounding_box(cells, MARGIN), max(threshold, float(np.finfo(np.float64).tiny))
+    low, high = map(math.log, DEEP_RATIOS)
+    logarithm = high  # of how many times denser than the threshold the densest part of the body is
+    if dense.any():
+        deep = float(np.quantile(density[dense], DEEP_QUANTILE, method="higher"))
+        logarithm = min(max(math.log(deep) - math.log(threshold), low), high)
     density, dense, cells = density[near], dense[near], cells[near]
     level, positive = np.full(cells.shape, -1.0, dtype=np.float32), density > 0.0
-    share = (np.log(density[positive]) - _safe_log(threshold)) / logarithm
+    share = (np.log(density[positive]) - math.log(threshold)) / logarithm
     level[positive] = np.where(share < 0.0, np.expm1(share), share)
     np.clip(level, -1.0, 1.0, out=level)
     level[cells & ~dense] = 1.0
@@ -78,27 +83,13 @@ def level_of(
     return result
 
 
-def _safe_log(threshold: float) -> float:
-    """Logarithm of the threshold; one of 0 asks for any density at all, and what has some is then deep inside."""
-    return math.log(max(threshold, float(np.finfo(np.float64).tiny)))
-
-
-def _logarithm_of_deep(dense: npt.NDArray[np.floating], threshold: float) -> float:
-    """Logarithm of how many times denser than the threshold the densest part of the body is, within `DEEP_RATIOS`."""
-    low, high = map(math.log, DEEP_RATIOS)
-    if len(dense) == 0:
-        return high
-    deep = math.log(float(np.quantile(dense, DEEP_QUANTILE, method="higher")))
-    return min(max(deep - _safe_log(threshold), low), high)
-
-
 def _signed(level: Float32Array, least: Float32Array | np.float32, cells: BoolArray) -> Float32Array:
-    """The level, raised to `least` in solid voxels and lowered to minus that in empty ones."""
+    """Return the level, raised to `least` in solid voxels and lowered to minus that in empty ones."""
     return np.where(cells, np.maximum(level, least), np.minimum(level, -least))
 
 
 def _thin(cells: BoolArray) -> BoolArray:
-    """Voxels of walls one voxel thick: without a neighbour on either side, and beside at least two others like it."""
+    """Return the voxels of walls one voxel thick: alone along an axis, and beside at least two others like them."""
     thin = np.zeros_like(cells)
     for axis in range(3):
         alone = cells & ~_beside(cells, axis, 1) & ~_beside(cells, axis, -1)
@@ -108,7 +99,7 @@ def _thin(cells: BoolArray) -> BoolArray:
 
 
 def _beside(cells: BoolArray, axis: int, step: int) -> BoolArray:
-    """The neighbour of every voxel along an axis; on the border of the lattice, where there is none, the voxel."""
+    """Return the neighbour of every voxel along an axis; on the border of the lattice, where there is none, itself."""
     row = np.moveaxis(cells, axis, 0)
     return np.moveaxis(np.concatenate((row[1:], row[-1:]) if step > 0 else (row[:1], row[:-1])), 0, axis)
 
@@ -116,14 +107,11 @@ def _beside(cells: BoolArray, axis: int, step: int) -> BoolArray:
 def _keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, cells: BoolArray) -> Float32Array:
     """Shift a smoothed level until around every voxel about as much is solid as the level before smoothing has it.
 
-    A level of -1 and 1 smoothed over three voxels has its zero where it should be on flat walls, but inside it at
-    convex edges; of a bar one voxel thick a third would be left.
-
-    Of each voxel near the surface, the solid share is taken from the trilinear level, and from where the sharp level
-    changes its sign along the axes. Their differences, averaged with weights 1 4 6 4 1 along each axis and divided by
-    the surface around, say how far the surface should move. Differences below `UNNOTICED` of what is there are left
-    alone, so that this acts on bars, corners, specks and pits, not on the faces and long edges of a body of many
-    voxels. Signs stay, and no level comes nearer to 0 than `least`.
+    Of a bar one voxel thick, smoothing would leave a third. Of each voxel near the surface, the solid share is taken
+    from the trilinear level, and from where the sharp level changes its sign along the axes. Their differences,
+    averaged with weights 1 4 6 4 1 along each axis and divided by the surface around, say how far the surface should
+    move. Differences below `UNNOTICED` of what is there are left alone, so that faces and long edges of a body of many
+    voxels stay. Signs stay, and no level comes nearer to 0 than `least`.
     """
     some, every = (look(cells, 3, mode="nearest") for look in (ndimage.maximum_filter, ndimage.minimum_filter))
     near = np.pad(np.not_equal(some, every), 1)
@@ -179,7 +167,7 @@ def _wanted(sharp: Float32Array, index: IntArray, strides: IntArray) -> tuple[Fl
 
 
 def _octant_weights() -> tuple[Float32Array, Float32Array]:
-    """Weights of the 27 levels around a voxel in value (8, 27) and gradient (3, 8, 27) in the middle of its octants."""
+    """Return the weights of the 27 levels around a voxel in value (8, 27) and gradient (3, 8, 27) of its octants."""
     side = np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1
     towards = _AROUND[None] == side[:, None]
     share = np.where(_AROUND[None] == 0, 0.75, np.where(towards, 0.25, 0.0))
@@ -192,8 +180,9 @@ _VALUES, _SLOPES = _octant_weights()
 
 
 def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> tuple[Float32Array, Float32Array]:
-    """Solid share and mean slope [1 / voxel] of some voxels. The level is taken for linear in each octant of a voxel:
-    of a cube of half a voxel, cut by a plane at distance d from its middle, 1/2 + 2 d is inside (on average).
+    """Return solid share and mean slope [1 / voxel] of some voxels; the level is taken for linear in each octant.
+
+    Of a cube of half a voxel, cut by a plane at distance d from its middle, 1/2 + 2 d is inside (on average).
     """
     share, slope = np.empty(len(index), dtype=np.float32), np.empty(len(index), dtype=np.float32)
     for start in range(0, len(index), _CHUNK):
@@ -207,7 +196,7 @@ def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> tuple[Floa
 
 
 def _windowed(values: Float32Array, at_index: Float32Array, index: IntArray, steps: IntArray) -> Float32Array:
-    """Mean around voxels at flat indices, with weights 1 4 6 4 1 along each axis; `at_index` overwrites `values`."""
+    """Return means around voxels at flat indices, weights 1 4 6 4 1 along each axis; `at_index` overwrites `values`."""
     for _ in range(2):
         values[index] = at_index
         at_index = np.empty(len(index), dtype=np.float32)

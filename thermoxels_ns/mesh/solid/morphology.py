@@ -13,30 +13,33 @@ _PLANES_AT_A_TIME = 64
 
 
 def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
-    """Find the box of voxels that holds all solid ones and `margin` more to each side; empty if none is solid.
+    """Return the box of voxels that holds all solid ones and `margin` more to each side; empty if none is solid.
 
     >>> bounding_box(np.array([[[False, False, True, True, False]]]), 1)
     (slice(0, 2, None), slice(0, 2, None), slice(1, 5, None))
     """
-    spans = []
+    box = ()
     for axis in range(3):
-        used = np.flatnonzero(cells.any(axis=tuple({0, 1, 2} - {axis})))
+        used = np.flatnonzero(cells[box].any(axis=tuple({0, 1, 2} - {axis})))
         if len(used) == 0:
             return (slice(0, 0),) * 3
-        spans.append((int(used[0]), int(used[-1]) + 1))
-        # What is left to look at gets smaller.
-        cells = cells[(slice(None),) * axis + (slice(*spans[-1]),)]
-    return tuple(slice(max(low - margin, 0), high + margin) for low, high in spans)
+        box = (*box, slice(int(used[0]), int(used[-1]) + 1))
+    return tuple(slice(max(part.start - margin, 0), part.stop + margin) for part in box)
 
 
 def face_connected(cells: BoolArray) -> npt.NDArray[np.int32]:
     """Number the bodies whose voxels touch by faces: 1, 2, ... in C order of their first voxel, 0 elsewhere."""
-    return _numbered(cells, ndimage.generate_binary_structure(3, 1))
+    return connected(cells, connectivity=1)
 
 
-def connected(cells: BoolArray) -> npt.NDArray[np.int32]:
+def connected(cells: BoolArray, connectivity: int = 3) -> npt.NDArray[np.int32]:
     """Number the bodies whose voxels touch by faces, edges or corners, as `face_connected` does."""
-    return _numbered(cells, np.ones((3, 3, 3)))
+    # Only where something is solid: a lattice is mostly empty.
+    labels, box = np.zeros(cells.shape, dtype=np.int32), bounding_box(cells)
+    inside = np.zeros(cells[box].shape, dtype=np.int32)
+    ndimage.label(cells[box], ndimage.generate_binary_structure(3, connectivity), output=inside)
+    labels[box] = inside
+    return labels
 
 
 def repeated(values: npt.NDArray, times: int) -> npt.NDArray:
@@ -50,33 +53,28 @@ def repeated(values: npt.NDArray, times: int) -> npt.NDArray:
     return values
 
 
-def halved(cells: BoolArray, join: np.ufunc) -> BoolArray:
-    """Join each aligned block of 2 x 2 x 2 to one by `np.logical_or` or `np.logical_and`; none lies beyond the border.
-
-    >>> halved(np.array([[[True, False, True]]]), np.logical_or).tolist()
-    [[[True, True]]]
-    """
-    cells = np.pad(cells, [(0, n % 2) for n in cells.shape])
-    for axis in range(3):
-        row = np.moveaxis(cells, axis, 0)
-        cells = np.moveaxis(join(row[0::2], row[1::2]), 0, axis)
-    return cells
-
-
 def grow(cells: BoolArray, by: int) -> BoolArray:
     """Add all voxels that a cube of 2 `by` + 1 voxels around a solid one reaches.
 
     >>> grow(np.array([[[False, False, False, True]]]), 2)[0, 0].tolist()
     [False, True, True, True]
     """
-    grown = cells
-    for axis in range(3):
-        grown = _spread(grown, axis, by)
-    return grown
+    return np.asarray(ndimage.maximum_filter(cells, 2 * by + 1, mode="constant"), dtype=bool)
+
+
+def shrink(cells: BoolArray, size: int | tuple[int, ...], origin: int | tuple[int, ...] = 0) -> BoolArray:
+    """Keep the voxels around which a box of `size` voxels lies in the set; nothing beyond the array does.
+
+    A box of an even size lies half a voxel lower, with an origin of -1 half a voxel higher.
+
+    >>> shrink(np.array([[[True, True, True, True]]]), (1, 1, 3))[0, 0].tolist()
+    [False, True, True, False]
+    """
+    return np.asarray(ndimage.minimum_filter(cells, size, mode="constant", origin=origin), dtype=bool)  # type: ignore[arg-type]
 
 
 def close_gaps(cells: BoolArray, by: int) -> BoolArray:
-    """Fill what a cube of 2 `by` + 1 voxels, made of empty voxels, cannot reach; nothing solid goes.
+    """Add what no cube of 2 `by` + 1 empty voxels reaches.
 
     >>> close_gaps(np.array([[[True, False, True]]]), 1)[0, 0].tolist()
     [True, True, True]
@@ -90,7 +88,7 @@ def close_gaps(cells: BoolArray, by: int) -> BoolArray:
 
 
 def fill_enclosed(cells: BoolArray) -> BoolArray:
-    """Make solid all empty voxels that have no way to the outside of the box through voxel faces.
+    """Add all empty voxels that have no way out of the lattice through voxel faces.
 
     >>> cells = np.ones((3, 3, 3), dtype=bool)
     >>> cells[1, 1, 1] = False
@@ -103,7 +101,7 @@ def fill_enclosed(cells: BoolArray) -> BoolArray:
 
 
 def convex_hull(cells: BoolArray, of_centres: bool = False) -> BoolArray:
-    """Find the voxels whose centres lie in the convex hull of the solid voxels: of the cubes, or of their centres.
+    """Return the voxels whose centres lie in the convex hull of the solid voxels: of the cubes, or of their centres.
 
     The hull meets every column of voxels in one interval, so it costs one comparison per column and plane.
     """
@@ -134,25 +132,3 @@ def convex_hull(cells: BoolArray, of_centres: bool = False) -> BoolArray:
         low = np.maximum(low, z.max(axis=0, where=(c < 0) & ~upright, initial=-np.inf))
     centre = np.arange(nz) + 0.5
     return (centre >= low[..., None] - 1e-9) & (centre <= high[..., None] + 1e-9)
-
-
-def _numbered(cells: BoolArray, structure: npt.NDArray) -> npt.NDArray[np.int32]:
-    """Look only where something is solid: a lattice is mostly empty."""
-    labels, box = np.zeros(cells.shape, dtype=np.int32), bounding_box(cells)
-    inside = np.zeros(cells[box].shape, dtype=np.int32)
-    ndimage.label(cells[box], structure=structure, output=inside)
-    labels[box] = inside
-    return labels
-
-
-def _spread(cells: BoolArray, axis: int, by: int) -> BoolArray:
-    """Grow along one axis, by doubling steps."""
-    grown = cells.copy()
-    reach = 0
-    while reach < by:
-        step = min(reach + 1, by - reach)
-        row, before = np.moveaxis(grown, axis, 0), np.moveaxis(grown.copy(), axis, 0)
-        row[step:] |= before[:-step]
-        row[:-step] |= before[step:]
-        reach += step
-    return grown

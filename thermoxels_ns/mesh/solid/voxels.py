@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_positive
+from thermoxels_ns.core.checks import check_positive, is_number
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
+from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, first_solid
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
 from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
-from thermoxels_ns.mesh.solid.region import Ball, Box, RegionKind, asked_region, check_region, where_cameras_look
 
+RegionKind = Literal["auto", "all"]
 InteriorKind = Literal["solid", "hollow"]
+Box = tuple[float, float, float, float, float, float]
+Ball = tuple[float, float, float, float]
 
 SMALLEST_BODY = 0.01
 """Bodies (voxels that touch, if only by corners) of less than this share of the largest are mostly floaters."""
@@ -32,6 +38,14 @@ SHARE_THAT_ENDS = 0.5
 that ends all rays that come, 0 where light leaked past a surface."""
 LEAST_WEIGHT = 0.5  # weight that rays spent in a voxel, [rays], below which density alone decides about it
 FEWEST_RAYS = 100  # with fewer rays than this that end on something, there is no evidence to choose by
+LEAST_SHARE = 0.15
+"""Space belongs to the region if photographs show it at least this well, as a share of how well they show what they
+were taken of. Chosen on nine drawn scenes with a street or a room around: all of the scene stays and half of what is
+around goes; of drawn rooms seen from inside 99.7 % of what two photographs see stays."""
+CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # the middle of an image, as a share of its sides, and rays along each of them
+NEAREST_SHARE = 0.25  # a camera was pointed at what this share of these rays end on first
+FEWEST_CAMERAS = 0.1  # share of the cameras that may look at places which are seen less well
+MOST_BLOCKS = 500_000  # how well places are seen changes slowly: in larger lattices it is found in blocks of voxels
 
 
 @dataclass(frozen=True)
@@ -51,30 +65,36 @@ class SolidSelection:
     wall_thickness: float | None = None  # [m]; takes the place of filling the interior
 
     def __post_init__(self) -> None:
-        for name, (kind, high, usual) in _BOUNDS.items():
-            value, option = getattr(self, name), f"--{name.replace('_', '-')}"
-            number = isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)
-            if not ((number and 0 <= value <= high) or (value is None and usual is None)):
-                what = "a whole number" if kind is int else "a finite number"
-                expected = f"{what} of at least 0" if high == math.inf else f"{what} from 0 to {high:g}"
-                remedy = f"Leave {option} out." if usual is None else f"Pass {option} {usual}, or leave it out."
-                raise MeshError(name, expected=expected, got=repr(value), remedy=remedy)
-        for name in ("voxel_optical_depth", "wall_thickness"):
-            if getattr(self, name) is not None:
-                check_positive(name, getattr(self, name), f"Leave --{name.replace('_', '-')} out.", MeshError)
-        check_region(self.region, self.region_box, self.region_near)
-        if self.interior not in get_args(InteriorKind):
-            kinds = " or ".join(get_args(InteriorKind))
-            raise MeshError("interior", expected=kinds, got=repr(self.interior), remedy="Pass --interior solid.")
+        def good(value: object, most: float = math.inf) -> bool:
+            return is_number(value) and 0 <= value <= most and value < math.inf
 
+        def whole(value: object) -> bool:
+            return isinstance(value, int) and good(value, 100)
 
-_BOUNDS: dict[str, tuple[Any, float, int | None]] = {
-    "density_percentile": ((int, float), 100.0, None),
-    "density_threshold": ((int, float), math.inf, None),
-    "close_gaps": (int, 100, 1),
-    "seal_openings": (int, 100, 2),
-}
-"""Type and most of options from 0 on; what to pass instead, None for those that may be None."""
+        depth, wall, box, near = self.voxel_optical_depth, self.wall_thickness, self.region_box, self.region_near
+        percentile, threshold = self.density_percentile, self.density_threshold
+        box_is_good = box is None or (np.isfinite(box).all() and np.less(box[:3], box[3:]).all())
+        for name, allowed, expected, instead in (
+            ("voxel_optical_depth", depth is None or (good(depth) and depth > 0), "a finite number above 0", None),
+            ("density_percentile", percentile is None or good(percentile, 100), "a finite number from 0 to 100", None),
+            ("density_threshold", threshold is None or good(threshold), "a finite number of at least 0", None),
+            ("close_gaps", whole(self.close_gaps), "a whole number from 0 to 100", "1"),
+            ("seal_openings", whole(self.seal_openings), "a whole number from 0 to 100", "2"),
+            ("wall_thickness", wall is None or (good(wall) and wall > 0), "a finite number above 0", None),
+            ("region", self.region in get_args(RegionKind), "auto or all", "auto"),
+            ("region_box", box_is_good, "finite xmin ymin zmin xmax ymax zmax, minima below maxima", "0 0 0 4 3 2"),
+            ("region_near", near is None or (np.isfinite(near).all() and near[3] > 0), "x y z radius > 0", "0 0 1 2.5"),
+            ("interior", self.interior in get_args(InteriorKind), "solid or hollow", "solid"),
+        ):
+            if not allowed:
+                option = f"--{name.replace('_', '-')}"
+                remedy = f"Leave {option} out." if instead is None else f"Pass {option} {instead}, or leave it out."
+                raise MeshError(name, expected=expected, got=repr(getattr(self, name)), remedy=remedy)
+        asked = [f"--region {self.region}"] * (self.region != "auto")
+        asked += ["--region-box"] * (box is not None) + ["--region-near"] * (near is not None)
+        if len(asked) > 1:
+            remedy = "Leave all but one of these options out."
+            raise MeshError("region", expected="one of them", got=" and ".join(asked), remedy=remedy)
 
 
 @dataclass(frozen=True)
@@ -92,15 +112,12 @@ class SolidCells:
     """The solid voxels and how they were found."""
 
     cells: BoolArray  # True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is
-    level: Float32Array
-    """Above 0 in solid voxels, below 0 in empty ones, in [-1, 1]; its trilinear zero between voxel centres is the
-    surface. Shape of `cells`."""
+    level: Float32Array  # what `level_of` returns, whose trilinear zero between voxel centres is the surface
     threshold: float  # density at voxel centres from which on a voxel counted as solid, [1 / world unit]
     explanation: str  # which rule chose the threshold, and why
     steps: tuple[SolidStep, ...]  # what each step did, in order; the first is the threshold
     component_sizes: IntArray  # Voxels in each body of the region once gaps are closed, largest first
-    within: BoolArray
-    """The region, solid or not. Where it ends the solid is cut, as it is where the lattice ends."""
+    within: BoolArray  # The region, solid or not; where it ends the solid is cut
     left_out: BoolArray  # Voxels that are solid, but not in the region or too small a body
 
 
@@ -116,7 +133,7 @@ def select_solid(
 
     A voxel without density is solid only if a step after the threshold makes it so. Only a wall thickness needs
     `metres_per_world_unit`; `world_to_input`, shape (3, 4), which leads to the coordinates of the region's box or
-    point, is the identity if left out; `makes_up_volume` as in `level_of`.
+    point, is the identity if left out; `makes_up_volume` is that of `level_of`.
 
     Raises:
         MeshError: No voxel is solid, or none in the region; density does not tell solid from empty; or a wall thickness
@@ -124,7 +141,7 @@ def select_solid(
     """
     thickness = _wall_voxels(snapshot, selection, metres_per_world_unit)
     density = snapshot.centre_density()
-    chosen = _threshold(snapshot, density, selection)
+    chosen = dense_voxels(snapshot, density, selection)
     if not chosen.cells.any():
         expected = f"at least one voxel with density above 0 and at least the threshold {chosen.density:.6g}"
         got = f"none of {density.size}; the highest density at a voxel centre is {density.max():.6g}"
@@ -141,23 +158,36 @@ def select_solid(
         remark = f"Gaps up to {2 * selection.close_gaps} voxels wide are filled."
         cells = step("close gaps", close_gaps(cells, selection.close_gaps), remark)
     everything = cells
-    within, where = _region(cells, snapshot, selection, world_to_input)
-    kept, sizes, small = _without_floaters(cells & within, 0.0 if selection.region == "all" else SMALLEST_BODY)
-    cells = step("region", kept, f"{where} {small}")
+    within, remark = _region(cells, snapshot, selection, world_to_input)
+    labels, least = connected(cells & within), 0.0 if selection.region == "all" else SMALLEST_BODY
+    sizes = np.bincount(labels.ravel())[1:]
+    small = sizes < least * sizes.max()
+    remark += (
+        f" {small.sum()} of {len(sizes)} bodies in it have less than {least:.0%} of the largest one's voxels and go."
+    )
+    cells = step("region", np.append(False, ~small)[labels], remark)
     left_out = everything & ~cells
-    # What is left out still stands between cameras and what is taken; floaters never stood anywhere.
-    standing = cells | (everything & ~within)
+    # What is outside of the region still stands between cameras and what is inside; floaters never stood anywhere.
+    opaque = cells | (everything & ~within)
     if thickness is not None:
         assert snapshot.views is not None
-        wall = cells | (wall_behind(standing, snapshot.lattice, snapshot.views, thickness) & within)
+        wall = cells | (wall_behind(opaque, snapshot.lattice, snapshot.views, thickness) & within)
         asked = f"{selection.wall_thickness:g} m thick ({thickness:.3g} voxels)"
         remark = f"The seen surface is made {asked}."
         if thickness < THINNEST_GROWN:
             remark = f"A wall {asked} is thinner than one and a half voxels; the seen surface stays as thick as it is."
         cells = step("wall", wall, remark)
     elif selection.interior == "solid":
-        inside, remark = _inside(standing, within, snapshot, selection)
-        cells = step("interior", cells | inside, remark)
+        inside = interior(opaque, snapshot.lattice, snapshot.views, selection.seal_openings, within)
+        remark = f"{int(inside.enclosed.sum())} voxels of enclosed cavities are filled"
+        if snapshot.views is None:
+            remark += "; the cameras are not known, so nothing is known to be hidden from them."
+        else:
+            hidden = int(inside.hidden.sum())
+            remark += f", and {hidden} voxels that cameras cannot look into, within the hull of their body."
+        if inside.rooms:
+            remark += f" {inside.rooms} cavities with a camera in them stay empty."
+        cells = step("interior", cells | inside.enclosed | inside.hidden, remark)
     return SolidCells(
         cells=cells,
         level=level_of(density, chosen.density, chosen.cells, cells, makes_up_volume=makes_up_volume),
@@ -170,113 +200,78 @@ def select_solid(
     )
 
 
-def _threshold(snapshot: GridSnapshot, density: FloatArray, selection: SolidSelection) -> Threshold:
-    """The voxels that are dense enough, by the rule that is asked for."""
-    if selection.density_threshold is not None:
-        return density_threshold(density, selection.density_threshold)
-    if selection.density_percentile is not None:
-        return percentile_threshold(density, selection.density_percentile)
-    if selection.voxel_optical_depth is not None:
-        return optical_depth_threshold(snapshot, density, selection.voxel_optical_depth)
-    return automatic_threshold(snapshot, density)
-
-
-def _region(
-    cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection, world_to_input: FloatArray | None
-) -> tuple[BoolArray, str]:
-    """The voxels, solid or not, that belong to what is asked for, and which these are."""
-    box, near, views = selection.region_box, selection.region_near, snapshot.views
-    if box is not None or near is not None:
-        to_input = np.eye(4)[:3] if world_to_input is None else world_to_input
-        what = (
-            "What lies in the box is taken." if near is None else f"What lies within {near[3]:g} of a point is taken."
-        )
-        return asked_region(cells, snapshot.lattice, box, near, to_input), what
-    if selection.region == "all":
-        return np.ones_like(cells), "All is taken."
-    if views is None or len(views.focal) == 0:
-        return np.ones_like(cells), "The cameras are not known, so all is taken."
-    what = "What photographs show about as well as what they were taken of is taken."
-    return where_cameras_look(cells, snapshot.lattice, views), what
-
-
-def _without_floaters(cells: BoolArray, smallest: float) -> tuple[BoolArray, IntArray, str]:
-    """Drop bodies below this share of the largest; sizes of all of them, and what was done."""
-    labels = connected(cells)
-    sizes = np.bincount(labels.ravel())[1:]
-    keep = sizes >= smallest * sizes.max()
-    gone = f"{len(sizes) - int(keep.sum())} of {len(sizes)} bodies in it"
-    remark = f"{gone} have less than {smallest:.0%} of the largest one's voxels and go."
-    return np.concatenate(([False], keep))[labels], sizes, remark
-
-
-def _inside(
-    cells: BoolArray, within: BoolArray, snapshot: GridSnapshot, selection: SolidSelection
-) -> tuple[BoolArray, str]:
-    inside = interior(cells, snapshot.lattice, snapshot.views, selection.seal_openings, within)
-    remark = f"{int(inside.enclosed.sum())} voxels of enclosed cavities are filled"
-    if snapshot.views is None:
-        remark += "; the cameras are not known, so nothing is known to be hidden from them."
-    else:
-        hidden = int(inside.hidden.sum())
-        remark += f", and {hidden} voxels that cameras cannot look into, within the hull of their body."
-    if inside.rooms:
-        remark += f" {inside.rooms} cavities with a camera in them stay empty."
-    return inside.enclosed | inside.hidden, remark
-
-
 def _wall_voxels(
     snapshot: GridSnapshot, selection: SolidSelection, metres_per_world_unit: float | None
 ) -> float | None:
-    """The wall thickness that is asked for, [voxels]."""
-    if selection.wall_thickness is None:
+    """Return the wall thickness that is asked for, [voxels], or raise `MeshError` if it cannot be made."""
+    thickness = selection.wall_thickness
+    if thickness is None:
         return None
     if metres_per_world_unit is None:
         remedy = "Pass --metres-per-unit 1 if the input poses are in metres, or leave out --wall-thickness."
-        got = f"{selection.wall_thickness:g} m, but no length of a unit"
+        got = f"{thickness:g} m, but no length of a unit"
         raise MeshError("wall_thickness", expected="a scene whose scale is known", got=got, remedy=remedy)
     check_positive("metres_per_world_unit", metres_per_world_unit, "Pass --metres-per-unit.", MeshError)
     if snapshot.views is None or len(snapshot.views.focal) == 0:
         expected = "training cameras, which tell the side that is seen"
         remedy = "Export from a trained scene, or leave out --wall-thickness."
         raise MeshError("wall_thickness", expected=expected, got="a field without cameras", remedy=remedy)
-    voxels = selection.wall_thickness / (metres_per_world_unit * snapshot.lattice.voxel_size)
-    if voxels > max(snapshot.lattice.cell_shape):
-        longest = selection.wall_thickness * max(snapshot.lattice.cell_shape) / voxels
-        got, remedy = f"{selection.wall_thickness:g} m", "Pass it in metres, and check --metres-per-unit."
-        raise MeshError("wall_thickness", expected=f"at most the scene box, {longest:.3g} m", got=got, remedy=remedy)
-    return voxels
+    voxel_m = metres_per_world_unit * snapshot.lattice.voxel_size
+    longest = max(snapshot.lattice.cell_shape) * voxel_m
+    if thickness > longest:
+        remedy, expected = "Pass it in metres, and check --metres-per-unit.", f"at most the scene box, {longest:.3g} m"
+        raise MeshError("wall_thickness", expected=expected, got=f"{thickness:g} m", remedy=remedy)
+    return thickness / voxel_m
 
 
 @dataclass(frozen=True)
 class Threshold:
     """The voxels that are dense enough."""
 
-    cells: BoolArray
-    """True where a voxel is dense enough, not empty and not ruled out by rays, shape `lattice.cell_shape`."""
+    cells: BoolArray  # True where a voxel is dense enough and not ruled out by rays, shape `lattice.cell_shape`
     density: float  # density at the voxel centre from which on it is dense enough, [1 / world unit]
     explanation: str  # which rule chose it, and why, in one or two sentences
 
 
-def automatic_threshold(snapshot: GridSnapshot, density: FloatArray) -> Threshold:
-    """Choose the threshold, and the voxels that reach it, by where training rays end.
+def dense_voxels(snapshot: GridSnapshot, density: FloatArray, selection: SolidSelection) -> Threshold:
+    """Return the voxels that are dense enough by the rule asked for; `density` is that at their centres.
+
+    Without a rule, training rays choose: see `_where_rays_end`. Without enough of them a voxel is solid whose density
+    times edge length is at least `FALLBACK_OPTICAL_DEPTH`.
+
+    Raises:
+        MeshError: A percentile is asked for, and all voxels have the same density.
+    """
+    evidence, depth = snapshot.evidence, selection.voxel_optical_depth
+    if selection.density_threshold is not None:
+        threshold = float(selection.density_threshold)
+        explanation = f"Voxels of density {threshold:g} or more are solid, as asked."
+        return Threshold((density >= threshold) & (density > 0.0), threshold, explanation)
+    if selection.density_percentile is not None:
+        return _densest_share(density, selection.density_percentile)
+    reason = ""
+    if depth is None:
+        if evidence is not None and len(evidence.half_depth_density) >= FEWEST_RAYS:
+            return _where_rays_end(evidence, density, snapshot.lattice.voxel_size)
+        known = "nothing is known of" if evidence is None else f"only {len(evidence.half_depth_density)} rays end among"
+        reason = f"Automatic: {known} the training rays, so the rule is a fixed optical depth. "
+        depth = FALLBACK_OPTICAL_DEPTH
+    threshold = depth / snapshot.lattice.voxel_size
+    reason += f"Voxels of optical depth {depth:g} or more are solid (density {threshold:.4g}): light that crosses one "
+    return Threshold(density >= threshold, threshold, f"{reason}loses at least {1.0 - math.exp(-depth):.0%}.")
+
+
+def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) -> Threshold:
+    """Return the voxels that training rays end on.
 
     A ray ends where half of its weight is spent. What it meets there is the densest voxel within half a voxel of that
     point (`RayEvidence.half_depth_density`). The threshold is the highest density that `SHARE_OF_RAYS` of the rays
     meet, within `OPTICAL_DEPTH_BOUNDS`: what nearly all rays end on is solid, what they merely pass through goes.
 
     Where rays spend weight but hardly any ends, density is what light left that leaked past a surface. Such a voxel
-    must be opaque by itself (`OPAQUE_OPTICAL_DEPTH`): a few behind a surface would widen the body by a layer.
-
-    Without evidence the rule is that of `optical_depth_threshold`; without `RayEvidence.voxel_ends` all voxels that
-    reach the threshold are solid. `density` is that at the voxel centres.
+    must be opaque by itself (`OPAQUE_OPTICAL_DEPTH`): a few behind a surface would widen the body by a layer. Without
+    `RayEvidence.voxel_ends` all voxels that reach the threshold are solid.
     """
-    evidence, voxel = snapshot.evidence, snapshot.lattice.voxel_size
-    if evidence is None or len(evidence.half_depth_density) < FEWEST_RAYS:
-        found = optical_depth_threshold(snapshot, density, FALLBACK_OPTICAL_DEPTH)
-        known = "nothing is known of" if evidence is None else f"only {len(evidence.half_depth_density)} rays end among"
-        reason = f"Automatic: {known} the training rays, so the rule is a fixed optical depth. {found.explanation}"
-        return Threshold(found.cells, found.density, reason)
     met, weight = evidence.half_depth_density, evidence.voxel_weight
     low, high = (depth / voxel for depth in OPTICAL_DEPTH_BOUNDS)
     threshold = min(max(float(np.quantile(met, 1.0 - SHARE_OF_RAYS, method="lower")), low), high)
@@ -300,27 +295,11 @@ def automatic_threshold(snapshot: GridSnapshot, density: FloatArray) -> Threshol
     )
 
 
-def optical_depth_threshold(snapshot: GridSnapshot, density: FloatArray, optical_depth: float) -> Threshold:
-    """Choose voxels in which density times edge length is at least `optical_depth`."""
-    threshold, lost = optical_depth / snapshot.lattice.voxel_size, 1.0 - np.exp(-optical_depth)
-    said = f"Voxels of optical depth {optical_depth:g} or more are solid (density {threshold:.4g}): light that crosses "
-    return Threshold(density >= threshold, threshold, f"{said}one loses at least {lost:.0%}.")
-
-
-def density_threshold(density: FloatArray, threshold: float) -> Threshold:
-    """Choose voxels of at least the given density, [1 / world unit]; a voxel without density is never solid."""
-    cells = (density >= threshold) & (density > 0.0)
-    return Threshold(cells, float(threshold), f"Voxels of density {threshold:g} or more are solid, as asked.")
-
-
-def percentile_threshold(density: FloatArray, percentile: float) -> Threshold:
-    """Choose the densest (100 - percentile) % of all voxels of the box, as in the Thermoxels paper.
+def _densest_share(density: FloatArray, percentile: float) -> Threshold:
+    """Return the densest (100 - percentile) % of all voxels of the box, as in the Thermoxels paper.
 
     Where more voxels tie at the threshold than were asked for (space that training never touched keeps its starting
     value), only the denser ones are taken, if there are any.
-
-    Raises:
-        MeshError: All voxels have the same density.
     """
     threshold = float(np.percentile(density, percentile))
     if percentile > 0.0 and 0.0 < density.min() == density.max():
@@ -333,3 +312,100 @@ def percentile_threshold(density: FloatArray, percentile: float) -> Threshold:
     said = f"{'more than' if tied else 'at least'} density {threshold:.4g}."
     explanation = f"The densest {100.0 - percentile:g} % of all voxels are solid, as asked: {said}"
     return Threshold(denser if tied else reached, threshold, explanation)
+
+
+def _region(
+    cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection, world_to_input: FloatArray | None
+) -> tuple[BoolArray, str]:
+    """Return the voxels, solid or not, that belong to what is asked for, and which these are."""
+    box, near, views = selection.region_box, selection.region_near, snapshot.views
+    if box is not None or near is not None:
+        to_input = np.eye(4)[:3] if world_to_input is None else world_to_input
+        what = "in the box" if near is None else f"within {near[3]:g} of a point"
+        return _asked_region(cells, snapshot.lattice, box, near, to_input), f"What lies {what} is taken."
+    if selection.region == "all":
+        return np.ones_like(cells), "All is taken."
+    if views is None or len(views.focal) == 0:
+        return np.ones_like(cells), "The cameras are not known, so all is taken."
+    what = "What photographs show about as well as what they were taken of is taken."
+    return where_cameras_look(cells, snapshot.lattice, views), what
+
+
+def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> BoolArray:
+    """Return the voxels, solid or not, that photographs show about as well as what they were taken of.
+
+    A camera was pointed at what the rays through the middle of its image end on, d away. It counts as one for all that
+    its image holds up to there, and as (d / distance)^2 behind: so many pixels does an equal area get. The region is
+    where the sum over the cameras, whatever stands in front, is `LEAST_SHARE` or more of what it is where nearly all
+    cameras look. A ground that runs on then ends about where the cameras stood.
+    """
+    eyes, far = lattice.world_to_index(views.camera_to_world[:, :, 3]), {}
+    count = len(views.focal)
+    part = CENTRAL_PART * ((np.arange(CENTRAL_RAYS) + 0.5) / CENTRAL_RAYS - 0.5)
+    for camera in np.unique(np.linspace(0, count - 1, min(count, MOST_CAMERAS)).round().astype(np.int64)).tolist():
+        across, along = np.meshgrid(*np.outer(views.size[camera] / views.focal[camera], part))
+        local = np.stack((across.ravel(), along.ravel(), np.full(CENTRAL_RAYS**2, -1.0)), axis=1)
+        direction = local / np.linalg.norm(local, axis=1, keepdims=True) @ views.camera_to_world[camera, :, :3].T
+        met = first_solid(cells, eyes[camera], direction)
+        if np.isfinite(met).any():
+            far[camera] = float(np.quantile(met[np.isfinite(met)], NEAREST_SHARE))
+    if not far:
+        return np.ones_like(cells)
+    matrices = views.matrices()
+    matrices[:, :, 3] += matrices[:, :, :3] @ np.asarray(lattice.lo)
+    matrices[:, :, :3] *= lattice.voxel_size
+
+    def seen(at: FloatArray) -> FloatArray:
+        """Return how well places (n, 3), in corner indices, are seen."""
+        total = np.zeros(len(at))
+        for camera, distance in far.items():
+            column, row, depth = matrices[camera, :, :3] @ at.T + matrices[camera, :, 3:]
+            width, height = views.size[camera]
+            held = (depth > 0) & (column >= 0) & (column <= width * depth) & (row >= 0) & (row <= height * depth)
+            total += held * np.minimum(1.0, distance**2 / np.maximum(((at - eyes[camera]) ** 2).sum(axis=1), 1e-12))
+        return total
+
+    looked_at = [eyes[c] - (1.0 - 1e-6) * distance * views.camera_to_world[c, :, 2] for c, distance in far.items()]
+    least = LEAST_SHARE * float(np.quantile(seen(np.array(looked_at)), FEWEST_CAMERAS))
+    block = 1
+    while cells.size > MOST_BLOCKS * block**3:
+        block *= 2
+    shape = tuple(-(-n // block) for n in cells.shape)
+    middles = (np.stack(np.unravel_index(np.arange(math.prod(shape)), shape), axis=1) + 0.5) * block
+    well: npt.NDArray[np.float32] = seen(middles).reshape(shape).astype(np.float32)
+    if block > 1:
+        well = np.asarray(ndimage.zoom(well, block, order=1, mode="nearest", grid_mode=True))
+    return well[tuple(slice(n) for n in cells.shape)] >= least
+
+
+def _asked_region(
+    cells: BoolArray, lattice: Lattice, box: Box | None, near: Ball | None, world_to_input: FloatArray
+) -> BoolArray:
+    """Return the voxels whose centres lie in a box or near a point; raise `MeshError` if none of `cells` does."""
+    # Each coordinate of the input is a sum of what the three indices of a voxel give.
+    middles = [
+        lattice.lo[axis] + (np.arange(count) + 0.5) * lattice.voxel_size for axis, count in enumerate(cells.shape)
+    ]
+    along_x, along_y, along_z = np.ix_(*middles)
+    places = [row[0] * along_x + row[1] * along_y + row[2] * along_z + row[3] for row in world_to_input]
+    if box is not None:
+        found = [(place >= low) & (place <= high) for place, low, high in zip(places, box[:3], box[3:])]
+        within = found[0] & found[1] & found[2]
+    else:
+        assert near is not None
+        away = [(place - middle) ** 2 for place, middle in zip(places, near[:3])]
+        within = away[0] + away[1] + away[2] <= near[3] ** 2
+    if (cells & within).any():
+        return within
+    size = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(world_to_input[:, :3]))))
+    digits = max(0, 1 - math.floor(math.log10(size)))
+    ends = (place[cells] for place in places)
+    lower, upper = (_typed(end, digits) for end in np.array([(end.min() - size, end.max() + size) for end in ends]).T)
+    expected = f"some of the solid in it, which lies from {lower} to {upper}"
+    got, remedy = f"none in {_typed(box or near or ())}", f"Pass --region-box {lower} {upper}, or less."
+    raise MeshError("region_near" if box is None else "region_box", expected=expected, got=got, remedy=remedy)
+
+
+def _typed(values: tuple[float, ...] | FloatArray, digits: int | None = None) -> str:
+    """Write numbers as a command line takes them."""
+    return " ".join(f"{value:g}" if digits is None else f"{value:.{digits}f}" for value in values)
