@@ -68,17 +68,6 @@ def test_streams_that_do_not_train_have_no_views(scene_folder):
         assert set(manager(scene.path, streams=streams).training_views().size[:, 0]) == widths
 
 
-def test_distortion_is_left_out(scene_folder):
-    scene = scene_folder(distortion={"k1": 0.08, "k2": -0.02, "p1": 0.003, "p2": -0.002})
-    bent = manager(scene.path).training_views()
-    for name in ("k1", "k2", "p1", "p2"):
-        del scene.meta[name]
-    scene.rewrite()
-    straight = manager(scene.path).training_views()
-    for name, array in vars(straight).items():
-        np.testing.assert_array_equal(getattr(bent, name), array)
-
-
 def test_a_fisheye_lens_spans_its_angles():
     """120 and 60 degrees across and along: the border pixels are just within, the image of the pinhole ends there."""
     lens = cameras(CameraType.FISHEYE, 120, 60, 120 / np.deg2rad(120), 60 / np.deg2rad(60))

@@ -8,7 +8,6 @@ import pytest
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.colmap_tracks import _matched, read_colmap_tracks
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
-from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.tracks import COLMAP_FOLDERS, TRACKS_KEY, SparseTracks, check_complete, write_tracks
 
@@ -98,17 +97,6 @@ def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, tex
     assert lines_of(scene, "val").metadata["feature_rays"] is None
 
 
-@pytest.mark.parametrize("where", COLMAP_FOLDERS)
-def test_the_box_too_is_found_wherever_a_model_may_lie(scene_folder, where):
-    scene = scene_folder(frames=len(NAMES), names=NAMES, scene_box=None)
-    add_model(scene, where, moved=False)
-    file = read_scene_file(scene.path)
-    evidence = find_scene_box(file, None, range(len(NAMES)))
-    box = evidence.box(np.eye(3))
-    assert evidence.source == f"the points of {where}"
-    assert (box[0] < POINTS.min(axis=0)).all() and (box[1] > POINTS.max(axis=0)).all()
-
-
 def test_without_a_model_and_switched_off_there_are_no_lines(scene):
     assert lines_of(scene).metadata["feature_rays"] is None
     add_model(scene)
@@ -189,7 +177,7 @@ def test_photographs_of_one_name_are_told_apart_by_their_folders():
 
 
 @pytest.mark.parametrize("part", ["cameras", "frames", "images", "points3D"])
-@pytest.mark.parametrize("share", [0.0, 0.25, 0.6])
+@pytest.mark.parametrize("share", [0.0, 0.6])
 def test_files_of_an_interrupted_copy_are_refused_before_colmap_reads_them(scene, part, share):
     add_model(scene)
     path = scene.path / f"colmap/sparse/0/{part}.bin"

@@ -20,18 +20,15 @@ from thermoxels_ns.training.model_config import MOST_VOXELS, ThermoxelsModelConf
         (160.0, (40, 80, 160)),
         (5000.0, (48, 96, 192)),
         (1.0, (8, 16, 32)),
+        (math.inf, (32, 64, 128)),
     ],
 )
 def test_resolutions_grow_and_shrink_alike_and_up_to_a_limit(voxels, expected):
     config = ThermoxelsModelConfig(voxel_pixels=2.0).suited_to(voxels)
     assert config.resolutions == expected
+    assert ThermoxelsModelConfig(voxel_pixels=0.0).suited_to(voxels).resolutions == (32, 64, 128), "nothing is asked"
     config.check()
     assert config.resolutions[-1] <= MOST_VOXELS * 128
-
-
-@pytest.mark.parametrize(("pixels", "voxels"), [(0.0, 50.0), (2.0, math.inf)])
-def test_resolutions_stay_where_nothing_is_asked_or_known(pixels, voxels):
-    assert ThermoxelsModelConfig(voxel_pixels=pixels).suited_to(voxels).resolutions == (32, 64, 128)
 
 
 @pytest.mark.parametrize(
