@@ -102,7 +102,7 @@ def record(error: type[ThermoxelsError]) -> Callable[[type[Record]], type[Record
                 build(self, *values, **named)
             except ValidationError as problem:
                 names = [field.name for field in dataclasses.fields(made) if field.init and not field.kw_only]
-                raise error(_told("", problem, made, dict(zip(names, values)) | named, names)) from problem
+                raise error(_report("", problem, made, dict(zip(names, values)) | named, names)) from problem
 
         made.__init__ = checked
         return made
@@ -129,14 +129,14 @@ def as_record(name: str, content: Mapping[str, Any], target: type[Record]) -> Re
         # Of json, pydantic takes lists for tuples and mappings for dataclasses, and converts nothing else.
         return TypeAdapter(alone, config=_config(infinite=True)).validate_json(f"[{''.join(parts)}]")[0]
     except ValidationError as problem:
-        raise ThermoxelsError(_told(name, problem, target, content)) from problem
+        raise ThermoxelsError(_report(name, problem, target, content)) from problem
 
 
 def _config(infinite: bool = False) -> ConfigDict:
     return {"extra": "forbid", "strict": True, "allow_inf_nan": infinite, "arbitrary_types_allowed": True}
 
 
-def _told(name: str, problem: ValidationError, target: Any, content: Any, positional: list[str] | None = None) -> str:
+def _report(name: str, problem: ValidationError, target: Any, content: Any, positional: list[str] | None = None) -> str:
     """Return a line for each mistake, at most `_MOST_TOLD`; `positional` names fields that were given in order."""
     found: dict[tuple[str | int, ...], tuple[bool, str]] = {}
     for one in problem.errors(include_url=False):

@@ -264,14 +264,14 @@ class ThermoxelsModel(Model):
         assert ray_bundle.camera_indices is not None
         photograph = ray_bundle.camera_indices[:, 0]
         if self.log_gain is not None and gains_on and rgb is not None:
-            log_gain = self._refined(self.log_gain, self.config.exposure)
+            log_gain = self._correction(self.log_gain, self.config.exposure)
             rgb = rgb * torch.exp(log_gain - log_gain.mean(0)).index_select(0, photograph)
         if self.thermal_offset is not None and offsets_on:
-            offset = self._refined(self.thermal_offset, self.config.per_image_offset)
+            offset = self._correction(self.thermal_offset, self.config.per_image_offset)
             thermal = thermal + (offset - offset.mean()).index_select(0, photograph)[:, None]
         return batch | {"rgb": rgb, "thermal": thermal, "accumulation": seen.box.accumulation[:, None], "render": seen}
 
-    def _refined(self, correction: Tensor, wanted: str) -> Tensor:
+    def _correction(self, correction: Tensor, wanted: str) -> Tensor:
         """Return a correction; one found in photographs learns only once surfaces stand, which would distort it."""
         return correction.detach() if wanted == "auto" and self.step < self.config.distortion_ramp[1] else correction
 

@@ -112,7 +112,8 @@ class ThermoxelsPipeline(VanillaPipeline):
                 ", ".join(f"{name} {' or '.join(map(str, numbers))}" for name, numbers in sorted(grid.items()))
                 for grid in (columns, found)
             )
-            expected, got = f"a voxel grid with the columns {here}", there or "no voxel grid: that of another method"
+            expected = f"a voxel grid with the columns {here}"
+            got = there or "no voxel grid: the checkpoint of another method"
             remedy = "Load it with the config.yml that was written beside it."
             raise CheckpointError("checkpoint", expected=expected, got=got, remedy=remedy)
         own = self.state_dict()
