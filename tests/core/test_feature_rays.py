@@ -53,12 +53,7 @@ def test_the_same_distance_off_is_doubted_where_points_are_dense_and_not_where_t
     dense, sparse = (np.concatenate((floor(count), off)) for count in (4000, 12))
     assert not agrees_with_neighbours(seen_by_all(dense))[-1]
     assert agrees_with_neighbours(seen_by_all(sparse))[-1]
-
-
-def test_what_is_not_known_better_is_not_doubted() -> None:
-    points = np.concatenate((floor(4000), [[0.0, 0.0, 0.3]]))
-    assert not agrees_with_neighbours(seen_by_all(points, uncertainty=0.01))[-1]
-    assert agrees_with_neighbours(seen_by_all(points, uncertainty=0.2))[-1]
+    assert agrees_with_neighbours(seen_by_all(dense, uncertainty=0.2))[-1], "what is not known better"
 
 
 def test_the_verdict_is_the_same_in_any_world_and_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:

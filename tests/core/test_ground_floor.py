@@ -4,7 +4,6 @@ import os
 
 import numpy as np
 import pytest
-import torch
 
 from thermoxels_ns.core.checks import (
     check_finite,
@@ -16,20 +15,12 @@ from thermoxels_ns.core.checks import (
     writable_folder,
 )
 from thermoxels_ns.core.errors import MeshError, OutputError, ThermoxelsError
-from thermoxels_ns.core.units import TemperatureRange, celsius_to_kelvin, kelvin_to_celsius
-
-
-def test_range_round_trip_for_floats_arrays_and_tensors():
-    span = TemperatureRange(-20.0, 60.0)
-    for value in (13.37, np.array([1.0, 2.0]), torch.tensor([5.0, -3.0], dtype=torch.float64)):
-        np.testing.assert_allclose(span.to_celsius(span.normalise(value)), value, rtol=1e-12)
-    assert span.normalise(-20.0) == 0.0 and span.normalise(60.0) == 1.0
-    assert kelvin_to_celsius(celsius_to_kelvin(21.5)) == pytest.approx(21.5)
+from thermoxels_ns.core.units import TemperatureRange
 
 
 @pytest.mark.parametrize("bounds", [(20.0, 20.0), (30.0, 20.0), (float("nan"), 1.0), (0.0, float("inf"))])
 def test_impossible_ranges_are_refused(bounds):
-    with pytest.raises(ThermoxelsError, match="temperature range: expected finite bounds"):
+    with pytest.raises(ThermoxelsError, match=r"^temperature range: "):
         TemperatureRange(*bounds)
 
 

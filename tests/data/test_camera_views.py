@@ -68,21 +68,10 @@ def test_streams_that_do_not_train_have_no_views(scene_folder):
         assert set(manager(scene.path, streams=streams).training_views().size[:, 0]) == widths
 
 
-def test_distortion_is_left_out(scene_folder):
-    scene = scene_folder(distortion={"k1": 0.08, "k2": -0.02, "p1": 0.003, "p2": -0.002})
-    bent = manager(scene.path).training_views()
-    for name in ("k1", "k2", "p1", "p2"):
-        del scene.meta[name]
-    scene.rewrite()
-    straight = manager(scene.path).training_views()
-    for name, array in vars(straight).items():
-        np.testing.assert_array_equal(getattr(bent, name), array)
-
-
 def test_a_fisheye_lens_spans_its_angles():
     """120 and 60 degrees across and along: the border pixels are just within, the image of the pinhole ends there."""
     lens = cameras(CameraType.FISHEYE, 120, 60, 120 / np.deg2rad(120), 60 / np.deg2rad(60))
-    views = views_of_cameras([lens])
+    views = views_of_cameras(lens)
     for number in range(2):
         middle_row = lens.generate_rays(number, keep_shape=True).directions[33].numpy()
         middle_column = lens.generate_rays(number, keep_shape=True).directions[:, 54].numpy()
@@ -93,8 +82,8 @@ def test_a_fisheye_lens_spans_its_angles():
 
 def test_a_panorama_sees_everything_once():
     lens = cameras(CameraType.EQUIRECTANGULAR, 64, 32, 32.0, 32.0)
-    views = views_of_cameras([lens, cameras(CameraType.PERSPECTIVE, 20, 10, 15.0, 15.0)])
-    assert views.camera_to_world.shape == (14, 3, 4) and (views.size[:12] == 16).all()
+    views = views_of_cameras(lens)
+    assert views.camera_to_world.shape == (12, 3, 4) and (views.size == 16).all()
     rays = np.random.default_rng(0).normal(size=(500, 3))
     for first in (0, 6):
         seen = np.array([inside(views, number, rays) for number in range(first, first + 6)])
@@ -103,4 +92,3 @@ def test_a_panorama_sees_everything_once():
             views.camera_to_world[first : first + 6, :, 3], views.camera_to_world[first, :, 3][None].repeat(6, 0)
         )
     np.testing.assert_allclose(np.linalg.det(views.camera_to_world[:, :, :3]), 1.0, atol=1e-6)
-    assert views.size[12:].tolist() == [[20, 10]] * 2

@@ -8,7 +8,6 @@ import pytest
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.colmap_tracks import _matched, read_colmap_tracks
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
-from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.tracks import COLMAP_FOLDERS, TRACKS_KEY, SparseTracks, check_complete, write_tracks
 
@@ -189,7 +188,7 @@ def test_photographs_of_one_name_are_told_apart_by_their_folders():
 
 
 @pytest.mark.parametrize("part", ["cameras", "frames", "images", "points3D"])
-@pytest.mark.parametrize("share", [0.0, 0.25, 0.6])
+@pytest.mark.parametrize("share", [0.0, 0.6])
 def test_files_of_an_interrupted_copy_are_refused_before_colmap_reads_them(scene, part, share):
     add_model(scene)
     path = scene.path / f"colmap/sparse/0/{part}.bin"

@@ -195,6 +195,8 @@ def test_training_rays_are_a_regular_subset(scene_folder):
         assert pixels.tolist() == [i * width * height + p for i in range(8) for p in inside]
     both = torch.cat([part.metadata["stream"] for part in served.training_rays(RGB_STREAM | THERMAL_STREAM)])
     assert both.flatten().tolist() == [RGB_STREAM] * 8 * 24 * 18 + [THERMAL_STREAM] * 8 * 12 * 10
+    alone = manager(scene.path, streams="thermal")
+    assert list(alone.training_rays(RGB_STREAM)) == [] and sum(map(len, alone.training_rays(3))) == 8 * 12 * 10
     with pytest.raises(ValueError, match="no such grid"):
         next(served.training_rays(0))
 
@@ -205,12 +207,6 @@ def test_training_rays_per_image_are_limited(scene_folder, most):
     images = torch.cat([part.camera_indices for part in served.training_rays(RGB_STREAM, most)])
     counts = torch.bincount(images.flatten(), minlength=8)
     assert int(counts.max()) <= most and int(counts.min()) >= min(most / 4, 432)
-
-
-def test_a_stream_that_does_not_train_has_no_training_rays(scene_folder):
-    served = manager(scene_folder().path, streams="thermal")
-    assert list(served.training_rays(RGB_STREAM)) == []
-    assert sum(len(part) for part in served.training_rays(RGB_STREAM | THERMAL_STREAM)) == 8 * 18 * 24
 
 
 def test_render_script_can_set_it_up_without_data(scene_folder):
@@ -242,21 +238,3 @@ def test_cuda_gives_the_batch_of_the_cpu(scene_folder, images_on_gpu):
     for name in targets:
         assert batch[name].is_cuda
         torch.testing.assert_close(batch[name].cpu(), targets[name])
-
-
-@pytest.mark.real_data
-def test_real_thermal_rays_are_those_of_its_own_camera(shared_data):
-    parser = {"downscale_factor": 8}
-    served = manager(shared_data / "arco", parser=parser, streams="thermal", thermal_num_rays_per_batch=500)
-    bundle, batch = served.next_train(0)
-    cameras = served.train_dataset.thermal_cameras
-    assert cameras is not None and (bundle.metadata["stream"] == THERMAL_STREAM).all()
-    image = int(bundle.camera_indices[0])
-    mine = (bundle.camera_indices[:, 0] == image).nonzero()[:, 0]
-    rays = cameras.generate_rays(image, keep_shape=True).flatten()
-    pixels = torch.cdist(bundle.directions[mine].double(), rays.directions.double()).argmin(1)
-    torch.testing.assert_close(bundle.directions[mine], rays.directions[pixels], atol=1e-6, rtol=0)
-    torch.testing.assert_close(bundle.origins[mine], rays.origins[pixels])
-    temperatures, valid = served.train_dataset.get_thermal(image)
-    torch.testing.assert_close(batch["thermal"][mine], temperatures.reshape(-1, 1)[pixels])
-    assert valid.all() and len(served.train_dataset) == 35

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig, refine_poses
 from thermoxels_ns.data.dataset import ThermalDataset
-from thermoxels_ns.data.pose_refinement import refine_poses
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene

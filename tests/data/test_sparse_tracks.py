@@ -6,7 +6,7 @@ import pytest
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
-from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, feature_rays, read_tracks, write_tracks
+from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, feature_rays, write_tracks
 
 TAGS = ["train", "train", "eval", "train", "train", "train"]
 NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]
@@ -28,14 +28,6 @@ def scene(scene_folder):
 
 def lines_of(folder, split: str = "train", **options):
     return ThermalDataParserConfig(data=folder.path, **options).setup().get_dataparser_outputs(split)
-
-
-def test_what_is_written_is_read(scene):
-    folder, tracks = scene
-    read = read_tracks(folder.path / "tracks.npz")
-    assert read.frames == tracks.frames
-    for name in ("points", "point_error_px", "sighting_frame", "sighting_point"):
-        assert np.array_equal(getattr(read, name), getattr(tracks, name)), name
 
 
 def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_world(scene):

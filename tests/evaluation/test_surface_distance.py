@@ -43,15 +43,6 @@ def test_temperatures_are_those_of_the_closest_point(mesh_of_cells):
     assert found.closest_temperature_c == pytest.approx(10.0 + 4.0 * points[:, 0], abs=1e-6)
 
 
-def test_a_missing_part_counts_from_the_truth_only(mesh_of_cells):
-    truth = Plane(0.25)
-    points = truth.surface_points(2000, 0)[0] * [2.0, 1.0, 1.0]  # twice as long as the mesh
-    found = surface_distances(slab(mesh_of_cells), truth, points)
-    assert found is not None
-    assert found.mesh_to_truth == pytest.approx(0.0, abs=1e-12)
-    assert found.truth_to_mesh == pytest.approx(0.25, rel=0.05)  # half of the points, 0.5 away on average
-
-
 def test_a_mesh_that_is_all_cut_by_the_box_has_no_surface(mesh_of_cells):
     mesh = mesh_of_cells(np.ones((2, 2, 2), dtype=bool), 0.5)
     assert np.all(mesh.facet_tags == FACET_BOX)

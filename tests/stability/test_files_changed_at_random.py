@@ -113,40 +113,8 @@ def ends_well(run: Callable[[], Any]) -> bool:
     return True
 
 
-def to_json(tree: Any) -> str:
-    return json.dumps(tree)
-
-
 def to_yaml(tree: Any) -> str:
     return yaml.safe_dump(tree, allow_unicode=True)
-
-
-def test_transforms_json(scene_folder) -> None:
-    scene, solved = scene_folder(frames=5), [0, 0]
-    camera = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.001)
-    meta = {**scene.meta, **camera, "test_filenames": [scene.meta["frames"][2]["file_path"]], "metres_per_unit": 1.0}
-
-    @EXAMPLES
-    @example(to_json(meta).encode())
-    @given(either(meta, to_json))
-    def check(content: bytes) -> None:
-        (scene.path / "transforms.json").write_bytes(content)
-
-        def run() -> None:
-            parser = ThermalDataParserConfig(data=scene.path).setup()
-            for split in ("train", "val"):
-                found = parser.get_dataparser_outputs(split)
-                cameras = found.cameras
-                assert len(found.image_filenames) == len(found.metadata["thermal_filenames"]) == len(cameras) > 0
-                assert all(path.is_file() for path in (*found.image_filenames, *found.metadata["thermal_filenames"]))
-                for values in (cameras.camera_to_worlds, cameras.fx, cameras.fy, cameras.cx, found.scene_box.aabb):
-                    assert bool(np.isfinite(values.numpy()).all())
-                assert bool((cameras.fx > 0).all()) and bool((found.scene_box.aabb[1] > found.scene_box.aabb[0]).all())
-
-        solved[ends_well(run)] += 1
-
-    check()
-    assert min(solved) > 0, "some are refused, the unchanged one at least is read"
 
 
 def building() -> TetMesh:
@@ -159,79 +127,81 @@ def building() -> TetMesh:
     return replace(mesh, boundary=replace(boundary, patch=patch, patch_names=names))
 
 
-def test_scene_yaml(tmp_path) -> None:
-    """Every effect that a scene may name."""
-    tree = yaml.safe_load((configs_folder() / "scene-all-effects.yaml").read_text(encoding="utf-8"))
-    tree["time"] = {"steps": 3, "step_seconds": 600.0}
-    tree["materials"] = {"*": {"conductivity_w_mk": 1.7, "density_kg_m3": 2200.0, "specific_heat_j_kgk": 880.0}}
-    mesh, path, solved = building(), tmp_path / "scene.yaml", [0, 0]
+def config(name: str) -> Any:
+    return yaml.safe_load((configs_folder() / name).read_text(encoding="utf-8"))
+
+
+def read_scene(path: Path) -> None:
+    parser = ThermalDataParserConfig(data=path.parent).setup()
+    for split in ("train", "val"):
+        found = parser.get_dataparser_outputs(split)
+        cameras = found.cameras
+        assert len(found.image_filenames) == len(found.metadata["thermal_filenames"]) == len(cameras) > 0
+        assert all(path.is_file() for path in (*found.image_filenames, *found.metadata["thermal_filenames"]))
+        for values in (cameras.camera_to_worlds, cameras.fx, cameras.fy, cameras.cx, found.scene_box.aabb):
+            assert bool(np.isfinite(values.numpy()).all())
+        assert bool((cameras.fx > 0).all()) and bool((found.scene_box.aabb[1] > found.scene_box.aabb[0]).all())
+
+
+def solve_scene(path: Path, mesh: TetMesh) -> None:
+    scene = load_heat_scene(path)
+    if scene.time is not None and scene.time.num_times > LONGEST:
+        return
+    found = run_scene(scene, mesh, Goals(memory_gb=1.0))
+    assert found.solution.converged and np.isfinite(found.nodes.states_c).all()
+    assert found.solution.energy_residual < 1e-9
+    assert all(np.isfinite(effect.heat_w) for effect in found.results.effects)
+
+
+def answer(path: Path, mesh: TetMesh) -> None:
+    """Down to the page."""
+    found = audit(mesh, load_conditions(path))
+    summary_text(answers_of(Audit(path.with_name("mesh.vtu"), path), found))
+    assert found.whole.u_w_m2k.low <= found.whole.u_w_m2k.high
+    page = audit_page(found, None, {}, "mesh.vtu", "thermoxels audit", ())
+    if b"nan" not in path.read_bytes().lower():  # as the name of a client, say
+        assert "nan" not in re.sub(r"[a-z]nan|nan[a-z]", "", page.lower())
+
+
+def format_of(kind: str, make_scene: Any) -> tuple[Any, Callable[[Any], str], str, Callable[[Path], Any]]:
+    """A valid tree, its writer, the file's name and its reader."""
+    if kind == "scene folder":
+        scene = make_scene(frames=5)
+        camera = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.001)
+        further = {"test_filenames": [scene.meta["frames"][2]["file_path"]], "metres_per_unit": 1.0}
+        return {**scene.meta, **camera, **further}, json.dumps, "scene/transforms.json", read_scene
+    if kind == "heat scene":  # every effect that a scene may name
+        tree, mesh = config("scene-all-effects.yaml"), building()
+        tree["time"] = {"steps": 3, "step_seconds": 600.0}
+        tree["materials"] = {"*": {"conductivity_w_mk": 1.7, "density_kg_m3": 2200.0, "specific_heat_j_kgk": 880.0}}
+        return tree, to_yaml, "scene.yaml", lambda path: solve_scene(path, mesh)
+    if kind == "audit conditions":
+        tree = config("conditions-example.yaml")
+        tree["references"] = [{"at": [1.0, 0.0, 1.2], "temperature": "1.4 +- 0.2 C"}]
+        tree["leave_out"] = ["cut"]
+        wall = photographed(solve_wall(audited_wall(0.2), STATED, true_draws(STATED, None)), STATED, 1)
+        return tree, to_yaml, "conditions.yaml", lambda path: answer(path, wall)
+    name, read = {
+        "materials": ("scene-concrete.yaml", load_heat_scene),
+        "patches": ("patches-example.yaml", load_patch_rules),
+    }[kind]
+    return config(name), to_yaml, name, read
+
+
+@pytest.mark.parametrize("kind", ["scene folder", "heat scene", "audit conditions", "materials", "patches"])
+def test_text_files(tmp_path, scene_folder, kind) -> None:
+    tree, write, name, read = format_of(kind, scene_folder)
+    solved = [0, 0]
 
     @EXAMPLES
-    @example(to_yaml(tree).encode())
-    @given(either(tree, to_yaml))
+    @example(write(tree).encode())
+    @given(either(tree, write))
     def check(content: bytes) -> None:
-        path.write_bytes(content)
-
-        def run() -> None:
-            scene = load_heat_scene(path)
-            if scene.time is not None and scene.time.num_times > LONGEST:
-                return
-            found = run_scene(scene, mesh, Goals(memory_gb=1.0))
-            assert found.solution.converged and np.isfinite(found.nodes.states_c).all()
-            assert found.solution.energy_residual < 1e-9
-            assert all(np.isfinite(effect.heat_w) for effect in found.results.effects)
-
-        solved[ends_well(run)] += 1
+        (tmp_path / name).write_bytes(content)
+        solved[ends_well(lambda: read(tmp_path / name))] += 1
 
     check()
-    assert min(solved) > 0
-
-
-def test_audit_conditions(tmp_path) -> None:
-    """What a survey may state, down to the page."""
-    tree = yaml.safe_load((configs_folder() / "conditions-example.yaml").read_text(encoding="utf-8"))
-    tree["references"] = [{"at": [1.0, 0.0, 1.2], "temperature": "1.4 +- 0.2 C"}]
-    tree["leave_out"] = ["cut"]
-    mesh = photographed(solve_wall(audited_wall(0.2), STATED, true_draws(STATED, None)), STATED, 1)
-    path, solved = tmp_path / "conditions.yaml", [0, 0]
-    options = Audit(tmp_path / "mesh.vtu", path)
-
-    @EXAMPLES
-    @example(to_yaml(tree).encode())
-    @given(either(tree, to_yaml))
-    def check(content: bytes) -> None:
-        path.write_bytes(content)
-
-        def run() -> None:
-            found = audit(mesh, load_conditions(path))
-            summary_text(answers_of(options, found))
-            assert found.whole.u_w_m2k.low <= found.whole.u_w_m2k.high
-            page = audit_page(found, None, {}, "mesh.vtu", "thermoxels audit", ())
-            if b"nan" not in content.lower():  # as the name of a client, say
-                assert "nan" not in re.sub(r"[a-z]nan|nan[a-z]", "", page.lower())
-
-        solved[ends_well(run)] += 1
-
-    check()
-    assert min(solved) > 0
-
-
-@pytest.mark.parametrize("kind", ["materials", "patches"])
-def test_conditions(tmp_path, kind) -> None:
-    """Materials in a scene, and rules for patches."""
-    name = {"materials": "scene-concrete.yaml", "patches": "patches-example.yaml"}[kind]
-    tree, path = yaml.safe_load((configs_folder() / name).read_text(encoding="utf-8")), tmp_path / "file.yaml"
-    read, solved = {"materials": load_heat_scene, "patches": load_patch_rules}[kind], [0, 0]
-
-    @EXAMPLES
-    @example(to_yaml(tree).encode())
-    @given(either(tree, to_yaml))
-    def check(content: bytes) -> None:
-        path.write_bytes(content)
-        solved[ends_well(lambda: read(path))] += 1
-
-    check()
-    assert min(solved) > 0
+    assert min(solved) > 0, "some are refused, the unchanged one at least is read"
 
 
 def read_changed(folder: Path, examples: list[tuple[str, bytes]], said) -> None:

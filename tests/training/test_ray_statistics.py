@@ -80,16 +80,6 @@ def test_corner_temperature_is_measured_where_rays_came_and_only_there(backend):
     torch.testing.assert_close(inner, expected, atol=5e-3, rtol=0)
 
 
-def test_corner_that_overshoots_is_brought_back_to_what_rays_saw(backend):
-    scene = slab(backend)
-    shape = scene.grid.lattice.shape
-    stored = scene.grid.temperature.data.view(shape)
-    stored[4:] = 9.0  # in front of the surface, where hardly any weight lies
-    stored[3] -= 0.4
-    seen = field_evidence(scene, rays_along_minus_x()).temperature
-    assert float(seen.thermal.min()) >= 0.0 and float(seen.thermal.max()) <= 1.0
-
-
 def test_corners_that_differ_in_turn_are_averaged(backend):
     """Rays see a mixture of neighbours that are too warm and too cold in turn: it is the mixture that was measured."""
     scene = slab(backend)

@@ -1,5 +1,4 @@
 from copy import deepcopy
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -64,34 +63,29 @@ def words(capsys) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
-def test_a_number_of_steps_that_a_quality_replaces_is_named(scene, tmp_path, capsys):
-    made = trainer(scene, tmp_path, *DRAFT, "--max-num-iterations", "2")
+FIRST_LATTICE = ("--pipeline.model.resolutions", "32", "--pipeline.model.refine-at")
+
+
+@pytest.mark.parametrize(
+    ("options", "resumed", "steps", "said"),
+    [
+        ((*DRAFT, "--max-num-iterations", "2"), False, (0, 800), "800 steps, in place of about 128 voxels and 2 steps"),
+        (DRAFT, True, (100, 700), "goes on from step 100 to step 800, where quality draft ends"),
+        (
+            (*FIRST_LATTICE, "--max-num-iterations", "150"),
+            True,
+            (100, 150),
+            "goes on from step 100 for 150 more; to end at step 150 pass --max-num-iterations 50",
+        ),
+        ((*FIRST_LATTICE, "--max-num-iterations", "50"), True, (100, 50), "goes on from step 100 for 50 more"),
+    ],
+)
+def test_where_a_training_begins_and_ends_is_said(scene, checkpoints, tmp_path, capsys, options, resumed, steps, said):
+    file = ("--load-checkpoint", str(checkpoints / "step-000000099.ckpt")) if resumed else ()
+    made = trainer(scene, tmp_path, *options, *file)
     made.setup()
-    assert made.config.max_num_iterations == 800 and made._start_step == 0
-    said = words(capsys)
-    assert "quality draft: about 64 voxels and 800 steps, in place of about 128 voxels and 2 steps" in said
-    assert "goes on from" not in said and writer.GLOBAL_BUFFER["max_iter"] == 800
-
-
-def test_a_quality_ends_where_it_ends_also_in_a_resumed_training(scene, checkpoints, tmp_path, capsys):
-    made = trainer(scene, tmp_path, *DRAFT, "--load-dir", str(checkpoints), "--load-step", "99")
-    made.setup()
-    assert (made._start_step, made.config.max_num_iterations) == (100, 700)
-    assert "goes on from step 100 to step 800, where quality draft ends" in words(capsys)
-    assert writer.GLOBAL_BUFFER["max_iter"] == 800
-
-
-def test_steps_are_counted_from_the_checkpoint_and_it_is_said(scene, checkpoints, tmp_path, capsys):
-    options = ["--pipeline.model.resolutions", "32", "--pipeline.model.refine-at"]
-    file = str(checkpoints / "step-000000099.ckpt")
-    made = trainer(scene, tmp_path, *options, "--load-checkpoint", file, "--max-num-iterations", "150")
-    made.setup()
-    assert (made._start_step, made.config.max_num_iterations) == (100, 150)
-    assert "goes on from step 100 for 150 more; to end at step 150 pass --max-num-iterations 50" in words(capsys)
-    assert writer.GLOBAL_BUFFER["max_iter"] == 250
-    trainer(scene, tmp_path, *options, "--load-checkpoint", file, "--max-num-iterations", "50").setup()
-    said = words(capsys)
-    assert "goes on from step 100 for 50 more" in said and "to end at" not in said
+    assert (made._start_step, made.config.max_num_iterations) == steps
+    assert said in words(capsys) and writer.GLOBAL_BUFFER["max_iter"] == sum(steps)
 
 
 @pytest.mark.parametrize(
@@ -157,33 +151,21 @@ def test_a_quality_sets_resolution_and_length_and_leaves_the_defaults_alone(qual
 
 @pytest.mark.parametrize(
     ("words", "host"),
-    [((), "127.0.0.1"), (("--viewer.websocket-host", "0.0.0.0"), "0.0.0.0"), (("--vis",), "127.0.0.1")],
-)
-def test_the_viewer_listens_on_this_machine_unless_told_otherwise(monkeypatch, words, host):
-    """ns-viewer replaces the viewer of a training by that of its own command line."""
-    config = deepcopy(thermoxels.config)
-    monkeypatch.setattr("sys.argv", ["ns-viewer", *words])
-    assert config.viewer.websocket_host == "127.0.0.1"
-    config.viewer = ViewerConfig()
-    assert config.viewer.websocket_host == host
-
-
-@pytest.mark.parametrize(
-    ("words", "host"),
     [
         ((), "127.0.0.1"),
+        (("--vis",), "127.0.0.1"),
         (("--viewer.websocket-host", "192.168.0.1"), "192.168.0.1"),
         (("--viewer.websocket_host=192.168.0.1",), "192.168.0.1"),
     ],
 )
-def test_a_config_does_not_open_the_viewer(monkeypatch, words, host):
+def test_neither_a_config_nor_ns_viewer_opens_the_viewer(monkeypatch, words, host):
+    """ns-viewer replaces the viewer of a training by that of its own command line."""
     monkeypatch.setattr("sys.argv", ["ns-train", "--load-config", "config.yml", *words])
     text = yaml.dump(thermoxels.config).replace("websocket_host: 127.0.0.1", "websocket_host: 0.0.0.0")
     config = yaml.load(text, Loader=yaml.Loader)
     assert "0.0.0.0" in text and config.viewer.websocket_host == host
-    assert replace(config, viewer=thermoxels.config.viewer) == replace(
-        thermoxels.config, viewer=thermoxels.config.viewer
-    )
+    config.viewer = ViewerConfig()
+    assert config.viewer.websocket_host == host
 
 
 @pytest.mark.parametrize("name", ["experiment_name", "timestamp", "method_name", "relative_model_dir"])
@@ -206,34 +188,25 @@ def test_a_run_is_named_by_the_folder_of_its_scene(tmp_path, monkeypatch, data, 
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "named"),
     [
-        (
-            ["--max-num-iterations", "0"],
-            r"max_num_iterations: expected 1 or more, got 0. Correct --max-num-iterations.",
-        ),
-        (["--max-num-iterations", "-5"], "max_num_iterations: expected 1 or more, got -5"),
-        (["--machine.seed", "-1"], "seed: expected from 0 .*, got -1. Correct --machine.seed."),
-        (["--pipeline.model.seed", "-1"], "seed: expected from 0 .*, got -1. Correct --pipeline.model.seed."),
-        (["--pipeline.datamanager.train-num-rays-per-batch", "0"], "train_num_rays_per_batch: expected 1 or more"),
-        (["--pipeline.datamanager.thermal-num-rays-per-batch", "-1"], "thermal_num_rays_per_batch: expected 1 or more"),
-        (
-            ["--optimizers.density.optimizer.lr", "-0.3"],
-            r"lr: expected above 0, got -0.3. Correct --optimizers.density",
-        ),
-        (["--optimizers.sh.scheduler.lr-final", "0"], "lr_final: expected above 0, got 0"),
-        (["--pipeline.model.loss-overrides", "rgb", "nan"], "expected a finite number, 0 or more, got nan"),
-        (
-            ["--machine.device-type", "cuda"],
-            "device_type: expected one of cpu.*got cuda. Pass --machine.device-type cpu",
-        ),
-        (["--experiment-name", "e" * 300], "File name too long"),
+        ("--max-num-iterations 0", "max_num_iterations: .*Correct --max-num-iterations"),
+        ("--machine.seed -1", "seed: .*Correct --machine.seed"),
+        ("--pipeline.model.seed -1", "seed: .*Correct --pipeline.model.seed"),
+        ("--pipeline.datamanager.train-num-rays-per-batch 0", "train_num_rays_per_batch: "),
+        ("--pipeline.datamanager.thermal-num-rays-per-batch -1", "thermal_num_rays_per_batch: "),
+        ("--optimizers.density.optimizer.lr -0.3", "lr: .*Correct --optimizers.density"),
+        ("--optimizers.sh.scheduler.lr-final 0", "lr_final: "),
+        ("--optimizers.sh.scheduler.max-steps 0", "max_steps: "),
+        ("--pipeline.model.loss-overrides rgb nan", "loss_overrides rgb: "),
+        ("--machine.device-type cuda", "device_type: .*Pass --machine.device-type cpu"),
+        ("--experiment-name " + "e" * 300, "File name too long"),
     ],
 )
-def test_what_cannot_work_is_refused_before_anything_is_written(scene, tmp_path, monkeypatch, options, message):
+def test_what_cannot_work_is_refused_before_anything_is_written(scene, tmp_path, monkeypatch, options, named):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(ThermoxelsError, match=message):
-        configured(scene, tmp_path / "out", *options).save_config()
+    with pytest.raises(ThermoxelsError, match=named):
+        configured(scene, tmp_path / "out", *options.split()).save_config()
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 

@@ -23,18 +23,15 @@ from thermoxels_ns.training.model_config import MOST_VOXELS, ThermoxelsModelConf
         (5000.0, (48, 96, 192, 384)),
         (50.0, (48,)),
         (1.0, (8,)),
+        (math.inf, (32, 64, 128)),
     ],
 )
 def test_resolutions_follow_the_photographs_up_to_a_limit(voxels, expected):
     config = ThermoxelsModelConfig(voxel_pixels=2.0).suited_to(voxels)
     assert config.resolutions == expected and max(config.prune_at) < config.thin_at[0]
+    assert ThermoxelsModelConfig(voxel_pixels=0.0).suited_to(voxels).resolutions == (32, 64, 128), "nothing is asked"
     config.check()
     assert config.resolutions[-1] <= MOST_VOXELS * 128
-
-
-@pytest.mark.parametrize(("pixels", "voxels"), [(0.0, 50.0), (2.0, math.inf)])
-def test_resolutions_stay_where_nothing_is_asked_or_known(pixels, voxels):
-    assert ThermoxelsModelConfig(voxel_pixels=pixels).suited_to(voxels).resolutions == (32, 64, 128)
 
 
 @pytest.mark.parametrize(

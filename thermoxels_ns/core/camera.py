@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import SceneError
-
-FloatArray = npt.NDArray[np.float64]
 
 Lens = Literal["perspective", "fisheye", "equirectangular"]
 
@@ -53,7 +52,7 @@ class Camera:
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal_deg: float) -> Camera:
-        """Camera with square pixels, its principal point at the centre and a given horizontal angle of view.
+        """Return a camera with square pixels, its principal point at the centre, by its horizontal angle of view.
 
         >>> round(Camera.from_field_of_view(640, 480, 90.0).fl_x, 6)
         320.0
@@ -71,14 +70,13 @@ class Camera:
         return self.k1, self.k2, self.k3, self.k4, self.p1, self.p2
 
     def resized(self, width: int, height: int) -> Camera:
-        """Same camera, its image sampled with another number of pixels; distortion does not change."""
+        """Return the same camera, its image sampled with another number of pixels; distortion does not change."""
         x, y = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height, fl_x=self.fl_x * x, fl_y=self.fl_y * y, cx=self.cx * x, cy=self.cy * y
-        )
+        lengths = {"fl_x": self.fl_x * x, "fl_y": self.fl_y * y, "cx": self.cx * x, "cy": self.cy * y}
+        return replace(self, width=width, height=height, **lengths)
 
     def scaled(self, factor: float) -> Camera:
-        """Same camera with pixels `1 / factor` times as large; a last part of a pixel is cut off."""
+        """Return the same camera with pixels `1 / factor` times as large; a last part of a pixel is cut off."""
         width, height = (max(int(length * factor + 1e-6), 1) for length in (self.width, self.height))
         lengths = {name: getattr(self, name) * factor for name in ("fl_x", "fl_y", "cx", "cy")}
         return replace(self, width=width, height=height, **lengths)
@@ -97,7 +95,7 @@ class Camera:
         return self.project(local * (1.0, -1.0, -1.0))
 
     def rays(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Points (n, 3) at depth 1 in OpenCV camera axes that the pixels (n, 2) see (distortion removed)."""
+        """Return the points (n, 3) at depth 1 in OpenCV camera axes that pixels (n, 2) see (distortion removed)."""
         pixels = np.asarray(pixels, dtype=np.float64)
         distorted = (pixels - (self.cx, self.cy)) / (self.fl_x, self.fl_y)
         plane = distorted
@@ -107,9 +105,9 @@ class Camera:
         return np.column_stack([plane, np.ones(len(plane))])
 
     def directions(self, pose: npt.ArrayLike, samples_per_axis: int = 1) -> FloatArray:
-        """Unit ray directions in the world through a regular grid of points in every pixel, without distortion.
+        """Return unit ray directions in the world through a grid of points in every pixel, without distortion.
 
-        `pose` is camera to world, shape (3, 4) or (4, 4). Returns shape (height, width, samples_per_axis ** 2, 3).
+        `pose` is camera to world, shape (3, 4) or (4, 4). The result has shape (height, width, samples_per_axis^2, 3).
         """
         s = samples_per_axis
         x = (np.arange(self.width * s) + 0.5) / s
@@ -123,13 +121,13 @@ class Camera:
         blocks = world.reshape(self.height, s, self.width, s, 3).transpose(0, 2, 1, 3, 4)
         return np.ascontiguousarray(blocks).reshape(self.height, self.width, s * s, 3)
 
-    def contains(self, pixels: npt.ArrayLike, border: float = 0.0) -> npt.NDArray[np.bool_]:
-        """Which pixels (n, 2) lie in the image, at least `border` pixels from its edge; NaN does not."""
+    def contains(self, pixels: npt.ArrayLike, border: float = 0.0) -> BoolArray:
+        """Return which pixels (n, 2) lie in the image, at least `border` pixels from its edge; NaN does not."""
         x, y = np.asarray(pixels, dtype=np.float64).T
         return (x >= border) & (x <= self.width - border) & (y >= border) & (y <= self.height - border)
 
     def _distort(self, plane: FloatArray) -> FloatArray:
-        """Brown's model on points (n, 2) at depth 1."""
+        """Apply Brown's model to points (n, 2) at depth 1."""
         if not any(self.distortion):
             return plane
         x, y = plane[:, 0], plane[:, 1]

@@ -39,7 +39,7 @@ def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsE
 
 
 def check_ranges(prefix: str, values: Mapping[str, tuple[Any, float, float, str]]) -> None:
-    """Check options by what follows `prefix` in their names: the value, its least and largest, and that in words."""
+    """Check options, named without their `prefix`: each has a value, its least and largest, and these in words."""
     for name, (value, low, high, expected) in values.items():
         if not low <= value <= high:  # NaN fails too
             remedy = f"Correct {prefix}{name.replace('_', '-')}."
@@ -64,8 +64,7 @@ def check_shape(
     error: type[ThermoxelsError] = ThermoxelsError,
 ) -> npt.NDArray:
     """Return `array` if its shape matches `shape` (None matches any length), else raise `error`."""
-    fits = len(array.shape) == len(shape) and all(want in (None, got) for want, got in zip(shape, array.shape))
-    if not fits:
+    if len(array.shape) != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape)):
         wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ")"
         raise error(name, expected=f"shape {wanted}", got=tuple(array.shape), remedy=remedy)
     return array
@@ -98,8 +97,11 @@ def writable_folder(path: Path | str, room_bytes: float = 0.0) -> Path:
         remedy = "Choose another folder or change its permissions."
         raise OutputError("output folder", expected=expected, got=got, remedy=remedy) from problem
     if free < room_bytes:
-        expected = f"{room_bytes / 1e6:.3g} MB of space for results in {folder}"
-        got, remedy = f"{free / 1e6:.3g} MB of free space", "Free space on that disk, or choose another folder."
+        expected, got = (
+            f"{room_bytes / 1e6:.3g} MB of space for results in {folder}",
+            f"{free / 1e6:.3g} MB of free space",
+        )
+        remedy = "Free space on that disk, or choose another folder."
         raise OutputError("output folder", expected=expected, got=got, remedy=remedy)
     return folder
 
@@ -122,15 +124,15 @@ def plain_os_errors(
 
 
 def remedy_of(problem: Exception, remedy: str) -> str:
-    """Give what helps against an error of reading a file: `remedy`, unless the system refused to read it at all."""
+    """Return what helps against an error of reading a file: `remedy`, unless the system refused to read it at all."""
     refused = isinstance(problem, OSError) and problem.errno not in (None, errno.ENOENT)
     return "Check its permissions and the disk, or copy it again." if refused else remedy
 
 
 def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock:
-    """Lock a file in an output folder for this process, or raise `OutputError` if another one holds it.
+    """Lock a file in an output folder for this process, or raise `OutputError` if another process holds it.
 
-    The system ends the lock with the process, however that ends. On a drive without locks none is held; `say` says so.
+    The system ends the lock with the process, however that ends. A drive without locks is named by `say`.
     """
     lock = FileLock(file)
     try:
@@ -151,10 +153,9 @@ def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock
 
 @contextmanager
 def replace_when_done(path: Path | str) -> Iterator[Path]:
-    """Give a temporary path beside `path`; rename it to `path` only if the block ends without an error.
+    """Yield a temporary path beside `path`; rename it to `path` only if the block ends without an error.
 
-    The temporary name keeps the suffix, because writers choose their format by it. An interrupted write leaves
-    the old file or none.
+    The temporary name keeps the suffix, by which writers choose their format.
 
     Raises:
         OutputError: The block or the renaming ended in an error of the operating system.
@@ -183,9 +184,9 @@ def remove_file(path: Path | str) -> None:
 
 
 def remove_stale_temporaries(folder: Path | str, names: Iterable[str]) -> None:
-    """Remove what a killed process left of files of these names that `replace_when_done` was to make.
+    """Remove what a killed process left of files of these names (stars as in ``step-*.vtu``) in a folder, if any.
 
-    A star in a name stands for anything, as in ``step-*.vtu``; the folder need not exist.
+    Temporary files of `replace_when_done` alone are removed.
     """
     for name in map(Path, names):
         for path in sorted(Path(folder).glob(f".{name.stem}.*.part{name.suffix}")):
@@ -206,10 +207,10 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
 def result_folder(
     path: Path | str, files: Sequence[str], own: Sequence[str], others: Sequence[str], series: str | None = None
 ) -> Path:
-    """Make the folder of a command's results, without what killed runs of it left half-written.
+    """Make the folder of a command's results, and remove what killed runs of the command left half-written.
 
-    Raises `OutputError`, before anything is computed, for what is in the way of results, and where a command that
-    writes or removes `files` would take what it did not write.
+    Raises `OutputError`, before anything is computed, for what is in the way of results, and for files that the command
+    would replace or remove although it did not write them.
 
     Args:
         path: The folder.
@@ -220,16 +221,15 @@ def result_folder(
     """
     folder, steps = writable_folder(path), [] if series is None else [series]
     refuse_what_is_in_the_way(folder, files, [Path(name).parent.name for name in steps])
-    found = [name for name in others if (folder / name).exists()]
+    found, every = [name for name in others if (folder / name).exists()], (*files, *steps)
     if not any((folder / name).exists() for name in own):
-        there = [next(folder.glob(name), None) for name in (*files, *steps)]
+        there = [next(folder.glob(name), None) for name in every]
         found += [one.relative_to(folder).as_posix() for one in there if one is not None]
     if found:
         expected = f"no files but those of an earlier run of this command in {folder}"
         remedy = "Choose another folder with --output-dir, or move them away."
         raise OutputError("output folder", expected=expected, got=", ".join(dict.fromkeys(found)), remedy=remedy)
-    remove_stale_temporaries(folder, files)
-    for name in steps:
+    for name in every:
         remove_stale_temporaries((folder / name).parent, [Path(name).name])
     return folder
 

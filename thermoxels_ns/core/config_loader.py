@@ -65,7 +65,7 @@ def _nodes(root: yaml.Node | None) -> Iterator[yaml.Node]:
 
 
 def _harmless(tag: str) -> bool:
-    """Whether a tag ``kind:name`` makes plain data, or names a class that a configuration may be made of."""
+    """Return whether a tag ``kind:name`` makes plain data, or names a class that a configuration may be made of."""
     kind, _, name = tag.partition(":")
     if not name or tag in _HARMLESS_TAGS:
         return True
@@ -83,7 +83,7 @@ def _harmless(tag: str) -> bool:
 
 
 def _plugin_packages() -> set[str]:
-    """Names of nerfstudio's package, ours, and those that say in their metadata that they extend nerfstudio."""
+    """Return the names of nerfstudio, of ours, and of packages whose metadata say that they extend nerfstudio."""
     groups = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
     values = [entry.value for group in groups for entry in entry_points(group=group)]
     for name in ("NERFSTUDIO_METHOD_CONFIGS", "NERFSTUDIO_DATAPARSER_CONFIGS"):
@@ -92,13 +92,13 @@ def _plugin_packages() -> set[str]:
 
 
 def typed(option: str) -> bool:
-    """Whether this process was started with an option, or with one whose name goes on after it."""
+    """Return whether this process was started with an option whose name is, or begins with, the given one."""
     start = option.replace("_", "-")
     return any(word.replace("_", "-").startswith(start) for word in sys.argv[1:])
 
 
 def typed_value(option: str) -> str | None:
-    """Return the value that this process was started with for an option, the last one; None where it was not typed."""
+    """Return the last value that was typed for an option when this process was started; None: it was not typed."""
     found = None
     for word, following in zip(sys.argv[1:], [*sys.argv[2:], None]):
         name, equals, value = word.partition("=")

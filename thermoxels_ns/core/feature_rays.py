@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 
 # A batch is one `RayBundle` whose ``metadata["stream"]`` holds these bits per ray, shape (n, 1), uint8.
 RGB_STREAM = 1  # The ray carries a colour target
@@ -32,35 +30,29 @@ class FeatureRays:
     uncertainty: FloatArray  # Standard error of each ray's length, shape (s,)
 
     def moved(self, rotation: FloatArray, translation: FloatArray, scale: float) -> FeatureRays:
-        """The same rays in another world: scale (rotation p + translation)."""
+        """Return the same rays in another world: scale (rotation p + translation)."""
         origins, points = (scale * (p @ rotation.T + translation) for p in (self.origins, self.points))
         return FeatureRays(origins, self.point, points, scale * self.uncertainty)
 
     def joined_with(self, others: FeatureRays) -> FeatureRays:
-        """These rays, and others after them."""
-        point = np.concatenate((self.point, len(self.points) + others.point))
-        return FeatureRays(
-            np.concatenate((self.origins, others.origins)),
-            point,
-            np.concatenate((self.points, others.points)),
-            np.concatenate((self.uncertainty, others.uncertainty)),
-        )
+        """Return these rays with others behind them."""
+        shifted = FeatureRays(others.origins, len(self.points) + others.point, others.points, others.uncertainty)
+        return FeatureRays(*map(np.concatenate, zip(vars(self).values(), vars(shifted).values())))
 
-    def of_points(self, chosen: npt.NDArray[np.bool_]) -> FeatureRays:
-        """Only the rays to some points, one boolean per point; all points stay, with their numbers."""
+    def of_points(self, chosen: BoolArray) -> FeatureRays:
+        """Return the rays to the chosen points, one boolean per point; all points stay, with their numbers."""
         kept = chosen[self.point]
         return FeatureRays(self.origins[kept], self.point[kept], self.points, self.uncertainty[kept])
 
 
-def agrees_with_neighbours(rays: FeatureRays) -> npt.NDArray[np.bool_]:
-    """Which points lie where the points around them in the photographs do: wrong matches put theirs anywhere.
+def agrees_with_neighbours(rays: FeatureRays) -> BoolArray:
+    """Return which points lie where the points around them in the photographs do: wrong matches lie anywhere.
 
     A photograph (all rays of one origin) vouches for a point if at least half of the `NEIGHBOURS` points that it sees
     nearest to it are as far away, give or take the largest of three lengths: `STEEPEST` times how far apart the two are
-    across the ray, the share `LEAST_TOLERANCE` of the distance, and `TOLERANCE_ERRORS` standard errors. So where
-    neighbours are few and far, much may differ, and among many little. Points agree that half of their photographs
-    vouch for, and those without rays or neighbours. A point on something thin before other things may fail; it is then
-    unknown, not wrong.
+    across the ray, the share `LEAST_TOLERANCE` of the distance, and `TOLERANCE_ERRORS` standard errors. A point agrees
+    if half of its photographs vouch for it, or if it has no rays or no neighbours. A point on something thin before
+    other things may fail.
     """
     from scipy.spatial import KDTree  # slow to import and only needed here
 

@@ -17,9 +17,9 @@ from thermoxels_ns.core.errors import ThermoxelsError
 
 
 def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] = ThermoxelsError) -> Any:
-    """Turn dataclasses, mappings, arrays, tuples and paths, nested as you like, into what json knows.
+    """Return dataclasses, mappings, arrays, tuples and paths, nested in any way, as values that json knows.
 
-    Raises `error`, which says where in `name` it is, for what has no place in json, as NaN and infinity.
+    Raises `error`, which says where in `name` the value stands, for a value that json has not, such as NaN.
 
     >>> plain_values({"sizes": (1, 2.5), "file": Path("a.npy")})
     {'sizes': [1, 2.5], 'file': 'a.npy'}
@@ -43,7 +43,7 @@ def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] =
 
 
 def write_json(path: Path, content: Any, error: type[ThermoxelsError] = ThermoxelsError) -> None:
-    """Write json, whole or not at all (`OutputError`); converts and refuses as `plain_values` does."""
+    """Write json, whole or not at all (`OutputError`), of values as `plain_values` converts or refuses them."""
     text = json.dumps(plain_values(content, path.stem, error), indent=1, allow_nan=False)
     with replace_when_done(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -55,7 +55,7 @@ def read_json(
     remedy: str = "Write it again, or pass another file.",
     error: type[ThermoxelsError] = ThermoxelsError,
 ) -> Any:
-    """Read json, or raise `error` if the file is missing or damaged, or has a key twice in one object."""
+    """Return what a json file holds, or raise `error` if it is missing or damaged, or has a key twice in one object."""
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_unique)
     except (OSError, ValueError, RecursionError) as problem:
@@ -65,7 +65,7 @@ def read_json(
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of json; of a key that stands twice, json would forget the first."""
+    """Return an object of json; refuse a key that stands twice, of which json would forget the first."""
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)

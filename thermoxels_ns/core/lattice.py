@@ -35,9 +35,9 @@ class Lattice:
 
     @classmethod
     def covering(cls, box_lo: npt.ArrayLike, box_hi: npt.ArrayLike, resolution: int) -> Lattice:
-        """Cover a box with `resolution` voxels along its longest side.
+        """Return the lattice that covers a box with `resolution` voxels along its longest side.
 
-        The other sides get as many voxels as it takes; what they exceed the box by is shared between both ends.
+        The other sides get as many voxels as cover them; both ends of a side exceed the box by the same length.
 
         >>> Lattice.covering((0, 0, 0), (2, 1, 0.9), 4)
         Lattice(lo=(0.0, 0.0, -0.05), voxel_size=0.5, shape=(5, 3, 3))
@@ -52,21 +52,17 @@ class Lattice:
         h = float(size.max()) / resolution
         cells = np.maximum(np.ceil(size / h - 1e-6).astype(int), 1)
         start = np.round(0.5 * (lo + hi) - 0.5 * cells * h, 12)
-        return cls(
-            (float(start[0]), float(start[1]), float(start[2])),
-            h,
-            (int(cells[0]) + 1, int(cells[1]) + 1, int(cells[2]) + 1),
-        )
+        return cls(tuple(start.tolist()), h, tuple((cells + 1).tolist()))
 
     def refined(self, factor: int) -> Lattice:
-        """Split every voxel into `factor`^3; every old corner is a corner of the new lattice."""
+        """Return the lattice with every voxel split into `factor`^3; every old corner is one of its corners."""
         nx, ny, nz = ((n - 1) * factor + 1 for n in self.shape)
         return Lattice(self.lo, self.voxel_size / factor, (nx, ny, nz))
 
     @property
     def hi(self) -> tuple[float, float, float]:
         """World position of the last corner."""
-        x, y, z = (lo + (n - 1) * self.voxel_size for lo, n in zip(self.lo, self.shape))
+        x, y, z = self.index_to_world(np.array(self.shape) - 1).tolist()
         return (x, y, z)
 
     @property
@@ -98,7 +94,7 @@ class Lattice:
         return self.index_to_world(cells + 0.5)
 
     def corner_to_cell_mean(self, values: npt.NDArray) -> npt.NDArray:
-        """Trilinear value at voxel centres: the mean of each voxel's eight corners, shape `cell_shape`."""
+        """Return trilinear values at voxel centres: the means of each voxel's eight corners, shape `cell_shape`."""
         total = np.zeros(self.cell_shape, dtype=np.result_type(values.dtype, np.float32))
         for dx, dy, dz in CORNER_OFFSETS:
             nx, ny, nz = self.cell_shape
@@ -107,7 +103,7 @@ class Lattice:
 
 
 def input_from_world(transform: npt.ArrayLike, scale: float) -> npt.NDArray[np.float64]:
-    """Invert a nerfstudio dataparser's p_world = scale * (R p_input + t), [R | t] of shape (3, 4); shape (4, 4).
+    """Return the inverse (4, 4) of a nerfstudio dataparser's p_world = scale * (R p_input + t), [R | t] of (3, 4).
 
     >>> input_from_world([[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]], 2.0) @ [12, 0, 4, 1]
     array([1., 0., 2., 1.])

@@ -82,10 +82,10 @@ class Unit:
 
 
 def read_measured(name: str, content: object, unit: str) -> Measured:
-    """Read a value as people write it: ``20.0 +- 0.5 C``, ``3 ± 1 m/s``, ``0.93``; kept in `unit`, "1" for none.
+    """Return a value that people wrote, such as ``20.0 +- 0.5 C``, ``3 ± 1 m/s``, ``0.93``, in `unit` ("1": none).
 
-    Raises `ThermoxelsError`, which calls the value `name`, for a text that is none, another unit, or none where there
-    is one.
+    Raises `ThermoxelsError`, which calls the value `name`, for a text that is no number, and for a wrong or missing
+    unit.
 
     >>> read_measured("wind", "3.6 +- 1.8 km/h", "m/s")
     Measured(value=1.0, off_by=0.5)
@@ -103,7 +103,7 @@ def read_measured(name: str, content: object, unit: str) -> Measured:
         says = "without a unit, or in %" if unit == "1" else f"with its unit, {unit}"
         if short:
             raise _wrong(name, f"a number {says}", got, f"Write {example}, for example.")
-        off = f" +- {off_by}" if off_by else ""
+        off = "" if off_by is None else f" +- {off_by}"
         raise _wrong(name, f"a number {says}", f"{got} without one", f"Write {number}{off} {unit}.")
     factor, summand = known[short]
     value, half = float(number) * factor + summand, float(off_by or 0.0) * factor

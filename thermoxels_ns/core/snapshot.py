@@ -81,8 +81,14 @@ class GridSnapshot:
             (views, "size", (count, 2), 1.0, np.inf),
         ):
             array = None if part is None else getattr(part, name)
-            if array is not None:
-                _check(f"grid snapshot {name}", array, shape, least, most, _CAMERAS if part is views else _FIELD)
+            if array is None:
+                continue
+            named, remedy = f"grid snapshot {name}", _CAMERAS if part is views else _FIELD
+            check_shape(named, array, shape, remedy, MeshError)
+            check_finite(named, array, remedy, MeshError)
+            if array.size and not least <= array.min() <= array.max() <= most:
+                expected, got = f"values from {least:g} to {most:g}", f"{array.min():g} to {array.max():g}"
+                raise MeshError(named, expected=expected, got=got, remedy=remedy)
 
     def centre_density(self) -> npt.NDArray[np.float64]:
         """Density at the voxel centres, shape `lattice.cell_shape`, [1 / world unit]."""
@@ -94,14 +100,3 @@ class GridSnapshot:
 _SMALLEST_FOCAL = 1e-6  # pixels; what is smaller is no lens
 _FIELD = "The checkpoint is damaged; resume from an earlier one."
 _CAMERAS = "Correct the camera poses and intrinsics of the scene."
-
-
-def _check(
-    name: str, array: npt.NDArray, shape: tuple[int | None, ...], least: float, most: float, remedy: str
-) -> None:
-    check_shape(name, array, shape, remedy, MeshError)
-    check_finite(name, array, remedy, MeshError)
-    if array.size and not least <= array.min() <= array.max() <= most:
-        expected = f"{least:g} or more" if most == np.inf else f"values from {least:g} to {most:g}"
-        got = f"{array.min():g} to {array.max():g}"
-        raise MeshError(name, expected=expected, got=got, remedy=remedy)

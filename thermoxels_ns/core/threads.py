@@ -12,7 +12,7 @@ _pool: list[ThreadPoolExecutor] = []
 
 
 def num_threads() -> int:
-    """Threads that kernels use."""
+    """Return the number of threads that kernels use."""
     return _state["threads"] or os.cpu_count() or 1
 
 
@@ -33,7 +33,7 @@ def _executor() -> ThreadPoolExecutor:
 
 
 def run_ranges(work: Callable[[int, int], object], total: int, smallest: int = 64) -> list[object]:
-    """Call ``work(first, last)`` on ranges that cover 0 to `total`, in parallel; give the results in order.
+    """Call ``work(first, last)`` on ranges that cover 0 to `total`, in parallel, and return the results in order.
 
     Kernels release Python's lock and write to disjoint places; how many threads there are never changes a result. A
     range of fewer than `smallest` items is not worth a thread.

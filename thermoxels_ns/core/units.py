@@ -45,7 +45,7 @@ class TemperatureRange:
         finite = np.isfinite(self.min_c) and np.isfinite(self.max_c)
         if not finite or self.max_c - self.min_c < _SMALLEST_SPAN_K:
             expected, got = f"finite bounds at least {_SMALLEST_SPAN_K} K apart", f"{self.min_c} to {self.max_c} C"
-            remedy = "Use TemperatureRange.spanning, which widens the range of a constant image."
+            remedy = "Use TemperatureRange.spanning: it widens the range of a constant image."
             raise ThermoxelsError("temperature range", expected=expected, got=got, remedy=remedy)
 
     @classmethod

@@ -8,7 +8,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -44,17 +44,14 @@ _MOST_PARTS = 1_000_000  # Of the json that a file becomes
 
 
 def configs_folder() -> Path:
-    """Find the folder of our yaml files: inside an installed package, or beside it in a source tree."""
-    for folder in (_PACKAGE / "configs", _PACKAGE.parent / "configs"):
-        if folder.is_dir():
-            return folder
-    got = f"none in or beside {_PACKAGE}"
-    raise wrong("configuration files", "a folder configs", got, "Install the package again.")
+    """Return the folder of our yaml files: inside an installed package, or beside it in a source tree."""
+    inside = _PACKAGE / "configs"
+    return inside if inside.is_dir() else _PACKAGE.parent / "configs"
 
 
 @contextmanager
 def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
-    """Raise what is wrong with a file as an error of the caller's kind; a context, or a decorator of a reader."""
+    """Raise a `ThermoxelsError` of the block again as one of the caller's kind; a context, or a decorator."""
     try:
         yield
     except ThermoxelsError as problem:
@@ -68,32 +65,30 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except OSError as problem:
         remedy = "Correct the path, or the permissions."
         raise wrong(str(path), "a yaml file", problem.strerror or problem, remedy) from problem
-    except RecursionError as problem:
-        raise wrong(path.name, "a yaml file", "entries nested too deeply to read") from problem
-    except (yaml.YAMLError, UnicodeDecodeError) as problem:
-        raise wrong(path.name, "a yaml file", " ".join(str(problem).split())) from problem
-    except ValueError as problem:  # a date such as 2025-13-01
-        raise wrong(path.name, "a yaml file with dates that exist", problem) from problem
+    except (yaml.YAMLError, ValueError, RecursionError) as problem:  # ValueError: a date such as 2025-13-01
+        nested = isinstance(problem, RecursionError)
+        got = "entries nested too deeply to read" if nested else " ".join(str(problem).split())
+        raise wrong(path.name, "a yaml file", got) from problem
     if not isinstance(content, dict) or not content:
         raise wrong(path.name, "key: value lines", shown(content))
     return content
 
 
 def wrong(name: str, expected: str, got: object, remedy: str = "Correct the file.") -> RecordError:
-    """Make the error for something in a file."""
+    """Return the error for an entry of a file."""
     return RecordError(name, expected=expected, got=got, remedy=remedy)
 
 
 def shown(content: object) -> str:
-    """Show what was read in a message."""
+    """Return what was read as a message shows it."""
     return "nothing" if content is None else repr(content)[:200]
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def record(error: type[ThermoxelsError]) -> Callable[[type[Record]], type[Record]]:
-    """Make a frozen dataclass whose values pydantic checks by their types; mistakes are one error of this kind.
+    """Make a frozen dataclass whose values pydantic checks by their types; all mistakes are one `error`.
 
-    What concerns several fields is checked in ``__post_init__``, which raises an error of ours that is a ValueError.
+    ``__post_init__`` checks what concerns several fields, and raises an error of ours that is a ValueError.
     """
     from pydantic import ValidationError
     from pydantic.dataclasses import dataclass
@@ -107,7 +102,7 @@ def record(error: type[ThermoxelsError]) -> Callable[[type[Record]], type[Record
                 build(self, *values, **named)
             except ValidationError as problem:
                 names = [field.name for field in dataclasses.fields(made) if field.init and not field.kw_only]
-                raise error(_told("", problem, made, dict(zip(names, values)) | named, names)) from problem
+                raise error(_report("", problem, made, dict(zip(names, values)) | named, names)) from problem
 
         made.__init__ = checked
         return made
@@ -116,10 +111,10 @@ def record(error: type[ThermoxelsError]) -> Callable[[type[Record]], type[Record
 
 
 def as_record(name: str, content: Mapping[str, Any], target: type[Record]) -> Record:
-    """Turn what was read from a file into a dataclass, whose fields without a default are required.
+    """Return the content of a file as a dataclass whose fields without a default are required.
 
-    `name` says where it stands, for messages, such as "winter.yaml". Raises `ThermoxelsError` that names all keys that
-    are unknown or missing, and all values of a wrong kind or out of range.
+    `name` says for messages where the content stands, such as "winter.yaml". Raises `ThermoxelsError`, which names all
+    keys that are unknown or missing, and all values of a wrong kind or out of range.
     """
     from pydantic import TypeAdapter, ValidationError
 
@@ -134,15 +129,15 @@ def as_record(name: str, content: Mapping[str, Any], target: type[Record]) -> Re
         # Of json, pydantic takes lists for tuples and mappings for dataclasses, and converts nothing else.
         return TypeAdapter(alone, config=_config(infinite=True)).validate_json(f"[{''.join(parts)}]")[0]
     except ValidationError as problem:
-        raise ThermoxelsError(_told(name, problem, target, content)) from problem
+        raise ThermoxelsError(_report(name, problem, target, content)) from problem
 
 
 def _config(infinite: bool = False) -> ConfigDict:
     return {"extra": "forbid", "strict": True, "allow_inf_nan": infinite, "arbitrary_types_allowed": True}
 
 
-def _told(name: str, problem: ValidationError, target: Any, content: Any, positional: list[str] | None = None) -> str:
-    """Say all mistakes, at most `_MOST_TOLD`, one a line; `positional` are names of fields that were given in order."""
+def _report(name: str, problem: ValidationError, target: Any, content: Any, positional: list[str] | None = None) -> str:
+    """Return a line for each mistake, at most `_MOST_TOLD`; `positional` names fields that were given in order."""
     found: dict[tuple[str | int, ...], tuple[bool, str]] = {}
     for one in problem.errors(include_url=False):
         place, at, path, chosen = one["loc"], content, list[str | int](), False
@@ -166,7 +161,7 @@ def _told(name: str, problem: ValidationError, target: Any, content: Any, positi
 
 
 def _mistake(name: str, path: list[str | int], value: object, one: dict[str, Any], target: Any) -> str:
-    """One of pydantic's errors as a sentence of ours."""
+    """Return one of pydantic's errors as a sentence of ours."""
     kind, where, above = one["type"], _where(name, path), _where(name, path[:-1]) or target.__name__
     if kind == "value_error":
         return ": ".join(filter(None, (printable(where), str(one["ctx"]["error"]).removeprefix(": "))))
@@ -198,7 +193,7 @@ def _where(name: str, path: list[str | int]) -> str:
 
 
 def _keys_at(hint: Any, path: list[str | int]) -> tuple[str, ...]:
-    """Keys of the dataclass, or of several, that a path leads to from a type."""
+    """Return the keys of the dataclass, or of several, that a path leads to from a type."""
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         if not path:
             return tuple(field.name for field in dataclasses.fields(hint) if field.init)
@@ -208,11 +203,10 @@ def _keys_at(hint: Any, path: list[str | int]) -> tuple[str, ...]:
 
 
 def _as_number(content: object) -> str:
-    """Say how to write a text that looks like a number: yaml takes 1e0 and 1.0e0 for text."""
-    try:
+    """Return how to write a text that looks like a number: yaml takes 1e0 and 1.0e0 for text."""
+    number = math.nan
+    with suppress(ValueError):
         number = float(content) if isinstance(content, str) else math.nan
-    except ValueError:
-        return _NUMBER
     if not math.isfinite(number):
         return _NUMBER
     mantissa, _, exponent = f"{number:.15g}".partition("e")
@@ -222,7 +216,7 @@ def _as_number(content: object) -> str:
 
 
 def _meant(key: str, known: tuple[str, ...]) -> str:
-    """Find the key that was meant: one that starts with the same word (air_k: air_c), or is spelled much the same."""
+    """Return the known key that starts with the same word (air_k: air_c), or else is spelled much the same, or ""."""
     word = re.split(r"[_-]", key)[0]
     same = [name for name in known if name.split("_")[0] == word]
     close = difflib.get_close_matches(key, same or known, n=1, cutoff=0.0 if len(same) == 1 else 0.6)
@@ -242,39 +236,25 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         found = super().construct_mapping(node, deep)
         odd = next((key for key in found if not isinstance(key, str)), "")
         if odd != "":
-            raise yaml.constructor.ConstructorError(
-                None, None, f"the key {odd!r}, no text without quotes", node.start_mark
-            )
+            said = f"the key {odd!r}, no text without quotes"
+            raise yaml.constructor.ConstructorError(None, None, said, node.start_mark)
         return found
 
 
 Config = TypeVar("Config")
 
-_PATTERNS = ("plenoxels*.yaml", "thermoxels*.yaml")
-"""The presets among the files of the folder, which also holds materials and heat scenes."""
-
 
 def read_preset(name: str) -> dict[str, Any]:
     """Read ``configs/<name>.yaml``, or raise `ThermoxelsError` if there is no such preset or it is not a mapping."""
-    path = configs_folder() / f"{name}.yaml"
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for pattern in _PATTERNS for p in configs_folder().glob(pattern))) or "none"
-        raise ThermoxelsError("preset", expected=f"one of {known}", got=name, remedy="Correct the name.")
-    return read_yaml(path)
+    return read_yaml(configs_folder() / f"{name}.yaml")
 
 
 def with_overrides(config: Config, overrides: Mapping[str, Any], name: str = "preset") -> Config:
-    """A copy of a (nested) dataclass, or of a dict of such, with some fields replaced; lists replace tuples as tuples.
+    """Return a copy of a (nested) dataclass, or of a dict of such, with some fields replaced; a list becomes a tuple.
 
-    Raises `ThermoxelsError` for a name that the configuration does not have, or a value of another kind.
+    Raises `ThermoxelsError` for a name that the configuration does not have.
     """
-    if isinstance(config, Mapping):
-        fields = dict(config)
-    elif dataclasses.is_dataclass(config) and not isinstance(config, type):
-        fields = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
-    else:
-        raise ThermoxelsError(name, expected="a single value", got="a mapping", remedy="Remove the nested keys.")
-    changed = {}
+    fields, changed = dict(config) if isinstance(config, Mapping) else vars(config), {}
     for key, value in overrides.items():
         if key not in fields:
             expected = f"one of {', '.join(sorted(fields))}"

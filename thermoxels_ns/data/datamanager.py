@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -14,7 +14,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
-from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
+from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
@@ -63,11 +63,10 @@ class ThermalDataManagerConfig(VanillaDataManagerConfig):
 
 
 class ThermalDataManager(VanillaDataManager[ThermalDataset]):
-    """Serves batches of colour and thermal rays of one scene.
+    """Serves batches of colour and thermal rays of one scene, in this process.
 
-    Everything runs in this process. In training (test_mode "val") a batch is a function of seed and step alone; in
-    the other modes nerfstudio's exporters ask for step 0 again and again and want new rays each time, so there the
-    number of the call counts.
+    In training (test_mode "val") a batch depends on seed and step alone. In the other modes nerfstudio's exporters ask
+    for step 0 again and again and want new rays each time, so there the number of the call takes the step's place.
     """
 
     config: ThermalDataManagerConfig
@@ -77,7 +76,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     def setup_train(self) -> None:
         """Precompute the rays and load the photographs of the training split; report what is masked."""
         # Stock exporters and dynamic batches set the number of rays on this object.
-        self.train_pixel_sampler = _ray_counter(self.config.train_num_rays_per_batch)
+        self.train_pixel_sampler = PixelSamplerConfig(num_rays_per_batch=self.config.train_num_rays_per_batch).setup()
         self.train_rays.load()
         dataset = self.train_dataset
         temperatures = dataset.temperature_range
@@ -89,7 +88,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
 
     def setup_eval(self) -> None:
         """Prepare whole evaluation images; rays of the evaluation split are made when first asked for."""
-        self.eval_pixel_sampler = _ray_counter(self.config.eval_num_rays_per_batch)
+        self.eval_pixel_sampler = PixelSamplerConfig(num_rays_per_batch=self.config.eval_num_rays_per_batch).setup()
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
         self.eval_dataloader = RandIndicesEvalDataloader(self.eval_dataset, device=self.device)
         CONSOLE.print(f"Evaluating on {len(self.eval_dataset)} pairs; thermal: {self.eval_dataset.thermal_report()}.")
@@ -97,12 +96,14 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     @cached_property
     def train_rays(self) -> RaySampler:
         """Pixels and rays of the training split."""
-        return self._sampler(self.train_dataset)
+        storage = self.device if self.config.images_on_gpu else "cpu"
+        return RaySampler(self.train_dataset, self.config.streams, storage, self.device)
 
     @cached_property
     def eval_rays(self) -> RaySampler:
         """Pixels and rays of the evaluation split."""
-        return self._sampler(self.eval_dataset)
+        storage = self.device if self.config.images_on_gpu else "cpu"
+        return RaySampler(self.eval_dataset, self.config.streams, storage, self.device)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Return the training batch of a step: rays, and ``image`` (n, 3) and ``thermal`` (n, 1) targets.
@@ -131,24 +132,25 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     def training_rays(
         self, stream: int, max_rays_per_image: int | None = None, *, stride: int = 1, chunk: int = 16384
     ) -> Iterator[RayBundle]:
-        """Give a regular, always equal subset of the training rays, in order, without decoding photographs.
+        """Yield training rays on a regular grid of pixels, always the same ones, without decoding photographs.
 
-        The bits of `core.feature_rays` say which: thermal gives valid pixels only, both bits give every ray once; a
-        stream that does not train (see the option streams) gives nothing. The stride, every n-th pixel in both
-        directions, is widened per photograph until no more than `max_rays_per_image` remain. Bundles have `chunk` rays
-        or fewer.
+        `stream` holds bits of `core.feature_rays`: the thermal bit gives valid pixels only, both bits give every ray
+        once; a stream that does not train (see the option streams) gives nothing. `stride` takes every n-th pixel in
+        both directions, and is widened per photograph until at most `max_rays_per_image` remain. A bundle has at most
+        `chunk` rays.
         """
         return self.train_rays.grid(stream, stride, max_rays_per_image, chunk)
 
     def training_views(self) -> Views:
-        """Give the cameras of the streams that train: the photographs', and the thermal ones where they differ."""
+        """Return the cameras of the streams that train: the photographs', and the thermal ones where they differ."""
         dataset, streams = self.train_dataset, self.config.streams
         chosen = []
         if streams != "thermal" or dataset.thermal_cameras is None:
             chosen.append(dataset.cameras)
         if streams != "rgb" and dataset.thermal_cameras is not None:
             chosen.append(dataset.thermal_cameras)
-        return views_of_cameras(chosen)
+        parts = [views_of_cameras(cameras) for cameras in chosen]
+        return Views(*(np.concatenate(arrays) for arrays in zip(*(vars(part).values() for part in parts))))
 
     def get_train_rays_per_batch(self) -> int:
         """Return how many rays `next_train` gives."""
@@ -160,28 +162,16 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         sampler = self.train_pixel_sampler
         return self.config.train_num_rays_per_batch if sampler is None else sampler.num_rays_per_batch
 
-    def _sampler(self, dataset: ThermalDataset) -> RaySampler:
-        storage = self.device if self.config.images_on_gpu else "cpu"
-        return RaySampler(dataset, self.config.streams, storage, self.device)
 
-
-def _ray_counter(rays: int) -> PixelSampler:
-    return PixelSamplerConfig(num_rays_per_batch=rays).setup()
-
-
-def views_of_cameras(cameras: Sequence[Cameras]) -> Views:
-    """Describe cameras by pinholes without distortion, in order.
+def views_of_cameras(cameras: Cameras) -> Views:
+    """Return views (pinholes without distortion) that stand for cameras, in order.
 
     Lens distortion is ignored, so at the border of a distorted photograph a view reaches a little too far or not far
     enough. A fisheye lens becomes a pinhole with the same focal length whose image spans the same angles along both
     axes, at most 80 degrees to each side; a panorama (equirectangular) becomes the six sides of a cube.
     """
-    parts = [_views_of_one(each.to("cpu")) for each in cameras]
-    names = ("camera_to_world", "focal", "centre", "size")
-    return Views(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    cameras = cameras.to("cpu")
 
-
-def _views_of_one(cameras: Cameras) -> Views:
     def pairs(first: str, second: str, kind: npt.DTypeLike = np.float64) -> npt.NDArray:
         return np.stack([getattr(cameras, name).numpy().reshape(-1).astype(kind) for name in (first, second)], axis=1)
 

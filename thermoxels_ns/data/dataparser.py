@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Optional
 
@@ -15,21 +16,21 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError, ThermalFileError
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
 from thermoxels_ns.data.colmap_tracks import TrackSource, find_feature_rays
-from thermoxels_ns.data.pose_refinement import PoseSource, refine_poses
-from thermoxels_ns.data.scene_box import BoxEvidence, find_scene_box
+from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import BOUNDS_NAME, Frame, SceneFile, read_scene_file
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixels, read_thermal_file
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
 _FAR_SIDES = 16.0
-"""Farther from the origin than this many times its longest side, as in national coordinates, a box is far: shifts in
-single precision are then off by more than a millionth of it."""
+"""Distance from the origin, in longest sides of the box, from which shifts in single precision are off by more than a
+millionth of the box, as in national coordinates."""
 _LEAST_THAT_MEETS = 0.01  # share of the rays that must meet the scene box
 _COLDEST_SKY_K = 150.0  # How far a clear sky may be below the lowest temperature that somebody declares, [K]
 _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
@@ -37,6 +38,11 @@ _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
 _MOST_FRAMES = 64  # frames per resolution that the search for dead pixels keeps in memory
 
 
+LONGEST_SIDE = 640  # pixels along the longer side of the pictures in which features are sought
+MOST_PHOTOGRAPHS = 500  # with more, poses stay as given: the normal equations would take minutes
+FEWEST_PHOTOGRAPHS = 3
+
+PoseSource = Literal["auto", "given"]
 SplitMode = Literal["auto", "filename", "lists", "interval"]
 _KEYS = {"train": "train_filenames", "val": "val_filenames", "test": "test_filenames"}
 
@@ -75,52 +81,29 @@ class ThermalDataParserConfig(DataParserConfig):
 
 
 @dataclass(frozen=True)
-class ThermalSurvey:
-    """What the thermal files of a scene have in common."""
-
-    shapes: dict[Path, tuple[int, int]]  # height and width of every file
-    temperature_range: TemperatureRange
-    """From temperature_bounds.json and the extremes of the training files' valid pixels."""
-    dead_pixels: dict[tuple[int, int], npt.NDArray[np.bool_]]  # mask of stuck pixels for every resolution that has some
-
-
-@dataclass(frozen=True)
-class _World:
-    """The way from input coordinates to nerfstudio's: p_ns = scale * (p + translation); the axes stay.
-
-    The middle of the scene box goes to the origin, and its longest side becomes `SCENE_SIZE`.
-    """
-
-    translation: npt.NDArray[np.float64]
-    scale: float
-
-    def poses(self, poses: npt.NDArray[np.float64]) -> torch.Tensor:
-        """Move camera-to-world matrices, shape (n, 4, 4), to shape (n, 3, 4) float32."""
-        moved = poses[:, :3].copy()
-        moved[:, :, 3] = self.scale * (poses[:, :3, 3] + self.translation)
-        return torch.from_numpy(moved.astype(np.float32))
-
-    @property
-    def transform(self) -> torch.Tensor:
-        """nerfstudio's dataparser_transform, shape (3, 4): rotation and translation before the scale."""
-        return torch.from_numpy(np.column_stack([np.eye(3), self.translation]).astype(np.float32))
-
-
-@dataclass(frozen=True)
 class _Scene:
-    """All that training and evaluation share; made from all frames, so that both agree."""
+    """All that training and evaluation share; made from all frames, so that both agree.
+
+    A point p of input coordinates lies at scale * (p + translation) in nerfstudio's world; the axes stay.
+    """
 
     file: SceneFile
     split: Split
-    survey: ThermalSurvey
-    world: _World
+    shapes: dict[Path, tuple[int, int]]  # height and width of every thermal file
+    translation: npt.NDArray[np.float64]
+    scale: float
+    metadata: dict[str, Any]  # what the outputs of all splits hold
     box: SceneBox
-    input_box: tuple[tuple[float, ...], ...]  # the same in input coordinates
-    pixel_size: float  # width of a photograph's pixel where most of what is seen stands, in nerfstudio's world
     feature_rays: FeatureRays | None  # what the training photographs see of the tracks; nerfstudio's world
     adjusted: bool  # whether the poses of training photographs are others than the json's
     fitted: dict[int, npt.NDArray[np.float64]]
-    """Poses (4, 4) that held-out photographs themselves say, in input coordinates, by number of the frame."""
+    """Poses (4, 4) that were fitted to held-out photographs, in input coordinates, by number of the frame."""
+
+    def placed(self, poses: Sequence[npt.NDArray[np.float64]]) -> torch.Tensor:
+        """Return camera-to-world matrices (4, 4) in nerfstudio's world, shape (n, 3, 4) float32."""
+        moved = np.stack(poses)[:, :3]
+        moved[:, :, 3] = self.scale * (moved[:, :, 3] + self.translation)
+        return torch.from_numpy(moved.astype(np.float32))
 
 
 class ThermalDataParser(DataParser):
@@ -128,12 +111,11 @@ class ThermalDataParser(DataParser):
 
     The outputs' metadata hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``, ``thermal_cameras``
     (`Cameras` of the split, or None where a pair shares camera and resolution), ``thermal_unit``, ``valid_range_c``,
-    ``thermal_dead_pixels`` (a mask per resolution), ``image_scale`` (1 / downscale_factor), ``pixel_size`` (width of a
-    pixel where most of what is seen stands, in the world), ``input_box`` (the scene box in input coordinates),
-    ``scene_name`` and, for train, ``feature_rays`` (`FeatureRays`, or None without tracks).
-    ``fitted_poses`` (n, 3, 4) say where held-out photographs themselves say that they were taken, and
-    ``adjusted_poses`` (camera to world in input coordinates, by the photograph's name) those of training, both None
-    where no pose was adjusted.
+    ``thermal_dead_pixels`` (a mask of stuck pixels by shape of the image), ``image_scale`` (1 / downscale_factor),
+    ``pixel_size`` (width of a pixel where most of what is seen stands, in the world), ``input_box`` (the scene box in
+    input coordinates), ``scene_name`` and, for train, ``feature_rays`` (`FeatureRays`, or None without tracks).
+    Where poses were adjusted, ``adjusted_poses`` are those of training photographs (camera to world in input
+    coordinates, by the photograph's name), and ``fitted_poses`` (n, 3, 4) those of held-out ones; else both are None.
     """
 
     config: ThermalDataParserConfig
@@ -148,60 +130,37 @@ class ThermalDataParser(DataParser):
         if self._scene is None:
             self._scene = self._read_scene()
         scene = self._scene
-        chosen = {"train": scene.split.train, "val": scene.split.val, "test": scene.split.test}.get(split)
-        if chosen is None:
+        if split not in _KEYS:
             raise SceneError("split", expected="train, val or test", got=split, remedy="Choose one of them.")
+        chosen: list[int] = getattr(scene.split, split)
         frames = [scene.file.frames[index] for index in chosen]
-        shapes = [scene.survey.shapes[frame.thermal] for frame in frames]
-        factor = 1.0 / self._downscale()
-        colour = [frame.intrinsics.scaled(factor) for frame in frames]
-        thermal = [_thermal_intrinsics(frame, shape) for frame, shape in zip(frames, shapes)]
-        cameras = _cameras(colour, scene.world.poses(np.stack([frame.pose for frame in frames])))
-        thermal_poses = np.stack([f.pose if f.thermal_pose is None else f.thermal_pose for f in frames])
-        thermal_cameras = _cameras(thermal, scene.world.poses(thermal_poses))
-        masks = [frame.mask for frame in frames if frame.mask is not None]
+        factor = 1.0 / (self.config.downscale_factor or 1.0)
+        poses = [frame.pose for frame in frames]
+        cameras = _cameras([frame.intrinsics.scaled(factor) for frame in frames], scene.placed(poses))
+        thermal_cameras = _cameras(
+            [_thermal_intrinsics(frame, scene.shapes[frame.thermal]) for frame in frames],
+            scene.placed([f.pose if f.thermal_pose is None else f.thermal_pose for f in frames]),
+        )
+        fitted = [scene.fitted.get(number, pose) for number, pose in zip(chosen, poses)]
+        training = split == "train"
         return DataparserOutputs(
             image_filenames=[frame.image for frame in frames],
             cameras=cameras,
             scene_box=scene.box,
-            mask_filenames=masks or None,
-            dataparser_transform=scene.world.transform,
-            dataparser_scale=scene.world.scale,
+            mask_filenames=[frame.mask for frame in frames if frame.mask is not None] or None,
+            dataparser_transform=torch.from_numpy(np.column_stack([np.eye(3), scene.translation]).astype(np.float32)),
+            dataparser_scale=scene.scale,
             metadata={
+                **scene.metadata,
                 "image_scale": factor,
-                "temperature_range": scene.survey.temperature_range,
                 "thermal_filenames": [frame.thermal for frame in frames],
                 "thermal_cameras": None if _same_cameras(cameras, thermal_cameras) else thermal_cameras,
-                "thermal_unit": scene.file.unit,
-                "valid_range_c": tuple(self.config.valid_range_c),
-                "thermal_dead_pixels": scene.survey.dead_pixels,
-                "pixel_size": scene.pixel_size / factor,
-                "input_box": scene.input_box,
-                "scene_name": scene.file.folder.resolve().name,
-                "feature_rays": scene.feature_rays if split == "train" else None,
-                "fitted_poses": self._fitted_poses(scene, chosen),
-                "adjusted_poses": {f.image.name: f.pose for f in frames}
-                if scene.adjusted and split == "train"
-                else None,
+                "pixel_size": scene.metadata["pixel_size"] / factor,
+                "feature_rays": scene.feature_rays if training else None,
+                "fitted_poses": scene.placed(fitted) if scene.fitted.keys() & set(chosen) else None,
+                "adjusted_poses": {f.image.name: f.pose for f in frames} if scene.adjusted and training else None,
             },
         )
-
-    @staticmethod
-    def _fitted_poses(scene: _Scene, chosen: Sequence[int]) -> torch.Tensor | None:
-        """Poses (n, 3, 4) in nerfstudio's world that held-out photographs say; None where nobody's differ."""
-        if not any(number in scene.fitted for number in chosen):
-            return None
-        frames = scene.file.frames
-        return scene.world.poses(np.stack([scene.fitted.get(number, frames[number].pose) for number in chosen]))
-
-    def _downscale(self) -> float:
-        factor = self.config.downscale_factor
-        if factor is None:
-            return 1.0
-        if not factor >= 1:
-            expected = "a number of at least 1"
-            raise SceneError("downscale_factor", expected=expected, got=factor, remedy="Pass 2, 4 or 8.")
-        return float(factor)
 
     def _read_scene(self) -> _Scene:
         config = self.config
@@ -209,6 +168,9 @@ class ThermalDataParser(DataParser):
         if not -ZERO_CELSIUS_K <= low < high:
             expected, got = "a lower and a higher temperature in degrees Celsius", f"{low} and {high}"
             raise SceneError("valid_range_c", expected=expected, got=got, remedy="Pass --valid-range-c -100 2000.")
+        if config.downscale_factor is not None and not config.downscale_factor >= 1:
+            expected, got = "a number of at least 1", config.downscale_factor
+            raise SceneError("downscale_factor", expected=expected, got=got, remedy="Pass 2, 4 or 8.")
         file = read_scene_file(Path(config.data), config.missing_thermal)
         names = [frame.name for frame in file.frames]
         split = split_frames(names, file.meta, config.eval_mode, config.eval_interval, file.left_out)
@@ -216,52 +178,55 @@ class ThermalDataParser(DataParser):
         if rays is None and config.refine_poses == "auto":
             file, fitted = refine_poses(given, split.train, CONSOLE.print)
         evidence = find_scene_box(file, config.scene_box, split.train)
-        world, box, input_box, pixel_size = _place(evidence)
-        paths, training = [f.thermal for f in file.frames], {file.frames[index].thermal for index in split.train}
-        survey = survey_thermal_files(paths, file.unit, config.valid_range_c, file.bounds_c, training)
-        _refuse_several_sizes(file.frames, survey.shapes)
-        met = _share_that_meets([file.frames[index] for index in split.train], world, box, evidence.source)
-        evaluation = set(split.val) | set(split.test)
+        box = evidence.box()
+        translation, longest = -box.mean(axis=0), float((box[1] - box[0]).max())
+        if np.abs(box).max() > _FAR_SIDES * longest:
+            # nerfstudio keeps the way back in single precision; without rounding here, both would differ by metres.
+            translation = translation.astype(np.float32).astype(np.float64)
+        scale = SCENE_SIZE / longest
+        paths, training = [f.thermal for f in file.frames], [file.frames[index] for index in split.train]
+        shapes, temperatures, dead = survey_thermal_files(
+            paths, file.unit, config.valid_range_c, file.bounds_c, {frame.thermal for frame in training}
+        )
+        _refuse_several_sizes(file.frames, shapes)
+        metadata = {
+            "temperature_range": temperatures,
+            "thermal_unit": file.unit,
+            "valid_range_c": tuple(config.valid_range_c),
+            "thermal_dead_pixels": dead,
+            "pixel_size": scale * evidence.pixel_size(box),
+            "input_box": tuple(map(tuple, box.tolist())),
+            "scene_name": file.folder.resolve().name,
+        }
+        placed = SceneBox(aabb=torch.from_numpy((scale * (box + translation)).astype(np.float32)))
+        if rays is not None:
+            rays = rays.moved(np.eye(3), translation, scale)
+        scene = _Scene(file, split, shapes, translation, scale, metadata, placed, rays, file is not given, fitted)
+        met = _share_that_meets(training, scene.placed([f.pose for f in training]), placed, evidence.source)
         metres = file.meta.get("metres_per_unit")
-        sides = (box.aabb[1] - box.aabb[0]).double() * (metres or 1.0) / world.scale
+        sides = (placed.aabb[1] - placed.aabb[0]).double() * (metres or 1.0) / scale
         size = f"{' x '.join(f'{side:.3g}' for side in sides.tolist())} {'m' if metres else 'units'}"
         CONSOLE.print(
-            f"Scene {file.folder.resolve().name}: {len(names)} frames, {len(split.train)} train, {len(evaluation)} "
-            f"evaluate ({split.how}); box from {evidence.source}, {size}, which {met:.0%} of the rays meet; "
-            f"{survey.temperature_range.min_c:.2f} to {survey.temperature_range.max_c:.2f} C."
+            f"Scene {metadata['scene_name']}: {len(names)} frames, {len(split.train)} train, "
+            f"{len({*split.val, *split.test})} evaluate ({split.how}); box from {evidence.source}, {size}, which "
+            f"{met:.0%} of the rays meet; {temperatures.min_c:.2f} to {temperatures.max_c:.2f} C."
         )
-        if file.bounds_swapped:
-            low, high = file.bounds_c or (0.0, 0.0)
-            said = f"{BOUNDS_NAME} has its lowest temperature above its highest; read as {low:g} to {high:g} C."
-            CONSOLE.print(said, style="bold yellow")
+        if file.bounds_swapped and file.bounds_c is not None:
+            said = "{} has its lowest temperature above its highest; read as {:g} to {:g} C."
+            CONSOLE.print(said.format(BOUNDS_NAME, *file.bounds_c), style="bold yellow")
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
-        if rays is not None:
-            rays = rays.moved(np.eye(3), world.translation, world.scale)
-        return _Scene(file, split, survey, world, box, input_box, pixel_size, rays, file is not given, fitted)
+        return scene
 
 
-def _place(evidence: BoxEvidence) -> tuple[_World, SceneBox, tuple[tuple[float, ...], ...], float]:
-    """Choose origin and scale, and express the scene box and a pixel's width in the new world."""
-    box = evidence.box()
-    translation, longest = -box.mean(axis=0), float((box[1] - box[0]).max())
-    if np.abs(box).max() > _FAR_SIDES * longest:
-        # As nerfstudio keeps it for the way back: five million metres from the origin that is off by half a metre.
-        translation = translation.astype(np.float32).astype(np.float64)
-    scale = SCENE_SIZE / longest
-    placed = SceneBox(aabb=torch.from_numpy((scale * (box + translation)).astype(np.float32)))
-    return _World(translation, scale), placed, tuple(map(tuple, box.tolist())), scale * evidence.pixel_size(box)
+def _share_that_meets(frames: list[Frame], poses: torch.Tensor, box: SceneBox, source: str) -> float:
+    """Return the share of the rays of photographs that meet the scene box, on a grid of 8 x 8 rays each.
 
-
-def _share_that_meets(frames: list[Frame], world: _World, box: SceneBox, source: str) -> float:
-    """Share of the rays of photographs that meet the scene box, on a grid of 8 x 8 rays each.
-
-    Lenses other than perspective ones count as seeing it. A `SceneError` is raised where next to no ray does.
+    Lenses other than perspective ones count as seeing it. Raises `SceneError` where next to no ray does.
     """
     corners, shares = box.aabb.double().numpy(), []
-    poses = world.poses(np.stack([frame.pose for frame in frames])).double().numpy()
     x, y = (each.ravel() for each in np.meshgrid(*2 * [(np.arange(8) + 0.5) / 8]))
-    for frame, pose in zip(frames, poses):
+    for frame, pose in zip(frames, poses.double().numpy()):
         lens = frame.intrinsics
         if lens.lens != "perspective":
             return 1.0
@@ -283,14 +248,14 @@ def _share_that_meets(frames: list[Frame], world: _World, box: SceneBox, source:
 
 
 def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int]]) -> None:
-    """Refuse thermal images of several sizes beside photographs of one, unless each has a camera of its own."""
-    sizes: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    """Refuse thermal images of several sizes beside photographs of one size, unless each has a camera of its own."""
     shared = [frame for frame in frames if frame.thermal_intrinsics is None]
+    sizes: defaultdict[tuple[int, int], Counter[tuple[int, int]]] = defaultdict(Counter)
     for frame in shared:
-        sizes.setdefault((frame.intrinsics.height, frame.intrinsics.width), []).append(shapes[frame.thermal])
-    usual = {photograph: Counter(each).most_common(1)[0][0] for photograph, each in sizes.items()}
+        sizes[frame.intrinsics.width, frame.intrinsics.height][shapes[frame.thermal]] += 1
     for frame in shared:
-        (height, width), found = usual[frame.intrinsics.height, frame.intrinsics.width], shapes[frame.thermal]
+        ((height, width), _), *_ = sizes[frame.intrinsics.width, frame.intrinsics.height].most_common(1)
+        found = shapes[frame.thermal]
         if found != (height, width):
             expected = f"thermal images of one size, {width} x {height} pixels as most have"
             remedy = "Remove the frame, or give it a 'thermal_camera' of its own in the json."
@@ -331,25 +296,22 @@ def survey_thermal_files(
     unit: ThermalUnit,
     valid_range_c: tuple[float, float],
     bounds_c: tuple[float, float] | None,
-    training: Collection[Path] | None = None,
-) -> ThermalSurvey:
-    """Read every thermal file once.
+    training: Collection[Path],
+) -> tuple[dict[Path, tuple[int, int]], TemperatureRange, dict[tuple[int, int], npt.NDArray[np.bool_]]]:
+    """Read every thermal file; return their shapes, the temperature range, and masks of stuck pixels by shape.
 
-    Range and stuck pixels come from the files in `training` alone (None: all). The range that the scene declares,
-    `bounds_c`, is widened to the extremes of training files that hold temperatures of their own; files that hold shares
-    of the range cannot exceed it. Temperatures in degrees Celsius.
+    Range and stuck pixels come from the files in `training` alone. The range that the scene declares, `bounds_c`, is
+    widened to the extremes of training files; files that hold shares of that range cannot exceed it. [degrees Celsius]
 
     Raises:
-        ThermalFileError: A file cannot be read or has no valid pixel at all.
+        ThermalFileError: A file cannot be read, has no valid pixel, or has another unit than bounds or other files.
     """
     shapes: dict[Path, tuple[int, int]] = {}
     extremes: dict[Path, tuple[float, float]] = {}
     middles: dict[Path, float] = {}
     kept: dict[tuple[int, int], list[npt.NDArray[np.float32]]] = {}
-    trains = [training is None or path in training for path in paths]
-    # Counted among the training files: every other file of all may be an evaluation's.
-    step = -(-sum(trains) // _MOST_FRAMES)
-    for path, is_training in zip(paths, trains):
+    step = -(-len(training) // _MOST_FRAMES)
+    for path in paths:
         temperature_c = read_thermal_file(path, unit, valid_range_c).temperature_c
         height, width = temperature_c.shape
         shapes[path] = (height, width)
@@ -357,7 +319,7 @@ def survey_thermal_files(
             expected = f"temperatures from {valid_range_c[0]} to {valid_range_c[1]} C"
             remedy = "Check thermal_unit or temperature_bounds.json, or widen --valid-range-c."
             raise ThermalFileError(str(path), expected=expected, got="no valid pixel", remedy=remedy)
-        if not is_training:
+        if path not in training:
             continue
         if len(extremes) % step == 0:
             kept.setdefault((height, width), []).append(temperature_c)
@@ -378,11 +340,11 @@ def survey_thermal_files(
     low, high = min(lows), max(highs)
     if bounds_c is not None:
         low, high = min(low, bounds_c[0]), max(high, bounds_c[1])
-    return ThermalSurvey(shapes, TemperatureRange.spanning(low, high), dead)
+    return shapes, TemperatureRange.spanning(low, high), dead
 
 
 def _thermal_intrinsics(frame: Frame, shape: tuple[int, int]) -> Camera:
-    """The projection of a thermal image: its own camera's, or the photograph's at the thermal resolution."""
+    """Return a thermal image's camera: its own, or the photograph's at the thermal resolution."""
     height, width = shape
     own = frame.thermal_intrinsics
     if own is not None:
@@ -418,11 +380,10 @@ def _cameras(intrinsics: list[Camera], poses: torch.Tensor) -> Cameras:
 
 
 def _same_cameras(first: Cameras, second: Cameras) -> bool:
-    """True if both give the same rays for the same pixels."""
-    for name in ("width", "height", "camera_type"):
-        if not torch.equal(getattr(first, name), getattr(second, name)):
-            return False
+    """Return whether both give the same rays for the same pixels."""
     return all(
+        torch.equal(getattr(first, name), getattr(second, name)) for name in ("width", "height", "camera_type")
+    ) and all(
         torch.allclose(getattr(first, name), getattr(second, name), rtol=1e-6, atol=1e-7)
         for name in ("fx", "fy", "cx", "cy", "distortion_params", "camera_to_worlds")
     )
@@ -439,29 +400,36 @@ class Split:
 
 
 def split_frames(
-    names: Sequence[str],
-    meta: Mapping[str, Any],
-    mode: SplitMode,
-    interval: int,
-    left_out: Sequence[str] = (),
+    names: Sequence[str], meta: Mapping[str, Any], mode: SplitMode, interval: int, left_out: Sequence[str] = ()
 ) -> Split:
     """Split frames, given by their sorted names, into training and evaluation.
 
     "auto" takes the first that the scene has: names with frame_train_ and frame_eval_, lists in the json
     (train_filenames, val_filenames, test_filenames), every n-th frame from half the interval on, so that the ends of
-    the sequence, which the others see least, stay in training. Lists may hold names left out.
+    the sequence, which the other frames see least, stay in training. Lists may hold names in `left_out`.
 
     Raises:
         SceneError: A side is empty, a frame is on both sides or a listed name is unknown.
     """
     tagged = [("frame_train_" in Path(n).name, "frame_eval_" in Path(n).name) for n in names]
-    lists = any(key in meta for key in _KEYS.values())
     if mode == "filename" or (mode == "auto" and any(train or test for train, test in tagged)):
-        split = _by_name(names, tagged)
-    elif mode == "lists" or (mode == "auto" and lists):
+        unclear = [name for name, (train, evaluate) in zip(names, tagged) if train == evaluate]
+        if unclear:
+            expected, got = "frame_train_ or frame_eval_ in every name", f"{unclear[0]} ({len(unclear)} such)"
+            remedy = "Rename them or pass --eval-mode interval."
+            raise SceneError("split by file name", expected=expected, got=got, remedy=remedy)
+        train, val = ([i for i, tags in enumerate(tagged) if tags[side]] for side in (0, 1))
+        split = Split(train, val, val, "by file name")
+    elif mode == "lists" or (mode == "auto" and not meta.keys().isdisjoint(_KEYS.values())):
         split = _by_lists(names, meta, left_out)
     else:
-        split = _by_interval(names, interval)
+        if interval < 2:
+            expected, remedy = "an interval of at least 2", "Pass --eval-interval 8."
+            raise SceneError("eval_interval", expected=expected, got=interval, remedy=remedy)
+        start = interval // 2
+        val = list(range(start, len(names), interval))
+        train = [i for i in range(len(names)) if i % interval != start]
+        split = Split(train, val, val, f"every {interval}th frame from number {start}")
     for side, chosen in (("training", split.train), ("evaluation", split.val), ("evaluation", split.test)):
         if not chosen:
             expected = f"at least one of the {len(names)} frames ({split.how})"
@@ -475,48 +443,88 @@ def split_frames(
     return split
 
 
-def _by_name(names: Sequence[str], tagged: list[tuple[bool, bool]]) -> Split:
-    unclear = [name for name, (train, evaluate) in zip(names, tagged) if train == evaluate]
-    if unclear:
-        expected, got = "frame_train_ or frame_eval_ in every name", f"{unclear[0]} ({len(unclear)} such)"
-        remedy = "Rename them or pass --eval-mode interval."
-        raise SceneError("split by file name", expected=expected, got=got, remedy=remedy)
-    evaluate = [i for i, (_, test) in enumerate(tagged) if test]
-    return Split([i for i, (train, _) in enumerate(tagged) if train], evaluate, evaluate, "by file name")
-
-
 def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[str]) -> Split:
+    """Split by the lists in the json; a list that is absent holds the frames that no other list holds."""
     position = {Path(name).as_posix(): i for i, name in enumerate(names)}
-    found: dict[str, list[int] | None] = {}
+    found: dict[str, list[int]] = {}
     for side, key in _KEYS.items():
         given = meta.get(key, [])
         if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
             remedy = 'Write ["images/a.jpg", "images/b.jpg"], for example.'
             raise SceneError(key, expected="a list of file names", got=repr(given)[:80], remedy=remedy)
-        listed = [Path(name).as_posix() for name in given] if key in meta else None
-        listed = None if listed is None else [name for name in listed if name not in left_out]
-        unknown = [name for name in listed or [] if name not in position]
+        listed = [name for name in (Path(each).as_posix() for each in given) if name not in left_out]
+        unknown = [name for name in listed if name not in position]
         if unknown:
             remedy = "Correct the list; it must write names as 'file_path' does."
             got = f"{unknown[0]} ({len(unknown)} unknown)"
             raise SceneError(key, expected="names that are in 'frames'", got=got, remedy=remedy)
-        found[side] = None if listed is None else sorted({position[name] for name in listed})
-    val = found["val"] or found["test"]
-    test = found["test"] or found["val"]
-    held = set(val or []) | set(test or [])
-    train = found["train"]
-    if train is None:
-        train = [i for i in range(len(names)) if i not in held]
-    if val is None or test is None:
+        found[side] = sorted({position[name] for name in listed})
+    train, val, test = found["train"], found["val"] or found["test"], found["test"] or found["val"]
+    if _KEYS["train"] not in meta:
+        train = [i for i in range(len(names)) if i not in {*val, *test}]
+    if not val:
         val = test = [i for i in range(len(names)) if i not in set(train)]
     return Split(train, val, test, f"by {', '.join(key for key in _KEYS.values() if key in meta)} in the json")
 
 
-def _by_interval(names: Sequence[str], interval: int) -> Split:
-    start = interval // 2
-    if interval < 2:
-        expected, remedy = "an interval of at least 2", "Pass --eval-interval 8."
-        raise SceneError("eval_interval", expected=expected, got=interval, remedy=remedy)
-    evaluate = list(range(start, len(names), interval))
-    train = [i for i in range(len(names)) if i % interval != start]
-    return Split(train, evaluate, evaluate, f"every {interval}th frame from number {start}")
+def refine_poses(
+    scene: SceneFile, training: Sequence[int], say: Callable[[str], None]
+) -> tuple[SceneFile, dict[int, npt.NDArray[np.float64]]]:
+    """Adjust the poses of the photographs that train to each other, if features that took no part then fit better.
+
+    Thermal cameras of their own follow their photographs. Held-out photographs keep the poses given, so that they
+    judge; the poses fitted to their own features are returned beside.
+
+    Returns:
+        The scene with poses adjusted (the same scene if those given fit), and by number of the frame the poses (4, 4)
+        that were fitted to held-out photographs.
+    """
+    began = time.perf_counter()
+    frames = scene.frames
+    others = [number for number in range(len(frames)) if number not in set(training)]
+    usable = all(frame.intrinsics.lens == "perspective" for frame in frames)
+    if not usable or not FEWEST_PHOTOGRAPHS <= len(training) <= MOST_PHOTOGRAPHS:
+        return scene, {}
+    from thermoxels_ns.multiview.bundle_adjustment import adjust_poses, features_of, find_tracks
+
+    pictures = [_picture(frames[number]) for number in training]
+    features, cameras = [features_of(picture, mask) for picture, mask, _ in pictures], [each[2] for each in pictures]
+    poses, focal = np.stack([frames[number].pose for number in training]), np.array([c.fl_x for c in cameras])
+    found = adjust_poses(find_tracks(features, cameras, poses), poses, focal)
+    if found is None:
+        say(f"poses: kept, features that photographs share ask for no others; {time.perf_counter() - began:.1f} s")
+        return scene, {}
+    moved = list(frames)
+    for number, pose in zip(training, found.poses):
+        frame = frames[number]
+        thermal = None if frame.thermal_pose is None else pose @ np.linalg.inv(frame.pose) @ frame.thermal_pose
+        moved[number] = replace(frame, pose=pose, thermal_pose=thermal)
+    for number in others:
+        picture, mask, camera = _picture(frames[number])
+        features.append(features_of(picture, mask))
+        cameras.append(camera)
+    every = np.concatenate((found.poses, [frames[number].pose for number in others])) if others else found.poses
+    tracks, fitted = find_tracks(features, cameras, every), {}
+    held_out = np.zeros(tracks.points, dtype=bool)
+    held_out[tracks.point[tracks.photograph >= len(training)]] = True
+    focal = np.array([camera.fl_x for camera in cameras])
+    theirs = adjust_poses(tracks.of_points(held_out), every, focal, fixed=len(training)) if held_out.any() else None
+    if theirs is not None:
+        fitted = dict(zip(others, theirs.poses[len(training) :]))
+    say(
+        f"poses: those given are off, adjusted to {found.tracks} points that photographs share; features that took no "
+        f"part lie {found.after_px:.2f} pixels from their points, {found.before_px:.2f} with the poses given; "
+        f"{time.perf_counter() - began:.1f} s (--refine-poses given keeps them)"
+    )
+    return replace(scene, frames=moved), fitted
+
+
+def _picture(frame: Frame) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_] | None, Camera]:
+    """Return a photograph in grey of at most `LONGEST_SIDE` pixels, its mask, and its camera at that size."""
+    grey, mask = frame.read_picture("L", LONGEST_SIDE)
+    factor = LONGEST_SIDE / max(grey.size)
+    if factor < 1.0:
+        size = (max(1, round(factor * grey.size[0])), max(1, round(factor * grey.size[1])))
+        grey, mask = grey.resize(size, Image.Resampling.BOX), mask and mask.resize(size, Image.Resampling.NEAREST)
+    use = None if mask is None else np.array(mask) > 0
+    return np.array(grey), use, frame.intrinsics.resized(*grey.size)

@@ -27,9 +27,9 @@ class ThermalDataset(InputDataset):
     """Photographs of one split with their thermal partners.
 
     An item holds ``image_idx``, ``image`` (h, w, 3), ``mask`` where the scene has masks, ``thermal`` (ht, wt, 1)
-    float32 normalised by the scene's range and 0 where invalid, ``thermal_valid`` (ht, wt, 1) bool, and
-    ``thermal_camera``, nerfstudio `Cameras` of shape (1,), where the thermal camera is not the photograph's; and, where
-    held-out photographs say that they were taken from elsewhere, ``fitted_camera`` and ``fitted_thermal_camera``.
+    float32 normalised by the scene's range and 0 where invalid, and ``thermal_valid`` (ht, wt, 1) bool. Where the
+    thermal camera is not the photograph's, it holds ``thermal_camera``, nerfstudio `Cameras` of shape (1,). Where poses
+    were fitted to held-out photographs, it holds ``fitted_camera`` and ``fitted_thermal_camera``.
     """
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
@@ -101,7 +101,7 @@ class ThermalDataset(InputDataset):
         return data
 
     def _fitted(self, cameras: Cameras, image_idx: int) -> Cameras:
-        """One of the cameras, `Cameras` of shape (1,), moved as its photograph moves to the pose that it says."""
+        """Return one of the cameras, shape (1,), moved as the photograph moves to its fitted pose."""
         moved = deepcopy(cameras[image_idx : image_idx + 1])
         given, own = (_square(c.camera_to_worlds[image_idx]) for c in (self.cameras, cameras))
         pose = _square(self.metadata["fitted_poses"][image_idx]) @ torch.linalg.inv(given) @ own
@@ -125,7 +125,7 @@ class ThermalDataset(InputDataset):
         return torch.from_numpy(resized > 0)[..., None]
 
     def get_thermal(self, image_idx: int) -> tuple[Float[Tensor, "ht wt 1"], Bool[Tensor, "ht wt 1"]]:
-        """Return the normalised temperatures (0 where invalid) and where they are valid; read once, then kept."""
+        """Return the normalised temperatures (0 where invalid) and where they are valid; the file is read once."""
         return self._read_thermal(image_idx)[:2]
 
     def thermal_report(self) -> PixelReport:
@@ -134,12 +134,10 @@ class ThermalDataset(InputDataset):
 
     def _read_thermal(self, image_idx: int) -> tuple[Tensor, Tensor, PixelReport]:
         if image_idx not in self._thermal:
-            given = self.metadata
-            path, valid_range_c = given["thermal_filenames"][image_idx], given["valid_range_c"]
-            image = read_thermal_file(path, given["thermal_unit"], valid_range_c)
-            valid = np.isfinite(image.temperature_c)
-            report = image.report
-            dead = self.metadata["thermal_dead_pixels"].get(valid.shape)
+            path, given = self.metadata["thermal_filenames"][image_idx], self.metadata
+            image = read_thermal_file(path, given["thermal_unit"], given["valid_range_c"])
+            valid, report = np.isfinite(image.temperature_c), image.report
+            dead = given["thermal_dead_pixels"].get(valid.shape)
             if dead is not None:
                 report = report + PixelReport(dead=int((valid & dead).sum()))
                 valid &= ~dead
@@ -151,7 +149,7 @@ class ThermalDataset(InputDataset):
         return self._thermal[image_idx]
 
     def _resized(self, picture: Image.Image, image_idx: int, filter_: Image.Resampling) -> Image.Image:
-        """Resample to the camera's resolution; the last part of a pixel is cut, as it is from the intrinsics."""
+        """Resample to the camera's resolution; the last part of a pixel is cut off, as in the intrinsics."""
         width, height = int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx])
         if picture.size == (width, height):
             return picture

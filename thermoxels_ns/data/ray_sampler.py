@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -45,9 +46,6 @@ class RaySampler:
         self.streams: Streams = streams
         self.storage, self.device = torch.device(storage), torch.device(device)
         self.shared = dataset.thermal_cameras is None
-        self._colour_rays: CameraRays | None = None
-        self._thermal_rays: CameraRays | None = None
-        self._colours: Tensor | None = None
 
         thermal, valid = zip(*(dataset.get_thermal(index) for index in range(len(dataset))))
         self._temperatures = torch.cat([image.reshape(-1) for image in thermal]).to(self.storage)
@@ -62,35 +60,38 @@ class RaySampler:
         self._thermal_pixels = _numbers(self._valid, "thermal pixels", "Check the masks and the thermal files.")
         self._valid = self._valid.to(self.storage)
 
-    @property
+    @cached_property
     def colour_rays(self) -> CameraRays:
         """Rays of the photographs."""
-        if self._colour_rays is None:
-            self._colour_rays = CameraRays(self.dataset.cameras, self.storage)
-        return self._colour_rays
+        return CameraRays(self.dataset.cameras, self.storage)
 
-    @property
+    @cached_property
     def thermal_rays(self) -> CameraRays:
         """Rays of the thermal images; the photographs' where the camera is shared."""
-        if self.dataset.thermal_cameras is None:
-            return self.colour_rays
-        if self._thermal_rays is None:
-            self._thermal_rays = CameraRays(self.dataset.thermal_cameras, self.storage)
-        return self._thermal_rays
+        cameras = self.dataset.thermal_cameras
+        return self.colour_rays if cameras is None else CameraRays(cameras, self.storage)
+
+    @cached_property
+    def _colours(self) -> Tensor:
+        """All photographs one after the other, shape (pixels, 3), uint8."""
+        first = self.colour_rays.first_pixel.tolist()
+        colours = torch.empty(first[-1], 3, dtype=torch.uint8)
+        for index in range(len(self.dataset)):
+            colours[first[index] : first[index + 1]] = self.dataset.get_image_uint8(index).reshape(-1, 3)
+        return colours.to(self.storage)
 
     def load(self) -> None:
         """Decode all photographs that the streams need and fill the tables of rays."""
         if self.streams != "thermal":
-            self._load_colours()
-            _ = self.colour_rays
+            _ = self._colours
         if self.streams != "rgb":
             _ = self.thermal_rays
 
     def draw(self, generator: torch.Generator, rgb_rays: int, thermal_rays: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Draw rays with equal chance for every pixel, with replacement; numbers from the CPU, so that devices agree.
+        """Draw rays with equal chance for every pixel, with replacement; random numbers are those of the CPU.
 
-        With the streams "thermal" and a shared camera `rgb_rays` go through thermal pixels; `thermal_rays` count where
-        thermal cameras are not the photographs'.
+        `thermal_rays` counts only where thermal cameras are not the photographs'. With the streams "thermal" and a
+        shared camera, `rgb_rays` go through thermal pixels.
 
         Returns:
             Rays (colour first, then thermal only) and the targets ``image`` (n, 3) and ``thermal`` (n, 1), float32 and
@@ -101,7 +102,7 @@ class RaySampler:
         if self.streams != "thermal":
             pixels = self._pick(self._rgb_pixels, len(self.colour_rays), rgb_rays, generator)
             columns.append(self.colour_rays.columns(pixels))
-            images.append(self._load_colours().index_select(0, pixels).to(self.device).to(torch.float32) / 255.0)
+            images.append(self._colours.index_select(0, pixels).to(self.device).to(torch.float32) / 255.0)
             stream = torch.full((rgb_rays, 1), RGB_STREAM, dtype=torch.uint8, device=self.storage)
             temperature = torch.zeros(rgb_rays, 1, device=self.storage)
             if self.shared and self.streams == "both":
@@ -123,7 +124,7 @@ class RaySampler:
         return self._bundle(rays, torch.cat(bits)), batch
 
     def grid(self, stream: int, stride: int, max_rays_per_image: int | None, chunk: int) -> Iterator[RayBundle]:
-        """Give the usable pixels of a stream on a regular grid, see `ThermalDataManager.training_rays`."""
+        """Yield the usable pixels of a stream on a regular grid, see `ThermalDataManager.training_rays`."""
         if not 0 < stream <= RGB_STREAM | THERMAL_STREAM or min(stride, chunk, max_rays_per_image or 1) < 1:
             raise ValueError(f"no such grid: {stream=}, {stride=}, {max_rays_per_image=}, {chunk=}")
         wanted = stream & _BITS[self.streams]
@@ -147,16 +148,6 @@ class RaySampler:
         moved = {name: column.to(self.device, non_blocking=True) for name, column in columns.items()}
         return RayBundle(**moved, metadata={"stream": bits.to(self.device, non_blocking=True)})
 
-    def _load_colours(self) -> Tensor:
-        """All photographs one after the other, shape (pixels, 3), uint8."""
-        if self._colours is None:
-            first = self.colour_rays.first_pixel.tolist()
-            colours = torch.empty(first[-1], 3, dtype=torch.uint8)
-            for index in range(len(self.dataset)):
-                colours[first[index] : first[index + 1]] = self.dataset.get_image_uint8(index).reshape(-1, 3)
-            self._colours = colours.to(self.storage)
-        return self._colours
-
     def _pick(
         self, numbers: Tensor | None, total: int, count: int, generator: torch.Generator
     ) -> Int[Tensor, " count"]:
@@ -168,7 +159,7 @@ class RaySampler:
 
 
 def _regular(rays: CameraRays, stride: int, max_rays_per_image: int | None) -> Int[Tensor, " n"]:
-    """Pixels of a regular grid in every photograph, at most `max_rays_per_image` of each."""
+    """Return the pixels of a regular grid in every photograph, at most `max_rays_per_image` of each."""
     strides = torch.full_like(rays.widths, stride)
     if max_rays_per_image is not None:
         # Rows and columns are rounded up, so the square root alone may give a few pixels too many.
@@ -180,15 +171,15 @@ def _regular(rays: CameraRays, stride: int, max_rays_per_image: int | None) -> I
 
 
 def draw_generator(*key: int) -> torch.Generator:
-    """Make a generator on the CPU whose numbers depend on `key` alone (non-negative integers).
+    """Return a generator on the CPU whose numbers depend on `key` alone (non-negative integers).
 
-    torch seeds its CPU generator with 32 bits, so the key is hashed first instead of added up.
+    torch seeds its CPU generator with 32 bits, so the key is hashed instead of added up.
     """
     return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1)[0]))
 
 
 def _numbers(usable: Bool[Tensor, " pixels"] | None, name: str, remedy: str) -> Int[Tensor, " usable"] | None:
-    """Numbers of the usable pixels, or None if all are."""
+    """Return the numbers of the usable pixels; None: all are usable."""
     if usable is None or bool(usable.all()):
         return None
     numbers = usable.nonzero()[:, 0]
@@ -198,11 +189,11 @@ def _numbers(usable: Bool[Tensor, " pixels"] | None, name: str, remedy: str) -> 
 
 
 class CameraRays:
-    """Every pixel of every camera has one number: cameras in order, rows from the top, columns from the left.
+    """Rays of all pixels; pixels are numbered camera by camera, rows from the top, columns from the left.
 
     Directions in camera axes depend on the intrinsics only, so one table serves all photographs of a camera; a ray
     is then one look-up and one rotation. The table is filled by nerfstudio's `Cameras.generate_rays`, so lens
-    distortion is the same as in evaluation.
+    distortion is the same as in evaluation. Above `table_limit_bytes` directions are computed when asked for.
 
     Attributes:
         first_pixel: Number of the first pixel of each camera and, last, the number of pixels, shape (n + 1,).
@@ -222,7 +213,10 @@ class CameraRays:
         self._rotations = poses[:, :, :3].contiguous().to(self.device)
         self._origins = poses[:, :, 3].contiguous().to(self.device)
 
-        models = self._models()
+        # Cameras with equal rows of numbers have equal directions in camera axes.
+        names = ["fx", "fy", "cx", "cy", "width", "height", "camera_type", "distortion_params"]
+        parts = [part.double() for name in names if (part := getattr(self.cameras, name)) is not None]
+        models = torch.cat(parts, dim=-1).numpy()
         _, first, self_model = np.unique(models, axis=0, return_index=True, return_inverse=True)
         model_sizes = sizes[torch.from_numpy(first)]
         self.has_table = int(model_sizes.sum()) * _BYTES_PER_PIXEL <= table_limit_bytes
@@ -237,16 +231,12 @@ class CameraRays:
     def __len__(self) -> int:
         return int(self.first_pixel[-1])
 
-    def image_of(self, pixels: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
-        """Return which camera each pixel number belongs to."""
-        return torch.searchsorted(self._first_pixel, pixels, right=True) - 1
-
     def columns(self, pixels: Int[Tensor, " n"]) -> dict[str, Tensor]:
-        """Return the rays through the centres of pixels, int64 numbers on the device of this object.
+        """Return the rays through the centres of pixels, given by their numbers on the device of this object.
 
         Fields of a `RayBundle`: origins (n, 3), unit directions (n, 3), pixel_area (n, 1) and camera_indices (n, 1).
         """
-        image = self.image_of(pixels)
+        image = torch.searchsorted(self._first_pixel, pixels, right=True) - 1
         if self.has_table:
             place = pixels + self._table_shift.index_select(0, image)
             camera_axes = self._directions.index_select(0, place)[..., None]
@@ -281,16 +271,8 @@ class CameraRays:
 
         return along(self.widths) * along(self.heights)
 
-    def _models(self) -> np.ndarray:
-        """One row of numbers per camera; equal rows have equal directions in camera axes."""
-        cameras = self.cameras
-        parts = [cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height, cameras.camera_type]
-        if cameras.distortion_params is not None:
-            parts.append(cameras.distortion_params)
-        return torch.cat([part.to(torch.float64) for part in parts], dim=-1).numpy()
-
     def _camera_axes(self, index: int) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 1"]]:
-        """Directions and areas of all pixels of one camera, seen from the camera."""
+        """Return the directions and areas of all pixels of one camera, in camera axes."""
         still = self.cameras[index : index + 1]
         still.camera_to_worlds = torch.eye(4)[None, :3]
         size = int(self.widths[index] * self.heights[index])
@@ -316,7 +298,7 @@ def _mend_optical_axis(
 ) -> None:
     """Give the ray on the optical axis of a fisheye lens its limit, where nerfstudio divides 0 by 0.
 
-    A `SceneError` is raised where a ray is lost elsewhere: the distortion cannot be undone there.
+    Raises `SceneError` where another ray is not finite: the distortion cannot be undone there.
     """
     axis = torch.cat([cameras.cy, cameras.cx], dim=-1)[image]
     on_axis = ((coords - axis).abs().amax(dim=1) < 1e-3) & (cameras.camera_type.view(-1)[image] == _FISHEYE)

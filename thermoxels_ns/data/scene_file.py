@@ -75,7 +75,8 @@ class SceneFile:
 def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "error") -> SceneFile:
     """Read a scene folder (or the json in it) and check all that can be checked without decoding images.
 
-    Frames without a thermal partner raise, or are left out and named (`missing_thermal`).
+    The thermal partner of a photograph is the file that `thermal_file_path` names, else the file of the same stem in
+    thermal/. Frames without one raise an error, or are left out and named (`missing_thermal`).
 
     Raises:
         SceneError: Something is missing, doubled, not finite or contradictory; the message names it.
@@ -88,39 +89,65 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
         expected = "a list 'frames' with one posed photograph per entry"
         remedy = "Run structure from motion (ns-process-data) on the photographs first."
         raise SceneError(json_path.name, expected=expected, got="no frames: the scene has no poses", remedy=remedy)
-    partners = _ThermalPartners(folder)
-    frames, left_out = [], []
+    by_stem: dict[str, list[Path]] = {}
+    for path in sorted((folder / "thermal").iterdir()) if (folder / "thermal").is_dir() else []:
+        if path.suffix.lower() in THERMAL_SUFFIXES and not path.name.startswith("."):
+            by_stem.setdefault(path.stem, []).append(path)
+    there = sum(map(len, by_stem.values()))
+    frames, left_out, by_name_alone = [], [], True
     for index, entry in enumerate(entries):
         where = f"{json_path.name}: frame {index}"
         if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
             raise SceneError(where, expected="an object with 'file_path'", got=entry, remedy="Correct the json.")
         name = Path(entry["file_path"]).as_posix()
         where = f"{where} ({name})"
-        image = _existing(folder / name, where, "file_path")
-        thermal = partners.of(entry, image)
-        if thermal is None:
+        image = _existing(folder, name, where, "file_path")
+        if "thermal_file_path" in entry:
+            partners = [path] if (path := folder / str(entry["thermal_file_path"])).is_file() else []
+        else:
+            partners, by_name_alone = by_stem.get(image.stem, []), False
+        if len(partners) > 1:
+            remedy = "Keep one of them, or name it with 'thermal_file_path' in the frame."
+            got = ", ".join(path.name for path in partners)
+            raise SceneError(f"thermal partner of {image.name}", expected="one file", got=got, remedy=remedy)
+        if partners:
+            frames.append(_frame(meta, entry, name, image, partners[0], folder, where))
+        else:
             left_out.append(name)
-            continue
-        frames.append(_frame(meta, entry, name, image, thermal, folder, where))
+    if not frames:
+        remedy = "Put them in thermal/, named like the photographs, or name them with 'thermal_file_path'."
+        got = f"{len(entries)} frames, none with one ({there} files in thermal/)"
+        raise SceneError(json_path.name, expected="frames with a thermal image", got=got, remedy=remedy)
+    stems = {frame.image.stem for frame in frames}
+    for parent in {frame.image.parent for frame in frames}:  # frames that have no pose still have photographs
+        stems |= {path.stem for path in parent.iterdir()}
+    orphans = [
+        str(path.relative_to(folder))
+        for stem, paths in by_stem.items()
+        for path in paths
+        if not by_name_alone and stem not in stems
+    ]
     if missing_thermal == "error" and left_out:
-        expected = (
-            f"a thermal partner for each of the {len(entries)} frames (thermal_file_path, or the same stem in thermal/)"
-        )
-        got = f"none for {len(left_out)}: {_some(left_out)} ({partners.count} files in thermal/)"
+        expected = f"a thermal image for each of the {len(entries)} frames (thermal_file_path, or the stem in thermal/)"
+        got = f"none for {len(left_out)}: {_some(left_out)} ({there} files in thermal/)"
         remedy = "Restore the thermal images, remove these frames, or pass --missing-thermal skip."
         raise SceneError(json_path.name, expected=expected, got=got, remedy=remedy)
-    orphans = partners.orphans(folder, [frame.image for frame in frames])
     if missing_thermal == "error" and orphans:
         expected = "one photograph in images/ for every thermal image"
-        got = f"{partners.count} thermal images, {len(orphans)} of them without a photograph: {_some(orphans)}"
+        got = f"{there} thermal images, {len(orphans)} of them without a photograph: {_some(orphans)}"
         remedy = "Restore the photographs, remove these files, or pass --missing-thermal skip."
         raise SceneError(f"{folder.name}/thermal", expected=expected, got=got, remedy=remedy)
-    if not frames:
-        remedy = "Put the thermal images in thermal/ or name them with 'thermal_file_path'."
-        got = f"{len(entries)} frames, none with one"
-        raise SceneError(json_path.name, expected="at least one frame with a thermal partner", got=got, remedy=remedy)
-    _refuse_duplicates(json_path, frames)
-    _refuse_half_masks(json_path, frames)
+    for kind, paths in (("photograph", [f.image for f in frames]), ("thermal image", [f.thermal for f in frames])):
+        twice = [path.name for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
+        if twice:
+            remedy = "Remove the duplicate frames: one of them could leak from training to evaluation."
+            got = f"{_some(twice)} more than once"
+            raise SceneError(json_path.name, expected=f"every {kind} in one frame only", got=got, remedy=remedy)
+    masks = sum(frame.mask is not None for frame in frames)
+    if masks not in (0, len(frames)):
+        expected, got = "a mask for every frame or for none", f"{masks} masks for {len(frames)} frames"
+        remedy = "Add the missing ones (white: use the pixel)."
+        raise SceneError(f"{json_path.name}: mask_path", expected=expected, got=got, remedy=remedy)
     scale_from_scene_file(meta)
     up_from_scene_file(meta)
     bounds, swapped = _read_bounds(folder), False
@@ -129,44 +156,6 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
     frames.sort(key=lambda frame: frame.name)
     unit = _unit(meta, json_path, bounds)
     return SceneFile(folder, json_path, frames, unit, bounds, meta, left_out + orphans, swapped)
-
-
-class _ThermalPartners:
-    """Finds the thermal image of a photograph: by `thermal_file_path`, else by the same stem in thermal/."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.by_stem: dict[str, list[Path]] = {}
-        self.used_stems = False
-        thermal = folder / "thermal"
-        for path in sorted(thermal.iterdir()) if thermal.is_dir() else []:
-            if path.suffix.lower() in THERMAL_SUFFIXES and not path.name.startswith("."):
-                self.by_stem.setdefault(path.stem, []).append(path)
-
-    @property
-    def count(self) -> int:
-        return sum(len(paths) for paths in self.by_stem.values())
-
-    def of(self, entry: dict[str, Any], image: Path) -> Path | None:
-        if "thermal_file_path" in entry:
-            path = self.folder / str(entry["thermal_file_path"])
-            return path if path.is_file() else None
-        self.used_stems = True
-        found = self.by_stem.get(image.stem, [])
-        if len(found) > 1:
-            remedy = "Keep one of them, or name it with 'thermal_file_path' in the frame."
-            got = ", ".join(path.name for path in found)
-            raise SceneError(f"thermal partner of {image.name}", expected="one file", got=got, remedy=remedy)
-        return found[0] if found else None
-
-    def orphans(self, folder: Path, images: list[Path]) -> list[str]:
-        """Thermal files without a photograph; frames that structure from motion left out still have theirs."""
-        if not self.used_stems:
-            return []
-        stems = {image.stem for image in images}
-        for parent in {image.parent for image in images}:
-            stems |= {path.stem for path in parent.iterdir()}
-        return [str(p.relative_to(folder)) for s, paths in self.by_stem.items() if s not in stems for p in paths]
 
 
 def _find_json(data: Path) -> Path:
@@ -227,7 +216,12 @@ def _frame(
         expected = "'thermal_camera' (w, h, fl_x, fl_y, cx, cy) beside 'thermal_transform_matrix'"
         remedy = "Add it at the top of the json or in every frame."
         raise SceneError(where, expected=expected, got="no thermal_camera", remedy=remedy)
-    mask = _mask(folder, entry, where)
+    mask, named = None, entry.get("mask_path")
+    if "mask_path" in entry:
+        if not isinstance(named, str):
+            remedy = "Name the mask; or leave mask_path out of all frames if none has a mask."
+            raise SceneError(f"{where}: mask_path", expected="a file name", got=repr(named), remedy=remedy)
+        mask = _existing(folder, named, where, "mask_path")
     if "transform_matrix" not in entry:
         remedy = "Remove the frame or run structure from motion again."
         raise SceneError(where, expected="'transform_matrix', the camera's pose", got="none", remedy=remedy)
@@ -236,38 +230,11 @@ def _frame(
     return Frame(name, image, thermal, mask, pose, intrinsics, thermal_pose, thermal_intrinsics)
 
 
-def _mask(folder: Path, entry: dict[str, Any], where: str) -> Path | None:
-    if "mask_path" not in entry:
-        return None
-    name = entry["mask_path"]
-    if not isinstance(name, str):
-        remedy = "Name the mask; or leave mask_path out of all frames if none has a mask."
-        raise SceneError(f"{where}: mask_path", expected="a file name", got=repr(name), remedy=remedy)
-    return _existing(folder / name, where, "mask_path")
-
-
-def _existing(path: Path, where: str, key: str) -> Path:
-    if path.is_file():
-        return path
+def _existing(folder: Path, name: str, where: str, key: str) -> Path:
+    if (folder / name).is_file():
+        return folder / name
     remedy = "Restore it or remove the frame."
-    raise SceneError(where, expected=f"the file of '{key}'", got=f"nothing at {path}", remedy=remedy)
-
-
-def _refuse_duplicates(json_path: Path, frames: list[Frame]) -> None:
-    for kind, paths in (("photograph", [f.image for f in frames]), ("thermal image", [f.thermal for f in frames])):
-        twice = [path.name for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
-        if twice:
-            remedy = "Remove the duplicate frames: one of them could leak from training to evaluation."
-            got = f"{_some(twice)} more than once"
-            raise SceneError(json_path.name, expected=f"every {kind} in one frame only", got=got, remedy=remedy)
-
-
-def _refuse_half_masks(json_path: Path, frames: list[Frame]) -> None:
-    masks = sum(frame.mask is not None for frame in frames)
-    if masks not in (0, len(frames)):
-        expected, got = "a mask for every frame or for none", f"{masks} masks for {len(frames)} frames"
-        remedy = "Add the missing ones (white: use the pixel)."
-        raise SceneError(f"{json_path.name}: mask_path", expected=expected, got=got, remedy=remedy)
+    raise SceneError(where, expected=f"the file of '{key}'", got=f"nothing at {folder / name}", remedy=remedy)
 
 
 def _some(names: list[str]) -> str:

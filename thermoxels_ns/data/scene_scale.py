@@ -29,11 +29,11 @@ class SceneScale:
     source: str  # Where the scale comes from: a sentence
 
     def area_standard_error(self, area_m2: float) -> float | None:
-        """What the scale's error makes of an area, twice its relative error, [m^2]; None where it is not known."""
+        """Return the standard error of an area, twice the relative one of the scale, [m^2]; None: not known."""
         return self._share(2, area_m2)
 
     def volume_standard_error(self, volume_m3: float) -> float | None:
-        """What the scale's error makes of a volume, three times its relative error, [m^3]; None where it is not known.
+        """Return the standard error of a volume, three times the relative one of the scale, [m^3]; None: not known.
 
         >>> SceneScale(2.0, 0.02, "").volume_standard_error(10.0)
         0.3
@@ -41,7 +41,7 @@ class SceneScale:
         return self._share(3, volume_m3)
 
     def as_mapping(self) -> dict[str, Any]:
-        """The scale as json can hold it."""
+        """Return the fields as json can hold them."""
         return asdict(self)  # type: ignore[call-overload]
 
     def _share(self, power: int, size: float) -> float | None:
@@ -85,11 +85,11 @@ def scale_from_option(metres_per_unit: float) -> SceneScale:
 def scale_from_known_distance(
     point_a: Vector, point_b: Vector, distance_m: float, standard_error_m: float | None = None
 ) -> SceneScale:
-    """Find the scale from two points of the scene whose distance was measured, [input units] and [m].
+    """Return the scale that two points of the scene [input units] give, whose distance was measured [m].
 
-    scale = D / d with the measured distance D and the distance d between the points; its relative standard
-    error is that of D, which includes how far the points may lie from the ends of what was measured. None:
-    nobody knows. Raises `ThermoxelsError` if a number is out of range, or the points coincide.
+    The scale is the measured distance over that of the points; its relative standard error is that of the measured
+    distance, which includes how far the points may lie from the ends of what was measured (None: not known).
+    Raises `ThermoxelsError` if a number is out of range, or the points coincide.
 
     >>> scale_from_known_distance((0, 0, 0), (0, 3, 4), 10.0, standard_error_m=0.1).standard_error
     0.02
@@ -138,10 +138,10 @@ def _in_file(meta: Mapping[str, Any]) -> _InFile:
 def choose_scale(
     option: float | None = None, known_distance: SceneScale | None = None, scene_file: Mapping[str, Any] | None = None
 ) -> SceneScale | None:
-    """Choose between what the user gives and what the scene's json says; the user goes before the json.
+    """Return the scale that the user gives, else that of the scene's json; None if neither gives one.
 
-    Returns the scale, whose source says what it was preferred to, None if nobody gives one; raises `ThermoxelsError` if
-    the user gives both a scale and a distance.
+    The source of the scale says what it was preferred to. Raises `ThermoxelsError` if the user gives both a scale and a
+    distance.
     """
     if option is not None and known_distance is not None:
         remedy = "Leave one of them out."
@@ -151,7 +151,7 @@ def choose_scale(
     given = known_distance if option is None else scale_from_option(option)
     if given is None:
         return in_file
-    if in_file is not None:
-        beside = f"It goes before the {in_file.metres_per_unit:g} m per unit of {_FILE}."
-        return replace(given, source=f"{given.source} {beside}")
-    return given
+    if in_file is None:
+        return given
+    beside = f"It goes before the {in_file.metres_per_unit:g} m per unit of {_FILE}."
+    return replace(given, source=f"{given.source} {beside}")

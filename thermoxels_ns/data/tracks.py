@@ -46,8 +46,8 @@ class SparseTracks:
 
 
 def write_tracks(path: Path, tracks: SparseTracks) -> None:
-    """Write tracks as a compressed .npz, put together in memory, because numpy's half-made files complain later."""
-    packed = io.BytesIO()
+    """Write tracks as a compressed .npz."""
+    packed = io.BytesIO()  # numpy complains of a half-made file when it is closed later
     np.savez_compressed(
         packed,
         points=tracks.points,
@@ -69,18 +69,11 @@ def read_tracks(path: Path) -> SparseTracks:
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as problem:
         expected = f"an .npz with {', '.join(names)}"
         raise SceneError(path.name, expected=expected, got=problem, remedy=remedy_of(problem, _REMEDY)) from problem
-    good = (
-        points.ndim == 2
-        and points.shape[1] == 3
-        and points.dtype.kind == error.dtype.kind == "f"
-        and error.shape == points.shape[:1]
-        and frames.ndim == 1
-        and frames.dtype.kind == "U"
-        and frame.dtype.kind == point.dtype.kind == "i"
-        and frame.ndim == 1
-        and frame.shape == point.shape
-        and (frame.size == 0 or (min(frame.min(), point.min()) >= 0))
-        and (frame.size == 0 or (frame.max() < len(frames) and point.max() < len(points)))
+    kinds = "".join(array.dtype.kind for array in (points, error, frames, frame, point))
+    good = kinds == "ffUii" and (points.ndim, frames.ndim, frame.ndim) == (2, 1, 1)
+    good = good and points.shape[1] == 3 and error.shape == points.shape[:1] and frame.shape == point.shape
+    good = good and all(
+        ((one >= 0) & (one < count)).all() for one, count in ((frame, len(frames)), (point, len(points)))
     )
     if not good:
         arrays = (points, error, frames, frame, point)
@@ -93,10 +86,10 @@ def read_tracks(path: Path) -> SparseTracks:
 def feature_rays(
     tracks: SparseTracks, frames: Sequence[Frame], name: str = "tracks", remedy: str = _REMEDY
 ) -> FeatureRays:
-    """Rays from frames to the points that they see and that are well known.
+    """Return the rays from frames (at least one) to the points that they see and whose place is well known.
 
     A point counts if at least `FEWEST_VIEWS` of the frames see it, more than `LEAST_PARALLAX_DEG` apart, with a mean
-    reprojection error of at most `MOST_ERROR_PX`. Of those, one that does not agree with its neighbours in the frames
+    reprojection error of at most `MOST_ERROR_PX`. A point that does not agree with its neighbours in the frames
     (`agrees_with_neighbours`) is listed without rays: wrong rays would make air of walls. The standard error of a
     ray's length is that of a triangulation: the error in the image, over the focal length and the sine of that angle,
     times the length.
@@ -106,16 +99,16 @@ def feature_rays(
     """
     place = {frame.name: number for number, frame in enumerate(frames)}
     number = np.array([place.get(known, -1) for known in tracks.frames], dtype=np.int64)
-    if len(frames) and not (number >= 0).any():
+    if not (number >= 0).any():
         got = f"{len(tracks.frames)} others, such as {', '.join(tracks.frames[:2]) or 'none'}"
         raise SceneError(name, expected="photographs of this scene", got=got, remedy=remedy)
     known = np.isfinite(tracks.points).all(axis=1) & (tracks.point_error_px <= MOST_ERROR_PX)
     known &= tracks.point_error_px >= 0.0  # COLMAP writes -1 for an error that it did not compute
     used = (number[tracks.sighting_frame] >= 0) & known[tracks.sighting_point]
     # Sorted by point, each pair once: a photograph that sees a point twice is still one that sees it.
-    pairs = np.unique(tracks.sighting_point[used] * max(1, len(frames)) + number[tracks.sighting_frame[used]])
-    frame, point = pairs % max(1, len(frames)), pairs // max(1, len(frames))
-    poses = np.stack([one.pose for one in frames]) if len(frames) else np.zeros((0, 4, 4))
+    pairs = np.unique(tracks.sighting_point[used] * len(frames) + number[tracks.sighting_frame[used]])
+    point, frame = np.divmod(pairs, len(frames))
+    poses = np.stack([one.pose for one in frames])
     focal = np.array([min(one.intrinsics.fl_x, one.intrinsics.fl_y) for one in frames])
     line = tracks.points[point] - poses[frame, :3, 3]
     behind = (line * -poses[frame, :3, 2]).sum(axis=1) <= 0.0
@@ -128,8 +121,7 @@ def feature_rays(
     angle = _parallax(line / np.maximum(length, 1e-300)[:, None], point, len(tracks.points))
     views = np.bincount(point, minlength=len(tracks.points))
     good = (views >= FEWEST_VIEWS) & (angle > np.radians(LEAST_PARALLAX_DEG))
-    chosen = good[point]
-    renumbered = np.cumsum(good) - 1
+    chosen, renumbered = good[point], np.cumsum(good) - 1
     frame, point, length = frame[chosen], point[chosen], length[chosen]
     error_px = np.maximum(tracks.point_error_px[point], LEAST_ERROR_PX)
     error = error_px / focal[frame] / np.sin(np.minimum(angle[point], np.pi / 2))
@@ -138,7 +130,7 @@ def feature_rays(
 
 
 def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray:
-    """Twice the largest angle between each point's directions and their mean, shape (count,), [radians]."""
+    """Return twice the largest angle between each point's directions and their mean, shape (count,), [radians]."""
     mean = np.stack([np.bincount(point, directions[:, axis], count) for axis in range(3)], axis=1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
     off = np.zeros(count)
@@ -159,16 +151,16 @@ def read_model(folder: Path) -> Any:
 
 
 def camera_to_world(image: Any) -> FloatArray:
-    """Pose of a pycolmap image, camera axes x right, y up, z back as transforms.json has them, shape (4, 4)."""
+    """Return the pose (4, 4) of a pycolmap image, its camera axes as in transforms.json: x right, y up, z back."""
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().inverse().matrix()
     return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def check_complete(folder: Path) -> None:
-    """Refuse a model with a file (named) that may not be read, or ends before what it announces.
+    """Raise `SceneError` for a file of a model that may not be read, or that ends before what it announces.
 
-    Of the one pycolmap would say that it is none, of the other it would read on behind the end.
+    pycolmap says of the first that it is no model, and reads on behind the end of the second, perhaps for ever.
     """
     for name in ("cameras", "frames", "images", "points3D"):
         for path in (folder / f"{name}.txt", folder / f"{name}.bin"):
@@ -178,8 +170,8 @@ def check_complete(folder: Path) -> None:
                 with path.open("rb") as file:
                     whole = path.suffix == ".txt" or _complete(name, file.read())
             except OSError as problem:
-                got = f"{path.name}: {problem.strerror}; check its permissions and the disk"
-                raise SceneError(f"it cannot be read, {got}") from problem
+                said = f"it cannot be read, {path.name}: {problem.strerror}; check its permissions and the disk"
+                raise SceneError(said) from problem
             if not whole:
                 said = f"{path.name} ends before its last entry, as after an interrupted copy"
                 raise SceneError(f"it cannot be read, {said}")

@@ -14,7 +14,7 @@ from thermoxels_ns.core.checks import is_number
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.decoders import errors_name
 
-_NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
+_NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")  # lenses in nerfstudio's order
 _ORIENTATION = 0x0112
 _LONGEST_LENS = 1e4  # Focal length, relative to the photograph's side: an angle of view of 0.006 degrees
 _MOST_DISTORTION = 10.0
@@ -34,9 +34,10 @@ _LENS_OF_MODEL: dict[str, Lens] = {
 
 
 def read_pose(values: Any, where: str, turned: bool = True) -> npt.NDArray[np.float64]:
-    """Check a camera-to-world matrix (3 x 4 or 4 x 4): finite, within `MOST_UNITS`, a rotation in its upper left.
+    """Return a camera-to-world matrix (4, 4) from 3 x 4 or 4 x 4 numbers of a json.
 
-    With `turned` False it may be any linear map there. A fourth row is 0, 0, 0, 1.
+    Raises `SceneError` unless the numbers are finite, the camera is within `MOST_UNITS` of the origin, a fourth row is
+    0, 0, 0, 1, and the upper left is a rotation (`turned` False: any linear map).
     """
     try:
         entries = np.array(values, dtype=object)
@@ -65,7 +66,7 @@ def read_pose(values: Any, where: str, turned: bool = True) -> npt.NDArray[np.fl
 
 
 def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | None, where: str) -> Camera:
-    """Read a camera; the frame's own values go before the scene's, the image's size before nothing."""
+    """Return the camera of a frame: its own values go before the scene's; without w and h the image's size counts."""
     values = {**meta, **entry}
     remedy = "Correct the json."
     model = values.get("camera_model", "OPENCV")
@@ -74,7 +75,11 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         expected = "PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR"
         undistort = "Undistort the photographs to a pinhole camera."
         raise SceneError(f"{where}: camera_model", expected=expected, got=model, remedy=undistort)
-    size = _image_size(image, where) if image is not None else None
+    size, orientation = None, 1
+    if image is not None:
+        named = f"{where}: {image.name}"
+        with errors_name(named, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(image) as opened:
+            size, orientation = opened.size, int(opened.getexif().get(_ORIENTATION, 1))
     try:
         if any(isinstance(value, bool) for key, value in values.items() if key in _NUMBERS):
             raise ValueError("true or false")
@@ -83,7 +88,7 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         if any(isinstance(side, float) and not side.is_integer() for side in (own["w"], own["h"])):
             raise ValueError(f"{own['w']} x {own['h']}, where w and h are whole numbers of pixels")
         numbers: dict[str, Any] = {key: float(values[key]) for key in ("fl_x", "fl_y", "cx", "cy")}
-        names = ("k1", "k2", "k3", "k4", "p1", "p2")
+        names = _NUMBERS[6:]
         listed = values.get("distortion_params", [values.get(key, 0.0) for key in names])
         numbers |= {key: float(value) for key, value in zip(names, listed, strict=True)}
         camera = Camera(width, height, **numbers, lens=lens)
@@ -97,9 +102,9 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         expected = "numbers as intrinsics, six of them for distortion_params"
         raise SceneError(where, expected=expected, got=problem, remedy=remedy) from problem
     _refuse_odd(camera, where)
-    if size is not None and (height, width) == size and _orientation(image) > 4:
+    if size is not None and (height, width) == size and orientation > 4:
         expected = f"a photograph stored as {width} x {height} pixels, as the intrinsics say"
-        got = f"{size[0]} x {size[1]} and EXIF orientation {_orientation(image)}: it is stored on its side"
+        got = f"{size[0]} x {size[1]} and EXIF orientation {orientation}: it is stored on its side"
         remedy = "Turn the photographs themselves: mogrify -auto-orient images/* (ImageMagick) does."
         raise SceneError(where, expected=expected, got=got, remedy=remedy)
     if size is not None and (width, height) != size:
@@ -128,18 +133,6 @@ def _refuse_odd(camera: Camera, where: str) -> None:
         got = ", ".join(f"{name} {getattr(camera, name):g}" for name in odd)
         remedy = "Correct the json; lengths are in pixels, k1 to k4, p1 and p2 as in OpenCV."
         raise SceneError(where, expected=expected, got=got, remedy=remedy)
-
-
-def _orientation(path: Path | None) -> int:
-    """EXIF orientation of a photograph, 1 where it has none; above 4 it is stored on its side."""
-    with errors_name(str(path), "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(str(path)) as image:
-        return int(image.getexif().get(_ORIENTATION, 1))
-
-
-def _image_size(path: Path, where: str) -> tuple[int, int]:
-    """Width and height from the file's header."""
-    with errors_name(f"{where}: {path.name}", "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(path) as image:
-        return image.size
 
 
 def path_inside(folder: Path, name: str, where: str) -> Path:

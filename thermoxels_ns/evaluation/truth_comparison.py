@@ -76,25 +76,22 @@ def surface_fscore(
     surroundings: TrueShape | None = None,
     within: BoolArray | None = None,
 ) -> tuple[SurfaceScore, SurfaceScore]:
-    """Compare the boundary of the solid voxels with the true surface: all of it, and the part that cameras see.
+    """Score the boundary of the solid voxels against the true surface: all of it, and the part that cameras see.
 
     Enclosed cavities are filled first: no camera sees what is inside. The boundary is sampled at four points per voxel
-    face. Faces where the lattice or the region ends, which cut the scene, do not count for precision. Distances for
-    recall go to the nearest sample, at most 0.36 voxels beyond the face itself.
-
-    A voxel face is seen if `MIN_VIEWS` cameras have a free line, past the solid voxels, to the empty voxel before it.
-    The score of that part tells what photographs could have shown from what was guessed behind it.
+    face. Faces where the lattice or the region ends, which cut the scene, do not count for precision. A face is seen if
+    `MIN_VIEWS` cameras have a free line, past the solid voxels, to the empty voxel before it.
 
     Args:
         cells: Solid voxels, shape `lattice.cell_shape`.
         lattice: Where they are, [world units].
         truth: The true body.
         true_points_seen: True surface that enough training cameras see, shape (m, 3), m at least 1, [truth units].
-        tolerance: Distance that counts as agreement, above 0, [truth units]; 1.5 voxels by custom.
+        tolerance: Distance that counts as agreement, above 0, [truth units].
         world_to_truth: Similarity, shape (4, 4), from the lattice's world to truth coordinates.
         views: The training cameras, in the coordinates of the lattice.
-        surroundings: What truly stands beside the body. Boundary in it, or within the tolerance of it, is neither right
-            nor wrong: photographs do not say where the body ends and its surroundings begin.
+        surroundings: What truly stands beside the body. Boundary within the tolerance of it is neither right nor wrong:
+            photographs do not say where the body ends and its surroundings begin.
         within: The region that was taken, shape `lattice.cell_shape`; None: all.
     """
     cells = check_shape("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
@@ -117,18 +114,15 @@ def surface_fscore(
         return SurfaceScore(recall=recalled), SurfaceScore()
     agrees = distance <= tolerance
     whole = SurfaceScore(float(agrees[scored].mean()), recalled, float(scored.mean()), float(distance[scored].mean()))
-    shown = scored.copy()
-    if len(views.focal) == 0:
-        return whole, SurfaceScore()
-    shown &= count_cameras(solid, lattice, views).free[tuple(empty[~on_border].T)] >= MIN_VIEWS
+    shown = scored & (count_cameras(solid, lattice, views).free[tuple(empty[~on_border].T)] >= MIN_VIEWS)
     if not shown.any():
         return whole, SurfaceScore()
     return whole, SurfaceScore(float(agrees[shown].mean()), recall(inner[shown]), float(shown.mean()))
 
 
 def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, IntArray, BoolArray]:
-    """Points on the faces between solid and empty voxels, [corner indices], the empty voxel beside each (n, 3), and
-    which faces lie on the border of the lattice or of the region (n,); beyond a border there may be no voxel."""
+    """Return points on the faces between solid and empty voxels, (n, 3) [corner indices], the empty voxel beside each
+    (n, 3), and whether each face lies on the border of the lattice or of the region (n,)."""
     steps, within, found = (np.arange(_PER_SIDE) + 0.5) / _PER_SIDE, np.pad(within, 1), []
     for axis in range(3):
         rise = np.diff(np.pad(cells, [(int(a == axis),) * 2 for a in range(3)]).astype(np.int8), axis=axis)
@@ -162,10 +156,9 @@ class SurfaceDistances:
 
 
 def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArray:
-    """Points spread evenly by area over triangles, shape (count, 3); the same points every time.
+    """Return points spread evenly by area over triangles, shape (count, 3); the same points every time.
 
-    A low-discrepancy sequence (the golden ratio and the plastic number's R2 sequence) walks along the triangles in
-    their order, so neighbouring triangles share the points in proportion to their areas.
+    A low-discrepancy sequence (the golden ratio and the plastic number's R2 sequence) walks along the triangles.
     """
     total = np.concatenate([[0.0], np.cumsum(facet_areas(points, facets))])
     number = np.arange(count)
@@ -276,7 +269,7 @@ def _scale_of(similarity: FloatArray) -> float:
 
 
 def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
-    """Get the truth of a scene folder (or its ``transforms.json``) and its training cameras; None for real photographs.
+    """Return the truth of a scene folder (or its ``transforms.json``) with its training cameras; None: not synthetic.
 
     Raises `SceneError` for a json that is unreadable or names an unknown scene, and for cameras that cannot be used.
     """
@@ -303,12 +296,10 @@ def compare_with_truth(
 ) -> dict[str, Any] | None:
     """Compare solid voxels, and the temperatures of a mesh made from them, with the exact scene.
 
-    Precision is the share of the reconstructed boundary within `TOLERANCE_VOXELS` of the true surface; recall the
-    share of the true surface that at least `MIN_VIEWS` training cameras see and that lies within the tolerance of
-    the reconstructed boundary; the F-score is their harmonic mean. Enclosed cavities are filled first, and the
-    boundary is not counted for precision where the scene box, or the region `within` that is exported, cuts it. Beside
-    them stand the same figures for the part of the boundary that at least `MIN_VIEWS` training cameras see: no
-    photograph shows the rest, which is a guess.
+    Precision is the share of the reconstructed boundary within `TOLERANCE_VOXELS` of the true surface. Recall is the
+    share of the true surface seen by `MIN_VIEWS` training cameras that lies within that tolerance of the boundary. The
+    F-score is their harmonic mean. `surface_fscore` says what is left out. Figures named ``..._seen`` are of the part
+    of the boundary that cameras see; the rest is a guess.
 
     `cells` has the shape `lattice.cell_shape`; `world_to_truth` (4, 4) is the similarity from the lattice's world to
     the input poses' coordinates, in which a synthetic scene is written in metres; without `mesh` no temperatures are
@@ -316,15 +307,13 @@ def compare_with_truth(
 
     Returns:
         A mapping that json can write, or None if the truth is not known. Scores are 0 to 1; mean distances are of the
-        boundary to the true surface, None without one; volumes and ``area_m2`` are those of the voxels (a staircase:
-        its area exceeds that of the slope it follows), ``filled_volume_m3`` with cavities. With a mesh also its volume
-        and the area of the true surface that its triangles stand for; ``chamfer_...`` and ``hausdorff_m`` between its
-        surface and the part of the true one that is seen; ``temperature_seen_mae_c``, the mean absolute error [K] at
-        the surface points closest to those true points that lie within the tolerance, and ``share_of_seen_reached``,
-        the share that do; and of the boundary nodes within the tolerance: ``temperature_nodes``, the number that a
-        thermal ray measured, ``temperature_mae_c``, their mean absolute error [K] (None without such a node), the same
-        of the others (``..._unmeasured...``), and ``temperature_p95_all_c``, the error [K] that 95 % of all of them
-        stay below.
+        boundary to the true surface (None without a boundary); volumes and ``area_m2`` are those of the voxels, a
+        staircase, ``filled_volume_m3`` with cavities. With a mesh also: its volume and area; ``chamfer_...`` and
+        ``hausdorff_m`` between its surface and the seen true one; ``share_of_seen_reached``, the share of seen true
+        points within the tolerance of its surface, and ``temperature_seen_mae_c``, the mean absolute error [K] at the
+        surface points closest to those; of the boundary nodes within the tolerance ``temperature_nodes``, the number
+        that a thermal ray measured, ``temperature_mae_c``, their mean absolute error [K], the same of the others
+        (``..._unmeasured...``), and ``temperature_p95_all_c``, the error [K] that 95 % of all stay below.
 
     Raises:
         SceneError: The scene folder cannot be used, or no true point is seen by enough training cameras.
@@ -370,14 +359,13 @@ def geometry_metrics(
 ) -> dict[str, float]:
     """Compare the surface that an export with default options has with the exact scene.
 
-    The surface is the boundary of the voxels that `SolidSelection` chooses by default; precision, recall and F-score,
-    0 to 1, and the arguments are those of `compare_with_truth`. `say` gets the reason where a figure cannot be given.
+    The surface is the boundary of the voxels that `SolidSelection` chooses by default; scores and arguments are those
+    of `compare_with_truth`. `say` gets the reason where there is no surface.
 
     Returns:
         ``fscore``, ``precision``, ``recall`` at 1.5 voxels of the snapshot's lattice; ``fscore_128``, at 1.5 voxels of
-        128 along the exact box, to compare resolutions and boxes; ``fscore_seen`` and ``fscore_128_seen``, of the part
-        of the boundary that training cameras see (the rest is a guess); and the mean distance to the true surface.
-        Without any solid voxel the scores are 0 and there is no distance.
+        128 along the exact box, to compare resolutions and boxes; ``fscore_seen`` and ``fscore_128_seen``; and the mean
+        distance to the true surface. Without any solid voxel the scores are 0 and there is no distance.
 
     Raises:
         SceneError: No true point is seen by enough training cameras.

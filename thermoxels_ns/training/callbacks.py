@@ -72,7 +72,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         rays = found[0] if len(found) == 1 else found[0].joined_with(found[1])
         air = air_voxels(lattice, rays).reshape(-1)[voxels.cells]
         centres = np.stack(np.unravel_index(voxels.cells, lattice.cell_shape), axis=1) + 0.5
-        air |= around_cameras(lattice.index_to_world(centres), rays, views_of_cameras([dataset.cameras]))
+        air |= around_cameras(lattice.index_to_world(centres), rays, views_of_cameras(dataset.cameras))
         if 0 < air.sum() < len(air):
             CONSOLE.log(f"step {step}: {air.sum():,} of {len(air):,} voxels are air, crossed by rays to what is seen")
             old = model.grid.row_parameters()

@@ -16,11 +16,10 @@ _SMALLEST_MSE = 1e-10
 _HSSIM_WINDOW = 4
 _HSSIM_C2 = 9e-4  # (0.03 x data range 1)^2
 SATURATED = 0.99  # Channel from which on a pixel may have been brighter than it says
-HALF_TRANSPARENT = (0.1, 0.9)  # A ray whose accumulation lies strictly between these is neither through nor stopped
 
 
 def psnr(predicted: Tensor, target: Tensor, valid: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio of values in [0, 1], [dB]; at most 100 (identical images)."""
+    """Return the peak signal-to-noise ratio of values in [0, 1], [dB]; at most 100 (identical images)."""
     squared = (predicted - target) ** 2
     mse = squared.mean() if valid is None else squared[valid].mean()
     return float(-10.0 * torch.log10(mse.clamp(min=_SMALLEST_MSE)))
@@ -32,10 +31,9 @@ def psnr_of_blocks(
     valid: Bool[Tensor, "h w 1"] | None = None,
     side: int = 8,
 ) -> float:
-    """`psnr` of both images averaged over blocks of `side` x `side` pixels, [dB].
+    """Return `psnr` of both images averaged over blocks of `side` x `side` pixels, [dB]: blur within a block is free.
 
-    It tells wrong colours from soft ones: what is blurred within a block costs nothing. A block is the mean of its
-    valid pixels; without any it is left out. NaN where no pixel is valid.
+    A block is the mean of its valid pixels; a block without any is left out. NaN where no pixel is valid.
 
     >>> fine = torch.tensor([[[0.0], [1.0]], [[1.0], [0.0]]])
     >>> round(psnr_of_blocks(torch.full((2, 2, 1), 0.6), fine, side=2), 3)  # pixels are 0.4 and 0.6 off, their mean 0.1
@@ -52,7 +50,7 @@ def psnr_of_blocks(
 
 
 def fitted_gain(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, " 3"]:
-    """Gain of each channel that makes a rendered photograph most like a measured one, robustly (Huber).
+    """Return the gain of each channel that fits a rendered photograph to a measured one, robustly (Huber).
 
     Saturated pixels do not count.
     """
@@ -67,9 +65,9 @@ def fitted_gain(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
 def ssim(
     predicted: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"], valid: Bool[Tensor, "h w 1"] | None = None
 ) -> float:
-    """Structural similarity (Wang et al. 2004): Gaussian window of 11 pixels, on smaller images a box that fits.
+    """Return the structural similarity (Wang et al. 2004), Gaussian window of 11 pixels, a box on smaller images.
 
-    With `valid`, the mean over the windows that hold valid pixels only; NaN if there is none.
+    With `valid`, it is the mean over the windows that hold valid pixels only; NaN if there is none.
     """
     side = min(11, *predicted.shape[:2])
     side -= 1 - side % 2
@@ -85,10 +83,10 @@ def ssim(
 def hssim(
     predicted: Float[Tensor, "h w 1"], target: Float[Tensor, "h w 1"], valid: Bool[Tensor, "h w 1"] | None = None
 ) -> float:
-    """Heat-based structural similarity (arXiv 2403.10340), as the Thermoxels paper reports it.
+    """Return the heat-based structural similarity (arXiv 2403.10340), as the Thermoxels paper reports it.
 
-    Mean over disjoint 4 x 4 windows (those with valid pixels only) of (2 cov + C2) / (var_p + var_t + C2), C2 = 9e-4; 1
-    where both are flat, NaN where no window is valid.
+    It is the mean of (2 cov + C2) / (var_p + var_t + C2), C2 = 9e-4, over disjoint 4 x 4 windows (those with valid
+    pixels only): 1 where both are flat, NaN where no window is valid.
     """
 
     def window_mean(image: Tensor) -> Tensor:
@@ -103,19 +101,17 @@ def hssim(
 
 
 def hot_region(temperature_c: Float[Tensor, "h w 1"], valid: Bool[Tensor, "h w 1"]) -> Bool[Tensor, "h w 1"]:
-    """The hot side of Otsu's threshold (Otsu 1979) over the valid pixels; all valid pixels if the image is flat."""
+    """Return the pixels above Otsu's threshold (Otsu 1979); all valid pixels if the image is flat."""
     values = temperature_c[valid]
-    if values.numel() == 0 or float(values.max() - values.min()) < 1e-6:
+    if values.numel() == 0:
         return valid
     low, span = values.min(), values.max() - values.min()
+    if float(span) < 1e-6:
+        return valid
     grey = ((temperature_c - low) / span * 255).round()
     levels = np.ascontiguousarray(grey[valid].to(torch.uint8).cpu().numpy()[:, None])
     threshold, _ = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     return valid & (grey > threshold)
-
-
-def _mean_abs(error: Tensor, where: Tensor) -> float:
-    return float(error[where].abs().mean()) if bool(where.any()) else float("nan")
 
 
 def thermal_metrics(
@@ -126,7 +122,7 @@ def thermal_metrics(
     in_box: Bool[Tensor, "h w 1"],
     span_k: float,
 ) -> dict[str, float]:
-    """All thermal metrics of one image.
+    """Return all thermal metrics of one image.
 
     Args:
         predicted: Rendered normalised temperature.
@@ -142,29 +138,28 @@ def thermal_metrics(
         half; `thermal_mae_box_c` in the box; `thermal_mae_roi_c` in the hot region; `thermal_mae_debiased_c` with the
         image's mean difference removed first. NaN where no pixel qualifies.
     """
-    filled_p = torch.where(valid, predicted, torch.zeros_like(predicted))
-    filled_t = torch.where(valid, target, torch.zeros_like(target))
+    filled_p, filled_t = (torch.where(valid, image, torch.zeros_like(image)) for image in (predicted, target))
     error_k = (predicted - target) * span_k
-    bias = error_k[valid].mean() if bool(valid.any()) else error_k.new_zeros(())
+    # The mean of no pixel is NaN.
     return {
-        "thermal_psnr": psnr(filled_p, filled_t, valid) if bool(valid.any()) else float("nan"),
+        "thermal_psnr": psnr(filled_p, filled_t, valid),
         "thermal_ssim": ssim(filled_p, filled_t, valid),
         "thermal_hssim": hssim(filled_p, filled_t, valid),
-        "thermal_mae_c": _mean_abs(error_k, valid),
-        "thermal_mae_hit_c": _mean_abs(error_k, valid & (accumulation > 0.5)),
-        "thermal_mae_box_c": _mean_abs(error_k, valid & in_box),
-        "thermal_mae_roi_c": _mean_abs(error_k, hot_region(target, valid)),
-        "thermal_mae_debiased_c": _mean_abs(error_k - bias, valid),
+        "thermal_mae_c": float(error_k[valid].abs().mean()),
+        "thermal_mae_hit_c": float(error_k[valid & (accumulation > 0.5)].abs().mean()),
+        "thermal_mae_box_c": float(error_k[valid & in_box].abs().mean()),
+        "thermal_mae_roi_c": float(error_k[hot_region(target, valid)].abs().mean()),
+        "thermal_mae_debiased_c": float((error_k - error_k[valid].mean())[valid].abs().mean()),
     }
 
 
 def lpips_available() -> bool:
-    """Whether the optional package for LPIPS is installed (`pip install thermoxels-ns[lpips]`)."""
+    """Return whether the optional package for LPIPS is installed (`pip install thermoxels-ns[lpips]`)."""
     return importlib.util.find_spec("lpips") is not None
 
 
 def lpips(predicted: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float:
-    """Learned perceptual distance (Zhang et al. 2018, AlexNet); its package fetches weights on first use."""
+    """Return the learned perceptual distance (Zhang et al. 2018, AlexNet); its package fetches weights on first use."""
     import lpips as package  # type: ignore[import-not-found]
 
     def prepare(image: Tensor) -> Tensor:
@@ -174,9 +169,3 @@ def lpips(predicted: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> 
         lpips.network = package.LPIPS(net="alex", verbose=False)  # type: ignore[attr-defined]
     with torch.no_grad():
         return float(lpips.network(prepare(predicted), prepare(target)))  # type: ignore[attr-defined]
-
-
-def half_transparent_share(accumulation: Tensor) -> float:
-    """Share of rays that are neither through nor stopped, 0 to 1: semi-transparent volume, or edges."""
-    low, high = HALF_TRANSPARENT
-    return float(((accumulation > low) & (accumulation < high)).double().mean())

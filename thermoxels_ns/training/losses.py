@@ -24,20 +24,20 @@ pass: they are fewer, and rooms would keep more floaters."""
 
 
 def rgb_loss(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
-    """Mean squared error of colour (paper, eq. 3)."""
+    """Return the mean squared error of colour (paper, eq. 3)."""
     return torch.mean((predicted - target) ** 2)
 
 
 def thermal_loss(
     predicted: Float[Tensor, "n 1"], target: Float[Tensor, "n 1"], l2_share: float = 0.5
 ) -> Float[Tensor, ""]:
-    """lambda L2 + (1 - lambda) L1 of normalised temperature (paper, eq. 4, lambda = 1/2)."""
+    """Return lambda L2 + (1 - lambda) L1 of normalised temperature (paper, eq. 4, lambda = 1/2)."""
     error = predicted - target
     return l2_share * torch.mean(error**2) + (1.0 - l2_share) * torch.mean(error.abs())
 
 
 def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple[int, int]:
-    """A contiguous part of a list of `voxels` kept voxels, about `share` of it, at a random place: first, behind last.
+    """Return first and end of a part of a list of kept voxels, about `share` of it, at a random place.
 
     Kept voxels are listed slab by slab along x, so the part is contiguous in space too.
     """
@@ -47,9 +47,9 @@ def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple
 
 
 def beta_loss(accumulation: Float[Tensor, " rays"], guard: float = 1e-3) -> Float[Tensor, ""]:
-    """Push rays to be opaque or empty: mean of log(A + guard) + log(1 - A + guard) (Neural Volumes; Plenoxels).
+    """Return the mean of log(A + guard) + log(1 - A + guard) (Neural Volumes; Plenoxels), 0 for decided rays.
 
-    Shifted so that a fully decided ray costs 0.
+    It pushes rays to be opaque or empty.
     """
     decided = math.log(guard) + math.log(1.0 + guard)
     return torch.mean(torch.log(accumulation + guard) + torch.log(1.0 - accumulation + guard)) - decided
@@ -92,11 +92,11 @@ class FeatureRaySampler:
         device: torch.device,
         surroundings_step: float = 0.0,
     ) -> RayRequest:
-        """Choose `count` feature rays at random and make two of each: first all that end before their points.
+        """Choose `count` feature rays at random; return for all one that ends before the point, then one behind it.
 
-        Behind them those that end behind their points, empty where nothing is known to be there. They want neither
-        colour nor temperature. Lengths are in world units; the generator is on the CPU. `surroundings_step` is the
-        share of the way from the box to infinity that a voxel of the surroundings spans.
+        A ray behind its point is empty where nothing is known to be there. The rays want neither colour nor
+        temperature. Lengths are in world units; the generator is on the CPU. `surroundings_step` is the share of the
+        way from the box to infinity that a voxel of the surroundings spans.
         """
         chosen = torch.randint(len(self._length), (count,), generator=generator)
         margin = (
@@ -113,10 +113,10 @@ class FeatureRaySampler:
 
 
 def feature_ray_loss(accumulation: Tensor, transmittance: Tensor, tolerated: float = 0.0) -> Tensor:
-    """Mean share of light that a feature ray loses before its point, plus that which passes the point.
+    """Return the mean share of light that feature rays lose before their points, plus the share that passes them.
 
-    Both are 0 where the surface lies at the point; for an empty ray the second is constant. The rays are those of
-    `FeatureRaySampler.request`, shape (2 n,); the share `tolerated` of the light may pass without counting.
+    Both are 0 where the surface lies at the point. The rays are those of `FeatureRaySampler.request`, shape (2 n,); the
+    share `tolerated` of the light may pass without counting.
 
     >>> float(feature_ray_loss(torch.tensor([0.25, 0.9]), torch.tensor([0.75, 0.1])))
     0.3499999940395355

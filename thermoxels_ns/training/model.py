@@ -42,7 +42,7 @@ from thermoxels_ns.training.image_metrics import (
     thermal_metrics,
 )
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
-from thermoxels_ns.training.ray_statistics import FieldEvidence, field_evidence
+from thermoxels_ns.training.ray_statistics import field_evidence
 
 SURROUNDINGS = (48, 12)
 """Voxels of the surroundings across a face of the box and from there to infinity, at the start; they are split
@@ -65,20 +65,18 @@ class ThermoxelsModel(Model):
         """Build the field, the background and what belongs to single images."""
         super().populate_modules()
         self.config.check()
-        box = self.scene_box.aabb.double().numpy()
-        voxel = self.config.voxel_pixels * (self.kwargs.get("metadata") or {}).get("pixel_size", math.inf)
+        box, metadata = self.scene_box.aabb.double().numpy(), self.kwargs.get("metadata") or {}
+        voxel = self.config.voxel_pixels * metadata.get("pixel_size", math.inf)
         longest = float((box[1] - box[0]).max())
         self.config = config = self.config.suited_to(longest / voxel if 0.0 < voxel < math.inf else math.inf)
         torch.manual_seed(config.seed)
         self.loss_weights = config.loss_weights()
-        temperature_range = (self.kwargs.get("metadata") or {}).get("temperature_range")
-        if not isinstance(temperature_range, TemperatureRange):
+        temperatures = metadata.get("temperature_range")
+        if not isinstance(temperatures, TemperatureRange):
             remedy = "Use the dataparser thermal-data."
             raise SceneError("scene", expected="thermal images with a temperature range", got="none", remedy=remedy)
-        self.register_buffer(
-            "temperature_bounds_c",
-            torch.tensor([temperature_range.min_c, temperature_range.max_c], dtype=torch.float64),
-        )
+        bounds_c = torch.tensor([temperatures.min_c, temperatures.max_c], dtype=torch.float64)
+        self.register_buffer("temperature_bounds_c", bounds_c)
         if 0.0 < voxel < math.inf:
             pixels = config.voxel_pixels * longest / config.resolutions[-1] / voxel
             CONSOLE.log(
@@ -101,13 +99,8 @@ class ThermoxelsModel(Model):
         wants_rgb = config.sh_degree is not None and config.background != "off"
         self.background_rgb = SphereImage(config.background_height) if wants_rgb else None
         self.background_thermal = SkyTemperature() if config.thermal_background != "minimum" else None
-        self.surroundings = (
-            Surroundings(
-                torch.from_numpy(box), *SURROUNDINGS, SURROUNDINGS_DENSITY, config.density_activation, wants_rgb
-            )
-            if config.surroundings == "on"
-            else None
-        )
+        start = (*SURROUNDINGS, SURROUNDINGS_DENSITY, config.density_activation, wants_rgb)
+        self.surroundings = Surroundings(torch.from_numpy(box), *start) if config.surroundings == "on" else None
         # Which of colour at infinity, temperature at infinity and surroundings take part; kept in the checkpoint.
         on = [wants_rgb, self.background_thermal is not None, self.surroundings is not None]
         self.register_buffer("backdrop_on", torch.tensor(on))
@@ -120,13 +113,10 @@ class ThermoxelsModel(Model):
         self.register_buffer("trained_steps", torch.tensor(0))
         self.step = 0
         # What training photographs see of the tracks of structure from motion.
-        self.feature_rays: FeatureRays | None = (self.kwargs.get("metadata") or {}).get("feature_rays")
-        seen = self.feature_rays is not None and len(self.feature_rays.point) and config.sh_degree is not None
-        self.feature_ray_sampler = (
-            losses.FeatureRaySampler(self.feature_rays, box, self.surroundings is not None)
-            if self.feature_rays is not None and seen
-            else None
-        )
+        rays: FeatureRays | None = metadata.get("feature_rays")
+        self.feature_rays, self.feature_ray_sampler = rays, None
+        if rays is not None and len(rays.point) and config.sh_degree is not None:
+            self.feature_ray_sampler = losses.FeatureRaySampler(rays, box, self.surroundings is not None)
         # Through pixels of photographs that show a plain backdrop; found when a training begins.
         self.backdrop_ray_sampler: losses.FeatureRaySampler | None = None
         # To the planes of plain walls; found when the lattice is refined.
@@ -141,17 +131,17 @@ class ThermoxelsModel(Model):
 
     @property
     def seen_surroundings(self) -> Surroundings | None:
-        """What lies outside the box; None where all of it lies at infinity."""
+        """The lattices outside the box; None where all that lies there is at infinity."""
         return self.surroundings if bool(self.backdrop_on[2]) else None
 
     @property
     def temperature_range(self) -> TemperatureRange:
-        """What normalised temperatures 0 and 1 stand for; part of the checkpoint."""
+        """The temperatures that 0 and 1 stand for; part of the checkpoint."""
         low, high = self.temperature_bounds_c.tolist()
         return TemperatureRange(low, high)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by optimiser: density, sh, temperature, background, corrections (those that exist)."""
+        """Return the parameters by optimiser: density, sh, temperature, background, corrections (those that exist)."""
         groups = {name: [parameter] for name, parameter in self.grid.row_parameters().items()}
         backdrop = [p for m in (self.background_rgb, self.background_thermal) if m is not None for p in m.parameters()]
         if backdrop:
@@ -182,10 +172,9 @@ class ThermoxelsModel(Model):
             How values of its columns change; None where they stay.
         """
         degree, stored = self.config.sh_degree, self.grid.sh_degree
-        early = int(self.trained_steps) < self.config.view_dependence_from
-        return (
-            None if early or degree is None or stored is None or stored >= degree else widen_colour(self.grid, degree)
-        )
+        if degree is None or stored is None or int(self.trained_steps) < self.config.view_dependence_from:
+            return None
+        return widen_colour(self.grid, degree) if stored < degree else None
 
     def update_to_step(self, step: int) -> None:
         """Tell the model which step it is at (schedules, random blocks)."""
@@ -195,21 +184,18 @@ class ThermoxelsModel(Model):
     def _request(
         self, origins: Tensor, directions: Tensor, nears: Tensor | None = None, fars: Tensor | None = None
     ) -> RayRequest:
-        """Rays between `nears` and `fars` (rays, 1) if given, behind the near plane."""
+        """Return rays between `nears` and `fars` (rays, 1) if given, behind the near plane."""
         near: float | Tensor = self.config.near_plane * self.unit
         if nears is not None:
             near = nears[:, 0].clamp(min=near)
         return RayRequest(origins, directions, near, None if fars is None else fars[:, 0])
 
     def _options(self) -> RenderOptions:
-        """How exactly to render."""
-        config = self.config
-        return RenderOptions(
-            config.steps_per_voxel, config.smallest_weight, config.early_stop, config.thermal_density_gradient
-        )
+        c = self.config
+        return RenderOptions(c.steps_per_voxel, c.smallest_weight, c.early_stop, c.thermal_density_gradient)
 
     def _training_options(self) -> RenderOptions:
-        """The same, and what this step's loss needs beside pixels."""
+        """Return the options with what this step's loss needs beside pixels."""
         return replace(
             self._options(),
             distortion_scale=2.0 * self.unit if self._distortion_weight() > 0 else None,
@@ -219,12 +205,12 @@ class ThermoxelsModel(Model):
         )
 
     def _blocks(self, grid: VoxelGrid, stream: int) -> dict[str, tuple[int, int]]:
-        """The parts of a grid whose total variation this step looks at."""
+        """Return the parts of a grid whose total variation this step looks at."""
         generator = torch.Generator().manual_seed(self.config.seed * stream + self.step)
         return {
             name: losses.random_block(len(grid.voxels), self.config.tv_share, generator)
             for name in self.grid.row_parameters()
-            if getattr(self.loss_weights, f"tv_{name}") and name in grid.row_parameters()
+            if getattr(self.loss_weights, f"tv_{name}")
         }
 
     @torch.no_grad()
@@ -241,11 +227,11 @@ class ThermoxelsModel(Model):
                 self.corrected[number] = True
 
     def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
-        """List the samples of rays in kept voxels and their weights, for statistics."""
+        """Return the samples of rays in kept voxels and their weights, for statistics."""
         return sample_rays(self.grid, self._request(origins, directions), self._options(), self.config.backend)
 
     def render_rays(self, request: RayRequest, options: RenderOptions) -> SceneRender:
-        """What rays see, from the box to infinity."""
+        """Render what rays see, from the box to infinity."""
         rgb_on, thermal_on, _ = self.backdrop_on.tolist()
         around = self.seen_surroundings
         rgb, thermal = self.background_rgb if rgb_on else None, self.background_thermal if thermal_on else None
@@ -274,20 +260,18 @@ class ThermoxelsModel(Model):
         rgb, thermal = seen.rgb, seen.thermal
         # The gradient of `index_select` adds rays in their order; that of an index leaves the order to a race.
         gains_on, offsets_on = self.corrected.tolist()
+        assert ray_bundle.camera_indices is not None
+        photograph = ray_bundle.camera_indices[:, 0]
         if self.log_gain is not None and gains_on and rgb is not None:
-            assert ray_bundle.camera_indices is not None
-            log_gain = self._refined(self.log_gain, self.config.exposure)
-            gain = torch.exp(log_gain - log_gain.mean(0))
-            rgb = rgb * gain.index_select(0, ray_bundle.camera_indices[:, 0])
+            log_gain = self._correction(self.log_gain, self.config.exposure)
+            rgb = rgb * torch.exp(log_gain - log_gain.mean(0)).index_select(0, photograph)
         if self.thermal_offset is not None and offsets_on:
-            assert ray_bundle.camera_indices is not None
-            offset = self._refined(self.thermal_offset, self.config.per_image_offset)
-            offset = offset - offset.mean()
-            thermal = thermal + offset.index_select(0, ray_bundle.camera_indices[:, 0])[:, None]
+            offset = self._correction(self.thermal_offset, self.config.per_image_offset)
+            thermal = thermal + (offset - offset.mean()).index_select(0, photograph)[:, None]
         return batch | {"rgb": rgb, "thermal": thermal, "accumulation": seen.box.accumulation[:, None], "render": seen}
 
-    def _refined(self, correction: Tensor, wanted: str) -> Tensor:
-        """What was found in photographs stays until surfaces stand, which would pull at it before; then it learns."""
+    def _correction(self, correction: Tensor, wanted: str) -> Tensor:
+        """Return a correction; one found in photographs learns only once surfaces stand, which would distort it."""
         return correction.detach() if wanted == "auto" and self.step < self.config.distortion_ramp[1] else correction
 
     def _image_outputs(self, request: RayRequest) -> dict[str, Tensor]:
@@ -308,24 +292,21 @@ class ThermoxelsModel(Model):
         }
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Colour and opacity, for nerfstudio's stock exporters."""
+        """Return colour and opacity, for nerfstudio's stock exporters."""
         return torch.cat((outputs[output_name], outputs["accumulation"]), dim=-1)
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        """The weighted loss terms; those of weight 0 are not computed."""
+        """Return the weighted loss terms; those of weight 0 are not computed."""
         weights, terms = self.loss_weights, {}
-        (chosen,) = outputs["rgb_rays"].nonzero(as_tuple=True)
-        if weights.rgb and outputs["rgb"] is not None and len(chosen):
-            seen, measured = (values.index_select(0, chosen) for values in (outputs["rgb"], batch["image"]))
+        if weights.rgb and (pair := _seen_and_measured(outputs, batch, "rgb", "image")) is not None:
+            seen, measured = pair
             if self.training and bool(self.corrected[0]):  # what saturates a photograph may be any brighter
                 seen = torch.where(measured >= SATURATED, torch.minimum(seen, measured), seen)
             terms["rgb_loss"] = weights.rgb * losses.rgb_loss(seen, measured)
-        (chosen,) = outputs["thermal_rays"].nonzero(as_tuple=True)
-        if weights.thermal and len(chosen):
-            seen, measured = (values.index_select(0, chosen) for values in (outputs["thermal"], batch["thermal"]))
-            terms["thermal_loss"] = weights.thermal * losses.thermal_loss(seen, measured, self.config.thermal_l2_share)
+        if weights.thermal and (pair := _seen_and_measured(outputs, batch, "thermal", "thermal")) is not None:
+            terms["thermal_loss"] = weights.thermal * losses.thermal_loss(*pair, self.config.thermal_l2_share)
         if not self.training:
             return terms
         render: SceneRender = outputs["render"]
@@ -352,7 +333,7 @@ class ThermoxelsModel(Model):
         return terms
 
     def _feature_ray_loss(self, rays: losses.FeatureRaySampler) -> Tensor:
-        """How far this step's feature rays are from ending at their points; coarse lattices may let light pass."""
+        """Return how far this step's feature rays are from ending at their points; coarse lattices let light pass."""
         config, near, lattice = self.config, self.config.near_plane * self.unit, self.grid.lattice
         generator = torch.Generator().manual_seed((config.seed + 1) * 2_000_003 + self.step)
         step = 0.0 if self.seen_surroundings is None else self.seen_surroundings.step
@@ -366,33 +347,29 @@ class ThermoxelsModel(Model):
         return losses.feature_ray_loss(lost, left, 0.0 if last else rays.coarse_light)
 
     def _distortion_weight(self) -> float:
-        """Weight of the distortion term at this step: it grows over its ramp."""
+        """Return the weight of the distortion term at this step: it grows over its ramp."""
         first, last = self.config.distortion_ramp
         return self.loss_weights.distortion * min(1.0, max(0.0, (self.step - first) / max(1, last - first)))
 
     @torch.no_grad()
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
-        """PSNR and temperature error of the batch."""
+        """Return PSNR and temperature error of the batch."""
         metrics = {}
-        (chosen,) = outputs["rgb_rays"].nonzero(as_tuple=True)
-        if outputs["rgb"] is not None and len(chosen):
-            seen, measured = (values.index_select(0, chosen) for values in (outputs["rgb"], batch["image"]))
-            metrics["psnr"] = torch.tensor(psnr(seen, measured))
-        (chosen,) = outputs["thermal_rays"].nonzero(as_tuple=True)
-        if len(chosen):
-            seen, measured = (values.index_select(0, chosen) for values in (outputs["thermal"], batch["thermal"]))
-            metrics["thermal_mae_c"] = (seen - measured).abs().mean() * self.temperature_range.span_k
+        if (pair := _seen_and_measured(outputs, batch, "rgb", "image")) is not None:
+            metrics["psnr"] = torch.tensor(psnr(*pair))
+        if (pair := _seen_and_measured(outputs, batch, "thermal", "thermal")) is not None:
+            metrics["thermal_mae_c"] = (pair[0] - pair[1]).abs().mean() * self.temperature_range.span_k
         return metrics
 
     @torch.no_grad()
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Metrics of one held-out frame, and pictures with the measured image left of the rendered one.
+        """Return metrics of one held-out frame, and pictures with the measured image left of the rendered one.
 
-        Where the thermal camera is its own, the thermal image is rendered from it. ``psnr_box`` and
-        ``thermal_mae_box_c`` count every pixel whose ray meets the lattice's box ahead of the camera. That needs no
-        truth and no threshold; some of these pixels show what stands in front of the box or behind it.
+        A thermal camera of its own has the thermal image rendered from its pose. ``psnr_box`` and
+        ``thermal_mae_box_c`` count every pixel whose ray meets the lattice's box ahead of the camera; some of these
+        pixels show what stands in front of the box or behind it.
         """
         metrics: dict[str, float] = {}
         images: dict[str, Tensor] = {}
@@ -426,11 +403,11 @@ class ThermoxelsModel(Model):
     def _fitted_metrics(
         self, outputs: dict[str, Tensor], seen: dict[str, Tensor], batch: dict[str, Any], valid: Tensor
     ) -> dict[str, float]:
-        """``psnr_fitted``: the corrections of training fitted to a held-out frame too.
+        """Return ``psnr_fitted``, for which a held-out frame is corrected as training frames are.
 
-        Its pose is where its own features say that it was taken, if training poses were adjusted (then also for
-        ``thermal_mae_debiased_c``); its gains are fitted to all of its pixels. `outputs` and `seen` are its photograph
-        and its thermal image as given.
+        Gains are fitted to all of its pixels. If training poses were adjusted, its pose is the one fitted to its own
+        features, for ``thermal_mae_debiased_c`` too. `outputs` and `seen` are photograph and thermal image as rendered
+        from the poses given.
         """
         metrics: dict[str, float] = {}
         if batch.get("fitted_camera") is not None:
@@ -442,59 +419,61 @@ class ThermoxelsModel(Model):
             metrics["thermal_mae_debiased_c"] = warm["thermal_mae_debiased_c"]
         if self.grid.sh is not None:
             target, predicted = batch["image"][..., :3].to(self.device), outputs["rgb"]
-            mask = (
-                batch["mask"].to(self.device).bool()[..., 0] if "mask" in batch else torch.ones_like(target[..., 0]) > 0
-            )
-            gain = fitted_gain(predicted[mask], target[mask])
-            metrics["psnr_fitted"] = psnr((gain * predicted).clamp(max=1.0)[mask], target[mask])
+            if "mask" in batch:
+                mask = batch["mask"].to(self.device).bool()[..., 0]
+                target, predicted = target[mask], predicted[mask]
+            target, predicted = target.reshape(-1, 3), predicted.reshape(-1, 3)
+            gain = fitted_gain(predicted, target)
+            metrics["psnr_fitted"] = psnr((gain * predicted).clamp(max=1.0), target)
         return metrics
 
     def _rendered(self, camera: Cameras, stream: int) -> dict[str, Tensor]:
-        """What a camera, of shape (1,), sees."""
+        """Render what a camera, of shape (1,), sees."""
         rays = camera.to(self.device).generate_rays(camera_indices=0, keep_shape=True)
         rays.metadata["stream"] = torch.full((*rays.shape, 1), stream, dtype=torch.uint8, device=self.device)
         return self.get_outputs_for_camera_ray_bundle(rays)
 
     @torch.no_grad()
     def grid_snapshot(self, rays: Iterable[RayBundle], views: Views | None = None) -> GridSnapshot:
-        """The trained field for the mesher.
+        """Return the trained field for the mesher.
 
         Training rays of both streams tell where solid is, which corners were measured and what temperature was seen
-        there; without any there is no evidence.
+        there; without any there is no evidence. Colour is that of the harmonic of degree 0, grey at corners of no kept
+        voxel: its sigmoid stands for the mean over directions, exact where colour is the same from all sides.
         """
-        grid = self.grid
+        grid, colour, evidence = self.grid, None, None
         seen = field_evidence(self, rays)
         # Corners of no kept voxel are given the middle of the range; nothing reads them.
         thermal = grid.corner_values(seen.temperature.thermal.float(), fill=0.5)
-        colour = self._corner_colour()
+        if grid.sh is not None and grid.sh_degree is not None:
+            constant = harmonics(grid.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # the same in all directions
+            mean = grid.sh.view(len(grid.sh), 3, num_coefficients(grid.sh_degree))[..., 0] * constant
+            channels = torch.sigmoid(mean).float().unbind(-1)
+            colour = torch.stack([grid.corner_values(rows, 0.5) for rows in channels], -1).cpu().numpy()
+        if seen.rays:
+            cells = np.zeros((2, *grid.lattice.cell_shape), dtype=np.float32)
+            cells.reshape(2, -1)[:, grid.voxels.cells] = torch.stack((seen.voxel_weight, seen.voxel_ends)).cpu()
+            evidence = RayEvidence(cells[0], seen.half_depth_density.float().cpu().numpy(), cells[1])
         return GridSnapshot(
             grid.lattice,
             density=grid.corner_density().float().cpu().numpy(),
             temperature_c=self.temperature_range.to_celsius(thermal).cpu().numpy(),
             observed_weight=grid.corner_values(seen.temperature.weight.float()).cpu().numpy(),
             voxel_density=grid.voxel_density().float().cpu().numpy(),
-            colour=None if colour is None else colour.cpu().numpy(),
-            evidence=self._ray_evidence(seen) if seen.rays else None,
+            colour=colour,
+            evidence=evidence,
             views=views,
         )
 
-    def _ray_evidence(self, seen: FieldEvidence) -> RayEvidence:
-        """What rays say about voxels, on the whole lattice."""
-        lattice = np.zeros((2, *self.grid.lattice.cell_shape), dtype=np.float32)
-        lattice.reshape(2, -1)[:, self.grid.voxels.cells] = torch.stack((seen.voxel_weight, seen.voxel_ends)).cpu()
-        return RayEvidence(lattice[0], seen.half_depth_density.float().cpu().numpy(), lattice[1])
 
-    def _corner_colour(self) -> Tensor | None:
-        """Colour at the corners from the harmonic of degree 0, grey at corners of no kept voxel, (x, y, z, 3).
-
-        The sigmoid of the mean stands for the mean of the sigmoid: exact where the colour is the same from all sides.
-        """
-        grid = self.grid
-        if grid.sh is None or grid.sh_degree is None:
-            return None
-        constant = harmonics(grid.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # the same in all directions
-        mean = grid.sh.view(len(grid.sh), 3, num_coefficients(grid.sh_degree))[..., 0] * constant
-        return torch.stack([grid.corner_values(rows, 0.5) for rows in torch.sigmoid(mean).float().unbind(-1)], -1)
+def _seen_and_measured(
+    outputs: dict[str, Any], batch: dict[str, Any], name: str, target: str
+) -> tuple[Tensor, Tensor] | None:
+    """Return what the rays of a stream (rgb or thermal) saw and what was measured; None without such rays."""
+    (chosen,) = outputs[f"{name}_rays"].nonzero(as_tuple=True)
+    if outputs[name] is None or not len(chosen):
+        return None
+    return outputs[name].index_select(0, chosen), batch[target].index_select(0, chosen)
 
 
 class SurroundingsSampler:
@@ -505,7 +484,7 @@ class SurroundingsSampler:
         self.grid, self._surroundings, self._config = model.surroundings.grid, model.surroundings, model.config
 
     def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
-        """List the samples of rays."""
+        """Return the samples of rays."""
         cut = self._surroundings.segments(origins, directions)
         request = RayRequest(cut.origins, cut.directions, 0.0, cut.lengths)
         return sample_rays(self.grid, request, RenderOptions(), self._config.backend)

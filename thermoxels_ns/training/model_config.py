@@ -164,7 +164,7 @@ class ThermoxelsModelConfig(ModelConfig):
     """Seed of everything random in the model."""
 
     def loss_weights(self) -> LossWeights:
-        """The recipe's weights with the overrides in place."""
+        """Return the recipe's weights with the overrides in place."""
         known = vars(LOSS_RECIPES[self.recipe])
         for name in self.loss_overrides.keys() - known.keys():
             expected = "one of " + ", ".join(known)
@@ -172,29 +172,21 @@ class ThermoxelsModelConfig(ModelConfig):
         return LossWeights(**{**known, **self.loss_overrides})
 
     def check(self) -> None:
-        """Refuse values that cannot work.
-
-        Raises:
-            ThermoxelsError: Names the option, what it takes and what it got.
-        """
+        """Raise `ThermoxelsError` for a value that cannot work."""
         self.refinements()
         ranges: dict[str, tuple[float, float, str]] = {
-            "prune_threshold": (0.0, 1.0, "from 0 to 1"),
-            "thin_threshold": (0.0, 1.0, "from 0 to 1"),
+            **dict.fromkeys(("prune_threshold", "thin_threshold", "thermal_l2_share"), (0.0, 1.0, "from 0 to 1")),
+            **dict.fromkeys(("smallest_weight", "early_stop"), (0.0, 0.1, "from 0 to 0.1")),
+            **dict.fromkeys(("eval_num_rays_per_chunk", "track_rays"), (1, 1e9, "at least 1")),
             "prune_dilation": (0, 100, "from 0 to 100"),
             "temperature_degree": (0, 2, "0, 1 or 2"),
             "seed": (0, 2**32 - 1, "from 0 to 2^32 - 1"),
-            "eval_num_rays_per_chunk": (1, 1e9, "at least 1"),
-            "track_rays": (1, 1e9, "at least 1"),
             "start_density": (1e-30, 1e30, "a finite number above 0"),
             "steps_per_voxel": (0.1, 1000.0, "from 0.1 to 1000"),
             "near_plane": (0.0, 1e30, "0 or more"),
-            "smallest_weight": (0.0, 0.1, "from 0 to 0.1"),
-            "early_stop": (0.0, 0.1, "from 0 to 0.1"),
             "memory_budget_gb": (1e-6, 1e6, "a number above 0"),
             "background_height": (2, 100_000, "at least 2"),
             "voxel_pixels": (0.0, 1000.0, "0 or more, at most 1000"),
-            "thermal_l2_share": (0.0, 1.0, "from 0 to 1"),
             "tv_share": (1e-6, 1.0, "above 0, at most 1"),
         }
         values = {name: (getattr(self, name), *limits) for name, limits in ranges.items()}
@@ -210,10 +202,10 @@ class ThermoxelsModelConfig(ModelConfig):
                 raise ThermoxelsError(name, expected="steps of at least 1", got=at, remedy="Correct the steps.")
 
     def refinements(self) -> dict[int, int]:
-        """Step -> factor by which voxels are split there.
+        """Return by step the factor by which voxels are split there.
 
         Raises:
-            ThermoxelsError: Resolutions that are not multiples, or a wrong number of steps.
+            ThermoxelsError: Resolutions are no multiples of each other, or the number of steps is wrong.
         """
         pairs = list(zip(self.resolutions, self.resolutions[1:]))
         increasing = all(b % a == 0 and b > a for a, b in pairs) and sorted(set(self.refine_at)) == list(self.refine_at)
@@ -226,7 +218,7 @@ class ThermoxelsModelConfig(ModelConfig):
         return {step: b // a for step, (a, b) in zip(self.refine_at, pairs)}
 
     def suited_to(self, voxels: float) -> ThermoxelsModelConfig:
-        """The settings for a scene along whose longest side that many voxels of `voxel_pixels` stand.
+        """Return the settings for a scene whose longest side is as long as this number of voxels of `voxel_pixels`.
 
         There are at most `MOST_VOXELS` times as many as the last of the resolutions. Their number is rounded up, unless
         less than a quarter of a step would be added: fewer voxels cost more than they save (courtyard: F 0.81, 0.86 and
@@ -245,21 +237,19 @@ class ThermoxelsModelConfig(ModelConfig):
         return replace(self, resolutions=schedule.resolutions, refine_at=at[0], prune_at=at[1])
 
     def first_sh_degree(self) -> int | None:
-        """Degree of colour that a training stores at its beginning: 0 until colour depends on the direction."""
+        """Return the degree of colour that is stored at the start: 0 until colour depends on the direction."""
         return 0 if self.sh_degree is not None and self.view_dependence_from > 0 else self.sh_degree
 
     def row_channels(self, resolution: int) -> int:
-        """Most channels that a row of the lattice of a resolution gets: all, if it is there when colour needs them."""
+        """Return the most channels that a row gets while the lattice has a resolution."""
         gives_way = dict(zip(self.resolutions, self.refine_at)).get(resolution, math.inf)
         degree = self.sh_degree if gives_way > self.view_dependence_from else self.first_sh_degree()
         return 1 + num_coefficients(self.temperature_degree) + (0 if degree is None else 3 * num_coefficients(degree))
 
     def checkpoint_columns(self) -> dict[str, tuple[int, ...]]:
-        """Columns that each parameter of the grid may have in a checkpoint."""
-        columns: dict[str, tuple[int, ...]] = {
-            "density": (1,),
-            "temperature": (num_coefficients(self.temperature_degree),),
-        }
+        """Return the numbers of columns that each parameter of the grid may have in a checkpoint."""
+        columns: dict[str, tuple[int, ...]] = {"density": (1,)}
+        columns["temperature"] = (num_coefficients(self.temperature_degree),)
         if self.sh_degree is not None:  # one per channel until colour depends on the direction
             columns["sh"] = tuple(dict.fromkeys((3, 3 * num_coefficients(self.sh_degree))))
         return columns

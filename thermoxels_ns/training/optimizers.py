@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,14 +17,11 @@ from thermoxels_ns.field.refine import ColumnChange, RowChange
 
 
 class RowOptimizer(torch.optim.Optimizer):
-    """An optimiser whose step goes over the rows of each parameter that have a gradient.
+    """An optimiser whose step goes over the rows (entries along the first axis) that have a gradient.
 
-    A batch of rays sees a small part of a voxel grid. Rows (entries along the first axis) without a gradient keep their
-    value and their state, and each row's bias correction counts its own updates, so that a corner that is seen for the
-    first time late in a training starts like all others did.
-
-    Gradients are row-sparse tensors (`torch.sparse_coo`, one sparse dimension) or dense ones, whose rows of zeros count
-    as rows without a gradient.
+    Other rows keep their value and their state, and each row's bias correction counts its own updates, so that a corner
+    first seen late in a training starts like all others. Gradients are row-sparse tensors (`torch.sparse_coo`, one
+    sparse dimension) or dense ones, whose rows of zeros count as rows without a gradient.
     """
 
     @torch.no_grad()
@@ -46,7 +44,7 @@ class RowOptimizer(torch.optim.Optimizer):
         return loss
 
     def new_state(self, parameter: Tensor) -> dict[str, Tensor]:
-        """State of a parameter that was never updated; each entry has the parameter's rows."""
+        """Return the state of a parameter that was never updated; each entry has the parameter's rows."""
         raise TypeError(f"{type(self).__name__} has no state")
 
     def update_rows(
@@ -57,13 +55,13 @@ class RowOptimizer(torch.optim.Optimizer):
 
     def change_rows(self, old: Tensor, new: torch.nn.Parameter, change: RowChange) -> None:
         """Go on with a parameter whose rows were split or dropped: the state follows as the values did."""
-        self._follow(old, new, lambda values: change(values.view(len(values), -1)).reshape(-1, *values.shape[1:]))
+        self._change(old, new, lambda values: change(values.view(len(values), -1)).reshape(-1, *values.shape[1:]))
 
     def change_columns(self, old: Tensor, new: torch.nn.Parameter, change: ColumnChange) -> None:
         """Go on with a parameter whose rows have other columns; state that is one number per row stays."""
-        self._follow(old, new, lambda values: change(values) if values.shape == old.shape else values)
+        self._change(old, new, lambda values: change(values) if values.shape == old.shape else values)
 
-    def _follow(self, old: Tensor, new: torch.nn.Parameter, change: Callable[[Tensor], Tensor]) -> None:
+    def _change(self, old: Tensor, new: torch.nn.Parameter, change: Callable[[Tensor], Tensor]) -> None:
         for group in self.param_groups:
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
         state = self.state.pop(old, None)  # type: ignore[arg-type]
@@ -73,7 +71,7 @@ class RowOptimizer(torch.optim.Optimizer):
 
 
 def touched_rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows with a gradient, ascending, and their gradients, (rows, channels)."""
+    """Return the rows with a gradient, ascending, and their gradients, (rows, channels)."""
     if gradient.is_sparse:
         rows = gradient._indices()[0]
         # Accumulation into `grad` forgets that a tensor is coalesced; finding out is quicker than doing it again.
@@ -147,17 +145,13 @@ class RowRMSprop(RowOptimizer):
         parameter[rows] -= lr * gradient / (mean.sqrt() + eps)
 
 
+@cache
 def _corrections(beta: float) -> np.ndarray:
-    """1 - beta^t for t = 0, 1, ... until it is 1; the last entry serves all later t."""
-    if beta not in _TABLES:
-        count = 2 if beta == 0 else min(1_000_000, int(np.ceil(np.log(1e-17) / np.log(beta))) + 2)
-        table = 1.0 - np.power(beta, np.arange(count, dtype=np.float64))
-        table[-1] = 1.0
-        _TABLES[beta] = table
-    return _TABLES[beta]
-
-
-_TABLES: dict[float, np.ndarray] = {}
+    """Return 1 - beta^t for t = 0, 1, ... until it is 1; the last entry serves all later t."""
+    count = 2 if beta == 0 else min(1_000_000, int(np.ceil(np.log(1e-17) / np.log(beta))) + 2)
+    table = 1.0 - np.power(beta, np.arange(count, dtype=np.float64))
+    table[-1] = 1.0
+    return table
 
 
 @dataclass

@@ -25,7 +25,6 @@ from thermoxels_ns.core.threads import set_num_threads
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import choose_backend, render_rays
-from thermoxels_ns.training.image_metrics import half_transparent_share
 from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.optimizers import RowAdam
 
@@ -102,25 +101,22 @@ class ThermoxelsPipeline(VanillaPipeline):
             CheckpointError: It belongs to another method, to other settings or to another scene.
         """
         state = {name.removeprefix("module."): value for name, value in loaded_state.items()}
-        expected = {_GRID + name: columns for name, columns in self.model.config.checkpoint_columns().items()}
+        columns = self.model.config.checkpoint_columns()
         found = {
-            name: tensor.shape[1]
+            name.removeprefix(_GRID): (tensor.shape[1],)
             for name, tensor in state.items()
             if name.startswith(_GRID) and getattr(tensor, "ndim", 0) == 2
         }
-        if expected.keys() != found.keys() or any(found[name] not in columns for name, columns in expected.items()):
-            here = _columns({name: (columns,) for name, columns in found.items()})
-            raise CheckpointError(
-                "checkpoint",
-                expected=f"a voxel grid with the columns {_columns(expected)}",
-                got=here or "no voxel grid: the checkpoint of another method",
-                remedy="Load it with the config.yml that was written beside it.",
+        if columns.keys() != found.keys() or not all(set(found[name]) <= set(columns[name]) for name in columns):
+            here, there = (
+                ", ".join(f"{name} {' or '.join(map(str, numbers))}" for name, numbers in sorted(grid.items()))
+                for grid in (columns, found)
             )
-        self._check_settings(self.state_dict(), state)
-        super().load_pipeline(state, step)
-
-    def _check_settings(self, own: dict[str, Any], state: dict[str, Any]) -> None:
-        """Compare what must agree before anything is loaded."""
+            expected = f"a voxel grid with the columns {here}"
+            got = there or "no voxel grid: the checkpoint of another method"
+            remedy = "Load it with the config.yml that was written beside it."
+            raise CheckpointError("checkpoint", expected=expected, got=got, remedy=remedy)
+        own = self.state_dict()
         differing = sorted(set(own) ^ set(state))
         if differing:
             remedy = "Use the same background, sky and per-image-offset options as in training."
@@ -147,6 +143,7 @@ class ThermoxelsPipeline(VanillaPipeline):
                 remedy = "Use the scene folder and the dataparser options of the training run."
                 got = "others from the scene"
                 raise CheckpointError(what, expected="those the checkpoint was trained with", got=got, remedy=remedy)
+        super().load_pipeline(state, step)
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
         """Average metrics over the held-out images; in ns-eval also those of the surface, if the truth is known."""
@@ -156,21 +153,22 @@ class ThermoxelsPipeline(VanillaPipeline):
         return averages
 
     def geometry_metrics(self) -> dict[str, float]:
-        """How well the surface agrees with the exact scene; empty if it is not known."""
+        """Return how well the surface agrees with the exact scene; empty if that is not known."""
         compare = type(self).compare_with_truth
         return {} if compare is None else compare(self)
 
     def get_average_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Average metrics over images; an image where a metric has no pixel does not count for it.
+        """Average metrics over images; an image without a pixel that counts for a metric does not count for it.
 
-        ``half_transparent``, the share of rays that are neither through nor stopped, joins the metrics of the model.
+        ``half_transparent``, the share of rays of opacity between 0.1 and 0.9, joins the metrics of the model.
         """
         rows: list[dict[str, float]] = []
         one_image = self.model.get_image_metrics_and_images
 
         def remember(outputs, batch):
             metrics, images = one_image(outputs, batch)
-            metrics["half_transparent"] = half_transparent_share(outputs["accumulation"])
+            opacity = outputs["accumulation"]
+            metrics["half_transparent"] = float(((opacity > 0.1) & (opacity < 0.9)).double().mean())
             rows.append(dict(metrics))
             return metrics, images
 
@@ -189,7 +187,7 @@ class ThermoxelsPipeline(VanillaPipeline):
         return averages
 
     def corrections(self) -> dict[str, Any]:
-        """What the training corrected in its photographs, by their names; a part that was not called for is absent.
+        """Return what the training corrected in its photographs, by their names; a part without corrections is absent.
 
         ``poses``: camera to world in input coordinates; ``gains``: of red, green and blue; ``thermal_offsets_c``: how
         much too warm the thermal image reads, [K]. The geometric mean of gains is 1, the mean of offsets 0.
@@ -209,7 +207,7 @@ class ThermoxelsPipeline(VanillaPipeline):
         return found
 
     def grid_snapshot(self, rays_per_image: int = 20_000) -> GridSnapshot:
-        """The trained field for the mesher, with what training rays of both streams say about it, and the cameras."""
+        """Return the trained field for the mesher, with the evidence of the training rays, and the cameras."""
         datamanager: Any = self.datamanager
         rays = datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, rays_per_image)
         return self.model.grid_snapshot(rays, datamanager.training_views())
@@ -225,9 +223,7 @@ def load_checkpoint(path: Any, **options: Any) -> dict[str, Any]:
         return torch.load(path, **{**options, "weights_only": True})
     except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as problem:
         named = re.search(r"GLOBAL ([\w.]+)", str(problem))
-        got = (
-            f"one that names {named[1]}, which could run code" if named else f"a damaged one ({type(problem).__name__})"
-        )
+        got = f"one that names {named[1]}, which could run code" if named else f"damage ({type(problem).__name__})"
         remedy = "Use a checkpoint that ns-train of this installation wrote, such as an earlier one beside it."
         if isinstance(problem, OSError) and problem.errno is not None:
             got, remedy = problem.strerror, "Check its permissions and the disk."
@@ -235,12 +231,8 @@ def load_checkpoint(path: Any, **options: Any) -> dict[str, Any]:
         raise CheckpointError(str(path), expected=expected, got=got, remedy=remedy) from problem
 
 
-def _columns(grid: dict[str, tuple[int, ...]]) -> str:
-    return ", ".join(f"{name.removeprefix(_GRID)} {' or '.join(map(str, n))}" for name, n in sorted(grid.items()))
-
-
 def compile_kernels(say: Callable[[str], None]) -> None:
-    """Run every kernel once on a few rays; numba keeps the compiled result. That it compiles is said."""
+    """Run every kernel once on a few rays, so that numba keeps the compiled result; `say` that it compiles."""
     from numba.core import event
 
     class Once(event.Listener):
@@ -262,9 +254,8 @@ def compile_kernels(say: Callable[[str], None]) -> None:
         origins = 3.0 * torch.nn.functional.normalize(torch.randn(4, 3, generator=generator), dim=-1)
         request = RayRequest(origins, torch.nn.functional.normalize(-origins, dim=-1))
         variation = {name: (0, 2) for name in grid.row_parameters()}
-        seen = render_rays(
-            grid, request, RenderOptions(distortion_scale=1.0, sparsity=True, variation=variation), "fused"
-        )
+        options = RenderOptions(distortion_scale=1.0, sparsity=True, variation=variation)
+        seen = render_rays(grid, request, options, "fused")
         assert seen.rgb is not None
         (seen.rgb.sum() + seen.thermal.sum() + sum(seen.variation.values())).backward()
         RowAdam(list(grid.parameters())).step()

@@ -54,7 +54,7 @@ def voxel_weights(model: RaySampler, rays: Iterable[RayBundle]) -> VoxelWeights:
 
 
 def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
-    """For each ray that ends on something (opacity above one half) the sample by which half of its weight is spent."""
+    """Return, for each ray of opacity above one half, the sample by which half of its weight is spent."""
     opacity = (1.0 - samples.transmittance)[samples.ray]
     spent = (opacity > 0.5) & (samples.before + samples.weight >= 0.5 * opacity)
     (places,) = spent.nonzero(as_tuple=True)
@@ -68,7 +68,7 @@ def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
 def half_way_points(
     model: RaySampler, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Where rays that end on something (opacity above one half) have spent half of their weight; NaN for others."""
+    """Return where rays of opacity above one half have spent half of their weight; NaN for other rays."""
     grid, points = model.grid, torch.full_like(origins, math.nan)
     samples = model.sample_rays(origins, directions)
     half_way = _half_way(samples)
@@ -81,9 +81,9 @@ def half_way_points(
 
 @torch.no_grad()
 def share_of_rays_opened(model: RaySampler, rays: Iterable[RayBundle], keep: Bool[Tensor, " voxels"]) -> float:
-    """Share of the rays that end on something (opacity above one half) of whose weight more than half would go.
+    """Return the share of the rays of opacity above one half that lose more than half of their weight.
 
-    Removing thin, half-transparent voxels lets no ray through; removing a body does.
+    Only voxels of `keep` stay. Removing thin, half-transparent voxels lets no ray through; removing a body does.
     """
     device = model.grid.density.device
     hit, opened = 0, 0
@@ -134,11 +134,10 @@ class FieldEvidence:
 def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidence:
     """Find in one pass where rays spend their weight, and what temperature thermal rays see around each corner.
 
-    The temperature is the average over thermal rays, each sample by its share of the pixel. A corner's own stored value
-    is only ever used mixed with its neighbours', so an image can be right while single corners overshoot; the average
-    over what rays used has no such freedom. Only first hits count for it: samples of rays that end on something
-    (opacity above one half), before half of the ray's light is spent. What leaks through a surface measures nothing
-    behind it. A ray that says of no stream (see `core.feature_rays`) counts as thermal too.
+    The temperature is the mean over thermal rays, each sample weighted by its share of the pixel: images can be right
+    while values stored at single corners overshoot, but this mean cannot. Only first hits count for it: samples of rays
+    of opacity above one half, before half of the ray's light is spent, so that light which leaks through a surface
+    measures nothing behind it. A ray without a stream (see `core.feature_rays`) counts as thermal too.
     """
     grid = model.grid
     device = grid.density.device
@@ -157,7 +156,11 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
         at_half, ray = samples.at.select(half_way), samples.ray[half_way]
         ends += torch.bincount(at_half.number, minlength=len(ends))
         half_depth.append(_density_met(grid, centre_density, at_half, directions[ray]))
-        first_hit = (samples.before < 0.5) & (_is_thermal(bundle, device) & (samples.transmittance < 0.5))[samples.ray]
+        stream = bundle.metadata.get("stream")
+        ends_here = samples.transmittance < 0.5
+        if stream is not None:
+            ends_here &= (stream[:, 0].to(device) & THERMAL_STREAM) > 0
+        first_hit = (samples.before < 0.5) & ends_here[samples.ray]
         at = samples.at.select(first_hit)
         weights = samples.weight[first_hit][:, None]
         thermal = grid.thermal_at(at, directions[samples.ray[first_hit]])
@@ -171,7 +174,7 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
 def _density_met(
     grid: VoxelGrid, centre_density: Float[Tensor, "x y z"], at: TrilinearPoints, directions: Float[Tensor, "n 3"]
 ) -> Float[Tensor, " n"]:
-    """The highest density at the centre of a voxel within `END_WIDTH` of points along unit directions."""
+    """Return the highest density at the centre of a voxel within `END_WIDTH` of points along unit directions."""
     shape = torch.tensor(grid.lattice.cell_shape, device=centre_density.device)
     voxel = torch.stack(torch.unravel_index(grid.cells[at.number], grid.lattice.cell_shape), -1)
     met = torch.zeros(len(voxel), dtype=centre_density.dtype, device=centre_density.device)
@@ -183,16 +186,9 @@ def _density_met(
     return met
 
 
-def _is_thermal(bundle: RayBundle, device: torch.device) -> Bool[Tensor, " rays"]:
-    stream = bundle.metadata.get("stream")
-    if stream is None:
-        return torch.ones(len(bundle.origins), dtype=torch.bool, device=device)
-    return (stream[:, 0].to(device) & THERMAL_STREAM) > 0
-
-
 @torch.no_grad()
 def backdrop_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> tuple[float, Float[Tensor, "n 3"]]:
-    """Share and directions of the rays that leave the box with more than half of their light still to come."""
+    """Return share and directions of the rays that leave the box with more than half of their light."""
     device = model.grid.density.device
     seen, open_directions = 0, [torch.zeros(0, 3, device=device)]
     for bundle in rays:

@@ -18,13 +18,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from thermoxels_ns.core.checks import (
-    check_ranges,
-    hold_folder,
-    plain_os_errors,
-    replace_when_done,
-    writable_folder,
-)
+from thermoxels_ns.core.checks import check_ranges, hold_folder, plain_os_errors, replace_when_done, writable_folder
 from thermoxels_ns.core.config_loader import ConfigLoader, typed, typed_value
 from thermoxels_ns.core.errors import CheckpointError, OutputError, ThermoxelsError
 from thermoxels_ns.training.schedule import QUALITIES, Quality, Schedule, schedule_for
@@ -32,16 +26,7 @@ from thermoxels_ns.training.schedule import QUALITIES, Quality, Schedule, schedu
 LOCAL_HOST = "127.0.0.1"
 _HELD: list[FileLock] = []
 """Locks of the folders of this process's trainings."""
-_SCHEDULE = (
-    "resolutions",
-    "refine_at",
-    "prune_at",
-    "steps",
-    "thin_at",
-    "distortion_ramp",
-    "view_dependence_from",
-    "voxel_pixels",
-)
+_SCHEDULE = tuple(field.name for field in fields(Schedule))
 """Options of the model that depend on the resolution and the number of steps."""
 
 
@@ -80,7 +65,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         self.follow_schedule(schedule_for(*QUALITIES[self.quality]))
 
     def set_experiment_name(self) -> None:
-        """Name the run by the folder of its scene where no name is given, for ``--data ..`` too."""
+        """Name the run by the folder of its scene if no name is given, for ``--data ..`` too."""
         data = self.pipeline.datamanager.data
         if self.experiment_name is None and data is not None:
             self.experiment_name = Path(os.path.abspath(data.parent if data.is_file() else data)).stem
@@ -102,7 +87,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         return super().get_base_dir()
 
     def save_config(self) -> None:
-        """Check what can be checked, hold the run's folder while this process lives, and write config.yml.
+        """Check all options, lock the run's folder while this process lives, and write config.yml.
 
         Raises:
             ThermoxelsError: An option is out of range, the folder cannot be written to, or another training is in it.
@@ -122,24 +107,23 @@ class ThermoxelsTrainerConfig(TrainerConfig):
     def check(self) -> None:
         """Raise `ThermoxelsError` for numbers that cannot work, and for a device that is not there."""
         manager: Any = self.pipeline.datamanager
-        count, seed, rate = (1, 1e9, "1 or more"), (0, 2**32 - 1, "from 0 to 2^32 - 1"), (1e-30, 1e6, "above 0")
-        values = {
-            "max_num_iterations": (self.max_num_iterations, *count),
-            "machine.seed": (self.machine.seed, *seed),
-            "machine.num_devices": (self.machine.num_devices, *count),
-            "pipeline.datamanager.seed": (manager.seed, *seed),
-        }
-        for name in ("train_num_rays_per_batch", "thermal_num_rays_per_batch", "eval_num_rays_per_batch"):
-            values[f"pipeline.datamanager.{name}"] = (getattr(manager, name), *count)
-        for name, group in self.optimizers.items():
-            values[f"optimizers.{name}.optimizer.lr"] = (group["optimizer"].lr, *rate)
-            if group.get("scheduler") is not None:
-                scheduler = f"optimizers.{name}.scheduler"
-                values[f"{scheduler}.max_steps"] = (group["scheduler"].max_steps, *count)
-                final = group["scheduler"].lr_final
-                values[f"{scheduler}.lr_final"] = (1.0 if final is None else final, *rate)
-        check_ranges("--", values)
         model: Any = self.pipeline.model
+        rays = [f"{stream}_num_rays_per_batch" for stream in ("train", "thermal", "eval")]
+        counts = {"max_num_iterations": self.max_num_iterations, "machine.num_devices": self.machine.num_devices}
+        counts |= {f"pipeline.datamanager.{name}": getattr(manager, name) for name in rays}
+        rates = {f"optimizers.{name}.optimizer.lr": group["optimizer"].lr for name, group in self.optimizers.items()}
+        for name, group in self.optimizers.items():
+            if (scheduler := group.get("scheduler")) is not None:
+                counts[f"optimizers.{name}.scheduler.max_steps"] = scheduler.max_steps
+                if scheduler.lr_final is not None:
+                    rates[f"optimizers.{name}.scheduler.lr_final"] = scheduler.lr_final
+        seeds = {"machine.seed": self.machine.seed, "pipeline.datamanager.seed": manager.seed}
+        for values, (low, high, words) in (
+            (counts, (1, 1e9, "1 or more")),
+            (seeds, (0, 2**32 - 1, "from 0 to 2^32 - 1")),
+            (rates, (1e-30, 1e6, "above 0")),
+        ):
+            check_ranges("--", {name: (value, low, high, words) for name, value in values.items()})
         model.check()
         there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
         if not there[self.machine.device_type]:
@@ -180,38 +164,32 @@ class ThermoxelsTrainer(Trainer):
     config: ThermoxelsTrainerConfig
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Build what trains, load the checkpoint, and say what a quality replaced: it may have been an option.
+        """Build the pipeline, load the checkpoint, and say which options a quality replaced.
 
         Raises:
-            CheckpointError: There is no checkpoint where one is to be, or the training cannot go on from it.
+            CheckpointError: The checkpoint that is named is not there, or the training cannot go on from it.
         """
         quality, replaced = self.config.quality, self.config.replaced
         if quality is not None:
-            resolution, steps, _ = QUALITIES[quality]
-            said = f"about {resolution} voxels and {steps} steps"
-            CONSOLE.log(
-                f"quality {quality}: {said}" + (f", in place of {replaced}" if replaced not in ("", said) else "")
-            )
+            said = "about {} voxels and {} steps".format(*QUALITIES[quality])
+            instead = f", in place of {replaced}" if replaced not in ("", said) else ""
+            CONSOLE.log(f"quality {quality}: {said}{instead}")
         self.config.follow_checkpoint()
         with plain_os_errors(self.base_dir):
             super().setup(test_mode)
         if self.local_rank == 0:
-            self._keep_what_was_found()
+            self._save_found_settings()
         # nerfstudio takes the shares and times that it shows from the number of steps without those before.
         writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
 
-    def _keep_what_was_found(self) -> None:
-        """Write the box and the resolutions that photographs asked for into config.yml: nobody has to find them again.
-
-        A box in a world that was turned is not one in input coordinates, and is found again.
-        """
+    def _save_found_settings(self) -> None:
+        """Write the box and the resolutions that photographs asked for into config.yml, for those who load it."""
         kept: Any = deepcopy(self.config)
         pipeline: Any = getattr(self.pipeline, "module", self.pipeline)
         model, parser = kept.pipeline.model, kept.pipeline.datamanager.dataparser
         found, model.voxel_pixels = pipeline.model.config, 0.0
         model.resolutions, model.refine_at, model.prune_at = found.resolutions, found.refine_at, found.prune_at
-        if (box := pipeline.datamanager.train_dataparser_outputs.metadata.get("input_box")) is not None:
-            parser.scene_box = box
+        parser.scene_box = pipeline.datamanager.train_dataparser_outputs.metadata["input_box"]
         with plain_os_errors(self.base_dir), replace_when_done(self.base_dir / "config.yml") as path:
             path.write_text(yaml.dump(kept), encoding="utf-8")
 
@@ -222,7 +200,15 @@ class ThermoxelsTrainer(Trainer):
 
     def _load_checkpoint(self) -> None:
         """Load a checkpoint if one is named, and say to which step the training goes on."""
-        self._check_that_there_is_one()
+        folder, step, file = self.config.load_dir, self.config.load_step, self.config.load_checkpoint
+        missing = None if folder is not None or file is None or file.is_file() else f"no file {file}"
+        if folder is not None:
+            pattern = "step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"
+            missing = None if any(folder.glob(pattern)) else f"no {pattern} in {folder}"
+        if missing is not None:
+            expected = "a folder with step-*.ckpt for --load-dir, or such a file for --load-checkpoint"
+            remedy = "Pass the folder nerfstudio_models of a training."
+            raise CheckpointError("checkpoint", expected=expected, got=missing, remedy=remedy)
         super()._load_checkpoint()
         first, steps = self._start_step, self.config.max_num_iterations
         if first == 0:
@@ -232,38 +218,18 @@ class ThermoxelsTrainer(Trainer):
             expected = f"one from before step {steps}, where quality {quality} ends"
             remedy = "Leave --quality out and pass --max-num-iterations 400, how many more steps to take."
             raise CheckpointError("checkpoint", expected=expected, got=f"step {first}", remedy=remedy)
-        self._check_lattice(first)
+        model: Any = getattr(self.pipeline, "module", self.pipeline).model
+        wanted = model.config.resolutions[sum(step < first for step in model.config.refine_at)]
+        if (found := max(model.grid.lattice.cell_shape)) < wanted:  # it would never be refined
+            expected = f"at least {wanted} voxels at step {first}, which these options refine to before it"
+            remedy = "Pass the quality, or the resolutions and refine-at, that the training began with."
+            raise CheckpointError("checkpoint", expected=expected, got=f"{found} voxels", remedy=remedy)
         if quality is not None:
             CONSOLE.log(f"goes on from step {first} to step {steps}, where quality {quality} ends")
             self.config.max_num_iterations = steps - first
         else:
             end = "" if first >= steps else f"; to end at step {steps} pass --max-num-iterations {steps - first}"
             CONSOLE.log(f"goes on from step {first} for {steps} more{end}")
-
-    def _check_that_there_is_one(self) -> None:
-        folder, step, file = self.config.load_dir, self.config.load_step, self.config.load_checkpoint
-        if folder is not None:
-            pattern = "step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"
-            missing = None if any(folder.glob(pattern)) else f"no {pattern} in {folder}"
-        else:
-            missing = None if file is None or file.is_file() else f"no file {file}"
-        if missing is not None:
-            expected = "a folder with step-*.ckpt for --load-dir, or such a file for --load-checkpoint"
-            remedy = "Pass the folder nerfstudio_models of a training."
-            raise CheckpointError("checkpoint", expected=expected, got=missing, remedy=remedy)
-
-    def _check_lattice(self, first: int) -> None:
-        """Refuse a lattice that is coarser than the options have it at a step: it would never be refined."""
-        model: Any = getattr(self.pipeline, "module", self.pipeline).model
-        refined = sum(step < first for step in model.config.refine_at)
-        expected, found = model.config.resolutions[refined], max(model.grid.lattice.cell_shape)
-        if found < expected:
-            raise CheckpointError(
-                "checkpoint",
-                expected=f"at least {expected} voxels at step {first}, which these options refine to before it",
-                got=f"{found} voxels",
-                remedy="Pass the quality, or the resolutions and refine-at, that the training began with.",
-            )
 
     def save_checkpoint(self, step: int) -> None:
         """Save model and optimisers under a temporary name, rename, and only then delete older checkpoints.
