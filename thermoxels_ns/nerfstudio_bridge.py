@@ -163,9 +163,9 @@ def _with_mesh_export(commands: Any) -> Any:
 
 
 def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
-    """How well a trained surface agrees with the exact scene, see `geometry_metrics`, and where held-out rays end.
+    """Compare a trained surface, see `geometry_metrics`, and the ends of held-out rays with the exact scene.
 
-    Empty if the scene is not known exactly. It stands here because `training` knows no evaluation.
+    Empty if the scene is not known exactly. The function stands here because `training` imports no evaluation.
     """
     from nerfstudio.utils.rich_utils import CONSOLE
     from rich.markup import escape
@@ -192,7 +192,7 @@ def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
 
 
 def _held_out_rays(pipeline: ThermoxelsPipeline) -> Iterator[RenderedRays]:
-    """Render the rays of each held-out photograph as it is given."""
+    """Render the rays of each held-out photograph."""
     from thermoxels_ns.evaluation.truth_comparison import RenderedRays
 
     datamanager: Any = pipeline.datamanager

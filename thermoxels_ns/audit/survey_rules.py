@@ -30,31 +30,28 @@ class SurveyCheck:
 
 def check_survey(conditions: Conditions) -> SurveyCheck:
     """Hold conditions against what EN 13187 asks for."""
-    return SurveyCheck(_forbidden(conditions), _doubts(conditions), _missing(conditions))
-
-
-def _forbidden(conditions: Conditions) -> tuple[str, ...]:
     survey, wind, difference = conditions.survey, conditions.outside.wind, conditions.difference_k
-    found = []
+    least, sun, dry = survey.least_difference_24h, survey.hours_since_sun, survey.hours_dry
+    forbidden = []
     if difference < LEAST_DIFFERENCE_K:
-        found.append(f"The airs differ by {difference:.1f} K; EN 13187 asks for {LEAST_DIFFERENCE_K:g} K.")
-    least = survey.least_difference_24h
-    if least is not None and difference >= LEAST_DIFFERENCE_K > least.value:
-        found.append(
+        forbidden.append(f"The airs differ by {difference:.1f} K; EN 13187 asks for {LEAST_DIFFERENCE_K:g} K.")
+    elif least is not None and least.value < LEAST_DIFFERENCE_K:
+        forbidden.append(
             f"During the last 24 hours the airs differed by {least.value:g} K at times; EN 13187 asks for "
             f"{LEAST_DIFFERENCE_K:g} K all the time."
         )
     if wind is not None and wind.value > MOST_WIND_M_S:
-        found.append(f"The wind was {wind.value:.1f} m/s; EN 13187 allows {MOST_WIND_M_S:g} m/s.")
-    sun, dry = survey.hours_since_sun, survey.hours_dry
-    if sun is not None and sun.value < LEAST_HOURS_WITHOUT_SUN and conditions.side == "outside":
-        found.append(
-            f"The sun shone on the surface {sun.value:g} hours before; EN 13187 asks for "
-            f"{LEAST_HOURS_WITHOUT_SUN:g} hours without, heavy walls need more."
-        )
-    if dry is not None and dry.value < LEAST_HOURS_DRY and conditions.side == "outside":
-        found.append(f"The surface was wet {dry.value:g} hours before; EN 13187 asks for {LEAST_HOURS_DRY:g} hours.")
-    return tuple(found)
+        forbidden.append(f"The wind was {wind.value:.1f} m/s; EN 13187 allows {MOST_WIND_M_S:g} m/s.")
+    if conditions.side == "outside":
+        if sun is not None and sun.value < LEAST_HOURS_WITHOUT_SUN:
+            forbidden.append(
+                f"The sun shone on the surface {sun.value:g} hours before; EN 13187 asks for "
+                f"{LEAST_HOURS_WITHOUT_SUN:g} hours without, heavy walls need more."
+            )
+        if dry is not None and dry.value < LEAST_HOURS_DRY:
+            asked = f"EN 13187 asks for {LEAST_HOURS_DRY:g} hours."
+            forbidden.append(f"The surface was wet {dry.value:g} hours before; {asked}")
+    return SurveyCheck(tuple(forbidden), _doubts(conditions), _missing(conditions))
 
 
 def _doubts(conditions: Conditions) -> tuple[str, ...]:
@@ -92,23 +89,12 @@ def _doubts(conditions: Conditions) -> tuple[str, ...]:
 
 
 def _missing(conditions: Conditions) -> tuple[str, ...]:
-    survey, camera = conditions.survey, conditions.camera
-    found = [
-        _NAMES.get(field.name, field.name.replace("_", " "))
-        for field in fields(survey)
-        if getattr(survey, field.name) in (None, "")
-    ]
-    if not conditions.outside_known:
-        found.append("air temperature outside")
-    for name, air in (("inside", conditions.inside), ("outside", conditions.outside)):
-        if air.lowest_24h is None or air.highest_24h is None:
-            found.append(f"lowest and highest air temperature {name} during the last 24 hours")
-    if conditions.outside.wind is None:
-        found.append("wind")
-    if not conditions.outside.wind_direction:
-        found.append("wind direction")
-    if not camera.model:
-        found.append("make and model of the camera")
-    if not camera.serial_number:
-        found.append("serial number of the camera")
-    return tuple(found)
+    survey, camera, outside = conditions.survey, conditions.camera, conditions.outside
+    said = {_NAMES.get(one.name, one.name.replace("_", " ")): getattr(survey, one.name) for one in fields(survey)}
+    said["air temperature outside"] = outside.air if conditions.outside_known else None
+    for name, air in (("inside", conditions.inside), ("outside", outside)):
+        both = air.lowest_24h if air.highest_24h is not None else None
+        said[f"lowest and highest air temperature {name} during the last 24 hours"] = both
+    said |= {"wind": outside.wind, "wind direction": outside.wind_direction}
+    said |= {"make and model of the camera": camera.model, "serial number of the camera": camera.serial_number}
+    return tuple(name for name, value in said.items() if value in (None, ""))
