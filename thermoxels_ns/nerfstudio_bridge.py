@@ -63,17 +63,13 @@ def print_our_errors_plainly() -> None:
 def allow_checkpoint_globals() -> None:
     """Let ``torch.load(weights_only=True)`` read the numpy scalars that nerfstudio's checkpoints hold.
 
-    Learning-rate schedulers save numpy numbers beside the tensors, and it refuses any type that is not registered as
-    harmless; these are: a scalar, its dtype and the classes of the plain number types.
+    Learning-rate schedulers save numpy numbers beside the tensors, and torch refuses any type that is not registered as
+    harmless. Harmless are a scalar, its dtype and the classes of the plain number types.
     """
-    numbers = (
-        *(np.bool_, np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64),
-        *(np.float16, np.float32, np.float64),
-    )
     # The function that pickle names: numpy.core.multiarray.scalar in numpy 1, numpy._core.multiarray.scalar in 2.
     rebuild_scalar: Any = np.float64(0).__reduce__()[0]
-    register = torch.serialization.add_safe_globals
-    register([rebuild_scalar, np.dtype, *dict.fromkeys(type(np.dtype(number)) for number in numbers)])
+    kinds = {type(np.dtype(code)) for code in "?efd" + np.typecodes["AllInteger"]}
+    torch.serialization.add_safe_globals([rebuild_scalar, np.dtype, *kinds])
 
 
 def extend_commands() -> None:

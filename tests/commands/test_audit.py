@@ -102,8 +102,8 @@ def test_pictures_of_a_room_look_into_it() -> None:
     seen = ((middle > 0.4) & (middle < 3.6)).all(axis=1)
     room = replace(mesh, boundary=replace(mesh.boundary, seen=seen))
     pictures = draw_audit(audit(room, INSIDE))
-    assert len(pictures.temperature) == 2
-    for png in pictures.temperature:
+    assert len(pictures["temperature"]) == 2
+    for png in pictures["temperature"]:
         drawn = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)[150:750, 50:900]
         coloured = np.ptp(drawn, axis=2) > 40
         assert coloured.mean() > 0.2

@@ -150,7 +150,6 @@ def test_the_rows_of_settings_qualities_methods_and_recipes():
     [
         *(({"settings": (text,)}, "settings") for text in ("64", "0:800", "64:0", "64:8e2", "64:800:2", " 64:800", "")),
         ({"settings": (), "qualities": ()}, "settings"),
-        ({"methods": ()}, "methods"),
         ({"baseline": "best"}, "baseline"),
         ({"train_options": "'"}, "train_options"),
         ({"repeats": 0}, "repeats"),

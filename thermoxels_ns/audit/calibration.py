@@ -201,7 +201,7 @@ class _Fit:
 
     def __init__(self, wall: _Wall, draws: Draws) -> None:
         self.wall, self.draws = wall, draws
-        self.names = [one.name for one in wall.asked.unknown]
+        self.names = [one.name() for one in wall.asked.unknown]
         self.stated = wall.asked.stated()
         self.start = {name: self.stated[name].value for name in self.names}
         area = wall.surface.area_m2[wall.counted]

@@ -190,9 +190,8 @@ class Unknown:
     property: Literal["conductivity", "thickness", "film"]
     of: str  # The entry of `conductivity`, `layers` or `film` that it belongs to
 
-    @property
     def name(self) -> str:
-        """What reports call it, such as "conductivity of wall"."""
+        """Name it as reports do, such as "conductivity of wall"."""
         return f"{self.property} of {self.of}"
 
 
@@ -214,7 +213,7 @@ class Calibrate:
         if both:
             remedy = "Give the layer another name."
             raise AuditError("layers", expected="names that no region has", got=both[0], remedy=remedy)
-        names = [one.name for one in self.unknown]
+        names = [one.name() for one in self.unknown]
         if not 1 <= len(set(names)) <= MOST_UNKNOWN or len(set(names)) < len(names):
             remedy = "Write unknown: [{property: conductivity, of: wall}], for example."
             expected = f"one to {MOST_UNKNOWN} different entries"

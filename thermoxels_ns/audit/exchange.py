@@ -159,7 +159,7 @@ def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], 
     """List the film models that the conditions have the figures for, their own one first, with conditions for each."""
     own = conditions.film
     windless = conditions.side == "outside" and conditions.outside.wind is None
-    others = [
+    others: list[tuple[FilmModel, Conditions]] = [
         (model, replace(conditions, film=Film(model, own.factor)))
         for model in FILM_MODELS[conditions.side]
         if model not in (own.model, "given") and not (windless and model in WINDY)

@@ -144,32 +144,22 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     worst = np.flatnonzero(surface.counted & ~surface.rim)
     worst = worst if len(worst) else counted
     away = surface_c[worst] * (-1.0 if conditions.side == "inside" else 1.0)
-    parts.append(surface.spot(worst, away))
+    parts += [surface.spot(worst, away), counted]
     work = _Parts(conditions, surface, groups, draws, parts)
 
     # Readings of each patch have an error of their own, those of a storey the errors of the patches in it.
     own = np.stack([work.slope_w_k[n] * work.own_error_k(n) for n in range(len(patches))])
-    models = work.u_by_model(len(patches))
     observed = np.isin(patch, patches)
     elements = [
-        work.element(
-            names[number], row, np.flatnonzero(patch == number), own[row], {m: u[row] for m, u in models.items()}
-        )
+        work.element(names[number], row, np.flatnonzero(patch == number), own[row])
         for row, number in enumerate(patches)
     ]
-    of_storeys = [
-        work.element(
-            *(storey_names[number], row, np.flatnonzero((storey == number) & observed)),
-            *(_shares(surface, parts[row], parts[: len(patches)]) @ own, {}),
-        )
-        for row, number in enumerate(storeys, start=len(patches))
-    ]
-    area = work.totals.area_m2[: len(patches)]
-    whole_flow = work.totals.flow_w[: len(patches)].sum(axis=0) + own.sum(axis=0)
-    whole_c = area @ work.totals.surface_c[: len(patches)] / area.sum()
-    whole_u = {model: float(u @ area / area.sum()) for model, u in models.items()}
-    every = np.flatnonzero(observed)
-    whole = work.figures("all that was observed", counted, every, whole_c, whole_flow, whole_u)
+    of_storeys = []
+    for row, number in enumerate(storeys, start=len(patches)):
+        every = np.flatnonzero((storey == number) & observed)
+        shares = _shares(surface, parts[row], parts[: len(patches)])
+        of_storeys.append(work.element(storey_names[number], row, every, shares @ own))
+    whole = work.element("all that was observed", len(parts) - 1, np.flatnonzero(observed), own.sum(axis=0))
 
     first = len(patches) + len(storeys)
     defects = [
@@ -180,7 +170,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     ]
     order = sorted(range(len(found)), key=lambda n: (bool(defects[n].not_counted), -defects[n].extra_w.value))
     found, defects = [found[n] for n in order], [defects[n] for n in order]
-    last, check = len(parts) - 1, check_survey(conditions)
+    last, check = len(parts) - 2, check_survey(conditions)
     f_rsi = work.temperature_factors(last, work.own_error_k(last))
     left = {why: float(surface.area_m2[surface.why_not == n].sum()) for n, why in enumerate(WHY_NOT.values())}
     return Audit(
@@ -193,7 +183,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
         defects=tuple(defects),
         found=tuple(found),
         limits=_limits(conditions, elements, defects, whole, f_rsi),
-        year=_year(conditions, draws, whole_flow / draws.difference_k),
+        year=_year(conditions, draws, (work.totals.flow_w[-1] + own.sum(axis=0)) / draws.difference_k),
         calibration=calibrated(conditions, surface, groups, draws),
         f_rsi=f_rsi,
         budget=work.budget(own),
@@ -238,39 +228,28 @@ class _Parts:
             for step in (-HALF_STEP_K, HALF_STEP_K)
         )
         self.slope_w_k = (high - low) / (2.0 * HALF_STEP_K)  # By which flows change with the readings, shape (parts,)
+        self.u_by_model = dict[str, FloatArray]()  # U-values by each film model from the stated values, shape (parts,)
+        for model, chosen in other_models(conditions):
+            flow_w = part_totals(chosen, groups, draws.stated, self.rows).flow_w[:, 0]
+            self.u_by_model[model] = flow_w / draws.difference_k[0] / np.maximum(self.totals.area_m2, 1e-12)
 
     def own_error_k(self, number: int) -> FloatArray:
         """Draw the error of readings that a part does not share with others, shape (k,), [K]."""
         return self.draws.local(self.conditions.camera.repeatability.off_by, number)
 
-    def element(
-        self, name: str, row: int, every: IntArray, error_w: FloatArray, u_by_model: Mapping[str, float]
-    ) -> Element:
+    def element(self, name: str, row: int, every: IntArray, error_w: FloatArray) -> Element:
         """Put figures to the part `row`; `every` are all of its triangles, `error_w` the error of its own readings."""
-        flow_w = self.totals.flow_w[row] + error_w
-        return self.figures(name, self.parts[row], every, self.totals.surface_c[row], flow_w, u_by_model)
-
-    def figures(
-        self,
-        name: str,
-        counted: IntArray,
-        every: IntArray,
-        surface_c: FloatArray,
-        flow_w: FloatArray,
-        u_by_model: Mapping[str, float],
-    ) -> Element:
-        """Put figures to a part of the envelope from its temperature and heat flow in every draw, shape (k,) each."""
-        surface = self.surface
-        area = float(surface.area_m2[counted].sum())
+        surface, counted, area = self.surface, self.parts[row], float(self.totals.area_m2[row])
         uncut = every[surface.why_not[every] != list(WHY_NOT).index("cut")]
+        flow_w = self.totals.flow_w[row] + error_w
         return Element(
             name=name,
             area_m2=area,
             unobserved_m2=max(float(surface.area_m2[uncut].sum()) - area, 0.0),
-            surface_c=interval_of(surface_c),
+            surface_c=interval_of(self.totals.surface_c[row]),
             loss_w=interval_of(flow_w),
             u_w_m2k=interval_of(flow_w / area / self.draws.difference_k),
-            u_by_model=u_by_model,
+            u_by_model={model: float(u[row]) for model, u in self.u_by_model.items()},
             unsupported_share=float(surface.area_m2[counted] @ surface.unsupported[counted]) / area,
         )
 
@@ -286,14 +265,6 @@ class _Parts:
             found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ends, axis=1).T], axis=1))
         of_group = np.concatenate(found)
         return np.where(self.surface.counted[:, None], of_group[self.groups.of_triangle], np.nan)
-
-    def u_by_model(self, count: int) -> dict[str, FloatArray]:
-        """Give the U-values of the first parts, shape (count,), by each film model from the stated values."""
-        stated, found = self.draws.stated, {}
-        for model, conditions in other_models(self.conditions):
-            one = part_totals(conditions, self.groups, stated, self.rows[:count])
-            found[model] = one.flow_w[:, 0] / stated.difference_k[0] / one.area_m2
-        return found
 
     def budget(self, own: FloatArray) -> dict[str, float]:
         """Say how far each uncertain quantity alone moves the loss from one end of its range to the other, [W]."""

@@ -221,10 +221,6 @@ def run_cost(cost: Cost, console: Console) -> None:
 
 def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     """Give the rows of the table, and the name of the baseline among them."""
-    for name in ("methods", "recipes"):
-        if not getattr(cost, name):
-            remedy = f"Leave out --{name} for the default."
-            raise ThermoxelsError(name, expected="at least one", got="none", remedy=remedy)
     try:
         further = tuple(shlex.split(cost.train_options))
     except ValueError as problem:
@@ -246,7 +242,8 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
         recipe_words = () if recipe == "default" else ("--pipeline.model.recipe", recipe)
         return CostSetting(f"{of}{kind}", method, (*words[of], *recipe_words, *further))
 
-    (method, *methods), (recipe, *recipes) = dict.fromkeys(cost.methods), dict.fromkeys(cost.recipes)
+    method, *methods = dict.fromkeys(cost.methods or ("thermoxels",))
+    recipe, *recipes = dict.fromkeys(cost.recipes or ("default",))
     rows = [row(name, method, recipe) for name in words]
     rows += [row(baseline, other, recipe, f", {other}") for other in methods]
     rows += [row(baseline, method, other, f", recipe {other}") for other in recipes]
@@ -314,23 +311,24 @@ def read_runs(path: Path) -> dict[RunKey, Figures]:
 
 def write_runs(path: Path, runs: Mapping[RunKey, Figures]) -> None:
     """Write the finished runs; an interrupted write leaves the old file."""
-    lines = [[*key, *(_cell(figures[name], "r") for name in FIGURES)] for key, figures in runs.items()]
-    _write_csv(path, [*RunKey._fields, *FIGURES], lines)
+    _write_csv(path, [*RunKey._fields, *FIGURES], ([*key, *_cells(figures)] for key, figures in runs.items()))
 
 
 def write_table(path: Path, rows: Iterable[CostRow], baseline: str) -> None:
-    """Write the rows with all figures; cells are empty where there is nothing to measure."""
+    """Write the rows with all figures."""
     fronts = [f"front_{name}" for name in FRONTS]
     lines = []
     for row in rows:
-        numbers = [_cell(number, ".6g") for number in (*(row.figures[name] for name in FIGURES), row.time_ratio)]
+        ratio = "" if math.isnan(row.time_ratio) else f"{row.time_ratio:.6g}"
         marks = [int(name in row.fronts) for name in FRONTS]
-        lines.append([row.setting.name, row.repeats, *numbers, baseline, *marks, row.setting.command()])
+        one = row.setting
+        lines.append([one.name, row.repeats, *_cells(row.figures), ratio, baseline, *marks, one.command()])
     _write_csv(path, ["setting", "repeats", *FIGURES, "time_ratio", "baseline", *fronts, "training"], lines)
 
 
-def _cell(number: float, form: str) -> str:
-    return "" if math.isnan(number) else repr(number) if form == "r" else format(number, form)
+def _cells(figures: Figures) -> list[str]:
+    """Write all figures in their order; cells are empty where there is nothing to measure."""
+    return ["" if math.isnan(figures[name]) else f"{figures[name]:.6g}" for name in FIGURES]
 
 
 def _write_csv(path: Path, head: Sequence[str], lines: Iterable[Sequence[object]]) -> None:

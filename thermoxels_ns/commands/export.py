@@ -4,7 +4,6 @@ from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
 import math
-import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -535,7 +534,9 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
 
     def check(config: TrainerConfig) -> TrainerConfig:
         _check_config(config)
-        check_scene(_scene_folder(config))
+        manager: Any = config.pipeline.datamanager
+        told = getattr(manager, "data", None)  # with --data of ns-train, else with the dataparser's own --data
+        check_scene(Path(manager.dataparser.data if told is None else told))
         return config
 
     try:
@@ -544,7 +545,9 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
         raise
     except (yaml.YAMLError, AssertionError, KeyError, UnicodeDecodeError) as problem:
         expected = "a config.yml that ns-train of this installation wrote"
-        got = f"{load_config}, which cannot be read ({_reason(load_config, problem)})"
+        # nerfstudio's own checks have no message
+        reason = f"{type(problem).__name__}: {problem}" if str(problem) else "it holds no TrainerConfig of nerfstudio"
+        got = f"{load_config}, which cannot be read ({reason})"
         remedy = "Pass the config.yml of the training run."
         raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy) from problem
     except RuntimeError as problem:
@@ -564,18 +567,6 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
         outputs.metadata["feature_rays"],
         pipeline_of_ours.corrections(),
     )
-
-
-def _reason(load_config: Path, problem: Exception) -> str:
-    """Say why nerfstudio refused a config.yml; its own checks have no message."""
-    if load_config.stat().st_size == 0:
-        return "the file is empty"
-    if str(problem):
-        return f"{type(problem).__name__}: {problem}"
-    check = (traceback.extract_tb(problem.__traceback__)[-1].line or "").strip()
-    if "TrainerConfig" in check:
-        return "it holds no TrainerConfig of nerfstudio"
-    return f"{type(problem).__name__} at: {check}"
 
 
 def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.ArrayLike) -> Viewpoint:
@@ -605,13 +596,7 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
     return Viewpoint(tuple(float(v) for v in up), source, direction)  # type: ignore[arg-type]
 
 
-def _scene_folder(config: TrainerConfig) -> Path:
-    """Say where the photographs are: what ns-train was told with --data, else with the dataparser's own --data."""
-    manager: Any = config.pipeline.datamanager
-    return Path(manager.dataparser.data if getattr(manager, "data", None) is None else manager.data)
-
-
-def _check_config(config: TrainerConfig) -> TrainerConfig:
+def _check_config(config: TrainerConfig) -> None:
     """Refuse another method's run, or one without a checkpoint, before its photographs are loaded."""
     pipeline: Any = config.pipeline
     if not callable(getattr(pipeline._target, "grid_snapshot", None)):
@@ -623,4 +608,3 @@ def _check_config(config: TrainerConfig) -> TrainerConfig:
     if not any(folder.glob("step-*.ckpt")):
         remedy = "Run the command in the folder where ns-train ran, or train to the first checkpoint."
         raise CheckpointError("checkpoint", expected=f"a file step-*.ckpt in {folder}", got="none", remedy=remedy)
-    return config

@@ -37,7 +37,9 @@ def lines_on_mesh(
     for step in built.solid.steps:
         amounts = []
         for sign, voxels in (("+", step.added), ("-", step.removed)):
-            size = f" ({voxels * voxel_size**3:.3g} m^3)" if unit == "m" else ""
+            volume_m3 = voxels * voxel_size**3
+            told = f"{1e3 * volume_m3:.3g} l" if volume_m3 < 1.0 else f"{volume_m3:.3g} m^3"
+            size = f" ({told})" if unit == "m" else ""
             if voxels:
                 amounts.append(f"{sign}{voxels} voxels{size}")
         changed = ", ".join(amounts) or "nothing changed"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import fields
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -16,6 +16,10 @@ from thermoxels_ns.audit.surface import WHY_NOT
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.reports.numbers import number_text, stated_text
 from thermoxels_ns.reports.page import Picture, build_page, image_file
+
+AuditPictures: TypeAlias = dict[str, list[bytes]]
+"""PNG files, from one or two sides each: surface "temperature" with the numbers of defects, "u_value" (heat flow if the
+air outside is not known), "misfit" (measured minus computed in a calibration); one each of "defects"."""
 
 MOST_DEFECTS = 12  # How many get a picture
 _ALL_AROUND = 0.35  # Share of the area that normals add up to, below which a building was seen from all around
@@ -38,7 +42,7 @@ def audit_page(
     counted = [(number, one) for number, one in numbered if not one.not_counted]
     loss, bound = abs(audit.whole.loss_w.value), audit.whole.loss_w.at_most or audit.whole.loss_w.unknown
     start = {} if asked is None else asked.stated()
-    unknown = set() if asked is None else {one.name for one in asked.unknown}
+    unknown = set() if asked is None else {one.name() for one in asked.unknown}
     return build_page(
         "audit.html.j2",
         audit=audit,
@@ -78,44 +82,36 @@ def _survey(survey: Survey) -> list[tuple[str, str]]:
     ]
 
 
-@dataclass(frozen=True)
-class AuditPictures:
-    """PNG files."""
-
-    temperature: tuple[bytes, ...]  # Surface temperature with the numbers of defects, from one or two sides
-    u_value: tuple[bytes, ...]  # U-value, from the same sides; heat flow where the air outside is not known
-    defects: tuple[bytes, ...]  # Surface temperature of each defect and what is around it
-    misfit: tuple[bytes, ...]  # Measured minus computed temperature of a calibration, from the same sides
-
-
 def draw_audit(audit: Audit) -> AuditPictures:
     """Draw all pictures; colours of all temperatures have one scale, what does not count is grey."""
-    surface = audit.surface
-    counted = surface.counted
+    surface, calibration, up = audit.surface, audit.calibration, audit.surface.selection.up
+    shown = np.unique(surface.mesh.facets[surface.counted])
     known = audit.conditions.outside_known
-    shown, name = audit.triangle_u[:, 0] if known else audit.triangle_flow_w_m2, "U-value" if known else "Heat flow"
-    surface_c, u = (_at_nodes(audit, values) for values in (audit.triangle_surface_c, shown))
-    ends = np.quantile(surface_c[np.unique(surface.mesh.facets[counted])], (0.005, 0.995))
-    u_ends = np.quantile(u[np.unique(surface.mesh.facets[counted])], (0.02, 0.98))
-    same: dict[str, Any] = {"clim": (float(ends[0]), float(ends[1])), "up": surface.selection.up}
-    temperature, u_value, misfit = [], [], []
-    calibration = audit.calibration
-    off_k = None if calibration is None else _at_nodes(audit, calibration.difference_k)
+    values, name, unit = audit.triangle_u[:, 0], "U-value", "W/(m² K)"
+    if not known:
+        values, name, unit = audit.triangle_flow_w_m2, "Heat flow", "W/m²"
+    surface_c, u = _at_nodes(audit, audit.triangle_surface_c), _at_nodes(audit, values)
+    temperatures: dict[str, Any] = {"up": up, "clim": np.quantile(surface_c[shown], (0.005, 0.995)).tolist()}
+    flows: dict[str, Any] = {"up": up, "clim": np.quantile(u[shown], (0.02, 0.98)).tolist(), "colour_map": "viridis"}
+    flows |= {"bar_title": f"{name} [{unit}]", "title": f"{name} by the stated values"}
+    pictures: AuditPictures = {"temperature": [], "u_value": [], "misfit": []}
     for direction in _views(audit):
         view = {"view_direction": direction.tolist()}
         facing = surface.selection.facet_normal @ direction < 0.0
         labels = _labels(audit, direction)
         title = "Surface temperature, corrected for emissivity and reflection"
-        temperature.append(_picture(audit, facing, surface_c, title=title, labels=labels, **same, **view))
-        look: dict[str, Any] = {"clim": (float(u_ends[0]), float(u_ends[1])), "colour_map": "viridis"}
-        look |= {"bar_title": f"{name} [{'W/(m² K)' if known else 'W/m²'}]", "up": surface.selection.up}
-        u_value.append(_picture(audit, facing, u, title=f"{name} by the stated values", **look, **view))
-        if off_k is not None:
-            most = float(np.quantile(np.abs(off_k[np.unique(surface.mesh.facets[counted])]), 0.98)) or 1.0
-            look |= {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "difference [K]"}
-            misfit.append(_picture(audit, facing, off_k, title="Measured minus computed", **look, **view))
-    defects = [_defect(audit, number, surface_c, same) for number in range(min(len(audit.defects), MOST_DEFECTS))]
-    return AuditPictures(tuple(temperature), tuple(u_value), tuple(defects), tuple(misfit))
+        drawn = _picture(audit, facing, surface_c, title=title, labels=labels, **temperatures, **view)
+        pictures["temperature"].append(drawn)
+        pictures["u_value"].append(_picture(audit, facing, u, **flows, **view))
+        if calibration is not None:
+            off_k = _at_nodes(audit, calibration.difference_k)
+            most = float(np.quantile(np.abs(off_k[shown]), 0.98)) or 1.0
+            look: dict[str, Any] = {"up": up, "clim": (-most, most), "colour_map": "coolwarm"}
+            look |= {"bar_title": "difference [K]", "title": "Measured minus computed"}
+            pictures["misfit"].append(_picture(audit, facing, off_k, **look, **view))
+    count = min(len(audit.defects), MOST_DEFECTS)
+    pictures["defects"] = [_defect(audit, number, surface_c, temperatures) for number in range(count)]
+    return pictures
 
 
 def _at_nodes(audit: Audit, values: FloatArray) -> FloatArray:

@@ -113,6 +113,6 @@ def colours(temperature_c: npt.NDArray, limits: tuple[float, float] | None = Non
         low, high = limits
     share = np.nan_to_num((temperature_c - low) / max(float(high - low), 1e-6))
     levels = np.clip(255 * share, 0, 255).astype(np.uint8)
-    shown = cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO)[..., ::-1].copy()
+    shown = np.array(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO)[..., ::-1], dtype=np.uint8)
     shown[~known] = 0
     return shown

@@ -107,7 +107,7 @@ def image_of_surface(
     font = str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
     plotter = pv.Plotter(off_screen=True, window_size=list(window_size))
     try:
-        plotter.set_background("white")
+        plotter.renderer.set_background("white")
         if not plain.all():
             surface = pv.PolyData.from_regular_faces(points_m, facets[~plain])
             surface.point_data["value"] = values
@@ -298,9 +298,14 @@ def draw_surface(
         drawn = {HEAT_PICTURES[1]: (values, how | {"title": f"Surface temperature{when}"})}
     for name, (values, how) in drawn.items():
         write_picture(folder / name, image_of_mesh(mesh, values, up=up, **how))
-    *surface, view = cut_open(mesh, states_c[-1], up)
-    look: Any = {"title": f"Cut through the middle{when}", "words": [_size_of(mesh, "m")], "up": up}
-    write_picture(folder / HEAT_PICTURES[3], image_of_surface(*surface, view_direction=view, **look))
+    points, facets, values, view = cut_open(mesh, states_c[-1], up)
+    look: Any = {
+        "title": f"Cut through the middle{when}",
+        "words": [_size_of(mesh, "m")],
+        "up": up,
+        "view_direction": view,
+    }
+    write_picture(folder / HEAT_PICTURES[3], image_of_surface(points, facets, values, **look))
     return [*drawn, HEAT_PICTURES[3]]
 
 
