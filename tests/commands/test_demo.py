@@ -8,7 +8,7 @@ import tyro
 
 from thermoxels_ns import cli
 from thermoxels_ns.audit.conditions import load_conditions
-from thermoxels_ns.audit.survey_rules import check_survey
+from thermoxels_ns.audit.run import check_survey
 from thermoxels_ns.commands import demo
 from thermoxels_ns.commands.audit import Audit
 from thermoxels_ns.commands.demo_results import Target, audit_target, compare, read_results, true_u_of_patches
