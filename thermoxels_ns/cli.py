@@ -119,7 +119,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def entrypoint() -> None:
-    """Entry point of the console script."""
+    """Run the console script and end the process with its status."""
     if not sys.warnoptions:  # whoever sets filters wants to see what they let through
         warnings.filterwarnings("ignore", _NEWS_FOR_PROGRAMMERS, FutureWarning)
     try:

@@ -34,7 +34,7 @@ def _group(lr: float, lr_final: float, optimizer: type[OptimizerConfig]) -> dict
 def _trainer(
     optimizer: type[OptimizerConfig] = RowAdamConfig, dense: type[OptimizerConfig] = FusedAdamConfig
 ) -> ThermoxelsTrainerConfig:
-    """The default training: `optimizer` for the rows of the voxel grid, `dense` for what every batch touches whole."""
+    """Give the default training: `optimizer` moves the rows of the voxel grid, `dense` what a batch touches whole."""
     return ThermoxelsTrainerConfig(
         method_name="thermoxels",
         max_num_iterations=ITERATIONS,

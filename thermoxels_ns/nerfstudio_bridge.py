@@ -63,17 +63,13 @@ def print_our_errors_plainly() -> None:
 def allow_checkpoint_globals() -> None:
     """Let ``torch.load(weights_only=True)`` read the numpy scalars that nerfstudio's checkpoints hold.
 
-    Learning-rate schedulers save numpy numbers beside the tensors, and it refuses any type that is not registered as
-    harmless; these are: a scalar, its dtype and the classes of the plain number types.
+    Learning-rate schedulers save numpy numbers beside the tensors, and torch refuses any type that is not registered as
+    harmless. Harmless are a scalar, its dtype and the classes of the plain number types.
     """
-    numbers = (
-        *(np.bool_, np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64),
-        *(np.float16, np.float32, np.float64),
-    )
     # The function that pickle names: numpy.core.multiarray.scalar in numpy 1, numpy._core.multiarray.scalar in 2.
     rebuild_scalar: Any = np.float64(0).__reduce__()[0]
-    register = torch.serialization.add_safe_globals
-    register([rebuild_scalar, np.dtype, *dict.fromkeys(type(np.dtype(number)) for number in numbers)])
+    kinds = {type(np.dtype(code)) for code in "?efd" + np.typecodes["AllInteger"]}
+    torch.serialization.add_safe_globals([rebuild_scalar, np.dtype, *kinds])
 
 
 def extend_commands() -> None:
@@ -163,9 +159,9 @@ def _with_mesh_export(commands: Any) -> Any:
 
 
 def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
-    """How well a trained surface agrees with the exact scene, see `geometry_metrics`, and where held-out rays end.
+    """Compare a trained surface, see `geometry_metrics`, and the ends of held-out rays with the exact scene.
 
-    Empty if the scene is not known exactly. It stands here because `training` knows no evaluation.
+    Empty if the scene is not known exactly. The function stands here because `training` imports no evaluation.
     """
     from nerfstudio.utils.rich_utils import CONSOLE
     from rich.markup import escape
@@ -192,7 +188,7 @@ def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
 
 
 def _held_out_rays(pipeline: ThermoxelsPipeline) -> Iterator[RenderedRays]:
-    """Render the rays of each held-out photograph as it is given."""
+    """Render the rays of each held-out photograph."""
     from thermoxels_ns.evaluation.truth_comparison import RenderedRays
 
     datamanager: Any = pipeline.datamanager

@@ -16,8 +16,8 @@ from tests.support.audited_wall import (
     solve_wall,
     true_draws,
 )
+from thermoxels_ns.audit.calibration import Calibration
 from thermoxels_ns.audit.conditions import Calibrate, Camera, Layer, Unknown
-from thermoxels_ns.audit.results import Calibration
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured

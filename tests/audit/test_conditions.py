@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from thermoxels_ns.audit.conditions import EXAMPLE, load_conditions, write_example
-from thermoxels_ns.audit.survey_rules import check_survey
+from thermoxels_ns.audit.run import check_survey
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.yaml_records import configs_folder

@@ -8,7 +8,7 @@ from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.audit.conditions import Camera
 from thermoxels_ns.audit.defects import find_defects, undisturbed_temperature
 from thermoxels_ns.audit.draws import interval_of
-from thermoxels_ns.audit.run import audit
+from thermoxels_ns.audit.run import audit, incidence_factor
 from thermoxels_ns.audit.surface import audited_surface
 from thermoxels_ns.core.measured import Measured
 
@@ -98,25 +98,18 @@ def test_two_bridges_stay_two_and_lose_nothing_to_each_other(plate) -> None:
 
 def test_incidence_is_the_published_one() -> None:
     """Ti 20, T_1D 18.5; equal areas 60 at 18.5, 20 at 18.0, 20 at 17.0 C: 1.26667."""
-    areas, temperatures = np.array([60.0, 20.0, 20.0]), np.array([18.5, 18.0, 17.0])
-    from thermoxels_ns.audit.exchange import PartTotals
-    from thermoxels_ns.audit.run import PartFigures
-
-    mean = float(areas @ temperatures / areas.sum())
-    rows = np.array([[mean] * 3, [18.5] * 3])
-    totals = PartTotals(np.array([100.0, 60.0]), rows, rows, np.full(3, 20.0), np.zeros(3))
-    found = PartFigures(totals, np.zeros(2), np.zeros(3)).incidence(0, 1, "inside")
+    mean, calm = np.full(3, 0.6 * 18.5 + 0.2 * 18.0 + 0.2 * 17.0), np.full(3, 18.5)
+    found = incidence_factor(mean, calm, np.full(3, 20.0))
     assert found is not None and found.value == pytest.approx(1.26667, abs=5e-6)
-    near = PartTotals(totals.area_m2, totals.flow_w, rows, np.array([18.6, 18.4, 18.6]), np.zeros(3))
-    assert PartFigures(near, np.zeros(2), np.zeros(3)).incidence(0, 1, "inside") is None
+    assert incidence_factor(mean, calm, np.array([18.6, 18.4, 18.6])) is None
 
 
 def test_the_undisturbed_temperature_is_that_of_the_larger_part() -> None:
     generator = np.random.default_rng(0)
     values = np.concatenate([generator.normal(3.0, 0.1, 600), generator.uniform(3.5, 9.0, 400)])
-    found = undisturbed_temperature(values, np.ones(1000))
-    assert found.temperature_c == pytest.approx(3.0, abs=0.05)
-    assert 0.25 < found.least_departure_k < 0.6  # three standard deviations, a little more for what is mixed in
+    temperature_c, least_departure_k = undisturbed_temperature(values, np.ones(1000))
+    assert temperature_c == pytest.approx(3.0, abs=0.05)
+    assert 0.25 < least_departure_k < 0.6  # three standard deviations, a little more for what is mixed in
 
 
 def test_intervals_hold_nine_tenths_of_the_draws() -> None:

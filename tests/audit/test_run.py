@@ -23,8 +23,7 @@ from tests.support.audited_wall import (
 from thermoxels_ns.audit.conditions import Camera, Film, Limits, OutsideAir, Reference, Surface, Surroundings, Year
 from thermoxels_ns.audit.draws import Interval
 from thermoxels_ns.audit.heat_flow import radiation_w_m2
-from thermoxels_ns.audit.results import Audit
-from thermoxels_ns.audit.run import audit
+from thermoxels_ns.audit.run import Audit, audit
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
 

@@ -9,8 +9,7 @@ from PIL import Image
 
 from tests.support.audited_wall import STATED, UP
 from tests.support.heat_meshes import box_mesh, planes
-from thermoxels_ns.audit.results import Audit
-from thermoxels_ns.audit.run import audit
+from thermoxels_ns.audit.run import Audit, audit
 from thermoxels_ns.commands.audit_photographs import photographs_of_defects
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError

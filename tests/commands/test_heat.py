@@ -176,7 +176,7 @@ def test_a_failing_run_leaves_the_old_results(folder, tmp_path) -> None:
     options = Heat(folder / "wall" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path, pictures=False)
     run_heat(options)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(HeatError, match="probe 1: expected a point inside the body"):
+    with pytest.raises(HeatError, match=r"^probe 1: expected"):
         run_heat(replace(options, probes=((9.0, 9.0, 9.0),)))
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -186,33 +186,44 @@ def test_files_of_others_are_not_removed(folder, tmp_path, name) -> None:
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text("mine")
     options = Heat(folder / "room" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path, pictures=False)
-    with pytest.raises(OutputError, match=rf"of an earlier run .*, got {name}. Choose"):
+    with pytest.raises(OutputError, match=f"got {name}"):
         run_heat(options)
     assert (tmp_path / name).read_text() == "mine"
 
 
-def test_an_export_without_scale_is_refused_and_its_up_is_used(folder, tmp_path) -> None:
+@pytest.mark.parametrize(
+    ("summary", "name"),
+    [
+        ({"length_unit": "input unit", "up": [0, 0, 1]}, "scale of the mesh"),
+        ([1, 2], ".*summary.json"),
+        ({"up": [0, 1]}, ".*summary.json: up"),
+    ],
+)
+def test_an_export_that_cannot_be_used_is_refused(folder, tmp_path, summary, name) -> None:
+    write_mesh(tmp_path / "mesh.vtu", wall())
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    with pytest.raises(ThermoxelsError, match=f"^{name}: expected"):
+        compute_heat(Heat(tmp_path / "mesh.vtu", str(folder / "steady.yaml"), tmp_path / "out"))
+
+
+def test_the_up_of_an_export_is_used(folder, tmp_path) -> None:
     write_mesh(tmp_path / "mesh.vtu", wall())
     options = Heat(tmp_path / "mesh.vtu", str(folder / "steady.yaml"), tmp_path / "out")
-    (tmp_path / "summary.json").write_text(json.dumps({"length_unit": "input unit", "up": [0, 0, 1]}))
-    with pytest.raises(HeatError, match=r"scale of the mesh: expected an export in metres.*--metres-per-unit"):
-        compute_heat(options)
     (tmp_path / "summary.json").write_text(json.dumps({"length_unit": "m", "up": [0, 2, 0]}))
     assert compute_heat(options).problem.up == (0.0, 1.0, 0.0)
     assert compute_heat(replace(options, up=(1.0, 0.0, 0.0))).problem.up == (1.0, 0.0, 0.0)
+    lines: list[str] = []
+    compute_heat(replace(options, mesh=folder / "wall" / "mesh.vtu"), lines.append)
+    assert any("summary.json is missing; the mesh is taken to be in metres" in line for line in lines)
 
 
 def test_bad_input_is_one_sentence_and_exit_status_1(folder, tmp_path, capsys) -> None:
     words = ["heat", str(folder / "room" / "mesh.vtu"), "--output-dir", str(tmp_path / "out")]
-    for more, message in (
-        (["--scene", "summer-nite"], "heat scene: expected one of"),
-        (["--scene", "original", "--leave-out-below", "-1"], "leave-out-below: expected a finite number"),
-    ):
-        assert cli.main([*words, *more]) == 1
-        shown = capsys.readouterr().err.splitlines()
-        assert len(shown) == 1 and shown[0].startswith(f"Error: {message}"), shown
+    assert cli.main([*words, "--scene", "summer-nite"]) == 1
+    shown = capsys.readouterr().err.splitlines()
+    assert len(shown) == 1 and shown[0].startswith("Error: heat scene: expected"), shown
     (tmp_path / "out" / "report.html").mkdir(parents=True)
-    with pytest.raises(OutputError, match=r"no folder in the place of a file.*got report\.html"):
+    with pytest.raises(OutputError, match=r"^output folder: expected"):
         run_heat(Heat(folder / "wall" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path / "out"))
 
 
@@ -283,25 +294,26 @@ def test_a_tolerance_in_time_keeps_the_scenes_times(folder, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("more", "name"),
     [
-        ({"tolerance": 0.0}, "tolerance: expected a finite number above 0 .* Pass --tolerance 0.05"),
-        ({"flow_tolerance": 2.0}, "flow-tolerance: .* at most 1 .* Pass --flow-tolerance 0.01"),
-        ({"flow_tolerance": 0.1}, "flow-tolerance: expected --tolerance beside it"),
-        ({"tolerance": 0.1, "leave_out_below": 0.1}, "leave-out-below: expected 0 or nothing beside a tolerance"),
-        ({"memory_gb": 1e-5}, "memory of the heat problem: expected at most .*Pass a larger --memory-gb"),
-        ({"tolerance": 1e-6, "memory_gb": 0.002}, "Not within 1e-06 K|memory_bytes: expected room"),
+        ({"tolerance": 0.0}, "tolerance: expected"),
+        ({"flow_tolerance": 2.0}, "flow-tolerance: expected"),
+        ({"flow_tolerance": 0.1}, "flow-tolerance: expected"),
+        ({"leave_out_below": -1.0}, "leave-out-below: expected"),
+        ({"tolerance": 0.1, "leave_out_below": 0.1}, "leave-out-below: expected"),
+        ({"memory_gb": 1e-5}, "memory of the heat problem: expected"),
+        ({"tolerance": 1e-6, "memory_gb": 0.002}, "Not within 1e-06 K|memory_bytes: expected"),
     ],
 )
-def test_accuracy_options_that_cannot_be_used(folder, tmp_path, more, message) -> None:
-    with pytest.raises(HeatError, match=message):
+def test_accuracy_options_that_cannot_be_used(folder, tmp_path, more, name) -> None:
+    with pytest.raises(HeatError, match=name):
         compute_heat(Heat(folder / "room" / "mesh.vtu", str(folder / "hour.yaml"), tmp_path, **more))
 
 
 def test_a_tolerance_that_does_not_fit_is_said_and_written_if_allowed(folder, tmp_path) -> None:
     options = Heat(folder / "room" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path, tolerance=1e-4, pictures=False)
     small = replace(options, memory_gb=0.003)
-    with pytest.raises(HeatError, match=r"Not within 0.0001 K: P2, given mesh.*needs about .* MiB, more than"):
+    with pytest.raises(HeatError, match="Not within"):
         run_heat(small)
     assert list(tmp_path.iterdir()) == []
     run_heat(replace(small, allow_unmet=True))
@@ -344,33 +356,13 @@ def test_no_u_value_where_more_than_two_airs_acts(folder, tmp_path) -> None:
     assert answers(tmp_path / "out")["wall"] is None and "internal heat" in answers(tmp_path / "out")["no_wall"]
 
 
-@pytest.mark.parametrize(
-    ("summary", "message"),
-    [
-        ("[1, 2]", "summary.json: expected a json object, got list"),
-        ('{"up": [0, 1]}', "summary.json: up: expected three numbers, got \\[0, 1\\]"),
-    ],
-)
-def test_a_damaged_summary_is_refused(folder, tmp_path, summary: str, message: str) -> None:
-    write_mesh(tmp_path / "mesh.vtu", wall())
-    (tmp_path / "summary.json").write_text(summary)
-    with pytest.raises(ThermoxelsError, match=message):
-        compute_heat(Heat(tmp_path / "mesh.vtu", str(folder / "steady.yaml"), tmp_path))
-
-
-def test_a_mesh_without_a_summary_is_said_to_be_taken_in_metres(folder, tmp_path, capsys) -> None:
-    lines: list[str] = []
-    compute_heat(Heat(folder / "wall" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path), lines.append)
-    assert any("summary.json is missing; the mesh is taken to be in metres" in line for line in lines)
-
-
 def test_a_cut_body_is_half_of_it() -> None:
     mesh = room()
     values = mesh.points_m @ np.array([1.0, 2.0, 3.0])
-    half, cut_c, view = cut_open(mesh, values, (0.0, 0.0, 1.0))
-    np.testing.assert_allclose(cut_c, half.points_m @ np.array([1.0, 2.0, 3.0]), atol=1e-5)
-    corner = half.points_m[half.facets]
+    points, facets, cut_c, view = cut_open(mesh, values, (0.0, 0.0, 1.0))
+    np.testing.assert_allclose(cut_c, points @ np.array([1.0, 2.0, 3.0]), atol=1e-5)
+    corner = points[facets]
     area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum()
     # Back 16, cut 16 - 4, sides 4 x 8; of the room inside: back 4, sides 4 x 2.
     assert area == pytest.approx(16.0 + 12.0 + 32.0 + 4.0 + 8.0, rel=1e-5)
-    assert np.ptp(half.points_m, axis=0).min() == pytest.approx(2.0) and view[2] < 0.0
+    assert np.ptp(points, axis=0).min() == pytest.approx(2.0) and view[2] < 0.0

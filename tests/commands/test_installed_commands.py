@@ -15,17 +15,6 @@ PYTHON = sys.executable
 
 
 @pytest.fixture
-def command(fake_command):
-    """Gives a function that writes a command and returns the words to run it."""
-
-    def write(body: str) -> list[str]:
-        fake_command("work", body)
-        return ["work"]
-
-    return write
-
-
-@pytest.fixture
 def console() -> Console:
     return Console(file=io.StringIO(), width=200)
 
@@ -72,12 +61,12 @@ def test_a_command_draws_for_the_terminal_that_shows_it(fake_command, tmp_path, 
     assert (tmp_path / "ask.log").read_text().startswith(f"{os.environ.get('FORCE_COLOR')} ")
 
 
-def test_memory_is_that_of_the_command(command, tmp_path):
+def test_memory_is_that_of_the_command(fake_command, tmp_path):
     """400 MB more are seen, also when they are free again before the end.
 
     Measured from a process of its own: this one may be large, and what it starts would be told to be as large.
     """
-    command("x = b'1' * int(sys.argv[1]); del x")
+    fake_command("work", "x = b'1' * int(sys.argv[1]); del x")
     script = (
         "import io, math, pathlib, sys\n"
         "from rich.console import Console\n"
@@ -104,8 +93,7 @@ def test_a_failing_command_is_an_error_with_its_last_lines(fake_command, tmp_pat
     message = str(caught.value)
     assert message.startswith("fail: expected exit status 0, got 1.")
     assert message.splitlines()[-2:] == ["    line 39", "    no space left"]
-    assert len(message.splitlines()) < 20
-    assert str(tmp_path / "fail.log") in message
+    assert len(message.splitlines()) < 20 and str(tmp_path / "fail.log") in message
 
 
 def test_a_command_of_another_environment_is_not_used(fake_command, tmp_path, console, monkeypatch):
@@ -114,16 +102,17 @@ def test_a_command_of_another_environment_is_not_used(fake_command, tmp_path, co
     (other / "ns-train").write_text("#!/bin/sh\n")
     (other / "ns-train").chmod(0o755)
     monkeypatch.setenv("PATH", str(other))
-    with pytest.raises(ThermoxelsError, match=r"ns-train: expected a command in .*bin, got none"):
+    with pytest.raises(ThermoxelsError, match=r"^ns-train: expected"):
         run_command(["ns-train"], tmp_path / "log", console)
 
 
-def test_an_interrupt_ends_the_command(command, tmp_path):
+def test_an_interrupt_ends_the_command(fake_command, tmp_path):
     """The command would write its mark at the end; after the interrupt nothing is left to write it."""
     mark = tmp_path / "mark"
-    words = command(
+    fake_command(
+        "work",
         f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); print('started')\n"
-        f"time.sleep(5); open({str(mark)!r}, 'w')"
+        f"time.sleep(5); open({str(mark)!r}, 'w')",
     )
 
     class Interrupter(io.StringIO):
@@ -133,12 +122,13 @@ def test_an_interrupt_ends_the_command(command, tmp_path):
             return len(text)
 
     with pytest.raises(KeyboardInterrupt):
-        run_command(words, tmp_path / "log", Console(file=Interrupter()))
+        run_command(["work"], tmp_path / "log", Console(file=Interrupter()))
     assert not Path(f"/proc/{(tmp_path / 'pid').read_text()}").exists()
     assert not mark.exists()
 
 
-def test_systems_that_do_not_tell_memory_still_measure_time(command, tmp_path, console, monkeypatch):
+def test_systems_that_do_not_tell_memory_still_measure_time(fake_command, tmp_path, console, monkeypatch):
     monkeypatch.delattr("os.wait4")
-    cost = run_command(command("sys.exit(0)"), tmp_path / "log", console)
+    fake_command("work", "sys.exit(0)")
+    cost = run_command(["work"], tmp_path / "log", console)
     assert cost.seconds > 0 and cost.peak_memory_gb != cost.peak_memory_gb

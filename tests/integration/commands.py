@@ -50,6 +50,20 @@ def run_forked(*command: str, timeout_s: float = 300.0) -> subprocess.CompletedP
         return subprocess.CompletedProcess(command, process.exitcode, Path(log.name).read_text())
 
 
+def succeed(*command: str) -> str:
+    """Run a console script in a fork to its end, which has to be a good one; gives what it printed, on one line."""
+    result = run_forked(*command)
+    assert result.returncode == 0, result.stdout
+    return " ".join(result.stdout.split())
+
+
+def fail(*command: str) -> str:
+    """Run a console script in a fork; it has to end with a sentence of ours. Gives what it printed, on one line."""
+    result = run_forked(*command)
+    assert result.returncode != 0 and "Error: " in result.stdout and "Traceback" not in result.stdout, result.stdout
+    return " ".join(result.stdout.split())
+
+
 @contextmanager
 def started(*command: str, log: Path) -> Iterator[ForkServerProcess]:
     """A console script that runs in a fork and writes into `log`; it is killed at the end."""

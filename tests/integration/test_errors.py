@@ -8,7 +8,7 @@ import pytest
 import yaml
 from nerfstudio.configs.method_configs import all_methods
 
-from tests.integration.commands import SHORT_TRAINING, Trained, run_forked
+from tests.integration.commands import SHORT_TRAINING, Trained, fail, succeed
 
 
 def lose_partner(scene: Path) -> None:
@@ -26,54 +26,43 @@ def test_damaged_scene(tiny_scene, tmp_path, damage, word):
     scene = tmp_path / "scene"
     shutil.copytree(tiny_scene, scene)
     damage(scene)
-    result = run_forked(
+    said = fail(
         *("ns-train", "thermoxels", "--output-dir", str(tmp_path / "out"), *SHORT_TRAINING),
         *("thermal-data", "--data", str(scene)),
     )
-    assert result.returncode != 0
-    assert "Error: " in result.stdout and "expected" in result.stdout
-    assert "Traceback" not in result.stdout and word in result.stdout
+    assert "expected" in said and word in said
 
 
-def export(config: Path, output: Path, *options: str):
-    return run_forked(
+def export(config: Path, output: Path, *options: str) -> str:
+    return fail(
         *("ns-export", "thermoxels-mesh", "--load-config", str(config), "--output-dir", str(output)),
         *("--metres-per-unit", "1", "--pictures", "False", *options),
     )
 
 
 def test_nothing_solid(trained: Trained, tmp_path):
-    result = export(trained.config, tmp_path, "--density-threshold", "1e9")
-    assert result.returncode == 1
-    assert "solid voxels: expected at least one" in result.stdout and "Traceback" not in result.stdout
+    assert "solid voxels: expected" in export(trained.config, tmp_path, "--density-threshold", "1e9")
     assert not (tmp_path / "mesh.vtu").exists()
 
 
 def test_output_folder_that_cannot_be_written(trained: Trained, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
-    result = export(trained.config, blocked / "export")
-    assert result.returncode == 1
-    assert "output folder: expected a folder that can be written to" in " ".join(result.stdout.split())
+    assert "output folder: expected" in export(trained.config, blocked / "export")
 
 
 def test_checkpoint_of_another_method(trained: Trained, tmp_path):
     """The config of the thermal baseline beside a checkpoint of thermoxels."""
     folder = tmp_path / "outputs" / "tiny" / "plenoxels-t" / "run"
-    result = run_forked(
+    succeed(
         *("ns-train", "plenoxels-t", "--output-dir", str(tmp_path / "outputs"), "--experiment-name", "tiny"),
         *("--timestamp", "run", *SHORT_TRAINING, "--max-num-iterations", "2", "--pipeline.model.refine-at", "50"),
         *("thermal-data", "--data", str(trained.scene)),
     )
-    assert result.returncode == 0, result.stdout
     shutil.copy(trained.checkpoints / "step-000000039.ckpt", folder / "nerfstudio_models")
-    result = export(folder / "config.yml", tmp_path / "export")
-    assert result.returncode == 1
-    assert "checkpoint: expected a voxel grid with" in " ".join(result.stdout.split())
-    result = run_forked(
-        "ns-eval", "--load-config", str(folder / "config.yml"), "--output-path", str(tmp_path / "e.json")
-    )
-    assert result.returncode == 1 and "Error: checkpoint:" in result.stdout and "Traceback" not in result.stdout
+    assert "checkpoint: expected a voxel grid" in export(folder / "config.yml", tmp_path / "export")
+    evaluate = ("ns-eval", "--load-config", str(folder / "config.yml"), "--output-path", str(tmp_path / "e.json"))
+    assert "Error: checkpoint:" in fail(*evaluate)
 
 
 def test_poses_that_changed_since_the_training(trained: Trained, tmp_path):
@@ -85,17 +74,14 @@ def test_poses_that_changed_since_the_training(trained: Trained, tmp_path):
     moved["transform_matrix"][0][3] += 0.05
     try:
         scene.write_text(json.dumps(content))
-        result = export(trained.config, tmp_path / "export")
+        said = export(trained.config, tmp_path / "export")
     finally:
         scene.write_text(known)
-    assert result.returncode == 1
-    assert "poses and scene box: expected those the checkpoint was trained with" in " ".join(result.stdout.split())
+    assert "poses and scene box: expected" in said
 
 
 def test_config_of_a_stock_method(tmp_path):
     """nerfacto's config: a method without a voxel grid is named before anything is loaded."""
     config = tmp_path / "config.yml"
     config.write_text(yaml.dump(all_methods["nerfacto"]))
-    result = export(config, tmp_path / "export")
-    words = " ".join(result.stdout.split())
-    assert result.returncode == 1 and "nerfacto" in words and "Traceback" not in words
+    assert "nerfacto" in export(config, tmp_path / "export")

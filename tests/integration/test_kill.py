@@ -3,7 +3,7 @@ from pathlib import Path
 
 import torch
 
-from tests.integration.commands import SHORT_TRAINING, run_forked, started
+from tests.integration.commands import SHORT_TRAINING, started, succeed
 
 
 def test_kill_9_while_saving_loses_at_most_the_work_since_the_last_checkpoint(tiny_scene: Path, tmp_path: Path):
@@ -26,7 +26,6 @@ def test_kill_9_while_saving_loses_at_most_the_work_since_the_last_checkpoint(ti
         assert checkpoint.name == f"step-{steps[-1]:09d}.ckpt"
     assert sorted(steps) == list(range(1, max(steps) + 1)) and len(steps) >= 4
     again = [*words, "--load-dir", str(folder), "--max-num-iterations", "3", "--steps-per-save", "1000"]
-    result = run_forked("ns-train", *again, *scene)
-    assert result.returncode == 0, result.stdout
+    succeed("ns-train", *again, *scene)
     last = folder / f"step-{max(steps) + 3:09d}.ckpt"
     assert last.is_file(), sorted(path.name for path in folder.iterdir())

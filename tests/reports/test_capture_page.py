@@ -16,8 +16,8 @@ from thermoxels_ns.capture.sfm.scale_and_up import MetricScale, Up
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.radiometry.measurement_model import Conditions
-from thermoxels_ns.reports.capture_page import Overlay, capture_page
-from thermoxels_ns.reports.capture_pictures import colours, thermal_in_photograph
+from thermoxels_ns.reports.capture_page import Overlay, capture_page, thermal_in_photograph
+from thermoxels_ns.reports.charts import colours
 
 THERMAL = Camera(80, 60, 70.0, 70.0, 41.0, 29.0)
 

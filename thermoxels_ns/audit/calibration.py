@@ -8,14 +8,13 @@ measured minus computed, by area, are least (Beck and Arnold 1977, Parameter Est
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermoxels_ns.audit.conditions import Calibrate, Conditions, Film, unknown_name
+from thermoxels_ns.audit.conditions import Calibrate, Conditions, Film
 from thermoxels_ns.audit.draws import Draws, Interval, emissivity_name, interval_of
 from thermoxels_ns.audit.exchange import HALF_STEP_K, film_flow_w_m2, radiant_k4, triangle_exchange
-from thermoxels_ns.audit.results import Calibration
 from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface, chosen_names
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
@@ -37,6 +36,19 @@ _LEAST_K = 0.02  # Root mean square by which surface temperatures must change if
 _MOST_SPREAD = 0.5  # Standard deviation of a logarithm by noise and drift alone from which on nothing is known
 _SMALL_SHARE = 0.1  # What takes part by less than this in a combination is not named
 _OF_A_PATCH, _OF_THE_NOISE, _OF_WHAT_IS_STATED = 3 * 10**6, 4 * 10**6, 5 * 10**6  # Numbers of errors of their own
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Properties with which the computed surface temperature meets the measured one."""
+
+    found: Mapping[str, Interval]  # By name, such as "conductivity of wall"; empty if refused
+    units: Mapping[str, str]  # Of each property, known or unknown
+    refused: str  # Why no values are given, in sentences; else empty
+    moved_most_by: Mapping[str, str]  # Which stated quantity moves each most within its range
+    misfit_k: float  # Root mean square of measured minus computed, by area, [K]
+    difference_k: FloatArray
+    """Measured minus computed surface temperature of each triangle, shape (f,), NaN where it does not count, [K]."""
 
 
 def calibrated(
@@ -61,12 +73,11 @@ def calibrated(
     logarithms, most = fit.spread()
     found = {}
     for name, drawn in zip(names, logarithms):
-        interval = interval_of(np.exp(np.clip(drawn, -20.0, 20.0)) * fit.start[name])
-        ends = [
-            np.log(end / fit.start[name]) - drawn[0] if end > 0.0 else -np.inf for end in (interval.low, interval.high)
-        ]
-        low, high = 0.0 if ends[0] < -_FAR else interval.low, np.inf if ends[1] > _FAR else interval.high
-        found[name] = Interval(interval.value, low, high)
+        one = interval_of(np.exp(np.clip(drawn, -20.0, 20.0)) * fit.start[name])
+        least, largest = one.value * np.exp(-_FAR), one.value * np.exp(_FAR)
+        found[name] = Interval(
+            one.value, one.low if one.low > least else 0.0, one.high if one.high < largest else np.inf
+        )
     return Calibration(found, units, "", dict(zip(names, most)), misfit, difference)
 
 
@@ -107,12 +118,11 @@ class _Wall:
         self._film = {name: self._on("film", self.seen, (name,)) for name in asked.film}
 
     def measured_c(self, draws: Draws) -> FloatArray:
-        """Corrected surface temperature of every triangle that counts, shape (c,)."""
-        up = self.surface.selection.up
-        return triangle_exchange(self.conditions, self.surface, self.groups, draws, up)[0][self.counted]
+        """Give the corrected surface temperature of every triangle that counts, shape (c,)."""
+        return triangle_exchange(self.conditions, self.surface, self.groups, draws)[0][self.counted]
 
     def computed_c(self, values: Mapping[str, float], draws: Draws, measured_c: FloatArray) -> FloatArray:
-        """Surface temperature of every triangle that counts, of the steady state, shape (c,).
+        """Give the surface temperature of every triangle that counts in the steady state, shape (c,).
 
         The film of the photographed side is linear in the temperature, by its tangent at the measured one.
         """
@@ -140,7 +150,7 @@ class _Wall:
     def _photographed_side(
         self, values: Mapping[str, float], draws: Draws, at_c: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Coefficient and temperature of air, shape (s,) each, for which convection is the tangent of the film."""
+        """Give coefficient and temperature of air, (s,) each, for which convection is the tangent of the film."""
         surface, up = self.surface, self.surface.selection.up
         normals = surface.selection.facet_normal[self.seen]
         every = np.stack([draws[emissivity_name(self.conditions, n)] for n in range(len(self.conditions.surfaces))])
@@ -167,7 +177,7 @@ class _Wall:
         return coefficient, air_c
 
     def _far_side(self, values: Mapping[str, float]) -> FloatArray:
-        """Coefficient of what lies behind, layers included, shape (b,), [W/(m2 K)]."""
+        """Give the coefficient of what lies behind, layers included, shape (b,), [W/(m2 K)]."""
         surface = self.surface
         normals = surface.selection.facet_normal[self.behind]
         film = outside_coefficient("iso-6946-combined") * np.ones(len(self.behind))
@@ -191,12 +201,12 @@ class _Fit:
 
     def __init__(self, wall: _Wall, draws: Draws) -> None:
         self.wall, self.draws = wall, draws
-        self.names = [unknown_name(one) for one in wall.asked.unknown]
+        self.names = [one.name() for one in wall.asked.unknown]
         self.stated = wall.asked.stated()
         self.start = {name: self.stated[name].value for name in self.names}
         area = wall.surface.area_m2[wall.counted]
         self.weight = area / area.sum()
-        self._first = Draws({name: values[:1] for name, values in draws.values.items()})  # what is stated
+        self._first = draws.stated
         self.logarithm = self._search()
 
     def _residual(self, logarithm: FloatArray, draws: Draws, known: Mapping[str, float] | None = None) -> FloatArray:
@@ -206,7 +216,10 @@ class _Fit:
         return measured - self.wall.computed_c(values, draws, measured)
 
     def _search(self) -> FloatArray:
-        """Gauss-Newton's method; a step that does not help is halved, directions that change nothing stay at rest."""
+        """Find the least squares by Gauss-Newton's method.
+
+        A step that does not help is halved; directions that change nothing stay at rest.
+        """
         x = np.zeros(len(self.names))
         residual = self._residual(x, self._first)
         for _ in range(_MOST_STEPS):
@@ -232,22 +245,17 @@ class _Fit:
 
     def what_cannot_be_told(self, units: Mapping[str, str]) -> str:
         """Say which properties the readings do not tell, and which combination of them they do; else nothing."""
-        far = np.abs(self.logarithm) > _FAR
-        sentences = []
-        for number, name in enumerate(self.names):
-            if far[number]:
-                end = "small" if self.logarithm[number] < 0.0 else "large"
-                sentences.append(
-                    f"No {name} explains the readings: however {end} it is, the computed surface is on one side of "
-                    "the measured one. Check the airs, the camera's offset and what is taken as known."
-                )
-        if sentences:
-            return " ".join(sentences)
-        spread = self._local_spread()
-        for direction, sensitive, off in zip(self.directions.T, self.sensitive_k, spread):
-            if sensitive < _LEAST_K or off > _MOST_SPREAD:
-                sentences.append(self._combination(direction, sensitive, units))
-        return " ".join(sentences)
+        far = [
+            f"No {name} explains the readings: however {'small' if x < 0.0 else 'large'} it is, the computed surface "
+            "is on one side of the measured one. Check the airs, the camera's offset and what is taken as known."
+            for name, x in zip(self.names, self.logarithm)
+            if abs(x) > _FAR
+        ]
+        return " ".join(far) or " ".join(
+            self._combination(direction, sensitive, units)
+            for direction, sensitive, off in zip(self.directions.T, self.sensitive_k, self._local_spread())
+            if sensitive < _LEAST_K or off > _MOST_SPREAD
+        )
 
     def _combination(self, direction: FloatArray, sensitive_k: float, units: Mapping[str, str]) -> str:
         """Put into words what is not known along a direction of logarithms, and what is across it."""
@@ -269,13 +277,13 @@ class _Fit:
         return f"{told}: their {what} is, {known}. Take one of the two as known."
 
     def _local(self, gain: FloatArray) -> Iterator[tuple[int, FloatArray]]:
-        """Each patch, and how far its own error of 1 K moves what `gain`, (m, c), makes of residuals, shape (m,)."""
+        """Yield each patch, and how far its own error of 1 K moves `gain`, (m, c), times the residuals, shape (m,)."""
         patch = self.wall.surface.selection.facet_patch[self.wall.counted]
         for number in np.unique(patch):
             yield int(number), gain[:, patch == number].sum(axis=1)
 
     def _noise(self, gain: FloatArray) -> FloatArray:
-        """Covariance that the scatter of nodes' readings leaves in what `gain` makes of residuals, shape (m, m).
+        """Give the covariance that the scatter of nodes' readings leaves in `gain` times the residuals, shape (m, m).
 
         A triangle's reading is the mean of three nodes', so its variance a third of theirs.
         """
@@ -285,7 +293,7 @@ class _Fit:
         return 3.0 * float(self.weight @ self.residual_k**2) * at_nodes @ at_nodes.T
 
     def _local_spread(self) -> FloatArray:
-        """Standard deviation of the logarithm along each direction by noise and the patches' own errors, shape (m,)."""
+        """Give the deviation of the logarithm along each direction by noise and the patches' own errors, shape (m,)."""
         told = np.maximum(self.sensitive_k, 1e-12)
         gain = (self.directions.T / told[:, None] ** 2) @ (self.slope.T * self.weight)
         variance = np.diag(self._noise(gain)).copy()
@@ -295,7 +303,7 @@ class _Fit:
         return np.sqrt(variance)
 
     def spread(self) -> tuple[FloatArray, list[str]]:
-        """Logarithms of the properties in every draw, shape (m, k), and which quantity moves each most.
+        """Give the logarithms of the properties in every draw, shape (m, k), and which quantity moves each most.
 
         What is common to all readings is followed to both ends of its range, and in between by a parabola; effects of
         several quantities add up.
@@ -322,7 +330,7 @@ class _Fit:
         return drawn, most
 
     def _uncertain(self) -> dict[str, FloatArray]:
-        """All that is uncertain and common to all readings: conditions, and properties that are taken as known."""
+        """Give what is uncertain and common to all readings: conditions, and properties that are taken as known."""
         common = {name: values for name, values in self.draws.values.items() if not name.startswith("contact")}
         for number, (name, one) in enumerate(self.stated.items()):
             if name not in self.start:
@@ -330,7 +338,7 @@ class _Fit:
         return {name: values for name, values in common.items() if np.ptp(values) > 0.0}
 
     def _follow(self, gain: FloatArray, name: str, value: float) -> FloatArray:
-        """Logarithms for which `gain` sees no residual with another value of a quantity (Broyden's method)."""
+        """Find the logarithms for which `gain` sees no residual with another value of a quantity (Broyden's method)."""
         common = name in self.draws.values
         draws = Draws({**self._first.values, name: np.array([value])}) if common else self._first
         known = {} if common else {name: value}

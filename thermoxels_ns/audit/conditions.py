@@ -112,10 +112,10 @@ class Film:
 
     def __post_init__(self) -> None:
         if (self.model == "given") != (self.coefficient is not None):
-            needed = self.model == "given"
-            expected = f"{'one' if needed else 'none'} beside the model {self.model}"
-            remedy = "Add coefficient: 8 +- 1 W/(m2 K)." if needed else "Remove coefficient, or write model: given."
-            raise AuditError("coefficient", expected=expected, got="none" if needed else "one", remedy=remedy)
+            expected = "one beside the model given, and none beside others"
+            remedy = "Add coefficient: 8 +- 1 W/(m2 K) and model: given, or remove both."
+            got = "none" if self.coefficient is None else f"one beside {self.model}"
+            raise AuditError("coefficient", expected=expected, got=got, remedy=remedy)
 
 
 @record(AuditError)
@@ -190,6 +190,10 @@ class Unknown:
     property: Literal["conductivity", "thickness", "film"]
     of: str  # The entry of `conductivity`, `layers` or `film` that it belongs to
 
+    def name(self) -> str:
+        """Name it as reports do, such as "conductivity of wall"."""
+        return f"{self.property} of {self.of}"
+
 
 @record(AuditError)
 class Calibrate:
@@ -209,28 +213,22 @@ class Calibrate:
         if both:
             remedy = "Give the layer another name."
             raise AuditError("layers", expected="names that no region has", got=both[0], remedy=remedy)
-        names = [unknown_name(one) for one in self.unknown]
+        names = [one.name() for one in self.unknown]
         if not 1 <= len(set(names)) <= MOST_UNKNOWN or len(set(names)) < len(names):
             remedy = "Write unknown: [{property: conductivity, of: wall}], for example."
             expected = f"one to {MOST_UNKNOWN} different entries"
             raise AuditError("unknown", expected=expected, got=", ".join(names) or "none", remedy=remedy)
-        for name in names:
-            if name not in self.stated():
-                remedy = "Give it there, where the search is to start."
-                expected = f"one out of {', '.join(self.stated())}"
-                raise AuditError("unknown", expected=expected, got=name, remedy=remedy)
+        strange = [name for name in names if name not in self.stated()]
+        if strange:
+            expected, remedy = f"one out of {', '.join(self.stated())}", "Give it there, where the search is to start."
+            raise AuditError("unknown", expected=expected, got=strange[0], remedy=remedy)
 
     def stated(self) -> dict[str, Measured]:
-        """All properties by name, such as "conductivity of wall", as they are stated."""
+        """Give all properties as they are stated, by names such as "conductivity of wall"."""
         every = {f"conductivity of {name}": value for name, value in self.conductivity.items()}
         every |= {f"conductivity of {name}": layer.conductivity for name, layer in self.layers.items()}
         every |= {f"thickness of {name}": layer.thickness for name, layer in self.layers.items()}
         return every | {f"film of {name}": value for name, value in self.film.items()}
-
-
-def unknown_name(one: Unknown) -> str:
-    """What reports call an unknown property."""
-    return f"{one.property} of {one.of}"
 
 
 @record(AuditError)
@@ -255,9 +253,18 @@ class Conditions:
     title: str = ""
 
     def __post_init__(self) -> None:
-        _check_models(self)
-        inside, outside = self.inside.air, self.outside.air
-        self._check_outside_air()
+        known, model, inside, outside = FILM_MODELS[self.side], self.film.model, self.inside.air, self.outside.air
+        if model not in known:
+            name, remedy = f"film: model of surfaces seen from {self.side}", f"Write model: {known[0]}, for example."
+            raise AuditError(name, expected=f"one of {', '.join(known)}", got=model, remedy=remedy)
+        if self.side == "outside" and model in WINDY and self.outside.wind is None:
+            expected, remedy = f"a speed, because {model} needs it", "Add wind: 1.5 +- 0.5 m/s, for example."
+            raise AuditError("outside: wind", expected=expected, got="none", remedy=remedy)
+        needed = {"calibrate": self.calibrate is not None, "year": self.year is not None}
+        for name, there in {"seen from outside": self.side == "outside", **needed}.items():
+            if there and not self.outside_known:
+                remedy = "Add air: 0.0 +- 0.5 C, as measured or from a weather station."
+                raise AuditError("outside: air", expected=f"a temperature beside {name}", got="none", remedy=remedy)
         if inside.low <= outside.high:
             expected = "air that is warmer than outside by more than both may be off"
             got = f"{inside.value:g} +- {inside.off_by:g} C inside, {outside.value:g} +- {outside.off_by:g} C outside"
@@ -266,15 +273,6 @@ class Conditions:
         if self.side == "inside" and self.surroundings.sky is not None:
             remedy = "Write surroundings: {reflected: 19.5 +- 0.5 C}."
             raise AuditError("surroundings", expected="a reflected temperature inside", got="a sky", remedy=remedy)
-
-    def _check_outside_air(self) -> None:
-        """Refuse what nothing follows from without the air outside."""
-        needed = {"seen from outside": self.side == "outside", "calibrate": self.calibrate is not None}
-        needed["year"] = self.year is not None
-        for name, there in needed.items():
-            if there and not self.outside_known:
-                remedy = "Add air: 0.0 +- 0.5 C, as measured or from a weather station."
-                raise AuditError("outside: air", expected=f"a temperature beside {name}", got="none", remedy=remedy)
 
     @property
     def outside_known(self) -> bool:
@@ -302,14 +300,3 @@ def write_example(path: Path) -> None:
     writable_folder(path.parent)
     with replace_when_done(path) as temporary:
         temporary.write_text((configs_folder() / EXAMPLE).read_text(encoding="utf-8"), encoding="utf-8")
-
-
-def _check_models(conditions: Conditions) -> None:
-    known, model = FILM_MODELS[conditions.side], conditions.film.model
-    if model not in known:
-        remedy = f"Write model: {known[0]}, for example."
-        raise AuditError(f"film: model of surfaces seen from {conditions.side}", expected=f"one of {', '.join(known)}",
-                         got=model, remedy=remedy)  # fmt: skip
-    if conditions.side == "outside" and model in WINDY and conditions.outside.wind is None:
-        remedy = "Add wind: 1.5 +- 0.5 m/s, for example."
-        raise AuditError("outside: wind", expected=f"a speed, because {model} needs it", got="none", remedy=remedy)

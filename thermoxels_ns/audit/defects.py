@@ -30,15 +30,6 @@ _WIDEST_ZONE_M = {"line": 0.5, "point": 0.5, "area": 0.3}
 _FARTHEST_OUT_M = 2.0  # What stands out farther from the surface does not belong to a defect
 _GAP_M = 0.3  # Sets of triangles this near to each other are one defect
 _NEIGHBOURS = 64
-SPOT_M2 = 0.01  # Area over which the coldest or hottest spot is averaged
-
-
-@dataclass(frozen=True)
-class Undisturbed:
-    """The temperature that most of a patch has."""
-
-    temperature_c: float  # Mean of the narrowest range of temperatures that half of the area has
-    least_departure_k: float  # From where on a triangle departs from it
 
 
 @dataclass(frozen=True)
@@ -52,7 +43,7 @@ class FoundDefect:
     reference: IntArray  # Undisturbed triangles near by
     base_area_m2: float  # Area of the undisturbed surface that the zone stands on
     length_m: float  # Of a line, else the largest extent
-    spot: IntArray  # Triangles of the core that depart most, together at least `SPOT_M2`
+    spot: IntArray  # Triangles of the core that depart most, together at least a square decimetre
     not_counted: str  # Why it is not to be believed, a sentence; else empty
 
 
@@ -79,13 +70,11 @@ def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, lea
     for patch in np.unique(surface.selection.facet_patch[sure]):
         on_patch = np.flatnonzero(sure & (surface.selection.facet_patch == patch))
         values, area = surface_c[on_patch], surface.area_m2[on_patch]
-        whole = undisturbed_temperature(values, area, least_k)
-        differs = values - whole.temperature_c
         beside = values - background_c(surface.centroid_m[on_patch], values, area)
-        near = undisturbed_temperature(beside, area, least_k)
-        beside -= near.temperature_c
-        away[on_patch] = np.maximum(sign * differs, sign * beside)
-        parts = np.stack([differs / whole.least_departure_k, beside / near.least_departure_k])
+        undisturbed = [undisturbed_temperature(one, area, least_k) for one in (values, beside)]
+        differs = np.stack([one - most_c for one, (most_c, _) in zip((values, beside), undisturbed)])
+        away[on_patch] = (sign * differs).max(axis=0)
+        parts = differs / [[least] for _, least in undisturbed]
         share[on_patch] = (sign * parts).max(axis=0)
         calm[on_patch] = (np.abs(parts) < 1.0).all(axis=0)
     cores = _cores(surface, share)
@@ -94,7 +83,7 @@ def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, lea
 
 
 def background_c(points_m: FloatArray, surface_c: FloatArray, area_m2: FloatArray) -> FloatArray:
-    """Temperature that most of the surface has around each point, shape (k,), [degrees Celsius].
+    """Find the temperature that most of the surface has around each point, shape (k,), [degrees Celsius].
 
     The median, by area, of the means of cells of 0.25 m within 1.25 m; strips and spots of less than half of that area
     do not change it.
@@ -108,13 +97,14 @@ def background_c(points_m: FloatArray, surface_c: FloatArray, area_m2: FloatArra
     return np.array([_weighted_median(mean[near], weight[near]) for near in around])[cell]
 
 
-def undisturbed_temperature(surface_c: FloatArray, area_m2: FloatArray, least_k: float = 0.0) -> Undisturbed:
-    """Find the temperature that most of a patch has: the mean of the shortest range that holds half of its area.
+def undisturbed_temperature(surface_c: FloatArray, area_m2: FloatArray, least_k: float = 0.0) -> tuple[float, float]:
+    """Find the temperature that most of a patch has, and from where on a triangle departs from it, [K].
 
-    Of values that scatter normally that range is 1.349 standard deviations wide (Rousseeuw and Leroy 1988, the shorth),
-    whatever the other half does.
+    The temperature is the mean of the shortest range that holds half of the area. Of values that scatter normally that
+    range is 1.349 standard deviations wide (Rousseeuw and Leroy 1988, the shorth), whatever the other half does. A
+    triangle departs by three standard deviations, at least by `least_k` and 0.1 K.
 
-    >>> undisturbed_temperature(np.array([1.0, 1.1, 1.05, 4.0]), np.ones(4)).temperature_c
+    >>> undisturbed_temperature(np.array([1.0, 1.1, 1.05, 4.0]), np.ones(4))[0]
     1.025
     """
     order = np.argsort(surface_c, kind="stable")
@@ -126,7 +116,7 @@ def undisturbed_temperature(surface_c: FloatArray, area_m2: FloatArray, least_k:
     inside = slice(start, last[start] + 1)
     scatter = float(values[last[start]] - values[start]) / _SHORTH
     middle = float(np.average(values[inside], weights=weights[inside]))
-    return Undisturbed(middle, max(_DEVIATIONS * scatter, least_k, LEAST_DEPARTURE_K))
+    return middle, max(_DEVIATIONS * scatter, least_k, LEAST_DEPARTURE_K)
 
 
 def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
@@ -136,7 +126,7 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 
 def _cores(surface: AuditedSurface, share: FloatArray) -> list[IntArray]:
-    """Triangles that depart and hang together within a patch, by edges or over a gap of 0.3 m, if they are enough.
+    """Find triangles that depart and hang together within a patch, by edges or over a gap of 0.3 m, if they are enough.
 
     `share` is the departure over the least one that counts, shape (f,).
     """
@@ -162,14 +152,14 @@ def _cores(surface: AuditedSurface, share: FloatArray) -> list[IntArray]:
 
 
 def _neighbours(surface: AuditedSurface, which: IntArray) -> IntArray:
-    """Pairs among some triangles, by their place in `which`, that share an edge and a patch, shape (p, 2)."""
+    """List pairs of triangles, by their place in `which`, that share an edge and a patch, shape (p, 2)."""
     pairs = triangles_across_edges(group_sides(surface.mesh.facets[which]))
     patch = surface.selection.facet_patch[which]
     return pairs[patch[pairs[:, 0]] == patch[pairs[:, 1]]]
 
 
 class _Zones:
-    """What lies around cores."""
+    """The surface around cores, the sets of triangles that depart."""
 
     def __init__(self, surface: AuditedSurface, sure: BoolArray, departs: BoolArray, cores: list[IntArray]) -> None:
         self.surface, self.departs = surface, departs
@@ -186,10 +176,13 @@ class _Zones:
         surface, patch = self.surface, int(self.patch[core[0]])
         area = surface.area_m2[core]
         edge = float(np.average(self.edge_m[core], weights=area))
-        same = self._beside(core, self.of_patch[patch])
+        same = self.of_patch[patch]  # of it what lies in a box around the core, which holds all that may belong to it
+        at, ends = self.at[same], self.at[core]
+        beside = (at > ends.min(axis=0) - _FARTHEST_OUT_M) & (at < ends.max(axis=0) + _FARTHEST_OUT_M)
+        same = same[beside.all(axis=1)]
         width = max(self._width(core), edge)
         reach = float(np.clip(0.5 * width, _NARROWEST_ZONE_M, _WIDEST_ZONE_M["line"]))
-        distance = self._distance(core, same)
+        distance, _ = KDTree(self.at[core]).query(self.at[same], distance_upper_bound=_FARTHEST_OUT_M)  # [m]
         near = self._nearest(core, same, distance, distance <= reach)
         axes = self._plane(core, self._calm(same, near, distance, reach))
         kind, length = _kind(self.at[core] @ axes, area, width, edge)
@@ -203,8 +196,6 @@ class _Zones:
         flat = self._base(reference, reference)
         wrinkled = float(surface.area_m2[reference].sum()) / flat if flat > 0.0 else 1.0
         base = wrinkled * self._base(zone, reference)
-        ranked = core[np.argsort(-away[core], kind="stable")]
-        enough = int(np.searchsorted(np.cumsum(surface.area_m2[ranked]), SPOT_M2 * (1.0 - 1e-9))) + 1
         unsupported = float(area @ surface.unsupported[core]) / float(area.sum())
         return FoundDefect(
             kind=kind,
@@ -214,20 +205,9 @@ class _Zones:
             reference=reference,
             base_area_m2=max(base, 0.0),
             length_m=length,
-            spot=ranked[:enough],
+            spot=surface.spot(core, away[core]),
             not_counted="No photograph says that the surface lies there." if unsupported > 0.5 else "",
         )
-
-    def _beside(self, core: IntArray, same: IntArray) -> IntArray:
-        """Leave what lies in a box around a core that holds all that may belong to it or be compared with it."""
-        at, inside = self.at[same], np.ones(len(same), dtype=bool)
-        for along, ends in zip(at.T, self.at[core].T):
-            inside &= (along > ends.min() - _FARTHEST_OUT_M) & (along < ends.max() + _FARTHEST_OUT_M)
-        return same[inside]
-
-    def _distance(self, core: IntArray, same: IntArray) -> FloatArray:
-        """Distance of triangles to a core, shape (k,), [m]; infinite far away."""
-        return KDTree(self.at[core]).query(self.at[same], distance_upper_bound=_FARTHEST_OUT_M)[0]
 
     def _nearest(self, core: IntArray, same: IntArray, distance: FloatArray, near: BoolArray) -> BoolArray:
         """Take from what is near a core what is nearer to another one."""
@@ -250,7 +230,7 @@ class _Zones:
         return found
 
     def _calm(self, same: IntArray, near: BoolArray, distance: FloatArray, reach: float) -> IntArray:
-        """Undisturbed triangles around a zone, of half its area or more; else all undisturbed ones of the patch."""
+        """Find undisturbed triangles around a zone, of half its area or more; else all such ones of the patch."""
         calm = ~near & ~self.departs[same]
         ring = calm & (distance <= 2.0 * reach + 0.5)
         wanted = 0.5 * float(self.surface.area_m2[same[near]].sum())
@@ -262,7 +242,7 @@ class _Zones:
         return calm if len(calm) else whole
 
     def _plane(self, core: IntArray, reference: IntArray) -> FloatArray:
-        """Two axes across the mean normal of the undisturbed surface, shape (3, 2)."""
+        """Give two axes across the mean normal of the undisturbed surface, shape (3, 2)."""
         normal = self.surface.area_m2[core] @ self._reference_normal(core, reference)
         normal /= max(float(np.linalg.norm(normal)), 1e-12)
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
@@ -270,12 +250,12 @@ class _Zones:
         return np.stack([first, np.cross(normal, first)], axis=1)
 
     def _base(self, which: IntArray, reference: IntArray) -> float:
-        """Area of the undisturbed surface that triangles stand on, [m2]."""
+        """Give the area of the undisturbed surface that triangles stand on, [m2]."""
         towards = self._reference_normal(which, reference)
         return float(self.surface.area_m2[which] @ np.einsum("ij,ij->i", self.normal[which], towards))
 
     def _reference_normal(self, which: IntArray, reference: IntArray) -> FloatArray:
-        """Mean normal of the undisturbed surface next to triangles, shape (k, 3); their own where there is none."""
+        """Give the mean normal of the undisturbed surface next to triangles, (k, 3); their own where there is none."""
         if not len(reference):
             return self.normal[which]
         count = min(_NEIGHBOURS, len(reference))
@@ -285,7 +265,7 @@ class _Zones:
         return np.where(length > 0.1, mean / np.maximum(length, 0.1), self.normal[which])
 
     def _width(self, core: IntArray) -> float:
-        """Width of a strip, [m]: four times the mean distance of its points to its edge."""
+        """Give the width of a strip, [m], four times the mean distance of its points to its edge."""
         facets, points = self.surface.mesh.facets[core], self.surface.mesh.points_m
         sides = group_sides(facets)
         alone = sides.order[sides.start[sides.sizes == 1]]

@@ -57,14 +57,24 @@ class Draws:
 
     @property
     def count(self) -> int:
-        """1 + k."""
+        """Number of values, 1 + k."""
         return len(next(iter(self.values.values())))
+
+    @property
+    def stated(self) -> Draws:
+        """The stated values alone, without errors of parts."""
+        return Draws({name: values[:1] for name, values in self.values.items()})
+
+    @property
+    def difference_k(self) -> FloatArray:
+        """Difference of the airs, shape (1 + k,), [K], above 0; NaN if the air outside is not known."""
+        return self["inside air"] - self["outside air"]
 
     def __getitem__(self, name: str) -> FloatArray:
         return self.values[name]
 
     def local(self, off_by: float, number: int) -> FloatArray:
-        """Draws of the error of one part of the surface, independent for each `number`, shape (1 + k,)."""
+        """Draw the error of one part of the surface, independent for each `number`, shape (1 + k,)."""
         if not self.errors_of_parts:
             return np.zeros(self.count)
         drawn = np.random.default_rng((self.seed, number)).uniform(-off_by, off_by, self.count)
@@ -83,9 +93,9 @@ def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:
 
 
 def one_at_a_time(conditions: Conditions) -> Iterator[tuple[str, Draws]]:
-    """Yield for each quantity that is not exact draws of the stated value, its lowest, its highest, the rest as stated.
+    """Yield, for each quantity that is not exact, its name and three draws: as stated, its lowest, its highest value.
 
-    What depends on it is the same to first order in each half of its range.
+    All other quantities are as stated.
     """
     every = uncertain(conditions)
     for name, what in every.items():
@@ -96,7 +106,7 @@ def one_at_a_time(conditions: Conditions) -> Iterator[tuple[str, Draws]]:
 
 
 def uncertain(conditions: Conditions) -> dict[str, Measured]:
-    """All quantities that results follow from, by the names that reports call them."""
+    """Give all quantities that results follow from, by the names that reports call them."""
     film, camera, around = conditions.film, conditions.camera, conditions.surroundings
     named: dict[str, Measured | None] = {
         "inside air": conditions.inside.air,
@@ -113,17 +123,12 @@ def uncertain(conditions: Conditions) -> dict[str, Measured]:
         "ground": around.ground,
     }
     named |= {emissivity_name(conditions, n): surface.emissivity for n, surface in enumerate(conditions.surfaces)}
-    named |= {contact_name(number): one.temperature for number, one in enumerate(conditions.references)}
+    named |= {f"contact temperature {n}": one.temperature for n, one in enumerate(conditions.references, start=1)}
     return {name: what for name, what in named.items() if what is not None}
 
 
-def contact_name(number: int) -> str:
-    """What reports call the temperature of an entry of `references`."""
-    return f"contact temperature {number + 1}"
-
-
 def emissivity_name(conditions: Conditions, number: int) -> str:
-    """What reports call the emissivity of an entry of `surfaces`."""
+    """Name the emissivity of an entry of `surfaces` as reports do."""
     return f"emissivity of {', '.join(conditions.surfaces[number].patches)}, entry {number + 1}"
 
 

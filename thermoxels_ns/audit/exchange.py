@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
 from thermoxels_ns.audit.conditions import FILM_MODELS, WINDY, Conditions, Film, FilmModel
-from thermoxels_ns.audit.draws import Draws, contact_name, emissivity_name
+from thermoxels_ns.audit.draws import Draws, emissivity_name
 from thermoxels_ns.audit.heat_flow import (
     albatici_tonelli_w_m2,
     dallo_w_m2,
@@ -34,103 +35,75 @@ _AROUND_M, _FARTHEST_M = 0.15, 0.5
 _OF_A_REFERENCE = 2 * 10**6  # Numbers of errors of their own
 
 
-@dataclass(frozen=True)
-class Exchange:
+class Exchange(NamedTuple):
     """What groups of triangles do in every draw; the first draw is made of the stated values."""
 
     surface_c: FloatArray  # Surface temperature, corrected, shape (g, k), [degrees Celsius]
     flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (g, k)
-    inside_c: FloatArray  # Air inside, shape (k,), [degrees Celsius]
-    outside_c: FloatArray  # Air outside, shape (k,), [degrees Celsius]
-
-    @property
-    def difference_k(self) -> FloatArray:
-        """Difference of the airs, shape (k,), [K], above 0."""
-        return self.inside_c - self.outside_c
 
 
-@dataclass(frozen=True)
-class PartTotals:
+class PartTotals(NamedTuple):
     """What parts of the surface do together in every draw."""
 
     area_m2: FloatArray  # (p,)
-    flow_w: FloatArray  # Heat flow from inside to outside, shape (p, k), [W]
     surface_c: FloatArray  # Mean surface temperature, shape (p, k), [degrees Celsius]
-    inside_c: FloatArray  # Air inside, shape (k,), [degrees Celsius]
-    outside_c: FloatArray  # Air outside, shape (k,), [degrees Celsius]
-
-    @property
-    def difference_k(self) -> FloatArray:
-        """Difference of the airs, shape (k,), [K], above 0."""
-        return self.inside_c - self.outside_c
+    flow_w: FloatArray  # Heat flow from inside to outside, shape (p, k), [W]
 
 
-def exchange(
-    conditions: Conditions,
-    groups: AlikeTriangles,
-    draws: Draws,
-    up: tuple[float, float, float],
-    warmer_k: float = 0.0,
-) -> Exchange:
+def exchange(conditions: Conditions, groups: AlikeTriangles, draws: Draws, warmer_k: float = 0.0) -> Exchange:
     """Correct the readings of groups for emissivity and reflection, and let heat flow by the film model.
 
-    `warmer_k` is added to all readings, [K]: how results change with it.
+    `warmer_k` is added to all readings, [K].
     """
     emissivity = np.stack([draws[emissivity_name(conditions, n)] for n in range(len(conditions.surfaces))])
     emissivity = emissivity[groups.surface_entry]
-    around_k4 = radiant_k4(conditions, draws, groups.normal, up)
-    set_k = celsius_to_kelvin(draws.values.get("reflected temperature set in the camera", np.zeros(draws.count)))
+    around_k4 = radiant_k4(conditions, draws, groups.normal, groups.up)
     reading_k = celsius_to_kelvin(groups.reading_c + warmer_k)[:, None] + draws["camera offset"]
-    surface_k = surface_temperature_k(reading_k, emissivity, around_k4, draws["emissivity set in the camera"], set_k)
-    flow = film_flow_w_m2(conditions, draws, surface_k, around_k4, emissivity, groups.normal, up)
-    return Exchange(surface_k - ZERO_CELSIUS_K, flow, draws["inside air"], draws["outside air"])
+    surface_k = surface_temperature_k(reading_k, emissivity, around_k4, *_camera_settings(draws))
+    flow = film_flow_w_m2(conditions, draws, surface_k, around_k4, emissivity, groups.normal, groups.up)
+    return Exchange(surface_k - ZERO_CELSIUS_K, flow)
+
+
+def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
+    """Give the emissivity and the reflected temperature, [K], that the camera was set to; 0 C if none was stated."""
+    reflected_c = draws.values.get("reflected temperature set in the camera", np.zeros(draws.count))
+    return draws["emissivity set in the camera"], celsius_to_kelvin(reflected_c)
 
 
 def part_totals(
-    conditions: Conditions,
-    groups: AlikeTriangles,
-    draws: Draws,
-    up: tuple[float, float, float],
-    area_m2: sparse.csr_array,
-    warmer_k: float = 0.0,
+    conditions: Conditions, groups: AlikeTriangles, draws: Draws, area_m2: sparse.csr_array, warmer_k: float = 0.0
 ) -> PartTotals:
     """Add up heat flow and surface temperature over parts of the surface; `area_m2` has shape (parts, g)."""
     columns, count = area_m2.tocsc(), len(groups.reading_c)
     total = np.asarray(area_m2.sum(axis=1)).reshape(-1, 1)
     flow_w, temperature = np.zeros((len(total), draws.count)), np.zeros((len(total), draws.count))
     for start in range(0, count, CHUNK):
-        part = slice(start, min(start + CHUNK, count))
-        some = exchange(conditions, groups.some(part), draws, up, warmer_k)
+        part = slice(start, start + CHUNK)
+        some = exchange(conditions, groups.some(part), draws, warmer_k)
         flow_w += columns[:, part] @ some.flow_w_m2
         temperature += columns[:, part] @ some.surface_c
-    mean = temperature / np.where(total > 0.0, total, 1.0)
-    return PartTotals(total[:, 0], flow_w, mean, draws["inside air"], draws["outside air"])
+    return PartTotals(total[:, 0], temperature / np.where(total > 0.0, total, 1.0), flow_w)
 
 
 def triangle_exchange(
-    conditions: Conditions,
-    surface: AuditedSurface,
-    groups: AlikeTriangles,
-    draws: Draws,
-    up: tuple[float, float, float],
+    conditions: Conditions, surface: AuditedSurface, groups: AlikeTriangles, draws: Draws
 ) -> tuple[FloatArray, FloatArray]:
-    """Surface temperature [degrees Celsius] and heat flow [W/m2] of each triangle by the first draw, shape (f,) each.
+    """Give surface temperature [degrees Celsius] and heat flow [W/m2] of each triangle by the first draw, (f,) each.
 
     NaN where a triangle does not count.
     """
     steps = (-HALF_STEP_K, 0.0, HALF_STEP_K)
-    low, mean, high = (exchange(conditions, groups, draws, up, step) for step in steps)
+    low, mean, high = (exchange(conditions, groups, draws, step) for step in steps)
     off = (surface.reading_c - groups.reading_c[groups.of_triangle]) / (2.0 * HALF_STEP_K)
-    values = []
-    for name in ("surface_c", "flow_w_m2"):
-        at, change = getattr(mean, name)[:, 0], (getattr(high, name) - getattr(low, name))[:, 0]
-        of_triangle = at[groups.of_triangle] + off * change[groups.of_triangle]
-        values.append(np.where(surface.counted, of_triangle, np.nan))
-    return values[0], values[1]
+    temperature, flow = (
+        np.where(surface.counted, at[groups.of_triangle, 0] + off * (above - below)[groups.of_triangle, 0], np.nan)
+        for below, at, above in zip(low, mean, high)
+    )
+    return temperature, flow
 
 
 def radiant_k4(conditions: Conditions, draws: Draws, normals: FloatArray, up: tuple[float, float, float]) -> FloatArray:
-    """Fourth power of the radiant temperature of what surfaces see, shape (g, k), [K^4]; normals (g, 3)."""
+    """Give the fourth power of the radiant temperature of what surfaces see, (g, k), [K^4]; normals are (g, 3)."""
     if conditions.surroundings.sky is None:
         return np.broadcast_to(
             fourth_power(celsius_to_kelvin(draws["reflected temperature"])), (len(normals), draws.count)
@@ -150,7 +123,7 @@ def film_flow_w_m2(
     normals: FloatArray,
     up: tuple[float, float, float],
 ) -> FloatArray:
-    """Heat flow from inside to outside by the film model, shape (g, k), [W/m2].
+    """Give the heat flow from inside to outside by the film model, shape (g, k), [W/m2].
 
     Surface temperatures, what is around and emissivities have shape (g, k), normals (g, 3).
     """
@@ -183,21 +156,22 @@ def film_flow_w_m2(
 
 
 def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], ...]:
-    """All film models that the conditions have the figures for, their own one first."""
-    found: list[tuple[FilmModel, Conditions]] = [(conditions.film.model, conditions)]
-    for model in FILM_MODELS[conditions.side]:
-        windless = conditions.side == "outside" and conditions.outside.wind is None
-        needs_wind = model in WINDY and windless
-        if model not in (conditions.film.model, "given") and not needs_wind:
-            found.append((model, replace(conditions, film=Film(model, conditions.film.factor))))
-    return tuple(found)
+    """List the film models that the conditions have the figures for, their own one first, with conditions for each."""
+    own = conditions.film
+    windless = conditions.side == "outside" and conditions.outside.wind is None
+    others: list[tuple[FilmModel, Conditions]] = [
+        (model, replace(conditions, film=Film(model, own.factor)))
+        for model in FILM_MODELS[conditions.side]
+        if model not in (own.model, "given") and not (windless and model in WINDY)
+    ]
+    return ((own.model, conditions), *others)
 
 
 def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draws) -> Draws:
     """Replace the offset of the camera by what contact temperatures say of it, in every draw.
 
-    It is what must be added to the readings near a reference so that they give the temperature measured there. Errors
-    of emissivity and reflection then largely cancel elsewhere. Of several references the mean holds.
+    The offset is what must be added to the readings near a reference so that they give the temperature measured there;
+    of several references it is the mean. Errors of emissivity and reflection then largely cancel elsewhere.
 
     Raises:
         AuditError: No triangle that counts is near a reference.
@@ -205,16 +179,15 @@ def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draw
     if not conditions.references:
         return draws
     up, offsets = surface.selection.up, []
-    set_k = celsius_to_kelvin(draws.values.get("reflected temperature set in the camera", np.zeros(draws.count)))
     for number in range(len(conditions.references)):
         near = _near(surface, conditions, number)
         area = surface.area_m2[near]
         normal = area @ surface.selection.facet_normal[near]
         normal = (normal / np.linalg.norm(normal))[None]
         emissivity = draws[emissivity_name(conditions, int(surface.surface_entry[near[0]]))]
-        contact_k = celsius_to_kelvin(draws[contact_name(number)])
+        contact_k = celsius_to_kelvin(draws[f"contact temperature {number + 1}"])
         around_k4 = radiant_k4(conditions, draws, normal, up)[0]
-        needed_k = reading_k(contact_k, emissivity, around_k4, draws["emissivity set in the camera"], set_k)
+        needed_k = reading_k(contact_k, emissivity, around_k4, *_camera_settings(draws))
         read_k = celsius_to_kelvin(float(np.average(surface.reading_c[near], weights=area)))
         own = draws.local(conditions.camera.repeatability.off_by, _OF_A_REFERENCE + number)
         offsets.append(needed_k - read_k + own)
@@ -233,7 +206,7 @@ def reference_doubts(conditions: Conditions, draws: Draws) -> tuple[str, ...]:
 
 
 def _near(surface: AuditedSurface, conditions: Conditions, number: int) -> IntArray:
-    """Triangles that count around a reference, of the patch of the nearest one."""
+    """Find the triangles that count around a reference, on the patch of the nearest one."""
     at = np.array(conditions.references[number].at)
     counted = np.flatnonzero(surface.counted)
     distance = np.linalg.norm(surface.centroid_m[counted] - at, axis=1)

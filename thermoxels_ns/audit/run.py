@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import numpy as np
 
-from thermoxels_ns.audit.calibration import calibrated
-from thermoxels_ns.audit.conditions import Conditions, Side
-from thermoxels_ns.audit.defects import SPOT_M2, FoundDefect, find_defects
-from thermoxels_ns.audit.draws import CONFIDENCE, Draws, Interval, draw, interval_of, one_at_a_time
+from thermoxels_ns.audit.calibration import Calibration, calibrated
+from thermoxels_ns.audit.conditions import Conditions
+from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
+from thermoxels_ns.audit.draws import CONFIDENCE, Draws, Interval, draw, interval_of, one_at_a_time, uncertain
 from thermoxels_ns.audit.exchange import (
     CHUNK,
     HALF_STEP_K,
-    PartTotals,
     exchange,
     other_models,
     part_totals,
@@ -23,9 +23,7 @@ from thermoxels_ns.audit.exchange import (
     with_references,
 )
 from thermoxels_ns.audit.heat_flow import temperature_factor
-from thermoxels_ns.audit.results import Audit, Defect, Element, Limit, Severity, Verdict, YearResult
 from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
-from thermoxels_ns.audit.survey_rules import check_survey
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.fem.selection import matching_names
@@ -38,80 +36,174 @@ F_RSI_M2K_W = (0.13, 0.25)
 _LEAST_FLOW_W_M2 = 1e-9
 _OF_A_TRIANGLE, _OF_THE_YEAR = 10**6, 10**6 + 1  # Numbers of errors of their own, beyond those of parts
 
+LEAST_DIFFERENCE_K, MOST_WIND_M_S, LEAST_HOURS_WITHOUT_SUN, LEAST_HOURS_DRY = 10.0, 5.0, 2.0, 24.0
+"""Difference of the airs, wind, time without sun and time since the surface was wet that EN 13187 asks for."""
+
+_MEANT_AS_EXACT = ("emissivity set in the camera", "reflected temperature set in the camera")
+_NAMES = {
+    "hours_since_sun": "hours since the sun last shone on the surface",
+    "sun_last_12h": "sun during the last 12 hours",
+    "hours_dry": "hours since the surface was last wet",
+    "least_difference_24h": "smallest difference of the airs during the last 24 hours",
+}
+
+Verdict = Literal["met", "not met", "cannot tell"]
+Severity = Literal["severe", "moderate", "slight", "uncertain"]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What was asked for, and whether it is met."""
+
+    name: str
+    limit: float
+    unit: str
+    at_most: bool  # Whether it is an upper limit
+    found: Interval
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class Element:
+    """A part of the envelope: a patch, a storey, or all that was observed."""
+
+    name: str
+    area_m2: float  # True area that counts
+    unobserved_m2: float  # True area of it of which nothing is known, or that is left out
+    surface_c: Interval  # Mean surface temperature, [degrees Celsius]
+    loss_w: Interval  # Heat flow to the outside, [W]
+    u_w_m2k: Interval
+    u_by_model: Mapping[str, float]  # U-value that each film model would give of the stated values
+    unsupported_share: float  # Share of the area that smoothness alone has placed, 0 to 1
+
+
+@dataclass(frozen=True)
+class Defect:
+    """A thermal bridge or defect; heat flows are beyond those of the undisturbed surface."""
+
+    kind: DefectKind
+    patch: str
+    storey: str  # Empty if the conditions name none there
+    centre_m: tuple[float, float, float]
+    height_m: float  # Of its middle above the lowest point of the mesh
+    length_m: float  # Of a line, else its largest extent
+    area_m2: float  # Of what departs by more than noise
+    departure_k: float  # Of its worst square decimetre from the undisturbed surface near by, above 0
+    spot_c: Interval  # Temperature of that, [degrees Celsius]
+    undisturbed_c: float  # Mean temperature of that, [degrees Celsius]
+    incidence: Interval | None  # I_tb; None where the undisturbed surface may be as warm as the air
+    extra_w: Interval  # Extra heat flow
+    coefficient: Interval
+    """psi of a line, [W/(m K)], chi of a point, or extra heat flow per kelvin of an area, [W/K]."""
+    f_rsi: tuple[Interval, ...]  # Temperature factors for `F_RSI_M2K_W`; empty if seen from outside
+    severity: Severity
+    not_counted: str  # Why it is not to be believed; else empty
+
+
+@dataclass(frozen=True)
+class YearResult:
+    """A heating season of what was observed."""
+
+    heat_kwh: Interval
+    cost: Interval | None  # In the user's currency
+    co2_kg: Interval | None
+
+
+@dataclass(frozen=True)
+class SurveyCheck:
+    """What is wrong with a survey, sentences and names."""
+
+    forbidden: tuple[str, ...]  # Conditions that EN 13187 does not allow
+    doubts: tuple[str, ...]  # What makes the figures less certain than their intervals say
+    missing: tuple[str, ...]  # What a report after EN 13187 has to say and the conditions do not
+
+
+@dataclass(frozen=True)
+class Audit:
+    """All that was found."""
+
+    conditions: Conditions
+    surface: AuditedSurface
+    check: SurveyCheck
+    patches: tuple[Element, ...]
+    storeys: tuple[Element, ...]
+    whole: Element
+    defects: tuple[Defect, ...]  # Those with the most extra heat flow first, those that do not count last
+    found: tuple[FoundDefect, ...]  # The triangles of each defect
+    limits: tuple[Limit, ...]
+    year: YearResult | None
+    calibration: Calibration | None
+    f_rsi: tuple[Interval, ...]  # Of the coldest square decimetre of all, for `F_RSI_M2K_W`; empty seen from outside
+    budget: Mapping[str, float]  # How far each uncertain quantity alone moves the loss from lowest to highest, [W]
+    not_counted_m2: Mapping[str, float]  # True area that does not count, by reason
+    triangle_surface_c: FloatArray  # Surface temperature, NaN where it does not count, shape (f,), [degrees Celsius]
+    triangle_flow_w_m2: FloatArray  # Heat flow to the outside, likewise, shape (f,)
+    triangle_u: FloatArray  # U-value, its lower and its upper end, likewise, shape (f, 3), [W/(m2 K)]
+
 
 def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Audit:
     """Answer what a survey asks: heat flow, U-values, thermal bridges and their intervals.
 
     `up` is a unit vector. Raises `AuditError` if the conditions do not fit the mesh.
     """
-    work = _Work(mesh, conditions, up)
-    surface, side = work.surface, conditions.side
-    surface_c, flow = triangle_exchange(conditions, surface, work.groups, work.stated, up)
-    repeatability = conditions.camera.repeatability.off_by
-    found = find_defects(surface, surface_c, side == "outside", repeatability)
+    surface = audited_surface(mesh, conditions, up)
+    groups = alike_triangles(surface)
+    draws = with_references(surface, conditions, draw(conditions))
+    surface_c, flow = triangle_exchange(conditions, surface, groups, draws.stated)
+    found = find_defects(surface, surface_c, conditions.side == "outside", conditions.camera.repeatability.off_by)
 
     patch, names = surface.selection.facet_patch, surface.selection.patch_names
+    storey, storey_names = _storey_of(surface, conditions), [*conditions.storeys, ""]
     counted = np.flatnonzero(surface.counted)
     patches = [int(n) for n in np.unique(patch[counted])]
-    storey = work.storey_of()
     storeys = [int(n) for n in np.unique(storey[counted]) if n >= 0]
     parts = [counted[patch[counted] == n] for n in patches]
     parts += [counted[storey[counted] == n] for n in storeys]
     parts += [part for one in found for part in (one.zone, one.reference, one.spot)]
-    parts.append(_worst(surface, surface_c, side))
-    rows = work.groups.rows(parts, surface.area_m2)
-    totals, slope = part_totals(conditions, work.groups, work.draws, up, rows), work.slopes(parts)
+    worst = np.flatnonzero(surface.counted & ~surface.rim)
+    worst = worst if len(worst) else counted
+    away = surface_c[worst] * (-1.0 if conditions.side == "inside" else 1.0)
+    parts += [surface.spot(worst, away), counted]
+    work = _Parts(conditions, surface, groups, draws, parts)
 
     # Readings of each patch have an error of their own, those of a storey the errors of the patches in it.
-    own = np.stack([slope[n] * work.draws.local(repeatability, n) for n in range(len(patches))])
-    models = work.u_by_model(parts[: len(patches)])
-    elements = []
-    for row, number in enumerate(patches):
-        u = {model: float(values[row]) for model, (values, _) in models.items()}
-        every = np.flatnonzero(patch == number)
-        element = _Part(names[number], parts[row], every, totals.surface_c[row], totals.flow_w[row] + own[row], u)
-        elements.append(work.element(element, totals.difference_k))
+    own = np.stack([work.slope_w_k[n] * work.own_error_k(n) for n in range(len(patches))])
+    observed = np.isin(patch, patches)
+    elements = [
+        work.element(names[number], row, np.flatnonzero(patch == number), own[row])
+        for row, number in enumerate(patches)
+    ]
     of_storeys = []
     for row, number in enumerate(storeys, start=len(patches)):
-        every, error = (
-            np.flatnonzero((storey == number) & np.isin(patch, patches)),
-            _shares(surface, parts[row], parts[: len(patches)]) @ own,
-        )
-        name = list(conditions.storeys)[number]
-        element = _Part(name, parts[row], every, totals.surface_c[row], totals.flow_w[row] + error, {})
-        of_storeys.append(work.element(element, totals.difference_k))
-    area, whole_flow = totals.area_m2[: len(patches)], totals.flow_w[: len(patches)].sum(axis=0) + own.sum(axis=0)
-    mean_c = area @ totals.surface_c[: len(patches)] / area.sum()
-    u = {model: mean for model, (_, mean) in models.items()}
-    name, every = "all that was observed", np.flatnonzero(np.isin(patch, patches))
-    whole = work.element(_Part(name, counted, every, mean_c, whole_flow, u), totals.difference_k)
+        every = np.flatnonzero((storey == number) & observed)
+        shares = _shares(surface, parts[row], parts[: len(patches)])
+        of_storeys.append(work.element(storey_names[number], row, every, shares @ own))
+    whole = work.element("all that was observed", len(parts) - 1, np.flatnonzero(observed), own.sum(axis=0))
 
-    defects = []
     first = len(patches) + len(storeys)
-    for number, one in enumerate(found):
-        figures = PartFigures(totals, slope, work.draws.local(repeatability, first + number))
-        at = storey[one.spot[0]]
-        where = list(conditions.storeys)[at] if at >= 0 else ""
-        defects.append(
-            describe_defect(surface, conditions, one, figures, first + 3 * number, where, whole.loss_w.value)
+    defects = [
+        work.defect(
+            one, first + 3 * n, work.own_error_k(first + n), storey_names[storey[one.spot[0]]], whole.loss_w.value
         )
+        for n, one in enumerate(found)
+    ]
     order = sorted(range(len(found)), key=lambda n: (bool(defects[n].not_counted), -defects[n].extra_w.value))
     found, defects = [found[n] for n in order], [defects[n] for n in order]
-    last, check = len(parts) - 1, check_survey(conditions)
-    f_rsi = PartFigures(totals, slope, work.draws.local(repeatability, last)).factors(last, side)
+    last, check = len(parts) - 2, check_survey(conditions)
+    f_rsi = work.temperature_factors(last, work.own_error_k(last))
     left = {why: float(surface.area_m2[surface.why_not == n].sum()) for n, why in enumerate(WHY_NOT.values())}
     return Audit(
         conditions=conditions,
         surface=surface,
-        check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, work.draws))),
+        check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, draws))),
         patches=tuple(elements),
         storeys=tuple(of_storeys),
         whole=whole,
         defects=tuple(defects),
         found=tuple(found),
         limits=_limits(conditions, elements, defects, whole, f_rsi),
-        year=_year(conditions, work.draws, whole_flow / totals.difference_k),
-        calibration=calibrated(conditions, surface, work.groups, work.draws),
+        year=_year(conditions, draws, (work.totals.flow_w[-1] + own.sum(axis=0)) / draws.difference_k),
+        calibration=calibrated(conditions, surface, groups, draws),
         f_rsi=f_rsi,
         budget=work.budget(own),
         not_counted_m2={why: area for why, area in left.items() if area > 0.0},
@@ -121,92 +213,157 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     )
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A part of the surface in every draw."""
-
-    name: str
-    counted: IntArray  # Its triangles that count
-    every: IntArray  # All of its triangles
-    surface_c: FloatArray  # (k,)
-    flow_w: FloatArray  # (k,)
-    u_by_model: Mapping[str, float]
+def _storey_of(surface: AuditedSurface, conditions: Conditions) -> IntArray:
+    """Give the storey of each triangle by its number in the conditions; -1 below all and without storeys."""
+    begins = np.array([what.value for what in conditions.storeys.values()])
+    order = np.argsort(begins, kind="stable")
+    place = np.searchsorted(begins[order], surface.height_m + 1e-9, side="right")
+    return np.concatenate([[-1], order])[place].astype(np.int64)
 
 
-class _Work:
-    """A surface, its groups of triangles, and the draws."""
+def _shares(surface: AuditedSurface, part: IntArray, patches: Sequence[IntArray]) -> FloatArray:
+    """Give the share of each patch's area that lies in a part, shape (patches,)."""
+    within = np.zeros(len(surface.area_m2))
+    within[part] = surface.area_m2[part]
+    return np.array([within[patch].sum() / surface.area_m2[patch].sum() for patch in patches])
 
-    def __init__(self, mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float]) -> None:
-        self.conditions, self.up = conditions, up
-        self.surface: AuditedSurface = audited_surface(mesh, conditions, up)
-        self.groups: AlikeTriangles = alike_triangles(self.surface)
-        self.draws = with_references(self.surface, conditions, draw(conditions))
-        self.stated = Draws({name: values[:1] for name, values in self.draws.values.items()})
 
-    def element(self, part: _Part, difference_k: FloatArray) -> Element:
-        """Put figures to a part of the envelope."""
-        surface = self.surface
-        area = float(surface.area_m2[part.counted].sum())
-        uncut = part.every[surface.why_not[part.every] != list(WHY_NOT).index("cut")]
+class _Parts:
+    """Parts of the surface, each given by its triangles that count, and what they do in every draw."""
+
+    def __init__(
+        self,
+        conditions: Conditions,
+        surface: AuditedSurface,
+        groups: AlikeTriangles,
+        draws: Draws,
+        parts: Sequence[IntArray],
+    ) -> None:
+        self.conditions, self.surface, self.groups, self.draws = conditions, surface, groups, draws
+        self.parts, self.rows = parts, groups.rows([*parts], surface.area_m2)
+        self.totals = part_totals(conditions, groups, draws, self.rows)
+        low, high = (
+            part_totals(conditions, groups, draws.stated, self.rows, step).flow_w[:, 0]
+            for step in (-HALF_STEP_K, HALF_STEP_K)
+        )
+        self.slope_w_k = (high - low) / (2.0 * HALF_STEP_K)  # By which flows change with the readings, shape (parts,)
+        self.u_by_model = dict[str, FloatArray]()  # U-values by each film model from the stated values, shape (parts,)
+        for model, chosen in other_models(conditions):
+            flow_w = part_totals(chosen, groups, draws.stated, self.rows).flow_w[:, 0]
+            self.u_by_model[model] = flow_w / draws.difference_k[0] / np.maximum(self.totals.area_m2, 1e-12)
+
+    def own_error_k(self, number: int) -> FloatArray:
+        """Draw the error of readings that a part does not share with others, shape (k,), [K]."""
+        return self.draws.local(self.conditions.camera.repeatability.off_by, number)
+
+    def element(self, name: str, row: int, every: IntArray, error_w: FloatArray) -> Element:
+        """Put figures to the part `row`; `every` are all of its triangles, `error_w` the error of its own readings."""
+        surface, counted, area = self.surface, self.parts[row], float(self.totals.area_m2[row])
+        uncut = every[surface.why_not[every] != list(WHY_NOT).index("cut")]
+        flow_w = self.totals.flow_w[row] + error_w
         return Element(
-            name=part.name,
+            name=name,
             area_m2=area,
             unobserved_m2=max(float(surface.area_m2[uncut].sum()) - area, 0.0),
-            surface_c=interval_of(part.surface_c),
-            loss_w=interval_of(part.flow_w),
-            u_w_m2k=interval_of(part.flow_w / area / difference_k),
-            u_by_model=part.u_by_model,
-            unsupported_share=float(surface.area_m2[part.counted] @ surface.unsupported[part.counted]) / area,
+            surface_c=interval_of(self.totals.surface_c[row]),
+            loss_w=interval_of(flow_w),
+            u_w_m2k=interval_of(flow_w / area / self.draws.difference_k),
+            u_by_model={model: float(u[row]) for model, u in self.u_by_model.items()},
+            unsupported_share=float(surface.area_m2[counted] @ surface.unsupported[counted]) / area,
         )
 
     def triangle_u(self) -> FloatArray:
-        """U-value of each triangle and the ends of its interval, shape (f, 3); NaN where it does not count."""
-        off = self.draws.local(self.conditions.camera.repeatability.off_by, _OF_A_TRIANGLE)
+        """Give the U-value of each triangle and the ends of its interval, (f, 3); NaN where it does not count."""
+        off = self.own_error_k(_OF_A_TRIANGLE)
         ends, found = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE), []
         for start in range(0, len(self.groups.reading_c), CHUNK):
             some = self.groups.some(slice(start, start + CHUNK))
-            here = exchange(self.conditions, some, self.draws, self.up)
-            warmer = exchange(self.conditions, some, self.stated, self.up, HALF_STEP_K)
-            slope = (warmer.flow_w_m2 - here.flow_w_m2[:, :1]) / HALF_STEP_K
-            u = (here.flow_w_m2 + slope * off) / here.difference_k
+            flow = exchange(self.conditions, some, self.draws).flow_w_m2
+            warmer = exchange(self.conditions, some, self.draws.stated, HALF_STEP_K).flow_w_m2
+            u = (flow + (warmer - flow[:, :1]) / HALF_STEP_K * off) / self.draws.difference_k
             found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ends, axis=1).T], axis=1))
         of_group = np.concatenate(found)
         return np.where(self.surface.counted[:, None], of_group[self.groups.of_triangle], np.nan)
 
-    def slopes(self, parts: Sequence[IntArray]) -> FloatArray:
-        """How the heat flow of each part changes with its readings, shape (parts,), [W/K]."""
-        rows = self.groups.rows(list(parts), self.surface.area_m2)
-        low, high = (
-            part_totals(self.conditions, self.groups, self.stated, self.up, rows, step)
-            for step in (-HALF_STEP_K, HALF_STEP_K)
-        )
-        return (high.flow_w - low.flow_w)[:, 0] / (2.0 * HALF_STEP_K)
-
-    def u_by_model(self, parts: Sequence[IntArray]) -> dict[str, tuple[FloatArray, float]]:
-        """U-values of parts, shape (parts,), and of all together, by each film model from the stated values."""
-        rows, found = self.groups.rows(list(parts), self.surface.area_m2), {}
-        for model, conditions in other_models(self.conditions):
-            one = part_totals(conditions, self.groups, self.stated, self.up, rows)
-            per_kelvin = one.flow_w[:, 0] / one.difference_k[0]
-            found[model] = per_kelvin / one.area_m2, float(per_kelvin.sum() / one.area_m2.sum())
-        return found
-
-    def storey_of(self) -> IntArray:
-        """Number of the storey of each triangle, in the order of the conditions; -1 below all and without storeys."""
-        begins = np.array([what.value for what in self.conditions.storeys.values()])
-        order = np.argsort(begins, kind="stable")
-        place = np.searchsorted(begins[order], self.surface.height_m + 1e-9, side="right")
-        return np.concatenate([[-1], order])[place].astype(np.int64)
-
     def budget(self, own: FloatArray) -> dict[str, float]:
-        """How far each uncertain quantity alone moves the loss from one end of its range to the other, [W]."""
+        """Say how far each uncertain quantity alone moves the loss from one end of its range to the other, [W]."""
         rows, found = self.groups.rows([np.flatnonzero(self.surface.counted)], self.surface.area_m2), {}
         for name, stated in one_at_a_time(self.conditions):
             draws = with_references(self.surface, self.conditions, stated)
-            found[name] = float(np.ptp(part_totals(self.conditions, self.groups, draws, self.up, rows).flow_w[0][1:]))
+            found[name] = float(np.ptp(part_totals(self.conditions, self.groups, draws, rows).flow_w[0][1:]))
         if self.conditions.camera.repeatability.off_by > 0.0:
             found["camera repeatability"] = float(np.ptp(own.sum(axis=0)))
         return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    def temperature_factors(self, part: int, off_k: FloatArray) -> tuple[Interval, ...]:
+        """Give the temperature factors of a part for `F_RSI_M2K_W`, none if seen from outside.
+
+        `off_k` are draws of the error of its own readings, shape (k,), [K].
+        """
+        if self.conditions.side == "outside":
+            return ()
+        flow = self.totals.flow_w[part] + self.slope_w_k[part] * off_k
+        flow = np.maximum(flow / max(self.totals.area_m2[part], 1e-12), _LEAST_FLOW_W_M2)
+        above = self.totals.surface_c[part] + off_k - self.draws["outside air"]
+        return tuple(interval_of(np.asarray(temperature_factor(above / flow, one))) for one in F_RSI_M2K_W)
+
+    def defect(self, one: FoundDefect, zone: int, off_k: FloatArray, storey: str, whole_w: float) -> Defect:
+        """Put figures to a defect: the part `zone` is its zone, the next its reference, the one after that its spot.
+
+        Extra heat flow is that of the zone minus what the undisturbed surface near by would lose on the area that the
+        zone stands on (psi = q_tb - q_uniform per metre, O'Grady and others 2017; areas are those of the outer
+        surface). `off_k` are draws of the error of its own readings, [K]; `whole_w` is the flow of all that was seen.
+        """
+        surface, totals = self.surface, self.totals
+        calm, spot = zone + 1, zone + 2
+        flow_w = totals.flow_w[zone] + self.slope_w_k[zone] * off_k
+        extra = flow_w - totals.flow_w[calm] / max(totals.area_m2[calm], 1e-12) * one.base_area_m2
+        per_kelvin = extra / self.draws.difference_k / (one.length_m if one.kind == "line" else 1.0)
+        extra_w, f_rsi = interval_of(extra), self.temperature_factors(spot, off_k)
+        air_c = self.draws["inside air" if self.conditions.side == "inside" else "outside air"]
+        around_c = float(totals.surface_c[calm, 0])
+        area, spot_c = surface.area_m2[one.core], interval_of(totals.surface_c[spot] + off_k)
+        x, y, z = np.average(surface.centroid_m[one.core], axis=0, weights=area).tolist()
+        return Defect(
+            kind=one.kind,
+            patch=surface.selection.patch_names[one.patch],
+            storey=storey,
+            centre_m=(x, y, z),
+            height_m=float(np.average(surface.height_m[one.core], weights=area)),
+            length_m=one.length_m,
+            area_m2=float(area.sum()),
+            departure_k=abs(spot_c.value - around_c),
+            spot_c=spot_c,
+            undisturbed_c=around_c,
+            incidence=incidence_factor(totals.surface_c[zone] + off_k, totals.surface_c[calm], air_c),
+            extra_w=extra_w,
+            coefficient=interval_of(per_kelvin),
+            f_rsi=f_rsi,
+            severity=_severity(self.conditions, extra_w, f_rsi, whole_w),
+            not_counted=one.not_counted,
+        )
+
+
+def incidence_factor(bridge_c: FloatArray, undisturbed_c: FloatArray, air_c: FloatArray) -> Interval | None:
+    """Give I_tb = (Ta - Tp) / (Ta - T1D) of a thermal bridge (Asdrubali and others); shape (k,) each.
+
+    Tp is the mean temperature of its surface, T1D that of the undisturbed surface, Ta the air on the side seen. None
+    where the undisturbed surface is not on the same side of the air in all draws.
+    """
+    undisturbed = undisturbed_c - air_c
+    if undisturbed.min() <= 0.0 <= undisturbed.max():
+        return None
+    return interval_of((bridge_c - air_c) / undisturbed)
+
+
+def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ...], whole_w: float) -> Severity:
+    limit = conditions.limits.f_rsi
+    if f_rsi and limit is not None and f_rsi[-1].high < limit.value:
+        return "severe"
+    if extra.low <= 0.0 or whole_w <= 0.0:
+        return "uncertain"
+    share = extra.value / whole_w
+    return "severe" if share >= SEVERE_SHARE else "moderate" if share >= MODERATE_SHARE else "slight"
 
 
 def verdict(found: Interval, limit: float, at_most: bool = True) -> Verdict:
@@ -217,22 +374,6 @@ def verdict(found: Interval, limit: float, at_most: bool = True) -> Verdict:
     """
     low, high, edge = (found.low, found.high, limit) if at_most else (-found.high, -found.low, -limit)
     return "met" if high <= edge else "not met" if low > edge else "cannot tell"
-
-
-def _worst(surface: AuditedSurface, surface_c: FloatArray, side: str) -> IntArray:
-    """Triangles of the square decimetre, no rim, that is warmest from outside or coldest from inside."""
-    sure = np.flatnonzero(surface.counted & ~surface.rim)
-    sure = sure if len(sure) else np.flatnonzero(surface.counted)
-    ranked = sure[np.argsort(surface_c[sure] * (1.0 if side == "inside" else -1.0), kind="stable")]
-    enough = int(np.searchsorted(np.cumsum(surface.area_m2[ranked]), SPOT_M2 * (1.0 - 1e-9))) + 1
-    return ranked[:enough]
-
-
-def _shares(surface: AuditedSurface, part: IntArray, patches: Sequence[IntArray]) -> FloatArray:
-    """Share of each patch's area that lies in a part, shape (patches,)."""
-    within = np.zeros(len(surface.area_m2))
-    within[part] = surface.area_m2[part]
-    return np.array([within[patch].sum() / surface.area_m2[patch].sum() for patch in patches])
 
 
 def _limits(
@@ -263,7 +404,7 @@ def _limits(
 
 
 def _year(conditions: Conditions, draws: Draws, coupling_w_k: FloatArray) -> YearResult | None:
-    """Heat, cost and carbon dioxide of a heating season: coupling times degree days times 0.024 kWh / (W d)."""
+    """Give heat, cost and carbon dioxide of a season: coupling times degree days times 0.024 kWh / (W d)."""
     year = conditions.year
     if year is None:
         return None
@@ -277,87 +418,73 @@ def _year(conditions: Conditions, draws: Draws, coupling_w_k: FloatArray) -> Yea
     return YearResult(interval_of(heat), cost, co2)
 
 
-@dataclass(frozen=True)
-class PartFigures:
-    """Parts of the surface in every draw, and the error of one of them that the others do not share."""
-
-    totals: PartTotals
-    slope_w_k: FloatArray  # How the heat flow of each part changes with its readings, shape (parts,)
-    off_k: FloatArray  # Draws of the error of the part's own readings, shape (k,), [K]
-
-    def flow_w(self, part: int) -> FloatArray:
-        """Heat flow of a part with that error, shape (k,)."""
-        return self.totals.flow_w[part] + self.slope_w_k[part] * self.off_k
-
-    def factors(self, part: int, side: Side) -> tuple[Interval, ...]:
-        """Temperature factors of a part for `F_RSI_M2K_W`; none if seen from outside."""
-        if side == "outside":
-            return ()
-        flow = np.maximum(self.flow_w(part) / max(self.totals.area_m2[part], 1e-12), _LEAST_FLOW_W_M2)
-        above = self.totals.surface_c[part] + self.off_k - self.totals.outside_c
-        return tuple(interval_of(np.asarray(temperature_factor(above / flow, one))) for one in F_RSI_M2K_W)
-
-    def incidence(self, bridge: int, calm: int, side: Side) -> Interval | None:
-        """I_tb = sum A_p (Ta - T_p) / (A (Ta - T_1D)), Ta the air on the side seen (Asdrubali and others).
-
-        None where the undisturbed surface is not on the same side of the air in all draws.
-        """
-        air = self.totals.inside_c if side == "inside" else self.totals.outside_c
-        undisturbed = self.totals.surface_c[calm] - air
-        if undisturbed.min() <= 0.0 <= undisturbed.max():
-            return None
-        return interval_of((self.totals.surface_c[bridge] + self.off_k - air) / undisturbed)
+def check_survey(conditions: Conditions) -> SurveyCheck:
+    """Hold conditions against what EN 13187 asks for."""
+    survey, wind, difference = conditions.survey, conditions.outside.wind, conditions.difference_k
+    least, sun, dry = survey.least_difference_24h, survey.hours_since_sun, survey.hours_dry
+    forbidden = []
+    if difference < LEAST_DIFFERENCE_K:
+        forbidden.append(f"The airs differ by {difference:.1f} K; EN 13187 asks for {LEAST_DIFFERENCE_K:g} K.")
+    elif least is not None and least.value < LEAST_DIFFERENCE_K:
+        forbidden.append(
+            f"During the last 24 hours the airs differed by {least.value:g} K at times; EN 13187 asks for "
+            f"{LEAST_DIFFERENCE_K:g} K all the time."
+        )
+    if wind is not None and wind.value > MOST_WIND_M_S:
+        forbidden.append(f"The wind was {wind.value:.1f} m/s; EN 13187 allows {MOST_WIND_M_S:g} m/s.")
+    if conditions.side == "outside":
+        if sun is not None and sun.value < LEAST_HOURS_WITHOUT_SUN:
+            forbidden.append(
+                f"The sun shone on the surface {sun.value:g} hours before; EN 13187 asks for "
+                f"{LEAST_HOURS_WITHOUT_SUN:g} hours without, heavy walls need more."
+            )
+        if dry is not None and dry.value < LEAST_HOURS_DRY:
+            asked = f"EN 13187 asks for {LEAST_HOURS_DRY:g} hours."
+            forbidden.append(f"The surface was wet {dry.value:g} hours before; {asked}")
+    return SurveyCheck(tuple(forbidden), _doubts(conditions), _missing(conditions))
 
 
-def describe_defect(
-    surface: AuditedSurface,
-    conditions: Conditions,
-    one: FoundDefect,
-    figures: PartFigures,
-    first_part: int,
-    storey: str,
-    whole_w: float,
-) -> Defect:
-    """Put figures to a defect: its zone is the part `first_part`, followed by its reference and its spot.
-
-    Extra heat flow is that of the zone minus what the undisturbed surface near by would lose on the area that the zone
-    stands on (psi = q_tb - q_uniform per metre, O'Grady and others 2017; areas are those of the outer surface).
-    `whole_w` is the heat flow of all that was observed.
-    """
-    totals, side = figures.totals, conditions.side
-    zone, reference, spot = first_part, first_part + 1, first_part + 2
-    calm_w_m2 = totals.flow_w[reference] / max(totals.area_m2[reference], 1e-12)
-    extra = figures.flow_w(zone) - calm_w_m2 * one.base_area_m2
-    per_kelvin = extra / totals.difference_k / (one.length_m if one.kind == "line" else 1.0)
-    extra_w, f_rsi = interval_of(extra), figures.factors(spot, side)
-    around_c = float(totals.surface_c[reference, 0])
-    area, spot_c = surface.area_m2[one.core], interval_of(totals.surface_c[spot] + figures.off_k)
-    x, y, z = np.average(surface.centroid_m[one.core], axis=0, weights=area).tolist()
-    return Defect(
-        kind=one.kind,
-        patch=surface.selection.patch_names[one.patch],
-        storey=storey,
-        centre_m=(x, y, z),
-        height_m=float(np.average(surface.height_m[one.core], weights=area)),
-        length_m=one.length_m,
-        area_m2=float(area.sum()),
-        departure_k=abs(spot_c.value - around_c),
-        spot_c=spot_c,
-        undisturbed_c=around_c,
-        incidence=figures.incidence(zone, reference, side),
-        extra_w=extra_w,
-        coefficient=interval_of(per_kelvin),
-        f_rsi=f_rsi,
-        severity=_severity(conditions, extra_w, f_rsi, whole_w),
-        not_counted=one.not_counted,
-    )
+def _doubts(conditions: Conditions) -> tuple[str, ...]:
+    found, difference = [], conditions.difference_k
+    not_meant = _MEANT_AS_EXACT if conditions.outside_known else (*_MEANT_AS_EXACT, "outside air")
+    exact = [name for name, what in uncertain(conditions).items() if not what.off_by and name not in not_meant]
+    if exact:
+        found.append(f"Taken as exact, because nothing says how far they may be off: {', '.join(exact)}.")
+    if not conditions.outside_known:
+        found.append(
+            "The air outside is not known. U-values, psi, chi and temperature factors are shares of the difference of "
+            "the airs: none can be told. Heat flow through the surface can: it follows from the room alone."
+        )
+    for name, air in (("inside", conditions.inside), ("outside", conditions.outside)):
+        if air.lowest_24h is not None and air.highest_24h is not None:
+            change = air.highest_24h.value - air.lowest_24h.value
+            if change > 0.2 * difference:
+                found.append(
+                    f"The air {name} changed by {change:.1f} K within 24 hours, {100 * change / difference:.0f} % of "
+                    "the difference of the airs. Heat flow is taken as steady; heavy walls lag behind by hours."
+                )
+        else:
+            found.append(f"How the air {name} changed before is not known. Heat flow is taken as steady.")
+    if conditions.surroundings.reflected is None and conditions.surroundings.ground is None:
+        found.append("The ground is taken to be as warm as the air.")
+    metal = [", ".join(surface.patches) for surface in conditions.surfaces if surface.emissivity.value < 0.7]
+    if metal:
+        found.append(
+            f"Emissivities below 0.7 ({'; '.join(metal)}): such surfaces mirror more than they show; leave_out does "
+            "without them."
+        )
+    if conditions.side == "inside" and conditions.outside_known:
+        found.append("U-values hold where the open air is behind the surface; the mesh does not say where that is.")
+    return tuple(found)
 
 
-def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ...], whole_w: float) -> Severity:
-    limit = conditions.limits.f_rsi
-    if f_rsi and limit is not None and f_rsi[-1].high < limit.value:
-        return "severe"
-    if extra.low <= 0.0 or whole_w <= 0.0:
-        return "uncertain"
-    share = extra.value / whole_w
-    return "severe" if share >= SEVERE_SHARE else "moderate" if share >= MODERATE_SHARE else "slight"
+def _missing(conditions: Conditions) -> tuple[str, ...]:
+    survey, camera, outside = conditions.survey, conditions.camera, conditions.outside
+    said = {_NAMES.get(one.name, one.name.replace("_", " ")): getattr(survey, one.name) for one in fields(survey)}
+    said["air temperature outside"] = outside.air if conditions.outside_known else None
+    for name, air in (("inside", conditions.inside), ("outside", outside)):
+        both = air.lowest_24h if air.highest_24h is not None else None
+        said[f"lowest and highest air temperature {name} during the last 24 hours"] = both
+    said |= {"wind": outside.wind, "wind direction": outside.wind_direction}
+    said |= {"make and model of the camera": camera.model, "serial number of the camera": camera.serial_number}
+    return tuple(name for name, value in said.items() if value in (None, ""))

@@ -14,9 +14,10 @@ from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
-_CUT = "cut"
 _STEP_K, _STEP_COSINE = 0.05, 0.05
 """Widths of the bins of readings, [K], and of normals, within which triangles are alike."""
+
+SPOT_M2 = 0.01  # Area over which the coldest or hottest spot is averaged
 
 WHY_NOT = {
     "cut": "that the scene box or the region of the export cuts",
@@ -59,6 +60,11 @@ class AuditedSurface:
         unknown[facets[~self.counted & (self.why_not != list(WHY_NOT).index("left out"))]] = True
         return self.counted & unknown[facets].any(axis=1)
 
+    def spot(self, which: IntArray, amount: FloatArray) -> IntArray:
+        """Take of some triangles those with the largest amounts, shape (k,), together at least a square decimetre."""
+        ranked = which[np.argsort(-amount, kind="stable")]
+        return ranked[: int(np.searchsorted(np.cumsum(self.area_m2[ranked]), SPOT_M2 * (1.0 - 1e-9))) + 1]
+
 
 @dataclass(frozen=True)
 class AlikeTriangles:
@@ -68,14 +74,15 @@ class AlikeTriangles:
     normal: FloatArray  # Mean unit normal, shape (g, 3)
     surface_entry: IntArray  # Entry of `Conditions.surfaces`, shape (g,)
     of_triangle: IntArray  # Group of each boundary triangle, -1 where it does not count, shape (f,)
+    up: tuple[float, float, float]  # Unit vector
 
     def some(self, part: slice) -> AlikeTriangles:
         """Take some of the groups; which triangles they are made of is lost."""
         none = np.zeros(0, dtype=np.int64)
-        return AlikeTriangles(self.reading_c[part], self.normal[part], self.surface_entry[part], none)
+        return AlikeTriangles(self.reading_c[part], self.normal[part], self.surface_entry[part], none, self.up)
 
     def rows(self, parts: list[IntArray], area_m2: FloatArray) -> sparse.csr_array:
-        """Area of each group in each part of the surface (given by its triangles, all counted), shape (parts, g)."""
+        """Give the area of each group in each part of the surface, a set of triangles that count; shape (parts, g)."""
         row = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         which = np.concatenate([*parts, np.zeros(0, dtype=np.int64)]).astype(np.int64)
         shape = (len(parts), len(self.reading_c))
@@ -96,9 +103,8 @@ def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, floa
     names = selection.patch_names
     entry_of_patch = np.full(len(names), -1)
     for number, surface in enumerate(conditions.surfaces):
-        entry_of_patch[
-            np.isin(names, [*chosen_names(f"surfaces entry {number + 1}: patches", names, surface.patches)])
-        ] = number
+        chosen = chosen_names(f"surfaces entry {number + 1}: patches", names, surface.patches)
+        entry_of_patch[np.isin(names, [*chosen])] = number
     left_out = np.isin(names, [*chosen_names("leave_out", names, conditions.leave_out)])
     chosen_names("limits: u", names, conditions.limits.u)
 
@@ -108,7 +114,7 @@ def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, floa
     if tags.photographs is not None:
         unseen = unseen | (tags.photographs[:, 0] == 0)
         unsupported = tags.photographs[:, 1] == 0
-    cut = (mesh.facet_tags == FACET_BOX) | np.array([name == _CUT for name in names])[patch]
+    cut = (mesh.facet_tags == FACET_BOX) | np.array([name == "cut" for name in names])[patch]
     no_reading = ~mesh.observed[mesh.facets].all(axis=1)
     why_not = np.select([cut, unseen, no_reading, left_out[patch]], [0, 1, 2, 3], default=-1)
     counted = why_not < 0
@@ -156,11 +162,12 @@ def alike_triangles(surface: AuditedSurface) -> AlikeTriangles:
         normal=mean_up[:, None] * up + np.sqrt(1.0 - mean_up**2)[:, None] * across,
         surface_entry=surface.surface_entry[which[first]],
         of_triangle=of_triangle,
+        up=surface.selection.up,
     )
 
 
 def chosen_names(name: str, names: tuple[str, ...], patterns: Iterable[str], what: str = "patches") -> set[str]:
-    """Names that match any pattern; raises `AuditError` for one that matches none."""
+    """Give the names that match any pattern; raises `AuditError` for a pattern that matches none."""
     chosen = set[str]()
     for pattern in patterns:
         found = matching_names(names, pattern)

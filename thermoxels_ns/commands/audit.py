@@ -19,7 +19,7 @@ from thermoxels_ns.core.checks import check_direction, check_positive, remove_fi
 from thermoxels_ns.core.errors import AuditError
 
 if TYPE_CHECKING:
-    from thermoxels_ns.audit.results import Audit as Found
+    from thermoxels_ns.audit.run import Audit as Found
     from thermoxels_ns.reports.page import Picture
 
 ANSWERS, PAGE, SURFACE = "answers.json", "audit.html", "surface.vtp"
@@ -96,15 +96,15 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     whole = found.whole
     say(f"Heat loss: {interval_text(whole.loss_w, 'W')}; U-value: {interval_text(whole.u_w_m2k, 'W/(m2 K)')}.")
     say(f"{sum(not one.not_counted for one in found.defects)} thermal bridges or defects.")
-    if found.calibration is not None:
-        told = [
-            f"{name} {interval_text(value, found.calibration.units[name])}"
-            for name, value in found.calibration.found.items()
-        ]
-        say(f"Calibration: {'; '.join(told) or f'refused. {found.calibration.refused}'}")
+    calibration = found.calibration
+    if calibration is not None:
+        told = [f"{name} {interval_text(one, calibration.units[name])}" for name, one in calibration.found.items()]
+        say(f"Calibration: {'; '.join(told) or f'refused. {calibration.refused}'}")
     photographs = {}
     if options.scene is not None:
-        photographs = photographs_of_defects(options.scene, _metres_per_unit(export), found)
+        scale = (export.get("scale") or {}).get("metres_per_unit", 1.0)
+        scale = check_positive("summary.json: metres_per_unit", scale, "Export the mesh again.", AuditError)
+        photographs = photographs_of_defects(options.scene, scale, found)
         say(f"Photographs show {sum(not found.defects[number].not_counted for number in photographs)} of them.")
     _write(folder, options, found, photographs)
     say(f"Written to {folder}: {PAGE}, {ANSWERS}, {SURFACE} ({clock.perf_counter() - begin:.1f} s)")
@@ -112,43 +112,27 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
 
 
 def answers_of(options: Audit, found: Found) -> dict[str, Any]:
-    """Everything that answers.json says."""
+    """Give everything that answers.json says; null stands for numbers and ends of intervals that are not known."""
     from pydantic_core import to_jsonable_python
 
     calibration = found.calibration
+    same = ("conditions", "whole", "patches", "storeys", "defects", "limits", "f_rsi", "year", "not_counted_m2")
     named = ("found", "units", "refused", "moved_most_by", "misfit_k")
     told = {
         "mesh": options.mesh,
-        "conditions": found.conditions,
-        "whole": found.whole,
-        "patches": found.patches,
-        "storeys": found.storeys,
-        "defects": found.defects,
-        "limits": found.limits,
-        "f_rsi": found.f_rsi,
-        "year": found.year,
+        **{name: getattr(found, name) for name in same},
         "calibration": None if calibration is None else {name: getattr(calibration, name) for name in named},
         "forbidden": found.check.forbidden,
         "doubts": found.check.doubts,
         "missing_for_en_13187": found.check.missing,
         "loss_moved_by_w": found.budget,
-        "not_counted_m2": found.not_counted_m2,
     }
-    # null for numbers that are not known, and for ends of intervals that are not there
     return to_jsonable_python(told, inf_nan_mode="null")
-
-
-def _metres_per_unit(export: dict[str, Any]) -> float:
-    """Scale of the mesh over the poses of its scene, 1 where the export does not say."""
-    scale = export.get("scale") or {}
-    value = scale.get("metres_per_unit", 1.0) if isinstance(scale, dict) else 1.0
-    return check_positive("summary.json: metres_per_unit", value, "Export the mesh again.", AuditError)
 
 
 def _write(folder: Path, options: Audit, found: Found, photographs: Mapping[int, tuple[Picture, ...]]) -> None:
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
-    from thermoxels_ns.reports.audit_page import audit_page
-    from thermoxels_ns.reports.audit_pictures import draw_audit
+    from thermoxels_ns.reports.audit_page import audit_page, draw_audit
     from thermoxels_ns.reports.page import write_page
 
     answers = answers_of(options, found)
@@ -170,23 +154,19 @@ def _write_surface(path: Path, found: Found) -> None:
     from thermoxels_ns.mesh.files.content import surface_of
     from thermoxels_ns.mesh.files.vtu import write_vtk
 
-    mesh = found.surface.mesh
+    mesh, calibration = found.surface.mesh, found.calibration
     surface = surface_of(mesh.points_m, mesh.facets)
     data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
     numbers = np.zeros(len(mesh.facets), dtype=np.int32)
     for number, one in enumerate(found.found, start=1):
         numbers[one.core] = number
-    calibration = found.calibration
-    off = {} if calibration is None else {"measured_minus_computed_k": calibration.difference_k}
     for name, values in {
         "surface_temperature_c": found.triangle_surface_c,
         "heat_flow_w_m2": found.triangle_flow_w_m2,
-        "u_w_m2k": found.triangle_u[:, 0],
-        "u_low_w_m2k": found.triangle_u[:, 1],
-        "u_high_w_m2k": found.triangle_u[:, 2],
+        **dict(zip(("u_w_m2k", "u_low_w_m2k", "u_high_w_m2k"), found.triangle_u.T)),
         "counted": found.surface.counted.astype(np.uint8),
         "defect": numbers,
-        **off,
+        **({} if calibration is None else {"measured_minus_computed_k": calibration.difference_k}),
     }.items():
         data.cell_data[name] = values
     write_vtk(vtkXMLPolyDataWriter(), path, data)

@@ -8,15 +8,15 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
-from thermoxels_ns.audit.results import Audit
+from thermoxels_ns.audit.run import Audit
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
 from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
-from thermoxels_ns.reports.audit_pictures import MOST_DEFECTS
-from thermoxels_ns.reports.capture_pictures import colours, jpeg_of
-from thermoxels_ns.reports.page import Picture
+from thermoxels_ns.reports.audit_page import MOST_DEFECTS
+from thermoxels_ns.reports.charts import colours
+from thermoxels_ns.reports.page import Picture, image_file
 
 _MOST_POINTS = 1000  # Triangles of a defect that are looked for in photographs
 _CELLS = 64  # Cells across a photograph in which the nearest triangle hides others
@@ -49,37 +49,35 @@ def photographs_of_defects(folder: Path, metres_per_unit: float, found: Audit) -
         frame = frames[int(np.argmax(scores))]
         shown = _cut_out(scene, frame, points, (low, high))
         if shown is not None:
-            name = frame.image.name
-            ends = f"{low:.1f} °C and less black, {high:.1f} °C and more bright"
-            pictures[number] = ((shown[0], name), (shown[1], f"Thermal image, as read: {ends}"))
+            caption = f"Thermal image, as read: {low:.1f} °C and less black, {high:.1f} °C and more bright"
+            pictures[number] = ((shown[0], frame.image.name), (shown[1], caption))
     return pictures
 
 
 def _nearest(frame: Frame, points: FloatArray) -> FloatArray:
-    """Distance of the nearest point in each cell of a photograph, (cells, cells); infinite where there is none."""
-    pixels, distance = frame.intrinsics.project_world(frame.pose, points), _distance(frame.pose, points)
-    inside = frame.intrinsics.contains(pixels)
+    """Give the distance of the nearest point in each cell of a photograph, (cells, cells); infinite without any."""
+    pixels, inside, distance = _seen_from(frame, points)
     nearest = np.full((_CELLS, _CELLS), np.inf)
     np.minimum.at(nearest, _cells(frame.intrinsics, pixels[inside]), distance[inside])
     return nearest
 
 
-def _cells(camera: Camera, pixels: FloatArray) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _cells(camera: Camera, pixels: FloatArray) -> tuple[npt.NDArray[np.int64], ...]:
     share = pixels / (camera.width, camera.height)
-    x, y = np.clip((share * _CELLS).astype(np.int64), 0, _CELLS - 1).T
-    return x, y
+    return tuple(np.clip((share * _CELLS).astype(np.int64), 0, _CELLS - 1).T)
 
 
-def _distance(pose: FloatArray, points: FloatArray) -> FloatArray:
-    return np.linalg.norm(points - pose[:3, 3], axis=1)
+def _seen_from(frame: Frame, points: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Give the pixels of points in a photograph, whether they lie in it, and their distance from the camera."""
+    pixels = frame.intrinsics.project_world(frame.pose, points)
+    return pixels, frame.intrinsics.contains(pixels), np.linalg.norm(points - frame.pose[:3, 3], axis=1)
 
 
 def _size_in_view(
     frame: Frame, nearest: FloatArray, points: FloatArray, normals: FloatArray, area: FloatArray
 ) -> float:
-    """Solid angle of what a photograph shows of some triangles: in the image, facing, nothing nearer in their cell."""
-    pixels, distance = frame.intrinsics.project_world(frame.pose, points), _distance(frame.pose, points)
-    seen: BoolArray = frame.intrinsics.contains(pixels)
+    """Give the solid angle of the triangles that a photograph shows: in it, facing it, nothing nearer in their cell."""
+    pixels, seen, distance = _seen_from(frame, points)
     if not seen.any():
         return 0.0
     seen[seen] = distance[seen] <= _HIDDEN * nearest[_cells(frame.intrinsics, pixels[seen])]
@@ -91,7 +89,7 @@ def _size_in_view(
 def _cut_out(
     scene: SceneFile, frame: Frame, points: FloatArray, limits: tuple[float, float]
 ) -> tuple[bytes, bytes] | None:
-    """The parts of photograph and thermal image around some points, as JPEG; None where one does not show them."""
+    """Cut photograph and thermal image around some points, as JPEG; None where one does not show them."""
     temperature_c = read_thermal_file(frame.thermal, scene.unit).temperature_c
     height, width = temperature_c.shape
     thermal = frame.thermal_intrinsics or frame.intrinsics.resized(width, height)
@@ -101,7 +99,7 @@ def _cut_out(
     cut = []
     for picture, camera, pose in (
         (photograph, visible, frame.pose),
-        (colours(temperature_c, limits).astype(np.uint8), thermal, thermal_pose),
+        (colours(temperature_c, limits), thermal, thermal_pose),
     ):
         pixels = camera.project_world(pose, points)
         pixels = pixels[camera.contains(pixels)]
@@ -124,4 +122,4 @@ def _framed(picture: npt.NDArray[np.uint8], pixels: FloatArray) -> bytes:
     image = image.resize((_WIDTH, max(1, round(image.height * zoom))))
     frame = [*((low - (left, top)) * zoom - 4.0), *((high - (left, top)) * zoom + 4.0)]
     ImageDraw.Draw(image).rectangle([float(edge) for edge in frame], outline=(255, 255, 255), width=2)
-    return jpeg_of(np.asarray(image))
+    return image_file(np.asarray(image))

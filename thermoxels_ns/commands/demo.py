@@ -125,7 +125,7 @@ def prepare_folder(path: Path) -> Path:
 
 
 def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> list[list[str]]:
-    """The commands of the demo in order: synthetic, ns-train, ns-eval, ns-render, ns-export, and audit of the house."""
+    """List the commands of the demo in order: synthetic, train, eval, render, export, and audit of the house."""
     config = str(folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml")
     survey = folder / "survey"
     patches = ["--patches", str(survey / "patches.yaml")] if scene == _AUDITED else []
@@ -170,7 +170,7 @@ def print_targets(targets: Iterable[Target], console: Console) -> None:
 
 
 def next_steps(folder: Path, scene: str) -> list[tuple[str, str]]:
-    """Commands to try next, and what each does: look at the model, a heat report, a scene of one's own."""
+    """List commands to try next, and what each does: look at the model, a heat report, a scene of one's own."""
     config = folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml"
     steps: list[tuple[list[str | Path], str]] = [
         (["ns-viewer", "--load-config", config], "Walk around the trained model in a browser:")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +12,15 @@ from PIL import Image
 
 from thermoxels_ns.audit.draws import Interval
 from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.core.checks import plain_os_errors
+from thermoxels_ns.core.checks import is_number, plain_os_errors
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json, read_json_object
 from thermoxels_ns.mesh.boundary.patches import apply_patches, load_patch_rules
-from thermoxels_ns.reports.capture_pictures import colours, jpeg_of
-from thermoxels_ns.reports.page import build_page
+from thermoxels_ns.reports.charts import colours
+from thermoxels_ns.reports.page import build_page, image_file
 from thermoxels_ns.synthetic.drawn_scenes import BRIDGE_PSI_W_MK, house_corner, true_u_w_m2k
 
 _AGAIN = "Run the demo again."
-_ENERGY_UNITS = ("J", "kJ", "MJ", "GJ", "TJ", "PJ")  # Each a thousand of the one before
 _BRIDGE_PATCH = "side-wall"  # Where nothing stands before the band, and its psi is that of the drawing
 _POINTS = 200_000  # On the true surface, from which the mean U-value of each element is told
 _INPUTS_SHOWN = 6
@@ -81,10 +79,9 @@ def read_results(eval_json: Path, summary_json: Path) -> tuple[tuple[Target, ...
             "Change of the heat in the insulated solid while heat flows inside it.",
         ),
     )
-    seen_error, seen = truth("temperature_seen_mae_c"), 100.0 * truth("share_of_seen_reached")
-    chamfer, chamfer_mm = truth("chamfer_voxels"), 1e3 * truth("chamfer_m")
-    volume, true_volume = truth("mesh_volume_m3"), truth("true_volume_m3")
-    area, true_area = truth("mesh_area_m2"), truth("true_area_m2")
+    seen_percent = 100.0 * truth("share_of_seen_reached")
+    seen_error = f"{truth('temperature_seen_mae_c'):.2f} °C ({seen_percent:.0f} % of the surface)"
+    distance = f"{truth('chamfer_voxels'):.2f} voxels, {1e3 * truth('chamfer_m'):.1f} mm"
     others = (
         ("RGB SSIM", f"{image('ssim'):.3f}"),
         ("Thermal PSNR", f"{image('thermal_psnr'):.2f} dB"),
@@ -94,59 +91,32 @@ def read_results(eval_json: Path, summary_json: Path) -> tuple[tuple[Target, ...
         ("Voxel size", f"{1e3 * truth('voxel_size_m'):.1f} mm"),
         ("Surface precision", f"{truth('precision'):.3f}"),
         ("Surface recall", f"{truth('recall'):.3f}"),
-        (
-            "Distance between the mesh's and the true surface, mean of both ways (Chamfer)",
-            f"{chamfer:.2f} voxels, {chamfer_mm:.1f} mm",
-        ),
-        (
-            "Temperature error of the mesh on the seen surface, mean",
-            f"{seen_error:.2f} °C ({seen:.0f} % of the surface)",
-        ),
-        ("Volume of the mesh", f"{volume:.4g} m³ (true: {true_volume:.4g} m³)"),
-        ("Surface of the mesh", f"{area:.4g} m² (true: {true_area:.4g} m²)"),
+        ("Distance of mesh and true surface, mean of both ways (Chamfer)", distance),
+        ("Temperature error of the mesh on the seen surface, mean", seen_error),
+        ("Volume of the mesh", f"{truth('mesh_volume_m3'):.4g} m³ (true: {truth('true_volume_m3'):.4g} m³)"),
+        ("Surface of the mesh", f"{truth('mesh_area_m2'):.4g} m² (true: {truth('true_area_m2'):.4g} m²)"),
         ("Tetrahedra", f"{mesh('tets'):,.0f}"),
         ("Nodes", f"{mesh('nodes'):,.0f}"),
         ("Nodes with a measured temperature", f"{100.0 * mesh('share_of_nodes_observed'):.0f} %"),
-        ("Heat content before", energy_text(heat("energy_before_j"))),
-        ("Heat content after", energy_text(heat("energy_after_j"))),
+        ("Heat content before", f"{1e-9 * heat('energy_before_j'):.4g} GJ"),
+        ("Heat content after", f"{1e-9 * heat('energy_after_j'):.4g} GJ"),
     )
     return targets, others
 
 
-def energy_text(energy_j: float) -> str:
-    """Write an energy in the unit in which it has one to three digits before the point; NaN: it was not computed.
-
-    >>> energy_text(1.003777e11), energy_text(-2.5e6), energy_text(0.0), energy_text(999.99)
-    ('100.4 GJ', '-2.5 MJ', '0 J', '1 kJ')
-    """
-    if math.isnan(energy_j):
-        return "not computed"
-    value = float(f"{energy_j:.3e}")
-    power = max((number for number in range(len(_ENERGY_UNITS)) if abs(value) >= 1e3**number), default=0)
-    return f"{value / 1e3**power:.4g} {_ENERGY_UNITS[power]}"
-
-
 def numbers_of(path: Path, name: str) -> Callable[[str], float]:
-    """Read an object of a json file; returns a function that gives its numbers by key, NaN for null.
+    """Read an object of a json file; returns a function that gives its numbers by key.
 
-    Both raise `ThermoxelsError` for what is missing or of another kind. Null is a figure that does not exist, for
-    instance without a surface.
+    Null, a figure that does not exist, for instance without a surface, becomes NaN. The function raises
+    `ThermoxelsError` for what is missing or no number.
     """
-
-    def refuse(expected: str, got: object) -> ThermoxelsError:
-        return ThermoxelsError(f"{path}: {name}", expected=expected, got=repr(got), remedy=_AGAIN)
-
     content = read_json_object(path, _AGAIN).get(name)
-    if not isinstance(content, dict):
-        raise refuse("an object", content)
 
     def number(key: str) -> float:
-        value = content.get(key, "nothing")
-        if value is None:
-            return math.nan
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise refuse(f"a number under {key}", value)
-        return float(value)
+        value = content.get(key, "nothing") if isinstance(content, dict) else "nothing"
+        if value is not None and not is_number(value):
+            raise ThermoxelsError(f"{path}: {name}: {key}", expected="a number", got=repr(value), remedy=_AGAIN)
+        return math.nan if value is None else float(value)
 
     return number
 
@@ -180,18 +150,17 @@ def compare(answers: Path, rules: Path) -> tuple[Compared, ...]:
 
 
 def true_u_of_patches(rules: Path) -> dict[str, float]:
-    """Mean true U-value of each element that a file of patches cuts out of the house, [W/(m2 K)]."""
+    """Give the mean true U-value of each element that a file of patches cuts out of the house, [W/(m2 K)]."""
     points, normals = house_corner().solid.surface_points(_POINTS)
     every, none = np.ones(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
-    applied = apply_patches(
-        load_patch_rules(rules), centroids_m=points, normals=normals, up=(0.0, 0.0, 1.0), seen=every, on_box=none
-    )
+    where = {"centroids_m": points, "normals": normals, "up": (0.0, 0.0, 1.0), "seen": every, "on_box": none}
+    applied = apply_patches(load_patch_rules(rules), **where)
     u: FloatArray = true_u_w_m2k(points)
     return {applied.names[n]: float(u[applied.number == n].mean()) for n in np.unique(applied.number)}
 
 
 def audit_target(compared: Sequence[Compared]) -> Target:
-    """How many of the figures lie in their intervals: all of them should."""
+    """Say how many of the figures lie in their intervals, which all of them should."""
     share = sum(one.held for one in compared) / len(compared) if compared else math.nan
     return Target(
         *("Audit: true U-values and psi in their intervals", 100.0 * share, 100.0, True, "{:.0f} %"),
@@ -225,8 +194,9 @@ def demo_page(
         for number in range(_INPUTS_SHOWN):
             path = photographs[number * len(photographs) // _INPUTS_SHOWN]
             with Image.open(drawn / "thermal" / f"{path.stem}.png") as counts:  # 16 bits that span the bounds
-                thermal = colours(np.asarray(counts, dtype=np.float64) / 65535.0, (0.0, 1.0)).astype(np.uint8)
-            inputs.append((path.read_bytes(), jpeg_of(thermal, 88)))
+                thermal = colours(np.asarray(counts, dtype=np.float64) / 65535.0, (0.0, 1.0))
+            inputs.append((path.read_bytes(), image_file(thermal, quality=88)))
+        kinds = ("gt-rgb", "rgb", "gt-thermal", "thermal")
         return build_page(
             "demo.html.j2",
             scene=scene,
@@ -235,13 +205,7 @@ def demo_page(
             others=others,
             compared=compared,
             inputs=inputs,
-            views=[
-                (
-                    name,
-                    [(renders / of / f"{name}.png").read_bytes() for of in ("gt-rgb", "rgb", "gt-thermal", "thermal")],
-                )
-                for name in held_out
-            ],
+            views=[(name, [(renders / of / f"{name}.png").read_bytes() for of in kinds]) for name in held_out],
             gradient=[to_hex(colour) for colour in colormaps["inferno"](np.linspace(0.0, 1.0, 17))],
             ends_c=[float(bounds[f"absolute_{end}_temperature"]) for end in ("min", "max")],
             heat=_panels(export / "heat.png", 3),
@@ -255,11 +219,5 @@ def demo_page(
 
 def _panels(path: Path, count: int) -> list[bytes]:
     """Cut a picture of panels side by side, so that a narrow screen can show one below the other."""
-    panels = []
     with Image.open(path) as whole:
-        for number in range(count):
-            file = BytesIO()
-            left, right = number * whole.width // count, (number + 1) * whole.width // count
-            whole.crop((left, 0, right, whole.height)).save(file, format="PNG")
-            panels.append(file.getvalue())
-    return panels
+        return [image_file(panel, "PNG") for panel in np.array_split(np.asarray(whole.convert("RGB")), count, axis=1)]

@@ -3,28 +3,154 @@
 from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
-import traceback
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of, up_of
-from thermoxels_ns.core.errors import CheckpointError, SceneError, ThermoxelsError
+from thermoxels_ns.core.checks import remove_file, result_folder
+from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json_object
-from thermoxels_ns.core.lattice import input_from_world
+from thermoxels_ns.core.lattice import Lattice, input_from_world
+from thermoxels_ns.data.scene_scale import (
+    SceneScale,
+    choose_scale,
+    scale_from_known_distance,
+    scale_from_option,
+    up_from_scene_file,
+)
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
     from thermoxels_ns.core.feature_rays import FeatureRays
     from thermoxels_ns.core.snapshot import GridSnapshot
-    from thermoxels_ns.mesh.solid.voxels import SolidCells
+    from thermoxels_ns.fem.problem import TimeSteps
+    from thermoxels_ns.heat.materials import Material
+    from thermoxels_ns.heat.scene import HeatScene
+    from thermoxels_ns.mesh.boundary.patches import PatchRules
+    from thermoxels_ns.mesh.build import BuiltMesh
+    from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection
     from thermoxels_ns.mesh.tetrahedra import TetMesh
+    from thermoxels_ns.multiview.stereo import Depths
+
+Settings = TypeVar("Settings", "Material", "TimeSteps")
+Say = Callable[[str], None]
+Compare = Callable[["SolidCells", "TetMesh", float], "dict[str, Any] | None"]
+"""Compares solid voxels and mesh with a known truth, in metres by the metres per unit; None if none is known."""
+
+_SUMMARY, _HEAT, _QUALITY, _HEAT_PICTURE = "summary.json", "heat.pvd", "quality.json", "heat.png"
+_MESH_PICTURES = ("mesh.png", "mesh-measured.png", "quality.png", "region.png")
+HEAT_SKIPPED = (
+    "Heat step skipped: the size of the scene is not known. Pass --metres-per-unit, the length in metres of one unit "
+    "of the input poses (1 if they are in metres), or --known-distance."
+)
+INNER_SIDE = (
+    "The exact scene is filled, so the inner side of a shell or a wall counts as wrong surface in precision, fscore "
+    "and mean distance; precision_seen and fscore_seen are those of the side that photographs show."
+)
+"""What to know of the figures beside the truth if the mesh is not filled: hollow, or a wall of a given thickness."""
+
+
+@dataclass
+class ExportOptions:
+    """Everything an export can be told."""
+
+    boundary: Literal["conforming", "voxel"] = "conforming"
+    """conforming: the boundary follows the level set of the density; voxel: it follows voxel faces, as in the
+    Thermoxels paper, and every boundary triangle says how much true surface it stands for."""
+    voxel_optical_depth: float | None = None
+    """Voxels in which density times edge length is at least this are solid: at 0.5, light that crosses one loses 39 %.
+    Lower it if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: the
+    highest that 95 % of the training rays that end on something meet within half a voxel of where they end."""
+    density_percentile: float | None = None
+    """Voxels denser than this share of all voxels of the scene box are solid, [%], 0 to 100; the Thermoxels paper's
+    way, where 90 keeps the densest tenth. Takes the place of the optical depth."""
+    density_threshold: float | None = None
+    """Voxels at least this dense are solid, [1 / world unit]. Takes the place of both."""
+    close_gaps: int = 1
+    """Fill gaps and pinholes up to twice this many voxels wide; thin walls are not continuous without it. 0: none."""
+    region: Literal["auto", "all"] = "auto"
+    """Which part is exported. auto: what photographs show about as well as what they were taken of, an object with its
+    table, a house with the ground around it, a room with its walls; without bodies below 1 % of the largest, which are
+    mostly floaters. all: everything that was reconstructed."""
+    region_box: tuple[float, float, float, float, float, float] | None = None
+    """In place of auto, what lies in a box in the coordinates of the input poses, xmin ymin zmin xmax ymax zmax."""
+    region_near: tuple[float, float, float, float] | None = None
+    """In place of auto, what lies near a point in the coordinates of the input poses, x y z radius."""
+    interior: Literal["solid", "hollow"] = "solid"
+    """What becomes of the inside of a body of which photographs only show the shell. solid: it is filled; a cavity with
+    a camera in it is a room and stays empty. hollow: the shell alone, as thick as the photographs happened to make
+    it."""
+    seal_openings: int = 2
+    """While looking for the inside, openings in the shell up to twice this many voxels wide count as closed."""
+    wall_thickness: float | None = None
+    """For facades seen from one side: make the seen surface this thick, [m], growing away from the cameras. Takes the
+    place of filling the interior."""
+    coarsest_cell: int = 4
+    """Edge of the largest cells deep inside a conforming mesh, a power of two, [voxels]; 1: as fine as the surface."""
+    patches: Path | None = None
+    """A yaml file that names parts of the surface and regions of the volume by box, plane or colour; see
+    configs/patches-example.yaml."""
+    metres_per_unit: float | None = None
+    """Length of one unit of the input poses, [m]; 1 if the poses are in metres. Needed for heat, unless the scene's
+    json has metres_per_unit: without a scale the mesh is written in units of the input, without heat."""
+    up: tuple[float, float, float] | None = None
+    """Direction that points up, in the coordinates of the input poses; it decides which patches face up, down or
+    sideways. Left out: that of the scene's json, else from the cameras, whose pictures people hold level."""
+    known_distance: tuple[float, float, float, float, float, float, float] | None = None
+    """In place of metres per unit: two points in the coordinates of the input poses and the distance between them,
+    x y z x y z metres."""
+    known_distance_error: float | None = None
+    """Standard error of that distance, with what the two points may be off, [m]; the summary then says how well areas
+    and volumes are known."""
+    formats: tuple[Literal["vtu", "xdmf", "msh", "inp", "stl", "ply", "glb"], ...] = ("vtu", "glb")
+    """Files to write the mesh to: vtu (ParaView), xdmf (FEniCSx), msh (Gmsh), inp (CalculiX, Abaqus), stl, ply
+    (surface), glb (browsers, phones)."""
+    heat_preset: str = "concrete"
+    """Heat scene of the heat step, of one material and with equal steps: the name of one of configs/scene-NAME.yaml, or
+    the path of a yaml file. concrete: a body of concrete that is left to itself. The file for CalculiX and Abaqus takes
+    material and steps from it, not what acts on the body."""
+    steps: int | None = None
+    """Number of time steps; the scene's by default (10 for concrete)."""
+    step_seconds: float | None = None
+    """Length of a time step, [s]; the scene's by default (60 for concrete)."""
+    conductivity_w_mk: float | None = None
+    """Thermal conductivity, [W / (m K)]; the scene's by default."""
+    density_kg_m3: float | None = None
+    """Mass density of the material, [kg / m3]; the scene's by default."""
+    specific_heat_j_kgk: float | None = None
+    """Specific heat capacity, [J / (kg K)]; the scene's by default."""
+    pictures: bool = True
+    """Write PNG pictures of the mesh coloured by temperature, and of its quality."""
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """How pictures look at the mesh, in the coordinates of the input poses."""
+
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction that points up."""
+    up_source: str = "Up is assumed to be z."
+    """How it was found."""
+    view_direction: tuple[float, float, float] | None = None
+    """Direction from the camera to the mesh; None: obliquely from above."""
+
+
+class CheckedOptions(NamedTuple):
+    """What the options say, once they are known to be in range."""
+
+    selection: SolidSelection
+    rules: PatchRules
+    distance: SceneScale | None  # The scale that the known distance gives
+    scene: HeatScene  # The scene of the heat step with the options' changes applied
+    material: Material  # What that scene says the body is made of
+    time: TimeSteps  # How long it says the body is followed
 
 
 @dataclass(frozen=True)
@@ -34,15 +160,11 @@ class TrainedScene:
     snapshot: GridSnapshot
     world_to_input: npt.NDArray[np.float64]
     """Takes homogeneous column vectors of the trained scene to the coordinates of the input poses, shape (4, 4)."""
-    viewpoint: Viewpoint
-    """From where pictures show most of what the cameras saw."""
+    viewpoint: Viewpoint  # From where pictures show most of what the cameras saw
     scene_folder: Path
-    dataset: Any
-    """The training photographs, a `ThermalDataset`."""
-    tracks: FeatureRays | None
-    """Lines from photographs to points that they see, in the trained scene; None: it has no tracks."""
-    corrections: dict[str, Any]
-    """What training corrected in its photographs, see `ThermoxelsPipeline.corrections`."""
+    dataset: Any  # The training photographs, a `ThermalDataset`
+    tracks: FeatureRays | None  # Lines from photographs to points that they see, in the trained scene
+    corrections: dict[str, Any]  # What training corrected in its photographs, see `ThermoxelsPipeline.corrections`
 
 
 @dataclass(kw_only=True)
@@ -67,10 +189,8 @@ class ExportThermoxelsMesh(ExportOptions):
             CONSOLE.print(f"[bold red]Error:[/bold red] {escape(str(problem))}")
             raise SystemExit(1) from None
 
-    def run(self, say: Any = print) -> dict[str, Any]:
+    def run(self, say: Say) -> dict[str, Any]:
         """Run the export and return the summary that summary.json holds, or raise `ThermoxelsError`."""
-        from thermoxels_ns.commands.export_snapshot import export_snapshot, prepare_folder
-
         checked = check_options(self)
         prepare_folder(self.output_dir)
         say(f"Loading {self.load_config}")
@@ -91,27 +211,305 @@ class ExportThermoxelsMesh(ExportOptions):
         def compare(solid: SolidCells, mesh: TetMesh, scale: float) -> dict[str, Any] | None:
             from thermoxels_ns.evaluation.truth_comparison import compare_with_truth
 
-            lattice = scene.snapshot.lattice
             truth = scene.world_to_input, scene.scene_folder
             return compare_with_truth(solid.cells, lattice, *truth, mesh, scale, within=solid.within)
 
+        lattice = scene.snapshot.lattice
+        depths = depths_of_dataset(scene.dataset, 0.0, lattice.lo, lattice.hi)
         return export_snapshot(
-            scene.snapshot,
-            scene.world_to_input,
-            self,
-            self.output_dir,
-            say,
-            scene.viewpoint,
-            compare,
-            scene_json(scene.scene_folder),
-            depths_of_dataset(scene.dataset, 0.0, scene.snapshot.lattice.lo, scene.snapshot.lattice.hi),
-            scene.tracks,
-            scene.corrections,
+            *(scene.snapshot, scene.world_to_input, self, self.output_dir, say, scene.viewpoint, compare),
+            *(scene_json(scene.scene_folder), depths, scene.tracks, scene.corrections),
         )
 
 
+def check_options(options: ExportOptions) -> CheckedOptions:
+    """Check every option, so that a wrong one is refused (`ThermoxelsError`) before anything slow runs."""
+    from thermoxels_ns.mesh.boundary.patches import PatchRules, load_patch_rules
+    from thermoxels_ns.mesh.build import MeshOptions
+    from thermoxels_ns.mesh.solid.voxels import SolidSelection
+
+    if options.metres_per_unit is not None:
+        scale_from_option(options.metres_per_unit)
+    distance = None
+    if options.known_distance is not None:
+        first, second, length = options.known_distance[:3], options.known_distance[3:6], options.known_distance[6]
+        distance = scale_from_known_distance(first, second, length, options.known_distance_error)
+    elif options.known_distance_error is not None:
+        remedy = "Pass --known-distance x y z x y z metres, or leave the error out."
+        raise MeshError("known_distance_error", expected="--known-distance beside it", got="none", remedy=remedy)
+    choose_scale(options.metres_per_unit, distance)
+    if not options.formats or len(set(options.formats)) < len(options.formats):
+        remedy = "Pass --formats vtu glb, for example."
+        raise MeshError("formats", expected="at least one format, each once", got=options.formats, remedy=remedy)
+    MeshOptions(options.boundary, options.coarsest_cell)  # refuses what is out of range
+    selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
+    rules = PatchRules() if options.patches is None else load_patch_rules(options.patches)
+    return CheckedOptions(selection, rules, distance, *_heat_settings(options))
+
+
+def _heat_settings(options: ExportOptions) -> tuple[HeatScene, Material, TimeSteps]:
+    """Read the scene of the heat step, its material and its steps, and apply the options' changes."""
+    from thermoxels_ns.fem.problem import TimeSteps
+    from thermoxels_ns.heat.scene import load_heat_scene
+
+    def changed(settings: Settings) -> Settings:
+        given = {field.name: getattr(options, field.name, None) for field in fields(settings)}
+        return replace(settings, **{name: value for name, value in given.items() if value is not None})
+
+    scene = load_heat_scene(options.heat_preset)
+    given, *others = set(scene.materials.values())
+    if others or not isinstance(scene.time, TimeSteps):
+        expected = "a scene of one material, with time: {steps: 10, step_seconds: 60}"
+        remedy = "Export without it, then run thermoxels heat with that scene on the mesh."
+        raise HeatError("heat_preset", expected=expected, got=options.heat_preset, remedy=remedy)
+    material, time = changed(given), changed(scene.time)
+    if material != given:
+        material = replace(material, name=f"{material.name} (changed)")
+    return replace(scene, materials=dict.fromkeys(scene.materials, material), time=time), material, time
+
+
+def scale_of(options: ExportOptions, checked: CheckedOptions, scene_file: Mapping | None) -> SceneScale | None:
+    """Give the scale of an export: what the user gives, else what the scene's json says; None if nobody does.
+
+    Raises `ThermoxelsError` for a scale out of range, or for a format or option that needs one where there is none.
+    """
+    scale = choose_scale(options.metres_per_unit, checked.distance, scene_file)
+    asked = {
+        "--formats inp": "inp" in options.formats,
+        "--wall-thickness": options.wall_thickness is not None,
+        "--patches": options.patches is not None,
+    }
+    needs = [option for option, given in asked.items() if given]
+    if scale is None and needs:
+        remedy = "Pass --metres-per-unit, or --known-distance."
+        got = "none in the options or in the scene's json"
+        raise MeshError("scale", expected=f"a scene whose scale is known, for {needs[0]}", got=got, remedy=remedy)
+    return scale
+
+
+def up_of(
+    options: ExportOptions, scene_file: Mapping[str, Any] | None, viewpoint: Viewpoint
+) -> tuple[tuple[float, float, float], str]:
+    """Give the unit vector up, and where it comes from: the user, else the scene's json, else the cameras."""
+    if options.up is not None:
+        length = math.sqrt(sum(value * value for value in options.up))
+        if not (math.isfinite(length) and length > 0.0):
+            raise MeshError("up", expected="a direction", got=options.up, remedy="Pass --up 0 0 1, for example.")
+        x, y, z = (value / length for value in options.up)
+        return (x, y, z), "Given with --up."
+    in_file = up_from_scene_file(scene_file or {})
+    if in_file is not None:
+        return in_file, "From the scene's json."
+    return viewpoint.up, viewpoint.up_source
+
+
+def prepare_folder(output_dir: Path | str) -> Path:
+    """Make the folder of an export, refuse what is in the way, and remove what killed exports left half-written."""
+    from thermoxels_ns.heat.vtk_series import STEP_PATTERN
+    from thermoxels_ns.mesh.files.formats import MESH_FORMATS
+
+    names = (*_mesh_files(MESH_FORMATS), *_MESH_PICTURES, _HEAT, _HEAT_PICTURE, _QUALITY, _SUMMARY)
+    others = ("answers.json", "series.csv")
+    return result_folder(output_dir, names, (_QUALITY, _SUMMARY), others, f"{Path(_HEAT).stem}/{STEP_PATTERN}")
+
+
+def export_snapshot(
+    snapshot: GridSnapshot,
+    world_to_input: npt.NDArray[np.float64],
+    options: ExportOptions,
+    output_dir: Path | str,
+    say: Say = lambda _: None,
+    viewpoint: Viewpoint = Viewpoint(),
+    compare: Compare | None = None,
+    scene_file: Mapping[str, Any] | None = None,
+    depths: Depths | None = None,
+    tracks: FeatureRays | None = None,
+    corrections: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Write the mesh in the formats asked for, quality.json, summary.json, and as asked pictures and the heat series.
+
+    All of it is computed before anything is written. Then the summary of an earlier export goes first and the new one
+    comes last, so the files in a folder with a summary.json belong together; what this export does not make is removed.
+
+    Args:
+        snapshot: The trained field.
+        world_to_input: Takes the trained scene to the input poses, shape (4, 4).
+        options: What the export was told.
+        output_dir: Folder for the files.
+        say: Takes lines of progress.
+        viewpoint: How pictures look at the mesh; its up is the mesh's unless an option or the scene's json has one.
+        compare: Compares with a known truth if the scale is known; its `ThermoxelsError` goes into the summary.
+        scene_file: The scene's json, for its scale and up.
+        depths: Depths of photographs, by which boundary triangles are supported.
+        tracks: Lines from photographs to points that they see, which support boundary triangles too.
+        corrections: What training corrected in photographs, for the summary.
+
+    Raises:
+        ThermoxelsError: An option is wrong, nothing is solid, the heat solver failed, or a file cannot be written.
+    """
+    from thermoxels_ns.commands import export_summary
+    from thermoxels_ns.fem.solution import HeatSolution
+    from thermoxels_ns.heat.solving import Goals, solve_problem
+    from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, write_heat_series
+    from thermoxels_ns.mesh.build import MeshOptions, apply_transform, build_mesh
+    from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
+    from thermoxels_ns.mesh.files.solvers import HeatStep
+    from thermoxels_ns.mesh.files.surface import check_stl
+    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
+    from thermoxels_ns.mesh.quality.report import check_mesh, picture_of_quality
+    from thermoxels_ns.mesh.tetrahedra import support_of_facets
+    from thermoxels_ns.mesh.voxel_tets import used_corners, voxel_facets
+    from thermoxels_ns.reports import mesh_pictures
+
+    checked = check_options(options)
+    scale = scale_of(options, checked, scene_file)
+    metres, unit = (1.0, "input unit") if scale is None else (scale.metres_per_unit, "m")
+    up, up_source = up_of(options, scene_file, viewpoint)
+    folder = prepare_folder(output_dir)
+    to_mesh = np.diag([metres, metres, metres, 1.0]) @ world_to_input
+    mesh_options = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
+    built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options, metres)
+    if depths is not None:
+        built = _with_support(built, depths, tracks, snapshot.lattice, to_mesh)
+    mesh = built.mesh
+    suffixes = [f".{name}" for name in options.formats]
+    if ".stl" in suffixes:
+        check_stl(mesh)
+    voxel_size = snapshot.lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(to_mesh[:3, :3]))))
+    report = check_mesh(mesh, options.boundary, built.observed_range_c, length_unit=unit)
+    say(f"Up: {', '.join(f'{value:.3g}' for value in up)}. {up_source}")
+    region = export_summary.region_summary(built, checked.selection)
+    for line in export_summary.lines_on_mesh(built, region, report.volume_m3, unit, voxel_size):
+        say(line)
+
+    scene, material, time = checked.scene, checked.material, checked.time
+    solution: HeatSolution | None = None
+    truth = None
+    if scale is not None:
+        say(f"Heat: {time.steps} steps of {time.step_seconds:g} s through {material.name}")
+        everything = Goals(leave_out_below=0.0, memory_gb=None)
+        found = solve_problem(scene.problem(mesh, up=up), time, everything, say).solution
+        assert isinstance(found, HeatSolution), "the scene has time steps"
+        solution = found
+        say(f"Heat: {solution.status} Energy conserved to {solution.energy_residual:.1e}.")
+        inner_side = options.interior == "hollow" or options.wall_thickness is not None
+        truth = None if compare is None else _compared(compare, built, metres, inner_side, say)
+    else:
+        say(HEAT_SKIPPED)
+
+    files = [*_mesh_files(suffixes), _QUALITY]
+    if solution is not None:
+        files += [p.relative_to(folder).as_posix() for p in heat_series_paths(folder / _HEAT, len(solution.times_s))]
+    if options.pictures:
+        files += [*_MESH_PICTURES, *([] if solution is None else [_HEAT_PICTURE])]
+    skipped = {"computed": False, "reason": HEAT_SKIPPED}
+    summary = {
+        "options": {field.name: getattr(options, field.name) for field in fields(options)},
+        "versions": export_summary.versions(),
+        "length_unit": unit,
+        "scale": None if scale is None else scale.as_mapping(),
+        "up": up,
+        "up_source": up_source,
+        "region": region,
+        "mesh": export_summary.mesh_summary(built, report, checked.selection, scale, voxel_size),
+        "heat": skipped if solution is None else export_summary.heat_summary(material, time, solution),
+        "corrections": dict(corrections or {}),
+        **({} if truth is None else {"truth": truth}),
+        "files": [*files, _SUMMARY],
+    }
+    summary_text(summary)  # raises if json cannot hold it
+
+    remove_file(folder / _SUMMARY)
+    write_summary(folder / _QUALITY, report.as_mapping())  # first: it tells the next export that the rest is one's, too
+    for name in {*_mesh_files(MESH_FORMATS), *_MESH_PICTURES, _HEAT_PICTURE} - set(files):
+        remove_file(folder / name)
+    if solution is None:
+        remove_heat_series(folder / _HEAT)
+    heat_step = HeatStep(
+        material.conductivity_w_mk, material.density_kg_m3, material.specific_heat_j_kgk, time.steps, time.step_seconds
+    )
+    for suffix in suffixes:
+        write_mesh(folder / f"mesh{suffix}", mesh, heat_step=heat_step, up=up)
+    if solution is not None:
+        write_heat_series(folder / _HEAT, mesh, solution)
+    if options.pictures:
+        look = {"up": up, "view_direction": viewpoint.view_direction}
+        mesh_pictures.draw_mesh([folder / name for name in _MESH_PICTURES[:2]], mesh, look, unit)
+        picture_of_quality(folder / _MESH_PICTURES[2], report)
+        if support_of_facets(mesh) is not None:
+            mesh_pictures.add_support(folder / _MESH_PICTURES[2], mesh, look)
+        # In grey the faces of the voxels that are not exported.
+        left_out = built.solid.left_out
+        ghost = (
+            apply_transform(to_mesh, snapshot.lattice.index_to_world(used_corners(left_out))),
+            voxel_facets(left_out),
+        )
+        note = "grey: left out of the region" if len(ghost[0]) else "nothing is left out"
+        beside: Any = {"title": "Region", "length_unit": unit, "ghost": ghost, "note": note, **look}
+        mesh_pictures.write_picture(folder / _MESH_PICTURES[3], mesh_pictures.image_of_mesh(mesh, **beside))
+        if solution is not None:
+            mesh_pictures.draw_heat(folder / _HEAT_PICTURE, mesh, solution, look)
+    write_summary(folder / _SUMMARY, summary)
+    say(f"Written to {folder}: {', '.join(name for name in summary['files'] if '/' not in name)}")
+    return summary
+
+
+def _mesh_files(suffixes: Iterable[str]) -> list[str]:
+    """Name the files that the mesh is written to in these formats."""
+    from thermoxels_ns.mesh.files.formats import mesh_file_paths
+
+    return [path.name for suffix in suffixes for path in mesh_file_paths(f"mesh{suffix}")]
+
+
+def _with_support(
+    built: BuiltMesh,
+    depths: Depths,
+    tracks: FeatureRays | None,
+    lattice: Lattice,
+    to_mesh: npt.NDArray[np.float64],
+) -> BuiltMesh:
+    """Count for each boundary triangle the photographs that see it, and those that support it.
+
+    See `facet_views` and `supporting_photographs`. `to_mesh` takes the trained scene to the mesh's coordinates.
+    """
+    from thermoxels_ns.mesh.boundary.visibility import facet_views
+    from thermoxels_ns.mesh.build import apply_transform
+    from thermoxels_ns.multiview.votes import supporting_photographs
+
+    mesh = built.mesh
+    assert mesh.boundary is not None
+    middle = apply_transform(np.linalg.inv(to_mesh), mesh.points_m[mesh.facets].mean(axis=1))
+    normal = mesh.boundary.normal @ to_mesh[:3, :3] / np.cbrt(abs(np.linalg.det(to_mesh[:3, :3])))
+    photographs = depths.photographs
+    cameras = photographs.matrices, photographs.centres, photographs.sizes
+    views = facet_views(built.solid.cells, lattice, *cameras, middle, normal)
+    found = supporting_photographs(depths, views.middle, views.seen, lattice.voxel_size, tracks)
+    count = np.stack((views.seen.sum(axis=1), found.sum(axis=1)), axis=1)[views.group]
+    return replace(built, mesh=replace(mesh, boundary=replace(mesh.boundary, photographs=count)))
+
+
+def _compared(compare: Compare, built: BuiltMesh, metres: float, inner_side: bool, say: Say) -> dict[str, Any] | None:
+    """Compare with the truth; a truth that cannot be used costs the comparison, not the export.
+
+    A mesh with an inner side, of a shell or of a wall, gets a note on what that does to the figures.
+    """
+    try:
+        truth = compare(built.solid, built.mesh, metres)
+    except ThermoxelsError as problem:
+        say(f"Not compared with the truth: {problem}")
+        return {"error": str(problem)}
+    if truth is None:
+        return None
+    told = (f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in truth.items())
+    say(f"Against the truth: {', '.join(told)}")
+    if not inner_side:
+        return truth
+    say(INNER_SIDE)
+    return {**truth, "note": INNER_SIDE}
+
+
 def scene_json(scene_folder: Path) -> dict[str, Any]:
-    """The scene's json as it is, for what it says about scale and up; empty if the scene has none (COLMAP)."""
+    """Read the scene's json as it is, for what it says about scale and up; empty if the scene has none (COLMAP)."""
     from thermoxels_ns.data.scene_file import JSON_NAMES
 
     folder = scene_folder if scene_folder.is_dir() else scene_folder.parent
@@ -136,7 +534,9 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
 
     def check(config: TrainerConfig) -> TrainerConfig:
         _check_config(config)
-        check_scene(_scene_folder(config))
+        manager: Any = config.pipeline.datamanager
+        told = getattr(manager, "data", None)  # with --data of ns-train, else with the dataparser's own --data
+        check_scene(Path(manager.dataparser.data if told is None else told))
         return config
 
     try:
@@ -145,7 +545,9 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
         raise
     except (yaml.YAMLError, AssertionError, KeyError, UnicodeDecodeError) as problem:
         expected = "a config.yml that ns-train of this installation wrote"
-        got = f"{load_config}, which cannot be read ({_reason(load_config, problem)})"
+        # nerfstudio's own checks have no message
+        reason = f"{type(problem).__name__}: {problem}" if str(problem) else "it holds no TrainerConfig of nerfstudio"
+        got = f"{load_config}, which cannot be read ({reason})"
         remedy = "Pass the config.yml of the training run."
         raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy) from problem
     except RuntimeError as problem:
@@ -165,18 +567,6 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
         outputs.metadata["feature_rays"],
         pipeline_of_ours.corrections(),
     )
-
-
-def _reason(load_config: Path, problem: Exception) -> str:
-    """Why nerfstudio refused a config.yml; its own checks have no message."""
-    if load_config.stat().st_size == 0:
-        return "the file is empty"
-    if str(problem):
-        return f"{type(problem).__name__}: {problem}"
-    check = (traceback.extract_tb(problem.__traceback__)[-1].line or "").strip()
-    if "TrainerConfig" in check:
-        return "it holds no TrainerConfig of nerfstudio"
-    return f"{type(problem).__name__} at: {check}"
 
 
 def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.ArrayLike) -> Viewpoint:
@@ -206,13 +596,7 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
     return Viewpoint(tuple(float(v) for v in up), source, direction)  # type: ignore[arg-type]
 
 
-def _scene_folder(config: TrainerConfig) -> Path:
-    """Where the photographs are: what ns-train was told with --data, else with the dataparser's own --data."""
-    manager: Any = config.pipeline.datamanager
-    return Path(manager.dataparser.data if getattr(manager, "data", None) is None else manager.data)
-
-
-def _check_config(config: TrainerConfig) -> TrainerConfig:
+def _check_config(config: TrainerConfig) -> None:
     """Refuse another method's run, or one without a checkpoint, before its photographs are loaded."""
     pipeline: Any = config.pipeline
     if not callable(getattr(pipeline._target, "grid_snapshot", None)):
@@ -224,4 +608,3 @@ def _check_config(config: TrainerConfig) -> TrainerConfig:
     if not any(folder.glob("step-*.ckpt")):
         remedy = "Run the command in the folder where ns-train ran, or train to the first checkpoint."
         raise CheckpointError("checkpoint", expected=f"a file step-*.ckpt in {folder}", got="none", remedy=remedy)
-    return config

@@ -83,11 +83,8 @@ def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     from thermoxels_ns.heat.vtk_series import STEP_PATTERN
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES
 
-    names, series = (
-        (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *HEAT_PICTURES),
-        f"{Path(THROUGH_TIME).stem}/{STEP_PATTERN}",
-    )
-    others = ("summary.json", "quality.json")
+    names, others = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *HEAT_PICTURES), ("summary.json", "quality.json")
+    series = f"{Path(THROUGH_TIME).stem}/{STEP_PATTERN}"
     folder = result_folder(options.output_dir, names, (ANSWERS, SERIES), others, series)
     run = compute_heat(options, say)
     write_heat_files(folder, options, run, say)
@@ -143,13 +140,9 @@ def read_export_summary(mesh: Path, say: Say) -> dict[str, Any]:
 
 
 def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
-    """Everything that answers.json says."""
-    solution = run.solution
-    accuracy, error, time_error_k = (
-        run.accuracy,
-        getattr(solution, "error", None),
-        getattr(solution, "time_error_k", math.nan),
-    )
+    """Give everything that answers.json says."""
+    solution, accuracy = run.solution, run.accuracy
+    error, time_error_k = getattr(solution, "error", None), getattr(solution, "time_error_k", math.nan)
     return {
         "mesh": options.mesh,
         "scene": options.scene,
@@ -181,8 +174,7 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
         "wall": None if run.wall is None else asdict(run.wall),
         "no_wall": run.no_wall,
         "probes": [
-            {"point_m": point, "temperature_c": run.probes_c[:, number]}
-            for number, point in enumerate(run.probes.points_m)
+            {"point_m": point, "temperature_c": values} for point, values in zip(run.probes.points_m, run.probes_c.T)
         ],
         "built": [heat.effect for heat in solution.effects],
         "left_out": [asdict(entry) for entry in run.left_out],
@@ -227,7 +219,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
 
 
 def _write_series(path: Path, run: HeatRun) -> None:
-    """Temperatures at each time, and mean heat flows during the interval that ends there."""
+    """Write temperatures at each time, and mean heat flows during the interval that ends there."""
     times, states = run.nodes.times_s, run.nodes.states_c
     effects = run.solution.effects
     head = ["time_s", "min_c", "mean_c", "max_c"]

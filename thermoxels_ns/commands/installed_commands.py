@@ -12,9 +12,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -31,22 +31,16 @@ PLAIN_TRAINING = (
 )
 """Options of an ns-train whose output somebody reads, or a file keeps."""
 
-_POLL_S = 0.05
 _QUIET_S = 20.0
 _LAST_LINES = 12
 # What nerfstudio 1.1 and torch tell their programmers, not their users.
-_SILENCED = ",".join(
-    (
-        "ignore::FutureWarning",
-        "ignore::DeprecationWarning",
-        "ignore:Using a non-tuple sequence:UserWarning",
-        "ignore:Converting a tensor with requires_grad:UserWarning",
-    )
+_SILENCED = (
+    "ignore::FutureWarning,ignore::DeprecationWarning,ignore:Using a non-tuple sequence:UserWarning,"
+    "ignore:Converting a tensor with requires_grad:UserWarning"
 )
 
 
-@dataclass(frozen=True)
-class ProcessCost:
+class ProcessCost(NamedTuple):
     """What a finished process took."""
 
     seconds: float  # Wall time, [s]
@@ -85,16 +79,20 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
     then that a quiet command still runs. Raises `ThermoxelsError` with the last lines if it failed or does not exist.
     """
     words = [str(argument) for argument in arguments]
-    program = _installed_command(words[0])
+    folder = Path(sys.executable).parent
+    program = shutil.which(words[0], path=str(folder))
+    if program is None:
+        remedy = "Install this package and nerfstudio into the environment of this Python."
+        raise ThermoxelsError(words[0], expected=f"a command in {folder}", got="none", remedy=remedy)
+    environment = dict(os.environ, PYTHONUNBUFFERED="1", PYTHONIOENCODING="utf-8")
+    environment.setdefault("PYTHONWARNINGS", _SILENCED)
+    if console.is_terminal:
+        environment |= {"FORCE_COLOR": "1", "COLUMNS": str(console.width)}
     console.print(f"$ {command_line(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)
     start = time.monotonic()
     with log.open("wb") as file:
         process = subprocess.Popen(
-            [program, *words[1:]],
-            stdin=subprocess.DEVNULL,
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            env=_environment(console),
+            [program, *words[1:]], stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, env=environment
         )
     try:
         peak_memory_gb = _wait(process, log, console, f"... {words[0]} is at work")
@@ -108,25 +106,6 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
         lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
         raise ThermoxelsError("\n".join([message, *(f"    {line}" for line in lines[-_LAST_LINES:])]))
     return ProcessCost(time.monotonic() - start, peak_memory_gb)
-
-
-def _installed_command(name: str) -> str:
-    """Path of a command of this installation."""
-    folder = Path(sys.executable).parent
-    program = shutil.which(name, path=str(folder))
-    if program is None:
-        remedy = "Install this package and nerfstudio into the environment of this Python."
-        raise ThermoxelsError(name, expected=f"a command in {folder}", got="none", remedy=remedy)
-    return program
-
-
-def _environment(console: Console) -> dict[str, str]:
-    """The environment of a command: output at once, without warnings that concern programmers, colours if wanted."""
-    environment = dict(os.environ, PYTHONUNBUFFERED="1", PYTHONIOENCODING="utf-8")
-    environment.setdefault("PYTHONWARNINGS", _SILENCED)
-    if console.is_terminal:
-        environment |= {"FORCE_COLOR": "1", "COLUMNS": str(console.width)}
-    return environment
 
 
 def _wait(process: subprocess.Popen[bytes], log: Path, console: Console, quiet: str) -> float:
@@ -146,11 +125,11 @@ def _wait(process: subprocess.Popen[bytes], log: Path, console: Console, quiet: 
                 console.print(f"{quiet}, {now - start:.0f} s", highlight=False)
             if ended:
                 return peak_memory_gb
-            time.sleep(_POLL_S)
+            time.sleep(0.05)
 
 
 def _ended(process: subprocess.Popen[bytes]) -> tuple[bool, float]:
-    """Whether a process has ended, and its peak memory [1e9 bytes] then."""
+    """Say whether a process has ended, and its peak memory [1e9 bytes] then."""
     wait4 = getattr(os, "wait4", None)  # POSIX; elsewhere memory is not measured
     if wait4 is None:
         return process.poll() is not None, math.nan
@@ -158,13 +137,9 @@ def _ended(process: subprocess.Popen[bytes]) -> tuple[bool, float]:
     if pid != process.pid:
         return False, math.nan
     process.returncode = os.waitstatus_to_exitcode(status)
-    if usage.ru_maxrss <= _own_peak_kib():
+    # Linux reports at least the peak of the process that started it.
+    own = Path("/proc/self/status")
+    found = re.search(r"^VmHWM:\s*(\d+) kB", own.read_text(), re.MULTILINE) if own.is_file() else None
+    if found and usage.ru_maxrss <= int(found[1]):
         return True, math.nan
     return True, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
-
-
-def _own_peak_kib() -> int:
-    """Largest resident memory of this process on Linux, [KiB], the least that it reports for others; else 0."""
-    status = Path("/proc/self/status")
-    found = re.search(r"^VmHWM:\s*(\d+) kB", status.read_text(), re.MULTILINE) if status.is_file() else None
-    return int(found[1]) if found else 0

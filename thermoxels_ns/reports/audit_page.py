@@ -1,18 +1,29 @@
-"""The page of an audit."""
+"""The page of an audit, and its pictures: the surface from fixed views, and a thermogram of each defect."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from typing import Any, TypeAlias
 
-from thermoxels_ns.audit.conditions import Survey, unknown_name
+import numpy as np
+
+from thermoxels_ns.audit.conditions import Survey
 from thermoxels_ns.audit.draws import CONFIDENCE
-from thermoxels_ns.audit.results import Audit
-from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE
-from thermoxels_ns.reports.audit_pictures import MOST_DEFECTS, AuditPictures
+from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit
+from thermoxels_ns.audit.surface import WHY_NOT
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.reports.numbers import number_text, stated_text
-from thermoxels_ns.reports.page import Picture, build_page
+from thermoxels_ns.reports.page import Picture, build_page, image_file
+
+AuditPictures: TypeAlias = dict[str, list[bytes]]
+"""PNG files, from one or two sides each: surface "temperature" with the numbers of defects, "u_value" (heat flow if the
+air outside is not known), "misfit" (measured minus computed in a calibration); one each of "defects"."""
+
+MOST_DEFECTS = 12  # How many get a picture
+_ALL_AROUND = 0.35  # Share of the area that normals add up to, below which a building was seen from all around
+_AROUND_DEFECT_M = 0.8
 
 
 def audit_page(
@@ -31,7 +42,7 @@ def audit_page(
     counted = [(number, one) for number, one in numbered if not one.not_counted]
     loss, bound = abs(audit.whole.loss_w.value), audit.whole.loss_w.at_most or audit.whole.loss_w.unknown
     start = {} if asked is None else asked.stated()
-    unknown = set() if asked is None else {unknown_name(one) for one in asked.unknown}
+    unknown = set() if asked is None else {one.name() for one in asked.unknown}
     return build_page(
         "audit.html.j2",
         audit=audit,
@@ -61,7 +72,7 @@ def audit_page(
 
 
 def _survey(survey: Survey) -> list[tuple[str, str]]:
-    """What a survey says of itself, by name."""
+    """Name what a survey says of itself."""
     units = {"pressure_difference": "Pa", "least_difference_24h": "K", "hours_since_sun": "h", "hours_dry": "h"}
     said = [(field.name, getattr(survey, field.name)) for field in fields(survey)]
     return [
@@ -69,3 +80,110 @@ def _survey(survey: Survey) -> list[tuple[str, str]]:
         for name, value in said
         if value not in (None, "")
     ]
+
+
+def draw_audit(audit: Audit) -> AuditPictures:
+    """Draw all pictures; colours of all temperatures have one scale, what does not count is grey."""
+    surface, calibration, up = audit.surface, audit.calibration, audit.surface.selection.up
+    shown = np.unique(surface.mesh.facets[surface.counted])
+    known = audit.conditions.outside_known
+    values, name, unit = audit.triangle_u[:, 0], "U-value", "W/(m² K)"
+    if not known:
+        values, name, unit = audit.triangle_flow_w_m2, "Heat flow", "W/m²"
+    surface_c, u = _at_nodes(audit, audit.triangle_surface_c), _at_nodes(audit, values)
+    temperatures: dict[str, Any] = {"up": up, "clim": np.quantile(surface_c[shown], (0.005, 0.995)).tolist()}
+    flows: dict[str, Any] = {"up": up, "clim": np.quantile(u[shown], (0.02, 0.98)).tolist(), "colour_map": "viridis"}
+    flows |= {"bar_title": f"{name} [{unit}]", "title": f"{name} by the stated values"}
+    pictures: AuditPictures = {"temperature": [], "u_value": [], "misfit": []}
+    for direction in _views(audit):
+        view = {"view_direction": direction.tolist()}
+        facing = surface.selection.facet_normal @ direction < 0.0
+        labels = _labels(audit, direction)
+        title = "Surface temperature, corrected for emissivity and reflection"
+        drawn = _picture(audit, facing, surface_c, title=title, labels=labels, **temperatures, **view)
+        pictures["temperature"].append(drawn)
+        pictures["u_value"].append(_picture(audit, facing, u, **flows, **view))
+        if calibration is not None:
+            off_k = _at_nodes(audit, calibration.difference_k)
+            most = float(np.quantile(np.abs(off_k[shown]), 0.98)) or 1.0
+            look: dict[str, Any] = {"up": up, "clim": (-most, most), "colour_map": "coolwarm"}
+            look |= {"bar_title": "difference [K]", "title": "Measured minus computed"}
+            pictures["misfit"].append(_picture(audit, facing, off_k, **look, **view))
+    count = min(len(audit.defects), MOST_DEFECTS)
+    pictures["defects"] = [_defect(audit, number, surface_c, temperatures) for number in range(count)]
+    return pictures
+
+
+def _at_nodes(audit: Audit, values: FloatArray) -> FloatArray:
+    """Average at each node the triangles around it that count, by area; 0 where there are none."""
+    surface = audit.surface
+    facets, area = surface.mesh.facets[surface.counted], surface.area_m2[surface.counted]
+    weight, count = np.repeat(area, 3), len(surface.mesh.points_m)
+    known = np.nan_to_num(values[surface.counted])  # a calibration may leave out patches
+    total = np.bincount(facets.ravel(), weight * np.repeat(known, 3), count)
+    share = np.bincount(facets.ravel(), weight, count)
+    return total / np.where(share > 0.0, share, 1.0)
+
+
+def _labels(audit: Audit, direction: FloatArray) -> list[tuple[str, tuple[float, float, float]]]:
+    """Number the defects that face the camera, and say where they are."""
+    surface, labels = audit.surface, []
+    for number, (one, found) in enumerate(zip(audit.defects, audit.found), start=1):
+        normal = surface.area_m2[found.core] @ surface.selection.facet_normal[found.core]
+        if not one.not_counted and normal @ direction < 0.0:
+            labels.append((str(number), one.centre_m))
+    return labels
+
+
+def _views(audit: Audit) -> list[FloatArray]:
+    """Choose directions to look in: at what was seen, or from two corners where it was seen from all around."""
+    surface, up = audit.surface, np.array(audit.surface.selection.up)
+    area = surface.area_m2 * surface.counted
+    mean = area @ surface.selection.facet_normal / area.sum()
+    level = mean - (mean @ up) * up
+    if np.linalg.norm(level) > _ALL_AROUND:
+        front = level / np.linalg.norm(level)
+        return [-(front + 0.35 * np.cross(up, front) + 0.25 * up)]
+    side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    side /= np.linalg.norm(side)
+    corner = side + 0.7 * np.cross(up, side)
+    if audit.conditions.side == "inside":  # floor and walls, then ceiling and walls
+        return [-(corner + 0.5 * up), corner + 0.5 * up]
+    return [-(corner + 0.5 * up), corner - 0.5 * up]
+
+
+def _defect(audit: Audit, number: int, surface_c: FloatArray, same: dict[str, Any]) -> bytes:
+    """Draw a defect and what is around it, seen along the mean normal of both."""
+    surface, found, defect = audit.surface, audit.found[number], audit.defects[number]
+    low, high = surface.centroid_m[found.core].min(axis=0), surface.centroid_m[found.core].max(axis=0)
+    margin = max(_AROUND_DEFECT_M, 0.25 * float(np.max(high - low)))
+    near = np.all((surface.centroid_m > low - margin) & (surface.centroid_m < high + margin), axis=1)
+    normal = surface.area_m2[found.zone] @ surface.selection.facet_normal[found.zone]
+    if np.linalg.norm(normal) < 1e-9:
+        normal = surface.selection.facet_normal[found.spot[0]]
+    normal = normal / np.linalg.norm(normal)
+    up = np.array(surface.selection.up)
+    towards = normal + 0.2 * np.cross(up, normal) + 0.2 * up
+    facing = near & (surface.selection.facet_normal @ towards > 0.0)
+    return _picture(
+        audit,
+        facing,
+        surface_c,
+        title=f"{number + 1}: surface temperature",
+        view_direction=(-towards).tolist(),
+        labels=[(str(number + 1), defect.centre_m)],
+        window_size=(800, 600),
+        **same,
+    )
+
+
+def _picture(audit: Audit, chosen: BoolArray, values: FloatArray, **look: Any) -> bytes:
+    """Draw some triangles, those that do not count in grey; of a room without what stands between it and the eye."""
+    from thermoxels_ns.reports.mesh_pictures import image_of_surface
+
+    mesh = audit.surface.mesh
+    if audit.conditions.side == "inside":
+        kinds = [number for number, name in enumerate(WHY_NOT) if name in ("cut", "unseen")]
+        chosen = chosen & ~np.isin(audit.surface.why_not, kinds)
+    painted = [("does not count", "lightgrey", ~audit.surface.counted[chosen])]
+    return image_file(image_of_surface(mesh.points_m, mesh.facets[chosen], values, painted=painted, **look), "PNG")

@@ -5,21 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from thermoxels_ns.capture.folder_scan import shown_name
 from thermoxels_ns.capture.frames import measurement_rows
+from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig.start import rig_frames
+from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame
 from thermoxels_ns.capture.scene_writer import scene_names
+from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.radiometry.thermal_pixels import MIN_FRAMES
-from thermoxels_ns.reports.capture_pictures import colours, jpeg_of, overlay
-from thermoxels_ns.reports.charts import bars, histogram
-from thermoxels_ns.reports.page import build_page, write_page
+from thermoxels_ns.reports.charts import PERCENTILES, bars, colours, histogram
+from thermoxels_ns.reports.page import build_page, image_file, write_page
 
-_PERCENTILES = (2.0, 98.0)  # Of a thermal image's temperatures, for its darkest and brightest colours
+_DEPTH_STEP = 4  # Depth is looked up at every so many pixels of the reduced photograph, and linear between
+_COLOUR_SHARE = 0.55  # How much of the thermal colours covers the photograph
 _SHOWN = 6
 _SAMPLED_PIXELS = 4000  # Of every thermal image, for the histogram
 
@@ -36,11 +41,12 @@ def write_capture_page(result: CaptureResult) -> None:
     for index in np.unique(np.linspace(0, len(paired) - 1, min(_SHOWN, len(paired))).round().astype(int)).tolist():
         temperature_c = scene.drift.corrected(index, np.load(scene.frames[index].thermal))
         start, found = (
-            jpeg_of(overlay(paired[index], temperature_c, scene.model.camera, rig)) for rig in (result.start, scene.rig)
+            image_file(overlay(paired[index], temperature_c, scene.model.camera, rig))
+            for rig in (result.start, scene.rig)
         )
         known = temperature_c[np.isfinite(temperature_c)]
-        low, high = (float(each) for each in np.percentile(known, _PERCENTILES)) if known.size else (0.0, 1.0)
-        alone = jpeg_of(colours(temperature_c, (low, high)).astype(np.uint8))
+        low, high = (float(each) for each in np.percentile(known, PERCENTILES)) if known.size else (0.0, 1.0)
+        alone = image_file(colours(temperature_c, (low, high)))
         title = f"{names[index]}: {scene.frames[index].photograph_source}"
         ends = f": {low:.1f} °C and less are black, {high:.1f} °C and more are bright yellow" if known.size else ""
         overlays.append((title, start, found, alone, f"thermal image{ends}"))
@@ -52,6 +58,55 @@ def write_capture_page(result: CaptureResult) -> None:
     write_page(result.page, capture_page(result, overlays, np.concatenate(samples), masked / max(pixels, 1)))
 
 
+def thermal_in_photograph(
+    frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: RigEstimate, width: int = 640
+) -> npt.NDArray[np.float32]:
+    """Carry a thermal image, [degrees C], into the photograph's view, through the depth of the scene points.
+
+    Returns temperatures by pixel of the photograph reduced to a width, NaN where the thermal image does not reach.
+    """
+    height = max(1, round(visible.height * width / visible.width))
+    rays = _grid_rays(visible, width, height)
+    coarse = (max(2, width // _DEPTH_STEP), max(2, height // _DEPTH_STEP))
+    depth, _ = SparseDepth(frame.points_visible()).at(_grid_rays(visible, *coarse))
+    inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=np.isfinite(depth)).reshape(coarse[::-1])
+    parallax = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR).ravel()
+    rotation, shift = rig.visible_to_thermal[:3, :3], rig.visible_to_thermal[:3, 3]
+    local = rays @ rotation.T + parallax[:, None] * shift  # a point times its inverse depth projects alike
+    pixels = rig.thermal_camera.project(local).reshape(height, width, 2).astype(np.float32) - np.float32(0.5)
+    return cv2.remap(
+        temperature_c.astype(np.float32),
+        np.nan_to_num(pixels[..., 0], nan=-1e6),
+        np.nan_to_num(pixels[..., 1], nan=-1e6),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=float("nan"),  # type: ignore[arg-type]
+    )
+
+
+def _grid_rays(camera: Camera, width: int, height: int) -> npt.NDArray[np.float64]:
+    """Give rays of depth 1 through the pixels of a reduced photograph, row by row, shape (width * height, 3)."""
+    grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
+    return camera.resized(width, height).rays(grid)
+
+
+def overlay(frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: RigEstimate) -> npt.NDArray:
+    """Draw a photograph in grey with its edges, the thermal image in colours over it, shape (height, width, 3)."""
+    carried = thermal_in_photograph(frame, temperature_c, visible, rig)
+    height, width = carried.shape
+    if isinstance(frame.photograph, np.ndarray):
+        picture = Image.fromarray(frame.photograph.astype(np.uint8)).convert("L")
+    else:
+        picture = open_photograph(frame.photograph).convert("L")
+    grey = np.asarray(picture.resize((width, height), Image.Resampling.BOX))
+    base = np.repeat(grey[..., None], 3, axis=2).astype(np.float32)
+    known = np.isfinite(carried)
+    mixed = np.where(known[..., None], (1 - _COLOUR_SHARE) * base + _COLOUR_SHARE * colours(carried), base)
+    edges = cv2.Canny(cv2.GaussianBlur(grey, (0, 0), 1.5), 40, 100) > 0
+    mixed[edges & known] = 255.0
+    return np.clip(mixed, 0, 255).astype(np.uint8)
+
+
 def capture_page(
     result: CaptureResult, overlays: Sequence[Overlay], temperatures_c: npt.NDArray[np.float32], masked_share: float
 ) -> str:
@@ -61,8 +116,6 @@ def capture_page(
     """
     scene, rig, drift = result.scene, result.scene.rig, result.scene.drift
     errors, known_c = scene.model.sighting_error_px(), temperatures_c[np.isfinite(temperatures_c)]
-    limit = max(float(np.percentile(errors, 99)), 0.1) if errors.size else 0.1
-    low, high = (float(end) for end in np.percentile(known_c, (0.1, 99.9))) if known_c.size else (0.0, 1.0)
     label = "temperature, °C; how many pixels of a sample, without the coldest and hottest 0.1 %"
     frames = []
     for index, (name, frame) in enumerate(zip(scene_names(len(scene.frames)), scene.model.frames)):
@@ -78,12 +131,12 @@ def capture_page(
         shift=float(np.linalg.norm(rig.visible_to_thermal[:3, 3])),
         errors=errors,
         median_error=np.median(errors) if errors.size else math.nan,
-        error_chart=histogram(errors, "reprojection error, pixels of the photographs", limits=(0.0, limit)),
+        error_chart=histogram(errors, "reprojection error, pixels of the photographs", (0.0, 99.0)),
         frames=frames,
         up_words=", ".join(f"{value:.3f}" for value in np.round(scene.up.direction, 3) + 0.0),
         temperatures_c=known_c,
         median_c=np.median(known_c) if known_c.size else math.nan,
-        temperature_chart=histogram(known_c, label, limits=(low, high)),
+        temperature_chart=histogram(known_c, label, (0.1, 99.9)),
         measurement=measurement_rows(scene.frames),
         masked_share=masked_share,
         min_frames=MIN_FRAMES,
@@ -92,29 +145,21 @@ def capture_page(
 
 
 def _cameras(result: CaptureResult) -> list[tuple[str, ...]]:
-    """Photographs' camera, and the thermal camera at the start and as found: rows of what describes them."""
+    """Describe the photographs' camera, and the thermal camera at the start and as found, in rows of a table."""
     rig = result.scene.rig
-    sure: Mapping[str, float] = {}
-    found = dict(rig.standard_errors)
-    found["focal"] = found.get("log_focal", math.nan) * rig.thermal_camera.fl_x
-    columns: list[tuple[Camera, Mapping[str, float]]] = [
-        *((result.scene.model.camera, sure), (result.start.thermal_camera, sure), (rig.thermal_camera, found))
-    ]
+    errors = dict(rig.standard_errors)
+    errors["focal"] = errors.get("log_focal", math.nan) * rig.thermal_camera.fl_x
 
-    def told(value: float, errors: Mapping[str, float], name: str) -> str:
-        return with_error(value, errors.get(name, math.nan), 1)
+    def described(camera: Camera, errors: Mapping[str, float]) -> tuple[str, ...]:
+        values = {"focal": camera.fl_x, "cx": camera.cx, "cy": camera.cy}
+        focal, x, y = (with_error(value, errors.get(name, math.nan), 1) for name, value in values.items())
+        angle = 2.0 * math.degrees(math.atan(camera.width / (2.0 * camera.fl_x)))
+        size = f"{camera.width} x {camera.height}"
+        return size, focal, f"{angle:.1f}", f"{x}, {y}", f"{camera.k1:.4f}, {camera.k2:.4f}"
 
-    angles = [float(2 * np.degrees(np.arctan(c.width / (2 * c.fl_x)))) for c, _ in columns]
-    return [
-        ("size, pixels", *(f"{c.width} x {c.height}" for c, _ in columns)),
-        ("focal length, pixels", *(told(c.fl_x, errors, "focal") for c, errors in columns)),
-        ("angle of view, degrees", *(f"{angle:.1f}" for angle in angles)),
-        (
-            "principal point, pixels",
-            *(f"{told(c.cx, errors, 'cx')}, {told(c.cy, errors, 'cy')}" for c, errors in columns),
-        ),
-        ("distortion k1, k2", *(f"{c.k1:.4f}, {c.k2:.4f}" for c, _ in columns)),
-    ]
+    names = ("size, pixels", "focal length, pixels", "angle of view, degrees", "principal point, pixels")
+    cameras = (result.scene.model.camera, {}), (result.start.thermal_camera, {}), (rig.thermal_camera, errors)
+    return [*zip((*names, "distortion k1, k2"), *(described(*one) for one in cameras))]
 
 
 def with_error(value: float, error: float, decimals: int) -> str:

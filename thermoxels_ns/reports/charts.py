@@ -1,4 +1,4 @@
-"""Charts as SVG text, for pages that fetch nothing."""
+"""Charts as SVG text, for pages that fetch nothing, and temperatures in colours."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 INK, SOFT, LINE, ACCENT = "#1d2430", "#9aa3ae", "#e1e5ea", "#b3431e"
 """Colours of the pages' style sheet."""
 
+PERCENTILES = (2.0, 98.0)  # Of a thermal image's temperatures, for its darkest and brightest colours
 _MOST_CURVES = 8  # Probes or effects in one plot; more cannot be told apart
 
 
@@ -51,13 +52,14 @@ def svg_text(figure: Figure) -> str:
     return svg[svg.index("<svg") :].rstrip()
 
 
-def histogram(values: npt.NDArray, label: str, limits: tuple[float, float] | None = None) -> str:
-    """Draw how often finite values occur between limits, None: all, as an svg element; empty without values."""
+def histogram(values: npt.NDArray, label: str, percentiles: tuple[float, float] = (0.0, 100.0)) -> str:
+    """Draw how often finite values occur between two of their percentiles, as an svg element; empty without values."""
     values = values[np.isfinite(values)]
     if not values.size:
         return ""
+    low, high = np.percentile(values, percentiles).tolist()
     with chart(7.0, 2.2) as (figure, (axis,)):
-        axis.hist(values, bins=60, range=limits, color=ACCENT, alpha=0.8)
+        axis.hist(values, bins=60, range=(low, high), color=ACCENT, alpha=0.8)
         axis.set_xlabel(label)
         return svg_text(figure)
 
@@ -98,3 +100,19 @@ def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatAr
             axis.set_ylabel(label)
             axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8.5)
         return svg_text(figure)
+
+
+def colours(temperature_c: npt.NDArray, limits: tuple[float, float] | None = None) -> npt.NDArray[np.uint8]:
+    """Show temperatures as red, green and blue, 0 to 255, black where NaN; `limits` are by default the middle 96 %."""
+    import cv2
+
+    known = np.isfinite(temperature_c)
+    if limits is None:
+        low, high = np.percentile(temperature_c[known], PERCENTILES) if known.any() else (0.0, 1.0)
+    else:
+        low, high = limits
+    share = np.nan_to_num((temperature_c - low) / max(float(high - low), 1e-6))
+    levels = np.clip(255 * share, 0, 255).astype(np.uint8)
+    shown = np.array(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO)[..., ::-1], dtype=np.uint8)
+    shown[~known] = 0
+    return shown

@@ -60,7 +60,7 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, comma
 
 
 def _values(effect: Effect, selection: Selection) -> str:
-    """The quantities of an effect with their units."""
+    """Write the quantities of an effect with their units."""
     shown = []
     for field in fields(effect):  # type: ignore[arg-type]
         if field.name not in effect.bounds or getattr(effect, field.name) == field.default:
@@ -73,9 +73,10 @@ def _values(effect: Effect, selection: Selection) -> str:
         elif isinstance(effect, FixedTemperature):
             shown.append(f"{name} varies")
         else:
-            source = isinstance(effect, InternalHeat)
-            where = selection.tets(effect.where) if source else selection.facets(effect.where)
-            places = selection.tet_places(where) if source else selection.facet_places(where)
+            if isinstance(effect, InternalHeat):
+                places = selection.tet_places(selection.tets(effect.where))
+            else:
+                places = selection.facet_places(selection.facets(effect.where))
             values = effect.bounded(field.name).at(places, 0.0)
             changes = ", changes with time" if value.in_time else ""
             ends = dict.fromkeys(f"{end:.3g}" for end in (values.min(), values.max())) if len(values) else ("nowhere",)
@@ -88,10 +89,8 @@ def _how_time_was_followed(time: TimeSteps | AdaptiveSteps | None, accuracy: Tol
     if time is None:
         return "the steady state"
     if accuracy is not None:
-        duration = duration_text(float(time.times_s[-1]))
-        return (
-            f"{duration} in steps chosen by the tolerance (they may err by {accuracy.settings.step_tolerance_k:.2g} K)"
-        )
+        may_err = f"they may err by {accuracy.settings.step_tolerance_k:.2g} K"
+        return f"{duration_text(float(time.times_s[-1]))} in steps chosen by the tolerance ({may_err})"
     if isinstance(time, TimeSteps):
         return f"{time.steps} steps of {time.step_seconds:g} s"
     return f"{duration_text(time.duration_s)} in steps that keep within {time.tolerance_k:g} K"

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
-import tempfile
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_direction, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import MeshError, OutputError
+from thermoxels_ns.core.checks import check_direction, replace_when_done
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, SUPPORT, TetMesh, support_of_facets
 from thermoxels_ns.reports.numbers import duration_text
+from thermoxels_ns.reports.page import image_file
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 _MESH_AREA = (0.04, 0.16, 0.80, 0.90)
 _INK = "#202020"
 _SUPPORT_COLOURS: tuple[str, ...] = ("green", "gold", "red", "grey")
-BAR_TITLE = "temperature [°C]"  # What a colour bar says unless told otherwise
 _LEAST_CHANGE_K = 1e-3  # Half the span of the smallest scale of changes, [K]
 _SHARE_OF_CHANGES = 0.95
 HEAT_PICTURES = ("surface-start.png", "surface-end.png", "surface-change.png", "cut.png")
@@ -39,48 +37,46 @@ _MATTER = {"ambient": 0.5, "diffuse": 0.65, "smooth_shading": False}  # Colours 
 _DARKEST = 0.1  # Share of inferno left out at its dark end, where shading could not be told from cold
 
 
-def picture_of_mesh(
-    path: Path | str,
-    mesh: TetMesh,
-    temperature_c: npt.NDArray[np.floating] | None = None,
+def image_of_surface(
+    points_m: FloatArray,
+    facets: IntArray,
+    values: npt.NDArray[np.floating],
     *,
     title: str = "",
     clim: tuple[float, float] | None = None,
     up: Sequence[float] = (0.0, 0.0, 1.0),
     view_direction: Sequence[float] | None = None,
     painted: Sequence[tuple[str, str, BoolArray]] = (),
-    length_unit: str = "m",
     colour_map: str = "inferno",
-    bar_title: str = BAR_TITLE,
-    note: str = "",
+    bar_title: str = "temperature [°C]",
+    words: Sequence[str] = (),
     labels: Sequence[tuple[str, Sequence[float]]] = (),
-    size: bool = True,
     ghost: tuple[FloatArray, IntArray] | None = None,
     window_size: tuple[int, int] = (1200, 900),
-) -> None:
-    """Draw the surface of a mesh, coloured by temperature, as a PNG: all of it, in parallel projection.
+) -> npt.NDArray[np.uint8]:
+    """Draw a surface coloured by values at its nodes, all of it, in parallel projection.
 
     Args:
-        path: File to write, ending in .png; its folder is made if need be.
-        mesh: The mesh.
-        temperature_c: Nodal values to show, shape (n,), [degrees Celsius] unless `bar_title` says otherwise; the
-            mesh's own temperatures if left out.
+        points_m: Nodes, shape (n, 3).
+        facets: Triangles of the surface, shape (f, 3).
+        values: Nodal values, shape (n,), such as temperatures [degrees Celsius].
         title: Text above the picture.
         clim: Values at the ends of the colour bar. If left out, the data's extremes; or, where a few nodes stretch
             the range to more than twice that of the middle 99 %, the range of those, and the words below the picture
             give the extremes.
-        up: Direction that points up in the picture, in mesh coordinates.
-        view_direction: Direction from the camera to the mesh; obliquely from above if left out.
-        painted: Boundary triangles that do not show values: what they are, their colour, and a boolean for each
-            triangle of the mesh. The words below the picture say which colour is what.
-        length_unit: Name of the unit of the node positions, written below the picture.
+        up: Direction that points up in the picture.
+        view_direction: Direction from the camera to the surface; obliquely from above if left out.
+        painted: Triangles that do not show values: what they are, their colour, and a boolean for each triangle. The
+            words below the picture say which colour is what.
         colour_map: Name of a colour map of matplotlib, such as "coolwarm" for changes to both sides of 0.
         bar_title: Quantity and unit, written beside the colour bar.
-        note: Words below the size of the mesh.
-        labels: Short words and the points of the mesh that they stand at, in front of everything.
-        size: Write the size of the mesh below the picture.
-        ghost: Points (n, 3) and triangles (m, 3) of something beside the mesh, in a grey that one looks through.
+        words: Lines below the picture.
+        labels: Short words and the points that they stand at, in front of everything.
+        ghost: Points (n, 3) and triangles (m, 3) of something beside the surface, in a grey that one looks through.
         window_size: Width and height, [pixels].
+
+    Returns:
+        The picture, shape (height, width, 3).
     """
     # Without a screen VTK draws through Mesa, which loads the system's LLVM. A triton (torch's compiler) that is loaded
     # after that ends in a segmentation fault; loaded before, both work.
@@ -89,68 +85,83 @@ def picture_of_mesh(
     import matplotlib
     import pyvista as pv
     from matplotlib.colors import ListedColormap
+    from vtkmodules.vtkCommonCore import vtkLogger
 
-    path = Path(path)
-    if path.suffix != ".png":
-        raise OutputError("picture", expected="a name that ends in .png", got=path.name, remedy="Rename the file.")
-    values = np.asarray(mesh.temperature_c if temperature_c is None else temperature_c, dtype=np.float64)
-    axes = _view_axes(up, view_direction)
-    shown = values[np.unique(mesh.facets)]
-    ends = _without_outliers(shown) if clim is None else np.asarray(clim, dtype=np.float64)
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # without a display VTK warns that it found no X server
+    nodes = np.unique(facets)
+    shown = np.asarray(values[nodes], dtype=np.float64)
+    ends = _without_outliers(shown) if clim is None else np.array(clim)
     low, high = float(ends.min()), float(ends.max())
     if not high - low > 1e-3:  # a constant temperature gets 1 K around it
         low, high = low - 0.5, high + 0.5
-    plain = np.any([which for *_, which in painted], axis=0) if painted else np.zeros(len(mesh.facets), dtype=bool)
-    words = [_size_of(mesh, length_unit)] if size else []
-    words += [textwrap.fill("; ".join(f"{colour}: {what}" for what, colour, which in painted if which.any()), 58)]
+    plain = np.any([which for *_, which in painted], axis=0) if painted else np.zeros(len(facets), dtype=bool)
+    below = [
+        *words,
+        textwrap.fill("; ".join(f"{colour}: {what}" for what, colour, which in painted if which.any()), 58),
+    ]
     if clim is None and not plain.all() and (float(shown.min()) < low or float(shown.max()) > high):
-        words.append(f"colours: middle 99 %; all: {float(shown.min()):.1f} to {float(shown.max()):.1f}")
-    words.append(note)
+        below.append(f"colours: middle 99 %; all: {float(shown.min()):.1f} to {float(shown.max()):.1f}")
 
-    folder, height = writable_folder(path.parent), window_size[1]
+    height = window_size[1]
     # DejaVu Sans, which comes with matplotlib, is the easiest to read in small pictures.
     font = str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
-    with _quiet_vtk(), replace_when_done(folder / path.name) as temporary:
-        plotter = pv.Plotter(off_screen=True, window_size=list(window_size))
-        try:
-            plotter.renderer.set_background("white")
-            if not plain.all():
-                surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[~plain])
-                surface.point_data["temperature_c"] = values
-                start = _DARKEST if colour_map == "inferno" else 0.0
-                colours = ListedColormap(matplotlib.colormaps[colour_map](np.linspace(start, 1.0, 256)))
-                bar_look: Any = _colour_bar(bar_title, high - low, height)
-                plotter.add_mesh(surface, cmap=colours, clim=(low, high), scalar_bar_args=bar_look, **_MATTER)
-            for _, colour, which in painted:
-                if which.any():
-                    surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[which])
-                    plotter.add_mesh(surface, color=colour, **_MATTER)
-            in_sight = mesh.points_m[np.unique(mesh.facets)]
-            if ghost is not None and len(ghost[1]):
-                plotter.add_mesh(pv.PolyData.from_regular_faces(*ghost), color="grey", opacity=0.35, **_MATTER)
-                in_sight = np.concatenate((in_sight, ghost[0]))
-            if labels:
-                points, texts = np.array([point for _, point in labels], dtype=np.float64), [text for text, _ in labels]
-                look: Any = {
-                    "font_size": round(height / 45),
-                    "font_file": font,
-                    "text_color": _INK,
-                    "shape_color": "white",
-                }
-                plotter.add_point_labels(points, texts, show_points=False, always_visible=True, **look)
-            for bar in plotter.scalar_bars.values():
-                for text in (bar.GetTitleTextProperty(), bar.GetLabelTextProperty()):
-                    text.SetFontFamily(4)  # VTK_FONT_FILE
-                    text.SetFontFile(font)
-            written: Any = {"viewport": True, "color": _INK, "font_file": font}
-            plotter.add_text(title, position=(0.04, 0.925), font_size=round(height / 60), **written)
-            below = "\n".join(line for line in words if line)
-            plotter.add_text(below, position=(0.17, 0.04), font_size=round(height / 78), **written)
-            plotter.renderer.add_axes(viewport=(0.0, 0.0, 0.15, 0.155), color=_INK)
-            _frame(plotter, in_sight, *axes)
-            plotter.screenshot(str(temporary), return_img=False)
-        finally:
-            plotter.close()
+    plotter = pv.Plotter(off_screen=True, window_size=list(window_size))
+    try:
+        plotter.renderer.set_background("white")
+        if not plain.all():
+            surface = pv.PolyData.from_regular_faces(points_m, facets[~plain])
+            surface.point_data["value"] = values
+            start = _DARKEST if colour_map == "inferno" else 0.0
+            colours = ListedColormap(matplotlib.colormaps[colour_map](np.linspace(start, 1.0, 256)))
+            bar_look: Any = _colour_bar(bar_title, high - low, height)
+            plotter.add_mesh(surface, cmap=colours, clim=(low, high), scalar_bar_args=bar_look, **_MATTER)
+        for _, colour, which in painted:
+            if which.any():
+                plotter.add_mesh(pv.PolyData.from_regular_faces(points_m, facets[which]), color=colour, **_MATTER)
+        in_sight = points_m[nodes]
+        if ghost is not None and len(ghost[1]):
+            plotter.add_mesh(pv.PolyData.from_regular_faces(*ghost), color="grey", opacity=0.35, **_MATTER)
+            in_sight = np.concatenate((in_sight, ghost[0]))
+        if labels:
+            look: Any = {"font_size": round(height / 45), "font_file": font, "text_color": _INK, "shape_color": "white"}
+            points = np.array([point for _, point in labels], dtype=np.float64)
+            texts = [text for text, _ in labels]
+            plotter.add_point_labels(points, texts, show_points=False, always_visible=True, **look)
+        for bar in plotter.scalar_bars.values():
+            for text in (bar.GetTitleTextProperty(), bar.GetLabelTextProperty()):
+                text.SetFontFamily(4)  # VTK_FONT_FILE
+                text.SetFontFile(font)
+        written: Any = {"viewport": True, "color": _INK, "font_file": font}
+        plotter.add_text(title, position=(0.04, 0.925), font_size=round(height / 60), **written)
+        lines = "\n".join(line for line in below if line)
+        plotter.add_text(lines, position=(0.17, 0.04), font_size=round(height / 78), **written)
+        plotter.renderer.add_axes(viewport=(0.0, 0.0, 0.15, 0.155), color=_INK)
+        _frame(plotter, in_sight, _unit("up", up), _towards_camera(up, view_direction))
+        return np.array(plotter.screenshot(return_img=True))
+    finally:
+        plotter.close()
+
+
+def write_picture(path: Path, image: npt.NDArray[np.uint8]) -> None:
+    """Write a picture, shape (h, w, 3), as a PNG; the file is complete or absent."""
+    with replace_when_done(path) as temporary:
+        temporary.write_bytes(image_file(image, "PNG"))
+
+
+def image_of_mesh(
+    mesh: TetMesh, values: FloatArray | None = None, length_unit: str = "m", note: str = "", **look: Any
+) -> npt.NDArray[np.uint8]:
+    """Draw the boundary of a mesh, its size written below; `values` are its temperatures if left out.
+
+    The other arguments are those of `image_of_surface`.
+    """
+    shown = mesh.temperature_c if values is None else values
+    return image_of_surface(mesh.points_m, mesh.facets, shown, words=(_size_of(mesh, length_unit), note), **look)
+
+
+def _size_of(mesh: TetMesh, length_unit: str) -> str:
+    size = " x ".join(f"{side:.3g}" for side in np.ptp(mesh.points_m, axis=0))
+    return f"{size} {length_unit}, {len(mesh.tets):,} tetrahedra"
 
 
 def before_after_change(
@@ -158,8 +169,8 @@ def before_after_change(
 ) -> list[tuple[FloatArray, dict[str, Any]]]:
     """Choose how to show the first and the last of some states in one range of colours, and the change in its own.
 
-    Colours span the values at the nodes `shown`. Returns nodal values and arguments of `picture_of_mesh` for each of
-    the three pictures.
+    Colours span the values at the nodes `shown`. Returns nodal values and arguments of `image_of_mesh` for each of the
+    three pictures.
     """
     before, after = states_c[0], states_c[-1]
     first, last = duration_text(float(times_s[0])), duration_text(float(times_s[-1]))
@@ -176,7 +187,7 @@ def before_after_change(
 
 
 def change_colours(change: npt.NDArray[np.floating]) -> dict[str, Any]:
-    """Colours for changes to both sides of 0, [K], and a note to write below, as arguments of `picture_of_mesh`.
+    """Choose colours for changes to both sides of 0, [K], and a note to write below, as arguments of `image_of_mesh`.
 
     Where a few nodes changed far more than the rest, all others would be as grey as no change: the scale then ends
     where 95 % of the sizes do, and the note says so; else it is empty.
@@ -190,22 +201,13 @@ def change_colours(change: npt.NDArray[np.floating]) -> dict[str, Any]:
     return {"clim": (-end, end), "colour_map": "coolwarm", "bar_title": "change [K]", "note": note}
 
 
-def _view_axes(
-    up: Sequence[float], view_direction: Sequence[float] | None
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Unit vectors of the picture: right, up, and from the mesh to the camera."""
+def _towards_camera(up: Sequence[float], view_direction: Sequence[float] | None) -> FloatArray:
+    """Give the unit vector from the surface to the camera; obliquely from above without a direction."""
+    if view_direction is not None:
+        return -_unit("view_direction", view_direction)
     upwards = _unit("up", up)
-    if view_direction is None:
-        side = _unit("up", np.cross(np.roll(np.eye(3)[np.argmax(np.abs(upwards))], 2), upwards))
-        towards_camera = _unit("view", 0.85 * side + 0.6 * np.cross(upwards, side) + 0.65 * upwards)
-    else:
-        towards_camera = -_unit("view_direction", view_direction)
-    right = np.cross(upwards, towards_camera)
-    if np.linalg.norm(right) < 1e-6:
-        # Looking along the up axis: any direction across it is as good as another.
-        right = np.cross(np.eye(3)[np.argmin(np.abs(towards_camera))], towards_camera)
-    right = _unit("right", right)
-    return right, np.cross(towards_camera, right), towards_camera
+    side = _unit("up", np.cross(np.roll(np.eye(3)[np.argmax(np.abs(upwards))], 2), upwards))
+    return _unit("view", 0.85 * side + 0.6 * np.cross(upwards, side) + 0.65 * upwards)
 
 
 def _unit(name: str, vector: npt.ArrayLike) -> FloatArray:
@@ -214,14 +216,14 @@ def _unit(name: str, vector: npt.ArrayLike) -> FloatArray:
 
 
 def _without_outliers(values: FloatArray) -> FloatArray:
-    """The values, or the middle 99 % of them where the others stretch their range to more than twice as much."""
+    """Give the values, or the middle 99 % of them where the others stretch their range to more than twice as much."""
     low, high = np.quantile(values, (0.005, 0.995))
     few = np.ptp(values) > 2.0 * (high - low) > 0.0
     return values[(values >= low) & (values <= high)] if few else values
 
 
 def _colour_bar(title: str, span: float, height: int) -> dict[str, Any]:
-    """How the colour bar of values over so wide a span looks, in a picture of so many rows of pixels."""
+    """Say how the colour bar of values over so wide a span looks, in a picture of so many rows of pixels."""
     import pyvista as pv
 
     decimals = 1 if span > 2.0 else 2 + max(0, math.ceil(-math.log10(span)))
@@ -233,71 +235,47 @@ def _colour_bar(title: str, span: float, height: int) -> dict[str, Any]:
     return {"title": f"{title}\n", "fmt": form, "color": _INK, "n_labels": 5, **place, **size}
 
 
-def _size_of(mesh: TetMesh, length_unit: str) -> str:
-    size = mesh.points_m.max(axis=0) - mesh.points_m.min(axis=0)
-    return f"{size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {length_unit}, {len(mesh.tets):,} tetrahedra"
-
-
-def _frame(
-    plotter: pv.Plotter, points: FloatArray, right: npt.NDArray, up: npt.NDArray, towards_camera: npt.NDArray
-) -> None:
+def _frame(plotter: pv.Plotter, points: FloatArray, up: FloatArray, towards_camera: FloatArray) -> None:
     """Point a parallel camera so that `points` just fill the mesh's area."""
+    if np.linalg.norm(np.cross(up, towards_camera)) < 1e-6:  # any direction across the up axis is as good as another
+        up = np.eye(3)[np.argmin(np.abs(towards_camera))]
+    right = _unit("right", np.cross(up, towards_camera))
+    axes = np.stack((right, np.cross(towards_camera, right), towards_camera))
     width, height = plotter.window_size
     left, bottom, area_right, top = _MESH_AREA
-    in_view = points @ np.stack((right, up, towards_camera), axis=1)
-    low, high = in_view.min(axis=0), in_view.max(axis=0)
+    low, high = (points @ axes.T).min(axis=0), (points @ axes.T).max(axis=0)
     across, along, depth = high - low
     camera = plotter.camera
     camera.enable_parallel_projection()
     camera.parallel_scale = 0.5 * max(along / (top - bottom), across / (area_right - left) * height / width, 1e-12)
-    middle = 0.5 * (low + high) @ np.stack((right, up, towards_camera))
+    middle = 0.5 * (low + high) @ axes
     camera.focal_point = tuple(middle)
     camera.position = tuple(middle + (4.0 * camera.parallel_scale + depth) * towards_camera)
-    camera.up = tuple(up)
+    camera.up = tuple(axes[1])
     camera.SetWindowCenter(1.0 - left - area_right, 1.0 - bottom - top)  # the area's is off the picture's
     plotter.camera_set = True
     plotter.reset_camera_clipping_range()
 
 
-@contextmanager
-def _quiet_vtk() -> Iterator[None]:
-    """Without a display VTK draws in software and warns that it found no X server, which nobody needs to read."""
-    from vtkmodules.vtkCommonCore import vtkLogger
-
-    if os.environ.get("DISPLAY"):
-        yield
-        return
-    before = vtkLogger.GetCurrentVerbosityCutoff()
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
-    try:
-        yield
-    finally:
-        vtkLogger.SetStderrVerbosity(before)
-
-
 def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], length_unit: str) -> None:
     """Draw the mesh twice: all temperatures, and with grey where no thermal ray measured one.
 
-    `look` are the arguments `up` and `view_direction` of `picture_of_mesh`.
+    `look` are the arguments `up` and `view_direction` of `image_of_surface`.
     """
-    every, measured = paths
-    picture_of_mesh(every, mesh, title="Surface temperature", length_unit=length_unit, **look)
     painted = [("no thermal ray", "grey", ~mesh.observed[mesh.facets].all(axis=1))]
+    every = image_of_mesh(mesh, title="Surface temperature", length_unit=length_unit, **look)
+    write_picture(paths[0], every)
     title = "Measured surface temperature"
-    picture_of_mesh(measured, mesh, title=title, painted=painted, length_unit=length_unit, **look)
+    write_picture(paths[1], image_of_mesh(mesh, title=title, painted=painted, length_unit=length_unit, **look))
 
 
 def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[str, Any]) -> None:
     """Draw the temperatures before and after in one range of colours, and beside them the change in its own.
 
-    `look` are the arguments `up` and `view_direction` of `picture_of_mesh`.
+    `look` are the arguments `up` and `view_direction` of `image_of_surface`.
     """
-    from PIL import Image
-
     shown = before_after_change(solution.temperature_c, solution.times_s, np.unique(mesh.facets))
-    panels = [_panel(mesh, values, **how, **look) for values, how in shown]
-    with replace_when_done(path) as temporary:
-        Image.fromarray(np.concatenate(panels, axis=1)).save(temporary)
+    write_picture(path, np.concatenate([image_of_mesh(mesh, values, **how, **look) for values, how in shown], axis=1))
 
 
 def draw_surface(
@@ -312,30 +290,32 @@ def draw_surface(
     if mesh.boundary is not None:
         seen = seen & mesh.boundary.seen
     shown = np.unique(mesh.facets[seen] if seen.any() else mesh.facets)
-    drawn: dict[str, tuple[FloatArray, dict[str, Any]]] = dict(
-        zip(HEAT_PICTURES, before_after_change(states_c, times_s, shown))
-    )
-    half, values, view = cut_open(mesh, states_c[-1], up)
+    drawn = dict(zip(HEAT_PICTURES, before_after_change(states_c, times_s, shown)))
     when = f" at {duration_text(float(times_s[-1]))}"
     if len(times_s) == 1:
         when = ", steady"
-        drawn = {
-            HEAT_PICTURES[1]: (states_c[-1], {**drawn[HEAT_PICTURES[1]][1], "title": f"Surface temperature{when}"})
-        }
-    for name, (nodal, how) in drawn.items():
-        picture_of_mesh(folder / name, mesh, nodal, up=up, **how)
-    title = f"Cut through the middle{when}"
-    picture_of_mesh(folder / HEAT_PICTURES[3], half, values, title=title, up=up, view_direction=view.tolist())
+        values, how = drawn[HEAT_PICTURES[1]]
+        drawn = {HEAT_PICTURES[1]: (values, how | {"title": f"Surface temperature{when}"})}
+    for name, (values, how) in drawn.items():
+        write_picture(folder / name, image_of_mesh(mesh, values, up=up, **how))
+    points, facets, values, view = cut_open(mesh, states_c[-1], up)
+    look: Any = {
+        "title": f"Cut through the middle{when}",
+        "words": [_size_of(mesh, "m")],
+        "up": up,
+        "view_direction": view,
+    }
+    write_picture(folder / HEAT_PICTURES[3], image_of_surface(points, facets, values, **look))
     return [*drawn, HEAT_PICTURES[3]]
 
 
 def cut_open(
     mesh: TetMesh, nodal_c: FloatArray, up: tuple[float, float, float]
-) -> tuple[TetMesh, FloatArray, FloatArray]:
+) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
     """Take away the half of a body in front of an upright plane through its middle.
 
-    Returns what is left, as a mesh to draw (its nodes and boundary triangles are real, its tetrahedra only a number),
-    the values at its nodes, and the direction to look in, shape (3,).
+    Returns nodes (n, 3), triangles (f, 3) and nodal values (n,) of the surface of what is left, and the direction to
+    look in, shape (3,).
     """
     import pyvista as pv
     from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
@@ -353,25 +333,15 @@ def cut_open(
     outside.SetInputData(grid.clip(normal=tuple(towards), origin=tuple(origin)))
     outside.Update()
     surface: Any = pv.wrap(outside.GetOutput()).triangulate()
-    points = np.array(surface.points, dtype=np.float64)
+    view = -(towards + 0.25 * np.cross(upwards, towards) + 0.3 * upwards)
     facets = np.array(surface.regular_faces, dtype=np.int64)
-    half = TetMesh(
-        points_m=points,
-        tets=np.zeros_like(mesh.tets),
-        temperature_c=np.array(surface.point_data["value"], dtype=np.float64),
-        observed=np.ones(len(points), dtype=bool),
-        facets=facets,
-        facet_tags=np.zeros(len(facets), np.int64),
-        region=mesh.region,
-        region_names=mesh.region_names,
-    )
-    return half, half.temperature_c, -(towards + 0.25 * np.cross(upwards, towards) + 0.3 * upwards)
+    return np.array(surface.points, np.float64), facets, np.array(surface.point_data["value"], np.float64), view
 
 
 def add_support(path: Path, mesh: TetMesh, look: Mapping[str, Any]) -> None:
     """Add to a picture of a mesh's quality two views, from opposite sides, of how photographs support its surface.
 
-    `look` are the arguments `up` and `view_direction` of `picture_of_mesh`. The mesh must know its photographs.
+    `look` are the arguments `up` and `view_direction` of `image_of_surface`. The mesh must know its photographs.
     """
     from PIL import Image
 
@@ -381,24 +351,13 @@ def add_support(path: Path, mesh: TetMesh, look: Mapping[str, Any]) -> None:
     painted.append(("cut by the scene box or the region", "white", support < 0))
     with Image.open(path) as image:
         above = np.asarray(image.convert("RGB"))
-    width, up = above.shape[1], _unit("up", look["up"])
-    ahead = -_view_axes(look["up"], look["view_direction"])[2]
-    beside = {"painted": painted, "up": up, "window_size": (width // 2, width // 2)}
+    width, up = above.shape[1] // 2, _unit("up", look["up"])
+    ahead = -_towards_camera(look["up"], look["view_direction"])
+    beside = {"painted": painted, "up": up, "window_size": (width, width)}
     panels = [
-        _panel(mesh, title="Support by photographs", view_direction=ahead, **beside),
-        _panel(mesh, title="From the other side", view_direction=2.0 * (ahead @ up) * up - ahead, **beside),
+        image_of_mesh(mesh, title="Support by photographs", view_direction=ahead, **beside),
+        image_of_mesh(mesh, title="From the other side", view_direction=2.0 * (ahead @ up) * up - ahead, **beside),
     ]
-    row = np.full((panels[0].shape[0], *above.shape[1:]), 255, dtype=np.uint8)
-    row[:, : 2 * (width // 2)] = np.concatenate(panels, axis=1)
-    with replace_when_done(path) as temporary:
-        Image.fromarray(np.concatenate((above, row))).save(temporary)
-
-
-def _panel(mesh: TetMesh, temperature_c: FloatArray | None = None, **how: Any) -> npt.NDArray[np.uint8]:
-    """A picture of the mesh as an array, shape (h, w, 3); the arguments are those of `picture_of_mesh`."""
-    from PIL import Image
-
-    with tempfile.TemporaryDirectory() as scratch:
-        picture_of_mesh(Path(scratch) / "panel.png", mesh, temperature_c, **how)
-        with Image.open(Path(scratch) / "panel.png") as image:
-            return np.asarray(image.convert("RGB"))
+    row = np.full((width, *above.shape[1:]), 255, dtype=np.uint8)
+    row[:, : 2 * width] = np.concatenate(panels, axis=1)
+    write_picture(path, np.concatenate((above, row)))

@@ -9,8 +9,6 @@ from datetime import datetime
 from thermoxels_ns.audit.draws import Interval
 from thermoxels_ns.core.measured import Measured
 
-_LARGE = 1000.0
-
 
 def figure(value: float) -> str:
     """Write four digits, without powers of ten where figures are of everyday size.
@@ -29,17 +27,16 @@ def figure(value: float) -> str:
 def flow_text(heat_w: float, least_w: float, per_area: float | None = None) -> str:
     """Write a heat flow, [W], or what it is per area, [W/m^2]; flows below `least_w` are round-off and written as 0.
 
-    >>> flow_text(6e-10, 1e-6), flow_text(-12.5, 1e-6), flow_text(-12.5, 1e-6, -0.5)
-    ('0', '-12.50', '-0.5000')
+    >>> flow_text(6e-10, 1e-6), flow_text(6e-10, 1e-6, 1e5), flow_text(-12.5, 1e-6), flow_text(1e-2, 1e-6, 1e-3)
+    ('0', '0', '-12.50', '0.001000')
     """
     return "0" if abs(heat_w) < least_w else figure(heat_w if per_area is None else per_area)
 
 
 def least_flow(flows_w: Sequence[float], area_m2: float) -> float:
-    """Say from what size on heat flows are more than round-off in a body of so much surface, [W].
+    """Give the size from which on heat flows are more than round-off in a body of so much surface, [W].
 
-    Of a steady body, what flows in and out of it again rounds to a billionth of the largest of all flows, which a
-    balance need not close to, or to a billionth of a watt per square metre, where a surface is as warm as the air.
+    It is a billionth of the largest of all flows, or, if larger, a billionth of a watt per square metre.
 
     >>> f"{least_flow((1e3, -1e3), 200.0):g} {least_flow((), 200.0):g}"
     '1e-06 2e-07'
@@ -121,9 +118,8 @@ def stated_text(value: Measured | datetime | str, unit: str = "") -> str:
 def interval_text(interval: Interval, unit: str, bounds: bool = True) -> str:
     """Write a number with the range that holds it, to two digits of half its width.
 
-    What is only known from above is called "at most", from below "at least"; of what may be nothing at all, no number
-    is given. `bounds`:
-    the quantity is one that cannot be below 0; else any sign is a result.
+    If only the upper end is known, the text says "at most", else "at least". With `bounds` the quantity
+    cannot be below 0, and no number is given if it may be nothing at all; else any sign is a result.
 
     >>> interval_text(Interval(0.8851, 0.211, 1.552), "W/(m2 K)").replace("\\N{NO-BREAK SPACE}", " ")
     '0.89 (0.21 to 1.55) W/(m² K)'
@@ -172,6 +168,6 @@ def number_text(value: float, half_width: float) -> str:
     """
     size = abs(half_width) or abs(value) * 1e-3
     decimals = 2 if size == 0.0 else min(1 - math.floor(math.log10(size)), 4)
-    if abs(value) >= _LARGE:
+    if abs(value) >= 1000.0:
         decimals = min(decimals, 1)
     return f"{round(float(value), decimals) + 0.0:,.{max(decimals, 0)}f}"

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import base64
+import io
 import math
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
+import numpy as np
+import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
 
 from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.core.errors import ThermoxelsError
@@ -32,6 +36,13 @@ def write_page(path: Path, text: str) -> None:
     """Write a page, whole or not at all."""
     with replace_when_done(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def image_file(picture: npt.NDArray[np.uint8], kind: Literal["PNG", "JPEG"] = "JPEG", quality: int = 82) -> bytes:
+    """Encode a picture, shape (height, width, 3), as the content of a PNG or JPEG file."""
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, format=kind, quality=quality)
+    return stream.getvalue()
 
 
 def image_address(image: bytes, words: str) -> str:

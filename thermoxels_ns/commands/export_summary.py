@@ -1,0 +1,191 @@
+"""What an export says of its mesh: lines of progress, and what summary.json holds."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from thermoxels_ns import __version__
+from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.data.scene_scale import SceneScale
+from thermoxels_ns.fem.problem import TimeSteps
+from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.mesh.build import BuiltMesh
+from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.quality.report import QualityReport
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection
+from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, support_of_facets
+
+ONLY_THE_SHELL = (
+    "Space that no camera saw and that the mesh leaves empty, such as the inside of a building seen from outside with "
+    "--interior hollow or --wall-thickness. The heat content is that of the mesh."
+)
+"""What the heat balance of a reconstruction leaves out."""
+
+
+def lines_on_mesh(
+    built: BuiltMesh, region: Mapping[str, Any], volume: float, unit: str, voxel_size: float
+) -> Iterator[str]:
+    """Yield how the solid was found, step by step, and what the mesh has; `voxel_size` is in `unit`."""
+    for step in built.solid.steps:
+        amounts = []
+        for sign, voxels in (("+", step.added), ("-", step.removed)):
+            volume_m3 = voxels * voxel_size**3
+            told = f"{1e3 * volume_m3:.3g} l" if volume_m3 < 1.0 else f"{volume_m3:.3g} m^3"
+            size = f" ({told})" if unit == "m" else ""
+            if voxels:
+                amounts.append(f"{sign}{voxels} voxels{size}")
+        changed = ", ".join(amounts) or "nothing changed"
+        if step.name == "region":
+            size = " x ".join(f"{side:.3g}" for side in region["size"])
+            share, name = region["share_of_solid_taken"], region["asked_for"]
+            yield f"Region, {name}: {size} {unit}, {share:.1%} of the solid; {changed}. {step.remark}"
+        else:
+            yield f"Solid, {step.name}: {changed}. {step.remark}"
+    mesh = built.mesh
+    yield f"Mesh: {len(mesh.tets)} tetrahedra, {len(mesh.points_m)} nodes, volume {volume:.6g} {unit}^3"
+    if built.unobserved_parts:
+        yield (
+            f"Left out because no thermal ray saw them: {built.unobserved_parts} parts of the mesh, "
+            f"{built.unobserved_voxels} voxels in all."
+        )
+    shares = support_shares(mesh)
+    if shares is not None:
+        supported, weak, smooth, filled = shares.values()
+        yield (
+            f"{supported:.0%} of the surface is supported by three photographs or more, {weak:.0%} by one or two; "
+            f"{smooth:.0%} is seen, but placed by smoothness alone; {filled:.0%} is seen by no photograph."
+        )
+    for rule in built.idle_rules:
+        yield (
+            f"Rule without effect: {rule}. Nothing in the mesh meets its conditions, or later rules take all that does."
+        )
+
+
+def mesh_summary(
+    built: BuiltMesh, report: QualityReport, selection: SolidSelection, scale: SceneScale | None, voxel_size: float
+) -> dict[str, Any]:
+    """Give counts, sizes, and how the solid was found; lengths are in the unit that the summary names."""
+    mesh, solid = built.mesh, built.solid
+    assert mesh.boundary is not None
+    temperature = mesh.temperature_c
+    area = report.area_m2 if report.true_area_m2 is None else report.true_area_m2
+    of_triangles = facet_areas(mesh.points_m, mesh.facets)
+    unobserved = of_triangles @ ~mesh.observed[mesh.facets].all(axis=1)
+    litres = 1e3 * voxel_size**3
+    asked: dict[str, float] = {}
+    if selection.density_percentile is not None and selection.density_threshold is None:
+        asked = {
+            "share_of_voxels_asked_for": 1.0 - selection.density_percentile / 100.0,
+            "share_of_voxels_kept": _voxels_found(solid) / solid.cells.size,  # before a region was chosen
+        }
+    return {
+        "boundary": report.boundary_mode,
+        "nodes": report.num_nodes,
+        "tets": report.num_tets,
+        "voxels": int(np.count_nonzero(solid.cells)),
+        "boundary_triangles": report.num_facets,
+        "boundary_triangles_on_box": report.num_box_facets,
+        "non_manifold_edges": report.num_non_manifold_edges,
+        "volume": report.volume_m3,
+        "volume_standard_error": None if scale is None else scale.volume_standard_error(report.volume_m3),
+        "area": area,
+        "area_standard_error": None if scale is None else scale.area_standard_error(area),
+        "area_of_triangles": report.area_m2,
+        "bounds": {"lower": mesh.points_m.min(axis=0), "upper": mesh.points_m.max(axis=0)},
+        "dihedral_angles_deg": {"min": report.dihedral_range_deg[0], "max": report.dihedral_range_deg[1]},
+        "density_threshold_used": solid.threshold,
+        "density_threshold_why": solid.explanation,
+        **asked,
+        "solid_steps": [
+            {"step": step.name, "voxels_added": step.added, "voxels_removed": step.removed}
+            | ({} if scale is None else {"litres_added": litres * step.added, "litres_removed": litres * step.removed})
+            | {"remark": step.remark}
+            for step in solid.steps
+        ],
+        "component_sizes_voxels": solid.component_sizes,
+        "parts_without_thermal_rays_left_out": built.unobserved_parts,
+        "voxels_without_thermal_rays_left_out": built.unobserved_voxels,
+        "share_of_nodes_observed": float(np.mean(mesh.observed)),
+        "share_of_area_not_fully_observed": float(unobserved / of_triangles.sum()),
+        "share_of_area_by_support": support_shares(mesh),
+        "rules_without_effect": built.idle_rules,
+        "patches": _sums(mesh.boundary.patch_names, mesh.boundary.patch, of_triangles * mesh.boundary.area_factor),
+        "regions": _sums(mesh.region_names, mesh.region, signed_volumes(mesh.points_m, mesh.tets)),
+        "temperature_c": {
+            "min": float(temperature.min()),
+            "max": float(temperature.max()),
+            "mean_of_nodes": float(temperature.mean()),
+        },
+        "promises": {criterion.name: criterion.kept for criterion in report.criteria},
+    }
+
+
+def region_summary(built: BuiltMesh, selection: SolidSelection) -> dict[str, Any]:
+    """Say which part is exported, how large the mesh is [unit], and what share of the solid it was made from."""
+    near, box, points = selection.region_near, selection.region_box, built.mesh.points_m
+    left_out, found = int(built.solid.left_out.sum()), _voxels_found(built.solid)
+    return {
+        "asked_for": "near a point" if near else "a box" if box else selection.region,
+        "size": points.max(axis=0) - points.min(axis=0),
+        "voxels_taken": found - left_out,
+        "voxels_left_out": left_out,
+        "share_of_solid_taken": 1.0 - left_out / found,
+    }
+
+
+def _voxels_found(solid: SolidCells) -> int:
+    """Count the voxels that are solid in the whole lattice, before anything is left out or filled."""
+    return sum(step.added for step in solid.steps if step.name in ("threshold", "close gaps"))
+
+
+def _sums(names: tuple[str, ...], number: IntArray, amount: FloatArray) -> dict[str, float]:
+    """Add up the amounts of each number, by its name; names without any amount are left out."""
+    total = np.bincount(number, weights=amount, minlength=len(names))
+    return {names[n]: float(total[n]) for n in np.unique(number)}
+
+
+def support_shares(mesh: TetMesh) -> dict[str, float] | None:
+    """Give the share of the true area, without what the scene box cuts, in each class of `SUPPORT`; None if unknown."""
+    support = support_of_facets(mesh)
+    if support is None or not (support >= 0).any():
+        return None
+    assert mesh.boundary is not None
+    area = facet_areas(mesh.points_m, mesh.facets) * mesh.boundary.area_factor
+    total = np.bincount(support + 1, weights=area, minlength=len(SUPPORT) + 1)[1:]
+    return dict(zip(SUPPORT, (total / total.sum()).tolist()))
+
+
+def heat_summary(material: Material, time: TimeSteps, solution: HeatSolution) -> dict[str, Any]:
+    """Give the heat balance and how it was computed."""
+    return {
+        "computed": True,
+        "material": asdict(material),
+        "time": asdict(time),
+        "scheme": "P1 tetrahedra, lumped mass, backward Euler, conjugate gradients",
+        "energy_before_j": float(solution.heat_content_j[0]),
+        "energy_after_j": float(solution.heat_content_j[-1]),
+        "energy_residual": solution.energy_residual,
+        "energy_residual_of_spread": solution.energy_residual_of_spread,
+        "largest_net_heat_flow_w": float(np.abs(solution.heat_w).max()),
+        "temperature_c": {
+            name: {"min": float(state.min()), "max": float(state.max())}
+            for name, state in (("before", solution.temperature_c[0]), ("after", solution.temperature_c[-1]))
+        },
+        "status": solution.status,
+        "iterations": solution.iterations,
+        "skipped_effects": [*solution.skipped_effects, ONLY_THE_SHELL],
+    }
+
+
+def versions() -> dict[str, str]:
+    """Give the versions of what made the export."""
+    packages = ("numpy", "scipy", "torch", "nerfstudio", "pyvista", "scikit-fem")
+    return {"thermoxels": __version__, "python": platform.python_version()} | {name: version(name) for name in packages}
