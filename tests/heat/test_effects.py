@@ -53,13 +53,12 @@ def at_once(mesh: TetMesh, material, *effects: Effect) -> HeatSolution:
     ],
     ids=lambda value: value.label if isinstance(value, Effect) else "",
 )
-@pytest.mark.parametrize("lumped_boundary", [True, False])
-def test_positive_is_into_the_body(box, concrete, effect, watts, lumped_boundary) -> None:
+def test_positive_is_into_the_body(box, concrete, effect, watts) -> None:
     problem = HeatProblem(box, concrete, effects=(effect,))
-    solution = solve_heat(problem, TimeSteps(1, 1e-6), lumped_boundary=lumped_boundary)
+    solution = solve_heat(problem, TimeSteps(1, 1e-6))
     assert solution.effects[0].heat_w[0] == pytest.approx(watts, rel=1e-6)
     assert solution.heat_w[0] == pytest.approx(watts, rel=1e-6)
-    longer = solve_heat(problem, TimeSteps(1, 60.0), lumped_boundary=lumped_boundary)
+    longer = solve_heat(problem, TimeSteps(1, 60.0))
     mean_change = (longer.temperature_c[1] - 20.0).mean()
     assert np.sign(mean_change) == np.sign(watts)
 
@@ -134,7 +133,7 @@ def test_functions_are_told_where_they_are(box, concrete) -> None:
 
 def test_two_temperatures_at_one_node_are_refused(box, concrete) -> None:
     clash = (FixedTemperature(("x0",), 5.0), FixedTemperature(("y0",), 7.0))
-    with pytest.raises(HeatError, match=r"5 C from fixed temperature on x0 and 7 C from .* on y0 at node 0 and 2 more"):
+    with pytest.raises(HeatError, match=r"5 C and 7 C from fixed temperature on y0 at node 0"):
         at_once(box, concrete, *clash)
     same = (FixedTemperature(("x0",), 5.0), FixedTemperature(("y0",), 5.0))
     heat = at_once(box, concrete, *same)

@@ -18,8 +18,6 @@ from thermoxels_ns.heat.effects import Convection, FixedTemperature
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-BOUNDARIES = pytest.mark.parametrize("lumped_boundary", [True, False])
-
 
 def conductor(name: str, conductivity_w_mk: float) -> Material:
     return Material(name, conductivity_w_mk, 1000.0, 1000.0)
@@ -71,9 +69,8 @@ CASE_2 = {
 """x and z in mm, temperature in C."""
 
 
-@BOUNDARIES
 @pytest.mark.parametrize("parts", [1, 2])
-def test_case_2_metal_faced_wall(lumped_boundary, parts) -> None:
+def test_case_2_metal_faced_wall(parts) -> None:
     """Concrete, wood, insulation and an aluminium profile that bends into the wall; flow per metre of depth."""
     x = 1e-3 * np.unique(
         np.concatenate(
@@ -100,19 +97,18 @@ def test_case_2_metal_faced_wall(lumped_boundary, parts) -> None:
     materials = {"insulation": 0.029, "concrete": 1.15, "wood": 0.12, "aluminium": 230.0}
     effects = (Convection(("z1",), 1 / 0.06, 0.0), Convection(("z0",), 1 / 0.11, 20.0))
     problem = HeatProblem(mesh, {name: conductor(name, k) for name, k in materials.items()}, effects=effects)
-    solution = solve_steady(problem, lumped_boundary=lumped_boundary)
+    solution = solve_steady(problem)
     flow_w_m = solution.effects[1].heat_w[0] / depth
     assert flow_w_m == pytest.approx(9.5, abs=0.1) and solution.energy_residual < 1e-9
     for name, (px, pz, listed) in CASE_2.items():
         assert at(mesh, solution, 1e-3 * px, 0.0, 1e-3 * pz) == pytest.approx(listed, abs=0.1), name
 
 
-@BOUNDARIES
-def test_case_3_corner_with_a_balcony(lumped_boundary) -> None:
+def test_case_3_corner_with_a_balcony() -> None:
     flows = []
     for finest in (0.025, 0.0125):
         problem = building_corner(lambda *knots, f=finest: graded(*knots, finest=f, growth=1.3, coarsest=0.2))
-        mesh, solution = problem.mesh, solve_steady(problem, lumped_boundary=lumped_boundary)
+        mesh, solution = problem.mesh, solve_steady(problem)
         heat_w = [float(heat.heat_w[0]) for heat in solution.effects]
         assert heat_w == pytest.approx(LISTED_W, rel=0.01), len(mesh.tets)
         tags = mesh.boundary

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy import sparse
 from skfem import BilinearForm
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import HeatProblem, Term, effect_labels
 from thermoxels_ns.fem.solution import Assembled
@@ -78,17 +78,17 @@ class _Boundary(ABC):
     def surface_k(self, relative_k: Vector) -> Vector:
         """Temperature at the points of integration, shape (k, q)."""
         nodal = relative_k[self.nodes]
-        return nodal if self._space.lumped_boundary else np.einsum("ka,aq->kq", nodal, self._shapes)
+        return nodal if self._space.order == 1 else np.einsum("ka,aq->kq", nodal, self._shapes)
 
     def vector(self, flux_w_m2: Vector) -> Vector:
         """Entries integral(q phi_i), [W]; q at the points or even over each triangle."""
         heat_w = flux_w_m2 * self.basis.dx
-        shares = heat_w.T if self._space.lumped_boundary else np.einsum("kq,aq->ak", heat_w, self._shapes)
+        shares = heat_w.T if self._space.order == 1 else np.einsum("kq,aq->ak", heat_w, self._shapes)
         return sums_by_number(self._numbers, shares.ravel(), self._space.num_nodes)
 
     def matrix(self, coefficient_w_m2k: Vector) -> sparse.csr_matrix:
         """Entries integral(h phi_i phi_j), [W / K]; diagonal if points of integration are the nodes."""
-        if self._space.lumped_boundary:
+        if self._space.order == 1:
             matrix = sparse.csr_matrix(sparse.diags(self.vector(coefficient_w_m2k), format="csr"))
         else:
             coefficient = np.broadcast_to(coefficient_w_m2k, self.basis.dx.shape)
@@ -151,18 +151,10 @@ class FluxForm(_Boundary):
 
     def load(self, time_s: float) -> Vector:
         """Entries integral(q phi_i), [W]."""
-        return self.vector(self._given_w_m2(time_s))
+        return self.vector(self.flux_w_m2(np.zeros(0), time_s))
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
         """The flux, [W / m2], whatever the temperature."""
-        return self._given_w_m2(time_s)
-
-    def signs(self, time_s: float) -> tuple[bool, bool]:
-        """Whether it cools and whether it heats somewhere."""
-        flux = self._given_w_m2(time_s)
-        return bool(np.any(flux < 0.0)), bool(np.any(flux > 0.0))
-
-    def _given_w_m2(self, time_s: float) -> Vector:
         return math.prod((self.at(number, time_s) for number in range(len(self.quantities))), start=np.ones(1))
 
 
@@ -181,23 +173,15 @@ class SourceForm:
 
     def load(self, time_s: float) -> Vector:
         """Entries integral(s phi_i), [W]."""
-        return self._space.source_load(self._tets, self._heat_w(time_s))
+        return self._space.source_load(self._tets, self.part_heat_w(np.zeros(0), time_s))
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat set free at each point of integration, [W], whatever the temperature."""
-        return self._heat_w(time_s)
+        return self._source.at(self._places, time_s) * self._volumes
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat set free in each region, [W]."""
-        return sums_by_number(self._group, self._heat_w(time_s), len(self.groups))
-
-    def signs(self, time_s: float) -> tuple[bool, bool]:
-        """Whether it cools and whether it heats somewhere."""
-        heat = self._heat_w(time_s)
-        return bool(np.any(heat < 0.0)), bool(np.any(heat > 0.0))
-
-    def _heat_w(self, time_s: float) -> Vector:
-        return self._source.at(self._places, time_s) * self._volumes
+        return sums_by_number(self._group, self.part_heat_w(np.zeros(0), time_s), len(self.groups))
 
 
 class RadiationForm(_Exchange):
@@ -306,35 +290,22 @@ class FixedNodes:
 
     def _temperature_k(self, time_s: float) -> Vector:
         known = np.full(len(self.nodes), np.nan)
-        for number, form in enumerate(self._forms):
-            place, wanted = self._places[number], form.surroundings_k(time_s)
+        for form in self._forms:
+            place, wanted = np.searchsorted(self.nodes, form.nodes), form.surroundings_k(time_s)
             clash = np.abs(known[place] - wanted) > _SAME_TEMPERATURE_K
             if clash.any():
-                raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
+                first, second = (part[clash][0] + form.reference_c for part in (known[place], wanted))
+                node = form.nodes[clash][0]
+                raise HeatError(
+                    "fixed temperature",
+                    expected="one temperature at each node",
+                    got=f"{first:g} C and {second:g} C from {form.effect} at node {node} and"
+                    f" {np.count_nonzero(clash) - 1} more",
+                    remedy="Let one effect fix all patches that meet, with a Varying that says what holds there.",
+                )
             known[place] = wanted
         known.setflags(write=False)
         return known
-
-    @cached_property
-    def _places(self) -> list[npt.NDArray[np.int64]]:
-        """Where the nodes of each form stand in `nodes`."""
-        return [np.searchsorted(self.nodes, form.nodes) for form in self._forms]
-
-    def _explain_clash(self, number: int, nodes: npt.NDArray[np.int64], wanted: Vector, time_s: float) -> str:
-        form = self._forms[number]
-        others = [other for other in self._forms if other is not form and np.isin(other.nodes, nodes).any()]
-        other = others[0]
-        place = np.flatnonzero(np.isin(other.nodes, nodes))
-        node = int(other.nodes[place[0]])
-        first = other.surroundings_k(time_s)[place[0]] + other.reference_c
-        second = wanted[np.flatnonzero(nodes == node)[0]] + form.reference_c
-        return explain(
-            "fixed temperature",
-            expected="one temperature at each node",
-            got=f"{first:g} C from {other.effect} and {second:g} C from {form.effect} at node {node} "
-            f"and {len(nodes) - 1} more",
-            remedy="Let one effect fix all patches that meet, with a Varying that says what holds where they do.",
-        )
 
 
 @dataclass(frozen=True)

@@ -352,7 +352,7 @@ class _Balance:
             for part_w in system.exchange_parts(now_k, self._time_s):
                 kept_w, moved_w = kept_w + part_w, moved_w + np.abs(part_w)
         if np.isfinite(equation.step_s):
-            stored_w = system.mass_product(change_k) / equation.step_s
+            stored_w = system.nodal_mass_j_k * change_k / equation.step_s
             kept_w, moved_w = kept_w - stored_w, moved_w + np.abs(stored_w)
         fixed = system.fixed.nodes
         flows_w = float(np.sum(moved_w) + np.sum(np.abs(kept_w[fixed] - conducted_w[fixed])))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import numbers
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -42,10 +42,7 @@ class TimeSteps:
         remedy = "Give 60, for example: step_seconds in a scene, --step-seconds in an export."
         seconds = check_positive("step_seconds", self.step_seconds, remedy, HeatError)
         object.__setattr__(self, "step_seconds", seconds)
-        if self.steps * (seconds / sys.float_info.max) > 1.0:
-            expected = f"a last time that is a number, at most {sys.float_info.max:.3g} s"
-            got, remedy = f"{self.steps} steps of {seconds:g} s", "Give a shorter one."
-            raise HeatError("steps and step_seconds", expected=expected, got=got, remedy=remedy)
+        check_positive("steps times step_seconds", self.steps * seconds, "Give shorter steps.", HeatError)
 
     @property
     def duration_s(self) -> float:
@@ -235,8 +232,14 @@ class HeatProblem:
             remedy = "Remove the unused nodes; they have no heat capacity."
             raise HeatError("mesh points", expected=expected, got=got, remedy=remedy)
         self._check_temperatures()
-        self._check_materials()
         self._check_effects()
+        _ = self.selection  # refuses tags that do not fit the mesh
+        self._check_materials()
+
+    @cached_property
+    def selection(self) -> Selection:
+        """The named parts of the mesh."""
+        return Selection(self.mesh, self.up)
 
     @property
     def resolution_s(self) -> float:
@@ -250,18 +253,18 @@ class HeatProblem:
         return np.asarray(given, dtype=np.float64)
 
     @property
-    def conductivity_w_mk(self) -> float | npt.NDArray[np.float64]:
-        """Thermal conductivity, one for all or one per tetrahedron, shape (t,), [W / (m K)]."""
-        return self._property("conductivity_w_mk")
+    def conductivity_w_mk(self) -> npt.NDArray[np.float64]:
+        """Thermal conductivity of each tetrahedron, shape (t,), [W / (m K)]."""
+        return self._of_tets("conductivity_w_mk")
 
     @property
-    def heat_capacity_j_m3k(self) -> float | npt.NDArray[np.float64]:
-        """Heat capacity per volume, one for all or one per tetrahedron, shape (t,), [J / (m3 K)]."""
-        return self._property("heat_capacity_j_m3k")
+    def heat_capacity_j_m3k(self) -> npt.NDArray[np.float64]:
+        """Heat capacity per volume of each tetrahedron, shape (t,), [J / (m3 K)]."""
+        return self._of_tets("heat_capacity_j_m3k")
 
-    def _property(self, name: str) -> float | npt.NDArray[np.float64]:
+    def _of_tets(self, name: str) -> npt.NDArray[np.float64]:
         if isinstance(self.material, Conductor):
-            return float(getattr(self.material, name))
+            return np.full(len(self.mesh.tets), float(getattr(self.material, name)))
         known, names = self.material, self.mesh.region_names
         by_region = [float(getattr(known[region], name)) if region in known else np.nan for region in names]
         return np.array(by_region)[self.mesh.region]
@@ -273,12 +276,7 @@ class HeatProblem:
         if not isinstance(self.material, Mapping):
             got = repr(self.material)
             raise HeatError("material", expected="a Material or a mapping", got=got, remedy=remedy)
-        build, shape = "Build the mesh with thermoxels_ns.mesh.", (len(self.mesh.tets),)
-        region = check_shape("mesh region", self.mesh.region, shape, build, HeatError)
-        if region.min() < 0 or region.max() >= len(names):
-            expected, got = f"numbers from 0 to {len(names) - 1}", f"{region.min()} to {region.max()}"
-            raise HeatError("mesh region", expected=expected, got=got, remedy="Name every region of the mesh.")
-        used = {names[number] for number in np.unique(region)}
+        used = {names[number] for number in np.unique(self.mesh.region)}
         missing, unknown = used - set(self.material), set(self.material) - set(names)
         wrong = [name for name, material in self.material.items() if not isinstance(material, Conductor)]
         if missing or unknown or wrong:

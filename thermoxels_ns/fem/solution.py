@@ -19,13 +19,6 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]
 
-LEFT_OUT = {
-    "convection": "Convection: not modelled, {}.",
-    "radiation": "Thermal radiation: not modelled, {}.",
-    "absorbed solar": "Solar gain and internal sources: not modelled.",
-}
-"""What a computation without an effect of this kind says."""
-
 
 @dataclass
 class Assembled:
@@ -87,7 +80,7 @@ class ErrorSize:
 
 @dataclass(frozen=True)
 class HeatSolution:
-    """Temperatures over time and the account of the heat; converged: every step was solved to tolerance."""
+    """Temperatures over time and the account of the heat."""
 
     times_s: npt.NDArray[np.float64]  # Time of each state, the start first, shape (s + 1,), [s]
     temperature_c: npt.NDArray[np.float64]
@@ -105,9 +98,7 @@ class HeatSolution:
     """The same change relative to the heat stored in the initial differences, sum m_i |T_i - mean T|, plus all heat
     exchanged: the stricter measure. 0 where nothing is unaccounted for."""
     status: str
-    converged: bool
     iterations: npt.NDArray[np.int64]  # Iterations of the linear solver in each interval, shape (s,)
-    skipped_effects: tuple[str, ...]  # What the computation leaves out, one sentence each
     effects: tuple[EffectHeat, ...] = ()  # Heat that each effect of the problem brought, in the order of the problem
     newton_iterations: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
@@ -133,7 +124,6 @@ class SteadySolution:
     """Heat that each effect of the problem brings, in the order of the problem; they add up to 0."""
     energy_residual: float  # Sum of all heat flows, which should be 0, relative to the sum of their sizes
     status: str
-    converged: bool
     iterations: int
     newton_iterations: int  # Steps of Newton's method; 0 without radiation
     assembled: Assembled  # What was assembled
@@ -159,12 +149,6 @@ def heat_by_effect(
             names[owner].append(name)
     parts = ((effect, group_heat_w[:, columns[effect]]) for effect in effects)
     return tuple(EffectHeat(effect, heat.sum(axis=1), tuple(names[effect]), heat) for effect, heat in parts)
-
-
-def left_out(kinds: Sequence[str]) -> tuple[str, ...]:
-    """Say what a computation with effects of these kinds leaves out, one sentence each."""
-    why = "no effect asks for it" if kinds else "the boundary is insulated"
-    return tuple(sentence.format(why) for kind, sentence in LEFT_OUT.items() if kind not in kinds)
 
 
 Solution: TypeAlias = HeatSolution | SteadySolution  # What either solver returns

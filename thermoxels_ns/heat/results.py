@@ -21,6 +21,7 @@ from thermoxels_ns.heat.effects import Convection, InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.mesh.quality.checks import facet_owners
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]
@@ -135,7 +136,9 @@ def region_behind_facets(mesh: TetMesh) -> npt.NDArray[np.int64]:
 
 def volume_shares(mesh: TetMesh) -> Vector:
     """Give the share of the volume around each node, shape (n,)."""
-    weights = np.bincount(mesh.tets.ravel(), np.repeat(_volumes_m3(mesh) / 4.0, 4), len(mesh.points_m))
+    weights = np.bincount(
+        mesh.tets.ravel(), np.repeat(signed_volumes(mesh.points_m, mesh.tets) / 4.0, 4), len(mesh.points_m)
+    )
     return weights / weights.sum()
 
 
@@ -215,7 +218,7 @@ def _regions(
     behind, made_of = region_behind_facets(problem.mesh), materials_by_region(problem)
     heat = heat_by_part(solution, behind, len(names))
     area = np.bincount(nodes.of_facets(behind), selection.facet_area_m2, len(names))
-    volume = _volumes_m3(mesh)
+    volume = signed_volumes(mesh.points_m, mesh.tets)
     total = np.bincount(mesh.region, volume, len(names))
     content = np.bincount(mesh.region, volume * last_c[mesh.tets].mean(axis=1), len(names))
     results = []
@@ -235,13 +238,6 @@ def _regions(
             )
         )
     return tuple(results)
-
-
-def _volumes_m3(mesh: TetMesh) -> Vector:
-    """Volume of each tetrahedron, shape (t,)."""
-    corner = mesh.points_m[mesh.tets]
-    sides = corner[:, 1:] - corner[:, :1]
-    return np.einsum("ti,ti->t", sides[:, 0], np.cross(sides[:, 1], sides[:, 2])) / 6.0
 
 
 def _balance(solution: Solution, lengths: Vector) -> EnergyBalance:
@@ -314,7 +310,7 @@ def wall_of_scene(
     for label, effect in zip(effect_labels(problem), problem.effects):
         if not (isinstance(effect, Convection) and effect.air_c in (inside.air_c, outside.air_c)):
             return f"There is no U-value, because its heat would count in it: {label}. Ask for the two airs alone."
-    if not _faces_inside(problem, inside.patches).any():
+    if not matching_facets(problem.selection, inside.patches).any():
         return "There is no U-value, because no surface of the body faces the air inside."
     return wall_result(problem, solution, inside.patches, inside.air_c, outside.air_c, nodes)
 
@@ -333,8 +329,8 @@ def wall_result(
     through it. `inside` names the patches that face the inside, some of which have area; the airs differ.
     """
     difference_k = inside_c - outside_c
-    selection, mesh = Selection(problem.mesh, problem.up), problem.mesh
-    inner = _faces_inside(problem, inside)
+    selection, mesh = problem.selection, problem.mesh
+    inner = matching_facets(selection, inside)
 
     def parts(numbers: npt.NDArray[np.int64], names: tuple[str, ...]) -> tuple[WallPart, ...]:
         number, count = np.where(inner, numbers, len(names)), len(names) + 1
@@ -350,10 +346,10 @@ def wall_result(
     shown = solution_nodes(problem, solution) if nodes is None else nodes
     every_c, inner_nodes = shown.states_c[-1], np.unique(shown.mesh.facets[shown.of_facets(inner)])
     # At the rim of a hole both airs touch one node, which is no spot of the inner surface.
-    others = [effect for effect in problem.effects if isinstance(effect, Convection) and effect.air_c != inside_c]
     outer = np.zeros(len(mesh.facets), dtype=bool)
-    for effect in others:
-        outer[selection.facets(effect.patches)] = True
+    for effect in problem.effects:
+        if isinstance(effect, Convection) and effect.air_c != inside_c:
+            outer[selection.facets(effect.patches)] = True
     away = np.setdiff1d(inner_nodes, shown.mesh.facets[shown.of_facets(outer & ~inner)])
     inner_nodes = away if len(away) else inner_nodes
     # The worst spot: the coldest if it is colder outside, else the hottest.
@@ -373,10 +369,9 @@ def wall_result(
     )
 
 
-def _faces_inside(problem: HeatProblem, inside: Sequence[str]) -> npt.NDArray[np.bool_]:
+def matching_facets(selection: Selection, patterns: Sequence[str]) -> npt.NDArray[np.bool_]:
     """Mark the boundary triangles of patches whose names match one of some names or patterns, shape (f,)."""
-    selection = Selection(problem.mesh, problem.up)
-    matching = [any(fnmatchcase(name, pattern) for pattern in inside) for name in selection.patch_names]
+    matching = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in selection.patch_names]
     return np.array(matching, dtype=bool)[selection.facet_patch]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,14 @@ from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
 from thermoxels_ns.fem.tolerance import ToleratedSolution
-from thermoxels_ns.heat.results import HeatResults, WallResult, heat_results, volume_shares, wall_of_scene
+from thermoxels_ns.heat.results import (
+    HeatResults,
+    WallResult,
+    heat_results,
+    matching_facets,
+    volume_shares,
+    wall_of_scene,
+)
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_hours
 from thermoxels_ns.heat.sky import Vector as Direction
@@ -203,7 +209,7 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
     surface is what was seen. A scene that names patches of its own is trusted.
     """
     selection = Selection(mesh, up)
-    inside, outside = _chosen(selection, INSIDE), _chosen(selection, OUTSIDE)
+    inside, outside = matching_facets(selection, INSIDE), matching_facets(selection, OUTSIDE)
     inside_air = scene.inside_air is not None and scene.inside_air.patches == INSIDE
     outside_air = scene.outside_air is not None and scene.outside_air.patches == OUTSIDE
     warnings = []
@@ -230,7 +236,7 @@ def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tu
     if scene.inside_air is None or scene.outside_air is None:
         return ()
     selection = Selection(mesh, up)
-    inside, outside = (_chosen(selection, air.patches) for air in (scene.inside_air, scene.outside_air))
+    inside, outside = (matching_facets(selection, air.patches) for air in (scene.inside_air, scene.outside_air))
     inner = np.unique(mesh.facets[inside])
     shared = np.intersect1d(inner, mesh.facets[outside & ~inside])
     warnings = []
@@ -328,12 +334,6 @@ def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ..
         "thick walls are, nor what no camera saw, such as floors: heat losses and U-values are those of this shell, "
         "with its holes and loose parts. Where you know the walls, export with --wall-thickness.",
     )
-
-
-def _chosen(selection: Selection, patterns: tuple[str, ...]) -> npt.NDArray[np.bool_]:
-    """Mark the boundary triangles of patches that match, shape (f,)."""
-    matching = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in selection.patch_names]
-    return np.array(matching, dtype=bool)[selection.facet_patch]
 
 
 def _has_rooms(selection: Selection, inside: npt.NDArray[np.bool_]) -> bool:
