@@ -14,7 +14,7 @@ from thermoxels_ns.fem.runge_kutta import Step
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.time_loop import HeatBalance, solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Radiation
-from thermoxels_ns.heat.sun import moving_sun
+from thermoxels_ns.heat.sky import moving_sun
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 PAPER = TimeSteps(10, 60.0)

@@ -24,11 +24,7 @@ def test_these_meshes_do_have_obtuse_angles() -> None:
         matrix = stiffness(mesh.points_m, mesh.tets).tocoo()
         off = matrix.row != matrix.col
         assert (matrix.data[off] / matrix.diagonal()[matrix.row[off]]).max() > least
-
-
-def test_one_of_them_is_as_bad_as_is_promised() -> None:
-    quality = check_mesh(body(AT_THE_BOUNDS))
-    low, high = ANGLE_BOUNDS_DEG
+    quality, (low, high) = check_mesh(body(AT_THE_BOUNDS)), ANGLE_BOUNDS_DEG
     assert low <= quality.dihedral_range_deg[0] <= low + 0.2 and high - 0.2 <= quality.dihedral_range_deg[1] <= high
 
 
@@ -90,18 +86,6 @@ def test_a_wall_of_one_element() -> None:
     problem = HeatProblem(stuffed(level, spots), CONCRETE, effects=(Convection(("*",), 8.0, -5.0),))
     for fourier in (1e-3, 1.0, 1e6):
         assert faults(solve_heat(problem, TimeSteps(3, fourier * STEP_S)), -30.0, 90.0) == []
-
-
-def test_a_disconnected_piece() -> None:
-    points = centres(14, 7, 7)
-    distance = np.minimum(
-        np.linalg.norm(points - [-3.5, 0.1, 0.2], axis=-1), np.linalg.norm(points - [3.6, 0.1, 0.2], axis=-1)
-    )
-    mesh = stuffed(np.clip(2.3 - distance, -1.0, 1.0), spots)
-    problem = HeatProblem(mesh, CONCRETE, effects=(FixedTemperature(("x0",), 50.0),))
-    assert faults(solve_heat(problem, TimeSteps(2, 1e9)), -30.0, 90.0) == []
-    with pytest.raises(HeatError, match="none on 1 of 2 pieces"):
-        solve_steady(problem)
 
 
 @pytest.mark.parametrize("shape", ["regular", "sphere", AT_THE_BOUNDS])

@@ -85,33 +85,6 @@ def wall_mesh(x: float, y: float, z: float, **options) -> TetMesh:
     return replace(mesh, points_m=mesh.points_m * (np.array([x, y, z]) / [0.3, 0.5, 1.0]))
 
 
-def sixth_of_a_shell(inner_m: float, outer_m: float, parts: int) -> TetMesh:
-    """What lies between two spheres above one face of a cube; by symmetry nothing flows through its sides."""
-    side = np.linspace(-1.0, 1.0, parts + 1)
-    mesh = box_mesh(side, side, np.linspace(inner_m, outer_m, max(parts // 8, 1) + 1))
-    u, v, r = mesh.points_m.T
-    ray = np.stack([np.tan(0.25 * np.pi * u), np.tan(0.25 * np.pi * v), np.ones_like(u)], axis=1)
-    return replace(mesh, points_m=ray * (r / np.linalg.norm(ray, axis=1))[:, None])
-
-
-def test_spherical_shell() -> None:
-    """a = 0.5, b = 0.6, k = 1.7, 7.69 at 20 C inside, 25 at -10 C outside: 455.6634 W, second order in the mesh."""
-    errors = []
-    for parts in (8, 16, 32):
-        mesh = sixth_of_a_shell(0.5, 0.6, parts)
-        effects = (Convection(("z0",), 7.69, 20.0), Convection(("z1",), 25.0, -10.0))
-        solution = solve_steady(HeatProblem(mesh, CONCRETE, effects=effects))
-        assert solution.energy_residual < 1e-9
-        errors.append(6.0 * solution.effects[0].heat_w[0] / 455.6634 - 1.0)
-    radius = np.linalg.norm(mesh.points_m, axis=1)
-    inner, outer = (solution.temperature_c[np.abs(radius - r) < 1e-9] for r in (0.5, 0.6))
-    assert [inner.mean(), outer.mean()] == pytest.approx([1.13886, -5.97105], abs=0.01)
-    assert max(np.ptp(inner), np.ptp(outer)) < 0.15
-    orders = np.log2(np.abs(errors[:-1]) / np.abs(errors[1:]))
-    assert abs(errors[-1]) < 3e-3, f"relative errors {errors}"
-    assert np.all(np.abs(orders - 2.0) < 0.15), f"observed orders {orders}, relative errors {errors}"
-
-
 @pytest.mark.parametrize(
     ("depth_m", "time_s", "exact"), [(0.05, 3600.0, 0.5294616), (0.10, 3600.0, 0.2085161), (0.10, 14400.0, 0.5294616)]
 )

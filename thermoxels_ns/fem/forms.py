@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -161,7 +161,7 @@ class FluxForm(_Boundary):
 class SourceForm:
     """A given heat source: a load."""
 
-    def __init__(self, effect: str, term: Term, space: Space) -> None:
+    def __init__(self, effect: str, term: Term, space: Space, _: float) -> None:
         self.effect, self.kind, self._tets, self._space = effect, term.kind, term.parts, space
         self._source = term.quantities[0]
         self._places, self._volumes = space.source_points(term.parts)
@@ -215,7 +215,7 @@ class FixedForm:
 
     def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
         selection = space.selection
-        self.effect, self.facets, self.reference_c = effect, term.parts, reference_c
+        self.effect, self.kind, self.facets, self.reference_c = effect, term.kind, term.parts, reference_c
         self.owners: npt.NDArray[np.int64] = space.facet_nodes(term.parts)
         """Nodes of each triangle, shape (k, m)."""
         self.nodes = np.unique(self.owners)
@@ -331,20 +331,22 @@ def effect_forms(
     `assembled` counts fixed temperatures, which are ready at once. Raises `HeatError` if the mesh lacks a patch or
     region of an effect.
     """
-    convection, loads, radiation, fixed = [], [], [], []
+    made = {
+        "convection": ConvectionForm,
+        "flux": FluxForm,
+        "source": SourceForm,
+        "radiation": RadiationForm,
+        "fixed": FixedForm,
+    }
+    forms: list[Any] = []
     for label, effect in zip(effect_labels(problem), problem.effects):
         term = effect.term(space.selection)
-        if not len(term.parts):
-            continue
-        if term.kind == "convection":
-            convection.append(ConvectionForm(label, term, space, reference_c))
-        elif term.kind == "flux":
-            loads.append(FluxForm(label, term, space, reference_c))
-        elif term.kind == "source":
-            loads.append(SourceForm(label, term, space))
-        elif term.kind == "radiation":
-            radiation.append(RadiationForm(label, term, space, reference_c))
-        else:
-            with nullcontext() if assembled is None else assembled.form("fixed"):
-                fixed.append(FixedForm(label, term, space, reference_c))
-    return EffectForms(tuple(convection), tuple(loads), tuple(radiation), tuple(fixed))
+        if len(term.parts):
+            counted = assembled is not None and term.kind == "fixed"
+            with assembled.form("fixed") if counted else nullcontext():
+                forms.append(made[term.kind](label, term, space, reference_c))
+
+    def of(*kinds: str) -> tuple[Any, ...]:
+        return tuple(form for form in forms if form.kind in kinds)
+
+    return EffectForms(of("convection"), of("flux", "source"), of("radiation"), of("fixed"))

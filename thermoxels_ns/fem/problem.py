@@ -50,11 +50,6 @@ class TimeSteps:
         return self.steps * self.step_seconds
 
     @property
-    def num_times(self) -> int:
-        """Number of times at which temperatures are kept."""
-        return self.steps + 1
-
-    @property
     def times_s(self) -> npt.NDArray[np.float64]:
         """Start, then the end of every step, shape (steps + 1,), [s]."""
         return np.arange(self.steps + 1, dtype=np.float64) * self.step_seconds
@@ -85,11 +80,6 @@ class AdaptiveSteps:
         _check_count("outputs", self.outputs, "Give the number of intervals, such as 10.")
 
     @property
-    def num_times(self) -> int:
-        """Number of times at which temperatures are kept."""
-        return self.outputs + 1
-
-    @property
     def times_s(self) -> npt.NDArray[np.float64]:
         """Start, then the end of every interval, shape (outputs + 1,), [s]."""
         return np.linspace(0.0, self.duration_s, self.outputs + 1)
@@ -117,14 +107,9 @@ class GivenSteps:
         return GivenSteps(self.duration_s, lengths_s, self.tolerance_k)
 
     @property
-    def num_times(self) -> int:
-        """Number of times at which temperatures are kept."""
-        return len(self.lengths_s) + 1
-
-    @property
     def times_s(self) -> npt.NDArray[np.float64]:
         """Start, then the end of every interval, [s]."""
-        return np.linspace(0.0, self.duration_s, self.num_times)
+        return np.linspace(0.0, self.duration_s, len(self.lengths_s) + 1)
 
 
 def _check_count(name: str, value: int, remedy: str) -> None:

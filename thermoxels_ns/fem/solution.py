@@ -141,14 +141,14 @@ def heat_by_effect(
     effects: Sequence[str], groups: Iterable[tuple[str, str]], group_heat_w: npt.NDArray[np.float64]
 ) -> tuple[EffectHeat, ...]:
     """Sort heat flows, shape (s, g), [W], of groups, each an effect and a patch or region, by effect."""
-    columns: dict[str, list[int]] = {effect: [] for effect in effects}
-    names: dict[str, list[str]] = {effect: [] for effect in effects}
+    columns: dict[str, list[tuple[int, str]]] = {effect: [] for effect in effects}
     for number, (owner, name) in enumerate(groups):
-        if owner in columns:
-            columns[owner].append(number)
-            names[owner].append(name)
-    parts = ((effect, group_heat_w[:, columns[effect]]) for effect in effects)
-    return tuple(EffectHeat(effect, heat.sum(axis=1), tuple(names[effect]), heat) for effect, heat in parts)
+        columns[owner].append((number, name))
+    found = []
+    for effect, chosen in columns.items():
+        heat_w = group_heat_w[:, [number for number, _ in chosen]]
+        found.append(EffectHeat(effect, heat_w.sum(axis=1), tuple(name for _, name in chosen), heat_w))
+    return tuple(found)
 
 
 Solution: TypeAlias = HeatSolution | SteadySolution  # What either solver returns

@@ -43,11 +43,9 @@ def solve_steady(
     _check_held(system)
     equation = ImplicitEquation(system, 0.0, np.inf, relative_tolerance=relative_tolerance)
     solution = equation.solve(system.start_k, 0.0)
-    failure = too_cold(system, solution.relative_k)
     if not solution.converged:
-        failure = f"No steady state was found. {solution.status} Check the mesh's quality and the effects."
-    if failure:
-        raise HeatError(failure)
+        raise HeatError(f"No steady state was found. {solution.status} Check the mesh's quality and the effects.")
+    refuse_too_cold(system, solution.relative_k)
     relative_k, num_mesh_nodes = solution.relative_k, len(problem.mesh.points_m)
     group_heat = heat_of_groups_w(system, relative_k)
     flows_w = 0.0 if system.is_still(relative_k, 0.0) else max(solution.flows_w, 0.5 * np.abs(group_heat).sum())
@@ -88,16 +86,15 @@ def heat_of_groups_w(system: HeatSystem, relative_k: Vector) -> Vector:
     return np.concatenate([system.group_heat_w(relative_k, 0.0), system.fixed.shares @ kept_w])
 
 
-def too_cold(system: HeatSystem, relative_k: Vector) -> str:
-    """Say that temperatures are below absolute zero, or nothing."""
+def refuse_too_cold(system: HeatSystem, relative_k: Vector) -> None:
+    """Raise `HeatError` for temperatures below absolute zero."""
     coldest_k = float(relative_k.min()) + system.reference_c + ZERO_CELSIUS_K
-    if coldest_k >= -1e-6:
-        return ""
-    return (
-        f"The temperature falls to {coldest_k:.6g} K, below absolute zero: the given fluxes or sources take out more "
-        "heat than can flow in. Check their sign (positive is into the body). In long steps, schemes other than "
-        "backward Euler may overshoot, too."
-    )
+    if coldest_k < -1e-6:
+        raise HeatError(
+            f"The temperature falls to {coldest_k:.6g} K, below absolute zero: the given fluxes or sources take out "
+            "more heat than can flow in. Check their sign (positive is into the body). In long steps, schemes other "
+            "than backward Euler may overshoot, too."
+        )
 
 
 def _check_held(system: HeatSystem) -> None:

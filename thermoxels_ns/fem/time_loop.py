@@ -14,7 +14,7 @@ from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2, RungeKutta, Scheme, Step
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect
-from thermoxels_ns.fem.steady import OVERSHOOT_K, too_cold
+from thermoxels_ns.fem.steady import OVERSHOOT_K, refuse_too_cold
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
@@ -65,7 +65,7 @@ def solve_heat(
             stores next to no heat, a step's solver does not converge, or the temperature falls below absolute zero.
     """
     _check_stores(problem)
-    states = _room_for_states(time.num_times, len(problem.mesh.points_m))
+    states = _room_for_states(len(time.times_s), len(problem.mesh.points_m))
     system = HeatSystem(problem)
     states[0] = problem.start_c - system.reference_c
     if len(system.fixed.nodes):
@@ -78,9 +78,7 @@ def solve_heat(
         scheme = BACKWARD_EULER if isinstance(time, TimeSteps) else SDIRK2
     loop = _TimeLoop(system, scheme, time, relative_tolerance)
     for taken in loop.steps(states[0]):
-        failure = taken.failure or too_cold(system, taken.step.relative_k)
-        if failure:
-            raise HeatError(failure)
+        refuse_too_cold(system, taken.step.relative_k)
         balance.add(taken.step, taken.step_s, ends_interval=taken.ends_interval)
         if progress is not None:
             progress(balance.followed_s / time.duration_s, balance.steps)
@@ -97,12 +95,11 @@ def solve_heat(
 
 @dataclass(frozen=True)
 class _Taken:
-    """A step that was accepted, or failed."""
+    """A step that was accepted."""
 
     step: Step
     step_s: float  # Its length, [s]
     ends_interval: bool  # Whether temperatures are kept at its end
-    failure: str = ""  # Why the computation ends here; empty if the step was accepted
 
 
 def _error_of_equal_steps(found: HeatSolution, doubled: HeatSolution | None, order: int) -> HeatSolution:
@@ -134,7 +131,7 @@ class _TimeLoop:
         """Steps that were repeated with a shorter length."""
 
     def steps(self, start_k: Vector) -> Iterator[_Taken]:
-        """Take all steps; the last one may be a failure."""
+        """Take all steps; raises `HeatError` where one fails."""
         if isinstance(self._time, AdaptiveSteps):
             return self._adaptive(start_k, self._time)
         return self._given(start_k, self._time)
@@ -146,9 +143,10 @@ class _TimeLoop:
             for number, step_s in enumerate(lengths_s, start=1):
                 count += 1
                 step = self.runge_kutta.step(relative_k, now_s, step_s)
-                remedy = "Use shorter steps or check the mesh's quality."
-                failure = "" if step.converged else f"Step {count} of {total} failed. {step.status} {remedy}"
-                yield _Taken(step, step_s, number == len(lengths_s), failure)
+                if not step.converged:
+                    remedy = "Use shorter steps or check the mesh's quality."
+                    raise HeatError(f"Step {count} of {total} failed. {step.status} {remedy}")
+                yield _Taken(step, step_s, number == len(lengths_s))
                 relative_k, now_s = step.relative_k, now_s + step_s
 
     def _adaptive(self, start_k: Vector, time: AdaptiveSteps) -> Iterator[_Taken]:
@@ -164,8 +162,7 @@ class _TimeLoop:
                     self.repeated += 1
                     wished_s = step_s * min(factor, _SAFETY)
                     if wished_s < _SHORTEST * time.duration_s or now_s + 0.25 * wished_s == now_s:
-                        yield _Taken(step, step_s, False, self._failure(step, now_s, time))
-                        return
+                        raise HeatError(self._failure(step, now_s, time))
                     continue
                 now_s = end_s if step_s == left_s else now_s + step_s
                 relative_k = step.relative_k
@@ -342,17 +339,13 @@ def _check_stores(problem: HeatProblem) -> None:
 
 
 def _room_for_states(num_times: int, num_nodes: int) -> Vector:
-    """Array for the temperatures of all times, or an error that says how much memory they need."""
+    """Array for the temperatures of all times; `HeatError` says how much memory they need if that is too much."""
     needed = num_times * num_nodes * 8
-    try:
-        if needed <= MAX_STATE_BYTES:
-            return np.empty((num_times, num_nodes))
-        got = "more than"
-    except MemoryError:
-        got = "less memory free than"
-    raise HeatError(
-        "steps",
-        expected=f"temperatures of all times that fit into memory, at most {MAX_STATE_BYTES} bytes",
-        got=f"{got} that: {num_times} times x {num_nodes} nodes x 8 bytes = {needed} bytes",
-        remedy=f"Take at most {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)} steps, or a coarser mesh.",
-    )
+    if needed > MAX_STATE_BYTES:
+        raise HeatError(
+            "steps",
+            expected=f"temperatures of all times in at most {MAX_STATE_BYTES} bytes",
+            got=f"{num_times} times x {num_nodes} nodes x 8 bytes = {needed} bytes",
+            remedy=f"Take at most {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)} steps, or a coarser mesh.",
+        )
+    return np.empty((num_times, num_nodes))

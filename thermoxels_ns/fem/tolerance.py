@@ -10,7 +10,6 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
@@ -24,11 +23,11 @@ DEFAULT_MEMORY_BYTES = 4 * 2**30  # Most memory that a solution may need, [bytes
 HALVED = 0.3
 """Share of an error that is left after the mesh size or the steps are halved. Theory says 1/4 where temperatures are
 smooth, and 0.4 at the edges of a notch of a right angle, where they behave as r^(2/3)."""
-HALVED_QUADRATIC = 0.2  # The same of quadratic tetrahedra: 1/8 where temperatures are smooth, 0.4 at a notch
+_LEFT = {1: ErrorSize(HALVED, HALVED), 2: ErrorSize(0.2, 0.2)}
+"""The same by the order of the tetrahedra; of quadratic ones 1/8 where temperatures are smooth, 0.4 at a notch."""
 TO_QUADRATIC = ErrorSize(0.2, 0.1)
 """Shares of the errors of linear tetrahedra, of temperatures and of heat flows, that quadratic ones of the same size
 leave: they are 0.02 to 0.5 and 0.002 to 0.25 where temperatures are smooth and where they are singular."""
-_LEFT = {1: ErrorSize(HALVED, HALVED), 2: ErrorSize(HALVED_QUADRATIC, HALVED_QUADRATIC)}
 _STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
 """Of the linear solver: its error is far below any estimate here."""
 _STEPS_OVER_ERROR = 6.0
@@ -43,7 +42,7 @@ _BYTES_PER_TET, _BYTES_PER_FACET = {1: 400.0, 2: 2600.0}, {1: 600.0, 2: 4000.0}
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Errors that a user allows; what is None does not matter."""
+    """Errors that a user allows, above 0; what is None does not matter, but one is given."""
 
     temperature_k: float | None = 0.05
     """Largest error of the temperature at any node of the mesh, [K]. The default is half of what building physics asks
@@ -51,15 +50,6 @@ class Tolerance:
     heat_flow: float | None = None
     """Largest error of the mean heat flow that any effect brings, as a share of all heat that flows through the body;
     0.01 is what building physics asks for (ISO 10211)."""
-
-    def __post_init__(self) -> None:
-        if self.temperature_k is None and self.heat_flow is None:
-            remedy = "Give a tolerance in kelvin, or one for heat flows such as 0.01."
-            raise HeatError("tolerance", expected="temperature_k or heat_flow", got="neither", remedy=remedy)
-        for name, remedy in (("temperature_k", "Give it in kelvin."), ("heat_flow", "Give a share, such as 0.01.")):
-            value = getattr(self, name)
-            if value is not None:
-                object.__setattr__(self, name, check_positive(name, value, remedy, HeatError))
 
     def excess(self, error: ErrorSize) -> float:
         """Error over what is allowed, whichever is worse; at most 1 is good."""
@@ -146,13 +136,10 @@ def solve_to_tolerance(
     Raises:
         HeatError: The tolerance cannot be met within the memory, or a solution fails.
     """
-    check_positive("memory_bytes", memory_bytes, "Give the memory in bytes, such as 4e9.", HeatError)
-    run = _Run(problem, tolerance, float(memory_bytes), log)
+    run = _Run(problem, tolerance, memory_bytes, log)
     if duration_s is None:
         return run.close(_solve_steady(run), allow_unmet)
-    if tolerance.temperature_k is None:
-        remedy = "Give temperature_k too: steps in time are chosen by it."
-        raise HeatError("tolerance", expected="one in kelvin", got="heat_flow only", remedy=remedy)
+    assert tolerance.temperature_k is not None, "steps in time are chosen by it"
     steps = AdaptiveSteps(duration_s, _STEPS_OVER_ERROR * tolerance.temperature_k, outputs=outputs)
     return run.close(_solve_in_time(run, steps, progress), allow_unmet)
 
@@ -330,7 +317,7 @@ def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, i
 
     The error of m halvings of the mesh and j of the steps is of_mesh * HALVED^m + of_steps * HALVED^j.
     """
-    failure = run.lacks_memory(1, 1, steps.num_times)
+    failure = run.lacks_memory(1, 1, len(steps.times_s))
     if failure:
         return failure
     problems, num_nodes = [run.given], len(run.given.mesh.points_m)
@@ -370,7 +357,7 @@ def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, i
         choice = next((choice for choice in within if choice not in solved), None)
         if choice is None:
             return f"It would take more than {_MOST_HALVINGS} halvings of the mesh size or of the steps"
-        failure = run.lacks_memory(1, choice[0], steps.num_times)
+        failure = run.lacks_memory(1, choice[0], len(steps.times_s))
         if failure:
             return failure
         found = solve(choice)

@@ -129,7 +129,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
     """
     goals.check_fits(time)
     if not goals.estimated:
-        needed = peak_bytes(problem, times=1 if time is None else time.num_times)
+        needed = peak_bytes(problem, times=1 if time is None else len(time.times_s))
         say(f"Memory: about {describe_bytes(needed)} at most.")
         if needed > goals.memory_bytes:
             expected, got = f"at most {describe_bytes(goals.memory_bytes)}", f"about {describe_bytes(needed)}"
@@ -251,7 +251,7 @@ def _solve(problem: HeatProblem, time: Time, goals: Goals, say: Say) -> SolvedPr
         problem,
         Tolerance(goals.tolerance_k, goals.flow_tolerance),
         duration_s=None if time is None else time.duration_s,
-        outputs=1 if time is None else time.num_times - 1,
+        outputs=1 if time is None else len(time.times_s) - 1,
         memory_bytes=goals.memory_bytes,
         allow_unmet=goals.allow_unmet,
         log=say,
