@@ -177,36 +177,6 @@ def test_the_error_of_linear_tetrahedra_is_estimated_within_a_factor_of_two(name
     assert all(1 / 2 < ratio < 2 for ratio in ratios), ratios
 
 
-def test_nafems_t2_has_no_error() -> None:
-    """Temperatures of a rod with radiation at its end are straight."""
-    mesh = box_mesh(np.linspace(0.0, 0.1, 3), [0.0, 0.01], [0.0, 0.01])
-    effects = (FixedTemperature(("x0",), 1000.0 - 273.15), Radiation(("x1",), 0.98, 300.0 - 273.15))
-    problem = HeatProblem(mesh, Material("rod", 55.6, 7850.0, 460.0), effects=effects)
-    found = solve_to_tolerance(problem, Tolerance(1e-4, 1e-6), log=silent)
-    assert found.met and (found.settings.order, found.settings.refinements) == (1, 0)
-
-
-def slab(biot: float, parts: int) -> HeatProblem:
-    mesh = box_mesh(np.linspace(0.0, 0.1, parts + 1), [0.0, 0.02], [0.0, 0.02], temperature_c=100.0)
-    return HeatProblem(mesh, CONCRETE, effects=(Convection(("x1",), biot * 17.0, 0.0),))
-
-
-@pytest.mark.parametrize("biot", [0.1, 1.0, 10.0])
-def test_slab_with_convection(biot) -> None:
-    """Against a hundred and sixty layers, whose nodes have those of the given mesh among them."""
-    problem, fine, duration_s = slab(biot, 5), slab(biot, 160), 0.5 * 0.1**2 / CONCRETE.diffusivity_m2_s
-    exact = solve_heat(fine, AdaptiveSteps(duration_s, 0.02))
-    x, fine_x = problem.mesh.points_m[:, 0], fine.mesh.points_m[:, 0]
-    same = np.abs(x[:, None] - fine_x[None]).argmin(axis=1)
-    exact = replace(exact, temperature_c=exact.temperature_c[:, same])
-    for tolerance_k in (2.0, 0.5, 0.1):
-        found = solve_to_tolerance(problem, Tolerance(tolerance_k), duration_s=duration_s, log=silent)
-        true, estimate = true_error(found, problem, exact), found.settings.error
-        assert found.met and true.temperature_k <= tolerance_k
-        assert 1 / WITHIN < estimate.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
-        assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < MOST_FLOW, (found.settings, true)
-
-
 @pytest.mark.parametrize(
     "effect",
     [

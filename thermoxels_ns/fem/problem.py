@@ -175,16 +175,16 @@ def _checked_names(field: str, names: object) -> tuple[str, ...]:
 
 @runtime_checkable
 class Conductor(Protocol):
-    """What the solver asks of a material, such as `heat.materials.Material`."""
+    """What the solver asks of a material, such as `heat.materials.Material`: two numbers above 0."""
 
     @property
     def conductivity_w_mk(self) -> float:
-        """Thermal conductivity, [W / (m K)], above 0."""
+        """Thermal conductivity, [W / (m K)]."""
         ...
 
     @property
     def heat_capacity_j_m3k(self) -> float:
-        """Heat that warms a cubic metre by a kelvin, rho c, [J / (m3 K)], above 0."""
+        """Heat that warms a cubic metre by a kelvin, rho c, [J / (m3 K)]."""
         ...
 
 
@@ -262,11 +262,10 @@ class HeatProblem:
             got = repr(self.material)
             raise HeatError("material", expected="a Material or a mapping", got=got, remedy=remedy)
         used = {names[number] for number in np.unique(self.mesh.region)}
-        missing, unknown = used - set(self.material), set(self.material) - set(names)
-        wrong = [name for name, material in self.material.items() if not isinstance(material, Conductor)]
-        if missing or unknown or wrong:
-            faults = (("none for", missing), ("unknown", unknown), ("no Material for", wrong))
-            got = "; ".join(f"{what}: {', '.join(sorted(names))}" for what, names in faults if names)
+        given = {name for name, material in self.material.items() if isinstance(material, Conductor)}
+        unknown = set(self.material) - given | given - set(names)
+        if used - given or unknown:
+            got = f"none for: {', '.join(sorted(used - given))}; unknown: {', '.join(sorted(unknown))}"
             expected = f"a Material for each of the regions {', '.join(sorted(used))}"
             raise HeatError("material", expected=expected, got=got, remedy=remedy)
         conductivities = {name: self.material[name].conductivity_w_mk for name in used}

@@ -14,8 +14,6 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-WHOLE_BOUNDARY = "boundary"  # What the boundary of a mesh without patches is called in reports
-
 
 class Selection:
     """The named parts of a mesh and their geometry."""
@@ -25,8 +23,8 @@ class Selection:
         self.mesh, self.up = mesh, up
         self._check()
         tags = mesh.boundary
-        self.patch_names: tuple[str, ...] = (WHOLE_BOUNDARY,) if tags is None else tags.patch_names
-        """Names of the patches."""
+        self.patch_names: tuple[str, ...] = ("boundary",) if tags is None else tags.patch_names
+        """Names of the patches; a mesh without tags has one, "boundary"."""
         self.facet_patch: npt.NDArray[np.int64] = np.zeros(len(mesh.facets), np.int64) if tags is None else tags.patch
         """Index into `patch_names`, shape (f,)."""
 

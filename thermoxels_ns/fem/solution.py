@@ -177,8 +177,7 @@ class SolutionNodes:
     """A mesh with a temperature at every node, and whether the tetrahedra that were solved are quadratic."""
 
     mesh: TetMesh
-    """The mesh that was solved; of quadratic tetrahedra the same with all edges halved, whose new nodes are where their
-    further unknowns sit. So pictures, files and extremes show every temperature that was computed."""
+    """The mesh that was solved; of quadratic tetrahedra with all edges halved, for their unknowns on edges."""
     times_s: Vector  # Times, shape (s,), [s]; 0 alone for a steady state
     states_c: Vector  # Nodal temperatures, shape (s, n), [degrees Celsius]
     quadratic: bool

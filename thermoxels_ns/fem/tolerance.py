@@ -111,16 +111,14 @@ def solve_to_tolerance(
 ) -> ToleratedSolution:
     """Solve a problem with order, mesh size and time steps whose estimated error is allowed.
 
-    Errors are told by the difference of two solutions, of which the finer one has a share of the error of the coarser
-    one left (Richardson 1911): `TO_QUADRATIC` or `HALVED`.
+    The difference of two solutions tells their errors, because the finer one has a known share of the error of the
+    coarser one left (Richardson 1911): `TO_QUADRATIC` or `HALVED`.
 
     A steady state is solved with linear and then quadratic tetrahedra on the given mesh; as long as the error is too
-    large, quadratic ones of half the size follow. Where the solver fails on quadratic tetrahedra, as it may on very
-    flat ones, linear ones of half the size follow instead. In time tetrahedra stay linear, since the mass of quadratic
-    ones cannot be lumped. Three solutions tell the errors of the mesh and of the steps: one on the given mesh, one with
-    all steps halved, one on a mesh of half the size. From then on mesh and steps are made as fine as the tolerance asks
-    for. Both errors are added with their signs, node by node. What does not fit into memory ends this with the best so
-    far. The body is the one that the mesh describes: what flat facets lack of a round body's area is not estimated.
+    large, quadratic ones of half the size follow, or linear ones if the solver fails on quadratic ones. In time
+    tetrahedra stay linear: three solutions, on the given mesh, with all steps halved, and on a mesh of half the size,
+    tell the errors of mesh and steps, which are added with their signs, node by node; then both are made as fine as the
+    tolerance asks for. What flat facets lack of a round body's area is not estimated.
 
     Args:
         problem: Body, materials, initial temperatures and effects.
@@ -128,8 +126,7 @@ def solve_to_tolerance(
         duration_s: Time to follow the body for, [s]; None: its steady state.
         outputs: Number of equal intervals at whose ends temperatures are kept and compared.
         memory_bytes: Most memory that a solution may need, [bytes].
-        allow_unmet: Return the best solution that fits into memory, with `met` False and the reason in `status`,
-            instead of raising.
+        allow_unmet: Return the best solution that fits into memory, with `met` False, instead of raising.
         log: Takes a line per solution and one on the outcome; print by default.
         progress: As in `solve_heat`, of each solution through time.
 
@@ -207,9 +204,7 @@ def describe_bytes(amount: float) -> str:
 class _Run:
     """The solutions so far."""
 
-    def __init__(
-        self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable[[str], None]
-    ) -> None:
+    def __init__(self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable) -> None:
         self.given, self.tolerance, self._memory_bytes, self.say = problem, tolerance, memory_bytes, log
         self.solved: list[tuple[Level, HeatProblem, Solution]] = []
         self._begin_s = time.perf_counter()

@@ -124,8 +124,8 @@ def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes 
         regions=_regions(problem, solution, selection, nodes),
         balance=_balance(solution, lengths),
         overshoot_k=solution.overshoot_k,
-        coldest=_first_spot(selection, nodes, int(states.argmin())),
-        hottest=_first_spot(selection, nodes, int(states.argmax())),
+        coldest=_spot(selection, nodes, *divmod(int(states.argmin()), states.shape[1])),
+        hottest=_spot(selection, nodes, *divmod(int(states.argmax()), states.shape[1])),
     )
 
 
@@ -142,18 +142,12 @@ def volume_shares(mesh: TetMesh) -> Vector:
     return weights / weights.sum()
 
 
-def describe_spot(selection: Selection, node: int, temperature_c: float, time_s: float) -> Spot:
-    """Say where a node is."""
+def _spot(selection: Selection, nodes: SolutionNodes, time: int, node: int) -> Spot:
+    """Describe a node at the time with a number, -1 for the end."""
     touching = np.any(selection.mesh.facets == node, axis=1)
     patches = tuple(selection.patch_names[number] for number in np.unique(selection.facet_patch[touching]))
     x, y, z = selection.mesh.points_m[node].tolist()
-    return Spot(temperature_c, (x, y, z), time_s, node, patches)
-
-
-def _first_spot(selection: Selection, nodes: SolutionNodes, index: int) -> Spot:
-    """Describe an entry of the flattened temperatures of all times."""
-    time, node = np.unravel_index(index, nodes.states_c.shape)
-    return describe_spot(selection, int(node), float(nodes.states_c[time, node]), float(nodes.times_s[time]))
+    return Spot(float(nodes.states_c[time, node]), (x, y, z), float(nodes.times_s[time]), node, patches)
 
 
 def _patches(
@@ -165,14 +159,14 @@ def _patches(
         if not isinstance(effect, InternalHeat):
             for name, heat_w in zip(part.group_names, part.group_heat_w.T):
                 heat[name] = heat[name] + heat_w
-    facet_c, end_s = last_c[mesh.facets].mean(axis=1), float(nodes.times_s[-1])
+    facet_c = last_c[mesh.facets].mean(axis=1)
     results = []
     for number in np.unique(selection.facet_patch):
         chosen = selection.facet_patch == number
         on_patch, total = np.unique(mesh.facets[chosen]), float(area[chosen].sum())
         coldest, hottest = (int(on_patch[which(last_c[on_patch])]) for which in (np.argmin, np.argmax))
         heat_w = heat[names[number]]
-        mean = float(heat_w @ lengths / lengths.sum())
+        mean = float(np.average(heat_w, weights=lengths))
         results.append(
             PatchResult(
                 patch=names[number],
@@ -181,8 +175,8 @@ def _patches(
                 heat_w_m2=mean / total,
                 last_heat_w=float(heat_w[-1]),
                 mean_c=float(facet_c[chosen] @ area[chosen]) / total,
-                coldest=describe_spot(selection, coldest, float(last_c[coldest]), end_s),
-                hottest=describe_spot(selection, hottest, float(last_c[hottest]), end_s),
+                coldest=_spot(selection, nodes, -1, coldest),
+                hottest=_spot(selection, nodes, -1, hottest),
             )
         )
     return tuple(results)
@@ -354,7 +348,7 @@ def wall_result(
     inner_nodes = away if len(away) else inner_nodes
     # The worst spot: the coldest if it is colder outside, else the hottest.
     worst = int(inner_nodes[np.argmin(np.sign(difference_k) * every_c[inner_nodes])])
-    spot = describe_spot(Selection(shown.mesh, problem.up), worst, float(every_c[worst]), 0.0)
+    spot = _spot(Selection(shown.mesh, problem.up), shown, -1, worst)
     return WallResult(
         inside_c=inside_c,
         outside_c=outside_c,

@@ -26,7 +26,7 @@ from thermoxels_ns.heat.results import (
     wall_of_scene,
 )
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_hours
+from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_table
 from thermoxels_ns.heat.sky import Vector as Direction
 from thermoxels_ns.heat.solving import Goals, LeftOut, Say, solve_problem
 from thermoxels_ns.mesh.quality.checks import count_tets_in_other_bodies, count_twin_nodes
@@ -47,7 +47,7 @@ class Probes:
     nodes: npt.NDArray[np.int64]  # Nodes of the tetrahedron around each point, shape (p, 4)
     weights: npt.NDArray[np.float64]  # Barycentric coordinates in it, shape (p, 4); each row adds up to 1
 
-    def at(self, nodal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def at(self, nodal: Vector) -> Vector:
         """Interpolate nodal values, shape (..., n), to the points, shape (..., p)."""
         return np.einsum("...pa,pa->...p", nodal[..., self.nodes], self.weights)
 
@@ -80,23 +80,21 @@ def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
     return Probes(points, nodes, weights)
 
 
-def _barycentric(corner: npt.NDArray[np.float64], point: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _barycentric(corner: Vector, point: Vector) -> Vector:
     """Barycentric coordinates of a point in tetrahedra, shape (k, 4)."""
     sides = corner[:, 1:] - corner[:, :1]
     others = np.linalg.solve(np.swapaxes(sides, 1, 2), (point - corner[:, 0])[..., None])[..., 0]
     return np.concatenate([1.0 - others.sum(axis=1, keepdims=True), others], axis=1)
 
 
-def _outside(mesh: TetMesh, number: int, point: npt.NDArray[np.float64]) -> HeatError:
+def _outside(mesh: TetMesh, number: int, point: Vector) -> HeatError:
     distance = np.linalg.norm(mesh.points_m - point, axis=1)
-    nearest = int(np.argmin(distance))
-    x, y, z = mesh.points_m[nearest]
-    low, high = (", ".join(f"{v:.4g}" for v in end) for end in (mesh.points_m.min(axis=0), mesh.points_m.max(axis=0)))
+    x, y, z = mesh.points_m[np.argmin(distance)]
     return HeatError(
         f"probe {number + 1}",
-        expected=f"a point inside the body, which lies between ({low}) and ({high}) m",
-        got=f"({', '.join(f'{v:.6g}' for v in point)}), which is outside",
-        remedy=f"Move it; the nearest node is ({x:.6g}, {y:.6g}, {z:.6g}), {distance[nearest]:.3g} m away.",
+        expected="a point inside the body",
+        got=f"({', '.join(f'{part:.6g}' for part in point)}), which is outside",
+        remedy=f"Move it; the nearest node is ({x:.6g}, {y:.6g}, {z:.6g}), {distance.min():.3g} m away.",
     )
 
 
@@ -272,7 +270,7 @@ def unused_settings(scene: HeatScene) -> tuple[str, ...]:
     for name, air in (("inside_air", scene.inside_air), ("outside_air", scene.outside_air)):
         if air is None or air.air_series is None:
             continue
-        begin, end = air_series_hours(air.air_series)[[0, -1]].tolist()
+        begin, end = air_series_table(air.air_series)[[0, -1], 0].tolist()
         if begin > 0.0 or end < hours * (1.0 - 1e-9):
             warnings.append(
                 f"The air_series of {name} is from {begin:g} to {end:g} hours, but the body is followed from 0 to "

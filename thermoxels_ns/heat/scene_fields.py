@@ -278,18 +278,13 @@ class Sun:
 
 def read_air_series(path: str) -> Varying:
     """Read the temperature of air from a csv file with the columns hours and air_c; raises `HeatError`."""
-    table = _air_series(path)
+    table = air_series_table(path)
     Bounds("air_c", "degrees Celsius", -ZERO_CELSIUS_K, HOTTEST_C).check(table[:, 1])
     return tabulated(3600.0 * table[:, 0], table[:, 1])
 
 
-def air_series_hours(path: str) -> npt.NDArray[np.float64]:
-    """Times of such a file, ascending, shape (k,), [h]; raises `HeatError`."""
-    return _air_series(path)[:, 0]
-
-
-def _air_series(path: str) -> npt.NDArray[np.float64]:
-    """Hours and temperatures of a csv file, shape (k, 2)."""
+def air_series_table(path: str) -> npt.NDArray[np.float64]:
+    """Hours, ascending, and temperatures of a csv file, shape (k, 2); raises `HeatError`."""
     try:
         lines = [line for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip(" ,")]
     except (OSError, UnicodeDecodeError) as problem:
