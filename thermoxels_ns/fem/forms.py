@@ -59,7 +59,7 @@ class _Boundary(ABC):
         self.effect, self.kind, self.facets, self._reference_c = effect, term.kind, facets, reference_c
         self.quantities, self._factor = term.quantities, term.factor
         self.load_in_time = any(quantity.in_time for quantity in term.quantities)
-        """Whether its heat changes with time at one temperature."""
+        """Whether the heat of the term changes with time at one temperature."""
         self.basis = space.surface(facets)
         self.nodes = space.facet_nodes(facets)
         self._numbers, self._space = self.nodes.T.ravel(), space

@@ -177,7 +177,7 @@ class Residual:
 
     @cached_property
     def is_round_off(self) -> bool:
-        """Whether it is nothing but round-off, at all nodes together and in every piece."""
+        """Whether the residual is nothing but round-off, at all nodes together and in every piece."""
         in_pieces = bool(np.all(np.abs(self.piece_w) <= _ROUND_OFF * self.moved_w))
         return in_pieces and self.unbalanced_w <= self.round_off_w
 

@@ -147,21 +147,21 @@ class Effect(ABC):
 
     @property
     def where(self) -> tuple[str, ...]:
-        """Names or patterns of the patches, or of the regions, that it acts on."""
+        """Names or patterns of the patches, or of the regions, that the effect acts on."""
         return getattr(self, "patches", None) or getattr(self, "regions", ())
 
     @property
     def label(self) -> str:
-        """Name for reports: what it is and where."""
+        """Name of the effect in reports: its kind and where it acts."""
         return f"{self.kind} on {', '.join(self.where)}"
 
     def bounded(self, name: str) -> Bounded:
-        """Give one of its quantities with its range."""
+        """Give one of the quantities of the effect with its range."""
         return Bounded(getattr(self, name), self.bounds[name])
 
     @abstractmethod
     def term(self, selection: Selection) -> Term:
-        """Give the term that it adds to the heat equation of a body; `HeatError` if that lacks a patch or region."""
+        """Give the term of the effect in the heat equation; `HeatError` if the mesh lacks a patch or region of it."""
 
 
 def _checked_names(field: str, names: object) -> tuple[str, ...]:
@@ -228,7 +228,7 @@ class HeatProblem:
 
     @property
     def resolution_s(self) -> float:
-        """How far apart in time one may look at the effects and know how they change in between, [s]."""
+        """Longest time between two looks at the effects that tells how they change in between, [s]."""
         return min((e.bounded(name).resolution_s for e in self.effects for name in e.bounds), default=math.inf)
 
     @property

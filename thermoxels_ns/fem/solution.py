@@ -74,7 +74,7 @@ class ErrorSize:
     """Largest error of the mean heat flow of an effect, as a share of all heat that flows through the body."""
 
     def describe(self) -> str:
-        """Say it in words."""
+        """Describe both errors in words."""
         return f"{self.temperature_k:.2g} K and {100.0 * self.heat_flow:.2g} % of the heat flow"
 
 

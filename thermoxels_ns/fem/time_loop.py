@@ -199,7 +199,7 @@ class _TimeLoop:
 
 
 class HeatBalance:
-    """Keeps states at the ends of intervals and adds up the heat that flowed in between."""
+    """The account of a computation: states at the ends of intervals, and the heat that flowed in between."""
 
     def __init__(self, system: HeatSystem, states_k: Vector, times_s: Vector) -> None:
         """Begin with room for the states, shape (s + 1, n), [K], the first one given, and their times, [s]."""
@@ -247,7 +247,7 @@ class HeatBalance:
         return max(low - float(relative_k.min()), float(relative_k.max()) - high)
 
     def success(self, repeated: int) -> str:
-        """Say that all went well, and how."""
+        """Describe how the steps converged, and by how much any temperature left its range."""
         sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
         sentence += f" {repeated} more were repeated with a shorter length." if repeated else ""
         if self._overshooting:

@@ -57,7 +57,7 @@ class Tolerance:
         return max(found / allowed for found, allowed in pairs if allowed is not None)
 
     def describe(self) -> str:
-        """Say it in words."""
+        """Describe the allowed errors in words."""
         parts = [] if self.temperature_k is None else [f"{self.temperature_k:g} K"]
         parts += [] if self.heat_flow is None else [f"{100.0 * self.heat_flow:g} % of the heat flow"]
         return " and ".join(parts)
@@ -75,7 +75,7 @@ class Level:
     seconds: float  # Time to solve it, [s]
 
     def describe(self) -> str:
-        """Say it in a line."""
+        """Describe the solution and its errors in a line."""
         mesh = "given mesh" if self.refinements == 0 else f"mesh size halved {self.refinements}x"
         steps = "" if self.step_tolerance_k is None else f", steps to {self.step_tolerance_k:.2g} K"
         return (
@@ -193,7 +193,7 @@ def peak_bytes(problem: HeatProblem, *, order: int = 1, refinements: int = 0, ti
 
 
 def describe_bytes(amount: float) -> str:
-    """Say it in a unit that suits it.
+    """Give an amount of memory in GiB or MiB.
 
     >>> describe_bytes(3 * 2**30), describe_bytes(266000.0)
     ('3 GiB', '0.25 MiB')
@@ -224,7 +224,7 @@ class _Run:
         self.say(level.describe())
 
     def lacks_memory(self, order: int, refinements: int, times: int = 1) -> str:
-        """Say what a solution on the given mesh with its size halved so often takes; return that it does not fit."""
+        """Forecast the memory of a solution, mesh size halved so often; return why it does not fit, or nothing."""
         needed = peak_bytes(self.given, order=order, refinements=refinements, times=times)
         where = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
         what = f"P{order} on {where} needs about {describe_bytes(needed)}"

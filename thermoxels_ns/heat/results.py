@@ -112,7 +112,7 @@ class HeatResults:
 
 
 def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes | None = None) -> HeatResults:
-    """Work out what people ask: temperatures of all unknowns, heat flows that its own tetrahedra (P1 or P2) bring."""
+    """Compute what people ask of a solution: temperatures of all unknowns, heat flows as the solver evaluates them."""
     nodes = solution_nodes(problem, solution) if nodes is None else nodes
     times, states, selection = nodes.times_s, nodes.states_c, Selection(nodes.mesh, problem.up)
     lengths = np.diff(times) if len(times) > 1 else np.ones(1)
@@ -319,7 +319,7 @@ def wall_result(
 ) -> WallResult:
     """Work out what a body between two airs lets through.
 
-    What it says is that of a wall only if nothing but the two airs acts: sunlight or a cold sky count as heat
+    The figures are those of a wall only if nothing but the two airs acts: sunlight or a cold sky count as heat
     through it. `inside` names the patches that face the inside, some of which have area; the airs differ.
     """
     difference_k = inside_c - outside_c

@@ -150,7 +150,7 @@ class InsideAir(_Air):
         _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
 
     def convection(self) -> Convection:
-        """What it does to the body."""
+        """Make the convection between the air and the body."""
         coefficient: Quantity | None = self.coefficient_w_m2k
         if self.coefficient is not None:
             coefficient = inside_coefficient(self.coefficient, self.heat_flow, self.air_c, self.emissivity or 0.0)
@@ -179,7 +179,7 @@ class OutsideAir(_Air):
         _check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
 
     def convection(self) -> Convection:
-        """What it does to the body."""
+        """Make the convection between the air and the body."""
         coefficient = self.coefficient_w_m2k
         if self.coefficient is not None:
             wind, emissivity = self.wind_m_s or 0.0, self.emissivity or 0.0
@@ -217,7 +217,7 @@ class Sky:
 
     @property
     def needs_air(self) -> bool:
-        """Whether its temperature follows from that of the outside air."""
+        """Whether the temperature of the sky follows from that of the outside air."""
         return self.temperature_c is None
 
 
