@@ -342,8 +342,7 @@ def effect_forms(
     for label, effect in zip(effect_labels(problem), problem.effects):
         term = effect.term(space.selection)
         if len(term.parts):
-            counted = assembled is not None and term.kind == "fixed"
-            with assembled.form("fixed") if counted else nullcontext():
+            with assembled.form("fixed") if assembled and term.kind == "fixed" else nullcontext():
                 forms.append(made[term.kind](label, term, space, reference_c))
 
     def of(*kinds: str) -> tuple[Any, ...]:
