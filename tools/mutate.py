@@ -1,7 +1,7 @@
 """Change the code in one place at a time and see whether the tests near it notice.
 
     python tools/mutate.py --count 60 --seed 1
-    python tools/mutate.py thermoxels_ns/heat/sun.py --count 20
+    python tools/mutate.py thermoxels_ns/heat/sky.py --count 20
 
 What survives is printed with its line: either the change makes no difference (a tolerance, a speed-up), or a test is
 missing. Everything happens in a copy of the checkout; tests near a file are those that import it. A change is

@@ -6,8 +6,7 @@ import numpy.typing as npt
 import pytest
 
 from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_matrices import HeatMatrices, assemble
-from thermoxels_ns.fem.implicit_equation import LinearSolver
+from tests.support.heat_matrices import HeatMatrices, assemble, backward_euler
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.mesh.files.solvers import HeatStep, write_inp
 from thermoxels_ns.mesh.quality.checks import facet_areas
@@ -30,22 +29,8 @@ def capacities(problem: HeatProblem) -> dict[str, HeatMatrices]:
     point, the centre, all shape functions are 1 / 4: V / 16 for each pair, which is 5 / 4 consistent - 1 / 4 lumped.
     """
     lumped, consistent = (assemble(problem.mesh, problem.material, lumped=entry) for entry in (True, False))
-    one_point = HeatMatrices(
-        lumped.stiffness_w_k, 1.25 * consistent.mass_j_k - 0.25 * lumped.mass_j_k, lumped.nodal_mass_j_k
-    )
+    one_point = HeatMatrices(lumped.stiffness_w_k, 1.25 * consistent.mass_j_k - 0.25 * lumped.mass_j_k)
     return {"lumped": lumped, "consistent": consistent, "one point": one_point}
-
-
-def our_steps(matrices: HeatMatrices, start_c: npt.NDArray[np.float64], time: TimeSteps) -> npt.NDArray[np.float64]:
-    """Backward Euler with given matrices and our linear solver, shape (steps, n)."""
-    matrix = (matrices.mass_j_k / time.step_seconds + matrices.stiffness_w_k).tocsr()
-    solver = LinearSolver(matrix)
-    states = [start_c]
-    for _ in range(time.steps):
-        change = solver.solve(-(matrices.stiffness_w_k @ states[-1]))
-        assert change.converged
-        states.append(states[-1] + change.x)
-    return np.array(states[1:])
 
 
 def run_calculix(folder: Path, problem: HeatProblem, time: TimeSteps, ccx: str, run_in) -> npt.NDArray[np.float64]:
@@ -71,7 +56,7 @@ def test_ten_steps_agree_with_ours(tmp_path, heat_problem, ten_steps, program, r
     assert theirs.shape == (10, len(start))
     assert np.abs(theirs[-1] - start).max() > 0.1 * np.ptp(start)
     difference = {
-        name: float(np.abs(our_steps(matrices, start, ten_steps) - theirs).max() / np.ptp(start))
+        name: float(np.abs(backward_euler(matrices, start, ten_steps) - theirs).max() / np.ptp(start))
         for name, matrices in capacities(heat_problem).items()
     }
     assert difference["one point"] < 1e-5, f"differences relative to the span of temperatures: {difference}"
@@ -82,7 +67,7 @@ def test_ten_steps_agree_with_ours(tmp_path, heat_problem, ten_steps, program, r
 def test_steps_of_an_awkward_length_are_all_taken(tmp_path, heat_problem, program, run_in):
     time = TimeSteps(7, 1000.1 / 3.0)
     theirs = run_calculix(tmp_path, heat_problem, time, program("ccx", "calculix-ccx"), run_in)
-    ours = our_steps(capacities(heat_problem)["one point"], heat_problem.start_c, time)
+    ours = backward_euler(capacities(heat_problem)["one point"], heat_problem.start_c, time)
     assert theirs.shape == ours.shape
     assert np.abs(theirs - ours).max() < 1e-5 * np.ptp(heat_problem.start_c)
 

@@ -12,12 +12,12 @@ from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, Effect, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying, tabulated
-from thermoxels_ns.fem.runge_kutta import CRANK_NICOLSON, theta_scheme
+from thermoxels_ns.fem.runge_kutta import CRANK_NICOLSON
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.fem.tolerance import Tolerance, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection, GroundContact, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.heat.solving import Goals
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 REGIONS = {"inner": lambda p: p[..., 0] < 0.25, "outer": lambda p: p[..., 0] > 0.25}
@@ -51,22 +51,22 @@ def moved(values: np.ndarray, place: Any, value: float) -> np.ndarray:
 
 
 STEPS: Refused = [
+    ("tolerance", lambda: Goals(tolerance_k=0.0)),
+    ("flow-tolerance", lambda: Goals(flow_tolerance=1.5)),
+    ("flow-tolerance", lambda: Goals(flow_tolerance=0.1).check_fits(TimeSteps(1, 60.0))),
+    ("leave-out-below", lambda: Goals(flow_tolerance=0.05, leave_out_below=0.01)),
+    ("memory-gb", lambda: Goals(memory_gb=-1.0)),
+    ("steps times step_seconds", lambda: TimeSteps(10, 1e308)),
     *(("steps", lambda n=n: TimeSteps(n, 60.0)) for n in (0, -1, 2.5, True, "10")),
     *(("step_seconds", lambda s=s: TimeSteps(10, s)) for s in (0.0, -60.0, NAN, INF)),
     ("duration_s", lambda: AdaptiveSteps(0.0)),
     ("tolerance_k", lambda: AdaptiveSteps(60.0, -1.0)),
     *(("outputs", lambda n=n: AdaptiveSteps(60.0, outputs=n)) for n in (0, 1.5)),
-    *(("theta", lambda t=t: theta_scheme(t)) for t in (0.49, 1.01, NAN)),
     ("scheme", lambda: solve_heat(body(), AdaptiveSteps(3600.0), scheme=CRANK_NICOLSON)),
     *(
         ("heat capacity", lambda t=t: solve_heat(HeatProblem(BOX, EMPTY), t))
         for t in (TimeSteps(3, 1.0), AdaptiveSteps(9.0))
     ),
-    ("tolerance", lambda: Tolerance(None, None)),
-    ("temperature_k", lambda: Tolerance(0.0)),
-    ("heat_flow", lambda: Tolerance(1.0, -0.1)),
-    ("tolerance", lambda: solve_to_tolerance(body(), Tolerance(None, 0.1), duration_s=32.0)),
-    ("memory_bytes", lambda: solve_to_tolerance(body(), Tolerance(1.0), memory_bytes=-1.0)),
 ]
 MESHES: Refused = [
     ("mesh points", lambda: body(points_m=moved(BOX.points_m, (3, 1), NAN))),

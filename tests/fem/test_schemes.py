@@ -8,12 +8,13 @@ from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme
+from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-SCHEMES = (BACKWARD_EULER, theta_scheme(0.7), CRANK_NICOLSON, SDIRK2)
+SCHEMES = (BACKWARD_EULER, CRANK_NICOLSON, SDIRK2)
 H = 0.05
 STEP_S = H**2 / CONCRETE.diffusivity_m2_s
 """Step after which heat has spread over one element, h^2 / alpha."""
@@ -37,14 +38,12 @@ def bar(parts: int = 8, temperature_c=20.0) -> TetMesh:
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=lambda scheme: scheme.name)
-@pytest.mark.parametrize("lumped", [True, False])
-@pytest.mark.parametrize("lumped_boundary", [True, False])
 @pytest.mark.parametrize("fourier", [1e-3, 1.0, 1e3])
-def test_heat_is_conserved_by_every_scheme(scheme, lumped, lumped_boundary, fourier) -> None:
+def test_heat_is_conserved_by_every_scheme(scheme, fourier) -> None:
     """Stored = in - out + sources to 1e-9, over every single step, with everything that can flow."""
     mesh = bar(6, lambda p: 20.0 + 30.0 * np.sin(40.0 * p @ [1.0, 2.0, 3.0]))
     problem, time = HeatProblem(mesh, CONCRETE, effects=EVERY), TimeSteps(4, fourier * STEP_S)
-    solution = solve_heat(problem, time, scheme=scheme, lumped=lumped, lumped_boundary=lumped_boundary)
+    solution = solve_heat(problem, time, scheme=scheme)
     supplied = sum(heat.heat_w for heat in solution.effects)
     exchanged = sum(np.abs(heat.heat_w) for heat in solution.effects)
     np.testing.assert_array_less(np.abs(solution.heat_w - supplied), 1e-9 * exchanged)
@@ -57,30 +56,23 @@ def test_heat_is_conserved_by_every_scheme(scheme, lumped, lumped_boundary, four
     np.testing.assert_allclose(stored, np.diff(solution.temperature_c @ mass), rtol=1e-6)
 
 
-@pytest.mark.parametrize("theta", [1.0, 0.7, 0.5])
-def test_theta_steps_are_the_textbook_s(theta) -> None:
+@pytest.mark.parametrize(("theta", "scheme"), [(1.0, BACKWARD_EULER), (0.5, CRANK_NICOLSON)])
+def test_steps_are_the_textbook_s(theta, scheme) -> None:
     """(M + dt theta A) T1 = (M - dt (1 - theta) A) T0 + dt b, solved directly beside it."""
     mesh = bar(6, lambda p: 20.0 + 30.0 * np.sin(40.0 * p[:, 0]))
-    air = Convection(("x1",), 9.0, 5.0)
-    problem = HeatProblem(mesh, CONCRETE, effects=(air,))
-    dt = 0.8 * STEP_S
-    solution = solve_heat(problem, TimeSteps(3, dt), scheme=theta_scheme(theta), lumped=False)
-    from thermoxels_ns.fem.system import HeatSystem
-
-    system = HeatSystem(problem, lumped=False)
-    a = system.matrix(0.0, np.inf)
-    b = 5.0 * (a @ np.ones(system.num_nodes))
-    mass = assemble(mesh, CONCRETE, lumped=False).mass_j_k
-    state = mesh.temperature_c
-    for computed in solution.temperature_c[1:]:
+    problem = HeatProblem(mesh, CONCRETE, effects=(Convection(("x1",), 9.0, 5.0),))
+    dt, system = 0.8 * STEP_S, HeatSystem(problem)
+    a, mass, state = system.matrix(0.0, np.inf), assemble(mesh, CONCRETE).mass_j_k, mesh.temperature_c
+    for computed in solve_heat(problem, TimeSteps(3, dt), scheme=scheme).temperature_c[1:]:
+        b = 5.0 * (a @ np.ones(system.num_nodes))
         state = spsolve((mass + dt * theta * a).tocsc(), (mass - dt * (1 - theta) * a) @ state + dt * b)
         np.testing.assert_allclose(computed, state, atol=1e-9)
 
 
-def jump(fourier: float, scheme: Scheme | None, **options) -> np.ndarray:
+def jump(fourier: float, scheme: Scheme | None) -> np.ndarray:
     """A bar at 0 degrees whose end jumps to 1: temperatures of ten steps."""
     problem = HeatProblem(bar(20, 0.0), CONCRETE, effects=(FixedTemperature(("x0",), 1.0),))
-    return solve_heat(problem, TimeSteps(10, fourier * STEP_S), scheme=scheme, **options).temperature_c
+    return solve_heat(problem, TimeSteps(10, fourier * STEP_S), scheme=scheme).temperature_c
 
 
 @pytest.mark.parametrize("fourier", [1e-3, 1e-1, 1.0, 10.0, 100.0, 1e6])
@@ -94,17 +86,6 @@ def test_what_overshoots_instead() -> None:
     overshoot = {scheme.name: jump(100.0, scheme).max() - 1.0 for scheme in (CRANK_NICOLSON, SDIRK2)}
     assert overshoot["Crank-Nicolson"] > 0.25, overshoot
     assert 0.001 < overshoot["SDIRK2"] < 0.03, overshoot
-    assert jump(0.01, None, lumped=False).min() < -0.03
-
-
-@pytest.mark.parametrize("strength", [1e-6, 5.0, 1e6])
-@pytest.mark.parametrize("fourier", [1e-3, 1.0, 1e6])
-def test_surroundings_bound_the_temperature(strength, fourier) -> None:
-    mesh = bar(6, lambda p: np.random.default_rng(1).choice([-30.0, 20.0, 90.0], len(p)))
-    effects = (Convection(("x0", "y0"), strength, 120.0), Radiation(("x1", "y1"), 0.9, -60.0))
-    states = solve_heat(HeatProblem(mesh, CONCRETE, effects=effects), TimeSteps(5, fourier * STEP_S)).temperature_c
-    assert states.min() >= -60.0 - 1e-9 and states.max() <= 120.0 + 1e-9
-    assert np.isfinite(states).all()
 
 
 def test_a_body_radiates_from_1000_k_to_3_k() -> None:
@@ -118,7 +99,7 @@ def test_a_body_radiates_from_1000_k_to_3_k() -> None:
         solution = solve_heat(problem, AdaptiveSteps(duration, tolerance))
         exact = (1000.0**-3 + rate * solution.times_s) ** (-1.0 / 3.0) - 273.15
         np.testing.assert_allclose(solution.temperature_c, np.broadcast_to(exact[:, None], (11, 18)), atol=tolerance)
-        assert solution.energy_residual < 1e-9 and solution.converged
+        assert solution.energy_residual < 1e-9
         assert np.all(np.diff(solution.temperature_c, axis=0) < 0.0)
     assert solution.temperature_c[-1].max() < 3.0 - 273.15
 
@@ -172,6 +153,3 @@ def test_cooling_below_absolute_zero_is_refused() -> None:
     for time in (TimeSteps(10, 600.0), AdaptiveSteps(6000.0)):
         with pytest.raises(HeatError, match="below absolute zero"):
             solve_heat(problem, time)
-    stopped = solve_heat(problem, TimeSteps(10, 600.0), allow_unconverged=True)
-    assert not stopped.converged and len(stopped.times_s) == len(stopped.effects[0].heat_w) + 1 < 11
-    assert stopped.temperature_c.min() > -273.15

@@ -24,14 +24,14 @@ def test_layers_between_two_airs_are_exact() -> None:
     mesh = box_mesh(planes(0.0, 0.2, 0.3, step=0.05), [0, 0.1], [0, 0.1], regions=regions)
     materials = {"brick": Material("brick", 0.7, 1600.0, 940.0), "wool": Material("wool", 0.04, 30.0, 1030.0)}
     problem = HeatProblem(mesh, materials, effects=(Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0)))
-    for lumped_boundary in (True, False):
-        solution = solve_steady(problem, lumped_boundary=lumped_boundary)
+    for order in (1, 2):
+        solution = solve_steady(problem, order=order)
         flux = 30.0 / (1 / 8 + 0.2 / 0.7 + 0.1 / 0.04 + 1 / 25)
         x = mesh.points_m[:, 0]
         exact = 20.0 - flux / 8 - flux * (np.minimum(x, 0.2) / 0.7 + np.maximum(x - 0.2, 0.0) / 0.04)
         np.testing.assert_allclose(solution.temperature_c, exact, atol=1e-9)
         assert [heat.heat_w[0] for heat in solution.effects] == pytest.approx([0.01 * flux, -0.01 * flux], rel=1e-9)
-        assert solution.converged and solution.energy_residual < 1e-9 and solution.newton_iterations == 0
+        assert solution.energy_residual < 1e-9 and solution.newton_iterations == 0
         assert "mass" not in solution.assembled.counts
 
 
@@ -55,7 +55,7 @@ def test_newton_converges_from_anywhere(start_c, sky_c) -> None:
     end_k = solution.temperature_c[mesh.points_m[:, 0] > 0.0999] + 273.15
     sky_k = sky_c + 273.15
     np.testing.assert_allclose(50.0 * (500.0 - end_k) / 0.1, 0.9 * SIGMA * (end_k**4 - sky_k**4), rtol=1e-8, atol=1e-9)
-    assert solution.converged and solution.energy_residual < 1e-9
+    assert solution.energy_residual < 1e-9
     assert 0 < solution.newton_iterations < 25, solution.status
 
 
@@ -65,17 +65,13 @@ def test_radiation_alone_levels_the_body(start_c, sky_c) -> None:
     """Held by nothing but radiation, from 1000 K and to 3 K: the body takes the temperature of what it sees."""
     solution = solve_steady(HeatProblem(slab(start_c), STEEL, effects=(Radiation(("*",), 0.5, sky_c),)))
     np.testing.assert_allclose(solution.temperature_c, sky_c, atol=1e-4)
-    assert solution.converged
 
 
 def test_too_few_newton_steps_are_a_status(monkeypatch) -> None:
     monkeypatch.setattr(implicit_equation, "MAX_ITERATIONS", 2)
     problem = HeatProblem(slab(900.0), STEEL, effects=(Radiation(("*",), 0.9, -270.0),))
-    with pytest.raises(HeatError, match=r"No steady state was found\. Newton's method stopped after 2 steps"):
+    with pytest.raises(HeatError, match="Newton's method stopped after 2 steps"):
         solve_steady(problem)
-    solution = solve_steady(problem, allow_unconverged=True)
-    assert not solution.converged and "Newton's method stopped" in solution.status
-    assert np.isfinite(solution.temperature_c).all()
 
 
 def test_a_loose_piece_is_named() -> None:
@@ -108,7 +104,7 @@ def test_conductivity_contrast(contrast, order) -> None:
     materials = {"block": Material("a", 1.0, 1000.0, 1000.0), "rod": Material("b", contrast, 1000.0, 1000.0)}
     effects = (Convection(("x0",), 10.0, 20.0), FixedTemperature(("x1",), 0.0), Radiation(("z1",), 0.9, 10.0))
     solution = solve_steady(HeatProblem(mesh, materials, effects=effects), order=order)
-    assert solution.converged and solution.energy_residual < 1e-9
+    assert solution.energy_residual < 1e-9
     assert order == 2 or (solution.temperature_c.min() >= -1e-9 and solution.temperature_c.max() <= 20.0 + 1e-9)
 
 

@@ -14,7 +14,7 @@ from thermoxels_ns.fem.runge_kutta import Step
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.time_loop import HeatBalance, solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Radiation
-from thermoxels_ns.heat.sun import moving_sun
+from thermoxels_ns.heat.sky import moving_sun
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 PAPER = TimeSteps(10, 60.0)
@@ -28,16 +28,14 @@ def heat_content(mesh: TetMesh, material, temperature_c: np.ndarray) -> np.ndarr
     return material.heat_capacity_j_m3k * means @ volumes
 
 
-@pytest.mark.parametrize("lumped", [True, False])
 @pytest.mark.parametrize("step_seconds", [1e-2, 60.0, 1e9])
-def test_heat_is_conserved(random_body, concrete, lumped, step_seconds) -> None:
-    solution = solve_heat(HeatProblem(random_body, concrete), TimeSteps(10, step_seconds), lumped=lumped)
+def test_heat_is_conserved(random_body, concrete, step_seconds) -> None:
+    solution = solve_heat(HeatProblem(random_body, concrete), TimeSteps(10, step_seconds))
     content = heat_content(random_body, concrete, solution.temperature_c)
     assert np.abs(content / content[0] - 1.0).max() < 1e-12
     assert solution.energy_residual < 1e-14
     assert solution.energy_residual_of_spread < 1e-12
     np.testing.assert_allclose(solution.heat_content_j, content, rtol=1e-12)
-    assert solution.converged
     assert np.ptp(solution.temperature_c[-1]) < np.ptp(solution.temperature_c[0])  # heat did move
 
 
@@ -65,20 +63,16 @@ def test_uniform_temperature_does_not_change_at_all(random_body, concrete, tempe
     assert solution.energy_residual == 0.0 and solution.energy_residual_of_spread == 0.0
 
 
-def test_failure_to_converge_raises_and_can_be_a_status(random_body, concrete, monkeypatch) -> None:
+def test_failure_to_converge_raises(random_body, concrete, monkeypatch) -> None:
     monkeypatch.setattr("thermoxels_ns.fem.implicit_equation.MOST_UNBALANCED", 0.0)
-    problem = HeatProblem(random_body, concrete)
     with pytest.raises(HeatError, match=r"Step 1 of 10 failed.*are not balanced"):
-        solve_heat(problem, PAPER)
-    solution = solve_heat(problem, PAPER, allow_unconverged=True)
-    assert not solution.converged and "Step 1 of 10 failed" in solution.status
-    assert len(solution.times_s) == 1 and solution.heat_w.shape == (0,)
+        solve_heat(HeatProblem(random_body, concrete), PAPER)
 
 
 def test_states_that_do_not_fit_into_memory_are_refused(random_body, concrete, monkeypatch) -> None:
     nodes = len(random_body.points_m)
     monkeypatch.setattr("thermoxels_ns.fem.time_loop.MAX_STATE_BYTES", 11 * nodes * 8)
-    assert solve_heat(HeatProblem(random_body, concrete), PAPER).converged
+    assert len(solve_heat(HeatProblem(random_body, concrete), PAPER).times_s) == 11
     with pytest.raises(
         HeatError, match=rf"12 times x {nodes} nodes x 8 bytes = {12 * nodes * 8} .*Take at most 10 steps,"
     ):
@@ -113,7 +107,7 @@ def test_heat_that_nothing_accounts_for_is_told_beside_what_is_stored() -> None:
     balance = HeatBalance(system, states.copy(), np.array([0.0, 60.0]))
     step = Step(states[1], np.zeros(0), 1, 0, np.nan, True, "")
     balance.add(step, 60.0, ends_interval=True)
-    found = balance.close("", True, adaptive=False)
+    found = balance.close("", adaptive=False)
     assert found.energy_residual_of_spread == pytest.approx(0.1 / 3.0, rel=1e-9)
     assert found.energy_residual == pytest.approx(0.1 / 273.15, rel=1e-9)
 

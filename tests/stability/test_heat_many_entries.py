@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -57,43 +58,40 @@ def entries(count: int, alike: bool = False) -> tuple[tuple[Convection, ...], tu
     return tuple(airs), tuple(HeatFlux(name, 1e-9) for name in names)
 
 
-AIR = "convection: [{patches: ['*'], air_c: 5.0, coefficient_w_m2k: 5.0}]"
-WORK: dict[str, tuple[bool, Callable[[HeatProblem], Any]]] = {
-    "labels of effects alike": (True, effect_labels),
-    "assembling": (False, HeatSystem),
-    "leaving out": (False, lambda problem: _weak(problem, TimeSteps(2, 60.0), 0.01)),
-    "leaving out, steady": (False, lambda problem: _weak(problem, None, 0.01)),
+def from_file(folder: Path, count: int) -> Callable[[], Any]:
+    path, rows = folder / f"{count}.yaml", [f"  - {{patches: [p{n}], flux_w_m2: {n}.5}}" for n in range(count)]
+    air = "convection: [{patches: ['*'], air_c: 5.0, coefficient_w_m2k: 5.0}]"
+    path.write_text("\n".join(['materials: {"*": concrete}', "steady: true", air, "heat_flux:", *rows]))
+    mesh = many_patches(count)
+    return lambda: load_heat_scene(path).problem(mesh)
+
+
+def of_problem(work: Callable[[HeatProblem], Any], alike: bool = False) -> Callable[[Path, int], Callable[[], Any]]:
+    def make(_: Path, count: int) -> Callable[[], Any]:
+        effects = sum(entries(count, alike), ())
+        return partial(work, HeatProblem(many_patches(count), CONCRETE, effects=effects))
+
+    return make
+
+
+def of_scene(_: Path, count: int) -> Callable[[], Any]:
+    airs, fluxes = entries(count)
+    return partial(HeatScene({"*": CONCRETE}, convection=airs, heat_flux=fluxes).problem, many_patches(count))
+
+
+WORK = {
+    "labels of effects alike": of_problem(effect_labels, alike=True),
+    "assembling": of_problem(HeatSystem),
+    "leaving out": of_problem(lambda problem: _weak(problem, TimeSteps(2, 60.0), 0.01)),
+    "leaving out, steady": of_problem(lambda problem: _weak(problem, None, 0.01)),
+    "scene": of_scene,
+    "file": from_file,
 }
 
 
-@pytest.mark.parametrize("name", list(WORK))
-def test_twice_the_entries_are_about_twice_the_work(name) -> None:
-    alike, work = WORK[name]
-    few, many = (
-        lines_run(partial(work, HeatProblem(many_patches(count), CONCRETE, effects=sum(entries(count, alike), ()))))
-        for count in (60, 120)
-    )
-    assert many < MOST_RATIO * few, (few, many)
-
-
-def test_twice_the_entries_of_a_scene_are_about_twice_the_work() -> None:
-    few, many = (
-        lines_run(
-            partial(HeatScene({"*": CONCRETE}, convection=airs, heat_flux=fluxes).problem, many_patches(len(airs)))
-        )
-        for airs, fluxes in map(entries, (60, 120))
-    )
-    assert many < MOST_RATIO * few, (few, many)
-
-
-def test_twice_the_entries_of_a_file_are_about_twice_the_work(tmp_path) -> None:
-    def lines_of(count: int) -> int:
-        path, rows = tmp_path / f"{count}.yaml", [f"  - {{patches: [p{n}], flux_w_m2: {n}.5}}" for n in range(count)]
-        path.write_text("\n".join(['materials: {"*": concrete}', "steady: true", AIR, "heat_flux:", *rows]))
-        mesh = many_patches(count)
-        return lines_run(lambda: load_heat_scene(path).problem(mesh))
-
-    few, many = map(lines_of, (150, 300))
+@pytest.mark.parametrize("name", WORK)
+def test_twice_the_entries_are_about_twice_the_work(name, tmp_path) -> None:
+    few, many = (lines_run(WORK[name](tmp_path, count)) for count in (60, 120))
     assert many < MOST_RATIO * few, (few, many)
 
 

@@ -24,11 +24,7 @@ def test_these_meshes_do_have_obtuse_angles() -> None:
         matrix = stiffness(mesh.points_m, mesh.tets).tocoo()
         off = matrix.row != matrix.col
         assert (matrix.data[off] / matrix.diagonal()[matrix.row[off]]).max() > least
-
-
-def test_one_of_them_is_as_bad_as_is_promised() -> None:
-    quality = check_mesh(body(AT_THE_BOUNDS))
-    low, high = ANGLE_BOUNDS_DEG
+    quality, (low, high) = check_mesh(body(AT_THE_BOUNDS)), ANGLE_BOUNDS_DEG
     assert low <= quality.dihedral_range_deg[0] <= low + 0.2 and high - 0.2 <= quality.dihedral_range_deg[1] <= high
 
 
@@ -92,18 +88,6 @@ def test_a_wall_of_one_element() -> None:
         assert faults(solve_heat(problem, TimeSteps(3, fourier * STEP_S)), -30.0, 90.0) == []
 
 
-def test_a_disconnected_piece() -> None:
-    points = centres(14, 7, 7)
-    distance = np.minimum(
-        np.linalg.norm(points - [-3.5, 0.1, 0.2], axis=-1), np.linalg.norm(points - [3.6, 0.1, 0.2], axis=-1)
-    )
-    mesh = stuffed(np.clip(2.3 - distance, -1.0, 1.0), spots)
-    problem = HeatProblem(mesh, CONCRETE, effects=(FixedTemperature(("x0",), 50.0),))
-    assert faults(solve_heat(problem, TimeSteps(2, 1e9)), -30.0, 90.0) == []
-    with pytest.raises(HeatError, match="none on 1 of 2 pieces"):
-        solve_steady(problem)
-
-
 @pytest.mark.parametrize("shape", ["regular", "sphere", AT_THE_BOUNDS])
 @pytest.mark.parametrize("temperature_c", [-273.15, -273.1499])
 def test_near_absolute_zero(shape, temperature_c) -> None:
@@ -117,7 +101,7 @@ def jump() -> HeatProblem:
     return HeatProblem(body("sphere"), CONCRETE, effects=(FixedTemperature(("x1",), 100.0),))
 
 
-@pytest.mark.parametrize("options", [{}, {"scheme": CRANK_NICOLSON}, {"scheme": SDIRK2}, {"lumped": False}])
+@pytest.mark.parametrize("options", [{}, {"scheme": CRANK_NICOLSON}, {"scheme": SDIRK2}])
 def test_steps_say_when_a_temperature_leaves_its_range(options) -> None:
     solution = solve_heat(jump(), TimeSteps(2, 1e-2 * STEP_S), **options)
     beyond_k = 20.0 - float(solution.temperature_c.min())

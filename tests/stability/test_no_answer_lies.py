@@ -17,7 +17,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.implicit_equation import MOST_UNBALANCED
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, theta_scheme
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import NOTHING
 from thermoxels_ns.fem.time_loop import solve_heat
@@ -30,7 +30,8 @@ CASES = {"steady P1": 200, "steady P2": 150, "in time": 150}
 ANSWERED = {"steady P1": 179, "steady P2": 119, "in time": 131}
 """How many of them are answered; in the others the solver says that it cannot. Of all, 205 are ordinary."""
 HOSTILE = ("flat", "contrast", "size", "convection", "temperatures", "turned", "start")
-SCHEMES = (BACKWARD_EULER, CRANK_NICOLSON, theta_scheme(0.75), SDIRK2, None)
+THETA = Scheme("theta = 0.75", 1, (0.0, 1.0), ((0.0, 0.0), (0.25, 0.75)))
+SCHEMES = (BACKWARD_EULER, CRANK_NICOLSON, THETA, SDIRK2, None)
 """None: steps as long as a tolerance allows."""
 _MESH = 3.0  # To which factor the estimate of the mesh's error is right
 _STEPS = 3.0  # The same of the steps' error

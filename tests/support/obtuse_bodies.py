@@ -99,7 +99,7 @@ def spots(points: np.ndarray) -> np.ndarray:
 
 
 def faults(solution: HeatSolution, low: float, high: float, shape: str = "shaken") -> list[str]:
-    """What is wrong: not converged, not finite, not balanced, or out of range without a word or by too much.
+    """What is wrong: not finite, not balanced, or out of range without a word or by too much.
 
     Without obtuse angles, in the first two of `BLOCKS`, no temperature leaves its range but by round-off.
     """
@@ -107,7 +107,6 @@ def faults(solution: HeatSolution, low: float, high: float, shape: str = "shaken
     most_k = (1e-8 if shape in BLOCKS[:2] else MOST_OVERSHOOT) * (high - low)
     beyond_k = max(low - float(temperature_c.min()), float(temperature_c.max()) - high)
     found = {
-        "not converged": not solution.converged,
         "not finite": not np.isfinite(temperature_c).all(),
         f"energy {solution.energy_residual:.1e}": not solution.energy_residual < 1e-9,
         f"spread {solution.energy_residual_of_spread:.1e}": not solution.energy_residual_of_spread < 1e-9,

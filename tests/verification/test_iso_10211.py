@@ -2,8 +2,12 @@
 
 A program is a three-dimensional steady-state high precision method if its temperatures are within 0.1 C of the listed
 ones, its heat flow is within 0.1 W/m in case 2 and within 1 % in case 3, and flows change by less than 1 % when the
-number of subdivisions is doubled. Case 4, a bar through insulation, is beside them.
+number of subdivisions is doubled. Case 4, a
+bar through insulation, has figures of 0.540 W and 0.805 C in validation reports of other programs, which ask for 1 % of
+the flow and 0.005 C.
 """
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,8 +21,6 @@ from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import Convection, FixedTemperature
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-
-BOUNDARIES = pytest.mark.parametrize("lumped_boundary", [True, False])
 
 
 def conductor(name: str, conductivity_w_mk: float) -> Material:
@@ -71,9 +73,8 @@ CASE_2 = {
 """x and z in mm, temperature in C."""
 
 
-@BOUNDARIES
 @pytest.mark.parametrize("parts", [1, 2])
-def test_case_2_metal_faced_wall(lumped_boundary, parts) -> None:
+def test_case_2_metal_faced_wall(parts) -> None:
     """Concrete, wood, insulation and an aluminium profile that bends into the wall; flow per metre of depth."""
     x = 1e-3 * np.unique(
         np.concatenate(
@@ -100,19 +101,18 @@ def test_case_2_metal_faced_wall(lumped_boundary, parts) -> None:
     materials = {"insulation": 0.029, "concrete": 1.15, "wood": 0.12, "aluminium": 230.0}
     effects = (Convection(("z1",), 1 / 0.06, 0.0), Convection(("z0",), 1 / 0.11, 20.0))
     problem = HeatProblem(mesh, {name: conductor(name, k) for name, k in materials.items()}, effects=effects)
-    solution = solve_steady(problem, lumped_boundary=lumped_boundary)
+    solution = solve_steady(problem)
     flow_w_m = solution.effects[1].heat_w[0] / depth
     assert flow_w_m == pytest.approx(9.5, abs=0.1) and solution.energy_residual < 1e-9
     for name, (px, pz, listed) in CASE_2.items():
         assert at(mesh, solution, 1e-3 * px, 0.0, 1e-3 * pz) == pytest.approx(listed, abs=0.1), name
 
 
-@BOUNDARIES
-def test_case_3_corner_with_a_balcony(lumped_boundary) -> None:
+def test_case_3_corner_with_a_balcony() -> None:
     flows = []
     for finest in (0.025, 0.0125):
         problem = building_corner(lambda *knots, f=finest: graded(*knots, finest=f, growth=1.3, coarsest=0.2))
-        mesh, solution = problem.mesh, solve_steady(problem, lumped_boundary=lumped_boundary)
+        mesh, solution = problem.mesh, solve_steady(problem)
         heat_w = [float(heat.heat_w[0]) for heat in solution.effects]
         assert heat_w == pytest.approx(LISTED_W, rel=0.01), len(mesh.tets)
         tags = mesh.boundary
@@ -124,3 +124,71 @@ def test_case_3_corner_with_a_balcony(lumped_boundary) -> None:
         flows.append(heat_w[2])
     assert flows[1] == pytest.approx(flows[0], rel=0.01)
     assert abs(flows[1] + 59.98) < abs(flows[0] + 59.98)
+
+
+@pytest.mark.parametrize("finest", [0.0125, 0.00625])
+def test_case_4_an_iron_bar_through_insulation(finest) -> None:
+    """1 m x 1 m of insulation, 0.2 m thick; the bar, 0.1 m x 0.05 m x 0.6 m, ends at its cold face. A quarter of it."""
+    grading = {"finest": finest, "growth": 1.3, "coarsest": 0.1}
+    x, y, z = (graded(*knots, **grading) for knots in ((0, 0.05, 0.5), (0, 0.025, 0.5), (0, 0.2, 0.6)))
+
+    def insulation(p):
+        return p[..., 2] < 0.2
+
+    def bar(p):
+        return (p[..., 0] < 0.05) & (p[..., 1] < 0.025)
+
+    def cut(c):
+        return (np.minimum(c[:, 0], c[:, 1]) < 1e-9) | (np.maximum(c[:, 0], c[:, 1]) > 0.5 - 1e-9)
+
+    mesh = box_mesh(
+        x,
+        y,
+        z,
+        regions={"insulation": insulation, "bar": bar},
+        patches={
+            "warm": lambda c, n: ~cut(c) & (c[:, 2] > 0.2 - 1e-9),
+            "cold": lambda c, n: ~cut(c) & (c[:, 2] < 1e-9),
+        },
+        keep=lambda p: insulation(p) | bar(p),
+    )
+    materials = {"insulation": conductor("insulation", 0.1), "bar": conductor("iron", 50.0)}
+    effects = (Convection(("warm",), 10.0, 1.0), Convection(("cold",), 10.0, 0.0))
+    solution = solve_steady(HeatProblem(mesh, materials, effects=effects), order=2)
+    assert 4.0 * float(solution.effects[0].heat_w[0]) == pytest.approx(0.540, rel=0.01)
+    assert solution.energy_residual < 1e-9
+    cold = np.abs(mesh.points_m[:, 2]) < 1e-9
+    assert solution.temperature_c[cold].max() == pytest.approx(0.805, abs=0.005)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_case_1_turned_in_space(seed) -> None:
+    """Its directions, its place and the numbers of its nodes are any."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    away = rng.uniform(-50.0, 50.0, 3)
+
+    def sides(places, _):
+        x, _, z = ((places.points_m - away) @ turn).T
+        return np.where(z > 1.0 - 1e-9, np.where(x < 1e-9, 10.0, 20.0), 0.0)
+
+    straight = box_mesh(np.linspace(0, 0.5, 25), [0, 1 / 48], np.linspace(0, 1, 49), temperature_c=5.0)
+    boundary, number = straight.boundary, rng.permutation(len(straight.points_m))
+    assert boundary is not None
+    points = np.empty_like(straight.points_m)
+    points[number] = straight.points_m @ turn.T + away
+    mesh = replace(
+        straight,
+        points_m=points,
+        tets=number[straight.tets],
+        facets=number[straight.facets],
+        boundary=replace(boundary, normal=boundary.normal @ turn.T),
+    )
+    fixed = FixedTemperature(("x0", "z0", "z1"), Varying(sides, in_time=False))
+    solution = solve_steady(HeatProblem(mesh, conductor("any", 1.0), effects=(fixed,)))
+    straight_solution = replace(solution, temperature_c=solution.temperature_c[number])
+    for row, line in enumerate(CASE_1.splitlines(), start=1):
+        for column, listed in enumerate(line.split(), start=1):
+            computed = at(straight, straight_solution, column / 8, 0.0, 1 - row / 8)
+            assert computed == pytest.approx(float(listed), abs=0.1), f"row {row}, column {column}"

@@ -23,9 +23,12 @@ from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection
 from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, support_of_facets
 
-ONLY_THE_SHELL = (
+SKIPPED_EFFECTS = (
+    "Convection: not modelled, the boundary is insulated.",
+    "Thermal radiation: not modelled, the boundary is insulated.",
+    "Solar gain and internal sources: not modelled.",
     "Space that no camera saw and that the mesh leaves empty, such as the inside of a building seen from outside with "
-    "--interior hollow or --wall-thickness. The heat content is that of the mesh."
+    "--interior hollow or --wall-thickness. The heat content is that of the mesh.",
 )
 """What the heat balance of a reconstruction leaves out."""
 
@@ -181,7 +184,7 @@ def heat_summary(material: Material, time: TimeSteps, solution: HeatSolution) ->
         },
         "status": solution.status,
         "iterations": solution.iterations,
-        "skipped_effects": [*solution.skipped_effects, ONLY_THE_SHELL],
+        "skipped_effects": list(SKIPPED_EFFECTS),
     }
 
 

@@ -8,14 +8,14 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from skfem import BilinearForm
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import HeatProblem, Term, effect_labels
 from thermoxels_ns.fem.solution import Assembled
@@ -59,7 +59,7 @@ class _Boundary(ABC):
         self.effect, self.kind, self.facets, self._reference_c = effect, term.kind, facets, reference_c
         self.quantities, self._factor = term.quantities, term.factor
         self.load_in_time = any(quantity.in_time for quantity in term.quantities)
-        """Whether its heat changes with time at one temperature."""
+        """Whether the heat of the term changes with time at one temperature."""
         self.basis = space.surface(facets)
         self.nodes = space.facet_nodes(facets)
         self._numbers, self._space = self.nodes.T.ravel(), space
@@ -78,17 +78,17 @@ class _Boundary(ABC):
     def surface_k(self, relative_k: Vector) -> Vector:
         """Temperature at the points of integration, shape (k, q)."""
         nodal = relative_k[self.nodes]
-        return nodal if self._space.lumped_boundary else np.einsum("ka,aq->kq", nodal, self._shapes)
+        return nodal if self._space.order == 1 else np.einsum("ka,aq->kq", nodal, self._shapes)
 
     def vector(self, flux_w_m2: Vector) -> Vector:
         """Entries integral(q phi_i), [W]; q at the points or even over each triangle."""
         heat_w = flux_w_m2 * self.basis.dx
-        shares = heat_w.T if self._space.lumped_boundary else np.einsum("kq,aq->ak", heat_w, self._shapes)
+        shares = heat_w.T if self._space.order == 1 else np.einsum("kq,aq->ak", heat_w, self._shapes)
         return sums_by_number(self._numbers, shares.ravel(), self._space.num_nodes)
 
     def matrix(self, coefficient_w_m2k: Vector) -> sparse.csr_matrix:
         """Entries integral(h phi_i phi_j), [W / K]; diagonal if points of integration are the nodes."""
-        if self._space.lumped_boundary:
+        if self._space.order == 1:
             matrix = sparse.csr_matrix(sparse.diags(self.vector(coefficient_w_m2k), format="csr"))
         else:
             coefficient = np.broadcast_to(coefficient_w_m2k, self.basis.dx.shape)
@@ -151,25 +151,17 @@ class FluxForm(_Boundary):
 
     def load(self, time_s: float) -> Vector:
         """Entries integral(q phi_i), [W]."""
-        return self.vector(self._given_w_m2(time_s))
+        return self.vector(self.flux_w_m2(np.zeros(0), time_s))
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
         """The flux, [W / m2], whatever the temperature."""
-        return self._given_w_m2(time_s)
-
-    def signs(self, time_s: float) -> tuple[bool, bool]:
-        """Whether it cools and whether it heats somewhere."""
-        flux = self._given_w_m2(time_s)
-        return bool(np.any(flux < 0.0)), bool(np.any(flux > 0.0))
-
-    def _given_w_m2(self, time_s: float) -> Vector:
         return math.prod((self.at(number, time_s) for number in range(len(self.quantities))), start=np.ones(1))
 
 
 class SourceForm:
     """A given heat source: a load."""
 
-    def __init__(self, effect: str, term: Term, space: Space) -> None:
+    def __init__(self, effect: str, term: Term, space: Space, _: float) -> None:
         self.effect, self.kind, self._tets, self._space = effect, term.kind, term.parts, space
         self._source = term.quantities[0]
         self._places, self._volumes = space.source_points(term.parts)
@@ -181,23 +173,15 @@ class SourceForm:
 
     def load(self, time_s: float) -> Vector:
         """Entries integral(s phi_i), [W]."""
-        return self._space.source_load(self._tets, self._heat_w(time_s))
+        return self._space.source_load(self._tets, self.part_heat_w(np.zeros(0), time_s))
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat set free at each point of integration, [W], whatever the temperature."""
-        return self._heat_w(time_s)
+        return self._source.at(self._places, time_s) * self._volumes
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat set free in each region, [W]."""
-        return sums_by_number(self._group, self._heat_w(time_s), len(self.groups))
-
-    def signs(self, time_s: float) -> tuple[bool, bool]:
-        """Whether it cools and whether it heats somewhere."""
-        heat = self._heat_w(time_s)
-        return bool(np.any(heat < 0.0)), bool(np.any(heat > 0.0))
-
-    def _heat_w(self, time_s: float) -> Vector:
-        return self._source.at(self._places, time_s) * self._volumes
+        return sums_by_number(self._group, self.part_heat_w(np.zeros(0), time_s), len(self.groups))
 
 
 class RadiationForm(_Exchange):
@@ -231,7 +215,7 @@ class FixedForm:
 
     def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
         selection = space.selection
-        self.effect, self.facets, self.reference_c = effect, term.parts, reference_c
+        self.effect, self.kind, self.facets, self.reference_c = effect, term.kind, term.parts, reference_c
         self.owners: npt.NDArray[np.int64] = space.facet_nodes(term.parts)
         """Nodes of each triangle, shape (k, m)."""
         self.nodes = np.unique(self.owners)
@@ -306,35 +290,22 @@ class FixedNodes:
 
     def _temperature_k(self, time_s: float) -> Vector:
         known = np.full(len(self.nodes), np.nan)
-        for number, form in enumerate(self._forms):
-            place, wanted = self._places[number], form.surroundings_k(time_s)
+        for form in self._forms:
+            place, wanted = np.searchsorted(self.nodes, form.nodes), form.surroundings_k(time_s)
             clash = np.abs(known[place] - wanted) > _SAME_TEMPERATURE_K
             if clash.any():
-                raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
+                first, second = (part[clash][0] + form.reference_c for part in (known[place], wanted))
+                node = form.nodes[clash][0]
+                raise HeatError(
+                    "fixed temperature",
+                    expected="one temperature at each node",
+                    got=f"{first:g} C and {second:g} C from {form.effect} at node {node} and"
+                    f" {np.count_nonzero(clash) - 1} more",
+                    remedy="Let one effect fix all patches that meet, with a Varying that says what holds there.",
+                )
             known[place] = wanted
         known.setflags(write=False)
         return known
-
-    @cached_property
-    def _places(self) -> list[npt.NDArray[np.int64]]:
-        """Where the nodes of each form stand in `nodes`."""
-        return [np.searchsorted(self.nodes, form.nodes) for form in self._forms]
-
-    def _explain_clash(self, number: int, nodes: npt.NDArray[np.int64], wanted: Vector, time_s: float) -> str:
-        form = self._forms[number]
-        others = [other for other in self._forms if other is not form and np.isin(other.nodes, nodes).any()]
-        other = others[0]
-        place = np.flatnonzero(np.isin(other.nodes, nodes))
-        node = int(other.nodes[place[0]])
-        first = other.surroundings_k(time_s)[place[0]] + other.reference_c
-        second = wanted[np.flatnonzero(nodes == node)[0]] + form.reference_c
-        return explain(
-            "fixed temperature",
-            expected="one temperature at each node",
-            got=f"{first:g} C from {other.effect} and {second:g} C from {form.effect} at node {node} "
-            f"and {len(nodes) - 1} more",
-            remedy="Let one effect fix all patches that meet, with a Varying that says what holds where they do.",
-        )
 
 
 @dataclass(frozen=True)
@@ -360,20 +331,21 @@ def effect_forms(
     `assembled` counts fixed temperatures, which are ready at once. Raises `HeatError` if the mesh lacks a patch or
     region of an effect.
     """
-    convection, loads, radiation, fixed = [], [], [], []
+    made = {
+        "convection": ConvectionForm,
+        "flux": FluxForm,
+        "source": SourceForm,
+        "radiation": RadiationForm,
+        "fixed": FixedForm,
+    }
+    forms: list[Any] = []
     for label, effect in zip(effect_labels(problem), problem.effects):
         term = effect.term(space.selection)
-        if not len(term.parts):
-            continue
-        if term.kind == "convection":
-            convection.append(ConvectionForm(label, term, space, reference_c))
-        elif term.kind == "flux":
-            loads.append(FluxForm(label, term, space, reference_c))
-        elif term.kind == "source":
-            loads.append(SourceForm(label, term, space))
-        elif term.kind == "radiation":
-            radiation.append(RadiationForm(label, term, space, reference_c))
-        else:
-            with nullcontext() if assembled is None else assembled.form("fixed"):
-                fixed.append(FixedForm(label, term, space, reference_c))
-    return EffectForms(tuple(convection), tuple(loads), tuple(radiation), tuple(fixed))
+        if len(term.parts):
+            with assembled.form("fixed") if assembled and term.kind == "fixed" else nullcontext():
+                forms.append(made[term.kind](label, term, space, reference_c))
+
+    def of(*kinds: str) -> tuple[Any, ...]:
+        return tuple(form for form in forms if form.kind in kinds)
+
+    return EffectForms(of("convection"), of("flux", "source"), of("radiation"), of("fixed"))

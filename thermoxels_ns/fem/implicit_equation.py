@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -163,12 +162,6 @@ class Residual:
     round_off_w: float  # What floating point leaves of the sums of all nodes, [W]
 
     @cached_property
-    def is_round_off(self) -> bool:
-        """Whether it is nothing but round-off, at all nodes together and in every piece."""
-        in_pieces = bool(np.all(np.abs(self.piece_w) <= _ROUND_OFF * self.moved_w))
-        return in_pieces and self.unbalanced_w <= self.round_off_w
-
-    @cached_property
     def unbalanced_w(self) -> float:
         """Sum of the sizes of what is not balanced at nodes, [W].
 
@@ -182,10 +175,11 @@ class Residual:
         """Sum of the sizes of what is not balanced in pieces without fixed nodes, [W]."""
         return float(np.sum(np.abs(self.piece_w)))
 
-    @property
-    def uncertain_w(self) -> float:
-        """What is not balanced at nodes, with what round-off may hide, [W]."""
-        return self.unbalanced_w + self.round_off_w
+    @cached_property
+    def is_round_off(self) -> bool:
+        """Whether the residual is nothing but round-off, at all nodes together and in every piece."""
+        in_pieces = bool(np.all(np.abs(self.piece_w) <= _ROUND_OFF * self.moved_w))
+        return in_pieces and self.unbalanced_w <= self.round_off_w
 
 
 @dataclass(frozen=True)
@@ -212,27 +206,26 @@ class ImplicitEquation:
 
     Conduction moves heat within a connected piece and never out of it: what a piece without fixed nodes stores and
     exchanges sets its mean change. In long steps of insulated pieces the matrix is all but singular, and the linear
-    solver would lose that mean; so it is set apart from it.
+    solver would lose that mean; so the mean is solved for apart from the rest.
     """
 
     def __init__(self, system: HeatSystem, time_s: float, step_s: float, *, relative_tolerance: float) -> None:
         """Assemble the matrix at a time, for a step of a length, [s]; infinite for a steady state."""
-        self.system, self.step_s, self._relative_tolerance = system, step_s, relative_tolerance
-        self._free = system.fixed.free if len(system.fixed.nodes) else None
+        self._system, self._step_s, self._relative_tolerance = system, step_s, relative_tolerance
         convection = system.convection_matrix(time_s)
-        self.row_sums_w_k: Vector = np.zeros(system.num_nodes)
+        self._row_sums_w_k: Vector = np.zeros(system.num_nodes)
         """Row sums of M / step + R, shape (n,), [W / K]: of the matrix too, because those of K are 0, but exact."""
         if convection is not None:
-            self.row_sums_w_k += convection @ np.ones(system.num_nodes)
-        self.sizes_w_k: Vector = system.stiffness.diagonal() + self.row_sums_w_k
+            self._row_sums_w_k += convection @ np.ones(system.num_nodes)
+        self._sizes_w_k: Vector = system.stiffness.diagonal() + self._row_sums_w_k
         """Diagonal of K + R, about, whose round-off counts, shape (n,), [W / K]."""
         if np.isfinite(step_s):
-            self.row_sums_w_k += system.nodal_mass_j_k / step_s
-        self.matrix: sparse.csr_matrix = self._free_block(system.matrix(time_s, step_s))
+            self._row_sums_w_k += system.nodal_mass_j_k / step_s
+        self._matrix: sparse.csr_matrix = self._free_block(system.matrix(time_s, step_s))
         """M / step + K + R between free nodes."""
-        self.floating: npt.NDArray[np.bool_] = ~system.pieces.touched(system.fixed.nodes)
+        self._floating: npt.NDArray[np.bool_] = ~system.pieces.touched(system.fixed.nodes)
         """Pieces without fixed nodes, shape (p,)."""
-        self._rough_solver: LinearSolver | None = None
+        self._solvers: dict[float, LinearSolver] = {}
 
     def solve(self, start_k: Vector, time_s: float, given_w: Vector | None = None) -> ImplicitSolution:
         """Find the temperatures at the end from T_0, shape (n,), [K]; earlier stages give `given_w`, shape (n,), [W].
@@ -242,200 +235,156 @@ class ImplicitEquation:
         function along it: no damping factor is guessed, and the method converges from any start. Without radiation its
         first step is the solution, and further ones correct what the linear solver left.
         """
-        balance, fixed, nonlinear = _Balance(self, start_k, time_s, given_w), self.system.fixed, self.system.nonlinear
-        change_k = np.zeros(self.system.num_nodes)
+        fixed, nonlinear, change_k = self._system.fixed, self._system.nonlinear, np.zeros(self._system.num_nodes)
         if len(fixed.nodes):
             change_k[fixed.nodes] = fixed.temperature_k(time_s) - start_k[fixed.nodes]
-        rest = balance.residual(change_k)
-        if rest.is_round_off:
-            status = "The temperature is level: nothing flows."
-            return balance.solution(change_k, rest, 0, 0, status, True)
+        rest = self._residual(start_k, change_k, time_s, given_w)
+        count, spent, settled = 0, 0, rest.is_round_off
+        status = "The temperature is level: nothing flows." if settled else ""
         balanced = max(_BALANCED, _BALANCED_OVER_TOLERANCE * self._relative_tolerance)
-        settled, count, spent, status = False, 0, 0, ""
-        most = MAX_ITERATIONS if nonlinear else MOST_CORRECTIONS
+        most = 0 if settled else MAX_ITERATIONS if nonlinear else MOST_CORRECTIONS
+        tolerance = _NEWTON_TOLERANCE if nonlinear else self._relative_tolerance
         while count < most and np.isfinite(rest.unbalanced_w):
-            direction, linear = self._newton_direction(balance, change_k, rest)
-            spent, count = spent + linear.iterations, count + 1
-            length = _length(balance, change_k, direction) if nonlinear else 1.0
-            settled = not nonlinear or balance.is_short(change_k, direction, _SETTLED)
+            now_k = start_k + change_k
+            direction, linear = self._correction(rest.heat_w, rest.piece_w, now_k, time_s, tolerance)
+            spent, count, status = spent + linear.iterations, count + 1, linear.status
+            length = self._length(now_k, direction, rest.heat_w, time_s) if nonlinear else 1.0
+            settled = not nonlinear or self._is_short(now_k, direction, _SETTLED)
             then_k = change_k + length * direction
-            then = balance.residual(then_k)
+            then = self._residual(start_k, then_k, time_s, given_w)
             better = then.unbalanced_w < 0.5 * rest.unbalanced_w or then.floating_w < 0.5 * rest.floating_w
             if better or not settled or then.unbalanced_w < rest.unbalanced_w:
                 change_k, rest = then_k, then
-            status = linear.status
             done = settled and (rest.unbalanced_w <= balanced * rest.flows_w or rest.is_round_off or not better)
             if done or not (linear.converged or better):
                 break
-        if nonlinear:
+        if nonlinear and most:
             status = f"Newton's method {'ended' if settled else 'stopped'} after {count} steps. {status}"
-        return balance.solution(change_k, rest, spent, count if nonlinear else 0, status, settled)
+        now_k, uncertain_w, flows_w = start_k + change_k, rest.unbalanced_w + rest.round_off_w, rest.flows_w
+        if not uncertain_w <= MOST_UNBALANCED * flows_w:
+            # What two effects bring to and take from the same node is not in the sum over nodes.
+            groups_w = self._system.group_heat_w(now_k, time_s)
+            flows_w = max(flows_w, 0.5 * float(np.sum(np.abs(groups_w))))
+        balances = rest.is_round_off or uncertain_w <= MOST_UNBALANCED * flows_w or self._is_still(now_k, rest, time_s)
+        if settled and not balances:
+            status += (
+                f" {uncertain_w:.1e} W of {flows_w:.1e} W are not balanced: cells are too flat, or conductivities or "
+                "coefficients of convection too far apart, for the digits of floating point."
+            )
+        newton = count if nonlinear else 0
+        return ImplicitSolution(
+            now_k, change_k, uncertain_w, flows_w, spent, newton, converged=settled and balances, status=status
+        )
 
     def damped(self, heat_w: Vector, piece_w: Vector, relative_k: Vector, time_s: float) -> Vector:
         """Solve (M / step + K + R + slope of radiation) e = heat roughly, for error estimates; shape (n,), [K].
 
         `piece_w` is the heat of each piece without the round-off of conduction; the slope is that at `relative_k`.
         """
-        row_sums_w_k = self.row_sums_w_k
-        if self.system.nonlinear:
-            slope = self.system.radiation_slope(relative_k, time_s)
-            solver = LinearSolver(self.matrix + self._free_block(slope), relative_tolerance=_ESTIMATE_TOLERANCE)
-            row_sums_w_k = row_sums_w_k + slope @ np.ones(self.system.num_nodes)
-        else:
-            if self._rough_solver is None:
-                self._rough_solver = LinearSolver(self.matrix, relative_tolerance=_ESTIMATE_TOLERANCE)
-            solver = self._rough_solver
-        return self._correction(solver, row_sums_w_k, heat_w, piece_w)[0]
-
-    def _newton_direction(self, balance: _Balance, change_k: Vector, rest: Residual) -> tuple[Vector, LinearSolution]:
-        if not self.system.nonlinear:
-            return self._correction(self._own_solver, self.row_sums_w_k, rest.heat_w, rest.piece_w)
-        slope = balance.radiation_slope(change_k)
-        row_sums_w_k = self.row_sums_w_k + slope @ np.ones(self.system.num_nodes)
-        solver = LinearSolver(self.matrix + self._free_block(slope), relative_tolerance=_NEWTON_TOLERANCE)
-        return self._correction(solver, row_sums_w_k, rest.heat_w, rest.piece_w)
-
-    @cached_property
-    def _own_solver(self) -> LinearSolver:
-        return LinearSolver(self.matrix, relative_tolerance=self._relative_tolerance)
+        return self._correction(heat_w, piece_w, relative_k, time_s, _ESTIMATE_TOLERANCE)[0]
 
     def _correction(
-        self, solver: LinearSolver, row_sums_w_k: Vector, heat_w: Vector, piece_w: Vector
+        self, heat_w: Vector, piece_w: Vector, relative_k: Vector, time_s: float, tolerance: float
     ) -> tuple[Vector, LinearSolution]:
-        """Solve for a change, shape (n,), [K], that takes up heat; arguments as in `Residual`."""
-        if not self.floating.any():
-            linear = solver.solve(self.at_free(heat_w))
+        """Solve for a change, shape (n,), [K], that takes up heat (as in `Residual`), radiation made linear there."""
+        row_sums_w_k, pieces = self._row_sums_w_k, self._system.pieces
+        if self._system.nonlinear:
+            slope = self._system.radiation_slope(relative_k, time_s)
+            row_sums_w_k = row_sums_w_k + slope @ np.ones(self._system.num_nodes)
+            solver = LinearSolver(self._matrix + self._free_block(slope), relative_tolerance=tolerance)
+        else:
+            if tolerance not in self._solvers:
+                self._solvers[tolerance] = LinearSolver(self._matrix, relative_tolerance=tolerance)
+            solver = self._solvers[tolerance]
+        if not self._floating.any():
+            linear = solver.solve(self._at_free(heat_w))
             return self._everywhere(linear.x), linear
-        pieces = self.system.pieces
-        held_w_k = np.where(self.floating, pieces.sums(row_sums_w_k), 1.0)
+        held_w_k = np.where(self._floating, pieces.sums(row_sums_w_k), 1.0)
 
         def share(left_w: Vector) -> Vector:
-            return pieces.at_nodes(np.where(self.floating, left_w / held_w_k, 0.0))
+            return pieces.at_nodes(np.where(self._floating, left_w / held_w_k, 0.0))
 
         # In multiples of the row sums, this shifts the solution by a constant in each piece.
         rest_w = heat_w - share(pieces.sums(heat_w)) * row_sums_w_k
         if np.sum(np.abs(rest_w)) <= _ROUND_OFF * np.sum(np.abs(heat_w)):
             rest_w = np.zeros_like(rest_w)
-        linear = solver.solve(self.at_free(rest_w))
+        linear = solver.solve(self._at_free(rest_w))
         change_k = self._everywhere(linear.x)
         return change_k + share(piece_w - pieces.sums(row_sums_w_k * change_k)), linear
 
-    def at_free(self, nodal: Vector) -> Vector:
-        """Values at the nodes that are not fixed."""
-        return nodal if self._free is None else nodal[self._free]
+    def _at_free(self, nodal: Vector) -> Vector:
+        fixed = self._system.fixed
+        return nodal[fixed.free] if len(fixed.nodes) else nodal
 
     def _free_block(self, matrix: sparse.csr_matrix) -> sparse.csr_matrix:
-        """Rows and columns of the nodes that are not fixed."""
-        return matrix if self._free is None else sparse.csr_matrix(matrix[self._free][:, self._free])
+        fixed = self._system.fixed
+        return sparse.csr_matrix(matrix[fixed.free][:, fixed.free]) if len(fixed.nodes) else matrix
 
     def _everywhere(self, free: Vector) -> Vector:
         """Put 0 at the fixed nodes."""
-        if self._free is None:
-            return free
-        full = np.zeros(self.system.num_nodes)
-        full[self._free] = free
+        full = np.zeros(self._system.num_nodes)
+        full[self._system.fixed.free] = free
         return full
 
-
-class _Balance:
-    """The residual of an implicit equation as a function of the change of all temperatures."""
-
-    def __init__(self, equation: ImplicitEquation, start_k: Vector, time_s: float, given_w: Vector | None) -> None:
-        self._equation, self._start_k, self._time_s, self._given_w = equation, start_k, time_s, given_w
-
-    def residual(self, change_k: Vector) -> Residual:
+    def _residual(self, start_k: Vector, change_k: Vector, time_s: float, given_w: Vector | None) -> Residual:
         """Heat that is not balanced after a change of the temperatures, shape (n,), [K]."""
-        equation, system, now_k = self._equation, self._equation.system, self._start_k + change_k
+        system, now_k = self._system, start_k + change_k
         pieces, conducted_w = system.pieces, system.conducted_heat(now_k)
         kept_w, moved_w = np.zeros(system.num_nodes), np.zeros(system.num_nodes)
         if system.exchanges:
-            for part_w in system.exchange_parts(now_k, self._time_s):
+            for part_w in system.exchange_parts(now_k, time_s):
                 kept_w, moved_w = kept_w + part_w, moved_w + np.abs(part_w)
-        if np.isfinite(equation.step_s):
-            stored_w = system.mass_product(change_k) / equation.step_s
+        if np.isfinite(self._step_s):
+            stored_w = system.nodal_mass_j_k * change_k / self._step_s
             kept_w, moved_w = kept_w - stored_w, moved_w + np.abs(stored_w)
         fixed = system.fixed.nodes
         flows_w = float(np.sum(moved_w) + np.sum(np.abs(kept_w[fixed] - conducted_w[fixed])))
-        if self._given_w is not None:
-            kept_w, moved_w = kept_w + self._given_w, moved_w + np.abs(self._given_w)
+        if given_w is not None:
+            kept_w, moved_w = kept_w + given_w, moved_w + np.abs(given_w)
         heat_w = kept_w - conducted_w
         heat_w[fixed] = 0.0
-        sizes_w = equation.sizes_w_k * np.abs(pieces.without_means(now_k))
-        round_off_w = _ROUND_OFF * float(np.sum(equation.at_free(sizes_w + moved_w)))
-        piece_w = np.where(equation.floating, pieces.sums(kept_w), 0.0)
-        moved_w = pieces.sums(moved_w)
-        return Residual(heat_w, piece_w, moved_w, 0.5 * flows_w, round_off_w)
+        sizes_w = self._sizes_w_k * np.abs(pieces.without_means(now_k))
+        round_off_w = _ROUND_OFF * float(np.sum(self._at_free(sizes_w + moved_w)))
+        piece_w = np.where(self._floating, pieces.sums(kept_w), 0.0)
+        return Residual(heat_w, piece_w, pieces.sums(moved_w), 0.5 * flows_w, round_off_w)
 
-    def solution(
-        self, change_k: Vector, rest: Residual, iterations: int, newton_iterations: int, status: str, settled: bool
-    ) -> ImplicitSolution:
-        """Judge what was found by what it leaves unbalanced."""
-        now_k = self._start_k + change_k
-        flows_w = rest.flows_w
-        if not rest.uncertain_w <= MOST_UNBALANCED * flows_w:
-            # What two effects bring to and take from the same node is not in the sum over nodes.
-            groups_w = self._equation.system.group_heat_w(now_k, self._time_s)
-            flows_w = max(flows_w, 0.5 * float(np.sum(np.abs(groups_w))))
-        balanced = rest.is_round_off or rest.uncertain_w <= MOST_UNBALANCED * flows_w
-        converged = settled and (balanced or self._is_still(now_k, rest))
-        if settled and not converged:
-            status += (
-                f" {rest.uncertain_w:.1e} W of {flows_w:.1e} W are not balanced: cells are too flat, or "
-                "conductivities or coefficients of convection too far apart, for the digits of floating point."
-            )
-        how = rest.uncertain_w, flows_w, iterations, newton_iterations, converged, status
-        return ImplicitSolution(now_k, change_k, *how)
-
-    def _is_still(self, now_k: Vector, rest: Residual) -> bool:
+    def _is_still(self, now_k: Vector, rest: Residual, time_s: float) -> bool:
         """Whether next to nothing flows: all temperatures are equal, or each piece is level and balanced as a whole."""
-        equation, system, pieces = self._equation, self._equation.system, self._equation.system.pieces
-        if system.is_still(now_k, self._time_s):
+        system, pieces = self._system, self._system.pieces
+        if system.is_still(now_k, time_s):
             return True
         equal_k = NOTHING * (float(np.abs(now_k).max()) + abs(system.reference_c + ZERO_CELSIUS_K))
         level = bool(np.all(np.abs(pieces.without_means(now_k)) <= equal_k))
-        balanced = equation.floating & (np.abs(rest.piece_w) <= MOST_UNBALANCED * rest.moved_w)
-        return level and bool(np.all(balanced | (rest.moved_w <= equal_k * pieces.sums(equation.row_sums_w_k))))
+        balanced = self._floating & (np.abs(rest.piece_w) <= MOST_UNBALANCED * rest.moved_w)
+        return level and bool(np.all(balanced | (rest.moved_w <= equal_k * pieces.sums(self._row_sums_w_k))))
 
-    def radiation_slope(self, change_k: Vector) -> sparse.csr_matrix:
-        """Minus the derivative of the heat radiated into the body, shape (n, n), [W / K]."""
-        return self._equation.system.radiation_slope(self._start_k + change_k, self._time_s)
-
-    def is_short(self, change_k: Vector, direction: Vector, share: float) -> bool:
+    def _is_short(self, now_k: Vector, direction: Vector, share: float) -> bool:
         """Whether no absolute temperature changes by more than a share of it."""
-        kelvin = self._start_k + change_k + self._equation.system.reference_c + ZERO_CELSIUS_K
+        kelvin = now_k + self._system.reference_c + ZERO_CELSIUS_K
         return bool(np.all(np.abs(direction) <= share * np.maximum(np.abs(kelvin), COLDEST_SLOPE_K)))
 
-    def rise(self, change_k: Vector, direction: Vector) -> Callable[[float], float]:
-        """Slope of the energy along a direction: minus the power of the residual."""
-        equation, free = self._equation, self._equation.at_free(direction)
-        linear_w = self.residual(change_k).heat_w - self._radiated(change_k)
-        constant = float(np.sum(direction * linear_w))
-        curvature = float(np.sum(free * (equation.matrix @ free)))
+    def _length(self, now_k: Vector, direction: Vector, heat_w: Vector, time_s: float) -> float:
+        """Find how much of a direction to go: all of it, or about to where the energy along it is least."""
+        if self._is_short(now_k, direction, _SAFE):
+            return 1.0
+        free = self._at_free(direction)
+        radiated_w = self._system.radiation_load(now_k, time_s)
+        constant, curvature = np.sum(direction * (heat_w - radiated_w)), np.sum(free * (self._matrix @ free))
 
-        def along(length: float) -> float:
-            radiated_w = self._radiated(change_k + length * direction)
-            return length * curvature - constant - float(np.sum(direction * radiated_w))
+        def rise(length: float) -> float:
+            """Slope of the energy along the direction: minus the power of the residual."""
+            then_w = self._system.radiation_load(now_k + length * direction, time_s)
+            return float(length * curvature - constant - np.sum(direction * then_w))
 
-        return along
-
-    def _radiated(self, change_k: Vector) -> Vector:
-        return self._equation.system.radiation_load(self._start_k + change_k, self._time_s)
-
-
-def _length(balance: _Balance, change_k: Vector, direction: Vector) -> float:
-    """Find how much of a direction to go: all of it, or about to where the energy along it is least."""
-    if balance.is_short(change_k, direction, _SAFE):
-        return 1.0
-    rise = balance.rise(change_k, direction)
-    start = rise(0.0)
-    if start >= 0.0 or rise(1.0) <= _ENOUGH * -start:
-        return 1.0
-    left, right = 0.0, 1.0
-    for _ in range(_MOST_SEARCHES):
-        # The zero may lie many powers of ten below 1: a cold body that sees a hot one has next to no slope.
-        middle = 0.25 * right if left == 0.0 else 0.5 * (left + right)
-        value = rise(middle)
-        if abs(value) <= _ENOUGH * -start:
-            return middle
-        left, right = (middle, right) if value < 0.0 else (left, middle)
-    return right
+        start = rise(0.0)
+        if start >= 0.0 or rise(1.0) <= _ENOUGH * -start:
+            return 1.0
+        left, right = 0.0, 1.0
+        for _ in range(_MOST_SEARCHES):
+            # The zero may lie many powers of ten below 1: a cold body that sees a hot one has next to no slope.
+            middle = 0.25 * right if left == 0.0 else 0.5 * (left + right)
+            value = rise(middle)
+            if abs(value) <= _ENOUGH * -start:
+                return middle
+            left, right = (middle, right) if value < 0.0 else (left, middle)
+        return right

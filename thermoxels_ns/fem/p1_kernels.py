@@ -66,7 +66,7 @@ def mesh_edges(tets: npt.NDArray[np.int64], num_nodes: int) -> MeshEdges:
     >>> np.column_stack([edges.smaller_nodes(), edges.other]).tolist()
     [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]
     """
-    tets = _checked_tets(tets, num_nodes)
+    tets = np.ascontiguousarray(tets, np.int64)
     end, other = np.zeros(num_nodes + 1, np.int64), np.empty(6 * len(tets), np.int32)
     first, mark = np.zeros(num_nodes + 1, np.int64), np.full(num_nodes, -1, np.int32)
     kept = _unique_edges(tets, end, other, first, mark)
@@ -74,99 +74,68 @@ def mesh_edges(tets: npt.NDArray[np.int64], num_nodes: int) -> MeshEdges:
 
 
 def stiffness_matrix(
-    points_m: Vector, tets: Numbers, conductivity_w_mk: float | Vector, *, edges: MeshEdges | None = None
+    points_m: Vector, tets: Numbers, conductivity_w_mk: Vector, *, edges: MeshEdges | None = None
 ) -> sparse.csr_matrix:
     """Assemble K, entries k * integral(grad phi_i . grad phi_j), shape (n, n), [W / K], symmetric bit for bit.
 
-    It is what `space.conduction` gives through scikit-fem, in a tenth of the time and of the memory of whole runs
+    The result is that of `space.conduction` through scikit-fem, in a tenth of the time and of the memory of whole runs
     (`tests/benchmarks/heat_speed.py`). In a tetrahedron with faces opposite i and j of outward area vectors n_i and
     n_j, the entry is k n_i . n_j / (9 V), and 0 where the angle between the faces is right up to round-off of the
-    coordinates.
-
-    Nodes have shape (n, 3), [m], positively oriented tetrahedra (t, 4); the conductivity, [W / (m K)], is one for all
-    or one per tetrahedron, shape (t,). Raises `HeatError` if an array has the wrong shape, a conductivity is not above
-    0, a node number is out of range or a tetrahedron is flat or inverted.
+    coordinates. Nodes have shape (n, 3), [m], the conductivity (t,), [W / (m K)], above 0; `refuse_flat_tets` accepts
+    the tetrahedra, shape (t, 4).
 
     >>> corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    >>> (6 * stiffness_matrix(corner, np.array([[0, 1, 2, 3]]), 1.0)).toarray().round(12).tolist()
+    >>> (6 * stiffness_matrix(corner, np.array([[0, 1, 2, 3]]), np.ones(1))).toarray().round(12).tolist()
     [[3.0, -1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 1.0]]
     """
-    points_m, tets, unit_m = _checked(points_m, tets)
+    points_m, tets, unit_m = _prepared(points_m, tets)
     edges = mesh_edges(tets, len(points_m)) if edges is None else edges
-    conductivity = _per_tet("conductivity_w_mk", conductivity_w_mk, len(tets))
     coupling = np.zeros(len(edges.other))
-    flat = _add_couplings(points_m, tets, conductivity, 1.0 / unit_m, edges.first, edges.other, coupling)
-    _refuse_flat(flat, len(tets))
+    _add_couplings(points_m, tets, conductivity_w_mk, 1.0 / unit_m, edges.first, edges.other, coupling)
     coupling *= unit_m
     # A constant has no gradient: what couples a node to the others sums to 0.
     diagonal = np.zeros(edges.num_nodes)
     diagonal -= np.bincount(edges.smaller_nodes(), coupling, edges.num_nodes)
     diagonal -= np.bincount(edges.other, coupling, edges.num_nodes)
-    return _symmetric_matrix(edges, coupling, diagonal)
-
-
-def lumped_mass(points_m: Vector, tets: Numbers, heat_capacity_j_m3k: float | Vector) -> Vector:
-    """Compute rho c * integral(phi_i) for every node, the row sums of the mass matrix, shape (n,), [J / K].
-
-    With non-obtuse tetrahedra, such as those of a lattice, backward Euler with this mass keeps every temperature
-    within the initial range for any step length (Li and Huang, arXiv 1209.5657).
-    """
-    points_m, tets, unit_m = _checked(points_m, tets)
-    capacity = _per_tet("heat_capacity_j_m3k", heat_capacity_j_m3k, len(tets))
-    nodal = np.zeros(len(points_m))
-    _refuse_flat(_add_capacities(points_m, tets, capacity, 1.0 / unit_m, nodal), len(tets))
-    return nodal * unit_m**3
-
-
-def refuse_flat_tets(points_m: npt.NDArray[np.float64], tets: npt.NDArray[np.int64]) -> None:
-    """Raise `HeatError` if points or tetrahedra have the wrong shape or range, or tetrahedra are inverted or flat."""
-    points_m, tets, unit_m = _checked(points_m, tets)
-    _refuse_flat(_count_flat(points_m, tets, 1.0 / unit_m), len(tets))
-
-
-def _symmetric_matrix(edges: MeshEdges, edge_values: Vector, diagonal: Vector) -> sparse.csr_matrix:
-    """Put one value per edge and one per node into a matrix, symmetric bit for bit; zeros at edges are not stored."""
-    kept = np.flatnonzero(edge_values)
-    rows = np.searchsorted(kept, edges.first).astype(np.int32)
-    shape = (edges.num_nodes, edges.num_nodes)
-    upper = sparse.csr_matrix((edge_values[kept], edges.other[kept], rows), shape=shape)
+    kept = np.flatnonzero(coupling)
+    rows, shape = np.searchsorted(kept, edges.first).astype(np.int32), (edges.num_nodes, edges.num_nodes)
+    upper = sparse.csr_matrix((coupling[kept], edges.other[kept], rows), shape=shape)
     return sparse.csr_matrix(upper + upper.T.tocsr() + sparse.diags(diagonal, format="csr"))
 
 
-def _checked(points_m: Vector, tets: Numbers) -> tuple[Vector, Numbers, float]:
-    """Check the arrays; find the power of 2 above all coordinates: in that unit nothing over- or underflows."""
+def lumped_mass(points_m: Vector, tets: Numbers, heat_capacity_j_m3k: Vector) -> Vector:
+    """Compute rho c * integral(phi_i) for every node, the row sums of the mass matrix, shape (n,), [J / K].
+
+    With non-obtuse tetrahedra, such as those of a lattice, backward Euler with this mass keeps every temperature
+    within the initial range for any step length (Li and Huang, arXiv 1209.5657). The heat capacity has shape (t,).
+    """
+    points_m, tets, unit_m = _prepared(points_m, tets)
+    nodal = np.zeros(len(points_m))
+    _add_capacities(points_m, tets, heat_capacity_j_m3k, 1.0 / unit_m, nodal)
+    return nodal * unit_m**3
+
+
+def refuse_flat_tets(points_m: Vector, tets: Numbers) -> None:
+    """Raise `HeatError` if points or tetrahedra have the wrong shape or range, or tetrahedra are inverted or flat."""
     check_shape("mesh points", points_m, (None, 3), _REMEDY, HeatError)
-    points_m = np.ascontiguousarray(points_m, dtype=np.float64)
-    reach = float(max(np.max(points_m, initial=0.0), -np.min(points_m, initial=0.0)))
-    if not np.isfinite(reach):
-        check_finite("mesh points", points_m, _REMEDY, HeatError)
-    return points_m, _checked_tets(tets, len(points_m)), float(np.exp2(np.frexp(reach)[1])) if reach else 1.0
-
-
-def _checked_tets(tets: npt.NDArray[np.int64], num_nodes: int) -> npt.NDArray[np.int64]:
+    check_finite("mesh points", points_m, _REMEDY, HeatError)
     check_shape("mesh tets", tets, (None, 4), _REMEDY, HeatError)
-    if len(tets) and (tets.min() < 0 or tets.max() >= num_nodes):
-        expected, got = f"node numbers from 0 to {num_nodes - 1}", f"{tets.min()} to {tets.max()}"
+    if len(tets) and (tets.min() < 0 or tets.max() >= len(points_m)):
+        expected, got = f"node numbers from 0 to {len(points_m) - 1}", f"{tets.min()} to {tets.max()}"
         raise HeatError("mesh tets", expected=expected, got=got, remedy=_REMEDY)
-    return np.ascontiguousarray(tets, dtype=np.int64)
-
-
-def _per_tet(name: str, value: float | npt.NDArray[np.float64], num_tets: int) -> npt.NDArray[np.float64]:
-    """Give one value above 0 per tetrahedron, or one for all as an array of shape (1,)."""
-    values = np.asarray(value, dtype=np.float64)
-    bad = int(np.count_nonzero(~(np.isfinite(values) & (values > 0.0))))
-    if bad or values.shape not in ((), (num_tets,)):
-        expected = f"finite numbers above 0, one for all or shape ({num_tets},)"
-        remedy = "Give one number per tetrahedron of the mesh."
-        raise HeatError(name, expected=expected, got=f"shape {values.shape} with {bad} that are not", remedy=remedy)
-    return np.ascontiguousarray(values.reshape(-1))
-
-
-def _refuse_flat(num_flat: int, num_tets: int) -> None:
+    points_m, tets, unit_m = _prepared(points_m, tets)
+    num_flat = _count_flat(points_m, tets, 1.0 / unit_m)
     if num_flat:
         expected = f"volumes above 0 and heights of at least {FLATTEST:g} of the longest side"
-        got = f"{num_flat} of {num_tets} flat or inverted"
+        got = f"{num_flat} of {len(tets)} flat or inverted"
         raise HeatError("mesh tets", expected=expected, got=got, remedy=_REMEDY)
+
+
+def _prepared(points_m: Vector, tets: Numbers) -> tuple[Vector, Numbers, float]:
+    """Arrays for the kernels, and the power of 2 above all coordinates: in that unit nothing over- or underflows."""
+    reach = float(np.max(np.abs(points_m), initial=0.0))
+    unit_m = float(np.exp2(np.frexp(reach)[1])) if reach else 1.0
+    return np.ascontiguousarray(points_m, np.float64), np.ascontiguousarray(tets, np.int64), unit_m
 
 
 @kernel
@@ -237,9 +206,6 @@ def _count_flat(points, tets, scale):
 
 @kernel
 def _add_couplings(points, tets, conductivity, scale, first, other, coupling):
-    """Returns the number of tetrahedra that are flat or inverted."""
-    each = 0 if len(conductivity) == 1 else 1
-    flat = 0
     for t in range(len(tets)):
         tet = tets[t]
         a, b, c = _sides(points, tet, scale)
@@ -247,33 +213,23 @@ def _add_couplings(points, tets, conductivity, scale, first, other, coupling):
         n1, n2, n3 = _cross(b, c), _cross(c, a), _cross(a, b)
         n0 = (-n1[0] - n2[0] - n3[0], -n1[1] - n2[1] - n3[1], -n1[2] - n2[2] - n3[2])
         normals = (n0, n1, n2, n3)
-        six_volumes = _dot(a, n1)
-        if _is_flat(a, b, c):
-            flat += 1
-            continue
         right = _ANGLE_ROUND_OFF / _size(a, b, c)
         squares = (_dot(n0, n0), _dot(n1, n1), _dot(n2, n2), _dot(n3, n3))
-        factor = conductivity[each * t] / (6.0 * six_volumes)
+        factor = conductivity[t] / (6.0 * _dot(a, n1))
         for i in range(3):
             for j in range(i + 1, 4):
                 product = _dot(normals[i], normals[j])
                 if abs(product) > right * min(squares[i], squares[j]):
                     coupling[_place(first, other, tet[i], tet[j])] += factor * product
-    return flat
 
 
 @kernel
 def _add_capacities(points, tets, capacity, scale, nodal):
-    """Returns the number of tetrahedra that are flat or inverted."""
-    each = 0 if len(capacity) == 1 else 1
-    flat = 0
     for t in range(len(tets)):
         tet = tets[t]
         a, b, c = _sides(points, tet, scale)
-        flat += _is_flat(a, b, c)
         for i in range(4):
-            nodal[tet[i]] += capacity[each * t] * _dot(a, _cross(b, c)) / 24.0
-    return flat
+            nodal[tet[i]] += capacity[t] * _dot(a, _cross(b, c)) / 24.0
 
 
 @kernel

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import numbers
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -42,20 +42,12 @@ class TimeSteps:
         remedy = "Give 60, for example: step_seconds in a scene, --step-seconds in an export."
         seconds = check_positive("step_seconds", self.step_seconds, remedy, HeatError)
         object.__setattr__(self, "step_seconds", seconds)
-        if self.steps * (seconds / sys.float_info.max) > 1.0:
-            expected = f"a last time that is a number, at most {sys.float_info.max:.3g} s"
-            got, remedy = f"{self.steps} steps of {seconds:g} s", "Give a shorter one."
-            raise HeatError("steps and step_seconds", expected=expected, got=got, remedy=remedy)
+        check_positive("steps times step_seconds", self.steps * seconds, "Give shorter steps.", HeatError)
 
     @property
     def duration_s(self) -> float:
         """Time that the body is followed for, [s]."""
         return self.steps * self.step_seconds
-
-    @property
-    def num_times(self) -> int:
-        """Number of times at which temperatures are kept."""
-        return self.steps + 1
 
     @property
     def times_s(self) -> npt.NDArray[np.float64]:
@@ -88,11 +80,6 @@ class AdaptiveSteps:
         _check_count("outputs", self.outputs, "Give the number of intervals, such as 10.")
 
     @property
-    def num_times(self) -> int:
-        """Number of times at which temperatures are kept."""
-        return self.outputs + 1
-
-    @property
     def times_s(self) -> npt.NDArray[np.float64]:
         """Start, then the end of every interval, shape (outputs + 1,), [s]."""
         return np.linspace(0.0, self.duration_s, self.outputs + 1)
@@ -120,14 +107,9 @@ class GivenSteps:
         return GivenSteps(self.duration_s, lengths_s, self.tolerance_k)
 
     @property
-    def num_times(self) -> int:
-        """Number of times at which temperatures are kept."""
-        return len(self.lengths_s) + 1
-
-    @property
     def times_s(self) -> npt.NDArray[np.float64]:
         """Start, then the end of every interval, [s]."""
-        return np.linspace(0.0, self.duration_s, self.num_times)
+        return np.linspace(0.0, self.duration_s, len(self.lengths_s) + 1)
 
 
 def _check_count(name: str, value: int, remedy: str) -> None:
@@ -165,21 +147,21 @@ class Effect(ABC):
 
     @property
     def where(self) -> tuple[str, ...]:
-        """Names or patterns of the patches, or of the regions, that it acts on."""
+        """Names or patterns of the patches, or of the regions, that the effect acts on."""
         return getattr(self, "patches", None) or getattr(self, "regions", ())
 
     @property
     def label(self) -> str:
-        """Name for reports: what it is and where."""
+        """Name of the effect in reports: its kind and where it acts."""
         return f"{self.kind} on {', '.join(self.where)}"
 
     def bounded(self, name: str) -> Bounded:
-        """Give one of its quantities with its range."""
+        """Give one of the quantities of the effect with its range."""
         return Bounded(getattr(self, name), self.bounds[name])
 
     @abstractmethod
     def term(self, selection: Selection) -> Term:
-        """Give the term that it adds to the heat equation of a body; `HeatError` if that lacks a patch or region."""
+        """Give the term of the effect in the heat equation; `HeatError` if the mesh lacks a patch or region of it."""
 
 
 def _checked_names(field: str, names: object) -> tuple[str, ...]:
@@ -193,16 +175,16 @@ def _checked_names(field: str, names: object) -> tuple[str, ...]:
 
 @runtime_checkable
 class Conductor(Protocol):
-    """What the solver asks of a material, such as `heat.materials.Material`."""
+    """What the solver asks of a material, such as `heat.materials.Material`: two numbers above 0."""
 
     @property
     def conductivity_w_mk(self) -> float:
-        """Thermal conductivity, [W / (m K)], above 0."""
+        """Thermal conductivity, [W / (m K)]."""
         ...
 
     @property
     def heat_capacity_j_m3k(self) -> float:
-        """Heat that warms a cubic metre by a kelvin, rho c, [J / (m3 K)], above 0."""
+        """Heat that warms a cubic metre by a kelvin, rho c, [J / (m3 K)]."""
         ...
 
 
@@ -235,12 +217,18 @@ class HeatProblem:
             remedy = "Remove the unused nodes; they have no heat capacity."
             raise HeatError("mesh points", expected=expected, got=got, remedy=remedy)
         self._check_temperatures()
-        self._check_materials()
         self._check_effects()
+        _ = self.selection  # refuses tags that do not fit the mesh
+        self._check_materials()
+
+    @cached_property
+    def selection(self) -> Selection:
+        """The named parts of the mesh."""
+        return Selection(self.mesh, self.up)
 
     @property
     def resolution_s(self) -> float:
-        """How far apart in time one may look at the effects and know how they change in between, [s]."""
+        """Longest time between two looks at the effects that tells how they change in between, [s]."""
         return min((e.bounded(name).resolution_s for e in self.effects for name in e.bounds), default=math.inf)
 
     @property
@@ -250,18 +238,18 @@ class HeatProblem:
         return np.asarray(given, dtype=np.float64)
 
     @property
-    def conductivity_w_mk(self) -> float | npt.NDArray[np.float64]:
-        """Thermal conductivity, one for all or one per tetrahedron, shape (t,), [W / (m K)]."""
-        return self._property("conductivity_w_mk")
+    def conductivity_w_mk(self) -> npt.NDArray[np.float64]:
+        """Thermal conductivity of each tetrahedron, shape (t,), [W / (m K)]."""
+        return self._of_tets("conductivity_w_mk")
 
     @property
-    def heat_capacity_j_m3k(self) -> float | npt.NDArray[np.float64]:
-        """Heat capacity per volume, one for all or one per tetrahedron, shape (t,), [J / (m3 K)]."""
-        return self._property("heat_capacity_j_m3k")
+    def heat_capacity_j_m3k(self) -> npt.NDArray[np.float64]:
+        """Heat capacity per volume of each tetrahedron, shape (t,), [J / (m3 K)]."""
+        return self._of_tets("heat_capacity_j_m3k")
 
-    def _property(self, name: str) -> float | npt.NDArray[np.float64]:
+    def _of_tets(self, name: str) -> npt.NDArray[np.float64]:
         if isinstance(self.material, Conductor):
-            return float(getattr(self.material, name))
+            return np.full(len(self.mesh.tets), float(getattr(self.material, name)))
         known, names = self.material, self.mesh.region_names
         by_region = [float(getattr(known[region], name)) if region in known else np.nan for region in names]
         return np.array(by_region)[self.mesh.region]
@@ -273,17 +261,11 @@ class HeatProblem:
         if not isinstance(self.material, Mapping):
             got = repr(self.material)
             raise HeatError("material", expected="a Material or a mapping", got=got, remedy=remedy)
-        build, shape = "Build the mesh with thermoxels_ns.mesh.", (len(self.mesh.tets),)
-        region = check_shape("mesh region", self.mesh.region, shape, build, HeatError)
-        if region.min() < 0 or region.max() >= len(names):
-            expected, got = f"numbers from 0 to {len(names) - 1}", f"{region.min()} to {region.max()}"
-            raise HeatError("mesh region", expected=expected, got=got, remedy="Name every region of the mesh.")
-        used = {names[number] for number in np.unique(region)}
-        missing, unknown = used - set(self.material), set(self.material) - set(names)
-        wrong = [name for name, material in self.material.items() if not isinstance(material, Conductor)]
-        if missing or unknown or wrong:
-            faults = (("none for", missing), ("unknown", unknown), ("no Material for", wrong))
-            got = "; ".join(f"{what}: {', '.join(sorted(names))}" for what, names in faults if names)
+        used = {names[number] for number in np.unique(self.mesh.region)}
+        given = {name for name, material in self.material.items() if isinstance(material, Conductor)}
+        unknown = set(self.material) - given | given - set(names)
+        if used - given or unknown:
+            got = f"none for: {', '.join(sorted(used - given))}; unknown: {', '.join(sorted(unknown))}"
             expected = f"a Material for each of the regions {', '.join(sorted(used))}"
             raise HeatError("material", expected=expected, got=got, remedy=remedy)
         conductivities = {name: self.material[name].conductivity_w_mk for name in used}

@@ -137,12 +137,12 @@ class Bounded:
 
     @property
     def in_time(self) -> bool:
-        """Whether it changes with time."""
+        """Whether the quantity changes with time."""
         return isinstance(self.quantity, Varying) and self.quantity.in_time
 
     @property
     def unresolved(self) -> bool:
-        """Whether it changes with time and nobody knows how fast."""
+        """Whether the quantity changes with time and nobody knows how fast."""
         return self.in_time and math.isinf(self.resolution_s)
 
     @property

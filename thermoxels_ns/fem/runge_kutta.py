@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation
 from thermoxels_ns.fem.system import HeatSystem
 
@@ -42,22 +41,6 @@ class Scheme:
         return self.weights[-1]
 
 
-def theta_scheme(theta: float) -> Scheme:
-    """Make the theta method, theta from 0.5 (Crank-Nicolson) to 1 (backward Euler); below, it is unstable: `HeatError`.
-
-    >>> theta_scheme(0.5).ends
-    (0.5, 0.5)
-    """
-    if not 0.5 <= theta <= 1.0:
-        remedy = "Use 1 for backward Euler or 0.5 for Crank-Nicolson."
-        raise HeatError("theta", expected="a number from 0.5 to 1", got=repr(theta), remedy=remedy)
-    if theta == 1.0:
-        return BACKWARD_EULER
-    order = 2 if theta == 0.5 else 1
-    name = "Crank-Nicolson" if theta == 0.5 else f"theta = {theta:g}"
-    return Scheme(name, order, (0.0, 1.0), ((0.0, 0.0), (1.0 - theta, theta)))
-
-
 def _sdirk2() -> Scheme:
     """Alexander's two-stage scheme (SIAM Journal on Numerical Analysis 14, 1977), gamma = 1 - 1 / sqrt(2), L-stable.
 
@@ -74,7 +57,7 @@ def _sdirk2() -> Scheme:
 BACKWARD_EULER = Scheme("backward Euler", 1, (1.0,), ((1.0,),))
 """First order. With lumped masses and non-obtuse tetrahedra no temperature ever leaves the range of what it came from
 and of what surrounds it, however long the step."""
-CRANK_NICOLSON = theta_scheme(0.5)
+CRANK_NICOLSON = Scheme("Crank-Nicolson", 2, (0.0, 1.0), ((0.0, 0.0), (0.5, 0.5)))
 """Second order, but it does not damp: after a jump, long steps overshoot by up to the jump itself. No command uses it:
 it is the reference that the published NAFEMS benchmark T3 is compared with."""
 SDIRK2 = _sdirk2()
@@ -128,7 +111,7 @@ class RungeKutta:
                 unknown = np.full(len(system.groups), np.nan)
                 return Step(solution.relative_k, unknown, iterations, newton_iterations, np.nan, False, status)
             if estimate or number + 1 < len(scheme.nodes):
-                stored_w = system.mass_product(solution.change_k) / (implicit * step_s)
+                stored_w = system.nodal_mass_j_k * solution.change_k / (implicit * step_s)
                 inner_w.append(stored_w if given_w is None else stored_w - given_w)
         heat_w = self._heat(start_k, states, time_s, step_s)
         error_k = self._error(start_k, inner_w, time_s, step_s) if estimate and scheme.estimate else np.nan
@@ -140,7 +123,7 @@ class RungeKutta:
         if not system.groups:
             return np.zeros(0)
         flows, fixed = np.zeros(len(system.groups) - len(system.fixed.groups)), system.fixed
-        kept_w = system.mass_product(states[-1] - start_k)[fixed.nodes] / step_s if len(fixed.nodes) else np.zeros(0)
+        kept_w = (system.nodal_mass_j_k * (states[-1] - start_k))[fixed.nodes] / step_s
         for weight, node, state in zip(scheme.ends, scheme.nodes, states):
             if weight != 0.0:
                 flows += weight * system.group_heat_w(state, time_s + node * step_s)

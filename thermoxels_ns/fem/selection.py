@@ -9,12 +9,10 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-
-WHOLE_BOUNDARY = "boundary"  # What the boundary of a mesh without patches is called in reports
 
 
 class Selection:
@@ -25,8 +23,8 @@ class Selection:
         self.mesh, self.up = mesh, up
         self._check()
         tags = mesh.boundary
-        self.patch_names: tuple[str, ...] = (WHOLE_BOUNDARY,) if tags is None else tags.patch_names
-        """Names of the patches."""
+        self.patch_names: tuple[str, ...] = ("boundary",) if tags is None else tags.patch_names
+        """Names of the patches; a mesh without tags has one, "boundary"."""
         self.facet_patch: npt.NDArray[np.int64] = np.zeros(len(mesh.facets), np.int64) if tags is None else tags.patch
         """Index into `patch_names`, shape (f,)."""
 
@@ -73,23 +71,19 @@ class Selection:
 
     def _check(self) -> None:
         mesh, remedy = self.mesh, "Build the mesh with thermoxels_ns.mesh."
-        num_nodes, num_facets = len(mesh.points_m), len(mesh.facets)
+        num_facets, tags = len(mesh.facets), mesh.boundary
         check_shape("mesh facets", mesh.facets, (None, 3), remedy, HeatError)
-        _check_indices("mesh facets", mesh.facets, num_nodes, remedy)
+        _check_indices("mesh facets", mesh.facets, len(mesh.points_m), remedy)
         check_shape("mesh region", mesh.region, (len(mesh.tets),), remedy, HeatError)
         _check_indices("mesh region", mesh.region, len(mesh.region_names), remedy)
-        tags = mesh.boundary
         if tags is None:
             return
-        check_shape("boundary normal", tags.normal, (num_facets, 3), remedy, HeatError)
-        check_finite("boundary normal", tags.normal, remedy, HeatError)
-        check_shape("boundary area_factor", tags.area_factor, (num_facets,), remedy, HeatError)
-        check_finite("boundary area_factor", tags.area_factor, remedy, HeatError)
-        if num_facets and tags.area_factor.min() <= 0.0:
-            got = f"{tags.area_factor.min():g}"
-            raise HeatError("boundary area_factor", expected="numbers above 0", got=got, remedy=remedy)
-        check_shape("boundary patch", tags.patch, (num_facets,), remedy, HeatError)
+        for name, shape in (("normal", (num_facets, 3)), ("area_factor", (num_facets,)), ("patch", (num_facets,))):
+            check_shape(f"boundary {name}", getattr(tags, name), shape, remedy, HeatError)
+            check_finite(f"boundary {name}", getattr(tags, name), remedy, HeatError)
         _check_indices("boundary patch", tags.patch, len(tags.patch_names), remedy)
+        if num_facets:
+            check_positive("boundary area_factor", float(tags.area_factor.min()), remedy, HeatError)
 
 
 def _check_indices(name: str, indices: npt.NDArray[np.int64], count: int, remedy: str) -> None:

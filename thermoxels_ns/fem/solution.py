@@ -19,13 +19,6 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]
 
-LEFT_OUT = {
-    "convection": "Convection: not modelled, {}.",
-    "radiation": "Thermal radiation: not modelled, {}.",
-    "absorbed solar": "Solar gain and internal sources: not modelled.",
-}
-"""What a computation without an effect of this kind says."""
-
 
 @dataclass
 class Assembled:
@@ -81,13 +74,13 @@ class ErrorSize:
     """Largest error of the mean heat flow of an effect, as a share of all heat that flows through the body."""
 
     def describe(self) -> str:
-        """Say it in words."""
+        """Describe both errors in words."""
         return f"{self.temperature_k:.2g} K and {100.0 * self.heat_flow:.2g} % of the heat flow"
 
 
 @dataclass(frozen=True)
 class HeatSolution:
-    """Temperatures over time and the account of the heat; converged: every step was solved to tolerance."""
+    """Temperatures over time and the account of the heat."""
 
     times_s: npt.NDArray[np.float64]  # Time of each state, the start first, shape (s + 1,), [s]
     temperature_c: npt.NDArray[np.float64]
@@ -105,9 +98,7 @@ class HeatSolution:
     """The same change relative to the heat stored in the initial differences, sum m_i |T_i - mean T|, plus all heat
     exchanged: the stricter measure. 0 where nothing is unaccounted for."""
     status: str
-    converged: bool
     iterations: npt.NDArray[np.int64]  # Iterations of the linear solver in each interval, shape (s,)
-    skipped_effects: tuple[str, ...]  # What the computation leaves out, one sentence each
     effects: tuple[EffectHeat, ...] = ()  # Heat that each effect of the problem brought, in the order of the problem
     newton_iterations: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
@@ -133,7 +124,6 @@ class SteadySolution:
     """Heat that each effect of the problem brings, in the order of the problem; they add up to 0."""
     energy_residual: float  # Sum of all heat flows, which should be 0, relative to the sum of their sizes
     status: str
-    converged: bool
     iterations: int
     newton_iterations: int  # Steps of Newton's method; 0 without radiation
     assembled: Assembled  # What was assembled
@@ -151,20 +141,14 @@ def heat_by_effect(
     effects: Sequence[str], groups: Iterable[tuple[str, str]], group_heat_w: npt.NDArray[np.float64]
 ) -> tuple[EffectHeat, ...]:
     """Sort heat flows, shape (s, g), [W], of groups, each an effect and a patch or region, by effect."""
-    columns: dict[str, list[int]] = {effect: [] for effect in effects}
-    names: dict[str, list[str]] = {effect: [] for effect in effects}
+    columns: dict[str, list[tuple[int, str]]] = {effect: [] for effect in effects}
     for number, (owner, name) in enumerate(groups):
-        if owner in columns:
-            columns[owner].append(number)
-            names[owner].append(name)
-    parts = ((effect, group_heat_w[:, columns[effect]]) for effect in effects)
-    return tuple(EffectHeat(effect, heat.sum(axis=1), tuple(names[effect]), heat) for effect, heat in parts)
-
-
-def left_out(kinds: Sequence[str]) -> tuple[str, ...]:
-    """Say what a computation with effects of these kinds leaves out, one sentence each."""
-    why = "no effect asks for it" if kinds else "the boundary is insulated"
-    return tuple(sentence.format(why) for kind, sentence in LEFT_OUT.items() if kind not in kinds)
+        columns[owner].append((number, name))
+    found = []
+    for effect, chosen in columns.items():
+        heat_w = group_heat_w[:, [number for number, _ in chosen]]
+        found.append(EffectHeat(effect, heat_w.sum(axis=1), tuple(name for _, name in chosen), heat_w))
+    return tuple(found)
 
 
 Solution: TypeAlias = HeatSolution | SteadySolution  # What either solver returns
@@ -193,8 +177,7 @@ class SolutionNodes:
     """A mesh with a temperature at every node, and whether the tetrahedra that were solved are quadratic."""
 
     mesh: TetMesh
-    """The mesh that was solved; of quadratic tetrahedra the same with all edges halved, whose new nodes are where their
-    further unknowns sit. So pictures, files and extremes show every temperature that was computed."""
+    """The mesh that was solved; of quadratic tetrahedra with all edges halved, for their unknowns on edges."""
     times_s: Vector  # Times, shape (s,), [s]; 0 alone for a steady state
     states_c: Vector  # Nodal temperatures, shape (s, n), [degrees Celsius]
     quadratic: bool

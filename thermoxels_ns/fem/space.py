@@ -18,7 +18,6 @@ from thermoxels_ns.fem.p1_kernels import (
     FACET_EDGES,
     TET_EDGES,
     MeshEdges,
-    lumped_mass,
     mesh_edges,
     stiffness_matrix,
 )
@@ -40,37 +39,22 @@ def conduction(u, v, w):
     return w.conductivity * dot(u.grad, v.grad)
 
 
-@BilinearForm
-def storage(u, v, w):
-    """rho c u v, [J / K]."""
-    return w.heat_capacity * u * v
-
-
 class Space:
     """Unknowns at the mesh's nodes and, of quadratic tetrahedra, at the middles of its edges after them.
 
-    Matrices come from scikit-fem, of linear tetrahedra from the compiled loops of `p1_kernels` instead. Quadratic
-    tetrahedra are for steady states: lumping their mass would give the corners negative masses, and with the
-    consistent mass temperatures leave their range in steps below about h^2 / diffusivity.
+    Matrices of quadratic tetrahedra come from scikit-fem, of linear ones from the compiled loops of `p1_kernels`.
+    Convection and radiation are evaluated at the nodes of linear tetrahedra, which keeps temperatures in the range of
+    the surroundings, and integrated over the triangles of quadratic ones. Quadratic tetrahedra are for steady states:
+    lumping their mass would give the corners negative masses, and with the consistent mass temperatures leave their
+    range in steps below about h^2 / diffusivity.
     """
 
-    def __init__(
-        self, selection: Selection, *, order: int = 1, lumped: bool = True, lumped_boundary: bool | None = None
-    ) -> None:
-        """Choose the elements (order 1 or 2) and how masses, convection and radiation are integrated.
-
-        Lumped masses are on the diagonal; `lumped_boundary` evaluates convection and radiation at the nodes; False:
-        over each triangle; None: at the nodes of linear tetrahedra. Raises `HeatError` for lumped quadratic ones.
-        """
+    def __init__(self, selection: Selection, *, order: int = 1) -> None:
+        """Choose linear (order 1) or quadratic (order 2) tetrahedra."""
         if order not in (1, 2):
             remedy = "Use 1 for linear tetrahedra or 2 for quadratic ones."
             raise HeatError("order", expected="1 or 2", got=repr(order), remedy=remedy)
-        if order == 2 and (lumped or lumped_boundary):
-            got = "lumped=True" if lumped else "lumped_boundary=True"
-            remedy = "Leave it out: lumped, a quadratic tetrahedron would have negative masses at its corners."
-            raise HeatError("order 2", expected="integrals that are not lumped", got=got, remedy=remedy)
-        self.selection, self.order, self.lumped = selection, order, lumped
-        self.lumped_boundary: bool = order == 1 if lumped_boundary is None else lumped_boundary
+        self.selection, self.order = selection, order
         self.element = ElementTetP1() if order == 1 else ElementTetP2()
 
     @cached_property
@@ -105,28 +89,19 @@ class Space:
             return corners
         return np.concatenate([corners, len(self.selection.mesh.points_m) + self.edges.numbers(corners, ends)], axis=1)
 
-    def stiffness(self, conductivity_w_mk: float | Vector) -> sparse.csr_matrix:
-        """K, entries integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
+    def stiffness(self, conductivity_w_mk: Vector) -> sparse.csr_matrix:
+        """K, entries integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]; one conductivity per tetrahedron."""
         mesh = self.selection.mesh
         if self.order == 1:
             return stiffness_matrix(mesh.points_m, mesh.tets, conductivity_w_mk, edges=self.edges)
-        return self.assembled(conduction, 2 * self.order - 2, conductivity=conductivity_w_mk)
+        return self.assembled(conduction, 2, conductivity=conductivity_w_mk)
 
-    def mass(self, heat_capacity_j_m3k: float | Vector) -> tuple[sparse.csr_matrix | None, Vector]:
-        """M, entries integral(rho c phi_i phi_j), None if lumped, and its row sums, shapes (n, n) and (n,), [J / K]."""
-        mesh = self.selection.mesh
-        if self.lumped:
-            return None, lumped_mass(mesh.points_m, mesh.tets, heat_capacity_j_m3k)
-        matrix = self.assembled(storage, 2 * self.order, heat_capacity=heat_capacity_j_m3k)
-        return matrix, matrix @ np.ones(self.num_nodes)
-
-    def assembled(self, form: BilinearForm, degree: int, **tet_values: float | Vector) -> sparse.csr_matrix:
+    def assembled(self, form: BilinearForm, degree: int, **tet_values: Vector) -> sparse.csr_matrix:
         """Assemble a form by scikit-fem, symmetric bit for bit.
 
-        `degree` is that of the polynomials; parameters are one number for all or one per tetrahedron, shape (t,).
+        `degree` is that of the polynomials; parameters have shape (t,).
         """
         points_m, tets, nodes = self.selection.mesh.points_m, self.selection.mesh.tets, self.tet_nodes()
-        values = {name: np.broadcast_to(value, len(tets)) for name, value in tet_values.items()}
         parts = []
         for begin in range(0, len(tets), _BLOCK):
             block = slice(begin, begin + _BLOCK)
@@ -136,7 +111,9 @@ class Space:
             used, local = np.unique(nodes[block], return_inverse=True)
             dofs = _dofs(mesh, ElementTetP1(), local.reshape(len(mesh.t.T), -1), len(used))
             basis = Basis(mesh, self.element, dofs=dofs, intorder=degree, disable_doflocs=True)
-            parameters = {name: np.broadcast_to(value[block, None], basis.dx.shape) for name, value in values.items()}
+            parameters = {
+                name: np.broadcast_to(value[block, None], basis.dx.shape) for name, value in tet_values.items()
+            }
             part = sparse.triu(form.coo_data(basis, **parameters).tocsr(), format="coo")
             parts.append((part.data, used[part.row].astype(np.int32), used[part.col].astype(np.int32)))
         data, rows, columns = (np.concatenate(list(arrays)) for arrays in zip(*parts))
@@ -157,7 +134,7 @@ class Space:
         mesh = MeshTri(points, np.arange(3 * len(facets)).reshape(-1, 3).T.copy(), validate=False)
         element = ElementTriP1() if self.order == 1 else ElementTriP2()
         dofs = _dofs(mesh, ElementTriP1(), self.facet_nodes(facets), self.num_nodes)
-        rule = _CORNERS if self.lumped_boundary else get_quadrature(RefTri, _EXACT)
+        rule = _CORNERS if self.order == 1 else get_quadrature(RefTri, _EXACT)
         basis = Basis(mesh, element, dofs=dofs, quadrature=rule, disable_doflocs=True)
         basis.basis = [(DiscreteField(np.asarray(field)),) for (field,) in basis.basis]
         return basis

@@ -20,11 +20,8 @@ OVERSHOOT_K = 0.01  # How far out of its range a temperature may be without a wo
 def solve_steady(
     problem: HeatProblem,
     *,
-    time_s: float = 0.0,
     order: int = 1,
-    lumped_boundary: bool | None = None,
     relative_tolerance: float = 1e-12,
-    allow_unconverged: bool = False,
 ) -> SteadySolution:
     """Find the temperatures at which the effects of a problem balance, div(k grad T) + s = 0.
 
@@ -32,53 +29,46 @@ def solve_steady(
     source drives it out. Where one does leave it, the status says by how much.
 
     Args:
-        problem: Body, materials and effects. Its initial temperatures are where iterations start.
-        time_s: Time at which effects that change are taken, [s].
+        problem: Body, materials and effects, those that change with time as at the start. Its initial temperatures are
+            where iterations start.
         order: 1 for linear tetrahedra; 2 for quadratic ones, which have eight times as many unknowns and an error that
             falls with the cube of the mesh size where the solution is smooth, but may overshoot the surroundings.
-        lumped_boundary: Evaluate convection and radiation at the nodes, which keeps temperatures in the range of the
-            surroundings. False integrates them over each triangle: on smooth problems the error is smaller by a
-            constant. None: at the nodes of linear tetrahedra; quadratic ones are always integrated.
         relative_tolerance: Of the linear solver, and of Newton's method if there is radiation.
-        allow_unconverged: Return what was computed, with the reason in `status`, instead of raising.
 
     Raises:
         HeatError: A piece of the body exchanges heat with nothing whose temperature is known, two effects fix one node
-            differently, quadratic tetrahedra are to be lumped, or the solver does not converge.
+            differently, or the solver does not converge.
     """
-    system = HeatSystem(problem, lumped=order == 1, lumped_boundary=lumped_boundary, order=order)
-    check_held(system, time_s)
-    equation = ImplicitEquation(system, time_s, np.inf, relative_tolerance=relative_tolerance)
-    solution = equation.solve(system.start_k, time_s)
-    failure = too_cold(system, solution.relative_k)
+    system = HeatSystem(problem, order=order)
+    _check_held(system)
+    equation = ImplicitEquation(system, 0.0, np.inf, relative_tolerance=relative_tolerance)
+    solution = equation.solve(system.start_k, 0.0)
     if not solution.converged:
-        failure = f"No steady state was found. {solution.status} Check the mesh's quality and the effects."
-    if failure and not allow_unconverged:
-        raise HeatError(failure)
+        raise HeatError(f"No steady state was found. {solution.status} Check the mesh's quality and the effects.")
+    refuse_too_cold(system, solution.relative_k)
     relative_k, num_mesh_nodes = solution.relative_k, len(problem.mesh.points_m)
-    group_heat = heat_of_groups_w(system, relative_k, time_s)
-    flows_w = 0.0 if system.is_still(relative_k, time_s) else max(solution.flows_w, 0.5 * np.abs(group_heat).sum())
+    group_heat = heat_of_groups_w(system, relative_k)
+    flows_w = 0.0 if system.is_still(relative_k, 0.0) else max(solution.flows_w, 0.5 * np.abs(group_heat).sum())
     temperature_c = relative_k + system.reference_c
-    overshoot_k, overshoot = _overshoot(system, relative_k, time_s)
+    overshoot_k, overshoot = _overshoot(system, relative_k)
     return SteadySolution(
         temperature_c=temperature_c[:num_mesh_nodes],
         effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
         energy_residual=0.5 * abs(float(group_heat.sum())) / flows_w if flows_w > 0.0 else 0.0,
-        status=failure or f"The steady state was found. {solution.status}{overshoot}",
-        converged=not failure,
+        status=f"The steady state was found. {solution.status}{overshoot}",
         iterations=solution.iterations,
         newton_iterations=solution.newton_iterations,
         assembled=system.assembled,
         edge_temperature_c=temperature_c[num_mesh_nodes:],
         unbalanced_w=solution.unbalanced_w,
         overshoot_k=overshoot_k,
-        last_facet_heat=system.facet_heat(relative_k, time_s),
+        last_facet_heat=system.facet_heat(relative_k, 0.0),
     )
 
 
-def _overshoot(system: HeatSystem, relative_k: Vector, time_s: float) -> tuple[float, str]:
+def _overshoot(system: HeatSystem, relative_k: Vector) -> tuple[float, str]:
     """By how much temperatures are out of the range of the surroundings, [K], and a sentence on it, or nothing."""
-    low, high = system.surroundings_k(time_s)  # a steady state does not know its start
+    low, high = system.surroundings_k(0.0)  # a steady state does not know its start
     beyond_k = np.maximum(low - relative_k, relative_k - high)
     outside = int(np.count_nonzero(beyond_k > OVERSHOOT_K))
     if not outside:
@@ -90,27 +80,26 @@ def _overshoot(system: HeatSystem, relative_k: Vector, time_s: float) -> tuple[f
     )
 
 
-def heat_of_groups_w(system: HeatSystem, relative_k: Vector, time_s: float) -> Vector:
+def heat_of_groups_w(system: HeatSystem, relative_k: Vector) -> Vector:
     """Heat flow into the body of each group in a steady state, fixed nodes included, shape (g,), [W]."""
-    kept_w = -system.net_heat_at_fixed(relative_k, time_s)
-    return np.concatenate([system.group_heat_w(relative_k, time_s), system.fixed.shares @ kept_w])
+    kept_w = -system.net_heat_at_fixed(relative_k, 0.0)
+    return np.concatenate([system.group_heat_w(relative_k, 0.0), system.fixed.shares @ kept_w])
 
 
-def too_cold(system: HeatSystem, relative_k: Vector) -> str:
-    """Say that temperatures are below absolute zero, or nothing."""
+def refuse_too_cold(system: HeatSystem, relative_k: Vector) -> None:
+    """Raise `HeatError` for temperatures below absolute zero."""
     coldest_k = float(relative_k.min()) + system.reference_c + ZERO_CELSIUS_K
-    if coldest_k >= -1e-6:
-        return ""
-    return (
-        f"The temperature falls to {coldest_k:.6g} K, below absolute zero: the given fluxes or sources take out more "
-        "heat than can flow in. Check their sign (positive is into the body). In long steps, schemes other than "
-        "backward Euler may overshoot, too."
-    )
+    if coldest_k < -1e-6:
+        raise HeatError(
+            f"The temperature falls to {coldest_k:.6g} K, below absolute zero: the given fluxes or sources take out "
+            "more heat than can flow in. Check their sign (positive is into the body). In long steps, schemes other "
+            "than backward Euler may overshoot, too."
+        )
 
 
-def check_held(system: HeatSystem, time_s: float) -> None:
+def _check_held(system: HeatSystem) -> None:
     """Raise `HeatError` for a body of which a piece may have any temperature in a steady state."""
-    loose = np.flatnonzero(~system.exchanging_pieces(time_s))
+    loose = np.flatnonzero(~system.exchanging_pieces(0.0))
     if len(loose):
         remedy = "Remove the piece, give its boundary an effect, or follow it through time instead."
         got = f"none on {len(loose)} of {system.pieces.count} pieces; {_largest(system, loose)}"

@@ -21,8 +21,8 @@ from thermoxels_ns.fem.forms import (
     at_time,
     effect_forms,
 )
+from thermoxels_ns.fem.p1_kernels import lumped_mass
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Assembled, FacetHeat
 from thermoxels_ns.fem.space import Space
 
@@ -81,26 +81,27 @@ class HeatSystem:
     Temperatures are held relative to `reference_c`, so that round-off is relative to their differences.
     """
 
-    def __init__(
-        self, problem: HeatProblem, *, lumped: bool = True, lumped_boundary: bool | None = None, order: int = 1
-    ) -> None:
-        """Turn effects into terms and forms, and assemble the stiffness; options and errors are those of `Space`."""
+    def __init__(self, problem: HeatProblem, *, order: int = 1) -> None:
+        """Turn effects into terms and forms, and assemble the stiffness of linear or quadratic tetrahedra."""
         self.problem, self.assembled = problem, Assembled()
         start = problem.start_c
         # The middle of the range, not the mean: exact for a uniform temperature.
         self.reference_c: float = 0.5 * (float(start.min()) + float(start.max()))
         """What temperatures are relative to, [degrees Celsius]."""
-        selection = Selection(problem.mesh, problem.up)
-        self._space = Space(selection, order=order, lumped=lumped, lumped_boundary=lumped_boundary)
-        forms = effect_forms(problem, self._space, self.reference_c, self.assembled)
+        self.space: Space = Space(problem.selection, order=order)
+        """The nodes, and how what happens becomes numbers on them."""
+        self.num_nodes: int = self.space.num_nodes
+        """Number of nodes; with quadratic tetrahedra the mesh's nodes come first and then its edges."""
+        forms = effect_forms(problem, self.space, self.reference_c, self.assembled)
         self._convection, self._loads, self._radiation = forms.convection, forms.loads, forms.radiation
         self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*forms.convection, *forms.radiation)
         """Heat flows through the surface that depend on its temperature."""
         self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
         """Nodes whose temperature is given."""
         with self.assembled.form("stiffness"):
-            self._stiffness = self._space.stiffness(problem.conductivity_w_mk)
-        self.pieces: Pieces = Pieces(self._stiffness)
+            self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
+            """K, shape (n, n), [W / K]."""
+        self.pieces: Pieces = Pieces(self.stiffness)
         """Connected pieces of the body."""
         self.matrix_in_time: bool = any(form.matrix_in_time for form in self._convection)
         """Whether the matrix of the linear part changes with time."""
@@ -114,45 +115,21 @@ class HeatSystem:
         )
         """Effect and patch or region of each heat flow of `group_heat_w`, then of each of the fixed nodes."""
         self._convection_at: dict[float, sparse.csr_matrix | None] = {}
-        self._matrix_at: dict[float, sparse.csr_matrix] = {}
         self._loads_at: dict[float, Vector] = {}
         self._ambient_at: dict[float, Vector] = {}
         self._ranges_at: dict[float, tuple[float, float]] = {}
 
     @property
-    def num_nodes(self) -> int:
-        """Number of nodes; with quadratic tetrahedra the mesh's nodes come first and then its edges."""
-        return self._space.num_nodes
-
-    @property
-    def space(self) -> Space:
-        """The nodes, and how what happens becomes numbers on them."""
-        return self._space
-
-    @property
-    def stiffness(self) -> sparse.csr_matrix:
-        """K, shape (n, n), [W / K]."""
-        return self._stiffness
-
-    @property
-    def lumped(self) -> bool:
-        """Whether masses, convection and radiation are all on the diagonal."""
-        return self._space.lumped and self._space.lumped_boundary
-
-    @property
     def start_k(self) -> Vector:
         """Temperatures at the start, relative to the reference, shape (n,), [K]."""
-        return self._space.from_mesh_nodes(self.problem.start_c - self.reference_c)
+        return self.space.from_mesh_nodes(self.problem.start_c - self.reference_c)
 
-    @property
+    @cached_property
     def nodal_mass_j_k(self) -> Vector:
-        """Row sums of the mass matrix, shape (n,), [J / K]."""
-        return self._masses[1]
-
-    def mass_product(self, relative_k: Vector) -> Vector:
-        """M T, shape (n,), [J]."""
-        matrix, nodal = self._masses
-        return nodal * relative_k if matrix is None else matrix @ relative_k
+        """Diagonal of the lumped mass matrix of linear tetrahedra, shape (n,), [J / K]."""
+        with self.assembled.form("mass"):
+            mesh = self.problem.mesh
+            return lumped_mass(mesh.points_m, mesh.tets, self.problem.heat_capacity_j_m3k)
 
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix | None:
         """R, heat that convection takes from each node per kelvin, shape (n, n), [W / K]; None without convection.
@@ -164,11 +141,11 @@ class HeatSystem:
     def _sum_of_convection(self, time_s: float) -> sparse.csr_matrix | None:
         if not self._convection:
             return None
-        total = sparse.csr_matrix(self._stiffness.shape)
+        total = sparse.csr_matrix(self.stiffness.shape)
         for form in self._convection:
             with self.assembled.form("convection"):
                 total = sparse.csr_matrix(total + form.convection_matrix(time_s))
-        most = float(np.max(total.diagonal() / np.maximum(self._stiffness.diagonal(), _LEAST)))
+        most = float(np.max(total.diagonal() / np.maximum(self.stiffness.diagonal(), _LEAST)))
         if not most <= MOST_TIMES_CONDUCTION:
             remedy = "Give the surface the temperature of the air instead, or a smaller coefficient."
             expected = f"at most {MOST_TIMES_CONDUCTION:g} times as much heat per kelvin as the cells behind conduct"
@@ -177,17 +154,11 @@ class HeatSystem:
 
     def matrix(self, time_s: float, step_s: float) -> sparse.csr_matrix:
         """M / step + K + R, shape (n, n), [W / K]; without M for a step without end."""
-
-        def without_mass(at_s: float) -> sparse.csr_matrix:
-            convection = self.convection_matrix(at_s)
-            return self._stiffness if convection is None else sparse.csr_matrix(self._stiffness + convection)
-
-        time_s = time_s if self.matrix_in_time else 0.0
+        convection = self.convection_matrix(time_s)
+        matrix = self.stiffness if convection is None else sparse.csr_matrix(self.stiffness + convection)
         if np.isinf(step_s):
-            return at_time(self._matrix_at, time_s, without_mass, most=1)
-        mass, nodal = self._masses
-        storage = sparse.diags(nodal / step_s, format="csr") if mass is None else mass / step_s
-        return sparse.csr_matrix(without_mass(time_s) + storage)
+            return matrix
+        return sparse.csr_matrix(matrix + sparse.diags(self.nodal_mass_j_k / step_s, format="csr"))
 
     def load(self, time_s: float) -> Vector:
         """Heat that does not depend on the temperature, fluxes and sources, shape (n,), [W]."""
@@ -239,7 +210,7 @@ class HeatSystem:
 
         The mean of each piece, which conducts nothing, is taken from T first, so that it leaves no round-off.
         """
-        return self._stiffness @ self.pieces.without_means(relative_k)
+        return self.stiffness @ self.pieces.without_means(relative_k)
 
     def net_heat(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat into each node from outside and from its neighbours, shape (n,), [W].
@@ -302,15 +273,10 @@ class HeatSystem:
         for ambient in ambients:
             low, high = min(low, float(ambient.min())), max(high, float(ambient.max()))
         for form in self._loads:
-            cools, heats = form.signs(time_s)
-            low, high = -np.inf if cools else low, np.inf if heats else high
+            heat_w = form.part_heat_w(np.zeros(0), time_s)
+            low, high = -np.inf if np.any(heat_w < 0.0) else low, np.inf if np.any(heat_w > 0.0) else high
         return low, high
 
     @cached_property
-    def _masses(self) -> tuple[sparse.csr_matrix | None, Vector]:
-        with self.assembled.form("mass"):
-            return self._space.mass(self.problem.heat_capacity_j_m3k)
-
-    @cached_property
     def _fixed_rows(self) -> sparse.csr_matrix:
-        return sparse.csr_matrix(self._stiffness[self.fixed.nodes])
+        return sparse.csr_matrix(self.stiffness[self.fixed.nodes])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,8 +13,8 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2, RungeKutta, Scheme, Step
-from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
-from thermoxels_ns.fem.steady import OVERSHOOT_K, too_cold
+from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect
+from thermoxels_ns.fem.steady import OVERSHOOT_K, refuse_too_cold
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
@@ -39,28 +40,22 @@ def solve_heat(
     time: Steps,
     *,
     scheme: Scheme | None = None,
-    lumped: bool = True,
-    lumped_boundary: bool = True,
     relative_tolerance: float = 1e-12,
-    allow_unconverged: bool = False,
     estimate_steps: bool = False,
     progress: Callable[[float, int], None] | None = None,
 ) -> HeatSolution:
     """Follow the temperatures of a body through time.
 
-    With backward Euler, lumped masses and tetrahedra without obtuse angles no temperature leaves the range of the start
-    and of the surroundings at any step length, unless a flux or source drives it out. Where one does leave it, the
-    status says by how much.
+    Masses are lumped. With backward Euler and tetrahedra without obtuse angles no temperature leaves the range of the
+    start and of the surroundings at any step length, unless a flux or source drives it out. Where one does leave it,
+    the status says by how much.
 
     Args:
         problem: Body, materials, initial temperatures and effects; without effects the boundary is insulated.
         time: Equal steps, steps as long as a tolerance allows, or steps of given lengths.
         scheme: The scheme in time; None: backward Euler for equal steps, otherwise SDIRK2. Adaptive steps need a scheme
             with an estimate.
-        lumped: Lump the mass matrix, which keeps temperatures within their range at any step length.
-        lumped_boundary: Evaluate convection and radiation at the nodes, for the same reason.
         relative_tolerance: Of the linear solver in each step.
-        allow_unconverged: Return what was computed, with the reason in `status`, instead of raising.
         estimate_steps: Tell the error of equal steps too (`time_error_k`), by steps of twice the length beside them,
             which takes about half as long again. Adaptive steps tell it anyway.
         progress: Called after every step with the share of the duration that is done and the number of steps.
@@ -70,8 +65,8 @@ def solve_heat(
             stores next to no heat, a step's solver does not converge, or the temperature falls below absolute zero.
     """
     _check_stores(problem)
-    states = _room_for_states(time.num_times, len(problem.mesh.points_m))
-    system = HeatSystem(problem, lumped=lumped, lumped_boundary=lumped_boundary)
+    states = _room_for_states(len(time.times_s), len(problem.mesh.points_m))
+    system = HeatSystem(problem)
     states[0] = problem.start_c - system.reference_c
     if len(system.fixed.nodes):
         states[0, system.fixed.nodes] = system.fixed.temperature_k(0.0)
@@ -82,42 +77,29 @@ def solve_heat(
     if scheme is None:
         scheme = BACKWARD_EULER if isinstance(time, TimeSteps) else SDIRK2
     loop = _TimeLoop(system, scheme, time, relative_tolerance)
-    failure = ""
     for taken in loop.steps(states[0]):
-        failure = taken.failure or too_cold(system, taken.step.relative_k)
-        if failure:
-            break
+        refuse_too_cold(system, taken.step.relative_k)
         balance.add(taken.step, taken.step_s, ends_interval=taken.ends_interval)
         if progress is not None:
             progress(balance.followed_s / time.duration_s, balance.steps)
-    if failure and not allow_unconverged:
-        raise HeatError(failure)
-    status = failure or balance.success(loop.repeated) + _skips(problem, time)
-    solution = balance.close(status, not failure, adaptive=adaptive)
-    if failure or not estimate_steps or not isinstance(time, TimeSteps):
+    solution = balance.close(balance.success(loop.repeated) + _skips(problem, time), adaptive=adaptive)
+    if not estimate_steps or not isinstance(time, TimeSteps):
         return solution
     doubled: HeatSolution | None = None
     if time.steps >= 2:
-        doubled = solve_heat(
-            problem,
-            TimeSteps(time.steps // 2, 2.0 * time.step_seconds),
-            scheme=scheme,
-            lumped=lumped,
-            lumped_boundary=lumped_boundary,
-            relative_tolerance=relative_tolerance,
-            allow_unconverged=True,
-        )
+        with suppress(HeatError):
+            twice = TimeSteps(time.steps // 2, 2.0 * time.step_seconds)
+            doubled = solve_heat(problem, twice, scheme=scheme, relative_tolerance=relative_tolerance)
     return _error_of_equal_steps(solution, doubled, scheme.order)
 
 
 @dataclass(frozen=True)
 class _Taken:
-    """A step that was accepted, or failed."""
+    """A step that was accepted."""
 
     step: Step
     step_s: float  # Its length, [s]
     ends_interval: bool  # Whether temperatures are kept at its end
-    failure: str = ""  # Why the computation ends here; empty if the step was accepted
 
 
 def _error_of_equal_steps(found: HeatSolution, doubled: HeatSolution | None, order: int) -> HeatSolution:
@@ -126,8 +108,9 @@ def _error_of_equal_steps(found: HeatSolution, doubled: HeatSolution | None, ord
     Steps of half the length leave 1 / 2^p of the error of a scheme of order p, so that both differ by 2^p - 1 of the
     error of the shorter ones.
     """
-    if doubled is None or len(doubled.times_s) < 2:
-        return replace(found, status=f"{found.status} The error of the steps is not estimated: it takes two of them.")
+    if doubled is None:
+        why = "steps of twice the length fail" if found.steps > 1 else "it takes two of them"
+        return replace(found, status=f"{found.status} The error of the steps is not estimated: {why}.")
     apart_k = np.abs(found.temperature_c[: 2 * len(doubled.times_s) - 1 : 2] - doubled.temperature_c).max(axis=1)
     most_k, last_k = (float(part) / (2.0**order - 1.0) for part in (apart_k.max(), apart_k[-1]))
     said = (
@@ -148,7 +131,7 @@ class _TimeLoop:
         """Steps that were repeated with a shorter length."""
 
     def steps(self, start_k: Vector) -> Iterator[_Taken]:
-        """Take all steps; the last one may be a failure."""
+        """Take all steps; raises `HeatError` where one fails."""
         if isinstance(self._time, AdaptiveSteps):
             return self._adaptive(start_k, self._time)
         return self._given(start_k, self._time)
@@ -160,9 +143,10 @@ class _TimeLoop:
             for number, step_s in enumerate(lengths_s, start=1):
                 count += 1
                 step = self.runge_kutta.step(relative_k, now_s, step_s)
-                remedy = "Use shorter steps or check the mesh's quality."
-                failure = "" if step.converged else f"Step {count} of {total} failed. {step.status} {remedy}"
-                yield _Taken(step, step_s, number == len(lengths_s), failure)
+                if not step.converged:
+                    remedy = "Use shorter steps or check the mesh's quality."
+                    raise HeatError(f"Step {count} of {total} failed. {step.status} {remedy}")
+                yield _Taken(step, step_s, number == len(lengths_s))
                 relative_k, now_s = step.relative_k, now_s + step_s
 
     def _adaptive(self, start_k: Vector, time: AdaptiveSteps) -> Iterator[_Taken]:
@@ -178,8 +162,7 @@ class _TimeLoop:
                     self.repeated += 1
                     wished_s = step_s * min(factor, _SAFETY)
                     if wished_s < _SHORTEST * time.duration_s or now_s + 0.25 * wished_s == now_s:
-                        yield _Taken(step, step_s, False, self._failure(step, now_s, time))
-                        return
+                        raise HeatError(self._failure(step, now_s, time))
                     continue
                 now_s = end_s if step_s == left_s else now_s + step_s
                 relative_k = step.relative_k
@@ -216,7 +199,7 @@ class _TimeLoop:
 
 
 class HeatBalance:
-    """Keeps states at the ends of intervals and adds up the heat that flowed in between."""
+    """The account of a computation: states at the ends of intervals, and the heat that flowed in between."""
 
     def __init__(self, system: HeatSystem, states_k: Vector, times_s: Vector) -> None:
         """Begin with room for the states, shape (s + 1, n), [K], the first one given, and their times, [s]."""
@@ -264,7 +247,7 @@ class HeatBalance:
         return max(low - float(relative_k.min()), float(relative_k.max()) - high)
 
     def success(self, repeated: int) -> str:
-        """Say that all went well, and how."""
+        """Describe how the steps converged, and by how much any temperature left its range."""
         sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
         sentence += f" {repeated} more were repeated with a shorter length." if repeated else ""
         if self._overshooting:
@@ -274,17 +257,16 @@ class HeatBalance:
             )
         return sentence
 
-    def close(self, status: str, converged: bool, *, adaptive: bool) -> HeatSolution:
+    def close(self, status: str, *, adaptive: bool) -> HeatSolution:
         """Balance the heat and convert to degrees Celsius, in place because the states may be large."""
-        system, done = self._system, self._done
-        states_k, times_s = self._states[: done + 1], self._times[: done + 1]
-        heat_j, mass = self._heat_j[:done], system.nodal_mass_j_k
+        system, states_k, times_s, heat_j = self._system, self._states, self._times, self._heat_j
+        mass = system.nodal_mass_j_k
         total_mass = float(mass.sum())
         relative_content = states_k @ mass
         content = relative_content + total_mass * celsius_to_kelvin(system.reference_c)
         supplied = np.concatenate([[0.0], np.cumsum(heat_j.sum(axis=1))])
         unexplained = float(np.max(np.abs(relative_content - relative_content[0] - supplied)))
-        exchanged = float(self._exchanged_j[:done].sum())
+        exchanged = float(self._exchanged_j.sum())
         mean = relative_content[0] / total_mass
         # Not by BLAS, whose sum depends on the number of its threads.
         spread = float(np.sum(mass * np.abs(states_k[0] - mean)))
@@ -292,7 +274,6 @@ class HeatBalance:
         spread_scale = max(spread + exchanged, _NOTHING * float(content[0]))
         lengths, last_facet_heat = np.diff(times_s), system.facet_heat(states_k[-1], float(times_s[-1]))
         states_k += system.reference_c
-        kinds = [effect.kind for effect in system.problem.effects]
         return HeatSolution(
             times_s=times_s,
             temperature_c=states_k,
@@ -301,13 +282,11 @@ class HeatBalance:
             energy_residual=_share(unexplained, scale),
             energy_residual_of_spread=_share(unexplained, spread_scale),
             status=status,
-            converged=converged,
-            iterations=self._iterations[:done, 0],
-            skipped_effects=left_out(kinds),
+            iterations=self._iterations[:, 0],
             effects=heat_by_effect(effect_labels(system.problem), system.groups, heat_j / lengths[:, None]),
-            newton_iterations=self._iterations[:done, 1],
+            newton_iterations=self._iterations[:, 1],
             steps=self._steps,
-            step_lengths_s=tuple(np.array(lengths) for lengths in self._lengths_s[:done]),
+            step_lengths_s=tuple(np.array(lengths) for lengths in self._lengths_s),
             time_error_k=self._error_k if adaptive else float("nan"),
             unbalanced_w=self._unbalanced_w,
             last_facet_heat=last_facet_heat,
@@ -360,17 +339,13 @@ def _check_stores(problem: HeatProblem) -> None:
 
 
 def _room_for_states(num_times: int, num_nodes: int) -> Vector:
-    """Array for the temperatures of all times, or an error that says how much memory they need."""
+    """Array for the temperatures of all times; `HeatError` says how much memory they need if that is too much."""
     needed = num_times * num_nodes * 8
-    try:
-        if needed <= MAX_STATE_BYTES:
-            return np.empty((num_times, num_nodes))
-        got = "more than"
-    except MemoryError:
-        got = "less memory free than"
-    raise HeatError(
-        "steps",
-        expected=f"temperatures of all times that fit into memory, at most {MAX_STATE_BYTES} bytes",
-        got=f"{got} that: {num_times} times x {num_nodes} nodes x 8 bytes = {needed} bytes",
-        remedy=f"Take at most {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)} steps, or a coarser mesh.",
-    )
+    if needed > MAX_STATE_BYTES:
+        raise HeatError(
+            "steps",
+            expected=f"temperatures of all times in at most {MAX_STATE_BYTES} bytes",
+            got=f"{num_times} times x {num_nodes} nodes x 8 bytes = {needed} bytes",
+            remedy=f"Take at most {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)} steps, or a coarser mesh.",
+        )
+    return np.empty((num_times, num_nodes))

@@ -10,7 +10,6 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
@@ -24,11 +23,11 @@ DEFAULT_MEMORY_BYTES = 4 * 2**30  # Most memory that a solution may need, [bytes
 HALVED = 0.3
 """Share of an error that is left after the mesh size or the steps are halved. Theory says 1/4 where temperatures are
 smooth, and 0.4 at the edges of a notch of a right angle, where they behave as r^(2/3)."""
-HALVED_QUADRATIC = 0.2  # The same of quadratic tetrahedra: 1/8 where temperatures are smooth, 0.4 at a notch
+_LEFT = {1: ErrorSize(HALVED, HALVED), 2: ErrorSize(0.2, 0.2)}
+"""The same by the order of the tetrahedra; of quadratic ones 1/8 where temperatures are smooth, 0.4 at a notch."""
 TO_QUADRATIC = ErrorSize(0.2, 0.1)
 """Shares of the errors of linear tetrahedra, of temperatures and of heat flows, that quadratic ones of the same size
 leave: they are 0.02 to 0.5 and 0.002 to 0.25 where temperatures are smooth and where they are singular."""
-_LEFT = {1: ErrorSize(HALVED, HALVED), 2: ErrorSize(HALVED_QUADRATIC, HALVED_QUADRATIC)}
 _STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
 """Of the linear solver: its error is far below any estimate here."""
 _STEPS_OVER_ERROR = 6.0
@@ -43,7 +42,7 @@ _BYTES_PER_TET, _BYTES_PER_FACET = {1: 400.0, 2: 2600.0}, {1: 600.0, 2: 4000.0}
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Errors that a user allows; what is None does not matter."""
+    """Errors that a user allows, above 0; what is None does not matter, but one is given."""
 
     temperature_k: float | None = 0.05
     """Largest error of the temperature at any node of the mesh, [K]. The default is half of what building physics asks
@@ -52,22 +51,13 @@ class Tolerance:
     """Largest error of the mean heat flow that any effect brings, as a share of all heat that flows through the body;
     0.01 is what building physics asks for (ISO 10211)."""
 
-    def __post_init__(self) -> None:
-        if self.temperature_k is None and self.heat_flow is None:
-            remedy = "Give a tolerance in kelvin, or one for heat flows such as 0.01."
-            raise HeatError("tolerance", expected="temperature_k or heat_flow", got="neither", remedy=remedy)
-        for name, remedy in (("temperature_k", "Give it in kelvin."), ("heat_flow", "Give a share, such as 0.01.")):
-            value = getattr(self, name)
-            if value is not None:
-                object.__setattr__(self, name, check_positive(name, value, remedy, HeatError))
-
     def excess(self, error: ErrorSize) -> float:
         """Error over what is allowed, whichever is worse; at most 1 is good."""
         pairs = (error.temperature_k, self.temperature_k), (error.heat_flow, self.heat_flow)
         return max(found / allowed for found, allowed in pairs if allowed is not None)
 
     def describe(self) -> str:
-        """Say it in words."""
+        """Describe the allowed errors in words."""
         parts = [] if self.temperature_k is None else [f"{self.temperature_k:g} K"]
         parts += [] if self.heat_flow is None else [f"{100.0 * self.heat_flow:g} % of the heat flow"]
         return " and ".join(parts)
@@ -85,7 +75,7 @@ class Level:
     seconds: float  # Time to solve it, [s]
 
     def describe(self) -> str:
-        """Say it in a line."""
+        """Describe the solution and its errors in a line."""
         mesh = "given mesh" if self.refinements == 0 else f"mesh size halved {self.refinements}x"
         steps = "" if self.step_tolerance_k is None else f", steps to {self.step_tolerance_k:.2g} K"
         return (
@@ -121,16 +111,14 @@ def solve_to_tolerance(
 ) -> ToleratedSolution:
     """Solve a problem with order, mesh size and time steps whose estimated error is allowed.
 
-    Errors are told by the difference of two solutions, of which the finer one has a share of the error of the coarser
-    one left (Richardson 1911): `TO_QUADRATIC` or `HALVED`.
+    The difference of two solutions tells their errors, because the finer one has a known share of the error of the
+    coarser one left (Richardson 1911): `TO_QUADRATIC` or `HALVED`.
 
     A steady state is solved with linear and then quadratic tetrahedra on the given mesh; as long as the error is too
-    large, quadratic ones of half the size follow. Where the solver fails on quadratic tetrahedra, as it may on very
-    flat ones, linear ones of half the size follow instead. In time tetrahedra stay linear, since the mass of quadratic
-    ones cannot be lumped. Three solutions tell the errors of the mesh and of the steps: one on the given mesh, one with
-    all steps halved, one on a mesh of half the size. From then on mesh and steps are made as fine as the tolerance asks
-    for. Both errors are added with their signs, node by node. What does not fit into memory ends this with the best so
-    far. The body is the one that the mesh describes: what flat facets lack of a round body's area is not estimated.
+    large, quadratic ones of half the size follow, or linear ones if the solver fails on quadratic ones. In time
+    tetrahedra stay linear: three solutions, on the given mesh, with all steps halved, and on a mesh of half the size,
+    tell the errors of mesh and steps, which are added with their signs, node by node; then both are made as fine as the
+    tolerance asks for. What flat facets lack of a round body's area is not estimated.
 
     Args:
         problem: Body, materials, initial temperatures and effects.
@@ -138,21 +126,17 @@ def solve_to_tolerance(
         duration_s: Time to follow the body for, [s]; None: its steady state.
         outputs: Number of equal intervals at whose ends temperatures are kept and compared.
         memory_bytes: Most memory that a solution may need, [bytes].
-        allow_unmet: Return the best solution that fits into memory, with `met` False and the reason in `status`,
-            instead of raising.
+        allow_unmet: Return the best solution that fits into memory, with `met` False, instead of raising.
         log: Takes a line per solution and one on the outcome; print by default.
         progress: As in `solve_heat`, of each solution through time.
 
     Raises:
         HeatError: The tolerance cannot be met within the memory, or a solution fails.
     """
-    check_positive("memory_bytes", memory_bytes, "Give the memory in bytes, such as 4e9.", HeatError)
-    run = _Run(problem, tolerance, float(memory_bytes), log)
+    run = _Run(problem, tolerance, memory_bytes, log)
     if duration_s is None:
         return run.close(_solve_steady(run), allow_unmet)
-    if tolerance.temperature_k is None:
-        remedy = "Give temperature_k too: steps in time are chosen by it."
-        raise HeatError("tolerance", expected="one in kelvin", got="heat_flow only", remedy=remedy)
+    assert tolerance.temperature_k is not None, "steps in time are chosen by it"
     steps = AdaptiveSteps(duration_s, _STEPS_OVER_ERROR * tolerance.temperature_k, outputs=outputs)
     return run.close(_solve_in_time(run, steps, progress), allow_unmet)
 
@@ -209,7 +193,7 @@ def peak_bytes(problem: HeatProblem, *, order: int = 1, refinements: int = 0, ti
 
 
 def describe_bytes(amount: float) -> str:
-    """Say it in a unit that suits it.
+    """Give an amount of memory in GiB or MiB.
 
     >>> describe_bytes(3 * 2**30), describe_bytes(266000.0)
     ('3 GiB', '0.25 MiB')
@@ -220,9 +204,7 @@ def describe_bytes(amount: float) -> str:
 class _Run:
     """The solutions so far."""
 
-    def __init__(
-        self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable[[str], None]
-    ) -> None:
+    def __init__(self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable) -> None:
         self.given, self.tolerance, self._memory_bytes, self.say = problem, tolerance, memory_bytes, log
         self.solved: list[tuple[Level, HeatProblem, Solution]] = []
         self._begin_s = time.perf_counter()
@@ -242,7 +224,7 @@ class _Run:
         self.say(level.describe())
 
     def lacks_memory(self, order: int, refinements: int, times: int = 1) -> str:
-        """Say what a solution on the given mesh with its size halved so often takes; return that it does not fit."""
+        """Forecast the memory of a solution, mesh size halved so often; return why it does not fit, or nothing."""
         needed = peak_bytes(self.given, order=order, refinements=refinements, times=times)
         where = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
         what = f"P{order} on {where} needs about {describe_bytes(needed)}"
@@ -330,7 +312,7 @@ def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, i
 
     The error of m halvings of the mesh and j of the steps is of_mesh * HALVED^m + of_steps * HALVED^j.
     """
-    failure = run.lacks_memory(1, 1, steps.num_times)
+    failure = run.lacks_memory(1, 1, len(steps.times_s))
     if failure:
         return failure
     problems, num_nodes = [run.given], len(run.given.mesh.points_m)
@@ -370,7 +352,7 @@ def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, i
         choice = next((choice for choice in within if choice not in solved), None)
         if choice is None:
             return f"It would take more than {_MOST_HALVINGS} halvings of the mesh size or of the steps"
-        failure = run.lacks_memory(1, choice[0], steps.num_times)
+        failure = run.lacks_memory(1, choice[0], len(steps.times_s))
         if failure:
             return failure
         found = solve(choice)

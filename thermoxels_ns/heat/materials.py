@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from functools import lru_cache
-from pathlib import Path
+from functools import cache
 from typing import Annotated, Any, TypeAlias, cast
 
 import numpy as np
 from pydantic import Field
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml, record
+from thermoxels_ns.core.yaml_records import as_record, configs_folder, read_yaml, record
 from thermoxels_ns.fem.problem import HeatProblem
 
 Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
@@ -57,20 +56,20 @@ def with_names(content: Any) -> Any:
     return {key: {**entry, "name": key} if isinstance(entry, dict) else entry for key, entry in content.items()}
 
 
-@raising(HeatError)
-def load_material_table(path: Path | str | None = None) -> dict[str, MaterialRow]:
-    """Read the rows of a yaml file of materials by name, None: of our own; raises `HeatError` for a wrong one."""
-    file = configs_folder() / "materials.yaml" if path is None else Path(path)
+@cache
+def material_table() -> dict[str, MaterialRow]:
+    """Read the rows of ``configs/materials.yaml`` by name."""
+    file = configs_folder() / "materials.yaml"
     return as_record(file.name, with_names(read_yaml(file)), dict[str, MaterialRow])
 
 
-def material(name: str, table: Mapping[str, MaterialRow] | None = None) -> Material:
-    """Look up a building material by its name in a table, None: our own; raises `HeatError` if there is no such row.
+def material(name: str) -> Material:
+    """Look up a building material by its name in the table; raises `HeatError` if there is no such row.
 
     >>> material("mineral-wool").conductivity_w_mk
     0.035
     """
-    rows = _own_table() if table is None else table
+    rows = material_table()
     if name not in rows:
         close = difflib.get_close_matches(str(name), list(rows), n=1, cutoff=0.75)
         remedy = f"Did you mean {close[0]}?" if close else "Correct the name, or give the three figures themselves."
@@ -87,8 +86,3 @@ def materials_by_region(problem: HeatProblem) -> dict[str, Material]:
         name: problem.material[name] if isinstance(problem.material, Mapping) else problem.material for name in names
     }
     return cast(dict[str, Material], made_of)
-
-
-@lru_cache(maxsize=1)
-def _own_table() -> dict[str, MaterialRow]:
-    return load_material_table()

@@ -21,6 +21,7 @@ from thermoxels_ns.heat.effects import Convection, InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.mesh.quality.checks import facet_owners
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]
@@ -111,7 +112,7 @@ class HeatResults:
 
 
 def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes | None = None) -> HeatResults:
-    """Work out what people ask: temperatures of all unknowns, heat flows that its own tetrahedra (P1 or P2) bring."""
+    """Compute what people ask of a solution: temperatures of all unknowns, heat flows as the solver evaluates them."""
     nodes = solution_nodes(problem, solution) if nodes is None else nodes
     times, states, selection = nodes.times_s, nodes.states_c, Selection(nodes.mesh, problem.up)
     lengths = np.diff(times) if len(times) > 1 else np.ones(1)
@@ -123,8 +124,8 @@ def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes 
         regions=_regions(problem, solution, selection, nodes),
         balance=_balance(solution, lengths),
         overshoot_k=solution.overshoot_k,
-        coldest=_first_spot(selection, nodes, int(states.argmin())),
-        hottest=_first_spot(selection, nodes, int(states.argmax())),
+        coldest=_spot(selection, nodes, *divmod(int(states.argmin()), states.shape[1])),
+        hottest=_spot(selection, nodes, *divmod(int(states.argmax()), states.shape[1])),
     )
 
 
@@ -135,22 +136,18 @@ def region_behind_facets(mesh: TetMesh) -> npt.NDArray[np.int64]:
 
 def volume_shares(mesh: TetMesh) -> Vector:
     """Give the share of the volume around each node, shape (n,)."""
-    weights = np.bincount(mesh.tets.ravel(), np.repeat(_volumes_m3(mesh) / 4.0, 4), len(mesh.points_m))
+    weights = np.bincount(
+        mesh.tets.ravel(), np.repeat(signed_volumes(mesh.points_m, mesh.tets) / 4.0, 4), len(mesh.points_m)
+    )
     return weights / weights.sum()
 
 
-def describe_spot(selection: Selection, node: int, temperature_c: float, time_s: float) -> Spot:
-    """Say where a node is."""
+def _spot(selection: Selection, nodes: SolutionNodes, time: int, node: int) -> Spot:
+    """Describe a node at the time with a number, -1 for the end."""
     touching = np.any(selection.mesh.facets == node, axis=1)
     patches = tuple(selection.patch_names[number] for number in np.unique(selection.facet_patch[touching]))
     x, y, z = selection.mesh.points_m[node].tolist()
-    return Spot(temperature_c, (x, y, z), time_s, node, patches)
-
-
-def _first_spot(selection: Selection, nodes: SolutionNodes, index: int) -> Spot:
-    """Describe an entry of the flattened temperatures of all times."""
-    time, node = np.unravel_index(index, nodes.states_c.shape)
-    return describe_spot(selection, int(node), float(nodes.states_c[time, node]), float(nodes.times_s[time]))
+    return Spot(float(nodes.states_c[time, node]), (x, y, z), float(nodes.times_s[time]), node, patches)
 
 
 def _patches(
@@ -162,14 +159,14 @@ def _patches(
         if not isinstance(effect, InternalHeat):
             for name, heat_w in zip(part.group_names, part.group_heat_w.T):
                 heat[name] = heat[name] + heat_w
-    facet_c, end_s = last_c[mesh.facets].mean(axis=1), float(nodes.times_s[-1])
+    facet_c = last_c[mesh.facets].mean(axis=1)
     results = []
     for number in np.unique(selection.facet_patch):
         chosen = selection.facet_patch == number
         on_patch, total = np.unique(mesh.facets[chosen]), float(area[chosen].sum())
         coldest, hottest = (int(on_patch[which(last_c[on_patch])]) for which in (np.argmin, np.argmax))
         heat_w = heat[names[number]]
-        mean = float(heat_w @ lengths / lengths.sum())
+        mean = float(np.average(heat_w, weights=lengths))
         results.append(
             PatchResult(
                 patch=names[number],
@@ -178,8 +175,8 @@ def _patches(
                 heat_w_m2=mean / total,
                 last_heat_w=float(heat_w[-1]),
                 mean_c=float(facet_c[chosen] @ area[chosen]) / total,
-                coldest=describe_spot(selection, coldest, float(last_c[coldest]), end_s),
-                hottest=describe_spot(selection, hottest, float(last_c[hottest]), end_s),
+                coldest=_spot(selection, nodes, -1, coldest),
+                hottest=_spot(selection, nodes, -1, hottest),
             )
         )
     return tuple(results)
@@ -215,7 +212,7 @@ def _regions(
     behind, made_of = region_behind_facets(problem.mesh), materials_by_region(problem)
     heat = heat_by_part(solution, behind, len(names))
     area = np.bincount(nodes.of_facets(behind), selection.facet_area_m2, len(names))
-    volume = _volumes_m3(mesh)
+    volume = signed_volumes(mesh.points_m, mesh.tets)
     total = np.bincount(mesh.region, volume, len(names))
     content = np.bincount(mesh.region, volume * last_c[mesh.tets].mean(axis=1), len(names))
     results = []
@@ -235,13 +232,6 @@ def _regions(
             )
         )
     return tuple(results)
-
-
-def _volumes_m3(mesh: TetMesh) -> Vector:
-    """Volume of each tetrahedron, shape (t,)."""
-    corner = mesh.points_m[mesh.tets]
-    sides = corner[:, 1:] - corner[:, :1]
-    return np.einsum("ti,ti->t", sides[:, 0], np.cross(sides[:, 1], sides[:, 2])) / 6.0
 
 
 def _balance(solution: Solution, lengths: Vector) -> EnergyBalance:
@@ -314,7 +304,7 @@ def wall_of_scene(
     for label, effect in zip(effect_labels(problem), problem.effects):
         if not (isinstance(effect, Convection) and effect.air_c in (inside.air_c, outside.air_c)):
             return f"There is no U-value, because its heat would count in it: {label}. Ask for the two airs alone."
-    if not _faces_inside(problem, inside.patches).any():
+    if not matching_facets(problem.selection, inside.patches).any():
         return "There is no U-value, because no surface of the body faces the air inside."
     return wall_result(problem, solution, inside.patches, inside.air_c, outside.air_c, nodes)
 
@@ -329,12 +319,12 @@ def wall_result(
 ) -> WallResult:
     """Work out what a body between two airs lets through.
 
-    What it says is that of a wall only if nothing but the two airs acts: sunlight or a cold sky count as heat
+    The figures are those of a wall only if nothing but the two airs acts: sunlight or a cold sky count as heat
     through it. `inside` names the patches that face the inside, some of which have area; the airs differ.
     """
     difference_k = inside_c - outside_c
-    selection, mesh = Selection(problem.mesh, problem.up), problem.mesh
-    inner = _faces_inside(problem, inside)
+    selection, mesh = problem.selection, problem.mesh
+    inner = matching_facets(selection, inside)
 
     def parts(numbers: npt.NDArray[np.int64], names: tuple[str, ...]) -> tuple[WallPart, ...]:
         number, count = np.where(inner, numbers, len(names)), len(names) + 1
@@ -350,15 +340,15 @@ def wall_result(
     shown = solution_nodes(problem, solution) if nodes is None else nodes
     every_c, inner_nodes = shown.states_c[-1], np.unique(shown.mesh.facets[shown.of_facets(inner)])
     # At the rim of a hole both airs touch one node, which is no spot of the inner surface.
-    others = [effect for effect in problem.effects if isinstance(effect, Convection) and effect.air_c != inside_c]
     outer = np.zeros(len(mesh.facets), dtype=bool)
-    for effect in others:
-        outer[selection.facets(effect.patches)] = True
+    for effect in problem.effects:
+        if isinstance(effect, Convection) and effect.air_c != inside_c:
+            outer[selection.facets(effect.patches)] = True
     away = np.setdiff1d(inner_nodes, shown.mesh.facets[shown.of_facets(outer & ~inner)])
     inner_nodes = away if len(away) else inner_nodes
     # The worst spot: the coldest if it is colder outside, else the hottest.
     worst = int(inner_nodes[np.argmin(np.sign(difference_k) * every_c[inner_nodes])])
-    spot = describe_spot(Selection(shown.mesh, problem.up), worst, float(every_c[worst]), 0.0)
+    spot = _spot(Selection(shown.mesh, problem.up), shown, -1, worst)
     return WallResult(
         inside_c=inside_c,
         outside_c=outside_c,
@@ -373,10 +363,9 @@ def wall_result(
     )
 
 
-def _faces_inside(problem: HeatProblem, inside: Sequence[str]) -> npt.NDArray[np.bool_]:
+def matching_facets(selection: Selection, patterns: Sequence[str]) -> npt.NDArray[np.bool_]:
     """Mark the boundary triangles of patches whose names match one of some names or patterns, shape (f,)."""
-    selection = Selection(problem.mesh, problem.up)
-    matching = [any(fnmatchcase(name, pattern) for pattern in inside) for name in selection.patch_names]
+    matching = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in selection.patch_names]
     return np.array(matching, dtype=bool)[selection.facet_patch]
 
 

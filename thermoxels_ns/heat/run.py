@@ -5,7 +5,6 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -18,9 +17,16 @@ from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
 from thermoxels_ns.fem.tolerance import ToleratedSolution
-from thermoxels_ns.heat.results import HeatResults, WallResult, heat_results, volume_shares, wall_of_scene
+from thermoxels_ns.heat.results import (
+    HeatResults,
+    WallResult,
+    heat_results,
+    matching_facets,
+    volume_shares,
+    wall_of_scene,
+)
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_hours
+from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_table
 from thermoxels_ns.heat.sky import Vector as Direction
 from thermoxels_ns.heat.solving import Goals, LeftOut, Say, solve_problem
 from thermoxels_ns.mesh.quality.checks import count_tets_in_other_bodies, count_twin_nodes
@@ -41,7 +47,7 @@ class Probes:
     nodes: npt.NDArray[np.int64]  # Nodes of the tetrahedron around each point, shape (p, 4)
     weights: npt.NDArray[np.float64]  # Barycentric coordinates in it, shape (p, 4); each row adds up to 1
 
-    def at(self, nodal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def at(self, nodal: Vector) -> Vector:
         """Interpolate nodal values, shape (..., n), to the points, shape (..., p)."""
         return np.einsum("...pa,pa->...p", nodal[..., self.nodes], self.weights)
 
@@ -74,23 +80,21 @@ def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
     return Probes(points, nodes, weights)
 
 
-def _barycentric(corner: npt.NDArray[np.float64], point: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _barycentric(corner: Vector, point: Vector) -> Vector:
     """Barycentric coordinates of a point in tetrahedra, shape (k, 4)."""
     sides = corner[:, 1:] - corner[:, :1]
     others = np.linalg.solve(np.swapaxes(sides, 1, 2), (point - corner[:, 0])[..., None])[..., 0]
     return np.concatenate([1.0 - others.sum(axis=1, keepdims=True), others], axis=1)
 
 
-def _outside(mesh: TetMesh, number: int, point: npt.NDArray[np.float64]) -> HeatError:
+def _outside(mesh: TetMesh, number: int, point: Vector) -> HeatError:
     distance = np.linalg.norm(mesh.points_m - point, axis=1)
-    nearest = int(np.argmin(distance))
-    x, y, z = mesh.points_m[nearest]
-    low, high = (", ".join(f"{v:.4g}" for v in end) for end in (mesh.points_m.min(axis=0), mesh.points_m.max(axis=0)))
+    x, y, z = mesh.points_m[np.argmin(distance)]
     return HeatError(
         f"probe {number + 1}",
-        expected=f"a point inside the body, which lies between ({low}) and ({high}) m",
-        got=f"({', '.join(f'{v:.6g}' for v in point)}), which is outside",
-        remedy=f"Move it; the nearest node is ({x:.6g}, {y:.6g}, {z:.6g}), {distance[nearest]:.3g} m away.",
+        expected="a point inside the body",
+        got=f"({', '.join(f'{part:.6g}' for part in point)}), which is outside",
+        remedy=f"Move it; the nearest node is ({x:.6g}, {y:.6g}, {z:.6g}), {distance.min():.3g} m away.",
     )
 
 
@@ -203,7 +207,7 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
     surface is what was seen. A scene that names patches of its own is trusted.
     """
     selection = Selection(mesh, up)
-    inside, outside = _chosen(selection, INSIDE), _chosen(selection, OUTSIDE)
+    inside, outside = matching_facets(selection, INSIDE), matching_facets(selection, OUTSIDE)
     inside_air = scene.inside_air is not None and scene.inside_air.patches == INSIDE
     outside_air = scene.outside_air is not None and scene.outside_air.patches == OUTSIDE
     warnings = []
@@ -230,7 +234,7 @@ def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tu
     if scene.inside_air is None or scene.outside_air is None:
         return ()
     selection = Selection(mesh, up)
-    inside, outside = (_chosen(selection, air.patches) for air in (scene.inside_air, scene.outside_air))
+    inside, outside = (matching_facets(selection, air.patches) for air in (scene.inside_air, scene.outside_air))
     inner = np.unique(mesh.facets[inside])
     shared = np.intersect1d(inner, mesh.facets[outside & ~inside])
     warnings = []
@@ -266,7 +270,7 @@ def unused_settings(scene: HeatScene) -> tuple[str, ...]:
     for name, air in (("inside_air", scene.inside_air), ("outside_air", scene.outside_air)):
         if air is None or air.air_series is None:
             continue
-        begin, end = air_series_hours(air.air_series)[[0, -1]].tolist()
+        begin, end = air_series_table(air.air_series)[[0, -1], 0].tolist()
         if begin > 0.0 or end < hours * (1.0 - 1e-9):
             warnings.append(
                 f"The air_series of {name} is from {begin:g} to {end:g} hours, but the body is followed from 0 to "
@@ -328,12 +332,6 @@ def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ..
         "thick walls are, nor what no camera saw, such as floors: heat losses and U-values are those of this shell, "
         "with its holes and loose parts. Where you know the walls, export with --wall-thickness.",
     )
-
-
-def _chosen(selection: Selection, patterns: tuple[str, ...]) -> npt.NDArray[np.bool_]:
-    """Mark the boundary triangles of patches that match, shape (f,)."""
-    matching = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in selection.patch_names]
-    return np.array(matching, dtype=bool)[selection.facet_patch]
 
 
 def _has_rooms(selection: Selection, inside: npt.NDArray[np.bool_]) -> bool:

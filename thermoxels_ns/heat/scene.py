@@ -45,8 +45,7 @@ from thermoxels_ns.heat.scene_fields import (
     Surface,
     unclear,
 )
-from thermoxels_ns.heat.sky import Vector, outdoor_radiation, swinbank_sky_c
-from thermoxels_ns.heat.sun import Sunlight, fixed_sun, moving_sun
+from thermoxels_ns.heat.sky import Sunlight, Vector, fixed_sun, moving_sun, outdoor_radiation, swinbank_sky_c
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Value = TypeVar("Value")

@@ -150,7 +150,7 @@ class InsideAir(_Air):
         _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
 
     def convection(self) -> Convection:
-        """What it does to the body."""
+        """Make the convection between the air and the body."""
         coefficient: Quantity | None = self.coefficient_w_m2k
         if self.coefficient is not None:
             coefficient = inside_coefficient(self.coefficient, self.heat_flow, self.air_c, self.emissivity or 0.0)
@@ -179,7 +179,7 @@ class OutsideAir(_Air):
         _check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
 
     def convection(self) -> Convection:
-        """What it does to the body."""
+        """Make the convection between the air and the body."""
         coefficient = self.coefficient_w_m2k
         if self.coefficient is not None:
             wind, emissivity = self.wind_m_s or 0.0, self.emissivity or 0.0
@@ -217,7 +217,7 @@ class Sky:
 
     @property
     def needs_air(self) -> bool:
-        """Whether its temperature follows from that of the outside air."""
+        """Whether the temperature of the sky follows from that of the outside air."""
         return self.temperature_c is None
 
 
@@ -278,18 +278,13 @@ class Sun:
 
 def read_air_series(path: str) -> Varying:
     """Read the temperature of air from a csv file with the columns hours and air_c; raises `HeatError`."""
-    table = _air_series(path)
+    table = air_series_table(path)
     Bounds("air_c", "degrees Celsius", -ZERO_CELSIUS_K, HOTTEST_C).check(table[:, 1])
     return tabulated(3600.0 * table[:, 0], table[:, 1])
 
 
-def air_series_hours(path: str) -> npt.NDArray[np.float64]:
-    """Times of such a file, ascending, shape (k,), [h]; raises `HeatError`."""
-    return _air_series(path)[:, 0]
-
-
-def _air_series(path: str) -> npt.NDArray[np.float64]:
-    """Hours and temperatures of a csv file, shape (k, 2)."""
+def air_series_table(path: str) -> npt.NDArray[np.float64]:
+    """Hours, ascending, and temperatures of a csv file, shape (k, 2); raises `HeatError`."""
     try:
         lines = [line for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip(" ,")]
     except (OSError, UnicodeDecodeError) as problem:

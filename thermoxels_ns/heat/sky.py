@@ -1,16 +1,26 @@
-"""Long-wave exchange with the sky and the ground."""
+"""Sky, ground and sun: long-wave exchange, where the sun stands, and the sunlight that reaches a facet."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta, timezone
 
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
 from thermoxels_ns.fem.quantities import Places, Quantity, Varying
 
 Vector = tuple[float, float, float]
+
+SOLAR_CONSTANT_W_M2 = 1353.0
+"""Sunlight above the air at the mean distance of the sun, [W / m2]: the value that Meinel's fit was made with. (Today's
+is 1361.)"""
+
+_RESOLUTION_S = 3600.0  # The sun moves by 15 degrees in this time
+_EPOCH = datetime(2000, 1, 1, 12, tzinfo=timezone.utc)
 
 
 def swinbank_sky_c(air_c: float) -> float:
@@ -60,3 +70,165 @@ def outdoor_radiation(
         return Varying(lambda places, _: emissivity * sky_view(places.normals, places.up), in_time=False), sky_c
     assert ground_c is not None, "one of the two is given"
     return Varying(lambda places, _: emissivity * ground_view(places.normals, places.up), in_time=False), ground_c
+
+
+@dataclass(frozen=True)
+class SunPosition:
+    """The sun as seen from a place; its distance in astronomical units."""
+
+    azimuth_deg: float  # Direction along the horizon, clockwise from north, [degrees], 0 to 360
+    elevation_deg: float
+    """Height over the horizon, [degrees]; refraction, which lifts it by 0.5 degrees at the horizon and by 0.1 at 10
+    degrees, is left out."""
+    distance_au: float
+
+
+@dataclass(frozen=True)
+class Sunlight:
+    """Strength of the sunlight."""
+
+    direct_w_m2: float  # On a surface that faces the sun, [W / m2], at least 0
+    diffuse_w_m2: float  # From the sky on a surface that faces up, [W / m2], at least 0
+
+
+def sun_coordinates(moment: datetime) -> tuple[float, float, float]:
+    """Compute right ascension and declination, [degrees], and distance, [au], of the sun by the low-precision formulae
+    of the Astronomical Almanac (US Naval Observatory).
+
+    They are within 1 arc minute from 1800 to 2200. The moment has a time zone.
+    """
+    days = _days(moment)
+    anomaly = math.radians(357.529 + 0.98560028 * days)
+    longitude = 280.459 + 0.98564736 * days + 1.915 * math.sin(anomaly) + 0.020 * math.sin(2.0 * anomaly)
+    along, obliquity = math.radians(longitude), math.radians(23.439 - 0.00000036 * days)
+    right_ascension = math.atan2(math.cos(obliquity) * math.sin(along), math.cos(along))
+    declination = math.asin(math.sin(obliquity) * math.sin(along))
+    distance = 1.00014 - 0.01671 * math.cos(anomaly) - 0.00014 * math.cos(2.0 * anomaly)
+    return math.degrees(right_ascension) % 360.0, math.degrees(declination), distance
+
+
+def sun_position(moment: datetime, latitude_deg: float, longitude_deg: float) -> SunPosition:
+    """Compute where the sun stands at a moment with a time zone, within 0.02 degrees from 1800 to 2200.
+
+    >>> noon = sun_position(datetime(2025, 6, 21, 12, 2, tzinfo=timezone.utc), 47.0, 0.0)
+    >>> round(noon.azimuth_deg), round(noon.elevation_deg, 1)
+    (180, 66.4)
+    """
+    latitude = math.radians(latitude_deg)
+    right_ascension_deg, declination_deg, distance_au = sun_coordinates(moment)
+    # Greenwich mean sidereal time (US Naval Observatory), in degrees.
+    sidereal = 280.460625 + 360.98564736578 * _days(moment)
+    hour = math.radians((sidereal + longitude_deg - right_ascension_deg) % 360.0)
+    declination = math.radians(declination_deg)
+    east = -math.cos(declination) * math.sin(hour)
+    north = math.sin(declination) * math.cos(latitude) - math.cos(declination) * math.cos(hour) * math.sin(latitude)
+    height = math.sin(declination) * math.sin(latitude) + math.cos(declination) * math.cos(hour) * math.cos(latitude)
+    azimuth = math.degrees(math.atan2(east, north)) % 360.0
+    return SunPosition(azimuth, math.degrees(math.atan2(height, math.hypot(east, north))), distance_au)
+
+
+def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
+    """Turn a position into a unit vector from the mesh to the sun; the part of `north` along `up` is left out.
+
+    Raises `HeatError` if they are parallel.
+    """
+    upward, northward = _unit(up), _unit(north)
+    level = northward - (northward @ upward) * upward
+    if float(np.linalg.norm(level)) < 1e-6:
+        remedy = "Give north along the ground."
+        raise HeatError("north", expected="a direction other than up", got=list(north), remedy=remedy)
+    level /= np.linalg.norm(level)
+    azimuth, elevation = math.radians(position.azimuth_deg), math.radians(position.elevation_deg)
+    horizontal = math.cos(azimuth) * level + math.sin(azimuth) * np.cross(level, upward)
+    x, y, z = math.cos(elevation) * horizontal + math.sin(elevation) * upward
+    return float(x), float(y), float(z)
+
+
+def air_mass(elevation_deg: float) -> float:
+    """Length of the light's way through the air, relative to the zenith, 0 to 90 degrees (Kasten and Young 1989)."""
+    return 1.0 / (math.sin(math.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.07995) ** -1.6364)
+
+
+def meinel_clear_sky(elevation_deg: float, distance_au: float = 1.0) -> Sunlight:
+    """Estimate the sunlight under a clear sky at sea level; none if the sun is below the horizon.
+
+    Direct: E0 * 0.7^(AM^0.678) with air mass AM (Meinel and Meinel 1976). Diffuse: E0 sin(h) (0.271 - 0.294
+    tau), tau being the transmitted share of the direct light (Liu and Jordan 1960). Real clear days differ from
+    it by a tenth.
+    """
+    if elevation_deg <= 0.0:
+        return Sunlight(0.0, 0.0)
+    above_air = SOLAR_CONSTANT_W_M2 / distance_au**2
+    transmitted = 0.7 ** (air_mass(elevation_deg) ** 0.678)
+    diffuse = above_air * math.sin(math.radians(elevation_deg)) * (0.271 - 0.294 * transmitted)
+    return Sunlight(above_air * transmitted, diffuse)
+
+
+def facet_irradiance(
+    normals: npt.NDArray[np.float64], up: Vector, towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0
+) -> npt.NDArray[np.float64]:
+    """Compute the sunlight that falls on facets, [W / m2] of the facet, shape (k,); none shades another.
+
+    Direct light by the cosine of its angle; diffuse light alike from all of the sky, by (1 + cos tilt) / 2;
+    what the ground reflects, alike to all sides, by (1 - cos tilt) / 2 (Liu and Jordan 1963). `normals` are
+    outward unit vectors, shape (k, 3); `up` and `towards` (the sun) are unit vectors. A sun below the horizon
+    gives 0.
+    """
+    height = float(np.dot(up, towards))
+    if height <= 0.0:
+        return np.zeros(len(normals))
+    direct = sunlight.direct_w_m2 * np.maximum(normals @ np.array(towards), 0.0)
+    diffuse = sunlight.diffuse_w_m2 * sky_view(normals, up)
+    on_ground = sunlight.direct_w_m2 * height + sunlight.diffuse_w_m2
+    return direct + diffuse + ground_reflectance * on_ground * ground_view(normals, up)
+
+
+def fixed_sun(towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0) -> Varying:
+    """Make the irradiance of facets by a sun that stands still in a direction, for `AbsorbedSolar.irradiance_w_m2`."""
+    x, y, z = _unit(towards).tolist()
+    return Varying(
+        lambda places, _: facet_irradiance(places.normals, places.up, (x, y, z), sunlight, ground_reflectance),
+        in_time=False,
+    )
+
+
+def moving_sun(
+    start: datetime,
+    latitude_deg: float,
+    longitude_deg: float,
+    north: Vector,
+    sunlight: Sunlight | None = None,
+    ground_reflectance: float = 0.0,
+) -> Varying:
+    """Make the irradiance of facets by the sun at a date and place, for `AbsorbedSolar.irradiance_w_m2`.
+
+    `start` is the date and time, with a time zone, of the time 0; north and east are positive; `north` points there in
+    the coordinates of the mesh; without `sunlight` it is as strong as `meinel_clear_sky` estimates.
+    """
+
+    def irradiance(places: Places, time_s: float) -> npt.NDArray[np.float64]:
+        position = sun_position(_later(start, time_s), latitude_deg, longitude_deg)
+        light = sunlight or meinel_clear_sky(position.elevation_deg, position.distance_au)
+        towards = towards_sun(position, places.up, north)
+        return facet_irradiance(places.normals, places.up, towards, light, ground_reflectance)
+
+    return Varying(irradiance, resolution_s=_RESOLUTION_S)
+
+
+def _later(start: datetime, time_s: float) -> datetime:
+    try:
+        return start + timedelta(seconds=time_s)
+    except OverflowError as problem:
+        expected, remedy = "a date of the years 1 to 9999", "Follow the body for a shorter time."
+        got = f"{time_s:.3g} s after {start.isoformat()}"
+        raise HeatError("time of the sun", expected=expected, got=got, remedy=remedy) from problem
+
+
+def _days(moment: datetime) -> float:
+    """Days since noon of 1 January 2000."""
+    return (moment - _EPOCH).total_seconds() / 86400.0
+
+
+def _unit(direction: Vector) -> npt.NDArray[np.float64]:
+    vector = np.asarray(direction, dtype=np.float64)
+    return vector / np.linalg.norm(vector)

@@ -14,7 +14,6 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.forms import FixedForm, effect_forms
 from thermoxels_ns.fem.problem import AdaptiveSteps, Effect, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Bounds
-from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution, Solution, SteadySolution, mean_flows_w
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.steady import solve_steady
@@ -40,7 +39,6 @@ MOST_ESTIMATED = 300_000
 as long as linear ones (131,712: 5.4 s instead of 0.09 s)."""
 MOST_ATTEMPTS = 4  # Solutions with something left out, after which nothing is left out any more
 SAY_EVERY_S = 10.0  # Time between two lines of progress, [s]
-SAY_FIRST_S = 1.0  # Time of a first step from which on it is said, [s]: then the next ones will take some, too
 _LEAST_TIMES, _MOST_TIMES = 241, 200_001
 """Least and most times at which an effect is asked for that the solver may ask for at any time."""
 
@@ -131,7 +129,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
     """
     goals.check_fits(time)
     if not goals.estimated:
-        needed = peak_bytes(problem, times=1 if time is None else time.num_times)
+        needed = peak_bytes(problem, times=1 if time is None else len(time.times_s))
         say(f"Memory: about {describe_bytes(needed)} at most.")
         if needed > goals.memory_bytes:
             expected, got = f"at most {describe_bytes(goals.memory_bytes)}", f"about {describe_bytes(needed)}"
@@ -193,7 +191,7 @@ def _largest_w(
     have. What fixes temperatures is infinite, and so is what may change between two looks without a word how fast.
     """
     reference_c, num_nodes = float(problem.start_c.mean()), len(problem.mesh.points_m)
-    forms = effect_forms(problem, Space(Selection(problem.mesh, problem.up)), reference_c)
+    forms = effect_forms(problem, Space(problem.selection), reference_c)
     kept_s = found.times_s if isinstance(found, HeatSolution) else np.zeros(1)
     numbers = {label: number for number, label in enumerate(effect_labels(problem))}
     looks = [_looks(effect, time, kept_s) for effect in problem.effects]
@@ -253,7 +251,7 @@ def _solve(problem: HeatProblem, time: Time, goals: Goals, say: Say) -> SolvedPr
         problem,
         Tolerance(goals.tolerance_k, goals.flow_tolerance),
         duration_s=None if time is None else time.duration_s,
-        outputs=1 if time is None else time.num_times - 1,
+        outputs=1 if time is None else len(time.times_s) - 1,
         memory_bytes=goals.memory_bytes,
         allow_unmet=goals.allow_unmet,
         log=say,
@@ -273,14 +271,13 @@ def _with_mesh_error(found: SolvedProblem, goals: Goals) -> SolvedProblem:
 
 
 class _Progress:
-    """Says how long a slow first step took, and every now and then how far a solution has come.
+    """Says every now and then how far a solution has come, and what is left at the pace since the last line.
 
-    What is left is told by the pace since the last line: steps that are chosen by their error begin short.
+    Steps that are chosen by their error begin short: the pace from the start on would tell too long a time.
     """
 
     def __init__(self, say: Say) -> None:
-        self._say = say
-        self._share = self._said_share = 0.0
+        self._say, self._share, self._said_share = say, 0.0, 0.0
         self._called_s = self._said_s = clock.perf_counter()
 
     def __call__(self, share: float, steps: int) -> None:
@@ -288,26 +285,8 @@ class _Progress:
         if share < self._share:  # the next solution has begun
             self._said_share, self._said_s = 0.0, self._called_s
         self._share, self._called_s = share, clock.perf_counter()
-        took_s = self._called_s - self._said_s
-        if share >= 1.0 or share <= self._said_share:
-            return
-        if steps == 1 and took_s >= SAY_FIRST_S:
-            self._say(f"The first step took {took_s:.1f} s, for {_percent(share)} of the time.")
-        elif steps > 1 and took_s >= SAY_EVERY_S:
-            left_s = took_s / (share - self._said_share) * (1.0 - share)
-            self._say(f"{_percent(share)} of the time after {steps} steps; about {_duration(left_s)} left.")
-        else:
-            return
-        self._said_share, self._said_s = share, self._called_s
-
-
-def _percent(share: float) -> str:
-    """Say a share, also a small one."""
-    return f"{share:.0%}" if share >= 0.01 else f"{100.0 * share:.1g}%"
-
-
-def _duration(seconds: float) -> str:
-    """Say a time in the unit that suits it."""
-    if seconds < 120.0:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
+        took_s, done = self._called_s - self._said_s, share - self._said_share
+        if share < 1.0 and done > 0.0 and took_s >= SAY_EVERY_S:
+            left_s = took_s / done * (1.0 - share)
+            self._say(f"{share:.2%} of the time after {steps} steps; about {left_s:.0f} s left.")
+            self._said_share, self._said_s = share, self._called_s
