@@ -61,14 +61,6 @@ def _nothing(*_: Any, **__: Any) -> None:
     """Do nothing, find nothing."""
 
 
-def _no_planes(photographs: Any, backdrop: Any, depth: np.ndarray, tolerance: float) -> np.ndarray:
-    return np.full(len(depth), np.nan, np.float32)
-
-
-def _whole_backdrop(photographs: Any, backdrop: np.ndarray, depth: Any, tolerance: float) -> np.ndarray:
-    return backdrop
-
-
 def _without_ends(model: Any, rays: Any) -> Any:
     """Weights of voxels none of which is kept because rays end in it."""
     from thermoxels_ns.training.ray_statistics import voxel_weights
@@ -76,9 +68,6 @@ def _without_ends(model: Any, rays: Any) -> Any:
     weights = voxel_weights(model, rays)
     return replace(weights, ends=weights.ends & False)
 
-
-_NO_PLANES = (_CALLBACKS, "depths_on_planes", _no_planes)
-_WHOLE_BACKDROP = (_CALLBACKS, "backdrop_without_walls", _whole_backdrop)
 
 MECHANISMS: Mapping[str, Without] = {
     "photo-depth": Without((f"{_MODEL}photo-depth", "off")),
@@ -88,10 +77,7 @@ MECHANISMS: Mapping[str, Without] = {
             ("thermoxels_ns.multiview.stereo", "plain_backdrop", lambda _, depth: 2 * (np.zeros(len(depth), bool),)),
         )
     ),
-    "walls-in-training": Without(replaced=(_NO_PLANES, _WHOLE_BACKDROP)),
-    "walls-and-backdrop-rays": Without(replaced=((_CALLBACKS, "follow_walls", _nothing),)),
-    "planes": Without(replaced=(_NO_PLANES,)),
-    "backdrop-without-walls": Without(replaced=(_WHOLE_BACKDROP,)),
+    "planes": Without(replaced=((_CALLBACKS, "follow_planes", _nothing),)),
     "carve": Without((f"{_MODEL}carve", "off")),
     "opened-rays": Without(replaced=((_CALLBACKS, "MOST_OPENED_RAYS", 1.0),)),
     "opaque-neighbours": Without(replaced=((_CALLBACKS, "OPAQUE_DEPTH", math.inf),)),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.multiview.backdrop import backdrop_without_walls
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.planes import depths_on_planes
 
@@ -68,29 +67,3 @@ def test_a_plain_corner_is_cut_at_its_edge():
     found = depths_on_planes(one_photograph(colours), np.zeros(len(x), dtype=bool), depth, 0.02)
     known = np.isfinite(found)
     assert known.mean() > 0.9 and np.abs(found - depth)[known].max() < 0.01
-
-
-@pytest.mark.parametrize("takes_it_for_sky, remains", [([2], 0), ([0, 1, 3], 3)])
-def test_other_photographs_take_a_wall_out_of_the_backdrop(takes_it_for_sky, remains):
-    """Five photographs side by side look at a wall 3 away; its middle is in the backdrop of some of them."""
-    shots = [one_photograph(np.full((HEIGHT, WIDTH, 3), 0.6)) for _ in range(5)]
-    centres = np.column_stack((np.linspace(-0.2, 0.2, 5), np.zeros(5), np.zeros(5)))
-    matrices = np.concatenate([one.matrices for one in shots])
-    matrices[:, :, 3] = -np.einsum("nij,nj->ni", matrices[:, :, :3], centres)
-    pixels = WIDTH * HEIGHT
-    photographs = Photographs(
-        matrices,
-        centres,
-        np.concatenate([one.sizes for one in shots]),
-        np.arange(5) * pixels,
-        np.concatenate([one.colours for one in shots]),
-        np.concatenate([one.thermal for one in shots]),
-    )
-    x, y, _ = wall()
-    backdrop, middle = np.zeros((5, pixels), dtype=bool), (np.abs(x) < 0.2) & (np.abs(y) < 0.2)
-    for number in takes_it_for_sky:
-        backdrop[number] = np.abs(x + centres[number, 0] / 3.0) < 0.2
-    depth = np.tile(np.where(y < 0.3, np.float32(3.0), np.float32(np.nan)), 5)
-    kept = backdrop_without_walls(photographs, backdrop.ravel(), depth, 0.05).reshape(5, -1)
-    assert not (kept & ~backdrop).any() and kept[:, y >= 0.3].sum() == backdrop[:, y >= 0.3].sum()
-    assert (kept[:, middle].mean(axis=1) > 0.7).sum() == remains

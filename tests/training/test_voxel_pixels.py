@@ -21,14 +21,15 @@ from thermoxels_ns.training.model_config import MOST_VOXELS, ThermoxelsModelConf
         (220.0, (56, 112, 224)),
         (300.0, (40, 80, 160, 320)),
         (5000.0, (48, 96, 192, 384)),
-        (50.0, (48,)),
-        (1.0, (8,)),
+        (1.0, (8, 16, 32)),
         (math.inf, (32, 64, 128)),
     ],
 )
 def test_resolutions_follow_the_photographs_up_to_a_limit(voxels, expected):
     config = ThermoxelsModelConfig(voxel_pixels=2.0).suited_to(voxels)
     assert config.resolutions == expected and max(config.prune_at) < config.thin_at[0]
+    own = ThermoxelsModelConfig(voxel_pixels=2.0, refine_at=(5, 9)).suited_to(voxels)
+    assert own.refine_at == (5, 9) and own.resolutions[-1] <= 192, "steps of one's own stay"
     assert ThermoxelsModelConfig(voxel_pixels=0.0).suited_to(voxels).resolutions == (32, 64, 128), "nothing is asked"
     config.check()
     assert config.resolutions[-1] <= MOST_VOXELS * 128

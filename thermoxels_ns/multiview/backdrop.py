@@ -17,7 +17,6 @@ COLOUR_TOLERANCE = 0.1
 """Difference from the backdrop's colour up to which a pixel shows it, of 1. On eight drawn scenes and a real street,
 0.06 finds less of the sky (saharov32: 54 % instead of 69 %), and neither takes more than 1 % of a body's pixels."""
 THERMAL_TOLERANCE = 0.1  # Difference from its temperature, of the scene's range
-VOTES = 2  # Photographs that show a surface, for each that shows a backdrop, from which on it is one
 _WIDEST, _ROUNDS = 0.3, 8
 """Difference up to which colours count in the first of some fits; it shrinks to the tolerance."""
 
@@ -63,32 +62,6 @@ def plain_backdrop(
         around = cv2.dilate(alike[pixels].reshape(height, width).astype(np.uint8), np.ones((3, 3), np.uint8)).ravel()
         beside[pixels] &= (around > 0) & ~alike[pixels]
     return alike, beside
-
-
-def backdrop_without_walls(
-    photographs: Photographs,
-    backdrop: npt.NDArray[np.bool_],
-    depth: npt.NDArray[np.float32],
-    tolerance: float,
-) -> npt.NDArray[np.bool_]:
-    """The backdrop without what other photographs contradict, shape (pixels,).
-
-    A plain wall of the sky's colour may be taken for a backdrop in a photograph that does not show where it ends.
-    Where a model has a surface in spite of that, at a `depth`, (pixels,), [world units], each photograph that would
-    show the point there, give or take the `tolerance`, has a vote; `VOTES` to one that it is none make it a wall.
-    """
-    (chosen,) = np.nonzero(backdrop & np.isfinite(depth))
-    origins, along = photographs.of_pixels(chosen)
-    points = origins + depth[chosen, None] * along
-    surface, empty = (np.zeros(len(chosen), dtype=np.int64) for _ in range(2))
-    for number in range(len(photographs)):
-        pixel, far, shown = photographs.shown(number, points)
-        free = shown & ~(depth[pixel] < far - tolerance)
-        surface += free & ~backdrop[pixel]
-        empty += free & backdrop[pixel]
-    kept = backdrop.copy()
-    kept[chosen[surface >= VOTES * empty]] = False
-    return kept
 
 
 def upwards(photographs: Photographs) -> FloatArray:

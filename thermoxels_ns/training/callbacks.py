@@ -19,7 +19,7 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.data.datamanager import views_of_cameras
 from thermoxels_ns.field.refine import RowChange, prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.multiview.backdrop import backdrop_without_walls, mean_colours
+from thermoxels_ns.multiview.backdrop import mean_colours
 from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs, rays_through_backdrop
 from thermoxels_ns.multiview.planes import depths_on_planes
 from thermoxels_ns.multiview.stereo import rays_through
@@ -114,9 +114,9 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         CONSOLE.log(f"step {step}: surroundings of {len(grid.voxels):,} voxels")
 
     def look_at_walls(step: int) -> None:
-        """Before the lattice is refined, and a third of the way to its first change: backdrops shall not eat walls."""
+        """Before the lattice is refined, and a third of the way to its first change."""
         if evidence is not None:
-            follow_walls(model, evidence, step)
+            follow_planes(model, evidence, step)
 
     def change_lattice(step: int) -> None:
         assert attributes.pipeline is not None and attributes.optimizers is not None
@@ -191,23 +191,19 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
         model.feature_ray_sampler = FeatureRaySampler(depths, box, far, COARSE_LIGHT)
     elif depths is not None and tracks is not None:
         model.feature_ray_sampler = FeatureRaySampler(tracks.joined_with(depths), box, far)
+    open_rays = rays_through_backdrop(found.photographs, found.backdrop, 1e3 * float(np.linalg.norm(box[1] - box[0])))
+    model.backdrop_ray_sampler = None if open_rays is None else FeatureRaySampler(open_rays, box)
     if len(model.wall_depth):
-        _use_walls(model, found)
+        use_planes(model, found)
     if trainer is None or trainer._start_step == 0:
         points = model.grid.voxels.corner_index() * lattice.voxel_size + np.asarray(lattice.lo)
         model.grid.paint(torch.from_numpy(mean_colours(found.photographs, found.backdrop, points)))
     return found
 
 
-def follow_walls(model: ThermoxelsModel, evidence: PhotographEvidence, step: int) -> None:
-    """Give the model feature rays to the planes of plain walls, as it has them now, and to the backdrop without walls.
-
-    They take the place of earlier ones.
-    """
-    photographs, size = evidence.photographs, model.grid.lattice.voxel_size
-    backdrop = evidence.backdrop.copy()
-    if len(model.wall_depth):
-        backdrop &= np.isnan(model.wall_depth.cpu().numpy())  # a wall stays one
+def follow_planes(model: ThermoxelsModel, evidence: PhotographEvidence, step: int) -> None:
+    """Give the model feature rays to the planes of plain walls as the model has them now; earlier ones go."""
+    photographs = evidence.photographs
     depth = np.empty(len(photographs.colours), np.float32)
     for pixels in np.array_split(np.arange(len(depth)), -(-len(depth) // RAYS_AT_ONCE)):
         origins, along = photographs.of_pixels(pixels)
@@ -216,28 +212,18 @@ def follow_walls(model: ThermoxelsModel, evidence: PhotographEvidence, step: int
         points = half_way_points(model, *rays).cpu().numpy()
         depth[pixels] = np.linalg.norm(points - origins, axis=1) / lengths
     with threadpool_limits(1, "blas"):  # same bits for any number of threads
-        backdrop = backdrop_without_walls(photographs, backdrop, depth, size)
-        planes = depths_on_planes(photographs, backdrop, depth, PLANE_VOXELS * size)
-    CONSOLE.log(
-        f"step {step}: {np.isfinite(planes).mean():.1%} of the photographs' pixels show plain walls that are planes, "
-        f"{backdrop.mean():.1%} a plain backdrop"
-    )
-    planes[evidence.backdrop & ~backdrop & np.isnan(planes)] = np.inf
+        planes = depths_on_planes(photographs, evidence.backdrop, depth, PLANE_VOXELS * model.grid.lattice.voxel_size)
+    CONSOLE.log(f"step {step}: {np.isfinite(planes).mean():.1%} of the photographs' pixels show plain walls")
     model.wall_depth = torch.from_numpy(planes).to(model.device)
-    _use_walls(model, evidence)
+    use_planes(model, evidence)
 
 
-def _use_walls(model: ThermoxelsModel, evidence: PhotographEvidence) -> None:
-    """Point the feature rays of planes and backdrop to what the model has kept of them, see `wall_depth`."""
-    photographs, backdrop, box = evidence.photographs, evidence.backdrop, model.scene_box.aabb.double().numpy()
+def use_planes(model: ThermoxelsModel, evidence: PhotographEvidence) -> None:
+    """Point feature rays to the planes that the model holds, see `wall_depth`."""
     planes = model.wall_depth.cpu().numpy()
     (chosen,) = np.nonzero(np.isfinite(planes))
-    plane_rays = rays_through(photographs, chosen, planes[chosen].astype(np.float64))
-    model.plane_ray_sampler = FeatureRaySampler(plane_rays, box) if len(chosen) else None
-    open_rays = rays_through_backdrop(
-        photographs, backdrop & np.isnan(planes), 1e3 * float(np.linalg.norm(box[1] - box[0]))
-    )
-    model.backdrop_ray_sampler = None if open_rays is None else FeatureRaySampler(open_rays, box)
+    rays = rays_through(evidence.photographs, chosen, planes[chosen].astype(np.float64))
+    model.plane_ray_sampler = FeatureRaySampler(rays, model.scene_box.aabb.double().numpy()) if len(chosen) else None
 
 
 @dataclass(frozen=True)

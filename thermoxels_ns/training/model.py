@@ -121,7 +121,7 @@ class ThermoxelsModel(Model):
         self.backdrop_ray_sampler: losses.FeatureRaySampler | None = None
         # To the planes of plain walls; found when the lattice is refined.
         self.plane_ray_sampler: losses.FeatureRaySampler | None = None
-        # Depth of the plane that each pixel of the small photographs shows; infinite: a wall, but no plane; NaN: none.
+        # Depth of the plane that each pixel of the small photographs shows; NaN: none.
         self.register_buffer("wall_depth", torch.zeros(0))
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs):

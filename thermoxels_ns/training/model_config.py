@@ -21,7 +21,13 @@ MOST_VOXELS = 3.0
 """Voxels along the longest side that a scene may ask for, relative to the last of the resolutions. wild-11, whose
 ground runs on, asks for 256 and has F 0.95 of what is seen, 0.59 with 192; a statue photographed at 12 megapixels asks
 for 512 and gains nothing by 384 after 1500 steps (depths more than 2 % off: 15 %, 17 %)."""
+MOST_STRETCH = 1.5  # The same, up to which no split more is made
 STEP_OF_COARSEST = 8  # Of so many voxels the coarsest resolution is a multiple
+
+
+def _in_steps(voxels: float) -> int:
+    """Round to a coarsest resolution: up by less than three quarters of a step."""
+    return STEP_OF_COARSEST * max(1, math.ceil(voxels / STEP_OF_COARSEST - 0.25))
 
 
 @dataclass(frozen=True)
@@ -220,21 +226,23 @@ class ThermoxelsModelConfig(ModelConfig):
     def suited_to(self, voxels: float) -> ThermoxelsModelConfig:
         """Return the settings for a scene whose longest side is as long as this number of voxels of `voxel_pixels`.
 
-        There are at most `MOST_VOXELS` times as many as the last of the resolutions. Their number is rounded up, unless
-        less than a quarter of a step would be added: fewer voxels cost more than they save (courtyard: F 0.81, 0.86 and
-        0.89 of what is seen with 96, 112 and 128 voxels).
+        Up to `MOST_STRETCH` times the resolution, all resolutions grow or shrink alike. Beyond, up to `MOST_VOXELS`
+        times, the lattice is split as often as that many voxels need; resolutions and steps of one's own are not.
+        Voxels are rounded up by less than three quarters of a step: too few voxels lose more than they save (courtyard:
+        F 0.81, 0.86 and 0.89 of what is seen with 96, 112 and 128 voxels).
         """
         if not self.voxel_pixels or not math.isfinite(voxels):
             return self
-        wanted, splits = min(voxels, MOST_VOXELS * self.resolutions[-1]), 0
-        while STEP_OF_COARSEST * round(wanted / 2 ** (splits + 1) / STEP_OF_COARSEST) >= COARSEST:
+        first, last = self.resolutions[0], self.resolutions[-1]
+        usual, splits = schedule_for(last, self.steps), 0
+        if voxels <= MOST_STRETCH * last or (usual.resolutions, usual.refine_at) != (self.resolutions, self.refine_at):
+            coarsest = _in_steps(min(voxels, MOST_STRETCH * last) * first / last)
+            return replace(self, resolutions=tuple(coarsest * each // first for each in self.resolutions))
+        wanted = min(voxels, MOST_VOXELS * last)
+        while wanted / 2 ** (splits + 1) >= COARSEST - STEP_OF_COARSEST / 2:
             splits += 1
-        finest = 2**splits * STEP_OF_COARSEST * max(1, math.ceil(wanted / 2**splits / STEP_OF_COARSEST - 0.25))
-        schedule = schedule_for(finest, self.steps)
-        if len(schedule.resolutions) == len(self.resolutions):
-            return replace(self, resolutions=schedule.resolutions)
-        at = schedule.refine_at, schedule.prune_at
-        return replace(self, resolutions=schedule.resolutions, refine_at=at[0], prune_at=at[1])
+        found = schedule_for(_in_steps(wanted / 2**splits) * 2**splits, self.steps)
+        return replace(self, resolutions=found.resolutions, refine_at=found.refine_at, prune_at=found.prune_at)
 
     def first_sh_degree(self) -> int | None:
         """Return the degree of colour that is stored at the start: 0 until colour depends on the direction."""
