@@ -192,7 +192,7 @@ class _Capture:
             rows = [(each.name, name_of(each.photograph), name_of(each.thermal), each.how) for each in search.pairs]
             left_out = {printable(name_of(path)): why for path, why in search.unpaired.items()}
             write_json(folder / "pairs.json", {"pairs": rows, "left_out": left_out})
-            self.say(f"pairs: {len(search.pairs)}, files without a partner: {len(search.unpaired)}")
+            self.say(f"pairs: {len(search.pairs)}, files left out: {len(search.unpaired)}")
             for name, why in list(left_out.items())[:_MOST_NAMED]:
                 self.say(f"left out: {name}: {why}")
             if len(left_out) > _MOST_NAMED:

@@ -290,16 +290,17 @@ class FixedNodes:
 
     def _temperature_k(self, time_s: float) -> Vector:
         known = np.full(len(self.nodes), np.nan)
-        for form in self._forms:
+        for number, form in enumerate(self._forms):
             place, wanted = np.searchsorted(self.nodes, form.nodes), form.surroundings_k(time_s)
             clash = np.abs(known[place] - wanted) > _SAME_TEMPERATURE_K
             if clash.any():
                 first, second = (part[clash][0] + form.reference_c for part in (known[place], wanted))
                 node = form.nodes[clash][0]
+                other = next(form.effect for form in self._forms[number - 1 :: -1] if node in form.nodes)
                 raise HeatError(
                     "fixed temperature",
                     expected="one temperature at each node",
-                    got=f"{first:g} C and {second:g} C from {form.effect} at node {node} and"
+                    got=f"{first:g} C from {other} and {second:g} C from {form.effect} at node {node} and"
                     f" {np.count_nonzero(clash) - 1} more",
                     remedy="Let one effect fix all patches that meet, with a Varying that says what holds there.",
                 )

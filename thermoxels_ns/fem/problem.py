@@ -263,9 +263,13 @@ class HeatProblem:
             raise HeatError("material", expected="a Material or a mapping", got=got, remedy=remedy)
         used = {names[number] for number in np.unique(self.mesh.region)}
         given = {name for name, material in self.material.items() if isinstance(material, Conductor)}
-        unknown = set(self.material) - given | given - set(names)
-        if used - given or unknown:
-            got = f"none for: {', '.join(sorted(used - given))}; unknown: {', '.join(sorted(unknown))}"
+        wrong = {
+            "none for": used - set(self.material),
+            "no Material for": set(self.material) - given,
+            "unknown": given - set(names),
+        }
+        if any(wrong.values()):
+            got = "; ".join(f"{what}: {', '.join(sorted(which))}" for what, which in wrong.items() if which)
             expected = f"a Material for each of the regions {', '.join(sorted(used))}"
             raise HeatError("material", expected=expected, got=got, remedy=remedy)
         conductivities = {name: self.material[name].conductivity_w_mk for name in used}

@@ -341,11 +341,15 @@ def _check_stores(problem: HeatProblem) -> None:
 def _room_for_states(num_times: int, num_nodes: int) -> Vector:
     """Array for the temperatures of all times; `HeatError` says how much memory they need if that is too much."""
     needed = num_times * num_nodes * 8
-    if needed > MAX_STATE_BYTES:
-        raise HeatError(
-            "steps",
-            expected=f"temperatures of all times in at most {MAX_STATE_BYTES} bytes",
-            got=f"{num_times} times x {num_nodes} nodes x 8 bytes = {needed} bytes",
-            remedy=f"Take at most {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)} steps, or a coarser mesh.",
-        )
-    return np.empty((num_times, num_nodes))
+    try:
+        if needed <= MAX_STATE_BYTES:
+            return np.empty((num_times, num_nodes))
+        room = f"{MAX_STATE_BYTES} bytes"
+    except MemoryError:
+        room = "the memory that is free"
+    raise HeatError(
+        "steps",
+        expected=f"temperatures of all times in at most {room}",
+        got=f"{num_times} times x {num_nodes} nodes x 8 bytes = {needed} bytes",
+        remedy=f"Take at most {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)} steps, or a coarser mesh.",
+    )

@@ -51,6 +51,12 @@ class Tolerance:
     """Largest error of the mean heat flow that any effect brings, as a share of all heat that flows through the body;
     0.01 is what building physics asks for (ISO 10211)."""
 
+    def __post_init__(self) -> None:
+        given = [value for value in (self.temperature_k, self.heat_flow) if value is not None]
+        if not given or not all(0.0 < value < np.inf for value in given):
+            got, remedy = f"{self.temperature_k} and {self.heat_flow}", "Give kelvins, or a share such as 0.01."
+            raise HeatError("tolerance", expected="temperature_k, heat_flow or both, above 0", got=got, remedy=remedy)
+
     def excess(self, error: ErrorSize) -> float:
         """Error over what is allowed, whichever is worse; at most 1 is good."""
         pairs = (error.temperature_k, self.temperature_k), (error.heat_flow, self.heat_flow)

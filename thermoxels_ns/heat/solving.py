@@ -288,5 +288,6 @@ class _Progress:
         took_s, done = self._called_s - self._said_s, share - self._said_share
         if share < 1.0 and done > 0.0 and took_s >= SAY_EVERY_S:
             left_s = took_s / done * (1.0 - share)
-            self._say(f"{share:.2%} of the time after {steps} steps; about {left_s:.0f} s left.")
+            left = f"{left_s:.0f} s" if left_s < 120.0 else f"{left_s / 60.0:.0f} min"
+            self._say(f"{share:.2%} of the time after {steps} steps; about {left} left.")
             self._said_share, self._said_s = share, self._called_s

@@ -153,7 +153,7 @@ def rig_from_board_photos(
     Its files are paired and read like those of the capture, into `folder`. A `SceneError` is raised where there are no
     pairs, they come from another camera, or fewer than three show the board to both cameras.
     """
-    found = search_pairs(source, settings).pairs
+    found = search_pairs(source, settings, say=say).pairs
     read = read_frames(found, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
     pairs, size = [], (visible.width, visible.height)
     for frame in read.frames:

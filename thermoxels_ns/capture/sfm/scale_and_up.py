@@ -211,7 +211,8 @@ def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> t
         plane = np.linalg.lstsq(table * used, inverse * used[:, 0], rcond=1e-6)[0]
         off = np.abs(table @ plane - inverse)
         keep = off <= 3.0 * 1.4826 * float(np.median(off)) + 1e-12
-    at = max(float(plane[0]), 0.25 * float(np.median(inverse)))
+    at, usual = float(plane[0]), float(np.median(inverse))
+    at = at if at > 0.25 * usual else usual  # a plane that runs away behind the points tells no depth
     ray = model.ray(index, np.asarray(pixel))
     error = float(np.sqrt(np.mean(off[keep] ** 2))) / at**2 / math.sqrt(max(int(keep.sum()) - 3, 1))
     return model.centres[index] + ray / at, ray * error

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_direction
+from thermoxels_ns.core.checks import check_direction, check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, wrong
 
@@ -241,7 +241,9 @@ def _applied(
     colours: npt.NDArray | None,
 ) -> Applied:
     """Overwrite `start` where a rule holds, and append the rules' names; `allowed` says where other conditions do."""
-    count = len(start)
+    count, remedy = len(start), f"Pass one centroid per element that gets a {kind}."
+    check_shape("centroids", centroids, (count, 3), remedy, MeshError)
+    check_finite("centroids", centroids, remedy, MeshError)
     closest, winner, matches = np.full(count, np.inf), np.full(count, -1), []
     for number, (rule, mask) in enumerate(zip(rules, allowed)):
         inside = mask.copy()

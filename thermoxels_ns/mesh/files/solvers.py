@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_positive, remove_file, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import HeatError, MeshError
+from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_owners
@@ -66,6 +66,9 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     import h5py
 
     path = Path(path)
+    if path == heavy_data_path(path):
+        remedy = "Name the .xdmf; the .h5 beside it is written with it."
+        raise OutputError(str(path), expected="a name that ends in .xdmf", got=path.suffix, remedy=remedy)
     mesh, tags = checked_mesh(mesh)
     arrays: dict[str, npt.NDArray] = {
         "points_m": mesh.points_m,

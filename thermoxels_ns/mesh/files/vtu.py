@@ -191,16 +191,16 @@ def read_mesh(path: Path | str) -> TetMesh:
         boundary=tags,
         colour=None if colour is None else (np.asarray(colour) / 255.0).astype(np.float32),
     )
-    mesh.check(path.name, _REMEDY)
+    mesh.check(f"{path.name} with {beside.name}", _REMEDY)
     faces = group_faces(mesh.tets)
     wrong = count_wrong_facets(mesh, faces)
-    doubled = len(mesh.tets) - len(np.unique(np.sort(mesh.tets, axis=1), axis=0))
-    if doubled:
+    crowded = faces.sizes.max() > 2
+    if (wrong or crowded) and (doubled := len(mesh.tets) - len(np.unique(np.sort(mesh.tets, axis=1), axis=0))):
         raise _wrong(path.name, "every tetrahedron once", f"{doubled} of {len(mesh.tets)} listed again")
     if wrong:
         expected, got = "every face of one tetrahedron alone, and no other", f"{wrong} missing, inside or turned over"
         raise _wrong(beside.name, expected, got)
-    if faces.sizes.max() > 2:
+    if crowded:
         remedy = "Remove tetrahedra that lie in each other, or export the mesh again."
         raise _wrong(path.name, "faces of one or two tetrahedra each", "faces of more", remedy)
     return mesh

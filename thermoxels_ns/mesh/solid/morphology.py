@@ -33,7 +33,7 @@ def face_connected(cells: BoolArray) -> npt.NDArray[np.int32]:
 
 
 def connected(cells: BoolArray, connectivity: int = 3) -> npt.NDArray[np.int32]:
-    """Number the bodies whose voxels touch by faces, edges or corners, as `face_connected` does."""
+    """Number bodies as `face_connected` does; voxels touch by faces (`connectivity` 1), edges (2), or corners (3)."""
     # Only where something is solid: a lattice is mostly empty.
     labels, box = np.zeros(cells.shape, dtype=np.int32), bounding_box(cells)
     inside = np.zeros(cells[box].shape, dtype=np.int32)

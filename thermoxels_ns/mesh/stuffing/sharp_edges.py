@@ -146,7 +146,7 @@ def _carry_out(points: FloatArray, tets: IntArray, moves: _Moves) -> FloatArray:
 def _move_nodes(points, tets, around, first, node, to, corner, bounds):
     """Make the moves in place; the tetrahedra of node n are `around[first[n]:first[n + 1]]`."""
     moved = np.zeros(len(points), np.bool_)
-    taken = np.zeros(len(node), np.bool_)
+    taken = np.zeros(corner.max() + 1 if len(corner) else 0, np.bool_)
     for move in range(len(node)):
         n = node[move]
         if moved[n] or (corner[move] >= 0 and taken[corner[move]]):
