@@ -462,7 +462,7 @@ def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[
     train, val, test = found["train"], found["val"] or found["test"], found["test"] or found["val"]
     if _KEYS["train"] not in meta:
         train = [i for i in range(len(names)) if i not in {*val, *test}]
-    if not val:
+    if not {_KEYS["val"], _KEYS["test"]} & meta.keys():
         val = test = [i for i in range(len(names)) if i not in set(train)]
     return Split(train, val, test, f"by {', '.join(key for key in _KEYS.values() if key in meta)} in the json")
 

@@ -79,7 +79,9 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
     if image is not None:
         named = f"{where}: {image.name}"
         with errors_name(named, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(image) as opened:
-            size, orientation = opened.size, int(opened.getexif().get(_ORIENTATION, 1))
+            size = opened.size
+            if (values.get("h"), values.get("w")) == size:  # of a PNG, EXIF is read with all of its pixels
+                orientation = int(opened.getexif().get(_ORIENTATION, 1))
     try:
         if any(isinstance(value, bool) for key, value in values.items() if key in _NUMBERS):
             raise ValueError("true or false")

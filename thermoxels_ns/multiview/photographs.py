@@ -124,6 +124,8 @@ def thermal_at(dataset: Any, photographs: Photographs, depth: npt.NDArray[np.flo
     points, number = origins + depth[sure, None] * along, photographs.numbers[sure]
     for place, index in enumerate(photographs.index.tolist()):
         camera, own = dataset.camera(index, thermal=True), number == place
+        if camera is None:  # another lens than a perspective one
+            continue
         pixels = camera.project_world(dataset.pose(index, thermal=True), points[own])
         warm, valid = (values.numpy()[..., 0] for values in dataset.get_thermal(index))
         shown = camera.contains(pixels)

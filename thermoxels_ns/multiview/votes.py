@@ -57,7 +57,7 @@ def around_cameras(points: FloatArray, rays: FeatureRays, views: Views) -> BoolA
     shown, (left,) = np.zeros(len(points), dtype=np.int64), np.nonzero(near)
     for matrix, (width, height) in zip(views.matrices(), views.size):
         column, row, depth = matrix[:, :3] @ points[left].T + matrix[:, 3:]
-        held = (depth > 0.0) & (column >= 0.0) & (column <= width * depth) & (row >= 0.0) & (row <= height * depth)
+        held = (depth > 0.0) & (column >= 0.0) & (column < width * depth) & (row >= 0.0) & (row < height * depth)
         shown[left] += held
         left = left[shown[left] < 2]
     return near & (shown < 2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from threadpoolctl import threadpool_limits
 from torch.nn import Parameter
 
-from thermoxels_ns.core.errors import PruningError
+from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.data.datamanager import views_of_cameras
@@ -134,7 +134,18 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             change_surroundings(step)
         if step in factors:
             old = model.grid.row_parameters()
-            follow(old, model.split(factors[step]))
+            try:
+                follow(old, model.split(factors[step]))
+            except MemoryBudgetError as problem:
+                if not model.config.voxel_pixels:  # somebody asked for just this resolution
+                    raise
+                CONSOLE.log(
+                    f"step {step}: the lattice stays as it is, where photographs ask for a finer one: {problem}"
+                )
+                finest = model.config.resolutions.index(max(model.grid.lattice.cell_shape))
+                known = model.config.resolutions[: finest + 1], model.config.refine_at[:finest]
+                model.config = replace(model.config, resolutions=known[0], refine_at=known[1])
+                return
             CONSOLE.log(f"step {step}: lattice refined to {' x '.join(map(str, model.grid.lattice.cell_shape))} voxels")
             carve(step)
 

@@ -209,7 +209,7 @@ class ThermoxelsModel(Model):
         generator = torch.Generator().manual_seed(self.config.seed * stream + self.step)
         return {
             name: losses.random_block(len(grid.voxels), self.config.tv_share, generator)
-            for name in self.grid.row_parameters()
+            for name in grid.row_parameters()
             if getattr(self.loss_weights, f"tv_{name}")
         }
 
@@ -260,8 +260,7 @@ class ThermoxelsModel(Model):
         rgb, thermal = seen.rgb, seen.thermal
         # The gradient of `index_select` adds rays in their order; that of an index leaves the order to a race.
         gains_on, offsets_on = self.corrected.tolist()
-        assert ray_bundle.camera_indices is not None
-        photograph = ray_bundle.camera_indices[:, 0]
+        photograph = torch.zeros(0) if ray_bundle.camera_indices is None else ray_bundle.camera_indices[:, 0]
         if self.log_gain is not None and gains_on and rgb is not None:
             log_gain = self._correction(self.log_gain, self.config.exposure)
             rgb = rgb * torch.exp(log_gain - log_gain.mean(0)).index_select(0, photograph)

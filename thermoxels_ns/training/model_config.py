@@ -21,6 +21,7 @@ MOST_VOXELS = 3.0
 """Voxels along the longest side that a scene may ask for, relative to the last of the resolutions. wild-11, whose
 ground runs on, asks for 256 and has F 0.95 of what is seen, 0.59 with 192; a statue photographed at 12 megapixels asks
 for 512 and gains nothing by 384 after 1500 steps (depths more than 2 % off: 15 %, 17 %)."""
+MOST_ALONG = 512  # Voxels along the longest side that a scene may ask for at all
 MOST_STRETCH = 1.5  # The same, up to which no split more is made
 STEP_OF_COARSEST = 8  # Of so many voxels the coarsest resolution is a multiple
 
@@ -87,7 +88,7 @@ class ThermoxelsModelConfig(ModelConfig):
     """Steps at which the next resolution begins; one fewer than resolutions."""
     steps: int = _STANDARD.steps
     """Steps of a whole training, over which refine-at and prune-at are spread where voxel-pixels asks for another
-    number of resolutions."""
+    number of resolutions. A quality sets it; --max-num-iterations alone does not."""
     prune_at: tuple[int, ...] = _STANDARD.prune_at
     """Further steps at which voxels that no ray gives weight to are dropped (done at every refinement too)."""
     prune_threshold: float = 0.03
@@ -235,10 +236,11 @@ class ThermoxelsModelConfig(ModelConfig):
             return self
         first, last = self.resolutions[0], self.resolutions[-1]
         usual, splits = schedule_for(last, self.steps), 0
-        if voxels <= MOST_STRETCH * last or (usual.resolutions, usual.refine_at) != (self.resolutions, self.refine_at):
+        own = self.resolutions, self.refine_at, self.prune_at
+        if voxels <= MOST_STRETCH * last or own != (usual.resolutions, usual.refine_at, usual.prune_at):
             coarsest = _in_steps(min(voxels, MOST_STRETCH * last) * first / last)
             return replace(self, resolutions=tuple(coarsest * each // first for each in self.resolutions))
-        wanted = min(voxels, MOST_VOXELS * last)
+        wanted = min(voxels, MOST_VOXELS * last, MOST_ALONG)
         while wanted / 2 ** (splits + 1) >= COARSEST - STEP_OF_COARSEST / 2:
             splits += 1
         found = schedule_for(_in_steps(wanted / 2**splits) * 2**splits, self.steps)

@@ -38,7 +38,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
     quality: Quality | None = None
     """Named setting of resolution and length: draft (voxels of 3.2 pixels, up to 192 along the longest side, 800
     steps: a first look, half a minute on two cores), standard (1.6 pixels, up to 384, 1500 steps, the default: one to
-    some minutes) or fine (1.6 pixels, up to 768, 4000 steps: many minutes); `thermoxels cost` measures what they give.
+    some minutes) or fine (1.6 pixels, up to 512, 4000 steps: many minutes); `thermoxels cost` measures what they give.
     It replaces max-num-iterations, the lengths of the learning rate schedules, and the model's resolutions, refine-at,
     voxel-pixels, steps, prune-at, thin-at, distortion-ramp and view-dependence-from."""
     replaced: tyro.conf.Suppress[str] = ""
@@ -139,7 +139,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         earlier = yaml.load((folder.parent / "config.yml").read_text(encoding="utf-8"), Loader=ConfigLoader)
         if not isinstance(earlier, ThermoxelsTrainerConfig):
             return
-        if not any(typed(f"--pipeline.model.{item}") for item in _SCHEDULE):
+        if not any(typed_value(f"--pipeline.model.{item.replace('_', '-')}") for item in _SCHEDULE):
             for item in _SCHEDULE:
                 setattr(self.pipeline.model, item, getattr(earlier.pipeline.model, item))
         for name, group in self.optimizers.items():
