@@ -54,6 +54,11 @@ def test_only_rays_that_meet_the_box_ahead_are_in_it():
     assert make().eval()(bundle)["in_box"][:, 0].tolist() == [1.0, 0.0, 0.0, 1.0]
 
 
+def test_a_step_without_a_background_trains_surroundings_without_colour():
+    terms = (model := make(background="off").train()).get_loss_dict(model(rays()), targets())
+    assert all(bool(torch.isfinite(term)) for term in terms.values())
+
+
 @pytest.mark.parametrize("recipe", list(LOSS_RECIPES))
 def test_only_terms_of_non_zero_weight_are_computed(recipe):
     model = make(LINES, recipe=recipe, distortion_ramp=(0, 1)).train()
