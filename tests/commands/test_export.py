@@ -29,6 +29,7 @@ from thermoxels_ns.commands.export import (
 from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, OutputError, SceneError, ThermoxelsError
 from thermoxels_ns.core.lattice import Lattice, input_from_world
 from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.multiview.photographs import Photographs
@@ -427,9 +428,14 @@ def stand_in_run(monkeypatch, ball: GridSnapshot, fail: Exception | None = None)
         dataparser_transform=torch.eye(4)[:3], dataparser_scale=0.5, cameras=cameras, metadata={"feature_rays": None}
     )
     grey = torch.full((40, 40, 3), 128, dtype=torch.uint8)
-    dataset = SimpleNamespace(
-        cameras=cameras, thermal_cameras=cameras, get_image_uint8=lambda _: grey, get_mask=lambda _: None
-    )
+    dataset = ThermalDataset.__new__(ThermalDataset)
+    dataset.cameras, dataset.thermal_cameras = cameras, cameras
+    for name, value in {
+        "__len__": lambda _: 1,
+        "get_image_uint8": lambda *_: grey,
+        "get_mask": lambda *_: None,
+    }.items():
+        monkeypatch.setattr(ThermalDataset, name, value)
     datamanager = SimpleNamespace(
         train_dataparser_outputs=outputs, get_datapath=lambda: Path("no-scene"), train_dataset=dataset
     )

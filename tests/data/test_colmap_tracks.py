@@ -8,6 +8,7 @@ import pytest
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.colmap_tracks import _matched, read_colmap_tracks
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.tracks import COLMAP_FOLDERS, TRACKS_KEY, SparseTracks, check_complete, write_tracks
 
