@@ -63,27 +63,27 @@ NEVER = {
 """Other packages that a room does not import, not even inside a function."""
 
 MOST_LINES = {
-    "audit": 2370,
-    "capture": 5050,
-    "commands": 2600,
+    "audit": 2220,
+    "capture": 4700,
+    "commands": 2590,
     "core": 1670,
-    "data": 2840,
-    "evaluation": 540,
-    "fem": 3880,
-    "field": 990,
-    "heat": 2440,
-    "mesh": 6030,
-    "multiview": 2100,
-    "radiometry": 1490,
-    "render": 1830,
-    "reports": 1640,
-    "synthetic": 3040,
-    "training": 2640,
+    "data": 2620,
+    "evaluation": 530,
+    "fem": 3590,
+    "field": 890,
+    "heat": 2370,
+    "mesh": 5310,
+    "multiview": 1960,
+    "radiometry": 1440,
+    "render": 1670,
+    "reports": 1270,
+    "synthetic": 2810,
+    "training": 2550,
     "root": 470,
 }
 """Budget of lines of each room, comments and docstrings included: what it had when that was written down and 5 % more.
 Raising one is said in the message of the commit."""
-MOST_TEST_LINES = 34300
+MOST_TEST_LINES = 32400
 
 
 def room_of(module: str) -> str:
