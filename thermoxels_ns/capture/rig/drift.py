@@ -20,7 +20,7 @@ _RADIAL_TERMS = 2
 _HUBER = 1.345
 _MAD_TO_SIGMA = 1.4826
 _ITERATIONS = 30
-_CONVERGED_K = 1e-5
+_CONVERGED_K = 1e-3  # Offsets are right to 0.03 K or less
 _HELD_OUT_EVERY = 5
 _MOST_LAG = 6
 """How many readings before it, of the same point, each reading is compared with."""
