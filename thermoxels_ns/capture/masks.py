@@ -8,11 +8,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.photograph import open_photograph, read_mask, read_photograph_facts
+from thermoxels_ns.core.arrays import BoolArray
 from thermoxels_ns.core.errors import SceneError
 
 MIN_FRAMES = 8  # fewer photographs cannot tell what is drawn over them from what they all happen to show
@@ -30,7 +30,7 @@ class PhotographMasks:
     """Where photographs may be used: everywhere but under what the camera drew and what the user shut out."""
 
     size: tuple[int, int]  # width and height of the photographs, [pixels]
-    overlay: npt.NDArray[np.bool_] | None = None
+    overlay: BoolArray | None = None
     """False where the camera drew over all photographs, shape (height, width); None: nowhere."""
     files: Mapping[str, Path] = field(default_factory=dict)
     """Masks that the user gives, by frame; frames without one may be used everywhere."""
@@ -40,7 +40,7 @@ class PhotographMasks:
         """Whether anything is masked in any photograph."""
         return self.overlay is not None or bool(self.files)
 
-    def of(self, frame: str) -> npt.NDArray[np.bool_]:
+    def of(self, frame: str) -> BoolArray:
         """True where a frame's photograph may be used, shape (height, width); a `SceneError` for an unfit mask."""
         width, height = self.size
         use = np.ones((height, width), dtype=bool) if self.overlay is None else self.overlay.copy()
@@ -78,7 +78,7 @@ def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str,
     return found
 
 
-def find_overlay(photographs: Sequence[Path]) -> npt.NDArray[np.bool_] | None:
+def find_overlay(photographs: Sequence[Path]) -> BoolArray | None:
     """Find what the camera drew over all photographs of one size: text, scales and logos, at the same place in each.
 
     A pixel belongs to an overlay if it stays the same in all photographs, stands out from its surroundings in their

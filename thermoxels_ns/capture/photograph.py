@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
+from thermoxels_ns.core.arrays import BoolArray
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.decoders import ExifFacts, errors_name, read_exif_facts
 
@@ -86,7 +86,7 @@ def open_photograph(path: Path) -> Image.Image:
         return image.convert("RGB")
 
 
-def read_mask(path: Path, width: int, height: int) -> npt.NDArray[np.bool_]:
+def read_mask(path: Path, width: int, height: int) -> BoolArray:
     """Read a mask, white (128 and more) where the image may be used; a `SceneError` where its size is another."""
     mask = np.asarray(open_photograph(path).convert("L")) >= 128
     if mask.shape != (height, width):

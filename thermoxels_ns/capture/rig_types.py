@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
-
-FloatArray = npt.NDArray[np.float64]
 
 OPENGL_FROM_OPENCV: FloatArray = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns camera axes; it is its own inverse. ``pose @ OPENGL_FROM_OPENCV`` is camera to world in OpenCV's axes."""
@@ -39,7 +38,7 @@ class RigFrame:
     """Temperatures [degrees C], shape (height, width), NaN where there is none; or a .npy file of them."""
     camera_to_world: FloatArray  # pose of the visible camera, shape (4, 4), OpenGL axes
     points_world: FloatArray  # scene points that structure from motion saw in this photograph, shape (n, 3)
-    point_ids: npt.NDArray[np.int64]  # which point each of them is, the same number in all frames, shape (n,)
+    point_ids: IntArray  # which point each of them is, the same number in all frames, shape (n,)
 
     def points_visible(self) -> FloatArray:
         """Return the points in the visible camera's OpenCV axes, shape (n, 3)."""
@@ -193,7 +192,7 @@ class DriftEstimate:
         r2 = radius_squared(np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1), width, height)
         return np.sum([c * r2 ** (power + 1) for power, c in enumerate(self.radial)], axis=0) + np.zeros_like(r2)
 
-    def corrected(self, frame: int, temperature_c: npt.NDArray) -> npt.NDArray[np.float32]:
+    def corrected(self, frame: int, temperature_c: npt.NDArray) -> Float32Array:
         """Temperatures of a frame (by its number) without drift and vignetting, shape (height, width) [degrees C]."""
         height, width = temperature_c.shape
         return (temperature_c - self.offsets_k[frame] - self.radial_k(width, height)).astype(np.float32)

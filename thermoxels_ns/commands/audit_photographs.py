@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from thermoxels_ns.audit.run import Audit
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
 from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
@@ -62,7 +62,7 @@ def _nearest(frame: Frame, points: FloatArray) -> FloatArray:
     return nearest
 
 
-def _cells(camera: Camera, pixels: FloatArray) -> tuple[npt.NDArray[np.int64], ...]:
+def _cells(camera: Camera, pixels: FloatArray) -> tuple[IntArray, ...]:
     share = pixels / (camera.width, camera.height)
     return tuple(np.clip((share * _CELLS).astype(np.int64), 0, _CELLS - 1).T)
 

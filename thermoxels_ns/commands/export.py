@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import remove_file, result_folder
 from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json_object
@@ -158,7 +159,7 @@ class TrainedScene:
     """A trained field, where it lies, and the folder of its photographs."""
 
     snapshot: GridSnapshot
-    world_to_input: npt.NDArray[np.float64]
+    world_to_input: FloatArray
     """Takes homogeneous column vectors of the trained scene to the coordinates of the input poses, shape (4, 4)."""
     viewpoint: Viewpoint  # From where pictures show most of what the cameras saw
     scene_folder: Path
@@ -315,7 +316,7 @@ def prepare_folder(output_dir: Path | str) -> Path:
 
 def export_snapshot(
     snapshot: GridSnapshot,
-    world_to_input: npt.NDArray[np.float64],
+    world_to_input: FloatArray,
     options: ExportOptions,
     output_dir: Path | str,
     say: Say = lambda _: None,
@@ -466,7 +467,7 @@ def _with_support(
     depths: Depths,
     tracks: FeatureRays | None,
     lattice: Lattice,
-    to_mesh: npt.NDArray[np.float64],
+    to_mesh: FloatArray,
 ) -> BuiltMesh:
     """Count for each boundary triangle the photographs that see it, and those that support it.
 

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from filelock import FileLock, Timeout
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
 
@@ -72,7 +73,7 @@ def check_shape(
 
 def check_direction(
     name: str, vector: npt.ArrayLike, remedy: str, error: type[ThermoxelsError] = ThermoxelsError
-) -> npt.NDArray[np.float64]:
+) -> FloatArray:
     """Return `vector` as three numbers if it is a direction of any length above 0, else raise `error`."""
     array = np.asarray(vector, dtype=np.float64)
     length = float(np.linalg.norm(array)) if array.shape == (3,) else 0.0

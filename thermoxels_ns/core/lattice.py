@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import CheckpointError, ThermoxelsError
 
-CORNER_OFFSETS: npt.NDArray[np.int64] = np.array(
+CORNER_OFFSETS: IntArray = np.array(
     [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1], [1, 1, 0], [1, 1, 1]], dtype=np.int64
 )
 """Offsets of a voxel's eight corners, shape (8, 3), in C order: corner c is (c >> 2 & 1, c >> 1 & 1, c & 1)."""
@@ -76,19 +77,19 @@ class Lattice:
         """Number of corners."""
         return self.shape[0] * self.shape[1] * self.shape[2]
 
-    def index_to_world(self, index: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    def index_to_world(self, index: npt.ArrayLike) -> FloatArray:
         """Map (fractional) corner indices (..., 3) to world positions (..., 3)."""
         return np.asarray(self.lo) + np.asarray(index, dtype=np.float64) * self.voxel_size
 
-    def world_to_index(self, point: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    def world_to_index(self, point: npt.ArrayLike) -> FloatArray:
         """Map world positions (..., 3) to fractional corner indices (..., 3)."""
         return (np.asarray(point, dtype=np.float64) - np.asarray(self.lo)) / self.voxel_size
 
-    def corner_positions(self) -> npt.NDArray[np.float64]:
+    def corner_positions(self) -> FloatArray:
         """World positions of all corners, shape (nx, ny, nz, 3)."""
         return self.index_to_world(np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), axis=-1))
 
-    def cell_centres(self) -> npt.NDArray[np.float64]:
+    def cell_centres(self) -> FloatArray:
         """World positions of all voxel centres, shape (nx-1, ny-1, nz-1, 3)."""
         cells = np.stack(np.meshgrid(*map(np.arange, self.cell_shape), indexing="ij"), axis=-1)
         return self.index_to_world(cells + 0.5)
@@ -102,7 +103,7 @@ class Lattice:
         return total / 8.0
 
 
-def input_from_world(transform: npt.ArrayLike, scale: float) -> npt.NDArray[np.float64]:
+def input_from_world(transform: npt.ArrayLike, scale: float) -> FloatArray:
     """Return the inverse (4, 4) of a nerfstudio dataparser's p_world = scale * (R p_input + t), [R | t] of (3, 4).
 
     >>> input_from_world([[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]], 2.0) @ [12, 0, 4, 1]

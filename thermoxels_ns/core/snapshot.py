@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
@@ -16,12 +16,12 @@ from thermoxels_ns.core.lattice import Lattice
 class Views:
     """The training cameras (pinholes without distortion), in the coordinates of the lattice."""
 
-    camera_to_world: npt.NDArray[np.float64]  # Poses [R | centre], x right, y up, z back (OpenGL), shape (c, 3, 4)
-    focal: npt.NDArray[np.float64]  # Focal lengths along x and y, shape (c, 2), [pixels]
-    centre: npt.NDArray[np.float64]  # Principal points x, y from the image's upper left corner, shape (c, 2), [pixels]
-    size: npt.NDArray[np.int64]  # Image widths and heights, shape (c, 2), [pixels]
+    camera_to_world: FloatArray  # Poses [R | centre], x right, y up, z back (OpenGL), shape (c, 3, 4)
+    focal: FloatArray  # Focal lengths along x and y, shape (c, 2), [pixels]
+    centre: FloatArray  # Principal points x, y from the image's upper left corner, shape (c, 2), [pixels]
+    size: IntArray  # Image widths and heights, shape (c, 2), [pixels]
 
-    def matrices(self) -> npt.NDArray[np.float64]:
+    def matrices(self) -> FloatArray:
         """World to homogeneous pixels (columns, rows, depth, positive in front), shape (c, 3, 4)."""
         turned = self.camera_to_world[:, :, :3].transpose(0, 2, 1) * [[1.0], [-1.0], [-1.0]]
         local = np.concatenate((turned, -turned @ self.camera_to_world[:, :, 3:]), axis=2)
@@ -33,12 +33,12 @@ class Views:
 class RayEvidence:
     """What training rays, colour and thermal alike, say about where solid is."""
 
-    voxel_weight: npt.NDArray[np.float32]
+    voxel_weight: Float32Array
     """Sum of the weights that rays spent in each voxel, shape `lattice.cell_shape`, [rays]."""
-    half_depth_density: npt.NDArray[np.float32]
+    half_depth_density: Float32Array
     """One density per ray of opacity above one half, shape (rays,), [1 / world unit]: the highest at the centres of the
     voxels that the ray crosses within half a voxel of the point at which half of its weight is spent."""
-    voxel_ends: npt.NDArray[np.float32] | None = None
+    voxel_ends: Float32Array | None = None
     """Number of rays that end on something and have spent half of their weight in each voxel, shape
     `lattice.cell_shape`, [rays]. None: not known."""
 
@@ -48,16 +48,16 @@ class GridSnapshot:
     """The trained field, detached: arrays of the lattice's shape, all finite (checked)."""
 
     lattice: Lattice
-    density: npt.NDArray[np.float32]  # Density after activation at the corners, [1 / world unit], >= 0
-    temperature_c: npt.NDArray[np.float32]
+    density: Float32Array  # Density after activation at the corners, [1 / world unit], >= 0
+    temperature_c: Float32Array
     """Temperature at the corners, [degrees Celsius]: the mean over thermal training rays, each sample weighted by its
     share of the pixel; where `observed_weight` is 0 it is not a measurement."""
-    observed_weight: npt.NDArray[np.float32]
+    observed_weight: Float32Array
     """Sum of the weights that thermal training rays gave each corner; 0: no thermal ray ever saw it."""
-    voxel_density: npt.NDArray[np.float32] | None = None
+    voxel_density: Float32Array | None = None
     """Density at the voxel centres as the field has it, shape `lattice.cell_shape`, [1 / world unit]. None: density is
     trilinear, so it is the mean of the corners."""
-    colour: npt.NDArray[np.float32] | None = None
+    colour: Float32Array | None = None
     """Red, green, blue in [0, 1] at the corners, the mean over all directions, shape (*lattice.shape, 3). None: the
     model has no colour."""
     evidence: RayEvidence | None = None  # What training rays spent where. None: not known
@@ -90,7 +90,7 @@ class GridSnapshot:
                 expected, got = f"values from {least:g} to {most:g}", f"{array.min():g} to {array.max():g}"
                 raise MeshError(named, expected=expected, got=got, remedy=remedy)
 
-    def centre_density(self) -> npt.NDArray[np.float64]:
+    def centre_density(self) -> FloatArray:
         """Density at the voxel centres, shape `lattice.cell_shape`, [1 / world unit]."""
         if self.voxel_density is not None:
             return self.voxel_density.astype(np.float64)

@@ -18,6 +18,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError, ThermalFileError
 from thermoxels_ns.core.feature_rays import FeatureRays
@@ -90,16 +91,16 @@ class _Scene:
     file: SceneFile
     split: Split
     shapes: dict[Path, tuple[int, int]]  # height and width of every thermal file
-    translation: npt.NDArray[np.float64]
+    translation: FloatArray
     scale: float
     metadata: dict[str, Any]  # what the outputs of all splits hold
     box: SceneBox
     feature_rays: FeatureRays | None  # what the training photographs see of the tracks; nerfstudio's world
     adjusted: bool  # whether the poses of training photographs are others than the json's
-    fitted: dict[int, npt.NDArray[np.float64]]
+    fitted: dict[int, FloatArray]
     """Poses (4, 4) that were fitted to held-out photographs, in input coordinates, by number of the frame."""
 
-    def placed(self, poses: Sequence[npt.NDArray[np.float64]]) -> torch.Tensor:
+    def placed(self, poses: Sequence[FloatArray]) -> torch.Tensor:
         """Return camera-to-world matrices (4, 4) in nerfstudio's world, shape (n, 3, 4) float32."""
         moved = np.stack(poses)[:, :3]
         moved[:, :, 3] = self.scale * (moved[:, :, 3] + self.translation)
@@ -297,7 +298,7 @@ def survey_thermal_files(
     valid_range_c: tuple[float, float],
     bounds_c: tuple[float, float] | None,
     training: Collection[Path],
-) -> tuple[dict[Path, tuple[int, int]], TemperatureRange, dict[tuple[int, int], npt.NDArray[np.bool_]]]:
+) -> tuple[dict[Path, tuple[int, int]], TemperatureRange, dict[tuple[int, int], BoolArray]]:
     """Read every thermal file; return their shapes, the temperature range, and masks of stuck pixels by shape.
 
     Range and stuck pixels come from the files in `training` alone. The range that the scene declares, `bounds_c`, is
@@ -309,7 +310,7 @@ def survey_thermal_files(
     shapes: dict[Path, tuple[int, int]] = {}
     extremes: dict[Path, tuple[float, float]] = {}
     middles: dict[Path, float] = {}
-    kept: dict[tuple[int, int], list[npt.NDArray[np.float32]]] = {}
+    kept: dict[tuple[int, int], list[Float32Array]] = {}
     step = -(-len(training) // _MOST_FRAMES)
     for path in paths:
         temperature_c = read_thermal_file(path, unit, valid_range_c).temperature_c
@@ -469,7 +470,7 @@ def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[
 
 def refine_poses(
     scene: SceneFile, training: Sequence[int], say: Callable[[str], None]
-) -> tuple[SceneFile, dict[int, npt.NDArray[np.float64]]]:
+) -> tuple[SceneFile, dict[int, FloatArray]]:
     """Adjust the poses of the photographs that train to each other, if features that took no part then fit better.
 
     Thermal cameras of their own follow their photographs. Held-out photographs keep the poses given, so that they
@@ -519,7 +520,7 @@ def refine_poses(
     return replace(scene, frames=moved), fitted
 
 
-def _picture(frame: Frame) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_] | None, Camera]:
+def _picture(frame: Frame) -> tuple[npt.NDArray[np.uint8], BoolArray | None, Camera]:
     """Return a photograph in grey of at most `LONGEST_SIDE` pixels, its mask, and its camera at that size."""
     grey, mask = frame.read_picture("L", LONGEST_SIDE)
     factor = LONGEST_SIDE / max(grey.size)

@@ -15,6 +15,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from torch import Tensor
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.units import TemperatureRange
@@ -61,7 +62,7 @@ class ThermalDataset(InputDataset):
         named: dict[str, Any] = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), lens))
         return Camera(width, height, fx, fy, cx, cy, **named)
 
-    def pose(self, image_idx: int, thermal: bool = False) -> npt.NDArray[np.float64]:
+    def pose(self, image_idx: int, thermal: bool = False) -> FloatArray:
         """Pose of that camera, camera to world, OpenGL axes, shape (3, 4)."""
         cameras: Any = self.thermal_cameras if thermal else self.cameras
         return cameras.camera_to_worlds[image_idx].double().numpy()

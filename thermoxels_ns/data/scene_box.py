@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.data.tracks import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.transforms_json import read_pose
 
-FloatArray = npt.NDArray[np.float64]
 Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 
 _REMEDY = "Pass --scene-box with two corners in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax."
@@ -168,7 +167,7 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame], tail: float = _TA
     return _checked(np.stack([low, high]), "box of the points")
 
 
-def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> npt.NDArray[np.float32]:
+def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array:
     """Depth of each point for each photograph, (photographs, points); NaN where it is not in view."""
     depth = np.full((len(frames), len(points)), np.nan, dtype=np.float32)
     for row, frame in zip(depth, frames):
@@ -180,20 +179,18 @@ def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> npt.NDArray[
     return depth
 
 
-def _distance_behind(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def _distance_behind(depth: Float32Array) -> Float32Array:
     """Depth of each point, relative to the median of each photograph, in the one where that is smallest."""
     depth = depth[np.isfinite(depth).any(axis=1)]
     return np.nanmin(depth / np.nanmedian(depth, axis=1, keepdims=True), axis=0)
 
 
-def _rarity(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def _rarity(depth: Float32Array) -> Float32Array:
     """One over the number of photographs that have each point in view."""
     return 1.0 / np.isfinite(depth).sum(axis=0, dtype=np.float32)
 
 
-def _worth_keeping(
-    points: FloatArray, depth: npt.NDArray[np.float32], figure: npt.NDArray[np.float32], tail: float
-) -> npt.NDArray[np.bool_]:
+def _worth_keeping(points: FloatArray, depth: Float32Array, figure: Float32Array, tail: float) -> BoolArray:
     """Which points have so small a figure that they belong to the body, not to what lies around it.
 
     All do, unless a limit of the figure exists that gives half as many more points per length of the box; of the limits
@@ -259,7 +256,7 @@ def _checked(corners: Any, name: str) -> Box:
     return box
 
 
-def _read_ply(path: Path) -> npt.NDArray[np.float64]:
+def _read_ply(path: Path) -> FloatArray:
     """Read the x, y, z of a .ply (ASCII or binary); it is in the coordinates of the json."""
     import trimesh  # slow to import and only needed here
 
@@ -274,7 +271,7 @@ def _read_ply(path: Path) -> npt.NDArray[np.float64]:
     return points
 
 
-def _read_colmap(folder: str, scene: SceneFile) -> npt.NDArray[np.float64]:
+def _read_colmap(folder: str, scene: SceneFile) -> FloatArray:
     """Read a COLMAP model's points and bring them into the coordinates of the json.
 
     The json may hold COLMAP's world or one with other axes (``applied_transform``). Which one is decided by the

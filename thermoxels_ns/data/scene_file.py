@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import is_number, plain_os_errors
 from thermoxels_ns.core.errors import SceneError
@@ -34,9 +33,9 @@ class Frame:
     image: Path
     thermal: Path
     mask: Path | None
-    pose: npt.NDArray[np.float64]  # camera to world, shape (4, 4), OpenGL axes, input coordinates
+    pose: FloatArray  # camera to world, shape (4, 4), OpenGL axes, input coordinates
     intrinsics: Camera
-    thermal_pose: npt.NDArray[np.float64] | None  # pose of the thermal camera; None: the photograph's
+    thermal_pose: FloatArray | None  # pose of the thermal camera; None: the photograph's
     thermal_intrinsics: Camera | None
     """The thermal camera's own projection; None: the photograph's at the thermal image's resolution."""
 

@@ -6,9 +6,9 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.camera import Camera, Lens
 from thermoxels_ns.core.checks import is_number
 from thermoxels_ns.core.errors import SceneError
@@ -33,7 +33,7 @@ _LENS_OF_MODEL: dict[str, Lens] = {
 """nerfstudio's camera models whose rays start in one point."""
 
 
-def read_pose(values: Any, where: str, turned: bool = True) -> npt.NDArray[np.float64]:
+def read_pose(values: Any, where: str, turned: bool = True) -> FloatArray:
     """Return a camera-to-world matrix (4, 4) from 3 x 4 or 4 x 4 numbers of a json.
 
     Raises `SceneError` unless the numbers are finite, the camera is within `MOST_UNITS` of the origin, a fourth row is

@@ -11,17 +11,17 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from skfem import BilinearForm
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import HeatProblem, Term, effect_labels
 from thermoxels_ns.fem.solution import Assembled
 from thermoxels_ns.fem.space import Space, sums_by_number
 
-Vector = npt.NDArray[np.float64]
+Vector = FloatArray
 
 COLDEST_SLOPE_K = 1e-2
 """Below this temperature the slope of radiation is that at it, so that no Newton matrix is singular, [K]."""
@@ -120,7 +120,7 @@ class _Exchange(_Boundary):
         """Temperature of the surroundings at each triangle, relative to the reference, shape (k, 1), [K]."""
         return self.at(1, time_s) - self._reference_c
 
-    def exchanging_nodes(self, time_s: float) -> npt.NDArray[np.int64]:
+    def exchanging_nodes(self, time_s: float) -> IntArray:
         """Nodes whose temperature its surroundings pull on: the strength is above 0 there."""
         return np.unique(self.nodes[self.strength(time_s)[:, 0] > 0.0])
 
@@ -216,7 +216,7 @@ class FixedForm:
     def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
         selection = space.selection
         self.effect, self.kind, self.facets, self.reference_c = effect, term.kind, term.parts, reference_c
-        self.owners: npt.NDArray[np.int64] = space.facet_nodes(term.parts)
+        self.owners: IntArray = space.facet_nodes(term.parts)
         """Nodes of each triangle, shape (k, m)."""
         self.nodes = np.unique(self.owners)
         self._places, self._temperature = space.node_places(self.nodes), term.quantities[0]
@@ -235,9 +235,7 @@ class FixedNodes:
 
     def __init__(self, forms: Sequence[FixedForm], num_nodes: int) -> None:
         self._forms = tuple(forms)
-        self.nodes: npt.NDArray[np.int64] = np.unique(
-            np.concatenate([np.zeros(0, np.int64), *(f.nodes for f in forms)])
-        )
+        self.nodes: IntArray = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.nodes for f in forms)]))
         """Their numbers, ascending, shape (d,)."""
         self.groups: tuple[tuple[str, str], ...] = tuple(
             (form.effect, patch) for form in forms for patch in form.groups
@@ -269,7 +267,7 @@ class FixedNodes:
         sums = sparse.csr_matrix((ones, (group, np.arange(len(group)))), (int(counts[-1]), len(group)))
         return sparse.csr_matrix(sums @ self.facet_shares)
 
-    def facet_heat_w(self, kept_w: Vector) -> list[tuple[str, npt.NDArray[np.int64], Vector]]:
+    def facet_heat_w(self, kept_w: Vector) -> list[tuple[str, IntArray, Vector]]:
         """Effect, triangles and the heat flow into the body through each, [W], from that at `nodes`, shape (d,)."""
         heat_w, begin, found = self.facet_shares @ kept_w, 0, []
         for form in self._forms:
@@ -278,7 +276,7 @@ class FixedNodes:
         return found
 
     @cached_property
-    def free(self) -> npt.NDArray[np.int64]:
+    def free(self) -> IntArray:
         """Nodes that are not fixed, ascending."""
         free = np.ones(self._num_nodes, dtype=bool)
         free[self.nodes] = False

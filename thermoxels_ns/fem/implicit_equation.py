@@ -6,17 +6,17 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 from threadpoolctl import ThreadpoolController
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
 from thermoxels_ns.fem.system import NOTHING, HeatSystem
 
-Vector = npt.NDArray[np.float64]
+Vector = FloatArray
 
 MOST_UNBALANCED = 1e-3
 """Share of the heat flow that may be unbalanced, round-off included, in an answer: a tenth of what the geometry of a
@@ -223,7 +223,7 @@ class ImplicitEquation:
             self._row_sums_w_k += system.nodal_mass_j_k / step_s
         self._matrix: sparse.csr_matrix = self._free_block(system.matrix(time_s, step_s))
         """M / step + K + R between free nodes."""
-        self._floating: npt.NDArray[np.bool_] = ~system.pieces.touched(system.fixed.nodes)
+        self._floating: BoolArray = ~system.pieces.touched(system.fixed.nodes)
         """Pieces without fixed nodes, shape (p,)."""
         self._solvers: dict[float, LinearSolver] = {}
 

@@ -9,12 +9,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.kernel_cache import kernel
 
-Vector = npt.NDArray[np.float64]
-Numbers = npt.NDArray[np.int64]
+Vector = FloatArray
+Numbers = IntArray
 
 _REMEDY = "Build the mesh with thermoxels_ns.mesh."
 FLATTEST = 1e-6
@@ -31,7 +32,7 @@ FACET_EDGES = np.array([(0, 1), (1, 2), (0, 2)])  # Ends of the edges of a trian
 class MeshEdges:
     """Every edge of a tetrahedral mesh once, at its smaller node number: a strict upper triangle."""
 
-    first: npt.NDArray[np.int64]  # Edges of node i stand at first[i] to first[i + 1]; shape (n + 1,)
+    first: IntArray  # Edges of node i stand at first[i] to first[i + 1]; shape (n + 1,)
     other: npt.NDArray[np.int32]  # The larger node number of each edge, ascending for each smaller one, shape (e,)
 
     @property
@@ -43,11 +44,11 @@ class MeshEdges:
         """The smaller node number of each edge, shape (e,)."""
         return np.repeat(np.arange(self.num_nodes, dtype=np.int32), np.diff(self.first))
 
-    def midpoints(self, nodal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def midpoints(self, nodal: FloatArray) -> FloatArray:
         """Means of the values at both ends of each edge, shape (e, ...)."""
         return 0.5 * (nodal[self.smaller_nodes()] + nodal[self.other])
 
-    def numbers(self, elements: npt.NDArray[np.int64], ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    def numbers(self, elements: IntArray, ends: IntArray) -> IntArray:
         """Number the edges, shape (k, j), of tetrahedra or triangles; `ends` are the local nodes of each, shape (j, 2).
 
         >>> edges = mesh_edges(np.array([[3, 0, 2, 1]]), 4)
@@ -59,7 +60,7 @@ class MeshEdges:
         return numbers
 
 
-def mesh_edges(tets: npt.NDArray[np.int64], num_nodes: int) -> MeshEdges:
+def mesh_edges(tets: IntArray, num_nodes: int) -> MeshEdges:
     """Find the edges of a mesh in ascending order, in time and memory that grow with the number of tetrahedra.
 
     >>> edges = mesh_edges(np.array([[3, 0, 2, 1], [1, 2, 4, 3]]), 5)

@@ -11,8 +11,8 @@ from functools import cached_property
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
@@ -50,12 +50,12 @@ class TimeSteps:
         return self.steps * self.step_seconds
 
     @property
-    def times_s(self) -> npt.NDArray[np.float64]:
+    def times_s(self) -> FloatArray:
         """Start, then the end of every step, shape (steps + 1,), [s]."""
         return np.arange(self.steps + 1, dtype=np.float64) * self.step_seconds
 
     @property
-    def lengths_s(self) -> tuple[npt.NDArray[np.float64], ...]:
+    def lengths_s(self) -> tuple[FloatArray, ...]:
         """Lengths of the steps in each interval at whose ends temperatures are kept, [s]."""
         return (np.array([self.step_seconds]),) * self.steps
 
@@ -80,7 +80,7 @@ class AdaptiveSteps:
         _check_count("outputs", self.outputs, "Give the number of intervals, such as 10.")
 
     @property
-    def times_s(self) -> npt.NDArray[np.float64]:
+    def times_s(self) -> FloatArray:
         """Start, then the end of every interval, shape (outputs + 1,), [s]."""
         return np.linspace(0.0, self.duration_s, self.outputs + 1)
 
@@ -94,7 +94,7 @@ class GivenSteps:
     """
 
     duration_s: float  # Time to follow the body for, [s]
-    lengths_s: tuple[npt.NDArray[np.float64], ...]
+    lengths_s: tuple[FloatArray, ...]
     """Lengths of the steps in each of some equal intervals at whose ends temperatures are kept, [s]."""
     tolerance_k: float
     """Tolerance of the adaptive steps that these came from, [K]. A step whose temperatures leave their range by more
@@ -107,7 +107,7 @@ class GivenSteps:
         return GivenSteps(self.duration_s, lengths_s, self.tolerance_k)
 
     @property
-    def times_s(self) -> npt.NDArray[np.float64]:
+    def times_s(self) -> FloatArray:
         """Start, then the end of every interval, [s]."""
         return np.linspace(0.0, self.duration_s, len(self.lengths_s) + 1)
 
@@ -122,7 +122,7 @@ class Term:
     """What an effect adds to the heat equation besides conduction and storage; positive is into the body."""
 
     kind: Literal["convection", "flux", "radiation", "source", "fixed"]
-    parts: npt.NDArray[np.int64]  # Numbers of boundary triangles, of a source of tetrahedra, shape (k,)
+    parts: IntArray  # Numbers of boundary triangles, of a source of tetrahedra, shape (k,)
     quantities: tuple[Bounded, ...]
     """convection: h and T_ambient in h (T_ambient - T); flux: what it is the product of; radiation: eps and T_s in
     factor eps (T_s^4 - T^4), temperatures in kelvin; source: [W / m3]; fixed: the temperature of the nodes."""
@@ -199,7 +199,7 @@ class HeatProblem:
     mesh: TetMesh  # The body
     material: Conductor | Mapping[str, Conductor]
     """What all of it is made of, or one material per name of a region of the mesh."""
-    initial_temperature_c: npt.NDArray[np.float64] | None = None
+    initial_temperature_c: FloatArray | None = None
     """Nodal temperature at the start, shape (n,), [degrees Celsius]; None: the mesh's own. A steady solver starts its
     iterations from it."""
     effects: tuple[Effect, ...] = ()  # What acts on the body; several may act on one patch
@@ -232,22 +232,22 @@ class HeatProblem:
         return min((e.bounded(name).resolution_s for e in self.effects for name in e.bounds), default=math.inf)
 
     @property
-    def start_c(self) -> npt.NDArray[np.float64]:
+    def start_c(self) -> FloatArray:
         """Nodal temperature at the start, shape (n,), [degrees Celsius]."""
         given = self.mesh.temperature_c if self.initial_temperature_c is None else self.initial_temperature_c
         return np.asarray(given, dtype=np.float64)
 
     @property
-    def conductivity_w_mk(self) -> npt.NDArray[np.float64]:
+    def conductivity_w_mk(self) -> FloatArray:
         """Thermal conductivity of each tetrahedron, shape (t,), [W / (m K)]."""
         return self._of_tets("conductivity_w_mk")
 
     @property
-    def heat_capacity_j_m3k(self) -> npt.NDArray[np.float64]:
+    def heat_capacity_j_m3k(self) -> FloatArray:
         """Heat capacity per volume of each tetrahedron, shape (t,), [J / (m3 K)]."""
         return self._of_tets("heat_capacity_j_m3k")
 
-    def _of_tets(self, name: str) -> npt.NDArray[np.float64]:
+    def _of_tets(self, name: str) -> FloatArray:
         if isinstance(self.material, Conductor):
             return np.full(len(self.mesh.tets), float(getattr(self.material, name)))
         known, names = self.material, self.mesh.region_names

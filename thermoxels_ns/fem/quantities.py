@@ -10,6 +10,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 
 
@@ -17,8 +18,8 @@ from thermoxels_ns.core.errors import HeatError
 class Places:
     """Where a quantity is asked for: centroids of boundary triangles or of tetrahedra, or nodes."""
 
-    points_m: npt.NDArray[np.float64]  # Positions, shape (k, 3), [m]
-    normals: npt.NDArray[np.float64]  # Outward unit normals of the true surface, shape (k, 3); 0 inside the body
+    points_m: FloatArray  # Positions, shape (k, 3), [m]
+    normals: FloatArray  # Outward unit normals of the true surface, shape (k, 3); 0 inside the body
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Unit vector that points up
 
     def __len__(self) -> int:
@@ -88,7 +89,7 @@ class Bounds:
     varies: bool = True  # Whether it may be a `Varying`
     remedy: str = ""  # What to do instead of a value that is refused; empty: an example in the unit
 
-    def check(self, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    def check(self, value: npt.ArrayLike) -> FloatArray:
         """Return the values as an array if all are finite and in range, else raise `HeatError`."""
         try:
             values = np.asarray(value, dtype=np.float64)
@@ -150,7 +151,7 @@ class Bounded:
         """How far apart in time numbers may be that say how it changes in between, [s]."""
         return self.quantity.resolution_s if isinstance(self.quantity, Varying) and self.in_time else math.inf
 
-    def at(self, places: Places, time_s: float) -> npt.NDArray[np.float64]:
+    def at(self, places: Places, time_s: float) -> FloatArray:
         """Compute the quantity at places, shape (k,).
 
         Raises:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.p1_kernels import FACET_EDGES, TET_EDGES, mesh_edges
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -54,7 +54,7 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
     )
 
 
-def refined_values(mesh: TetMesh, nodal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def refined_values(mesh: TetMesh, nodal: FloatArray) -> FloatArray:
     """Interpolate values of a mesh's nodes to those of the refined one."""
     return np.concatenate([nodal, mesh_edges(mesh.tets, len(mesh.points_m)).midpoints(nodal)])
 
@@ -62,7 +62,7 @@ def refined_values(mesh: TetMesh, nodal: npt.NDArray[np.float64]) -> npt.NDArray
 _OPPOSITE = ((4, 9), (6, 8), (7, 5))  # Middles of opposite edges: 4 to 9 are those of `TET_EDGES`
 
 
-def _children() -> npt.NDArray[np.int64]:
+def _children() -> IntArray:
     """Local nodes (corners, then middles of `TET_EDGES`) of the children for each diagonal, shape (3, 8, 4)."""
     middle = {frozenset(map(int, ends)): 4 + number for number, ends in enumerate(TET_EDGES)}
     corners = [[i if j == i else middle[frozenset((i, j))] for j in range(4)] for i in range(4)]

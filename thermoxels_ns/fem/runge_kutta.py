@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation
 from thermoxels_ns.fem.system import HeatSystem
 
-Vector = npt.NDArray[np.float64]
+Vector = FloatArray
 
 _KEPT_EQUATIONS = 2  # Implicit equations, one for each length of a stage, whose matrices are kept
 _SAME_LENGTH = 1e-12  # Relative difference up to which two lengths are one

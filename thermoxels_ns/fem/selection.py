@@ -7,8 +7,8 @@ from fnmatch import fnmatchcase
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.quantities import Places
@@ -25,11 +25,11 @@ class Selection:
         tags = mesh.boundary
         self.patch_names: tuple[str, ...] = ("boundary",) if tags is None else tags.patch_names
         """Names of the patches; a mesh without tags has one, "boundary"."""
-        self.facet_patch: npt.NDArray[np.int64] = np.zeros(len(mesh.facets), np.int64) if tags is None else tags.patch
+        self.facet_patch: IntArray = np.zeros(len(mesh.facets), np.int64) if tags is None else tags.patch
         """Index into `patch_names`, shape (f,)."""
 
     @cached_property
-    def facet_area_m2(self) -> npt.NDArray[np.float64]:
+    def facet_area_m2(self) -> FloatArray:
         """True area that each boundary triangle stands for, shape (f,), [m2]; computed when first asked for."""
         cross = self._facet_cross_m2
         area = 0.5 * np.sqrt(np.einsum("fi,fi->f", cross, cross))
@@ -37,7 +37,7 @@ class Selection:
         return area if tags is None else area * tags.area_factor
 
     @cached_property
-    def facet_normal(self) -> npt.NDArray[np.float64]:
+    def facet_normal(self) -> FloatArray:
         """Outward unit normal of the true surface, shape (f, 3); computed when first asked for."""
         if self.mesh.boundary is not None:
             return self.mesh.boundary.normal
@@ -47,24 +47,24 @@ class Selection:
         return np.nan_to_num(own, nan=0.0, posinf=0.0, neginf=0.0)
 
     @cached_property
-    def _facet_cross_m2(self) -> npt.NDArray[np.float64]:
+    def _facet_cross_m2(self) -> FloatArray:
         corner = self.mesh.points_m[self.mesh.facets]
         return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
-    def facets(self, patterns: tuple[str, ...]) -> npt.NDArray[np.int64]:
+    def facets(self, patterns: tuple[str, ...]) -> IntArray:
         """Number the boundary triangles of the patches that match any pattern; each must match one, or `HeatError`."""
         return np.flatnonzero(_matching("patches", patterns, self.patch_names)[self.facet_patch])
 
-    def tets(self, patterns: tuple[str, ...]) -> npt.NDArray[np.int64]:
+    def tets(self, patterns: tuple[str, ...]) -> IntArray:
         """Number the tetrahedra of the regions that match any pattern; each must match one, or `HeatError`."""
         return np.flatnonzero(_matching("regions", patterns, self.mesh.region_names)[self.mesh.region])
 
-    def facet_places(self, facets: npt.NDArray[np.int64]) -> Places:
+    def facet_places(self, facets: IntArray) -> Places:
         """Give the centroids of boundary triangles."""
         centroids = self.mesh.points_m[self.mesh.facets[facets]].mean(axis=1)
         return Places(centroids, self.facet_normal[facets], self.up)
 
-    def tet_places(self, tets: npt.NDArray[np.int64]) -> Places:
+    def tet_places(self, tets: IntArray) -> Places:
         """Give the centroids of tetrahedra."""
         centroids = self.mesh.points_m[self.mesh.tets[tets]].mean(axis=1)
         return Places(centroids, np.zeros_like(centroids), self.up)
@@ -86,7 +86,7 @@ class Selection:
             check_positive("boundary area_factor", float(tags.area_factor.min()), remedy, HeatError)
 
 
-def _check_indices(name: str, indices: npt.NDArray[np.int64], count: int, remedy: str) -> None:
+def _check_indices(name: str, indices: IntArray, count: int, remedy: str) -> None:
     if indices.size and (indices.min() < 0 or indices.max() >= count):
         got = f"{indices.min()} to {indices.max()}"
         raise HeatError(name, expected=f"numbers from 0 to {count - 1}", got=got, remedy=remedy)
@@ -103,7 +103,7 @@ def matching_names(names: Collection[str], pattern: str) -> list[str]:
     return [pattern] if pattern in names else []
 
 
-def _matching(field: str, patterns: tuple[str, ...], names: tuple[str, ...]) -> npt.NDArray[np.bool_]:
+def _matching(field: str, patterns: tuple[str, ...], names: tuple[str, ...]) -> BoolArray:
     """Mark the names that match any pattern; each pattern must match one. Letters count as upper and lower case."""
     chosen = np.zeros(len(names), dtype=bool)
     for pattern in patterns:

@@ -12,12 +12,13 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-Vector = npt.NDArray[np.float64]
+Vector = FloatArray
 
 
 @dataclass
@@ -49,11 +50,11 @@ class EffectHeat:
     """Heat that one effect brings into the body."""
 
     effect: str  # What it is and where it acts
-    heat_w: npt.NDArray[np.float64]
+    heat_w: FloatArray
     """Mean heat flow into the body during each interval, as the scheme evaluates it, shape (s,), [W]; negative where
     heat leaves. A steady state has one interval."""
     group_names: tuple[str, ...]  # Names of the patches, or for a source of the regions, that it acts on
-    group_heat_w: npt.NDArray[np.float64]  # The same for each of them, shape (s, g), [W]
+    group_heat_w: FloatArray  # The same for each of them, shape (s, g), [W]
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,8 @@ class FacetHeat:
     """Heat that one effect brings into the body through single boundary triangles, at one moment."""
 
     effect: str
-    facets: npt.NDArray[np.int64]  # Numbers of the triangles, shape (k,)
-    heat_w: npt.NDArray[np.float64]  # Heat flow into the body through each, shape (k,), [W]
+    facets: IntArray  # Numbers of the triangles, shape (k,)
+    heat_w: FloatArray  # Heat flow into the body through each, shape (k,), [W]
 
 
 @dataclass(frozen=True)
@@ -82,14 +83,14 @@ class ErrorSize:
 class HeatSolution:
     """Temperatures over time and the account of the heat."""
 
-    times_s: npt.NDArray[np.float64]  # Time of each state, the start first, shape (s + 1,), [s]
-    temperature_c: npt.NDArray[np.float64]
+    times_s: FloatArray  # Time of each state, the start first, shape (s + 1,), [s]
+    temperature_c: FloatArray
     """Nodal temperatures, shape (s + 1, n), [degrees Celsius]. Surfaces with a fixed temperature have it from the
     start."""
-    heat_w: npt.NDArray[np.float64]
+    heat_w: FloatArray
     """Net heat flow into the body during each interval, measured as the change of its heat content over it,
     shape (s,), [W], positive into the body. Behind an insulated boundary it is 0 up to round-off."""
-    heat_content_j: npt.NDArray[np.float64]
+    heat_content_j: FloatArray
     """Heat content above absolute zero at each time, 1^T M T with T in kelvin, shape (s + 1,), [J]."""
     energy_residual: float
     """Largest change of the heat content that no heat flow accounts for, relative to the heat content or to all heat
@@ -98,12 +99,12 @@ class HeatSolution:
     """The same change relative to the heat stored in the initial differences, sum m_i |T_i - mean T|, plus all heat
     exchanged: the stricter measure. 0 where nothing is unaccounted for."""
     status: str
-    iterations: npt.NDArray[np.int64]  # Iterations of the linear solver in each interval, shape (s,)
+    iterations: IntArray  # Iterations of the linear solver in each interval, shape (s,)
     effects: tuple[EffectHeat, ...] = ()  # Heat that each effect of the problem brought, in the order of the problem
-    newton_iterations: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    newton_iterations: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
     steps: int = 0
-    step_lengths_s: tuple[npt.NDArray[np.float64], ...] = ()  # Lengths of the steps in each interval, [s]
+    step_lengths_s: tuple[FloatArray, ...] = ()  # Lengths of the steps in each interval, [s]
     time_error_k: float = float("nan")
     """Estimated largest error of the steps at any temperature, [K]: of adaptive ones their estimates added up, of equal
     ones by steps of twice the length, if asked for; else NaN."""
@@ -119,7 +120,7 @@ class HeatSolution:
 class SteadySolution:
     """Temperatures that no longer change, and the account of the heat."""
 
-    temperature_c: npt.NDArray[np.float64]  # Temperatures of the mesh's nodes, shape (n,), [degrees Celsius]
+    temperature_c: FloatArray  # Temperatures of the mesh's nodes, shape (n,), [degrees Celsius]
     effects: tuple[EffectHeat, ...]
     """Heat that each effect of the problem brings, in the order of the problem; they add up to 0."""
     energy_residual: float  # Sum of all heat flows, which should be 0, relative to the sum of their sizes
@@ -127,7 +128,7 @@ class SteadySolution:
     iterations: int
     newton_iterations: int  # Steps of Newton's method; 0 without radiation
     assembled: Assembled  # What was assembled
-    edge_temperature_c: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    edge_temperature_c: FloatArray = field(default_factory=lambda: np.zeros(0))
     """Temperatures of the middles of the mesh's edges, in the order of `mesh_edges`, shape (e,), [degrees Celsius];
     empty with linear tetrahedra."""
     unbalanced_w: float = 0.0
@@ -138,7 +139,7 @@ class SteadySolution:
 
 
 def heat_by_effect(
-    effects: Sequence[str], groups: Iterable[tuple[str, str]], group_heat_w: npt.NDArray[np.float64]
+    effects: Sequence[str], groups: Iterable[tuple[str, str]], group_heat_w: FloatArray
 ) -> tuple[EffectHeat, ...]:
     """Sort heat flows, shape (s, g), [W], of groups, each an effect and a patch or region, by effect."""
     columns: dict[str, list[tuple[int, str]]] = {effect: [] for effect in effects}

@@ -13,6 +13,7 @@ from skfem.helpers import dot
 from skfem.quadrature import get_quadrature
 from skfem.refdom import RefTet, RefTri
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.p1_kernels import (
     FACET_EDGES,
@@ -24,8 +25,8 @@ from thermoxels_ns.fem.p1_kernels import (
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.fem.selection import Selection
 
-Vector = npt.NDArray[np.float64]
-Numbers = npt.NDArray[np.int64]
+Vector = FloatArray
+Numbers = IntArray
 
 _CORNERS = (np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.full(3, 1.0 / 6.0))
 """Quadrature at the corners of the reference triangle."""

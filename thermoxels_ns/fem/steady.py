@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation
@@ -12,7 +12,7 @@ from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
 from thermoxels_ns.fem.system import HeatSystem
 
-Vector = npt.NDArray[np.float64]
+Vector = FloatArray
 
 OVERSHOOT_K = 0.01  # How far out of its range a temperature may be without a word, [K]
 
@@ -107,7 +107,7 @@ def _check_held(system: HeatSystem) -> None:
         raise HeatError("steady heat problem", expected=expected, got=got, remedy=remedy)
 
 
-def _largest(system: HeatSystem, chosen: npt.NDArray[np.int64]) -> str:
+def _largest(system: HeatSystem, chosen: IntArray) -> str:
     """Say where the largest of some pieces is."""
     sizes = np.bincount(system.pieces.number, minlength=system.pieces.count)
     piece = int(chosen[np.argmax(sizes[chosen])])

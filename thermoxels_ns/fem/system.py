@@ -10,6 +10,7 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.forms import (
@@ -26,7 +27,7 @@ from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import Assembled, FacetHeat
 from thermoxels_ns.fem.space import Space
 
-Vector = npt.NDArray[np.float64]
+Vector = FloatArray
 
 MOST_TIMES_CONDUCTION = 1e10
 """Largest convection at a node over what the cells around it conduct: more is a given temperature in all but name, and
@@ -68,7 +69,7 @@ class Pieces:
         """Subtract the mean of each piece, shape (n,)."""
         return nodal - self.at_nodes(self.sums(nodal) / self._sizes)
 
-    def touched(self, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    def touched(self, nodes: IntArray) -> BoolArray:
         """Mark the pieces that have any of the nodes, shape (p,)."""
         marks = np.zeros(self.count, dtype=bool)
         marks[self.number[nodes]] = True
@@ -240,7 +241,7 @@ class HeatSystem:
         kept_w = -self.net_heat_at_fixed(relative_k, time_s)
         return (*found, *(FacetHeat(*part) for part in self.fixed.facet_heat_w(kept_w)))
 
-    def exchanging_pieces(self, time_s: float) -> npt.NDArray[np.bool_]:
+    def exchanging_pieces(self, time_s: float) -> BoolArray:
         """Mark the pieces whose temperature convection, radiation or fixed nodes hold, shape (p,)."""
         marks = self.pieces.touched(self.fixed.nodes)
         for form in self.surface_forms:

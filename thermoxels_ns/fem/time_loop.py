@@ -7,8 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps, effect_labels
@@ -17,7 +17,7 @@ from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect
 from thermoxels_ns.fem.steady import OVERSHOOT_K, refuse_too_cold
 from thermoxels_ns.fem.system import HeatSystem
 
-Vector = npt.NDArray[np.float64]
+Vector = FloatArray
 Steps = TimeSteps | AdaptiveSteps | GivenSteps
 
 MAX_STATE_BYTES = 4 * 2**30

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
@@ -17,7 +17,7 @@ from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, Solution, Steady
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 
-Vector = npt.NDArray[np.float64]
+Vector = FloatArray
 
 DEFAULT_MEMORY_BYTES = 4 * 2**30  # Most memory that a solution may need, [bytes]
 HALVED = 0.3

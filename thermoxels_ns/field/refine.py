@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from thermoxels_ns.core.arrays import BoolArray, IntArray
 from thermoxels_ns.field.harmonics import num_coefficients
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels
@@ -75,11 +75,11 @@ def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
 
 
 @torch.no_grad()
-def prune(grid: VoxelGrid, keep: npt.NDArray[np.bool_]) -> RowChange:
+def prune(grid: VoxelGrid, keep: BoolArray) -> RowChange:
     """Keep only some of the kept voxels, one boolean for each, and return how rows change: by a copy."""
     voxels = grid.voxels
     new = KeptVoxels(voxels.lattice, voxels.cells[keep])
-    stay: npt.NDArray[np.int64] = np.searchsorted(voxels.corners, new.corners)
+    stay: IntArray = np.searchsorted(voxels.corners, new.corners)
 
     def change(rows: Tensor) -> Tensor:
         return rows[torch.from_numpy(stay).to(rows.device)]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import (
@@ -24,7 +24,7 @@ from thermoxels_ns.mesh.quality.checks import facet_owners
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-Vector = npt.NDArray[np.float64]
+Vector = FloatArray
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes 
     )
 
 
-def region_behind_facets(mesh: TetMesh) -> npt.NDArray[np.int64]:
+def region_behind_facets(mesh: TetMesh) -> IntArray:
     """Give the region of the tetrahedron behind each boundary triangle, shape (f,)."""
     return mesh.region[facet_owners(mesh.tets, mesh.facets)[0]]
 
@@ -326,7 +326,7 @@ def wall_result(
     selection, mesh = problem.selection, problem.mesh
     inner = matching_facets(selection, inside)
 
-    def parts(numbers: npt.NDArray[np.int64], names: tuple[str, ...]) -> tuple[WallPart, ...]:
+    def parts(numbers: IntArray, names: tuple[str, ...]) -> tuple[WallPart, ...]:
         number, count = np.where(inner, numbers, len(names)), len(names) + 1
         heat = heat_by_part(solution, number, count)
         area = np.bincount(number, selection.facet_area_m2, count)
@@ -363,13 +363,13 @@ def wall_result(
     )
 
 
-def matching_facets(selection: Selection, patterns: Sequence[str]) -> npt.NDArray[np.bool_]:
+def matching_facets(selection: Selection, patterns: Sequence[str]) -> BoolArray:
     """Mark the boundary triangles of patches whose names match one of some names or patterns, shape (f,)."""
     matching = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in selection.patch_names]
     return np.array(matching, dtype=bool)[selection.facet_patch]
 
 
-def heat_by_part(solution: Solution, part: npt.NDArray[np.int64], count: int) -> Vector:
+def heat_by_part(solution: Solution, part: IntArray, count: int) -> Vector:
     """Add up the heat flow into the body through parts of the surface at the end, shape (p,), [W].
 
     `part` is the number of the part, below `count`, of each boundary triangle of the mesh that was solved, shape (f,).

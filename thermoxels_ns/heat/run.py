@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import kelvin_to_celsius
@@ -32,7 +33,7 @@ from thermoxels_ns.heat.solving import Goals, LeftOut, Say, solve_problem
 from thermoxels_ns.mesh.quality.checks import count_tets_in_other_bodies, count_twin_nodes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-Vector = npt.NDArray[np.float64]
+Vector = FloatArray
 
 
 _OUTSIDE = 1e-9
@@ -43,9 +44,9 @@ _OUTSIDE = 1e-9
 class Probes:
     """Points in a body and how their temperature follows from that of the nodes."""
 
-    points_m: npt.NDArray[np.float64]  # Positions, shape (p, 3), [m]
-    nodes: npt.NDArray[np.int64]  # Nodes of the tetrahedron around each point, shape (p, 4)
-    weights: npt.NDArray[np.float64]  # Barycentric coordinates in it, shape (p, 4); each row adds up to 1
+    points_m: FloatArray  # Positions, shape (p, 3), [m]
+    nodes: IntArray  # Nodes of the tetrahedron around each point, shape (p, 4)
+    weights: FloatArray  # Barycentric coordinates in it, shape (p, 4); each row adds up to 1
 
     def at(self, nodal: Vector) -> Vector:
         """Interpolate nodal values, shape (..., n), to the points, shape (..., p)."""
@@ -334,14 +335,14 @@ def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ..
     )
 
 
-def _has_rooms(selection: Selection, inside: npt.NDArray[np.bool_]) -> bool:
+def _has_rooms(selection: Selection, inside: BoolArray) -> bool:
     """Whether enough of a surface faces up or sideways to be that of rooms."""
     area = selection.facet_area_m2[inside]
     level = selection.facet_normal[inside] @ np.array(selection.up) / np.linalg.norm(selection.up)
     return float(area[level > -_COS_45].sum()) > _LEAST_OF_A_ROOM * float(area.sum())
 
 
-def _outwards(selection: Selection, chosen: npt.NDArray[np.bool_]) -> float:
+def _outwards(selection: Selection, chosen: BoolArray) -> float:
     """Mean cosine between normals and the directions away from the middle; 0 of nothing."""
     area = selection.facet_area_m2[chosen]
     if not float(area.sum()) > 0.0:

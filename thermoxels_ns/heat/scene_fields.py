@@ -10,9 +10,9 @@ from types import MappingProxyType
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AfterValidator, AwareDatetime, Field
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
 from thermoxels_ns.core.yaml_records import record
@@ -55,7 +55,7 @@ def inside_coefficient(
         radiative = radiative_coefficient(mean_c, emissivity) if name == "iso-6946-separate" else 0.0
         table = np.array([INSIDE_CONVECTION_W_M2K[direction] + radiative for direction in directions])
 
-    def by_orientation(places: Places, _: float) -> npt.NDArray[np.float64]:
+    def by_orientation(places: Places, _: float) -> FloatArray:
         outward = places.normals @ np.array(places.up)
         upward = -outward if heat_flow == "into-body" else outward
         return table[np.where(upward > _HORIZONTAL, 0, np.where(upward < -_HORIZONTAL, 2, 1))]
@@ -283,7 +283,7 @@ def read_air_series(path: str) -> Varying:
     return tabulated(3600.0 * table[:, 0], table[:, 1])
 
 
-def air_series_table(path: str) -> npt.NDArray[np.float64]:
+def air_series_table(path: str) -> FloatArray:
     """Hours, ascending, and temperatures of a csv file, shape (k, 2); raises `HeatError`."""
     try:
         lines = [line for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip(" ,")]

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
 from thermoxels_ns.fem.quantities import Places, Quantity, Varying
@@ -34,7 +34,7 @@ def swinbank_sky_c(air_c: float) -> float:
     return kelvin_to_celsius(0.0552 * celsius_to_kelvin(air_c) ** 1.5)
 
 
-def sky_view(normals: npt.NDArray[np.float64], up: Vector) -> npt.NDArray[np.float64]:
+def sky_view(normals: FloatArray, up: Vector) -> FloatArray:
     """Share of the view of surfaces that is sky, (1 + cos tilt) / 2, shape (k,); normals point out, shape (k, 3).
 
     >>> sky_view(np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, -1]]), (0.0, 0.0, 1.0)).tolist()
@@ -43,7 +43,7 @@ def sky_view(normals: npt.NDArray[np.float64], up: Vector) -> npt.NDArray[np.flo
     return np.clip(0.5 * (1.0 + normals @ np.array(up)), 0.0, 1.0)
 
 
-def ground_view(normals: npt.NDArray[np.float64], up: Vector) -> npt.NDArray[np.float64]:
+def ground_view(normals: FloatArray, up: Vector) -> FloatArray:
     """Share of the view of surfaces that is ground, (1 - cos tilt) / 2, shape (k,)."""
     return 1.0 - sky_view(normals, up)
 
@@ -60,7 +60,7 @@ def outdoor_radiation(
         varying = sky_c if isinstance(sky_c, Varying) else Varying(lambda *_: sky_c, in_time=False)
         ground = celsius_to_kelvin(ground_c) ** 4
 
-        def mean(places: Places, time_s: float) -> npt.NDArray[np.float64]:
+        def mean(places: Places, time_s: float) -> FloatArray:
             seen = sky_view(places.normals, places.up)
             sky = celsius_to_kelvin(np.asarray(varying.function(places, time_s), dtype=np.float64)) ** 4
             return kelvin_to_celsius((seen * sky + (1.0 - seen) * ground) ** 0.25)
@@ -165,8 +165,8 @@ def meinel_clear_sky(elevation_deg: float, distance_au: float = 1.0) -> Sunlight
 
 
 def facet_irradiance(
-    normals: npt.NDArray[np.float64], up: Vector, towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0
-) -> npt.NDArray[np.float64]:
+    normals: FloatArray, up: Vector, towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0
+) -> FloatArray:
     """Compute the sunlight that falls on facets, [W / m2] of the facet, shape (k,); none shades another.
 
     Direct light by the cosine of its angle; diffuse light alike from all of the sky, by (1 + cos tilt) / 2;
@@ -206,7 +206,7 @@ def moving_sun(
     the coordinates of the mesh; without `sunlight` it is as strong as `meinel_clear_sky` estimates.
     """
 
-    def irradiance(places: Places, time_s: float) -> npt.NDArray[np.float64]:
+    def irradiance(places: Places, time_s: float) -> FloatArray:
         position = sun_position(_later(start, time_s), latitude_deg, longitude_deg)
         light = sunlight or meinel_clear_sky(position.elevation_deg, position.distance_au)
         towards = towards_sun(position, places.up, north)
@@ -229,6 +229,6 @@ def _days(moment: datetime) -> float:
     return (moment - _EPOCH).total_seconds() / 86400.0
 
 
-def _unit(direction: Vector) -> npt.NDArray[np.float64]:
+def _unit(direction: Vector) -> FloatArray:
     vector = np.asarray(direction, dtype=np.float64)
     return vector / np.linalg.norm(vector)

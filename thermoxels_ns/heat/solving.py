@@ -8,8 +8,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.forms import FixedForm, effect_forms
 from thermoxels_ns.fem.problem import AdaptiveSteps, Effect, HeatProblem, TimeSteps, effect_labels
@@ -27,7 +27,7 @@ from thermoxels_ns.fem.tolerance import (
     steady_error,
 )
 
-Vector = npt.NDArray[np.float64]
+Vector = FloatArray
 Say = Callable[[str], None]
 Time = TimeSteps | AdaptiveSteps | None  # How a body is followed; None: its steady state
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.multiview.photographs import SATURATED, Photographs
-
-FloatArray = npt.NDArray[np.float64]
 
 PLAIN = 0.03  # Difference of a channel from one pixel to the next, of 1, up to which a photograph is plain
 STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which a photograph has no top
@@ -21,9 +19,7 @@ _WIDEST, _ROUNDS = 0.3, 8
 """Difference up to which colours count in the first of some fits; it shrinks to the tolerance."""
 
 
-def plain_backdrop(
-    photographs: Photographs, depth: npt.NDArray[np.float32]
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolArray, BoolArray]:
     """Which pixels show nothing but a plain backdrop, and which beside these look like it, both (pixels,).
 
     No photograph tells how far away a plain area is. It is taken for a backdrop if plain pixels lead up from it to the
@@ -92,7 +88,7 @@ def _turns(inverse: FloatArray, up: FloatArray) -> int | None:
     return 1 if right > 0 else 3
 
 
-def even_pixels(picture: npt.NDArray[np.float32], most: float = PLAIN) -> npt.NDArray[np.bool_]:
+def even_pixels(picture: Float32Array, most: float = PLAIN) -> BoolArray:
     """Which pixels of a picture (h, w, 3) differ by at most so much from the four around; those at a mask do not."""
     even = np.ones(picture.shape[:2], dtype=bool)
     for axis in (0, 1):
@@ -105,11 +101,11 @@ def even_pixels(picture: npt.NDArray[np.float32], most: float = PLAIN) -> npt.ND
 
 
 def _alike(
-    values: npt.NDArray[np.float32],
+    values: Float32Array,
     directions: FloatArray,
-    chosen: npt.NDArray[np.bool_],
-    measured: npt.NDArray[np.float32] | None = None,
-) -> npt.NDArray[np.bool_]:
+    chosen: BoolArray,
+    measured: Float32Array | None = None,
+) -> BoolArray:
     """Which pixels look as most of the chosen do, by colour and, where it is known, temperature (pixels, 4).
 
     Between the colour corrected and the colour `measured` (pixels, 3) any will do, as what is nearly overexposed does
@@ -144,9 +140,7 @@ def _alike(
     return (np.nan_to_num(off) <= 1.0).all(1)
 
 
-def mean_colours(
-    photographs: Photographs, backdrop: npt.NDArray[np.bool_], points: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float32]:
+def mean_colours(photographs: Photographs, backdrop: BoolArray, points: FloatArray) -> Float32Array:
     """Mean colour of the pixels onto which points (n, 3) fall, without those of the backdrop, shape (n, 3).
 
     Where all photographs show the backdrop or none shows the point, it is the mean over all other pixels.

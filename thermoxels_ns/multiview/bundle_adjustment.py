@@ -9,10 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 MOST_FEATURES = 1000  # Features of one photograph
 SMALLEST_CONTRAST = 0.01  # Of a feature, of 1; SIFT's own default, 0.04, finds hardly any on plaster
@@ -40,7 +38,7 @@ class Features:
     """What stands out in one photograph."""
 
     pixels: FloatArray  # Shape (k, 2)
-    descriptors: npt.NDArray[np.float32]  # Unit vectors, shape (k, 128)
+    descriptors: Float32Array  # Unit vectors, shape (k, 128)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +49,7 @@ class Tracks:
     point: IntArray  # Of each sighting, 0, 1, ..., shape (s,)
     place: FloatArray  # Where its photograph shows it, at depth 1 in OpenCV axes, shape (s, 2)
 
-    def of_points(self, chosen: npt.NDArray[np.bool_]) -> Tracks:
+    def of_points(self, chosen: BoolArray) -> Tracks:
         """Only some points, one boolean each, numbered anew."""
         kept = chosen[self.point]
         number = np.cumsum(chosen) - 1
@@ -73,7 +71,7 @@ class AdjustedPoses:
     tracks: int
 
 
-def features_of(picture: npt.NDArray[np.uint8], mask: npt.NDArray[np.bool_] | None = None) -> Features:
+def features_of(picture: npt.NDArray[np.uint8], mask: BoolArray | None = None) -> Features:
     """Find features (SIFT, Lowe 2004) in a grey photograph (h, w); only where its `mask` (h, w) is true.
 
     Descriptors are roots of normalised histograms, by which brightness and contrast of a photograph do not count
@@ -177,7 +175,7 @@ def _pairs(rotations: FloatArray, centres: FloatArray) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _matches(one: npt.NDArray[np.float32], other: npt.NDArray[np.float32]) -> tuple[IntArray, IntArray]:
+def _matches(one: Float32Array, other: Float32Array) -> tuple[IntArray, IntArray]:
     """Features that are each other's nearest, much nearer than the second."""
     likeness = one @ other.T
     best = likeness.argmax(1)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import Float32Array, FloatArray, IntArray
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import TOLERANCE, Depths
-
-FloatArray = npt.NDArray[np.float64]
 
 MOST_PIXELS = 1500  # Pixels of each photograph that are looked up in the others
 DARKEST, BRIGHTEST = 0.06, 0.94  # Channels between which a pixel tells a gain: noise below, saturation above
@@ -53,7 +51,7 @@ def matters(value: FloatArray, error: FloatArray, least: float) -> bool:
     return size > max(least, SURE * doubt)
 
 
-def photograph_differences(depths: Depths, thermal: npt.NDArray[np.float32]) -> Differences:
+def photograph_differences(depths: Depths, thermal: Float32Array) -> Differences:
     """Compare what photographs show of the same points, where each of the two has found its own depth there.
 
     For two photographs a and b the median over shared pixels of ln(a / b), or of the difference of temperatures, is
@@ -111,9 +109,7 @@ def photograph_differences(depths: Depths, thermal: npt.NDArray[np.float32]) -> 
     return Differences(solved[:, :3], error[:, :3], solved[:, 3], error[:, 3])
 
 
-def _solve(
-    pairs: npt.NDArray[np.int64], off: FloatArray, weights: FloatArray, count: int
-) -> tuple[FloatArray, FloatArray]:
+def _solve(pairs: IntArray, off: FloatArray, weights: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
     """Values x of photographs from differences x_a - x_b, robustly, and their standard errors.
 
     Of the photographs that pairs link to each other; their mean is 0. Those of smaller groups have 0 and `FREE`.

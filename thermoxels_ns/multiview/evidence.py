@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.multiview.differences import matters, photograph_differences
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs, thermal_at
@@ -20,8 +21,6 @@ from thermoxels_ns.multiview.stereo import (
     feature_rays_to_depths,
     rays_through,
 )
-
-FloatArray = npt.NDArray[np.float64]
 
 LEAST_SHARE = 0.01  # Share of the pixels whose depth must be sure; less is chance
 REFINED_SIDE = 640  # Pixels along the longer side of the photographs in which depths are refined
@@ -34,7 +33,7 @@ class PhotographEvidence:
     """What training photographs say before there is a model."""
 
     photographs: Photographs  # The photographs, small, without differences of gain and offset that matter
-    backdrop: npt.NDArray[np.bool_]  # Which of their pixels show a plain backdrop, shape (pixels,)
+    backdrop: BoolArray  # Which of their pixels show a plain backdrop, shape (pixels,)
     feature_rays: FeatureRays | None
     """Rays to each depth that several photographs agree about; None where these are too few to tell anything."""
     log_gain: FloatArray | None
@@ -91,9 +90,7 @@ def evidence_of_photographs(
     return PhotographEvidence(photographs, backdrop, rays, log_gain, offset)
 
 
-def rays_through_backdrop(
-    photographs: Photographs, backdrop: npt.NDArray[np.bool_], beyond: float
-) -> FeatureRays | None:
+def rays_through_backdrop(photographs: Photographs, backdrop: BoolArray, beyond: float) -> FeatureRays | None:
     """Rays through the pixels of a backdrop, to points so far away [world units]; None where hardly any shows one."""
     (chosen,) = np.nonzero(backdrop)
     enough = len(chosen) >= LEAST_SHARE * len(backdrop)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 
 MOST_PHOTOGRAPHS = 64  # Photographs compared; of more, that many are taken at equal distances in the list
@@ -21,37 +22,35 @@ LONGEST_SIDE = 160  # Pixels along the longer side at which photographs are comp
 class Photographs:
     """Pinhole photographs in one array, for the kernels."""
 
-    matrices: npt.NDArray[np.float64]  # World to homogeneous pixels, depth positive in front, shape (photographs, 3, 4)
-    centres: npt.NDArray[np.float64]  # Camera centres, [world units], shape (photographs, 3)
-    sizes: npt.NDArray[np.int64]  # Width and height, [pixels], shape (photographs, 2)
-    firsts: npt.NDArray[np.int64]  # Row of `colours` with each photograph's upper left pixel, shape (photographs,)
-    colours: npt.NDArray[np.float32]
+    matrices: FloatArray  # World to homogeneous pixels, depth positive in front, shape (photographs, 3, 4)
+    centres: FloatArray  # Camera centres, [world units], shape (photographs, 3)
+    sizes: IntArray  # Width and height, [pixels], shape (photographs, 2)
+    firsts: IntArray  # Row of `colours` with each photograph's upper left pixel, shape (photographs,)
+    colours: Float32Array
     """Channels in [0, 1], photograph after photograph, row after row, shape (pixels, 3); NaN where masked."""
-    thermal: npt.NDArray[np.float32]
+    thermal: Float32Array
     """Normalised temperature, shape (pixels,); NaN where unknown, or measured by a camera of its own."""
     near: float = 0.0  # Depth up to which a photograph shows nothing, [world units]
-    index: npt.NDArray[np.int64] | None = None  # Number of each photograph in its dataset; None: of no dataset
-    measured: npt.NDArray[np.float32] | None = None
+    index: IntArray | None = None  # Number of each photograph in its dataset; None: of no dataset
+    measured: Float32Array | None = None
     """Channels before differences of gain were corrected, shape (pixels, 3); None: none was."""
 
     @property
-    def numbers(self) -> npt.NDArray[np.int64]:
+    def numbers(self) -> IntArray:
         """Which photograph each pixel belongs to, shape (pixels,)."""
         return np.repeat(np.arange(len(self)), np.prod(self.sizes, axis=1))
 
     def __len__(self) -> int:
         return len(self.matrices)
 
-    def of_pixels(self, chosen: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def of_pixels(self, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
         """Camera centres of the pixels `chosen` (n,), and their directions of depth 1, both (n, 3), in the world."""
         number = np.searchsorted(self.firsts, chosen, side="right") - 1
         place, width = chosen - self.firsts[number], self.sizes[number, 0]
         pixel = np.column_stack((place % width + 0.5, place // width + 0.5, np.ones(len(chosen))))
         return self.centres[number], np.einsum("nij,nj->ni", np.linalg.inv(self.matrices[:, :, :3])[number], pixel)
 
-    def shown(
-        self, number: int, points: npt.NDArray[np.float64]
-    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    def shown(self, number: int, points: FloatArray) -> tuple[IntArray, FloatArray, BoolArray]:
         """Pixels of one photograph that show points (n, 3), their depths there, and whether the photograph shows them.
 
         A point that it does not show has the photograph's first pixel.
@@ -81,7 +80,7 @@ def read_photographs(
     return replace(gathered(pinholes, [dataset.pose(index)[:, 3] for index in usable], near), index=usable)
 
 
-Pinhole = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.float64]]
+Pinhole = tuple[Float32Array, Float32Array, FloatArray]
 """A photograph without distortion, shape (h, w, 3), NaN where masked, its normalised temperature (h, w), NaN where
 unknown, and world -> homogeneous pixels, (3, 4)."""
 
@@ -109,7 +108,7 @@ def _photograph(dataset: Any, index: int, longest_side: int) -> Pinhole:
     return pinhole(picture, None if mask is None else mask.numpy()[..., 0], camera, pose, longest_side, thermal)
 
 
-def thermal_at(dataset: Any, photographs: Photographs, depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def thermal_at(dataset: Any, photographs: Photographs, depth: Float32Array) -> Float32Array:
     """Normalised temperature where a photograph's pixels have a known `depth` (pixels,); NaN elsewhere.
 
     Of a thermal camera of its own: what it shows where the point stands. It is beside the photograph's, so that hardly
@@ -139,11 +138,11 @@ def thermal_at(dataset: Any, photographs: Photographs, depth: npt.NDArray[np.flo
 
 def pinhole(
     photograph: npt.NDArray[np.uint8],
-    mask: npt.NDArray[np.bool_] | None,
+    mask: BoolArray | None,
     camera: Camera,
-    pose: npt.NDArray[np.float64],
+    pose: FloatArray,
     longest_side: int = LONGEST_SIDE,
-    thermal: npt.NDArray[np.float32] | None = None,
+    thermal: Float32Array | None = None,
 ) -> Pinhole:
     """Average a photograph (h, w, 3) down to `longest_side` [pixels] and remove its camera's distortion.
 
@@ -174,7 +173,7 @@ def pinhole(
     return picture, np.asarray(warm, dtype=np.float32), to_pixels
 
 
-def _distorted_places(camera: Camera) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+def _distorted_places(camera: Camera) -> tuple[Float32Array, Float32Array]:
     """Where the pixels of a pinhole picture lie in the distorted one: columns and rows for `cv2.remap`."""
     pinhole = replace(camera, k1=0.0, k2=0.0, k3=0.0, k4=0.0, p1=0.0, p2=0.0)
     rows, columns = np.mgrid[: camera.height, : camera.width]

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.multiview.backdrop import even_pixels
 from thermoxels_ns.multiview.photographs import Photographs
-
-FloatArray = npt.NDArray[np.float64]
 
 EVEN = (0.03, 0.02, 0.013, 0.009)
 """Differences of a channel from pixel to pixel, of 1, that bound plain areas: those that are no plane are cut up."""
@@ -21,10 +19,10 @@ _TRIALS, _FITS = 64, 3
 
 def depths_on_planes(
     photographs: Photographs,
-    backdrop: npt.NDArray[np.bool_],
-    depth: npt.NDArray[np.float32],
+    backdrop: BoolArray,
+    depth: Float32Array,
     tolerance: float,
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """Depths of plain areas that are planes, shape (pixels,), [world units]; NaN elsewhere.
 
     Nothing in a plain area contradicts a dent in it; that most of it lies on one plane does. In a pinhole photograph

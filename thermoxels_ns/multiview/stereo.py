@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.threads import run_ranges
 from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo_kernels import aggregate, correlate, refine_depths, weigh_patches
-
-FloatArray = npt.NDArray[np.float64]
 
 NEIGHBOURS = 4
 """Photographs that one is compared with; of these the better half counts at each pixel, as others may be hidden."""
@@ -62,9 +61,9 @@ class Depths:
     """Depths of the pixels of photographs."""
 
     photographs: Photographs  # The photographs
-    depth: npt.NDArray[np.float32]
+    depth: Float32Array
     """Depth of each pixel, in the order of `photographs.colours`, shape (pixels,), [world units]; NaN: not sure."""
-    error: npt.NDArray[np.float32]  # Depth by which its planes are apart there, shape (pixels,), [world units]
+    error: Float32Array  # Depth by which its planes are apart there, shape (pixels,), [world units]
 
     @property
     def share(self) -> float:
@@ -72,7 +71,7 @@ class Depths:
         return float(np.mean(np.isfinite(self.depth)))
 
 
-def depths_before_backdrop(depths: Depths) -> tuple[Depths, npt.NDArray[np.bool_]]:
+def depths_before_backdrop(depths: Depths) -> tuple[Depths, BoolArray]:
     """Depths without those that an outline gave to the backdrop beside it, and the backdrop's pixels, (pixels,)."""
     backdrop, beside = plain_backdrop(depths.photographs, depths.depth)
     return replace(depths, depth=np.where(beside, np.float32(np.nan), depths.depth)), backdrop
@@ -141,10 +140,10 @@ def depths_of(
 
 def other_views(
     photographs: Photographs,
-    depth: npt.NDArray[np.float32],
-    error: npt.NDArray[np.float32],
-    confirmed: npt.NDArray[np.bool_] | None = None,
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    depth: Float32Array,
+    error: Float32Array,
+    confirmed: BoolArray | None = None,
+) -> tuple[IntArray, IntArray]:
     """Count for each pixel the other photographs whose depth lies where its own does, and those that look through it.
 
     Depths agree if they differ by no more than `TOLERANCE` times the sum of both pixels' errors. A photograph looks
@@ -173,8 +172,8 @@ def _refine(
     photographs: Photographs,
     larger: Photographs,
     neighbours: list[list[int]],
-    depth: npt.NDArray[np.float32],
-    error: npt.NDArray[np.float32],
+    depth: Float32Array,
+    error: Float32Array,
 ) -> None:
     """Refine depths (pixels,) and their errors in `larger` photographs: surfaces are as exact as depths are."""
     turns, shifts = larger.matrices[:, :, :3], larger.matrices[:, :, 3]
@@ -208,7 +207,7 @@ def _refine(
     run_ranges(work, len(larger), 1)
 
 
-def _brightness(photographs: Photographs, number: int) -> npt.NDArray[np.float32]:
+def _brightness(photographs: Photographs, number: int) -> Float32Array:
     """Brightness of one photograph, shape (h, w); `_OUTSIDE` where masked."""
     (width, height), first = photographs.sizes[number], photographs.firsts[number]
     mean = photographs.colours[first : first + width * height].mean(axis=1).reshape(height, width)
@@ -219,9 +218,9 @@ def _brightness(photographs: Photographs, number: int) -> npt.NDArray[np.float32
 class _View:
     """One photograph."""
 
-    channels: npt.NDArray[np.float32]
+    channels: Float32Array
     """Brightness and, where the same camera measured it, temperature, shape (1 or 2, h, w); `_OUTSIDE` where masked."""
-    features: npt.NDArray[np.float32]
+    features: Float32Array
     """What tells which pixels belong together, shape (h, w, 3 or 4): a third of each colour, and temperature, as skies
     are cold."""
     matrix: FloatArray  # World to homogeneous pixels, (3, 4)
@@ -245,7 +244,7 @@ class _View:
         return self.channels.shape[1], self.channels.shape[2]
 
     @property
-    def noise(self) -> npt.NDArray[np.float32]:
+    def noise(self) -> Float32Array:
         """Variance of each channel that is noise."""
         return np.square(np.array(NOISE[: len(self.channels)], dtype=np.float32))
 
@@ -281,7 +280,7 @@ def _probes(photographs: Photographs, number: int, depths: FloatArray) -> FloatA
 
 def _usefully_seen(
     photographs: Photographs, number: int, other: int, points: FloatArray
-) -> tuple[npt.NDArray[np.bool_], FloatArray]:
+) -> tuple[BoolArray, FloatArray]:
     """Which points of one photograph another shows from a direction that tells how far they are; angles in degrees."""
     towards, away = (photographs.centres[each] - points for each in (number, other))
     lengths = np.linalg.norm(towards, axis=1) * np.linalg.norm(away, axis=1)
@@ -349,9 +348,9 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
 class _Patches:
     """Who belongs to the patch around each pixel of a photograph, and how much the patch varies."""
 
-    weights: npt.NDArray[np.float32]  # Shape (pixels of a patch, h, w)
-    means: npt.NDArray[np.float32]  # Shape (channels, h, w)
-    variances: npt.NDArray[np.float32]  # Shape (channels, h, w)
+    weights: Float32Array  # Shape (pixels of a patch, h, w)
+    means: Float32Array  # Shape (channels, h, w)
+    variances: Float32Array  # Shape (channels, h, w)
 
     @classmethod
     def of(cls, view: _View) -> _Patches:
@@ -362,7 +361,7 @@ class _Patches:
         return cls(weights, means, variances)
 
 
-def _neighbours_agree(depth: npt.NDArray[np.float32], error: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+def _neighbours_agree(depth: Float32Array, error: Float32Array) -> BoolArray:
     """Which pixels have `FEWEST_AROUND` neighbours whose depths are the same to one plane, shape (h, w)."""
     height, width = depth.shape
     framed, count = np.pad(depth, 1, constant_values=np.nan), np.zeros(depth.shape, dtype=np.int64)
@@ -384,7 +383,7 @@ def _num_planes(view: _View, others: list[_View], near: float, far: float) -> in
     return int(np.clip(np.ceil(most) + 1, *PLANES)) if most > 0.0 else PLANES[1]
 
 
-def _warped(other: _View, view: _View, depth: float, warped: npt.NDArray[np.float32]) -> None:
+def _warped(other: _View, view: _View, depth: float, warped: Float32Array) -> None:
     """Warp a photograph by the plane at a depth of another into what the other would see; fill `warped` (c, h, w)."""
     turn = depth * (other.matrix[:, :3] @ view.inverse)
     turn[:, 2] += other.matrix[:, :3] @ view.centre + other.matrix[:, 3]
@@ -400,7 +399,7 @@ def _warped(other: _View, view: _View, depth: float, warped: npt.NDArray[np.floa
         warped[:, turn[2, 0] * columns + turn[2, 1] * rows + turn[2, 2] <= 0.0] = _OUTSIDE
 
 
-def _between(cost: npt.NDArray[np.float32], best: npt.NDArray[np.int64]) -> FloatArray:
+def _between(cost: Float32Array, best: IntArray) -> FloatArray:
     """Where between planes, the last axis, the cost is least: the bottom of a parabola, in -1/2 to 1/2 planes."""
     inner = np.clip(best, 1, cost.shape[-1] - 2)
     before, at, behind = (
@@ -423,7 +422,7 @@ def feature_rays_to_depths(depths: Depths) -> FeatureRays:
 
 
 def rays_through(
-    photographs: Photographs, chosen: npt.NDArray[np.int64], depth: FloatArray, error: FloatArray | float = 0.0
+    photographs: Photographs, chosen: IntArray, depth: FloatArray, error: FloatArray | float = 0.0
 ) -> FeatureRays:
     """Feature rays through the pixels `chosen` (n,) to depths (n,) with standard errors (n,), [world units]."""
     origins, along = photographs.of_pixels(chosen)

@@ -7,14 +7,14 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from thermoxels_ns.core.feature_rays import FeatureRays, FloatArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.core.voxel_walk import cells_crossed
 from thermoxels_ns.multiview.stereo import ERROR_PLANES, Depths
 
-BoolArray = npt.NDArray[np.bool_]
 CountArray = npt.NDArray[np.int32]
 
 FEWEST_POINTS = 2  # Different points whose rays must cross a voxel: a single one may be wrong

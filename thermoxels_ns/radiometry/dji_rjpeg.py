@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
+from thermoxels_ns.core.arrays import Float32Array
 from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
 from thermoxels_ns.radiometry.decoders import (
     ExifFacts,
@@ -57,7 +57,7 @@ class _Parameters(ctypes.Structure):
 class DjiImage:
     """One R-JPEG of a DJI camera after reading."""
 
-    temperature_c: npt.NDArray[np.float32]  # shape (height, width), [degrees C]
+    temperature_c: Float32Array  # shape (height, width), [degrees C]
     conditions: Conditions
     exif: ExifFacts
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array
 from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
 from thermoxels_ns.core.units import kelvin_to_celsius
 from thermoxels_ns.radiometry.decoders import JPEG_START, PNG_START, app_segments, check_thermal_size, errors_name
@@ -84,12 +85,12 @@ class FlirImage:
     visible: bytes | None  # the photograph that the camera took with it, a JPEG or PNG file's bytes; None: it took none
 
     @property
-    def outside_calibration(self) -> npt.NDArray[np.bool_]:
+    def outside_calibration(self) -> BoolArray:
         """Pixels whose counts lie outside the range that the camera is calibrated for, shape (height, width)."""
         low, high = self.camera.raw_range
         return (self.counts < low) | (self.counts > high)
 
-    def temperature_c(self, conditions: Conditions | None = None) -> npt.NDArray[np.float32]:
+    def temperature_c(self, conditions: Conditions | None = None) -> Float32Array:
         """Degrees C, shape (height, width), NaN outside the calibrated range; None: with the camera's settings."""
         model = RadiometricModel(conditions or self.camera.conditions, self.camera.planck, self.camera.air)
         temperature_c = model.temperature_c(self.counts)

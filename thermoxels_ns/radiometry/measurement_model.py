@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import check_positive, is_number
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin, kelvin_to_celsius
@@ -161,7 +162,7 @@ class PlanckBand:
     longest_um: float = 13.0  # upper end of the band, [micrometres]
 
     @cached_property
-    def _table(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def _table(self) -> tuple[FloatArray, FloatArray]:
         """1 / T rising, and the logarithm of the radiance, [W / (m2 sr)]."""
         inverse_k = np.linspace(1.0 / _HOTTEST_K, 1.0 / _COLDEST_K, _STEPS)
         nodes, weights = np.polynomial.legendre.leggauss(48)

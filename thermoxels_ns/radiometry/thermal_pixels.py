@@ -13,6 +13,7 @@ import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 from PIL import Image, TiffImagePlugin
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
@@ -105,7 +106,7 @@ class PixelReport:
 class ThermalImage:
     """One thermal file after reading."""
 
-    temperature_c: npt.NDArray[np.float32]  # shape (height, width), [degrees Celsius], NaN where invalid
+    temperature_c: Float32Array  # shape (height, width), [degrees Celsius], NaN where invalid
     report: PixelReport
 
 
@@ -169,7 +170,7 @@ def read_thermal_file(
 def masked_image(
     temperature_c: npt.NDArray[np.floating],
     valid_range_c: tuple[float, float],
-    saturated: npt.NDArray[np.bool_] | None = None,
+    saturated: BoolArray | None = None,
 ) -> ThermalImage:
     """Mask temperatures (height, width) that are none, [degrees C], or beyond the calibration, and count them."""
     if saturated is None:
@@ -209,7 +210,7 @@ def _read_npy(path: Path) -> npt.NDArray[Any]:
     return values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
 
 
-def _read_csv(path: Path) -> npt.NDArray[np.float64]:
+def _read_csv(path: Path) -> FloatArray:
     """Read rows of numbers split by commas or semicolons; empty cells and nan, NA, null, - are NaN."""
     text = path.read_text(encoding="utf-8-sig")
     semicolons = ";" in text
@@ -231,7 +232,7 @@ def _number(cell: str) -> float:
     return float("nan") if cell.lower() in ("", "nan", "na", "n/a", "null", "none", "-") else float(cell)
 
 
-def _read_image(path: Path) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_] | None]:
+def _read_image(path: Path) -> tuple[npt.NDArray[Any], BoolArray | None]:
     """Read the shades of a grey picture, and which of its pixels are transparent."""
     pixels = None
     size = size_of_double_tiff(path)  # of numbers of 64 bits, which Pillow does not open
@@ -282,7 +283,7 @@ def _damaged(path: Path, problem: object) -> ThermalFileError:
     return ThermalFileError(str(path), expected=_EXPECTED, got=problem, remedy=_REMEDY)
 
 
-def find_dead_pixels(stack: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+def find_dead_pixels(stack: Float32Array) -> BoolArray:
     """Find pixels that show exactly one value in every frame while their surroundings change.
 
     A stuck pixel alone is no proof: where the image border always shows the same cold sky, or in a scene of one

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
+from thermoxels_ns.core.arrays import Float32Array
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.decoders import (
     JPEG_START,
@@ -92,7 +92,7 @@ class ThermogramMetadata:
 class Thermogram:
     """One thermal image in degrees."""
 
-    temperature_c: npt.NDArray[np.float32]  # shape (height, width), [degrees C], NaN where the camera measured nothing
+    temperature_c: Float32Array  # shape (height, width), [degrees C], NaN where the camera measured nothing
     metadata: ThermogramMetadata
     report: PixelReport  # how many pixels are NaN and why
 

@@ -18,6 +18,7 @@ from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame
 from thermoxels_ns.capture.scene_writer import scene_names
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.capture.stages import CaptureResult
+from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.radiometry.thermal_pixels import MIN_FRAMES
 from thermoxels_ns.reports.charts import PERCENTILES, bars, colours, histogram
@@ -60,7 +61,7 @@ def write_capture_page(result: CaptureResult) -> None:
 
 def thermal_in_photograph(
     frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: RigEstimate, width: int = 640
-) -> npt.NDArray[np.float32]:
+) -> Float32Array:
     """Carry a thermal image, [degrees C], into the photograph's view, through the depth of the scene points.
 
     Returns temperatures by pixel of the photograph reduced to a width, NaN where the thermal image does not reach.
@@ -84,7 +85,7 @@ def thermal_in_photograph(
     )
 
 
-def _grid_rays(camera: Camera, width: int, height: int) -> npt.NDArray[np.float64]:
+def _grid_rays(camera: Camera, width: int, height: int) -> FloatArray:
     """Give rays of depth 1 through the pixels of a reduced photograph, row by row, shape (width * height, 3)."""
     grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
     return camera.resized(width, height).rays(grid)
@@ -108,7 +109,7 @@ def overlay(frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: R
 
 
 def capture_page(
-    result: CaptureResult, overlays: Sequence[Overlay], temperatures_c: npt.NDArray[np.float32], masked_share: float
+    result: CaptureResult, overlays: Sequence[Overlay], temperatures_c: Float32Array, masked_share: float
 ) -> str:
     """Build the html text from its arguments alone.
 

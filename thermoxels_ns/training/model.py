@@ -17,6 +17,7 @@ from nerfstudio.utils import colormaps
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
+from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM, FeatureRays
 from thermoxels_ns.core.lattice import Lattice
@@ -214,9 +215,7 @@ class ThermoxelsModel(Model):
         }
 
     @torch.no_grad()
-    def correct_photographs(
-        self, index: npt.NDArray[np.int64], log_gain: npt.NDArray | None, offset: npt.NDArray | None
-    ) -> None:
+    def correct_photographs(self, index: IntArray, log_gain: npt.NDArray | None, offset: npt.NDArray | None) -> None:
         """Begin with gains (n, 3) and offsets (n,) found for some training images; the others begin with none.
 
         None: none was found, and none takes part.

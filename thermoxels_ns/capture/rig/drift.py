@@ -12,8 +12,9 @@ from scipy import ndimage
 from scipy.sparse import csr_matrix
 
 from thermoxels_ns.capture.rig.images import read_temperatures
-from thermoxels_ns.capture.rig_types import DriftEstimate, FloatArray, RigFrame, radius_squared
+from thermoxels_ns.capture.rig_types import DriftEstimate, RigFrame, radius_squared
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 
 _RADIAL_TERMS = 2
@@ -99,7 +100,7 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
     return DriftEstimate(offsets_k, tuple(map(float, coefficients)), before_k, after_k, True, explanation)
 
 
-def _differences(samples: DriftSamples) -> tuple[npt.NDArray[np.int64], csr_matrix, FloatArray]:
+def _differences(samples: DriftSamples) -> tuple[IntArray, csr_matrix, FloatArray]:
     """Differences of two readings of one point: the point, what drift adds as a row of a matrix, and the kelvin.
 
     The columns of the matrix, shape (n, frames + radial terms), belong to the offsets and the radial coefficients.
@@ -139,8 +140,8 @@ def _fit(design: csr_matrix, difference_k: FloatArray, share: FloatArray, unknow
 class DriftSamples:
     """Readings of scene points, sorted by point, then by frame. Only points with at least two readings."""
 
-    point: npt.NDArray[np.int64]  # number of the point, 0 to points - 1, shape (n,)
-    frame: npt.NDArray[np.int64]  # number of the frame, shape (n,)
+    point: IntArray  # number of the point, 0 to points - 1, shape (n,)
+    frame: IntArray  # number of the frame, shape (n,)
     temperature_c: FloatArray  # reading [degrees C], shape (n,)
     radius2: FloatArray  # squared distance from the image's centre, 1 in the corner, shape (n,)
     num_frames: int
@@ -178,7 +179,7 @@ def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_
     return DriftSamples(number, frame_number[order], reading[order], radius2[order], len(frames))
 
 
-def _chosen_points(frames: Sequence[RigFrame]) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+def _chosen_points(frames: Sequence[RigFrame]) -> tuple[FloatArray, BoolArray]:
     """World positions (n, 3) of the points that most frames share, some from every frame, and who tracks them."""
     every = np.concatenate([frame.point_ids for frame in frames])
     ids, first, inverse = np.unique(every, return_index=True, return_inverse=True)
@@ -196,7 +197,7 @@ def _chosen_points(frames: Sequence[RigFrame]) -> tuple[FloatArray, npt.NDArray[
     return world[chosen], tracked[:, chosen]
 
 
-def _read(image: npt.NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _read(image: Float32Array, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Temperatures (n,) at pixel positions (n, 2), slightly smoothed, and how steep the image is there [K/pixel]."""
     smooth = cv2.GaussianBlur(image, (0, 0), _BLUR_PX, borderType=cv2.BORDER_REPLICATE)  # NaN spreads, and is left out
     gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125)

@@ -12,12 +12,13 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.rig_types import FloatArray, RigFrame, RigModel
+from thermoxels_ns.capture.rig_types import RigFrame, RigModel
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
+from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 
-FloatImage = npt.NDArray[np.float32]
+FloatImage = Float32Array
 
 _COARSEST_WIDTH = 80
 _MOST_POINTS = 6_000
@@ -56,7 +57,7 @@ class ThermalEdges:
     def __init__(self, field: npt.NDArray[np.complex64]) -> None:
         """Take edge values, shape (height, width)."""
         self.field = field
-        self.weight: npt.NDArray[np.float32] = np.minimum.outer(*map(_ramp, field.shape)).astype(np.float32)
+        self.weight: Float32Array = np.minimum.outer(*map(_ramp, field.shape)).astype(np.float32)
         padded = np.pad(field, _PADDING)  # zeros around, so that everything outside reads 0
         self._planes = padded, np.gradient(padded, axis=1), np.gradient(padded, axis=0)
 
@@ -286,7 +287,7 @@ def _bilinear(padded: npt.NDArray, pixels: FloatArray) -> npt.NDArray:
     return ndimage.map_coordinates(padded, place, order=1, mode="nearest")
 
 
-def _ramp(length: int) -> npt.NDArray[np.float64]:
+def _ramp(length: int) -> FloatArray:
     """0 near both ends, where edges are not known well, and 1 from a small share of the length on."""
     distance = np.minimum(np.arange(length) + 0.5, length - np.arange(length) - 0.5) - _BORDER_PX
     return np.clip(distance / max(_BORDER_SHARE * length, 2.0), 0.0, 1.0)

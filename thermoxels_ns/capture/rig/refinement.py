@@ -12,7 +12,8 @@ from scipy import ndimage
 from scipy.optimize import approx_fprime, minimize
 
 from thermoxels_ns.capture.rig.images import FARTHEST_FROM_POINT, SURE_DISTANCE, FloatImage, PreparedFrames, RigScore
-from thermoxels_ns.capture.rig_types import FloatArray, RigModel
+from thermoxels_ns.capture.rig_types import RigModel
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 
 _DIFFERENCE_PX = 0.05
 _MOST_STEPS = 20
@@ -117,7 +118,7 @@ class Windows:
     """Windows of one photograph as points in front of its camera, with what temperatures are fitted by in each."""
 
     points: FloatArray  # shape (n, 3), the visible camera's OpenCV axes
-    index: npt.NDArray[np.int64]  # which points each window has, shape (windows, k)
+    index: IntArray  # which points each window has, shape (windows, k)
     plain: FloatArray  # orthonormal basis of weighted planes a + b x + c y, the same in all windows, shape (k, 3)
     bright: FloatArray
     """The photograph in every window, orthogonal to the planes and of length 1, weighted, shape (windows, k)."""
@@ -125,7 +126,7 @@ class Windows:
     trust: FloatArray  # how much each window counts, shape (windows,)
 
     @property
-    def middle(self) -> npt.NDArray[np.int64]:
+    def middle(self) -> IntArray:
         """The point in the middle of each window, shape (windows,)."""
         return self.index[:, self.index.shape[1] // 2]
 
@@ -155,7 +156,7 @@ class SmoothThermal:
         self.shape = contrast.shape
         """Height and width."""
 
-    def usable(self, pixels: FloatArray) -> npt.NDArray[np.bool_]:
+    def usable(self, pixels: FloatArray) -> BoolArray:
         """Which pixel positions (n, 2) lie in the image, one pixel from its border and away from missing pixels."""
         return ndimage.map_coordinates(self._good, _place(pixels), order=0, mode="constant") > 0.0
 
@@ -313,7 +314,7 @@ def refine(
 def choose_windows(
     photograph: FloatImage,
     points: FloatArray,
-    usable: npt.NDArray[np.bool_],
+    usable: BoolArray,
     trust: FloatArray,
     pitch: float,
     window_px: float,

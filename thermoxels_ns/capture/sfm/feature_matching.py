@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from thermoxels_ns.capture.settings import LensModel, Matching
 from thermoxels_ns.capture.sfm.colmap import run_in_process
+from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import replace_when_done
 
@@ -51,7 +51,7 @@ class ReducedPhotographs:
     masks: Path | None = None  # folder of pictures that are black where no feature is looked for; None: everywhere
 
 
-def image_pairs(count: int, matching: Matching) -> npt.NDArray[np.int64]:
+def image_pairs(count: int, matching: Matching) -> IntArray:
     """Pairs (p, 2) of numbers of photographs, in the order they were taken, to compare; smaller first, sorted.
 
     Every pair (exhaustive); neighbours in time and some far ones (sequential); or by their number (auto).

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV, FloatArray
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 
 _NEIGHBOURS = 12
@@ -32,8 +33,8 @@ class SfmModel:
     points: FloatArray  # shape (n, 3), in world units; empty where poses were given without points
     colours: npt.NDArray[np.uint8]  # red, green and blue of the points, shape (n, 3)
     point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
-    sighting_frame: npt.NDArray[np.int64]
-    sighting_point: npt.NDArray[np.int64]  # indices into `frames` and `points`, each shape (s,)
+    sighting_frame: IntArray
+    sighting_point: IntArray  # indices into `frames` and `points`, each shape (s,)
     sighting_pixel: FloatArray  # where the frame shows the point, shape (s, 2), [pixels of the photographs]
 
     @property
@@ -41,7 +42,7 @@ class SfmModel:
         """Where the cameras stood, shape (f, 3)."""
         return self.camera_to_world[:, :3, 3]
 
-    def seen_by(self, frame: int) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    def seen_by(self, frame: int) -> tuple[IntArray, FloatArray]:
         """Indices (m,) of the points that a frame shows, and their pixels (m, 2)."""
         first, last = np.searchsorted(self.sighting_frame, [frame, frame + 1])
         return self.sighting_point[first:last], self.sighting_pixel[first:last]

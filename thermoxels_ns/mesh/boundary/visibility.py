@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.lattice import Lattice
@@ -32,7 +31,7 @@ def facet_views(
     lattice: Lattice,
     matrices: FloatArray,
     centres: FloatArray,
-    sizes: npt.NDArray[np.int64],
+    sizes: IntArray,
     centroids_world: FloatArray,
     normals_world: FloatArray,
 ) -> FacetViews:

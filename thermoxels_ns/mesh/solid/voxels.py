@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -372,7 +371,7 @@ def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> Bool
         block *= 2
     shape = tuple(-(-n // block) for n in cells.shape)
     middles = (np.stack(np.unravel_index(np.arange(math.prod(shape)), shape), axis=1) + 0.5) * block
-    well: npt.NDArray[np.float32] = seen(middles).reshape(shape).astype(np.float32)
+    well: Float32Array = seen(middles).reshape(shape).astype(np.float32)
     if block > 1:
         well = np.asarray(ndimage.zoom(well, block, order=1, mode="nearest", grid_mode=True))
     return well[tuple(slice(n) for n in cells.shape)] >= least
