@@ -17,11 +17,10 @@ from thermoxels_ns.render.renderers import Backend
 from thermoxels_ns.training.schedule import COARSEST, QUALITIES, schedule_for
 
 _STANDARD = schedule_for(*QUALITIES["standard"])
-MOST_VOXELS = 3.0
+MOST_VOXELS = 2.0
 """Voxels along the longest side that a scene may ask for, relative to the last of the resolutions. wild-11, whose
-ground runs on, asks for 256 and has F 0.95 of what is seen, 0.59 with 192; a statue photographed at 12 megapixels asks
-for 512 and gains nothing by 384 after 1500 steps (depths more than 2 % off: 15 %, 17 %)."""
-MOST_ALONG = 512  # Voxels along the longest side that a scene may ask for at all
+ground runs on, asks for 256 and has F 0.95 of what is seen, 0.59 with 192. A statue photographed at 12 megapixels asks
+for 512: with 384 after 1500 steps more of its depths are off by 2 % (17 %, with 192 15 %)."""
 MOST_STRETCH = 1.5  # The same, up to which no split more is made
 STEP_OF_COARSEST = 8  # Of so many voxels the coarsest resolution is a multiple
 
@@ -80,7 +79,7 @@ class ThermoxelsModelConfig(ModelConfig):
 
     resolutions: tuple[int, ...] = _STANDARD.resolutions
     """Voxels along the longest side of the scene box, coarse to fine; each a multiple of the one before. Unless they
-    are typed, voxel-pixels replaces them by up to three times as many."""
+    are typed, voxel-pixels replaces them by up to twice as many."""
     voxel_pixels: float = 0.0
     """Width of the finest voxels in pixels of the photographs, where most of what they show stands. Finer ones follow
     noise, coarser ones cannot hold the shape. 0: as resolutions says."""
@@ -240,7 +239,7 @@ class ThermoxelsModelConfig(ModelConfig):
         if voxels <= MOST_STRETCH * last or own != (usual.resolutions, usual.refine_at, usual.prune_at):
             coarsest = _in_steps(min(voxels, MOST_STRETCH * last) * first / last)
             return replace(self, resolutions=tuple(coarsest * each // first for each in self.resolutions))
-        wanted = min(voxels, MOST_VOXELS * last, MOST_ALONG)
+        wanted = min(voxels, MOST_VOXELS * last)
         while wanted / 2 ** (splits + 1) >= COARSEST - STEP_OF_COARSEST / 2:
             splits += 1
         found = schedule_for(_in_steps(wanted / 2**splits) * 2**splits, self.steps)
