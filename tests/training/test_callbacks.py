@@ -120,7 +120,13 @@ def attributes(model: ThermoxelsModel, steps: int) -> TrainingCallbackAttributes
         parameters=dict(groups),
     )
     pipeline: Any = SimpleNamespace(datamanager=Rays(), model=model)
-    trainer: Any = SimpleNamespace(_start_step=0, config=SimpleNamespace(max_num_iterations=steps))
+    saved: list[tuple[int, ...]] = []
+    trainer: Any = SimpleNamespace(
+        _start_step=0,
+        config=SimpleNamespace(max_num_iterations=steps),
+        saved=saved,
+        save_found_settings=lambda: saved.append(model.config.resolutions),
+    )
     return TrainingCallbackAttributes(optimizers, None, pipeline, trainer)
 
 
@@ -220,7 +226,8 @@ def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is(voxel_pixels
     """An error where somebody asked for the resolution; where photographs did, training goes on without it."""
     budget = {"memory_budget_gb": 0.001, "prune_threshold": 0.0, "voxel_pixels": voxel_pixels}
     model = model_of(resolutions=(8, 32), refine_at=(2,), **budget)
-    callbacks = coarse_to_fine_callbacks(model, attributes(model, 4))
+    given: Any = attributes(model, 4)
+    callbacks = coarse_to_fine_callbacks(model, given)
     for step in range(2):
         for callback in callbacks:
             callback.run_callback(step)
@@ -228,4 +235,5 @@ def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is(voxel_pixels
         for callback in callbacks:
             callback.run_callback(2)
     assert model.config.resolutions == ((8,) if voxel_pixels else (8, 32))
+    assert given.trainer.saved == ([(8,)] if voxel_pixels else []), "what is resumed knows it"
     assert model.grid.lattice.cell_shape == (8, 8, 8) and model.grid.voxels.all_kept

@@ -135,9 +135,9 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
 def box_of_points(points: FloatArray, frames: Sequence[Frame], tail: float = _TAIL_OF_POINTS) -> Box:
     """Enclose what photographs show close up of points (n, 3) in input coordinates.
 
-    Per axis all but `tail` [%] of them at either end, and 8 % of the longest extent more on every
-    side (parts without texture have no points, and a flat scene keeps some depth). Points that are not finite or in no
-    photograph's view do not count; nor do those that lie far behind others, or that few photographs have in view, where
+    Per axis all but `tail` [%] of them at either end, and 8 % of the longest extent more on every side (parts without
+    texture have no points, and a flat scene keeps some depth). Points that are not finite or in no photograph's view do
+    not count; nor do those that lie far behind others, or that few photographs have in view, where
     they cost too much, see `_worth_keeping`. A ground that runs on belongs to what is seen. A photograph with hardly
     any of what is left in view, as of a plain wall, is taken to show something as far away as in the others.
     """

@@ -115,9 +115,10 @@ def supporting_photographs(
     """
     photographs, result = depths.photographs, np.zeros(seen.shape, dtype=np.bool_)
     for number in range(len(photographs)):
-        pixel, depth, shown = photographs.shown(number, middle)
+        (places,) = np.nonzero(seen[:, number])
+        pixel, depth, shown = photographs.shown(number, middle[places])
         reach = REACH * voxel_size + REACH_ERRORS * ERROR_PLANES * depths.error[pixel]
-        result[:, number] = shown & (np.abs(depths.depth[pixel] - depth) <= reach)  # false where it is NaN
+        result[places, number] = shown & (np.abs(depths.depth[pixel] - depth) <= reach)  # false where it is NaN
     if tracks is not None and len(tracks.point) and len(middle):
         result |= _by_tracks(tracks, photographs.centres, middle, REACH * voxel_size)
     return result & seen

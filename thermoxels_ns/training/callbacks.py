@@ -113,8 +113,8 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             follow(old, refine(grid, factors[step]), grid, prefix)
         CONSOLE.log(f"step {step}: surroundings of {len(grid.voxels):,} voxels")
 
-    def look_at_walls(step: int) -> None:
-        """Before the lattice is refined, and a third of the way to its first change."""
+    def look_at_planes(step: int) -> None:
+        """Find planes of plain walls before each refinement, and a third of the way to the first change."""
         if evidence is not None:
             follow_planes(model, evidence, step)
 
@@ -145,6 +145,9 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
                 finest = model.config.resolutions.index(max(model.grid.lattice.cell_shape))
                 known = model.config.resolutions[: finest + 1], model.config.refine_at[:finest]
                 model.config = replace(model.config, resolutions=known[0], refine_at=known[1])
+                trainer: Any = attributes.trainer
+                if trainer is not None:
+                    trainer.save_found_settings()  # for who goes on from here
                 return
             CONSOLE.log(f"step {step}: lattice refined to {' x '.join(map(str, model.grid.lattice.cell_shape))} voxels")
             carve(step)
@@ -164,7 +167,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         TrainingCallback(before, model.update_to_step),
         TrainingCallback(before, carve, iters=(0,)),
         TrainingCallback(before, change_surroundings, iters=tuple({0, early})),
-        TrainingCallback(before, look_at_walls, iters=tuple(sorted({*factors, early}))),
+        TrainingCallback(before, look_at_planes, iters=tuple(sorted({*factors, early}))),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
         TrainingCallback(before, widen),
     ]

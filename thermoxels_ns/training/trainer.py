@@ -178,11 +178,11 @@ class ThermoxelsTrainer(Trainer):
         with plain_os_errors(self.base_dir):
             super().setup(test_mode)
         if self.local_rank == 0:
-            self._save_found_settings()
+            self.save_found_settings()
         # nerfstudio takes the shares and times that it shows from the number of steps without those before.
         writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
 
-    def _save_found_settings(self) -> None:
+    def save_found_settings(self) -> None:
         """Write the box and the resolutions that photographs asked for into config.yml, for those who load it."""
         kept: Any = deepcopy(self.config)
         pipeline: Any = getattr(self.pipeline, "module", self.pipeline)
