@@ -9,7 +9,6 @@ with the plain area of their faces, voxels with the area factor, and conforming.
 """
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 import measuring  # noqa: F401 - makes tests.support importable
@@ -43,9 +42,7 @@ def heat_lost_j(mesh: TetMesh, hours: float) -> float:
 
 
 def size(mesh: TetMesh) -> tuple[float, float]:
-    assert mesh.boundary is not None
-    area = facet_areas(mesh.points_m, mesh.facets) * mesh.boundary.area_factor
-    return float(area.sum()), float(signed_volumes(mesh.points_m, mesh.tets).sum())
+    return float(facet_areas(mesh.points_m, mesh.facets).sum()), float(signed_volumes(mesh.points_m, mesh.tets).sum())
 
 
 def main() -> None:
@@ -68,19 +65,13 @@ def main() -> None:
             f"| {100 * (volume / known.scene.solid.volume - 1):+.1f} % | {truth / 3.6e6:.4g} kWh |"
         )
         for mode in ("voxel", "conforming"):
-            built = build_mesh(trained.snapshot, SolidSelection(), trained.world_to_input, MeshOptions(mode)).mesh
-            assert built.boundary is not None
-            plain = replace(built, boundary=replace(built.boundary, area_factor=np.ones(len(built.facets))))
-            cases = {"conforming": built}
-            if mode == "voxel":
-                cases = {"voxel, plain area": plain, "voxel, area factor": built}
-            for name, mesh in cases.items():
-                area, volume = size(mesh)
-                lost = heat_lost_j(mesh, arguments.hours)
-                rows.append(
-                    f"| {known.scene.name} | {name} | {100 * (area / known.scene.solid.area - 1):+.1f} % "
-                    f"| {100 * (volume / known.scene.solid.volume - 1):+.1f} % | {100 * (lost / truth - 1):+.1f} % |"
-                )
+            mesh = build_mesh(trained.snapshot, SolidSelection(), trained.world_to_input, MeshOptions(mode)).mesh
+            area, volume = size(mesh)
+            lost = heat_lost_j(mesh, arguments.hours)
+            rows.append(
+                f"| {known.scene.name} | {mode} | {100 * (area / known.scene.solid.area - 1):+.1f} % "
+                f"| {100 * (volume / known.scene.solid.volume - 1):+.1f} % | {100 * (lost / truth - 1):+.1f} % |"
+            )
     print("\n| scene | mesh | area | volume | heat lost |\n|---|---|---:|---:|---:|")
     print("\n".join(rows))
 

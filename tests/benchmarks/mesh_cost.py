@@ -30,7 +30,6 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
 from thermoxels_ns.evaluation.truth_comparison import sample_facets
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
@@ -109,8 +108,6 @@ def measure(name: str, voxels: int, mode: Mode, repeats: int) -> dict[str, Any]:
         seconds.append(time.perf_counter() - start)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     mesh, quality = built.mesh, check_mesh(built.mesh)
-    assert mesh.boundary is not None
-    area = float((facet_areas(mesh.points_m, mesh.facets) * mesh.boundary.area_factor).sum())
     distance = np.abs(body.signed_distance(sample_facets(mesh.points_m, mesh.facets, 50_000)))
     # Volume of the mesh inside the body, from 35 points evenly spread over each tetrahedron.
     volumes = signed_volumes(mesh.points_m, mesh.tets)
@@ -127,8 +124,7 @@ def measure(name: str, voxels: int, mode: Mode, repeats: int) -> dict[str, Any]:
         "tets": quality.num_tets,
         "seconds": statistics.median(seconds),
         "peak_mb": peak / 1024,
-        "area_error": area / body.area - 1.0,
-        "area_error_of_triangles": quality.area_m2 / body.area - 1.0,
+        "area_error": quality.area_m2 / body.area - 1.0,
         "volume_error": quality.volume_m3 / body.volume - 1.0,
         "mean_distance_voxels": float(distance.mean()) / snapshot.lattice.voxel_size,
         "hausdorff_voxels": float(distance.max()) / snapshot.lattice.voxel_size,
@@ -149,9 +145,6 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
             panel.plot(*zip(*dots), color=colour, marker=marker, label=mode) if dots else None
             for row, dot in zip(chosen, dots):
                 panel.annotate(str(row["voxels"]), dot, xytext=(4, 4), textcoords="offset points", fontsize=7)
-            if chosen and key == "area_error" and mode == "voxel":
-                stairs = [(row["seconds"], abs(100 * row["area_error_of_triangles"])) for row in chosen]
-                panel.plot(*zip(*stairs), color=colour, marker="s", ls=":", alpha=0.6, label="voxel, plain area")
         panel.margins(x=0.2)
         panels[0][column].set_title(name)
         panels[1][column].set_xlabel("seconds")

@@ -79,7 +79,6 @@ def mesh_summary(
     mesh, solid = built.mesh, built.solid
     assert mesh.boundary is not None
     temperature = mesh.temperature_c
-    area = report.area_m2 if report.true_area_m2 is None else report.true_area_m2
     of_triangles = facet_areas(mesh.points_m, mesh.facets)
     unobserved = of_triangles @ ~mesh.observed[mesh.facets].all(axis=1)
     litres = 1e3 * voxel_size**3
@@ -99,9 +98,8 @@ def mesh_summary(
         "non_manifold_edges": report.num_non_manifold_edges,
         "volume": report.volume_m3,
         "volume_standard_error": None if scale is None else scale.volume_standard_error(report.volume_m3),
-        "area": area,
-        "area_standard_error": None if scale is None else scale.area_standard_error(area),
-        "area_of_triangles": report.area_m2,
+        "area": report.area_m2,
+        "area_standard_error": None if scale is None else scale.area_standard_error(report.area_m2),
         "bounds": {"lower": mesh.points_m.min(axis=0), "upper": mesh.points_m.max(axis=0)},
         "dihedral_angles_deg": {"min": report.dihedral_range_deg[0], "max": report.dihedral_range_deg[1]},
         "density_threshold_used": solid.threshold,
@@ -120,7 +118,7 @@ def mesh_summary(
         "share_of_area_not_fully_observed": float(unobserved / of_triangles.sum()),
         "share_of_area_by_support": support_shares(mesh),
         "rules_without_effect": built.idle_rules,
-        "patches": _sums(mesh.boundary.patch_names, mesh.boundary.patch, of_triangles * mesh.boundary.area_factor),
+        "patches": _sums(mesh.boundary.patch_names, mesh.boundary.patch, of_triangles),
         "regions": _sums(mesh.region_names, mesh.region, signed_volumes(mesh.points_m, mesh.tets)),
         "temperature_c": {
             "min": float(temperature.min()),
@@ -156,12 +154,12 @@ def _sums(names: tuple[str, ...], number: IntArray, amount: FloatArray) -> dict[
 
 
 def support_shares(mesh: TetMesh) -> dict[str, float] | None:
-    """Give the share of the true area, without what the scene box cuts, in each class of `SUPPORT`; None if unknown."""
+    """Give the share of the area, without what the scene box cuts, in each class of `SUPPORT`; None if unknown."""
     support = support_of_facets(mesh)
     if support is None or not (support >= 0).any():
         return None
     assert mesh.boundary is not None
-    area = facet_areas(mesh.points_m, mesh.facets) * mesh.boundary.area_factor
+    area = facet_areas(mesh.points_m, mesh.facets)
     total = np.bincount(support + 1, weights=area, minlength=len(SUPPORT) + 1)[1:]
     return dict(zip(SUPPORT, (total / total.sum()).tolist()))
 

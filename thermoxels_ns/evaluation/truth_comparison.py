@@ -455,8 +455,6 @@ def _num_faces(cells: BoolArray) -> int:
 def _mesh_errors(known: KnownTruth, mesh: TetMesh, voxel_m: float, metres_per_unit: float) -> dict[str, Any]:
     """Size of the mesh, its distance to the true surface, and temperature errors where they meet."""
     area = facet_areas(mesh.points_m, mesh.facets)
-    if mesh.boundary is not None:
-        area = area * mesh.boundary.area_factor
     result: dict[str, Any] = {
         "mesh_volume_m3": float(signed_volumes(mesh.points_m, mesh.tets).sum()) / metres_per_unit**3,
         "mesh_area_m2": float(area.sum()) / metres_per_unit**2,

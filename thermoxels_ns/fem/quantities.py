@@ -19,7 +19,7 @@ class Places:
     """Where a quantity is asked for: centroids of boundary triangles or of tetrahedra, or nodes."""
 
     points_m: FloatArray  # Positions, shape (k, 3), [m]
-    normals: FloatArray  # Outward unit normals of the true surface, shape (k, 3); 0 inside the body
+    normals: FloatArray  # Outward unit normals of the surface, shape (k, 3); 0 inside the body
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Unit vector that points up
 
     def __len__(self) -> int:

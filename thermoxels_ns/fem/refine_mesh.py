@@ -19,9 +19,9 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
     along the one of its three diagonals that leaves the smallest largest angle between faces. Where a tetrahedron is
     one of the six of a cube (Kuhn), so are its children, and no angle becomes obtuse.
 
-    Nodes keep their numbers; the middles of `mesh_edges` follow. Children inherit regions, tags, patches, normals and
-    area factors, and stand in the order of their parents; temperatures and colours of new nodes are means, and a new
-    node counts as observed if both ends of its edge are.
+    Nodes keep their numbers; the middles of `mesh_edges` follow. Children inherit regions, tags and patches and
+    stand in the order of their parents; temperatures and colours of new nodes are means, and a new node counts as
+    observed if both ends of its edge are.
     """
     edges = mesh_edges(mesh.tets, len(mesh.points_m))
     num_nodes, low, high = len(mesh.points_m), edges.smaller_nodes(), edges.other
@@ -44,8 +44,6 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
         if tags is None
         else replace(
             tags,
-            normal=np.repeat(tags.normal, 4, axis=0),
-            area_factor=np.repeat(tags.area_factor, 4),
             seen=np.repeat(tags.seen, 4),
             patch=np.repeat(tags.patch, 4),
             photographs=None if tags.photographs is None else np.repeat(tags.photographs, 4, axis=0),

@@ -9,9 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
+from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.quantities import Places
+from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 
@@ -30,26 +31,13 @@ class Selection:
 
     @cached_property
     def facet_area_m2(self) -> FloatArray:
-        """True area that each boundary triangle stands for, shape (f,), [m2]; computed when first asked for."""
-        cross = self._facet_cross_m2
-        area = 0.5 * np.sqrt(np.einsum("fi,fi->f", cross, cross))
-        tags = self.mesh.boundary
-        return area if tags is None else area * tags.area_factor
+        """Area of each boundary triangle, shape (f,), [m2]; computed when first asked for."""
+        return facet_areas(self.mesh.points_m, self.mesh.facets)
 
     @cached_property
     def facet_normal(self) -> FloatArray:
-        """Outward unit normal of the true surface, shape (f, 3); computed when first asked for."""
-        if self.mesh.boundary is not None:
-            return self.mesh.boundary.normal
-        cross = self._facet_cross_m2
-        with np.errstate(invalid="ignore", divide="ignore"):
-            own = cross / np.sqrt(np.einsum("fi,fi->f", cross, cross))[:, None]
-        return np.nan_to_num(own, nan=0.0, posinf=0.0, neginf=0.0)
-
-    @cached_property
-    def _facet_cross_m2(self) -> FloatArray:
-        corner = self.mesh.points_m[self.mesh.facets]
-        return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        """Outward unit normal of each boundary triangle, shape (f, 3); computed when first asked for."""
+        return facet_normals(self.mesh.points_m, self.mesh.facets)
 
     def facets(self, patterns: tuple[str, ...]) -> IntArray:
         """Number the boundary triangles of the patches that match any pattern; each must match one, or `HeatError`."""
@@ -71,19 +59,14 @@ class Selection:
 
     def _check(self) -> None:
         mesh, remedy = self.mesh, "Build the mesh with thermoxels_ns.mesh."
-        num_facets, tags = len(mesh.facets), mesh.boundary
+        tags = mesh.boundary
         check_shape("mesh facets", mesh.facets, (None, 3), remedy, HeatError)
         _check_indices("mesh facets", mesh.facets, len(mesh.points_m), remedy)
         check_shape("mesh region", mesh.region, (len(mesh.tets),), remedy, HeatError)
         _check_indices("mesh region", mesh.region, len(mesh.region_names), remedy)
-        if tags is None:
-            return
-        for name, shape in (("normal", (num_facets, 3)), ("area_factor", (num_facets,)), ("patch", (num_facets,))):
-            check_shape(f"boundary {name}", getattr(tags, name), shape, remedy, HeatError)
-            check_finite(f"boundary {name}", getattr(tags, name), remedy, HeatError)
-        _check_indices("boundary patch", tags.patch, len(tags.patch_names), remedy)
-        if num_facets:
-            check_positive("boundary area_factor", float(tags.area_factor.min()), remedy, HeatError)
+        if tags is not None:
+            check_shape("boundary patch", tags.patch, (len(mesh.facets),), remedy, HeatError)
+            _check_indices("boundary patch", tags.patch, len(tags.patch_names), remedy)
 
 
 def _check_indices(name: str, indices: IntArray, count: int, remedy: str) -> None:

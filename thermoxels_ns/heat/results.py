@@ -40,7 +40,7 @@ class Spot:
 
 @dataclass(frozen=True)
 class PatchResult:
-    """A part of the surface: true area, mean heat flow into the body over all times, temperatures at the end."""
+    """A part of the surface: area, mean heat flow into the body over all times, temperatures at the end."""
 
     patch: str
     area_m2: float
@@ -54,7 +54,7 @@ class PatchResult:
 
 @dataclass(frozen=True)
 class EffectResult:
-    """What acts on the body: mean heat flow into it over all times, true area it acts on (None: a source inside)."""
+    """What acts on the body: mean heat flow into it over all times, area it acts on (None: a source inside)."""
 
     effect: str
     heat_w: float

@@ -26,7 +26,7 @@ from thermoxels_ns.mesh.temperature import (
     tet_conductances,
 )
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets, voxel_surface
+from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
 
 
 @dataclass(frozen=True)
@@ -176,16 +176,11 @@ def _tagged(
     options: MeshOptions,
 ) -> tuple[Boundary, tuple[str, ...]]:
     """Return the tags of every boundary triangle, and the rules that none follows; without cameras all are seen."""
-    if options.boundary == "voxel":
-        in_world, factor = voxel_surface(solid.level, points_index, mesh.facets)
-        normal = in_world @ rotation.T
-    else:
-        normal = facet_normals(mesh.points_m, mesh.facets)
-        in_world, factor = normal @ rotation, np.ones(len(mesh.facets))
+    normal = facet_normals(mesh.points_m, mesh.facets)
     seen = np.ones(len(mesh.facets), dtype=bool)
     if snapshot.views is not None:
         centroids = snapshot.lattice.index_to_world(points_index[mesh.facets].mean(axis=1))
-        seen = seen_facets(solid.cells, snapshot.views, snapshot.lattice, centroids, in_world)
+        seen = seen_facets(solid.cells, snapshot.views, snapshot.lattice, centroids, normal @ rotation)
     patch, names, idle = apply_patches(
         options.rules,
         centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
@@ -195,7 +190,7 @@ def _tagged(
         on_box=mesh.facet_tags == FACET_BOX,
         colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),
     )
-    return Boundary(normal=normal, area_factor=factor, seen=seen, patch=patch, patch_names=names), idle
+    return Boundary(seen=seen, patch=patch, patch_names=names), idle
 
 
 def check_similarity(name: str, matrix: npt.ArrayLike) -> FloatArray:

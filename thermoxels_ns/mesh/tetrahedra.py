@@ -26,12 +26,6 @@ SUPPORT = {
 class Boundary:
     """What physics needs to know of every boundary triangle, in the order of `TetMesh.facets`."""
 
-    normal: FloatArray
-    """Outward unit normal of the true surface, shape (f, 3). On a staircase of voxel faces it is not that of the
-    triangle."""
-    area_factor: FloatArray
-    """Area of true surface that a triangle stands for, over its own area, shape (f,), above 0; 1 where the mesh follows
-    the surface."""
     seen: BoolArray  # True where some training camera has a free line of sight to the triangle, shape (f,)
     patch: IntArray  # index into `patch_names`, shape (f,)
     patch_names: tuple[str, ...]  # names of the patches, all different; some may have no triangle
@@ -82,8 +76,6 @@ class TetMesh:
         if tags is not None:
             names["boundary.patch_names"] = tags.patch_names
             arrays += [
-                ("boundary.normal", tags.normal, (facets, 3), None),
-                ("boundary.area_factor", tags.area_factor, (facets,), None),
                 ("boundary.seen", tags.seen, (facets,), None),
                 ("boundary.patch", tags.patch, (facets,), len(tags.patch_names)),
             ]

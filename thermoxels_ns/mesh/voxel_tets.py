@@ -1,12 +1,11 @@
-"""Six conforming tetrahedra per voxel, their boundary, the surface that it stands for, and their edges."""
+"""Six conforming tetrahedra per voxel, their boundary and their edges."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.core.arrays import BoolArray, IntArray
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.solid.morphology import bounding_box
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
@@ -18,9 +17,6 @@ KUHN_PATTERN: IntArray = np.array(
 
 Each permutation of the axes a, b, c is a path 000 -> e_a -> e_a + e_b -> 111 along voxel edges (Kuhn 1960, Freudenthal
 1942); where its determinant, the permutation's sign, is negative, the two in the middle are exchanged."""
-
-LEAST_AREA_FACTOR = 0.05
-"""Lower bound of a triangle's area factor: none that convection or radiation acts on is without area."""
 
 
 def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
@@ -102,56 +98,6 @@ def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tu
         sides |= (points_index[:, axis] == count - 1).astype(np.uint8) << (2 * axis + 1)
     common = sides[facets[:, 0]] & sides[facets[:, 1]] & sides[facets[:, 2]]
     return np.where(common > 0, FACET_BOX, FACET_SURFACE).astype(np.int64)
-
-
-def voxel_surface(
-    level: npt.NDArray[np.floating], points_index: npt.NDArray, facets: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return normal and area of the true surface at each boundary triangle of a voxel mesh.
-
-    The normal n is minus the gradient of the level (Sobel's differences), the mean of the two voxels beside the face.
-    A staircase along a plane has |n_x| + |n_y| + |n_z| times the plane's area, so a triangle on a face across axis a
-    stands for |n_a| times its own area. Where the scene box cuts the solid, n is the box's normal and the factor 1.
-    Flat sides are exact; areas of spheres, tori, boxes and slabs of 80 voxels are within 3 %.
-
-    Args:
-        level: Above 0 in solid voxels, at voxel centres, shape (nx-1, ny-1, nz-1).
-        points_index: Corner indices of the nodes, whole numbers, shape (n, 3).
-        facets: Boundary triangles, each half of a voxel face, shape (f, 3).
-
-    Returns:
-        normals: Along the lattice's axes, out of the solid, shape (f, 3).
-        area_factors: True area over the triangle's own, from `LEAST_AREA_FACTOR` to 1, shape (f,).
-
-    >>> voxel_surface(np.ones((1, 1, 1)), np.array([[1, 0, 0], [1, 1, 0], [1, 1, 1]]), np.array([[0, 1, 2]]))
-    (array([[1., 0., 0.]]), array([1.]))
-    """
-    size, corners = np.array(level.shape), np.asarray(points_index)[facets]
-    low, span = corners.min(axis=1), np.ptp(corners, axis=1)
-    assert np.all(np.sort(span, axis=1) == (0, 1, 1)) and np.all((low >= 0) & (low + span <= size))
-    rows, axis = np.arange(len(facets)), np.argmin(span, axis=1)
-    above = low.astype(np.int64)
-    below = above.copy()
-    below[rows, axis] -= 1
-    on_border = (below[rows, axis] < 0) | (above[rows, axis] == size[axis])
-    above, below = np.minimum(above, size - 1), np.maximum(below, 0)
-    first, last = (low.min(axis=0), (low + span).max(axis=0)) if len(low) else (0 * size, size)
-    # Beyond the border of the lattice the level goes on as it is inside.
-    near = tuple(slice(max(int(a) - 2, 0), int(b) + 2) for a, b in zip(first, last))
-    padded = np.pad(level[near], 1, mode="reflect", reflect_type="odd")
-    origin = np.array([part.start - 1 for part in near])
-    normals = np.empty((len(facets), 3))
-    for along in range(3):
-        slope = ndimage.sobel(padded, axis=along)
-        normals[:, along] = -slope[tuple((above - origin).T)] - slope[tuple((below - origin).T)]
-    outwards = np.where(on_border, low[rows, axis] > 0, level[tuple(below.T)] > level[tuple(above.T)])
-    own = np.zeros_like(normals)
-    own[rows, axis] = np.where(outwards, 1.0, -1.0)
-    cosine = np.einsum("ij,ij->i", normals, own)
-    flat = on_border | (cosine <= 0.0)
-    normals[flat], cosine[flat] = own[flat], 1.0
-    length = np.linalg.norm(normals, axis=1)
-    return normals / length[:, None], np.maximum(cosine / length, LEAST_AREA_FACTOR)
 
 
 def _node_numbers(cells: BoolArray) -> tuple[BoolArray, IntArray, IntArray]:

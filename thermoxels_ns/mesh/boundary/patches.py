@@ -198,7 +198,7 @@ def apply_patches(
     Args:
         rules: The user's rules; without any, the default patches come back.
         centroids_m: Middle of each boundary triangle, shape (f, 3), [m].
-        normals: Outward unit normals of the true surface in the same axes, shape (f, 3).
+        normals: Outward unit normals in the same axes, shape (f, 3).
         up: Up direction in the same axes.
         seen: True where some camera sees the triangle, shape (f,).
         on_box: True where the scene box cuts the solid, shape (f,).

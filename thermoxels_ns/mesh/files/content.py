@@ -12,7 +12,6 @@ import numpy.typing as npt
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.units import celsius_to_kelvin
-from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 
 
@@ -29,8 +28,6 @@ def checked_mesh(mesh: TetMesh, temperature_c: FloatArray | None = None) -> tupl
     mesh.check()
     count = len(mesh.facets)
     return mesh, mesh.boundary or Boundary(
-        normal=facet_normals(mesh.points_m, mesh.facets),
-        area_factor=np.ones(count),
         seen=np.ones(count, dtype=bool),
         patch=np.zeros(count, dtype=np.int64),
         patch_names=("boundary",),

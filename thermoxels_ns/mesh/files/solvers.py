@@ -50,8 +50,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as ``NAME.xdmf`` and ``NAME.h5``.
 
     The grid "mesh" holds the tetrahedra with `region` per cell and `temperature_c`, `temperature_k`, `observed` and,
-    if the mesh has them, `colour` per node; the grid "facets" holds the boundary triangles with `patch`, `area_factor`
-    (true area over the triangle's own, other than 1 in voxel meshes) and `normal` (of the true surface) per triangle.
+    if the mesh has them, `colour` per node; the grid "facets" holds the boundary triangles with `patch` per triangle.
     Region and patch are numbers from 1, as in .msh files, where 0 stands for none; ``Information`` elements of their
     grids say their names. In FEniCSx::
 
@@ -76,8 +75,6 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
         "region": (mesh.region + 1).astype(np.int32),
         "facets": mesh.facets.astype(np.int64),
         "patch": (tags.patch + 1).astype(np.int32),
-        "area_factor": tags.area_factor,
-        "normal": tags.normal,
         **node_arrays(mesh),
     }
     data_file = heavy_data_path(path)
@@ -125,8 +122,6 @@ def _index(regions: Sequence[str], patches: Sequence[str], arrays: dict[str, npt
     # FEniCSx takes the first attribute of a grid for its tags.
     add_values(body, "region", "Cell")
     add_values(boundary, "patch", "Cell")
-    add_values(boundary, "area_factor", "Cell")
-    add_values(boundary, "normal", "Cell", "Vector")
     for grid in (body, boundary):
         for name in ("temperature_c", "temperature_k", "observed"):
             add_values(grid, name, "Node")
@@ -140,8 +135,7 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as a Gmsh file, MSH 4.1, binary, with one physical group per region and per patch.
 
     Regions are physical volumes and patches physical surfaces, numbered from 1; empty ones are left out. Nodal
-    temperatures are a view, "temperature_c". A mesh whose triangles stand for another area than their own, as in voxel
-    meshes, has two more: "area_factor" and "normal" of the true surface at each triangle, the same at its three nodes.
+    temperatures are a view, "temperature_c".
     Tetrahedron k of the mesh has the tag k + 1, and the boundary triangles follow; nodes are numbered anew, by the
     patch or region they lie on, as Gmsh wants them.
 
@@ -175,11 +169,7 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
             file.write(f"${section}\n".encode())
             file.writelines(chunks)
             file.write(f"\n$End{section}\n".encode())
-        file.write(_view("NodeData", TEMPERATURE_VIEW, 1, mesh.temperature_c[order][:, None]))
-        if np.any(tags.area_factor != 1.0):
-            for name, values in (("area_factor", tags.area_factor[:, None]), ("normal", tags.normal)):
-                # ElementData would be shorter, but meshio then wants a value for every element, in the file's order.
-                file.write(_view("ElementNodeData", name, len(mesh.tets) + 1, np.repeat(values[:, None], 3, axis=1)))
+        file.write(_view_of_nodes(TEMPERATURE_VIEW, mesh.temperature_c[order]))
 
 
 def _ints(*values: int) -> bytes:
@@ -254,16 +244,13 @@ def _elements(mesh: TetMesh, tags: Boundary, tag: IntArray) -> Iterator[bytes]:
             yield table.tobytes()
 
 
-def _view(section: str, name: str, first_tag: int, values: FloatArray) -> bytes:
-    """Return a view of values per node, shape (n, k), or per node of elements, shape (n, nodes, k)."""
-    count, components = len(values), values.shape[-1]
-    nodes = [("nodes", _INT)] if values.ndim == 3 else []  # how many an element has
-    table = np.full(count, 3, dtype=[("tag", _INT), *nodes, ("value", _DOUBLE, values.shape[1:])])
-    table["tag"] = np.arange(first_tag, first_tag + count)
-    table["value"] = values
-    # Name, time 0, step 0, number of components, number of nodes or elements.
-    head = f'${section}\n1\n"{name}"\n1\n0.0\n3\n0\n{components}\n{count}\n'
-    return head.encode() + table.tobytes() + f"\n$End{section}\n".encode()
+def _view_of_nodes(name: str, values: FloatArray) -> bytes:
+    """Return a view of one value per node, shape (n,), in the order of the nodes' tags."""
+    table = np.empty(len(values), dtype=[("tag", _INT), ("value", _DOUBLE)])
+    table["tag"], table["value"] = np.arange(1, len(values) + 1), values
+    # Name, time 0, step 0, number of components, number of nodes.
+    head = f'$NodeData\n1\n"{name}"\n1\n0.0\n3\n0\n1\n{len(values)}\n'
+    return head.encode() + table.tobytes() + b"\n$EndNodeData\n"
 
 
 @dataclass(frozen=True)
@@ -368,10 +355,7 @@ def _nodes_and_elements(mesh: TetMesh, regions: Sequence[str]) -> Iterator[str]:
 def _surfaces(mesh: TetMesh, tags: Boundary, patches: Sequence[str], owner: IntArray, face: IntArray) -> Iterator[str]:
     areas = facet_areas(mesh.points_m, mesh.facets)
     for name, members in _sets(tags.patch, patches):
-        mesh_m2 = float(areas[members].sum())
-        true_m2 = float((areas[members] * tags.area_factor[members]).sum())
-        yield f"** PATCH-{name}: true area {true_m2:.9g} m2, area of its triangles {mesh_m2:.9g} m2\n"
-        yield f"** Multiply film coefficients, emissivities and fluxes on PATCH-{name} by {true_m2 / mesh_m2:.9g}\n"
+        yield f"** PATCH-{name}: {float(areas[members].sum()):.9g} m2\n"
         yield f"*NSET, NSET=PATCH-{name}\n"
         yield from _rows("%d\n", np.unique(mesh.facets[members]) + 1)
         yield f"*SURFACE, NAME=PATCH-{name}, TYPE=ELEMENT\n"

@@ -20,7 +20,7 @@ from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_whe
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values
 from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays, surface_of, write_bytes
-from thermoxels_ns.mesh.quality.checks import count_wrong_facets, facet_areas, group_faces
+from thermoxels_ns.mesh.quality.checks import count_wrong_facets, facet_areas, facet_normals, group_faces
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
 
 _DISK_IS_FULL = 20007  # VTK's own number
@@ -115,14 +115,12 @@ def boundary_path(path: Path | str) -> Path:
 def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
     """Write the boundary triangles and their tags as VTK polygons (.vtp, read by ParaView and pyvista).
 
-    Cell arrays: `normal` (outward, of the true surface), `area_m2` (of the true surface that the triangle stands
-    for), `area_factor` (that over the triangle's own area), `seen` (1: a camera saw it), `patch` (an index into the
-    field array `patch_names`), `on_box` (1: where the scene box cuts the solid) and, where photographs were compared,
+    Cell arrays: `normal` (outward), `area_m2`, `seen` (1: a camera saw it), `patch` (an index into the field array
+    `patch_names`), `on_box` (1: where the scene box cuts the solid) and, where photographs were compared,
     `photographs_seen` and `photographs_supporting`, see `Boundary.photographs`. Point arrays: `temperature_c`,
     `observed`, `node` (number in the mesh, from 0) and, if the mesh has colours, `colour` as bytes.
 
-    A mesh without boundary tags is written with the triangles' own normals and areas, one patch "boundary", and
-    without `seen`, which nobody knows.
+    A mesh without boundary tags is written with one patch "boundary", and without `seen`, which nobody knows.
     """
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkStringArray
@@ -132,9 +130,8 @@ def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
     mesh, tags = checked_mesh(mesh)
     surface = surface_of(mesh.points_m, mesh.facets)
     arrays: dict[str, npt.NDArray] = {
-        "area_factor": tags.area_factor,
-        "area_m2": facet_areas(mesh.points_m, mesh.facets) * tags.area_factor,
-        "normal": tags.normal,
+        "area_m2": facet_areas(mesh.points_m, mesh.facets),
+        "normal": facet_normals(mesh.points_m, mesh.facets),
         "on_box": (mesh.facet_tags == FACET_BOX).astype(np.uint8),
         "patch": tags.patch,
     }
@@ -292,8 +289,6 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Bo
     counts = [f"photographs_{what}" for what in ("seen", "supporting")]
     counted = any(count in surface.cell_data for count in counts)
     return facets, Boundary(
-        normal=array("normal").astype(np.float64),
-        area_factor=array("area_factor").astype(np.float64),
         seen=array("seen") != 0,
         patch=array("patch").astype(np.int64),
         patch_names=tuple(str(names.GetValue(number)) for number in range(names.GetNumberOfValues())),

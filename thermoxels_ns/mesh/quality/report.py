@@ -103,8 +103,6 @@ class QualityReport:
     num_box_facets: int  # boundary triangles where the scene box cuts the solid
     volume_m3: float  # sum of the signed volumes, [m^3]
     area_m2: float  # sum of the boundary triangles' areas, [m^2]
-    true_area_m2: float | None
-    """Area of the surface that the boundary triangles stand for, [m^2]; None for a mesh whose boundary has no tags."""
     edge_length_m: tuple[float, float, float]  # shortest, mean and longest edge, [m]
     dihedral_range_deg: tuple[float, float]  # smallest and largest angle between two faces of a tetrahedron, [degrees]
     dihedral_counts: tuple[int, ...]  # number of these angles, six per tetrahedron, in the bins of `angle_edges`
@@ -226,7 +224,6 @@ def quality_report(
         num_facets=len(mesh.facets),
         num_box_facets=int(np.count_nonzero(mesh.facet_tags == FACET_BOX)),
         area_m2=float(areas.sum()),
-        true_area_m2=None if mesh.boundary is None else float((areas * mesh.boundary.area_factor).sum()),
         edge_length_m=(float(lengths.min()), float(lengths.mean()), float(lengths.max())),
         **figures,
         # Nodes without a tetrahedron are no bodies.
@@ -365,13 +362,11 @@ def _figures(report: QualityReport) -> dict[str, str]:
     """Return the figures that a person asks for first, by name."""
     unit = report.length_unit
     shortest, mean, longest = report.edge_length_m
-    true_area = "not known" if report.true_area_m2 is None else f"{report.true_area_m2:.6g} {unit}²"
     return {
         "nodes, tetrahedra": f"{report.num_nodes:,}, {report.num_tets:,}",
         "boundary triangles": f"{report.num_facets:,} ({report.num_box_facets:,} cut by the box or the region)",
         "volume": f"{report.volume_m3:.6g} {unit}³",
-        "area of triangles": f"{report.area_m2:.6g} {unit}²",
-        "area of the surface they stand for": true_area,
+        "area": f"{report.area_m2:.6g} {unit}²",
         "edge length: shortest, mean, longest": f"{shortest:.4g}, {mean:.4g}, {longest:.4g} {unit}",
         "bodies: sharing faces; sharing nodes": f"{report.bodies_by_face:,}; {report.bodies_by_node:,}",
         "boundary components; cavities": f"{len(report.components):,}; {report.num_cavities:,}",
