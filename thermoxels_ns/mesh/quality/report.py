@@ -49,13 +49,11 @@ _CRITERIA = {
     "dihedral_within_bounds": "Angles between two faces of a tetrahedron lie within {:g} to {:g} degrees.",
     "temperatures_in_range": "No node is colder than the coldest or hotter than the hottest observation.",
     "non_obtuse": "No obtuse angle between faces: heat with lumped mass keeps the maximum principle.",
-    "stiffness_monotone": "No stiffness entry of an edge is positive: all that the maximum principle needs.",
 }
-"""What a mesh should be, by name. The last two are for voxel meshes, as no cut along a level set meets them; none asks
-that a boundary nowhere touches itself, because bodies may."""
+"""What a mesh should be, by name. The last is for voxel meshes, as no cut along a level set meets it; none
+asks that a boundary nowhere touches itself, because bodies may."""
 _BINS_WITHIN_BOUNDS: dict[BoundaryMode, int] = {"voxel": 10, "conforming": 30}
 _MOST_COMPONENTS = 20
-_CANCELLED = 1e-9  # sums over an edge below this share of their terms' sizes are 0
 
 
 @dataclass(frozen=True)
@@ -110,9 +108,6 @@ class QualityReport:
     radius_ratio_mean: float
     radius_ratio_counts: tuple[int, ...]  # number of tetrahedra by radius ratio in the bins of `RATIO_EDGES`
     share_obtuse: float  # share of tetrahedra with an obtuse angle between two faces, 0 to 1
-    share_positive_edges: float
-    """Share of edges whose off-diagonal entry of the linear stiffness matrix, summed over the tetrahedra around the
-    edge at conductivity 1, is positive: there the discrete maximum principle can fail, 0 to 1."""
     bodies_by_node: int  # parts of the mesh that share no node
     bodies_by_face: int  # parts of the mesh that share no face, so that no heat is conducted between them
     euler_characteristic: int  # vertices - edges + triangles of the boundary
@@ -193,11 +188,10 @@ def quality_report(
     points, tets, temperature = mesh.points_m, mesh.tets, mesh.temperature_c
     observed_c = temperature[mesh.observed] if mesh.observed.any() else temperature
     low_c, high_c = observed_range_c or (float(observed_c.min()), float(observed_c.max()))
-    figures, volumes, stiffness = _measure_shapes(mesh, angle_edges(boundary_mode))
+    figures, volumes = _measure_shapes(mesh, angle_edges(boundary_mode))
     ends = tets[:, TET_EDGES].reshape(-1, 2).T
-    place, shape = (np.minimum(*ends), np.maximum(*ends)), (len(points),) * 2
-    links, sizes = (sparse.coo_array((values, place), shape).tocsr() for values in (stiffness, np.abs(stiffness)))
-    figures["share_positive_edges"] = float(np.mean(links.data > _CANCELLED * sizes.data))
+    place = np.minimum(*ends), np.maximum(*ends)
+    links = sparse.coo_array((np.ones(len(place[0])), place), (len(points),) * 2).tocsr()
     edges = links.tocoo()
     lengths = np.linalg.norm(points[edges.row] - points[edges.col], axis=1)
     faces, sides = group_faces(tets), group_sides(mesh.facets)
@@ -249,11 +243,7 @@ def _criteria(
     """Return all criteria of a boundary; `turned` is the number of tetrahedra whose volume is not above 0."""
     (smallest, largest), (low, high) = figures["dihedral_range_deg"], DIHEDRAL_BOUNDS_DEG[mode]
     inside, bad = min(smallest - low, high - largest), open_edges + wrong_facets
-    obtuse, positive, warm = (
-        figures["share_obtuse"],
-        figures["share_positive_edges"],
-        excess_k > TEMPERATURE_TOLERANCE_K,
-    )
+    obtuse, warm = figures["share_obtuse"], excess_k > TEMPERATURE_TOLERANCE_K
     smallest_volume = f"{turned:,} at or below 0" if turned else f"smallest {smallest_m3:.3g} {unit}³"
     found = (
         (turned == 0, smallest_m3, smallest_volume),
@@ -262,16 +252,15 @@ def _criteria(
         (inside >= -ANGLE_TOLERANCE_DEG, inside, f"{smallest:.2f}° to {largest:.2f}°"),
         (not warm, excess_k, f"{excess_k:.2g} K outside" if warm else "none outside"),
         (obtuse == 0.0, obtuse, f"{in_percent(obtuse)} of tetrahedra obtuse"),
-        (positive == 0.0, positive, f"{in_percent(positive)} of edges positive"),
     )
     criteria = (Criterion(name, text.format(low, high), *one) for (name, text), one in zip(_CRITERIA.items(), found))
     return tuple(criteria)[: None if mode == "voxel" else 5]
 
 
-def _measure_shapes(mesh: TetMesh, edges_deg: FloatArray) -> tuple[dict[str, Any], FloatArray, FloatArray]:
-    """Return figures by their names in `QualityReport`, volumes (t,), and stiffness of the six edges of each (6 t,)."""
+def _measure_shapes(mesh: TetMesh, edges_deg: FloatArray) -> tuple[dict[str, Any], FloatArray]:
+    """Return figures by their names in `QualityReport`, and volumes, shape (t,)."""
     num = len(mesh.tets)
-    volumes, ratios, stiffness = np.empty(num), np.empty(num), np.empty((num, 6))
+    volumes, ratios = np.empty(num), np.empty(num)
     angle_counts = np.zeros(len(edges_deg) - 1, dtype=np.int64)
     smallest, largest, obtuse = 180.0, 0.0, 0
     for which, shapes in shapes_in_chunks(mesh.points_m, mesh.tets):
@@ -281,7 +270,6 @@ def _measure_shapes(mesh: TetMesh, edges_deg: FloatArray) -> tuple[dict[str, Any
         smallest, largest = min(smallest, float(angles.min())), max(largest, float(angles.max()))
         obtuse += int(np.count_nonzero(cosines.min(axis=0) < 0.0))
         volumes[which], ratios[which] = shapes.volumes, shapes.radius_ratios()
-        stiffness[which] = shapes.stiffness(cosines).T
     figures = {
         "volume_m3": float(volumes.sum()),
         "share_obtuse": obtuse / num,
@@ -291,7 +279,7 @@ def _measure_shapes(mesh: TetMesh, edges_deg: FloatArray) -> tuple[dict[str, Any
         "radius_ratio_mean": float(ratios.mean()),
         "radius_ratio_counts": tuple(np.histogram(ratios, RATIO_EDGES)[0].tolist()),
     }
-    return figures, volumes, stiffness.ravel()
+    return figures, volumes
 
 
 def picture_of_quality(path: Path | str, report: QualityReport) -> None:
@@ -376,5 +364,4 @@ def _figures(report: QualityReport) -> dict[str, str]:
             f"{report.num_non_manifold_edges:,}, {report.num_non_manifold_vertices:,}"
         ),
         "tetrahedra with an obtuse angle": in_percent(report.share_obtuse),
-        "edges with a positive stiffness entry": in_percent(report.share_positive_edges),
     }
