@@ -57,10 +57,6 @@ class Without:
     """Module, attribute in it (dots lead into classes), and what takes its place."""
 
 
-def _nothing(*_: Any, **__: Any) -> None:
-    """Do nothing, find nothing."""
-
-
 def _without_ends(model: Any, rays: Any) -> Any:
     """Weights of voxels none of which is kept because rays end in it."""
     from thermoxels_ns.training.ray_statistics import voxel_weights
@@ -77,7 +73,6 @@ MECHANISMS: Mapping[str, Without] = {
             ("thermoxels_ns.multiview.stereo", "plain_backdrop", lambda _, depth: 2 * (np.zeros(len(depth), bool),)),
         )
     ),
-    "planes": Without(replaced=((_CALLBACKS, "follow_planes", _nothing),)),
     "carve": Without((f"{_MODEL}carve", "off")),
     "opened-rays": Without(replaced=((_CALLBACKS, "MOST_OPENED_RAYS", 1.0),)),
     "opaque-neighbours": Without(replaced=((_CALLBACKS, "OPAQUE_DEPTH", math.inf),)),

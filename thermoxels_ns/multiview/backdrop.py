@@ -38,7 +38,7 @@ def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolA
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         along = np.column_stack((columns.ravel(), rows.ravel(), np.ones(width * height))) @ inverse.T
         directions[pixels] = along / np.linalg.norm(along, axis=1, keepdims=True)
-        even = even_pixels(photographs.colours[pixels].reshape(*shape, 3)) & np.isnan(depth[pixels]).reshape(shape)
+        even = _even_pixels(photographs.colours[pixels].reshape(*shape, 3)) & np.isnan(depth[pixels]).reshape(shape)
         plain[pixels] = even.ravel()
         turns = _turns(inverse, up)
         if turns is not None:
@@ -88,11 +88,11 @@ def _turns(inverse: FloatArray, up: FloatArray) -> int | None:
     return 1 if right > 0 else 3
 
 
-def even_pixels(picture: Float32Array, most: float = PLAIN) -> BoolArray:
-    """Which pixels of a picture (h, w, 3) differ by at most so much from the four around; those at a mask do not."""
+def _even_pixels(picture: Float32Array) -> BoolArray:
+    """Which pixels of a picture (h, w, 3) differ by at most `PLAIN` from the four around; those at a mask do not."""
     even = np.ones(picture.shape[:2], dtype=bool)
     for axis in (0, 1):
-        small = np.abs(np.diff(picture, axis=axis)).max(-1) <= most
+        small = np.abs(np.diff(picture, axis=axis)).max(-1) <= PLAIN
         one, other = [slice(None)] * 2, [slice(None)] * 2
         one[axis], other[axis] = slice(1, None), slice(None, -1)
         even[tuple(one)] &= small

@@ -21,14 +21,11 @@ from thermoxels_ns.field.refine import RowChange, prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import mean_colours
 from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs, rays_through_backdrop
-from thermoxels_ns.multiview.planes import depths_on_planes
-from thermoxels_ns.multiview.stereo import rays_through
 from thermoxels_ns.multiview.votes import air_voxels, around_cameras
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
 from thermoxels_ns.training.ray_statistics import (
     backdrop_evidence,
-    half_way_points,
     share_of_rays_opened,
     voxel_weights,
 )
@@ -39,8 +36,6 @@ FEWEST_SKY_DIFFERENCE = 0.01
 MOST_OPENED_RAYS = 0.01  # Share of the rays that end on something which pruning may open
 OPAQUE_DEPTH = 0.7  # Optical depth across a voxel from which it is opaque: half of the light is lost
 PRUNING_ATTEMPTS = 4  # Thresholds tried before pruning fails
-RAYS_AT_ONCE = 1 << 16
-PLANE_VOXELS = 0.5  # Voxels by which a depth may differ from the plane of its wall
 RAYS_PER_IMAGE = 4096  # Training rays per image that statistics look at
 SHORTEST_RUN_WITH_DEPTHS = 400
 """Steps that a run must have for photo_depth auto: a shorter one would spend most of its time on depths."""
@@ -113,11 +108,6 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             follow(old, refine(grid, factors[step]), grid, prefix)
         CONSOLE.log(f"step {step}: surroundings of {len(grid.voxels):,} voxels")
 
-    def look_at_planes(step: int) -> None:
-        """Find planes of plain walls before each refinement, and a third of the way to the first change."""
-        if evidence is not None:
-            follow_planes(model, evidence, step)
-
     def change_lattice(step: int) -> None:
         assert attributes.pipeline is not None and attributes.optimizers is not None
         datamanager = attributes.pipeline.datamanager
@@ -167,7 +157,6 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         TrainingCallback(before, model.update_to_step),
         TrainingCallback(before, carve, iters=(0,)),
         TrainingCallback(before, change_surroundings, iters=tuple({0, early})),
-        TrainingCallback(before, look_at_planes, iters=tuple(sorted({*factors, early}))),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
         TrainingCallback(before, widen),
     ]
@@ -207,37 +196,10 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
         model.feature_ray_sampler = FeatureRaySampler(tracks.joined_with(depths), box, far)
     open_rays = rays_through_backdrop(found.photographs, found.backdrop, 1e3 * float(np.linalg.norm(box[1] - box[0])))
     model.backdrop_ray_sampler = None if open_rays is None else FeatureRaySampler(open_rays, box)
-    if len(model.wall_depth):
-        use_planes(model, found)
     if trainer is None or trainer._start_step == 0:
         points = model.grid.voxels.corner_index() * lattice.voxel_size + np.asarray(lattice.lo)
         model.grid.paint(torch.from_numpy(mean_colours(found.photographs, found.backdrop, points)))
     return found
-
-
-def follow_planes(model: ThermoxelsModel, evidence: PhotographEvidence, step: int) -> None:
-    """Give the model feature rays to the planes of plain walls as the model has them now; earlier ones go."""
-    photographs = evidence.photographs
-    depth = np.empty(len(photographs.colours), np.float32)
-    for pixels in np.array_split(np.arange(len(depth)), -(-len(depth) // RAYS_AT_ONCE)):
-        origins, along = photographs.of_pixels(pixels)
-        lengths = np.linalg.norm(along, axis=1)
-        rays = (torch.from_numpy(v).float().to(model.device) for v in (origins, along / lengths[:, None]))
-        points = half_way_points(model, *rays).cpu().numpy()
-        depth[pixels] = np.linalg.norm(points - origins, axis=1) / lengths
-    with threadpool_limits(1, "blas"):  # same bits for any number of threads
-        planes = depths_on_planes(photographs, evidence.backdrop, depth, PLANE_VOXELS * model.grid.lattice.voxel_size)
-    CONSOLE.log(f"step {step}: {np.isfinite(planes).mean():.1%} of the photographs' pixels show plain walls")
-    model.wall_depth = torch.from_numpy(planes).to(model.device)
-    use_planes(model, evidence)
-
-
-def use_planes(model: ThermoxelsModel, evidence: PhotographEvidence) -> None:
-    """Point feature rays to the planes that the model holds, see `wall_depth`."""
-    planes = model.wall_depth.cpu().numpy()
-    (chosen,) = np.nonzero(np.isfinite(planes))
-    rays = rays_through(evidence.photographs, chosen, planes[chosen].astype(np.float64))
-    model.plane_ray_sampler = FeatureRaySampler(rays, model.scene_box.aabb.double().numpy()) if len(chosen) else None
 
 
 @dataclass(frozen=True)

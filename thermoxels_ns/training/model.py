@@ -120,15 +120,6 @@ class ThermoxelsModel(Model):
             self.feature_ray_sampler = losses.FeatureRaySampler(rays, box, self.surroundings is not None)
         # Through pixels of photographs that show a plain backdrop; found when a training begins.
         self.backdrop_ray_sampler: losses.FeatureRaySampler | None = None
-        # To the planes of plain walls; found when the lattice is refined.
-        self.plane_ray_sampler: losses.FeatureRaySampler | None = None
-        # Depth of the plane that each pixel of the small photographs shows; NaN: none.
-        self.register_buffer("wall_depth", torch.zeros(0))
-
-    def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs):
-        """Make room for as many depths of walls as the checkpoint has."""
-        self.wall_depth = torch.zeros_like(state_dict.get(prefix + "wall_depth", self.wall_depth))
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     @property
     def seen_surroundings(self) -> Surroundings | None:
@@ -323,7 +314,6 @@ class ThermoxelsModel(Model):
             terms["surroundings_loss"] = weights.surroundings * (1.0 - around.transmittance).mean()
         for name, weight, sampler in (
             ("tracks", weights.tracks, self.feature_ray_sampler),
-            ("planes", weights.tracks, self.plane_ray_sampler),
             ("backdrop", weights.backdrop, self.backdrop_ray_sampler),
         ):
             if weight and sampler is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
@@ -62,21 +61,6 @@ def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
     first = torch.ones_like(ray, dtype=torch.bool)
     first[1:] = ray[1:] != ray[:-1]
     return places[first]
-
-
-@torch.no_grad()
-def half_way_points(
-    model: RaySampler, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 3"]:
-    """Return where rays of opacity above one half have spent half of their weight; NaN for other rays."""
-    grid, points = model.grid, torch.full_like(origins, math.nan)
-    samples = model.sample_rays(origins, directions)
-    half_way = _half_way(samples)
-    at = samples.at.select(half_way)
-    voxel = torch.stack(torch.unravel_index(grid.cells[at.number], grid.lattice.cell_shape), -1)
-    low = torch.tensor(grid.lattice.lo, dtype=points.dtype, device=points.device)
-    points[samples.ray[half_way]] = (voxel + at.fraction).to(points.dtype) * grid.lattice.voxel_size + low
-    return points
 
 
 @torch.no_grad()
