@@ -23,10 +23,9 @@ from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas
 
 
 def exact_mesh(scene, voxels: int) -> TetMesh:

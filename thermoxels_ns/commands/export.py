@@ -480,7 +480,7 @@ def _with_support(
     """
     from thermoxels_ns.mesh.boundary.visibility import facet_views
     from thermoxels_ns.mesh.build import apply_transform
-    from thermoxels_ns.mesh.quality.checks import facet_normals
+    from thermoxels_ns.mesh.tetrahedra import facet_normals
     from thermoxels_ns.multiview.votes import supporting_photographs
 
     mesh = built.mesh

@@ -17,11 +17,10 @@ from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.build import BuiltMesh
-from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.report import QualityReport
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection
-from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, support_of_facets
+from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, facet_areas, support_of_facets
 
 SKIPPED_EFFECTS = (
     "Convection: not modelled, the boundary is insulated.",

@@ -19,12 +19,11 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.mesh.build import apply_transform, check_similarity
-from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import fill_enclosed
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_areas
 from thermoxels_ns.synthetic.raycast import first_surface, visible_surface_points
 from thermoxels_ns.synthetic.scene_folder import load_truth
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene

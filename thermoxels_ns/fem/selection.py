@@ -12,8 +12,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.quantities import Places
-from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas, facet_normals
 
 
 class Selection:

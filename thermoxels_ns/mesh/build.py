@@ -13,7 +13,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_patches, apply_regions
 from thermoxels_ns.mesh.boundary.visibility import seen_facets
-from thermoxels_ns.mesh.quality.checks import component_of, facet_normals
+from thermoxels_ns.mesh.quality.checks import component_of
 from thermoxels_ns.mesh.quality.report import BoundaryMode
 from thermoxels_ns.mesh.solid.morphology import face_connected
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
@@ -25,7 +25,7 @@ from thermoxels_ns.mesh.temperature import (
     interpolate_corners,
     tet_conductances,
 )
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh, facet_normals
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
 
 

@@ -107,3 +107,21 @@ def support_of_facets(mesh: TetMesh) -> IntArray | None:
     seen, supporting = mesh.boundary.photographs.T
     on_box = mesh.facet_tags == FACET_BOX
     return np.select([on_box, supporting >= 3, supporting > 0, seen > 0], [-1, 0, 1, 2], default=3)
+
+
+def facet_area_vectors(points: FloatArray, facets: IntArray) -> FloatArray:
+    """Return the area times the unit normal of triangles (right-hand rule), shape (f, 3), [m^2]."""
+    origin = points[facets[:, 0]]
+    return 0.5 * np.cross(points[facets[:, 1]] - origin, points[facets[:, 2]] - origin)
+
+
+def facet_areas(points: FloatArray, facets: IntArray) -> FloatArray:
+    """Return the areas of triangles, shape (f,), [m^2]."""
+    return np.linalg.norm(facet_area_vectors(points, facets), axis=1)
+
+
+def facet_normals(points: FloatArray, facets: IntArray) -> FloatArray:
+    """Return the unit normals of triangles (right-hand rule), 0 for one without area, shape (f, 3)."""
+    vectors = facet_area_vectors(points, facets)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0.0, length, 1.0)

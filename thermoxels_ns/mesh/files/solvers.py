@@ -18,8 +18,8 @@ from thermoxels_ns.core.checks import check_positive, remove_file, replace_when_
 from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays
-from thermoxels_ns.mesh.quality.checks import facet_areas, facet_owners
-from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
+from thermoxels_ns.mesh.quality.checks import facet_owners
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_areas
 
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
 """Stefan-Boltzmann constant (CODATA 2018, exact to the digits given), [W / (m2 K4)]."""

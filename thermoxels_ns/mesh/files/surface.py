@@ -13,8 +13,7 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import checked_mesh, colour_bytes, surface_of, write_bytes
-from thermoxels_ns.mesh.quality.checks import facet_areas
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas
 
 _ROUNDING_NOTICED = 0.01  # share of a triangle's side by which rounding may move its corners
 _COLOUR_MAP = "inferno"  # perceptually uniform, readable in grey

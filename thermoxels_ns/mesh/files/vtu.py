@@ -20,8 +20,8 @@ from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_whe
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values
 from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays, surface_of, write_bytes
-from thermoxels_ns.mesh.quality.checks import count_wrong_facets, facet_areas, facet_normals, group_faces
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
+from thermoxels_ns.mesh.quality.checks import count_wrong_facets, group_faces
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh, facet_areas, facet_normals
 
 _DISK_IS_FULL = 20007  # VTK's own number
 _REMEDY = "Export the mesh again with ns-export thermoxels-mesh."

@@ -1,4 +1,4 @@
-"""Areas of triangles; faces, edges and components of a mesh: which are shared, missing or doubled."""
+"""Faces, edges and components of a mesh: which are shared, missing or doubled."""
 
 from __future__ import annotations
 
@@ -12,30 +12,12 @@ from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_normals
 
 OUTWARD_FACES: IntArray = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 """Faces of a positively oriented tetrahedron; face f lies opposite node f, its right-hand normal points outwards."""
 TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int64)
 """Positions of a tetrahedron's nodes at the ends of its six edges, shape (6, 2)."""
-
-
-def facet_area_vectors(points: FloatArray, facets: IntArray) -> FloatArray:
-    """Return the area times the unit normal of triangles (right-hand rule), shape (f, 3), [m^2]."""
-    origin = points[facets[:, 0]]
-    return 0.5 * np.cross(points[facets[:, 1]] - origin, points[facets[:, 2]] - origin)
-
-
-def facet_areas(points: FloatArray, facets: IntArray) -> FloatArray:
-    """Return the areas of triangles, shape (f,), [m^2]."""
-    return np.linalg.norm(facet_area_vectors(points, facets), axis=1)
-
-
-def facet_normals(points: FloatArray, facets: IntArray) -> FloatArray:
-    """Return the unit normals of triangles (right-hand rule), 0 for one without area, shape (f, 3)."""
-    vectors = facet_area_vectors(points, facets)
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(length > 0.0, length, 1.0)
 
 
 @dataclass(frozen=True)

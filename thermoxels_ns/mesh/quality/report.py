@@ -22,13 +22,12 @@ from thermoxels_ns.mesh.quality.checks import (
     count_overlaps,
     count_twin_nodes,
     count_wrong_facets,
-    facet_areas,
     group_faces,
     group_sides,
     surface_topology,
 )
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_areas
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

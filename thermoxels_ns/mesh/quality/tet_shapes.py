@@ -1,4 +1,4 @@
-"""Shapes of tetrahedra: volumes, dihedral angles and radius ratios."""
+"""Shapes of tetrahedra: volumes, dihedral angles, radius ratios and stiffness entries."""
 
 from __future__ import annotations
 
@@ -58,6 +58,22 @@ class TetShapes:
         ratios = np.zeros_like(self.six_volumes)
         np.divide(6.0 * self.six_volumes**2, scale, out=ratios, where=(self.six_volumes > 0.0) & (scale > 0.0))
         return np.minimum(ratios, 1.0, out=ratios)
+
+    def stiffness(self, cosines: FloatArray) -> FloatArray:
+        """Return what each tetrahedron adds to the stiffness of its edges at conductivity 1, shape (6, t), [m].
+
+        The entry of the linear element is V grad(lambda_i) . grad(lambda_j) = n_i . n_j / (36 V): the cotangent of the
+        angle at the opposite edge times minus a sixth of that edge's length. It is positive where that angle is obtuse,
+        and 0 where the volume is. `cosines` are those of `dihedral_cosines`.
+        """
+        entries = np.empty_like(cosines)
+        weight = np.zeros_like(self.six_volumes)
+        np.divide(1.0, 6.0 * self.six_volumes, out=weight, where=self.six_volumes != 0.0)
+        # Nodes i and j lie opposite the two faces that meet in the opposite edge, 5 - e.
+        for edge, (i, j) in enumerate(reversed(_FACE_PAIRS)):
+            np.multiply(_dot(self.normals[i], self.normals[j]), weight, out=entries[edge])
+        entries[cosines[::-1] == 0.0] = 0.0
+        return entries
 
 
 def shapes_in_chunks(points: FloatArray, tets: IntArray) -> Iterator[tuple[slice, TetShapes]]:

@@ -10,8 +10,9 @@ from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.kernel_cache import kernel
-from thermoxels_ns.mesh.quality.checks import component_of, facet_area_vectors
+from thermoxels_ns.mesh.quality.checks import component_of
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
+from thermoxels_ns.mesh.tetrahedra import facet_area_vectors
 
 ANGLES_DEG = (13.0, 160.0)
 """No move leaves a dihedral angle outside this range, narrower than that of stuffing itself."""
