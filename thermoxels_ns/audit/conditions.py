@@ -20,6 +20,7 @@ from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, 
 Share: TypeAlias = Annotated[Measured, Unit("1")]
 Emissivity: TypeAlias = Annotated[Measured, Unit("1", 0.0, 1.0, above=True)]
 Temperature: TypeAlias = Annotated[Measured, Unit("C", -ZERO_CELSIUS_K)]
+Air: TypeAlias = Annotated[Measured, Unit("C", -90.0, 100.0)]
 Difference: TypeAlias = Annotated[Measured, Unit("K")]
 Hours: TypeAlias = Annotated[Measured, Unit("h")]
 Conductivity: TypeAlias = Annotated[Measured, Unit("W/(m K)", 0.0, above=True)]
@@ -61,16 +62,22 @@ class Camera:
 class InsideAir:
     """The air behind the surface, or, seen from inside, before it."""
 
-    air: Temperature  # [degrees Celsius]
-    lowest_24h: Temperature | None = None  # During the last 24 hours
-    highest_24h: Temperature | None = None
+    air: Air  # [degrees Celsius]
+    lowest_24h: Air | None = None  # During the last 24 hours
+    highest_24h: Air | None = None
+
+    def __post_init__(self) -> None:
+        low, high = self.lowest_24h, self.highest_24h
+        if low is not None and high is not None and low.low > high.high:
+            expected, got = "at most highest_24h", f"{low.value:g} C above {high.value:g} C"
+            raise AuditError("lowest_24h", expected=expected, got=got, remedy="Exchange the two.")
 
 
 @record(AuditError)
 class OutsideAir(InsideAir):
     """The open air."""
 
-    air: Temperature = Measured(math.nan)
+    air: Air = Measured(math.nan)
     """[degrees Celsius]; not a number: not known, which only a view from inside may leave out."""
     wind: Annotated[Measured, Unit("m/s", 0.0, surely=False)] | None = None  # Near the surface, [m/s]
     wind_direction: str = ""

@@ -34,7 +34,7 @@ class AuditedSurface:
 
     selection: Selection
     reading_c: FloatArray  # What the thermal camera says, mean of the triangle, [degrees Celsius]
-    area_m2: FloatArray  # True area
+    area_m2: FloatArray  # Area
     centroid_m: FloatArray  # (f, 3)
     counted: BoolArray  # Where thermal rays measured, and nothing speaks against it
     why_not: IntArray  # Place in `WHY_NOT` of what speaks against it; -1 where nothing does
@@ -121,6 +121,8 @@ def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, floa
     if not counted.any():
         counts = "; ".join(f"{np.count_nonzero(why_not == n)} {why}" for n, why in enumerate(WHY_NOT.values()))
         remedy = "Export again, of a training with thermal images that show the surface."
+        if (why_not == list(WHY_NOT).index("left out")).any():
+            remedy = "Leave out fewer patches (leave_out)."
         raise AuditError("mesh", expected="boundary triangles with a reading", got=f"none: {counts}", remedy=remedy)
     bare = sorted({names[number] for number in np.unique(patch[counted]) if entry_of_patch[number] < 0})
     if bare:

@@ -70,7 +70,8 @@ class Unit:
                 above = f"{'above' if self.above else 'of at least'} {self.low:g}" if self.low > -math.inf else ""
                 most = f"at most {self.high:g}" if self.high < math.inf else ""
                 expected = f"a value {'surely ' * self.surely}{' and '.join(filter(None, (above, most)))} [{self.name}]"
-                raise _wrong("", expected, f"{found.value:g} +- {found.off_by:g}", "Correct it.")
+                written = f"{content!r}, which is " if isinstance(content, str) else ""
+                raise _wrong("", expected, f"{written}{found.value:g} +- {found.off_by:g}", "Correct it.")
         except ThermoxelsError as problem:
             raise ValueError(problem) from problem
         return found

@@ -157,9 +157,10 @@ def read_thermal_file(
         celsius = values.astype(np.float64) / most * unit.scale + unit.offset_c
     else:
         # Of a TIFF's counts cameras mean steps of a fixed size, which bounds do not tell.
-        got, remedy = f"{values.dtype} counts and no unit", _UNIT_REMEDY
+        got = f"{values.dtype} counts and no unit"
         if unit.kind == "bounds":
-            got, remedy = f"{values.dtype} counts of a TIFF and temperature_bounds.json", _COUNTS_REMEDY
+            got = f"{values.dtype} counts of a TIFF and temperature_bounds.json"
+        remedy = _COUNTS_REMEDY if unit.kind == "bounds" or suffix in _TIFF_SUFFIXES else _UNIT_REMEDY
         raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
     if no_data is not None:
         celsius[no_data] = np.nan
@@ -197,13 +198,19 @@ def _check_there(path: Path, suffix: str) -> None:
         raise ThermalFileError(str(path), expected=expected, got=f"suffix '{suffix}'", remedy=remedy)
 
 
-def _read_npy(path: Path) -> npt.NDArray[Any]:
+def load_array(path: Path) -> npt.NDArray[Any]:
+    """Map a .npy file of numbers into memory; `ThermalFileError` if it is none, or damaged."""
     try:
-        values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: its size is checked before it is read
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
     except ValueError as problem:  # whose text is the header itself
         raise _damaged(path, "a header that is no array's, or fewer numbers than it says") from problem
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fui":
         raise _damaged(path, f"an array of type {getattr(values, 'dtype', type(values))}")
+    return values
+
+
+def _read_npy(path: Path) -> npt.NDArray[Any]:
+    values = load_array(path)  # mapped: its size is checked before it is read
     if values.ndim >= 2 and values.size:
         check_thermal_size(path, values.shape[1], values.shape[0])
     values = np.array(values)

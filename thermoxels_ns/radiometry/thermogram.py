@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 from PIL import Image
 
 from thermoxels_ns.core.arrays import Float32Array
@@ -204,8 +203,8 @@ def _read_stored(
         unit, exif = _unit_of_image(path, options)
     elif found == "NPY" and unit is None:
         with errors_name(path, "a readable array of numbers", error=ThermalFileError):
-            whole_numbers = np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind in "ui"
-        if whole_numbers:
+            array = load_array(path)
+        if array.dtype.kind in "ui":
             expected = "an array of degrees C (float32 or float64), or whole numbers with a known unit"
             remedy = "Pass --camera, or --celsius-per-count and --celsius-offset."
             raise ThermalFileError(str(path), expected=expected, got="whole numbers and no unit", remedy=remedy)

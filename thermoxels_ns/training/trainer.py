@@ -80,6 +80,8 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         self.set_experiment_name()
         names = {name: str(getattr(self, name)) for name in ("experiment_name", "method_name", "timestamp")}
         names |= {"relative_model_dir": Path(self.relative_model_dir).as_posix()}
+        if (logs := Path(self.logging.relative_log_dir).as_posix()) != ".":
+            names["logging.relative_log_dir"] = logs
         for name, text in names.items():
             if text in (".", "..") or set(text) & {"/", "\\", "\0"}:
                 expected, remedy = "one name of a folder", f"Pass --{name.replace('_', '-')} with a plain name."
@@ -258,7 +260,9 @@ class ThermoxelsTrainer(Trainer):
         except (OSError, RuntimeError) as problem:
             free = shutil.disk_usage(final.parent).free
             got = f"{type(problem).__name__} with {free / 1e6:.3g} MB of free space"
-            remedy = f"Free space, then go on from the one before it: --load-dir {shlex.quote(str(final.parent))}"
+            remedy = "Free space, then train again."
+            if any(final.parent.glob("*.ckpt")):
+                remedy = f"Free space, then go on from the one before it: --load-dir {shlex.quote(str(final.parent))}"
             raise OutputError(f"checkpoint {final}", expected="room for it", got=got, remedy=remedy) from problem
         finally:
             unfinished.unlink(missing_ok=True)

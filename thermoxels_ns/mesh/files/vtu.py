@@ -276,7 +276,10 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Bo
         return _array(surface.cell_data, of, name)
 
     node = _array(surface.point_data, "node", name).astype(np.int64)
-    if node.min() < 0 or node.max() >= len(points) or not np.array_equal(points[node], surface.points, equal_nan=True):
+    if not np.isfinite(points).all():
+        bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
+        raise _wrong(name, "finite positions of nodes", f"{bad} that are not, in the mesh beside it")
+    if node.min() < 0 or node.max() >= len(points) or not np.array_equal(points[node], surface.points):
         raise _wrong(name, "the boundary of the mesh beside it", "that of another one")
     if not surface.is_all_triangles:
         raise _wrong(name, "triangles only", "other polygons")
