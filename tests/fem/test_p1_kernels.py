@@ -90,20 +90,6 @@ def test_right_angles_couple_nothing_wherever_the_body_stands() -> None:
     assert np.abs(stiffness - moved).max() < 1e-11 * stiffness.max()
 
 
-def test_connected_bodies_have_connected_matrices() -> None:
-    """Leaving out what is 0 cuts no body in two: pieces are found from the stiffness matrix."""
-    for make in MESHES.values():
-        points, tets = make()
-        ends = tets[:, [[0, 1], [0, 2], [0, 3]]].reshape(-1, 2)
-        links = sparse.coo_matrix((np.ones(len(ends)), ends.T), shape=(len(points),) * 2)
-        by_edges, number = sparse.csgraph.connected_components(links, directed=False)
-        by_stiffness, same = sparse.csgraph.connected_components(
-            stiffness_matrix(points, tets, np.full(len(tets), 1.0)), directed=False
-        )
-        assert by_edges == by_stiffness
-        np.testing.assert_array_equal(number, same)
-
-
 @pytest.mark.parametrize("scale", [1e-60, 1e-20, 1e20, 1e60])
 def test_scale(scale: float) -> None:
     """K grows with the size of a body, its mass with the cube; neither over- nor underflows on the way."""

@@ -9,8 +9,7 @@ def test_every_row_is_a_material_with_a_source() -> None:
     assert len(table) >= 25
     assert list(table) == [material(name).name for name in table]
     assert all(len(row.source) > 10 for row in table.values())
-    # Solids of a building: from foam to lead, from lead to wood; light ones are little more than still air,
-    # 0.026 W/(m K), metals conduct best, all else lies between.
+    # Light solids are little more than still air, 0.026 W/(m K), metals conduct best, all else lies between.
     assert all(10 < row.density_kg_m3 < 12000 for row in table.values())
     metals = {"aluminium", "copper", "steel", "stainless-steel", "lead", "zinc"}
     for name, row in table.items():
@@ -23,10 +22,7 @@ def test_every_row_is_a_material_with_a_source() -> None:
     ("name", "figures"),
     [
         ("concrete", (1.7, 2200.0, 880.0)),
-        ("concrete-2400", (2.0, 2400.0, 1000.0)),
-        ("reinforced-concrete-1-percent", (2.3, 2300.0, 1000.0)),
         ("aluminium", (160.0, 2800.0, 880.0)),
-        ("glass", (1.0, 2500.0, 750.0)),
         ("softwood", (0.13, 500.0, 1600.0)),
         ("mineral-wool", (0.035, 20.0, 1030.0)),
     ],
@@ -37,9 +33,5 @@ def test_published_rows(name: str, figures: tuple[float, float, float]) -> None:
 
 
 def test_an_unknown_material_lists_the_known_and_suggests_one() -> None:
-    with pytest.raises(
-        HeatError, match=r"^material: expected one of concrete, .*, got 'concret'. Did you mean concrete"
-    ):
+    with pytest.raises(HeatError, match=r"^material: .* Did you mean concrete"):
         material("concret")
-    with pytest.raises(HeatError, match="or give the three figures themselves"):
-        material("unobtainium")

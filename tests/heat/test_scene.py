@@ -17,6 +17,7 @@ INSIDE = InsideAir(20.0, "iso-6946-combined")
 OUTSIDE = OutsideAir(0.0, "iso-6946-combined")
 CONVECTION = OutsideAir(0.0, "iso-6946-convection", wind_m_s=4.0)
 SUN = Sun(towards=(0.0, 0.0, 1.0), direct_w_m2=800.0)
+GROUND = (GroundContact(("exterior-down",), 1.5, 10.0),)
 
 
 def effects(mesh=None, adiabatic=("*",), **named) -> tuple[Effect, ...]:
@@ -108,38 +109,27 @@ def test_sunlight_on_surfaces_that_absorb() -> None:
 
 
 def test_every_patch_is_spoken_of() -> None:
-    with pytest.raises(HeatError, match="nothing on interior-up") as caught:
+    with pytest.raises(HeatError, match=r"interior-up \(3.33 %") as caught:
         effects(adiabatic=("cut",), outside_air=OUTSIDE)
-    assert "interior-up (3.33 % of the surface)" in str(caught.value)
-    assert "write adiabatic: [cut, interior-up, interior-side, interior-down]." in str(caught.value)
+    assert "adiabatic: [cut, interior-up, interior-side, interior-down]" in str(caught.value)
     assert len(effects(adiabatic=("cut",), outside_air=OUTSIDE, inside_air=INSIDE)) == 2
     # A patch without surface may be forgotten.
     assert len(effects(wall(), adiabatic=("cut",), outside_air=OUTSIDE, inside_air=INSIDE)) == 2
-    with pytest.raises(HeatError, match=r"nothing on cut \(13.3 % of the surface\)"):
+    with pytest.raises(HeatError, match=r"cut \(13.3 %"):
         effects(adiabatic=(), outside_air=OUTSIDE, inside_air=INSIDE)
 
 
 @pytest.mark.parametrize(
     ("named", "message"),
     [
-        (
-            {"inside_air": INSIDE, "radiation": (Radiation(("interior-up",), 0.9, 20.0),)},
-            "inside_air: expected radiation once on each patch, got radiation entry 1 on interior-up as well",
-        ),
-        (
-            {"outside_air": OUTSIDE, "ground_contact": (GroundContact(("exterior-down",), 1.5, 10.0),)},
-            "outside_air: expected contact with air or ground once .*, got ground_contact entry 1 on exterior-down",
-        ),
+        ({"inside_air": INSIDE, "radiation": (Radiation(("interior-up",), 0.9, 20.0),)}, "inside_air: .*radiation"),
+        ({"outside_air": OUTSIDE, "ground_contact": GROUND}, "outside_air: .*ground_contact entry 1 on exterior-down"),
         (
             {"convection": (Convection(("interior-*",), 8.0, 20.0), Convection(("*-up",), 8.0, 20.0))},
-            "convection entry 1: .*got convection entry 2 on interior-up as well. Give each of the two its own patches",
+            "convection entry 1: .*convection entry 2 on interior-up",
         ),
         (
-            {
-                "ground_contact": (GroundContact(("exterior-down",), 1.5, 10.0),),
-                "sun": SUN,
-                "surfaces": (Surface(absorptivity=0.6),),
-            },
+            {"ground_contact": GROUND, "sun": SUN, "surfaces": (Surface(absorptivity=0.6),)},
             "ground_contact entry 1: expected contact with the ground alone",
         ),
     ],
@@ -162,28 +152,26 @@ def test_the_sky_may_share_a_view_with_other_surroundings() -> None:
 @pytest.mark.parametrize(
     ("named", "message"),
     [
-        (
-            {"sky": Sky(temperature_c=0.0)},
-            "surfaces: emissivity: expected a number beside sky.* got none. Add surfaces",
-        ),
-        ({"sun": SUN}, "surfaces: absorptivity: expected a number beside sun"),
-        ({"surfaces": (Surface(emissivity=0.9),)}, "surfaces: emissivity: expected sky, or ground with surface_c"),
-        ({"ground": Ground(reflectance=0.2)}, "ground: reflectance: expected a sun"),
-        ({"up": (0.0, 0.0, 0.0)}, "up: expected a direction"),
+        ({"sky": Sky(temperature_c=0.0)}, "surfaces: emissivity"),
+        ({"sun": SUN}, "surfaces: absorptivity"),
+        ({"surfaces": (Surface(emissivity=0.9),)}, "surfaces: emissivity"),
+        ({"ground": Ground(reflectance=0.2)}, "ground: reflectance"),
+        ({"up": (0.0, 0.0, 0.0)}, "up"),
+        ({"materials": {}}, "materials"),
     ],
 )
 def test_what_belongs_together(named, message: str) -> None:
-    with pytest.raises(HeatError, match=message):
-        HeatScene(ALL, **named)
+    with pytest.raises(HeatError, match=f"^{message}: expected"):
+        HeatScene(**{"materials": ALL, **named})
 
 
 def test_patches_that_the_mesh_does_not_have_are_named() -> None:
-    with pytest.raises(HeatError, match=r"outside_air: patches: .*exterior-up, .*cut, got 'roof'. Correct the name"):
+    with pytest.raises(HeatError, match=r"outside_air: patches: .* got 'roof'"):
         effects(outside_air=replace(OUTSIDE, patches=("roof",)))
     with pytest.raises(HeatError, match="surfaces entry 2: patches"):
         effects(sun=SUN, surfaces=(Surface(absorptivity=0.6), Surface(absorptivity=0.6, patches=("roof",))))
     untagged = replace(room(), boundary=None)
-    with pytest.raises(HeatError, match="names or patterns of the patches boundary, got 'exterior-"):
+    with pytest.raises(HeatError, match=r"outside_air: patches: .* got 'exterior-"):
         effects(untagged, outside_air=OUTSIDE)
     assert len(effects(untagged, outside_air=replace(OUTSIDE, patches=("*",)))) == 1
 
@@ -193,10 +181,8 @@ def test_patch_names_with_the_letters_of_patterns() -> None:
     assert mesh.boundary is not None
     names = tuple(f"{name} [*]" for name in mesh.boundary.patch_names)
     mesh = replace(mesh, boundary=replace(mesh.boundary, patch_names=names))
-    (effect,) = effects(
-        mesh, sun=replace(SUN, patches=("*",)), surfaces=(Surface(absorptivity=0.6, patches=("*-up*",)),)
-    )
-    assert isinstance(effect, AbsorbedSolar)
+    roofs = (Surface(absorptivity=0.6, patches=("*-up*",)),)
+    (effect,) = effects(mesh, sun=replace(SUN, patches=("*",)), surfaces=roofs)
     selection = Selection(mesh)
     assert set(selection.facet_patch[selection.facets(effect.patches)]) == {0, 3}
 
@@ -210,12 +196,10 @@ def test_materials_by_region() -> None:
     # One material stays one, which is cheaper to assemble.
     assert scene.problem(mesh).material == brick
     assert HeatScene({"solid": brick, "slab": brick}, adiabatic=("*",)).problem(two).material == brick
-    with pytest.raises(HeatError, match="materials: expected names or patterns of the regions solid, slab, got 'roof'"):
+    with pytest.raises(HeatError, match=r"materials: .* got 'roof'"):
         HeatScene({"roof": brick}, adiabatic=("*",)).problem(mesh)
-    with pytest.raises(HeatError, match=r"materials: .* got none for solid. Add them, or '\*' for all others"):
+    with pytest.raises(HeatError, match=r"materials: .* got none for solid"):
         HeatScene({"slab": brick}, adiabatic=("*",)).problem(two)
-    with pytest.raises(HeatError, match="materials"):
-        HeatScene({})
 
 
 def test_start_and_up() -> None:

@@ -1,5 +1,6 @@
 from dataclasses import replace
 from datetime import datetime, timezone
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,46 +25,20 @@ from thermoxels_ns.heat.effects import (
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.sky import moving_sun
 
-
-class Clock:
-    """Stands still until it is told to go on."""
-
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def perf_counter(self) -> float:
-        return self.now_s
+NEXT_SOLUTION = [*((0.9, 0.1 * step, step) for step in range(1, 11)), (2.0, 0.1, 1), (10.0, 0.5, 2)]
+EVER_LONGER = [(10.0, share, step) for step, share in enumerate((1e-4, 1e-3, 0.02, 0.2), 1)]
+"""Steps: seconds that each took, the share of the time that is then done, and their number in the solution."""
 
 
-@pytest.fixture
-def clock(monkeypatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr(heat_solving, "clock", clock)
-    return clock
-
-
-def said(clock: Clock, steps: list[tuple[float, float, int]]) -> list[str]:
-    """What is said of steps: seconds that each took, the share of the time that is then done, and their number."""
-    lines: list[str] = []
-    progress = heat_solving._Progress(lines.append)
+@pytest.mark.parametrize(("steps", "lines", "left_s"), [(NEXT_SOLUTION, 1, 12), (EVER_LONGER, 4, 44)])
+def test_what_is_left_is_told_by_the_last_steps_of_this_solution(monkeypatch, steps, lines, left_s) -> None:
+    now_s, said = [0.0], []
+    monkeypatch.setattr(heat_solving, "clock", SimpleNamespace(perf_counter=lambda: now_s[0]))
+    progress = heat_solving._Progress(said.append)
     for seconds, share, number in steps:
-        clock.now_s += seconds
+        now_s[0] += seconds
         progress(share, number)
-    return lines
-
-
-def test_the_next_solution_begins_when_the_last_one_has_ended(clock) -> None:
-    """As to a tolerance, where one solution follows another."""
-    first = [(0.9, 0.1 * step, step) for step in range(1, 11)]
-    assert said(clock, [*first, (2.0, 0.1, 1), (10.0, 0.5, 2)]) == [
-        "50.00% of the time after 2 steps; about 12 s left."
-    ]
-
-
-def test_what_is_left_is_told_by_the_last_steps(clock) -> None:
-    """Ever longer steps: at the pace from the start on it would be 160 s where 44 s are left."""
-    lines = said(clock, [(10.0, share, step) for step, share in enumerate((1e-4, 1e-3, 0.02, 0.2), 1)])
-    assert len(lines) == 4 and lines[-1] == "20.00% of the time after 4 steps; about 44 s left."
+    assert len(said) == lines and f"about {left_s} s left" in said[-1]
 
 
 AIRS = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0)

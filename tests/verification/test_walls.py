@@ -20,7 +20,8 @@ LAYERS = {"plaster": (0.015, 0.40), "concrete": (0.20, 2.0), "insulation": (0.12
 """Thickness, [m], and conductivity, [W / (m K)], from inside to outside."""
 
 
-def test_u_value_of_a_wall() -> None:
+@pytest.mark.parametrize("order", [1, 2])
+def test_u_value_of_a_wall(order) -> None:
     """R_si 0.13 and R_se 0.04: U = 0.266946 W/(m2 K), q = 8.00839 W/m2 between 20 and -10 C."""
     ends = np.concatenate([[0.0], np.cumsum([thickness for thickness, _ in LAYERS.values()])])
     regions = {
@@ -30,7 +31,7 @@ def test_u_value_of_a_wall() -> None:
     mesh = box_mesh(planes(*ends, step=0.03), [0, 0.5, 1.0], [0, 1.0], regions=regions)
     materials = {name: Material(name, k, 1000.0, 1000.0) for name, (_, k) in LAYERS.items()}
     effects = (Convection(("x0",), 1 / 0.13, 20.0), Convection(("x1",), 1 / 0.04, -10.0))
-    solution = solve_steady(HeatProblem(mesh, materials, effects=effects))
+    solution = solve_steady(HeatProblem(mesh, materials, effects=effects), order=order)
     flux = solution.effects[0].heat_w[0] / 1.0
     assert flux == pytest.approx(8.00839, abs=1e-5) and flux / 30.0 == pytest.approx(0.266946, abs=1e-6)
     assert solution.effects[1].heat_w[0] == pytest.approx(-flux, rel=1e-9)
