@@ -46,7 +46,7 @@ def test_body_without_measurement_is_named():
     cells = np.array([True, False, True])[:, None, None]
     edges, _ = lattice_edges(cells)
     observed = np.arange(16) < 8
-    with pytest.raises(MeshError, match=r"none in 1 of 2 parts: part 1 \(8 nodes, the first is node 8\)"):
+    with pytest.raises(MeshError, match="none in 1 of 2 parts"):
         extend_harmonically(edges, np.full(16, 20.0), observed)
 
 
@@ -84,22 +84,17 @@ def test_linear_temperatures_are_extended_through_tetrahedra_of_any_size():
 
 def test_an_edge_with_negative_conductance_does_not_break_the_maximum_principle():
     edges = np.array([[0, 1], [1, 2], [0, 2], [1, 3]])
-    filled = extend_harmonically(
-        edges, np.array([10.0, 0.0, 30.0, 0.0]), np.array([True, False, True, False]), np.array([1.0, 1.0, 1.0, -5.0])
-    )
+    known, conductance = np.array([True, False, True, False]), np.array([1.0, 1.0, 1.0, -5.0])
+    filled = extend_harmonically(edges, np.array([10.0, 0.0, 30.0, 0.0]), known, conductance)
     assert filled.tolist() == pytest.approx([10.0, 20.0, 30.0, 20.0])
 
 
 SHAPE = (4, 5, 3)
 
 
-def some_points(count: int = 200) -> np.ndarray:
-    return np.random.default_rng(0).random((count, 3)) * (np.array(SHAPE) - 1)
-
-
 def test_trilinear_functions_are_exact_where_all_is_known():
     x, y, z = np.indices(SHAPE).astype(float)
-    points = some_points()
+    points = np.random.default_rng(0).random((200, 3)) * (np.array(SHAPE) - 1)
     values, weight = interpolate_corners(points, 2 + x - 3 * y + x * y * z, np.ones(SHAPE))
     px, py, pz = points.T
     assert values == pytest.approx(2 + px - 3 * py + px * py * pz, abs=1e-12)

@@ -15,26 +15,14 @@ from thermoxels_ns.mesh.quality.checks import (
     count_open_edges,
     count_overlaps,
     count_twin_nodes,
-    facet_areas,
-    facet_normals,
     facet_owners,
     group_sides,
     surface_topology,
 )
 from thermoxels_ns.mesh.quality.report import check_mesh
-from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 CORNER_TET = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4]])
-
-
-def test_volume_area_and_normal_by_hand():
-    tet = np.array([[0, 1, 2, 3]])
-    assert signed_volumes(CORNER_TET, tet).tolist() == [4.0]
-    assert signed_volumes(CORNER_TET, tet[:, [0, 2, 1, 3]]).tolist() == [-4.0]
-    base = np.array([[0, 2, 1]])
-    assert facet_areas(CORNER_TET, base).tolist() == [3.0]
-    assert facet_normals(CORNER_TET, base).tolist() == [[0.0, 0.0, -1.0]]
 
 
 def _turned_over(mesh):
@@ -98,9 +86,6 @@ def test_sound_meshes_pass_whatever_the_order_of_nodes_in_triangles(box_mesh):
 
 
 def test_twin_nodes_are_counted():
-    random = np.random.default_rng(0)
-    points = random.integers(0, 4, size=(500, 3)).astype(float)
-    assert count_twin_nodes(points) == 500 - len(np.unique(points, axis=0))
     assert count_twin_nodes(np.array([[0.0, 1.0, 2.0], [-0.0, 1.0, 2.0], [1.0, 0.0, 2.0]])) == 1
 
 
@@ -154,9 +139,8 @@ def test_a_plate_with_holes_has_as_many_handles(holes):
 def test_a_cavity_is_a_component_of_its_own():
     cells = np.ones((5, 4, 4), dtype=bool)
     cells[1:3, 1, 1] = False
-    found = topology_of(cells)
     outside, inside = SurfaceComponent(2 * (4 * 20 + 2 * 16), 2, 0, False), SurfaceComponent(2 * 10, 2, 0, True)
-    assert found.components == (outside, inside) and found.euler_characteristic == 4
+    assert topology_of(cells).components == (outside, inside)
 
 
 def test_cubes_that_touch_at_a_point():

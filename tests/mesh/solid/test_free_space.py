@@ -9,7 +9,7 @@ LATTICE = Lattice((-1.0, -1.0, -1.0), 0.125, (17, 17, 17))
 
 
 def crossings(cells: np.ndarray, eye: np.ndarray, along: np.ndarray, wider: float = 0.0) -> tuple[np.ndarray, ...]:
-    """Distances (rays, solid voxels) at which rays enter and leave solid voxels, these wider by so much on all sides."""
+    """Distances (rays, solid voxels) where rays enter and leave solid voxels, wider by so much on all sides."""
     solid = np.argwhere(cells)
     with np.errstate(divide="ignore", invalid="ignore"):
         faces = [(solid[None] + side - eye) / along[:, None] for side in (-wider, 1.0 + wider)]

@@ -1,11 +1,16 @@
+from dataclasses import astuple
+
 import numpy as np
 import pytest
+from scipy import ndimage
+from scipy.spatial import Delaunay
 
 from tests.support.looking_cameras import looking_at
-from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid import interior as interior_module
-from thermoxels_ns.mesh.solid.interior import interior
-from thermoxels_ns.mesh.solid.morphology import convex_hull
+from thermoxels_ns.mesh.solid.interior import interior, wall_behind
+from thermoxels_ns.mesh.solid.morphology import close_gaps, convex_hull
 
 N = 24
 LATTICE = Lattice((0.0, 0.0, 0.0), 1.0, (N + 1, N + 1, N + 1))
@@ -82,17 +87,15 @@ def test_a_few_strays_below_an_open_underside_do_not_make_it_deeper():
     clean = interior(cells, LATTICE, looking_at(MIDDLE, around()), 0).hidden
     for corner in ((5, 5), (18, 18)):
         cells[(*corner, slice(3, 5))] = True
-    strays = cells.copy()
-    found = interior(strays, LATTICE, looking_at(MIDDLE, around()), 0).hidden
+    found = interior(cells, LATTICE, looking_at(MIDDLE, around()), 0).hidden
     assert clean[:, :, 5].any() and not clean[:, :, :5].any()
     assert not found[:, :, :5].any() and np.array_equal(found, clean)
-    assert convex_hull(strays, of_centres=True)[:, :, 3:5].sum() > 10  # what would be filled
+    assert convex_hull(cells, of_centres=True)[:, :, 3:5].sum() > 10  # what would be filled
 
 
 def test_what_cameras_look_into_is_not_inside():
     cells, inside = cup()
-    from_below = looking_at(MIDDLE, around(height=-60.0))
-    found = interior(cells, LATTICE, from_below, 0)
+    found = interior(cells, LATTICE, looking_at(MIDDLE, around(height=-60.0)), 0)
     assert found.hidden[inside].mean() < 0.35 and not found.hidden[11:13, 11:13, 5:12].any()
 
 
@@ -129,23 +132,14 @@ def test_blocks_give_the_same_inside(monkeypatch):
         assert np.array_equal(found, expected)
 
 
-def half_around(count: int = 20, height: float = 14.0) -> np.ndarray:
-    """Cameras on the side of low x."""
-    angle = np.linspace(0.5 * np.pi + 0.1, 1.5 * np.pi - 0.1, count)
-    return np.column_stack((12 + 60 * np.cos(angle), 12 + 60 * np.sin(angle), np.full(count, height)))
-
-
-def with_holes_far_away() -> tuple[np.ndarray, np.ndarray]:
-    """A thin shell of a box whose side at high x is a chessboard with squares of four voxels; cameras, of which three
-    of 23 look through it."""
+def test_crevices_that_a_few_cameras_see_through_holes_of_the_shell_are_filled():
+    """One side of a box is a chessboard with squares of four voxels; most cameras look at the other side."""
     cells = box(5, 19) & ~box(6, 18)
     y, z = np.indices((14, 14))
     cells[18, 5:19, 5:19] = (y // 4 + z // 4) % 2 == 0
-    return cells, np.vstack((half_around(), [(70.0, 12.0, 12.0), (70.0, 2.0, 16.0), (70.0, 22.0, 8.0)]))
-
-
-def test_crevices_that_a_few_cameras_see_through_holes_of_the_shell_are_filled():
-    cells, eyes = with_holes_far_away()
+    angle = np.linspace(0.5 * np.pi + 0.1, 1.5 * np.pi - 0.1, 20)
+    before = np.column_stack((12 + 60 * np.cos(angle), 12 + 60 * np.sin(angle), np.full(20, 14.0)))
+    eyes = np.vstack((before, [(70.0, 12.0, 12.0), (70.0, 2.0, 16.0), (70.0, 22.0, 8.0)]))
     found = interior(cells, LATTICE, looking_at(MIDDLE, eyes), 1)
     assert not (found.hidden | found.enclosed)[~box(5, 19)].any()
     assert (cells | found.hidden)[box(5, 19)].mean() > 0.88
@@ -189,3 +183,75 @@ def test_a_courtyard_stays_open_and_the_building_around_it_is_filled():
     for seal in (0, 1):
         found = interior(building & ~inside, LATTICE, looking_at(MIDDLE, eyes), seal)
         assert inside.sum() > 500 and np.array_equal(found.hidden | found.enclosed, inside)
+
+
+FRONT = [(80.0, 12.0, 12.0), (80.0, 18.0, 8.0), (70.0, 8.0, 14.0)]
+BACK = [(-56.0, 12.0, 12.0), (-56.0, 18.0, 8.0)]
+
+
+def plate(layers: int = 1) -> np.ndarray:
+    cells = np.zeros((N, N, N), dtype=bool)
+    cells[12 : 12 + layers, 2:22, 2:22] = True
+    return cells
+
+
+@pytest.mark.parametrize("thickness", [1.0, 2.0, 3.4, 5.0, 8.0])
+@pytest.mark.parametrize("layers", [1, 2])
+def test_a_plate_seen_from_one_side_grows_to_the_thickness_on_the_other(thickness, layers):
+    cells = plate(layers)
+    added = wall_behind(cells, LATTICE, looking_at(MIDDLE, FRONT), thickness)
+    assert not (added & cells).any()
+    thick = (cells | added)[:, 10:14, 10:14].sum(axis=0)
+    assert (np.abs(thick - max(thickness, layers)) <= 0.51).all()
+    assert not added[12 + layers :].any()  # never towards the cameras
+    assert added[:12].any() == (thickness >= layers + 0.5)
+
+
+def test_a_plate_seen_from_both_sides_does_not_grow():
+    for eyes in (FRONT + BACK, FRONT[:1] + BACK[:1]):
+        added = wall_behind(plate(), LATTICE, looking_at(MIDDLE, eyes), 6.0)
+        assert added[:, 4:20, 4:20].sum() == 0
+
+
+def test_space_that_cameras_look_through_stays_empty():
+    """A second plate shades half of the space behind the first; a camera behind looks through the other half."""
+    cells = plate()
+    views = looking_at((6.0, 12.0, 12.0), [*FRONT, (-56.0, 12.0, 60.0)])
+    added = wall_behind(cells, LATTICE, views, 5.0)
+    assert not added.any() or not added[:12, 8:16, 14:20].any()
+    cells[2, :, :] = True  # now nothing can be seen between them
+    assert wall_behind(cells, LATTICE, views, 5.0)[8:12, 8:16, 8:16].all()
+
+
+def test_it_does_not_reach_a_shadow_beyond_seen_space():
+    """A camera looks along the back of the plate through a slot three voxels wide; nobody looks behind that slot."""
+    front = looking_at(MIDDLE, FRONT[:1])
+    slot = looking_at((10.5, 12.0, 12.0), (10.5, -60.0, 12.0), focal=4800.0)
+    both = Views(*(np.concatenate(pair) for pair in zip(astuple(front), astuple(slot), strict=True)))
+    assert wall_behind(plate(), LATTICE, front, 6.0)[7:12, 10:14, 12].all()
+    assert not wall_behind(plate(), LATTICE, both, 6.0)[:, 10:14, 12].any()
+
+
+@pytest.mark.parametrize("share", [0.03, 0.3, 0.7])
+def test_closing_fills_what_a_cube_of_empty_voxels_does_not_reach(share):
+    by = 2
+    cells = np.random.default_rng(0).random((13, 11, 9)) < share
+    # Beyond the border the border voxels repeat, far enough for every cube that touches the lattice.
+    wide = np.pad(cells, 2 * by, mode="edge")
+    cube = np.ones((2 * by + 1,) * 3)
+    fits = np.asarray(ndimage.binary_erosion(~wide, cube, border_value=1))
+    reached = np.asarray(ndimage.binary_dilation(fits, cube), dtype=bool)
+    expected = ~reached[2 * by : -2 * by, 2 * by : -2 * by, 2 * by : -2 * by]
+    closed = close_gaps(cells, by)
+    assert (closed >= cells).all() and (closed >= expected).all()
+    inner = (slice(2 * by, -2 * by),) * 3
+    assert np.array_equal(closed[inner], expected[inner])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_hull_holds_the_voxel_centres_that_a_triangulation_of_the_corners_holds(seed):
+    cells = np.random.default_rng(seed).random((12, 9, 10)) < 0.01
+    cells[6, 4, 5] = True
+    corners = (np.argwhere(cells)[:, None] + CORNER_OFFSETS).reshape(-1, 3)
+    centres = np.stack(np.meshgrid(*map(np.arange, cells.shape), indexing="ij"), axis=-1) + 0.5
+    assert np.array_equal(convex_hull(cells), Delaunay(corners).find_simplex(centres) >= 0)
