@@ -102,15 +102,6 @@ def two_plates(step: float = 0.01) -> TetMesh:
     )
 
 
-def test_newton_ends_in_stages_whose_change_is_tiny(concrete) -> None:
-    """Short steps change far less than the temperatures are: what one stage stores must reach the next one in full."""
-    problem = HeatProblem(two_plates(), concrete, effects=(Radiation(("*",), 0.9, 306.6),))
-    fine = solve_heat(problem, AdaptiveSteps(264.0, 1e-3, outputs=4))
-    coarse = solve_heat(problem, AdaptiveSteps(264.0, 1e-2, outputs=4))
-    assert fine.energy_residual_of_spread < 1e-12
-    assert np.abs(fine.temperature_c - coarse.temperature_c).max() < 1e-2
-
-
 @pytest.mark.parametrize("scheme", [BACKWARD_EULER, CRANK_NICOLSON, SDIRK2])
 @pytest.mark.parametrize("step_s", [1e-9, 1e-6, 1e-3])
 def test_newton_takes_few_steps_however_short_the_time_step(concrete, scheme, step_s) -> None:

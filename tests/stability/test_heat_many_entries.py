@@ -51,10 +51,12 @@ def lines_run(work: Callable[[], Any]) -> int:
     return count
 
 
-def entries(count: int, alike: bool = False) -> tuple[tuple[Convection, ...], tuple[HeatFlux, ...]]:
+def problem(count: int, alike: bool = False) -> HeatProblem:
+    """Convection and a flux on each of many patches, or on all of them every time."""
     names = [("*",) if alike else (f"p{number}",) for number in range(count)]
-    airs = (Convection(name, 5.0, 5.0 + number % 2) for number, name in enumerate(names))
-    return tuple(airs), tuple(HeatFlux(name, 1e-9) for name in names)
+    airs = [Convection(name, 5.0, 5.0 + number % 2) for number, name in enumerate(names)]
+    fluxes = [HeatFlux(name, 1e-9) for name in names]
+    return HeatProblem(many_patches(count), CONCRETE, effects=(*airs, *fluxes))
 
 
 def from_file(folder: Path, count: int) -> Callable[[], Any]:
@@ -65,18 +67,10 @@ def from_file(folder: Path, count: int) -> Callable[[], Any]:
     return lambda: load_heat_scene(path).problem(mesh)
 
 
-def of_problem(work: Callable[[HeatProblem], Any], alike: bool = False) -> Callable[[Path, int], Callable[[], Any]]:
-    def make(_: Path, count: int) -> Callable[[], Any]:
-        effects = sum(entries(count, alike), ())
-        return partial(work, HeatProblem(many_patches(count), CONCRETE, effects=effects))
-
-    return make
-
-
-WORK = {
-    "labels of effects alike": of_problem(effect_labels, alike=True),
-    "assembling": of_problem(HeatSystem),
-    "leaving out": of_problem(lambda problem: _weak(problem, TimeSteps(2, 60.0), 0.01)),
+WORK: dict[str, Callable[[Path, int], Callable[[], Any]]] = {
+    "labels of effects alike": lambda _, count: partial(effect_labels, problem(count, alike=True)),
+    "assembling": lambda _, count: partial(HeatSystem, problem(count)),
+    "leaving out": lambda _, count: partial(_weak, problem(count), TimeSteps(2, 60.0), 0.01),
     "file": from_file,
 }
 

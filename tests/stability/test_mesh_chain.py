@@ -108,12 +108,6 @@ def test_hard_bodies_become_sound_meshes(name: str, mode) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_an_empty_field_is_refused(mode) -> None:
-    with pytest.raises(MeshError, match="solid voxels"):
-        build_mesh(trained(boxes()), AS_IT_IS, np.eye(4), MeshOptions(mode))
-
-
-@pytest.mark.parametrize("mode", MODES)
 def test_a_small_body_in_256_cubed_voxels(mode) -> None:
     cells = np.zeros((256, 256, 256), dtype=bool)
     cells[100:130, 100:130, 180:184] = True

@@ -87,12 +87,6 @@ def test_formats_are_found_by_their_ending():
         mesh_file_paths("house.obj")
 
 
-def test_an_input_file_needs_material_and_times(tmp_path, tagged_mesh):
-    with pytest.raises(MeshError, match="heat_step: expected material and times"):
-        write_mesh(tmp_path / "house.inp", tagged_mesh)
-    assert not list(tmp_path.iterdir())
-
-
 def colours(read: meshio.Mesh) -> np.ndarray:
     """Red, green, blue from 0 to 255; meshio reads bytes with a sign."""
     return np.stack([read.point_data[name].view(np.uint8) for name in ("red", "green", "blue")], axis=1).astype(float)

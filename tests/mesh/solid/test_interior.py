@@ -2,15 +2,13 @@ from dataclasses import astuple
 
 import numpy as np
 import pytest
-from scipy import ndimage
-from scipy.spatial import Delaunay
 
 from tests.support.looking_cameras import looking_at
-from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid import interior as interior_module
 from thermoxels_ns.mesh.solid.interior import interior, wall_behind
-from thermoxels_ns.mesh.solid.morphology import close_gaps, convex_hull
+from thermoxels_ns.mesh.solid.morphology import convex_hull
 
 N = 24
 LATTICE = Lattice((0.0, 0.0, 0.0), 1.0, (N + 1, N + 1, N + 1))
@@ -97,14 +95,6 @@ def test_what_cameras_look_into_is_not_inside():
     cells, inside = cup()
     found = interior(cells, LATTICE, looking_at(MIDDLE, around(height=-60.0)), 0)
     assert found.hidden[inside].mean() < 0.35 and not found.hidden[11:13, 11:13, 5:12].any()
-
-
-def test_one_pinhole_that_single_cameras_look_through_does_not_empty_it():
-    cells, inside = cup()
-    cells[5:7, 11, 11] = False
-    eyes = np.vstack((around(20), [(-60.0, 11.5, 11.5)]))
-    found = interior(cells, LATTICE, looking_at(MIDDLE, eyes), 0)
-    assert found.hidden[inside].mean() > 0.99
 
 
 def test_a_plate_and_two_bodies_side_by_side_have_no_inside():
@@ -230,28 +220,3 @@ def test_it_does_not_reach_a_shadow_beyond_seen_space():
     both = Views(*(np.concatenate(pair) for pair in zip(astuple(front), astuple(slot), strict=True)))
     assert wall_behind(plate(), LATTICE, front, 6.0)[7:12, 10:14, 12].all()
     assert not wall_behind(plate(), LATTICE, both, 6.0)[:, 10:14, 12].any()
-
-
-@pytest.mark.parametrize("share", [0.03, 0.3, 0.7])
-def test_closing_fills_what_a_cube_of_empty_voxels_does_not_reach(share):
-    by = 2
-    cells = np.random.default_rng(0).random((13, 11, 9)) < share
-    # Beyond the border the border voxels repeat, far enough for every cube that touches the lattice.
-    wide = np.pad(cells, 2 * by, mode="edge")
-    cube = np.ones((2 * by + 1,) * 3)
-    fits = np.asarray(ndimage.binary_erosion(~wide, cube, border_value=1))
-    reached = np.asarray(ndimage.binary_dilation(fits, cube), dtype=bool)
-    expected = ~reached[2 * by : -2 * by, 2 * by : -2 * by, 2 * by : -2 * by]
-    closed = close_gaps(cells, by)
-    assert (closed >= cells).all() and (closed >= expected).all()
-    inner = (slice(2 * by, -2 * by),) * 3
-    assert np.array_equal(closed[inner], expected[inner])
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_hull_holds_the_voxel_centres_that_a_triangulation_of_the_corners_holds(seed):
-    cells = np.random.default_rng(seed).random((12, 9, 10)) < 0.01
-    cells[6, 4, 5] = True
-    corners = (np.argwhere(cells)[:, None] + CORNER_OFFSETS).reshape(-1, 3)
-    centres = np.stack(np.meshgrid(*map(np.arange, cells.shape), indexing="ij"), axis=-1) + 0.5
-    assert np.array_equal(convex_hull(cells), Delaunay(corners).find_simplex(centres) >= 0)
