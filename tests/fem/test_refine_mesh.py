@@ -125,19 +125,7 @@ def random_mesh() -> tuple[np.ndarray, np.ndarray]:
     return points[used], numbers.reshape(-1, 4)
 
 
-def fan_mesh() -> tuple[np.ndarray, np.ndarray]:
-    """A hundred thin tetrahedra around one axis, numbered at random."""
-    count = 100
-    order = np.random.default_rng(8).permutation(count) + 2
-    angle = 2.0 * np.pi * np.arange(count) / count
-    points = np.zeros((count + 2, 3))
-    points[1, 2] = 0.5
-    points[order, 0], points[order, 1] = np.cos(angle), np.sin(angle)
-    tets = np.column_stack([np.zeros(count, int), np.ones(count, int), order, np.roll(order, -1)])
-    return points, oriented(points, tets)
-
-
-MESHES = {"kuhn": kuhn_mesh, "random": random_mesh, "fan": fan_mesh}
+MESHES = {"kuhn": kuhn_mesh, "random": random_mesh}
 
 
 def space(points: np.ndarray, tets: np.ndarray) -> Space:

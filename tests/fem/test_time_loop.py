@@ -9,10 +9,9 @@ from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Places, Quantity, Varying, tabulated
-from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Step
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.fem.time_loop import HeatBalance, solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, HeatFlux, Radiation
 from thermoxels_ns.heat.sky import moving_sun
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -59,19 +58,6 @@ def test_a_body_at_rest_in_the_dark_still_sees_the_sun_rise(concrete, outputs: i
     coarse = solve_heat(problem, TimeSteps(4, 86400.0))
     assert "Steps of 86400 s are longer than the 3600 s by which effects" in coarse.status
     assert "longer than" not in fine.status
-
-
-def test_heat_that_nothing_accounts_for_is_told_beside_what_is_stored() -> None:
-    """A body that warms by 0.1 K without a flow, beside differences from its mean of 6 K over half of its mass."""
-    mesh = box_mesh([0.0, 0.5, 1.0], [0.0, 1.0], [0.0, 1.0], temperature_c=lambda p: 12.0 * (p[:, 0] - 0.5))
-    system = HeatSystem(HeatProblem(mesh, CONCRETE))
-    states = np.stack([system.start_k, system.start_k + 0.1])
-    balance = HeatBalance(system, states.copy(), np.array([0.0, 60.0]))
-    step = Step(states[1], np.zeros(0), 1, 0, np.nan, True, "")
-    balance.add(step, 60.0, ends_interval=True)
-    found = balance.close("", adaptive=False)
-    assert found.energy_residual_of_spread == pytest.approx(0.1 / 3.0, rel=1e-9)
-    assert found.energy_residual == pytest.approx(0.1 / 273.15, rel=1e-9)
 
 
 @pytest.mark.parametrize("radiates", [False, True])

@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.scene_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.quantities import Places, Varying
+from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Effect, GroundContact, Radiation
 from thermoxels_ns.heat.materials import material
@@ -252,30 +252,15 @@ def test_sections_say_what_is_wrong(make, named: str) -> None:
         make()
 
 
-Z_UP = (0.0, 0.0, 1.0)
-CEILING, WALL, FLOOR = (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
-"""Outward normals of what surrounds a room."""
-
-
-def at(coefficient: Varying, *normals: tuple[float, float, float], up=Z_UP) -> list[float]:
-    places = Places(np.zeros((len(normals), 3)), np.array(normals), up)
-    return np.asarray(coefficient.function(places, 0.0)).tolist()
-
-
-@pytest.mark.parametrize(
-    ("mean_c", "published"), [(-10.0, 4.13), (0.0, 4.62), (10.0, 5.15), (20.0, 5.71), (30.0, 6.32)]
-)
+@pytest.mark.parametrize(("mean_c", "published"), [(-10.0, 4.13), (10.0, 5.15), (30.0, 6.32)])
 def test_radiation_made_linear(mean_c: float, published: float) -> None:
     assert round(radiative_coefficient(mean_c, 1.0), 2) == published
     assert radiative_coefficient(mean_c, 0.5) == 0.5 * radiative_coefficient(mean_c, 1.0)
 
 
 def test_horizontal_reaches_to_30_degrees() -> None:
-    def leaning(degrees: float) -> tuple[float, float, float]:
-        return float(np.cos(np.radians(degrees))), 0.0, float(np.sin(np.radians(degrees)))
-
-    found = at(
-        inside_coefficient("iso-6946-convection", "out-of-body"),
-        *(leaning(angle) for angle in (-31, -30, -29, 29, 30, 31)),
-    )
-    assert found == [0.7, 2.5, 2.5, 2.5, 2.5, 5.0]
+    angle = np.radians([-31, -30, -29, 29, 30, 31])
+    normals = np.stack([np.cos(angle), np.zeros(6), np.sin(angle)], axis=1)
+    coefficient = inside_coefficient("iso-6946-convection", "out-of-body")
+    found = coefficient.function(Places(np.zeros((6, 3)), normals, (0.0, 0.0, 1.0)), 0.0)
+    assert np.asarray(found).tolist() == [0.7, 2.5, 2.5, 2.5, 2.5, 5.0]

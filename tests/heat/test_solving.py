@@ -16,7 +16,6 @@ from thermoxels_ns.heat import solving as heat_solving
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
-    Effect,
     FixedTemperature,
     HeatFlux,
     InternalHeat,
@@ -50,29 +49,21 @@ def solved(problem: HeatProblem, time: heat_solving.Time = None, **goals: Any) -
     return heat_solving.solve_problem(problem, time, heat_solving.Goals(**goals))
 
 
-def sun(strength: float) -> Effect:
-    return AbsorbedSolar(("x1",), 0.6, 500.0 * strength)
-
-
-def wind(strength: float) -> Effect:
-    return Convection(("x1",), 20.0 * strength, -5.0)
-
-
-def sky(strength: float) -> Effect:
-    return Radiation(("*",), 0.9 * strength, -30.0)
-
-
-def source(strength: float) -> Effect:
-    return InternalHeat(("*",), 1000.0 * strength)
+BY_STRENGTH = {
+    "sun": lambda strength: AbsorbedSolar(("x1",), 0.6, 500.0 * strength),
+    "wind": lambda strength: Convection(("x1",), 20.0 * strength, -5.0),
+    "sky": lambda strength: Radiation(("*",), 0.9 * strength, -30.0),
+    "source": lambda strength: InternalHeat(("*",), 1000.0 * strength),
+}
 
 
 @pytest.mark.parametrize("time", [None, TimeSteps(5, 36_000.0), AdaptiveSteps(36_000.0, 0.5, outputs=2)], ids=str)
-@pytest.mark.parametrize("make", [sun, wind, sky, source])
-def test_what_is_left_out_brings_little_and_what_brings_more_is_built(make, time) -> None:
+@pytest.mark.parametrize("name", BY_STRENGTH)
+def test_what_is_left_out_brings_little_and_what_brings_more_is_built(name, time) -> None:
     """On a conforming mesh, from far too little to far too much to be left out."""
     left_out = []
     for strength in (1e-6, 1e-3, 1.0):
-        problem = HeatProblem(CONFORMING, CONCRETE, effects=(*AIRS, make(strength)))
+        problem = HeatProblem(CONFORMING, CONCRETE, effects=(*AIRS, BY_STRENGTH[name](strength)))
         found, whole = solved(problem, time), solved(problem, time, leave_out_below=0.0)
         left_out.append(len(found.left_out))
         flows, all_flows = mean_flows_w(found.solution), mean_flows_w(whole.solution)

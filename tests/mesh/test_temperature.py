@@ -9,18 +9,6 @@ from thermoxels_ns.mesh.temperature import extend_harmonically, interpolate_corn
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, lattice_edges
 
 
-def test_linear_field_is_reproduced_from_the_boundary_of_a_box():
-    cells = np.ones((7, 5, 9), dtype=bool)
-    corners, _ = kuhn_tets(cells)
-    exact = 20.0 + corners @ np.array([3.0, -1.0, 0.5])
-    observed = np.any((corners == 0) | (corners == np.array(cells.shape)), axis=1)
-    edges, weights = lattice_edges(cells)
-    for edge_weights in (None, weights):
-        filled = extend_harmonically(edges, np.where(observed, exact, -273.0), observed, edge_weights)
-        assert np.array_equal(filled[observed], exact[observed])
-        assert np.abs(filled - exact).max() < 1e-8
-
-
 @pytest.mark.parametrize("seed", range(12))
 def test_maximum_principle_on_random_bodies(random_cells, seed):
     cells = random_cells(seed)
@@ -40,14 +28,6 @@ def test_maximum_principle_on_random_bodies(random_cells, seed):
         inside = parts == part
         assert filled[inside].min() >= measured[inside & observed].min()
         assert filled[inside].max() <= measured[inside & observed].max()
-
-
-def test_body_without_measurement_is_named():
-    cells = np.array([True, False, True])[:, None, None]
-    edges, _ = lattice_edges(cells)
-    observed = np.arange(16) < 8
-    with pytest.raises(MeshError, match="none in 1 of 2 parts"):
-        extend_harmonically(edges, np.full(16, 20.0), observed)
 
 
 def test_a_solver_that_fails_is_reported(monkeypatch):

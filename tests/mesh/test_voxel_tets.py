@@ -29,30 +29,27 @@ def exposed_faces(cells: np.ndarray) -> int:
     )
 
 
-def pattern(name: str) -> np.ndarray:
+def voxels(*others: tuple[int, int, int]) -> np.ndarray:
+    """The middle one of 3 x 3 x 3 voxels, and others."""
     cells = np.zeros((3, 3, 3), dtype=bool)
-    cells[1, 1, 1] = True
-    if name == "sharing an edge":
-        cells[2, 2, 1] = True
-    elif name == "sharing a corner":
-        cells[2, 2, 2] = True
-    elif name == "sharing a face":
-        cells[1, 2, 1] = True
-    elif name == "checkerboard":
-        cells = np.indices((4, 3, 5)).sum(axis=0) % 2 == 0
-    elif name == "full":
-        cells[:] = True
-    elif name == "hollow":
-        cells = ~cells
+    cells[tuple(zip((1, 1, 1), *others))] = True
     return cells
 
 
-PATTERNS = ["single", "sharing a face", "sharing an edge", "sharing a corner", "checkerboard", "full", "hollow"]
+PATTERNS = {
+    "single": voxels(),
+    "sharing a face": voxels((1, 2, 1)),
+    "sharing an edge": voxels((2, 2, 1)),
+    "sharing a corner": voxels((2, 2, 2)),
+    "checkerboard": np.indices((4, 3, 5)).sum(axis=0) % 2 == 0,
+    "full": np.ones((3, 3, 3), dtype=bool),
+    "hollow": ~voxels(),
+}
 
 
 @pytest.mark.parametrize("name", PATTERNS)
 def test_volume_area_and_validity(mesh_of_cells, name):
-    cells = pattern(name)
+    cells = PATTERNS[name]
     quality = check_mesh(mesh_of_cells(cells, voxel_size=0.5))
     assert quality.num_tets == 6 * cells.sum()
     assert quality.volume_m3 == pytest.approx(cells.sum() * 0.5**3, rel=1e-14)
@@ -71,7 +68,7 @@ def turned(facets: np.ndarray) -> list:
 
 @pytest.mark.parametrize("name", PATTERNS)
 def test_voxel_faces_give_the_boundary_of_the_tetrahedra(name):
-    cells = pattern(name)
+    cells = PATTERNS[name]
     assert turned(voxel_facets(cells)) == turned(boundary_facets(kuhn_tets(cells)[1]))
 
 

@@ -2,17 +2,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from tests.support.looking_cameras import looking_at
-from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 from thermoxels_ns.mesh.build import BuiltMesh, MeshOptions, build_mesh
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.quality.report import check_mesh
-from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
+from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.voxel_tets import LEAST_AREA_FACTOR
 
 MODES = ["conforming", "voxel"]
@@ -114,47 +111,3 @@ def test_a_small_body_in_256_cubed_voxels(mode) -> None:
     built = build_mesh(trained(cells), AS_IT_IS, np.eye(4), MeshOptions(mode))
     assert_sound(built, mode)
     assert built.solid.cells.sum() == 30 * 30 * 4
-
-
-def snapshot(density: np.ndarray) -> GridSnapshot:
-    ones = np.ones(density.shape, dtype=np.float32)
-    lattice = Lattice((0.0, 0.0, 0.0), 0.1, density.shape)  # type: ignore[arg-type]
-    return GridSnapshot(lattice, density.astype(np.float32), 20.0 * ones, ones)
-
-
-@pytest.mark.parametrize("scale", [1e-30, 1e-6, 1.0, 1e30, 3e38])
-def test_selection_does_not_depend_on_the_scale_of_density(scale):
-    # 3e38: the sum of eight corners overflows float32.
-    pattern = np.random.default_rng(3).random((9, 9, 9))
-    expected = select_solid(snapshot(pattern), SolidSelection(close_gaps=0, density_percentile=90.0)).cells
-    solid = select_solid(snapshot(pattern * scale), SolidSelection(close_gaps=0, density_percentile=90.0))
-    assert np.isfinite(solid.threshold) and np.array_equal(solid.cells, expected)
-
-
-@settings(max_examples=40, deadline=None)
-@given(
-    shape=st.tuples(*[st.integers(2, 6)] * 3),
-    seed=st.integers(0, 2**32 - 1),
-    fill=st.floats(0.05, 1.0),
-    percentile=st.floats(0.0, 99.0),
-    region=st.sampled_from(["auto", "all"]),
-    interior=st.sampled_from(["solid", "hollow"]),
-    mirror=st.booleans(),
-)
-def test_every_mesh_that_is_built_is_valid(shape, seed, fill, percentile, region, interior, mirror):
-    random = np.random.default_rng(seed)
-    density = random.random(shape) * (random.random(shape) < fill)
-    selection = SolidSelection(close_gaps=0, density_percentile=percentile, region=region, interior=interior)
-    field = snapshot(density)
-    try:
-        solid = select_solid(field, selection)
-    except MeshError:
-        # Only without any density, or with the same density all over.
-        centre = field.lattice.corner_to_cell_mean(field.density)
-        assert not centre.any() or np.ptp(centre) == 0.0
-        return
-    transform = np.diag([-2.0 if mirror else 2.0, 2.0, 2.0, 1.0])
-    built = build_mesh(field, selection, transform, MeshOptions("voxel"))
-    assert np.array_equal(built.solid.cells, solid.cells)
-    assert check_mesh(built.mesh).volume_m3 == pytest.approx(solid.cells.sum() * 0.2**3, rel=1e-9)
-    assert solid.cells.sum() == sum(step.added - step.removed for step in solid.steps)

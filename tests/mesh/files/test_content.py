@@ -69,17 +69,6 @@ def test_a_mesh_that_is_refused_leaves_the_old_files(tmp_path, tagged_mesh, suff
     assert set(tmp_path.iterdir()) == set(mesh_file_paths(path))
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_place_that_cannot_be_written_is_named(tmp_path, tagged_mesh, suffix):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="output folder"):
-        write_mesh(tmp_path / "file" / f"house{suffix}", tagged_mesh, heat_step=STEP)
-    (tmp_path / f"house{suffix}").mkdir()
-    with pytest.raises(OutputError, match=f"house{suffix}"):
-        write_mesh(tmp_path / f"house{suffix}", tagged_mesh, heat_step=STEP)
-    assert not [path for path in tmp_path.iterdir() if ".part" in path.name]
-
-
 def test_formats_are_found_by_their_ending():
     assert set(MESH_FORMATS) == {".vtu", ".xdmf", ".msh", ".inp", ".stl", ".ply", ".glb"}
     assert mesh_file_paths("a.b.msh") == [Path("a.b.msh")]

@@ -12,24 +12,9 @@ from tests.support.unreadable import forbid
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import colour_bytes
 from thermoxels_ns.mesh.files.formats import write_mesh
-from thermoxels_ns.mesh.files.vtu import read_mesh, write_boundary_vtp, write_summary, write_vtu
+from thermoxels_ns.mesh.files.vtu import read_mesh, write_boundary_vtp, write_summary
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary
-
-
-def test_mesh_round_trips_through_pyvista(tmp_path, box_mesh):
-    path = tmp_path / "new" / "mesh.vtu"
-    temperature_c = box_mesh.temperature_c + 1.0  # of a later step
-    write_vtu(path, box_mesh, temperature_c=temperature_c)
-    grid = pv.read(path)
-    assert np.array_equal(grid.points, box_mesh.points_m)
-    assert np.array_equal(grid.cells_dict[pv.CellType.TETRA], box_mesh.tets)
-    assert np.array_equal(grid.point_data["temperature_c"], temperature_c)
-    assert np.array_equal(grid.point_data["temperature_k"], temperature_c + 273.15)
-    assert grid.point_data["observed"].dtype == np.uint8
-    assert np.array_equal(grid.point_data["observed"], box_mesh.observed)
-    assert np.array_equal(grid.cell_data["region"], box_mesh.region)
-    assert [p.name for p in path.parent.iterdir()] == ["mesh.vtu"]
 
 
 def names_in(data: pv.DataSet) -> list[str]:

@@ -142,6 +142,14 @@ def test_percentile_keeps_the_densest_share_of_all_voxels(snapshot_of, percentil
     assert centre[solid.cells].min() >= solid.threshold > centre[~solid.cells].max()
 
 
+@pytest.mark.parametrize("scale", [1e-30, 1e30, 3e38])
+def test_selection_does_not_depend_on_the_scale_of_density(snapshot_of, scale):
+    """3e38: the sum of eight corners overflows float32."""
+    pattern, selection = np.random.default_rng(3).random((9, 9, 9)), SolidSelection(density_percentile=90.0)
+    expected, scaled = (select_solid(snapshot_of(pattern * by), selection) for by in (1.0, scale))
+    assert np.isfinite(scaled.threshold) and np.array_equal(scaled.cells, expected.cells)
+
+
 def test_zero_density_is_never_solid(snapshot_of):
     snapshot = snapshot_of(cells_along_x([0, 0, 0, 5]))
     for selection in (SolidSelection(close_gaps=0, density_percentile=0.0), SolidSelection(density_threshold=0.0)):
