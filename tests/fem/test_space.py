@@ -117,11 +117,3 @@ def test_radiation_over_the_triangles_is_exact_for_linear_temperatures(box, conc
     system = HeatSystem(problem, order=2)
     heat = system.group_heat_w(system.start_k, 0.0)[0]
     assert heat == pytest.approx(-1e-8 * 0.2 * (330.0**5 - 300.0**5) / 500.0, rel=1e-12)
-
-
-def test_the_default_matrix_is_an_m_matrix(box, concrete) -> None:
-    system = HeatSystem(HeatProblem(box, concrete, effects=ALL))
-    dense = (system.matrix(0.0, np.inf) + system.radiation_slope(box.temperature_c - system.reference_c, 0.0)).toarray()
-    np.testing.assert_array_equal(dense, dense.T)
-    assert (dense - np.diag(np.diag(dense))).max() <= 0.0
-    assert np.linalg.inv(dense).min() >= 0.0

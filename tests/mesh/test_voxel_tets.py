@@ -13,7 +13,6 @@ from thermoxels_ns.mesh.voxel_tets import (
     LEAST_AREA_FACTOR,
     boundary_tags,
     kuhn_tets,
-    lattice_edges,
     voxel_facets,
     voxel_surface,
 )
@@ -80,12 +79,6 @@ def test_box_facets_are_those_on_the_lattice_border(mesh_of_cells):
     assert np.all(mesh.points_m[mesh.facets[box]][:, :, 0] == 3.0)
     assert facet_areas(mesh.points_m, mesh.facets[box]).sum() == pytest.approx(1.0)
     assert np.count_nonzero(mesh.facet_tags == FACET_SURFACE) == len(mesh.facets) - 2
-
-
-def test_voxels_around_an_edge_are_counted():
-    edges, num_voxels = lattice_edges(np.ones((2, 2, 2), dtype=bool))
-    assert len(edges) == 54
-    assert np.bincount(num_voxels).tolist() == [0, 24, 24, 0, 6]
 
 
 CELLS = 80

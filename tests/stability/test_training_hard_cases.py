@@ -20,26 +20,16 @@ def all_finite(pipeline) -> bool:
     return all(bool(torch.isfinite(p).all()) for p in pipeline.parameters())
 
 
-def evaluate(pipeline) -> dict[str, float]:
-    return pipeline.get_average_eval_image_metrics()
-
-
-def set_all_thermal(scene, value: int) -> None:
-    for path in (scene / "thermal").iterdir():
-        with Image.open(path) as image:
-            size = image.size
-        Image.fromarray(np.full(size[::-1], value, dtype=np.uint16)).save(path)
-
-
 def test_constant_thermal_images_of_a_textured_body_stay_constant(tmp_path):
     """Texture must not print into temperature: std below 0.1 K; and max = min must not divide by zero."""
     scene = sphere(tmp_path / "scene")
-    set_all_thermal(scene, 20_000)
+    for path in (scene / "thermal").iterdir():
+        Image.fromarray(np.full((30, 40), 20_000, dtype=np.uint16)).save(path)
     (scene / "temperature_bounds.json").write_text(
         json.dumps({"absolute_min_temperature": 20.0, "absolute_max_temperature": 20.0})
     )
     pipeline = train(scene, 60)
-    metrics = evaluate(pipeline)
+    metrics = pipeline.get_average_eval_image_metrics()
     assert all_finite(pipeline) and np.isfinite(metrics["thermal_psnr"])
     pipeline.eval()
     camera = pipeline.datamanager.eval_dataset.cameras[0:1]
@@ -71,7 +61,7 @@ def test_image_without_a_valid_thermal_pixel_in_evaluation_does_not_spoil_the_av
         return {**item, "thermal_valid": torch.zeros_like(item["thermal_valid"])} if index == 0 else item
 
     monkeypatch.setattr(dataset, "get_data", blind)
-    metrics = evaluate(pipeline)
+    metrics = pipeline.get_average_eval_image_metrics()
     assert np.isfinite(metrics["thermal_mae_c"]) and np.isfinite(metrics["thermal_psnr"])
 
 
@@ -96,7 +86,7 @@ def test_learning_rates_far_too_large_end_in_a_finite_model_or_a_clear_error(tmp
         assert "--pipeline.model" in str(error) or "learning rate" in str(error)
         return
     assert all_finite(pipeline)
-    assert all(np.isfinite(value) for value in evaluate(pipeline).values())
+    assert all(np.isfinite(value) for value in pipeline.get_average_eval_image_metrics().values())
     snapshot = pipeline.grid_snapshot()
     assert np.isfinite(snapshot.density).all() and np.isfinite(snapshot.temperature_c).all()
 
@@ -127,5 +117,5 @@ def test_scenes_that_show_little(tmp_path, change, views):
     (scene / "transforms.json").write_text(json.dumps(transforms))
     pipeline = train(scene, 70, SCHEDULE)
     assert pipeline.model.grid.lattice.cell_shape[0] == 16 and all_finite(pipeline)
-    metrics = evaluate(pipeline)
+    metrics = pipeline.get_average_eval_image_metrics()
     assert np.isfinite(metrics["thermal_mae_c"]) and np.isfinite(metrics["psnr"])

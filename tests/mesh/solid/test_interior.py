@@ -142,8 +142,7 @@ def test_the_long_shadow_between_posts_on_a_plate_is_not_their_inside(monkeypatc
     cells[2:70, 9:15, :2] = cells[2:5, 9:15, :10] = cells[67:70, 9:15, :10] = True
     views = looking_at((36.0, 12.0, 5.0), [(500.0, y, 6.0) for y in np.linspace(9.0, 15.0, 7)])
     between = (slice(16, 56), slice(9, 15), slice(6, 10))
-    found = interior(cells, lattice, views, 0)
-    assert found.hidden[between].mean() < 0.05
+    assert interior(cells, lattice, views, 0).hidden[between].mean() < 0.05
     monkeypatch.setattr(interior_module, "SHADOW_SURROUNDED", -1.0)
     assert interior(cells, lattice, views, 0).hidden[between].mean() > 0.8
 
