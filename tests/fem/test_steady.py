@@ -10,7 +10,6 @@ from tests.support.heat_bodies import CONCRETE, STEEL
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import implicit_equation, steady
-from thermoxels_ns.fem import implicit_equation as linear_solver
 from thermoxels_ns.fem.implicit_equation import LinearSolver
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
@@ -158,9 +157,9 @@ def weighted_graph(n: int = 400, seed: int = 0) -> sparse.csr_matrix:
     return sparse.csr_matrix(sparse.diags(total + 1e-2) - links)
 
 
-@pytest.mark.parametrize("patience", [1, linear_solver.PATIENCE])
+@pytest.mark.parametrize("patience", [1, implicit_equation.PATIENCE])
 def test_agrees_with_a_direct_solver(monkeypatch, patience) -> None:
-    monkeypatch.setattr(linear_solver, "PATIENCE", patience)
+    monkeypatch.setattr(implicit_equation, "PATIENCE", patience)
     matrix = weighted_graph()
     b = np.random.default_rng(1).normal(size=400)
     solution = LinearSolver(matrix).solve(b)
@@ -169,10 +168,10 @@ def test_agrees_with_a_direct_solver(monkeypatch, patience) -> None:
     np.testing.assert_allclose(solution.x, exact, atol=1e-8 * np.abs(exact).max())
 
 
-@pytest.mark.parametrize("patience", [1, linear_solver.PATIENCE])
+@pytest.mark.parametrize("patience", [1, implicit_equation.PATIENCE])
 def test_the_same_bits_with_any_number_of_threads(monkeypatch, patience) -> None:
     """A cube of 21^3 nodes, above the size from which BLAS shares a sum among threads."""
-    monkeypatch.setattr(linear_solver, "PATIENCE", patience)
+    monkeypatch.setattr(implicit_equation, "PATIENCE", patience)
     x = planes(0.0, 1.0, step=0.05)
     air = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -5.0)
     system = HeatSystem(HeatProblem(box_mesh(x, x, x), CONCRETE, effects=air))
