@@ -34,20 +34,27 @@ def two_walls() -> HeatProblem:
 def test_u_values_of_two_walls_side_by_side() -> None:
     """U = 1 / (1/8 + 0.2/k + 1/25): 2.21878 of brick, 0.19361 of wool; f_Rsi = 1 - U / 8 at the worse one."""
     problem = two_walls()
-    tags = problem.mesh.boundary
-    # Triangles that stand for 0.7 of their own area exchange 0.7 of the heat.
-    tags = dataclasses.replace(tags, area_factor=np.full(len(tags.area_factor), 0.7))
-    problem = dataclasses.replace(problem, mesh=dataclasses.replace(problem.mesh, boundary=tags))
     wall = wall_result(problem, solve_steady(problem), ("x0",), 20.0, -10.0)
     u = {name: 1.0 / (1 / 8 + 0.2 / k + 1 / 25) for name, k in (("brick", 0.7), ("wool", 0.04))}
     assert u == pytest.approx({"brick": 2.218700, "wool": 0.193611}, abs=1e-6)
     assert {part.name: part.u_value_w_m2k for part in wall.regions} == pytest.approx(u, rel=1e-9)
-    assert {part.name: part.area_m2 for part in wall.regions} == pytest.approx({"brick": 1.4, "wool": 4.2})
-    assert [(part.name, part.area_m2) for part in wall.patches] == [("x0", pytest.approx(5.6))]
-    assert wall.u_value_w_m2k == pytest.approx(wall.coupling_w_k / 5.6, rel=1e-9)
+    assert {part.name: part.area_m2 for part in wall.regions} == pytest.approx({"brick": 2.0, "wool": 6.0})
+    assert [(part.name, part.area_m2) for part in wall.patches] == [("x0", pytest.approx(8.0))]
+    assert wall.u_value_w_m2k == pytest.approx((2.0 * u["brick"] + 6.0 * u["wool"]) / 8.0, rel=1e-9)
+    assert wall.coupling_w_k == pytest.approx(8.0 * wall.u_value_w_m2k, rel=1e-9)
     assert wall.heat_w == pytest.approx(30.0 * wall.coupling_w_k, rel=1e-12)
     assert wall.temperature_factor == pytest.approx(1.0 - u["brick"] / 8.0, rel=1e-9)
     assert wall.coldest.point_m[0] == 0.0 and wall.coldest.point_m[1] <= 1.0 and wall.coldest.patches[0] == "x0"
+
+
+def test_true_areas_count() -> None:
+    """Triangles that stand for 0.7 of their own area exchange 0.7 of the heat."""
+    problem = two_walls()
+    tags = dataclasses.replace(problem.mesh.boundary, area_factor=np.full(len(problem.mesh.facets), 0.7))
+    problem = dataclasses.replace(problem, mesh=dataclasses.replace(problem.mesh, boundary=tags))
+    wall = wall_result(problem, solve_steady(problem), ("x0",), 20.0, -10.0)
+    assert wall.area_m2 == pytest.approx(5.6)
+    assert wall.regions[0].u_value_w_m2k == pytest.approx(1.0 / (1 / 8 + 0.7 * 0.2 / 0.7 + 1 / 25), rel=1e-9)
 
 
 def test_of_a_cooled_room_the_warmest_spot_is_the_worst() -> None:
