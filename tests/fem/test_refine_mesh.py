@@ -2,14 +2,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
 
-from tests.support.heat_meshes import box_mesh
+from tests.support.heat_matrices import storage
+from tests.support.heat_meshes import box_mesh, mesh_from
 from tests.support.shell_mesh import shell_mesh
-from thermoxels_ns.fem.p1_kernels import TET_EDGES, stiffness_matrix
+from thermoxels_ns.fem.p1_kernels import TET_EDGES, lumped_mass, stiffness_matrix
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.space import Space, conduction
 from thermoxels_ns.mesh.quality.checks import boundary_facets, facet_areas
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 
 def turned(facets: np.ndarray) -> set[tuple[int, ...]]:
@@ -59,10 +64,8 @@ def test_children_inherit() -> None:
     tags, finer = mesh.boundary, fine.boundary
     assert tags is not None and finer is not None and mesh.colour is not None and fine.colour is not None
     np.testing.assert_array_equal(fine.region, np.repeat(mesh.region, 8))
-    np.testing.assert_array_equal(finer.patch, np.repeat(tags.patch, 4))
-    np.testing.assert_array_equal(finer.area_factor, np.repeat(tags.area_factor, 4))
-    np.testing.assert_array_equal(finer.seen, np.repeat(tags.seen, 4))
-    np.testing.assert_array_equal(finer.normal, np.repeat(tags.normal, 4, axis=0))
+    for name in ("patch", "area_factor", "seen", "normal"):
+        np.testing.assert_array_equal(getattr(finer, name), np.repeat(getattr(tags, name), 4, axis=0))
     np.testing.assert_array_equal(fine.facet_tags, np.repeat(mesh.facet_tags, 4))
     assert finer.patch_names == tags.patch_names and fine.region_names == mesh.region_names
     old = len(mesh.points_m)
@@ -73,9 +76,7 @@ def test_children_inherit() -> None:
     np.testing.assert_array_equal(fine.observed, fine.points_m[:, 0] <= 1.0)
     assert fine.colour.dtype == np.float32 and fine.colour.min() >= 0.0 and fine.colour.max() <= 1.0
     np.testing.assert_array_equal(refined_values(mesh, mesh.temperature_c), fine.temperature_c)
-    untagged = refine_mesh(replace(mesh, boundary=None, colour=None))
-    assert untagged.boundary is None and untagged.colour is None
-    np.testing.assert_array_equal(untagged.tets, fine.tets)
+    np.testing.assert_array_equal(refine_mesh(replace(mesh, boundary=None, colour=None)).tets, fine.tets)
 
 
 def test_no_angle_of_a_lattice_becomes_obtuse() -> None:
@@ -102,3 +103,54 @@ def test_shapes_do_not_degenerate() -> None:
         longest = np.linalg.norm(corner[:, TET_EDGES[:, 0]] - corner[:, TET_EDGES[:, 1]], axis=2).max(axis=1)
         worst.append(float((signed_volumes(mesh.points_m, mesh.tets) / longest**3).min()))
     assert worst[-1] == pytest.approx(worst[0], rel=0.3), worst
+
+
+def oriented(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """Drop flat tetrahedra and turn the inverted ones over."""
+    sides = points[tets[:, 1:]] - points[tets[:, :1]]
+    volumes = np.linalg.det(sides)
+    tets = np.where(volumes[:, None] > 0, tets, tets[:, [0, 2, 1, 3]])
+    return tets[np.abs(volumes) > 1e-3 * np.median(np.abs(volumes))]
+
+
+def kuhn_mesh() -> tuple[np.ndarray, np.ndarray]:
+    corners, tets = kuhn_tets(np.random.default_rng(5).random((4, 3, 5)) < 0.8)
+    return 0.07 * corners, tets
+
+
+def random_mesh() -> tuple[np.ndarray, np.ndarray]:
+    points = np.random.default_rng(6).uniform(-1.0, 2.0, (150, 3))
+    tets = oriented(points, Delaunay(points).simplices.astype(np.int64))
+    used, numbers = np.unique(tets, return_inverse=True)
+    return points[used], numbers.reshape(-1, 4)
+
+
+MESHES = {"kuhn": kuhn_mesh, "random": random_mesh}
+
+
+def space(points: np.ndarray, tets: np.ndarray) -> Space:
+    return Space(Selection(mesh_from(points, tets)))
+
+
+@pytest.mark.parametrize("mesh", MESHES)
+def test_matrices_are_those_of_the_forms_of_scikit_fem(mesh: str) -> None:
+    points, tets = MESHES[mesh]()
+    varied = 10.0 ** np.random.default_rng(9).uniform(-3.0, 3.0, len(tets))
+    for conductivity in (np.full(len(tets), 1.7), varied):
+        expected = space(points, tets).assembled(conduction, 0, conductivity=conductivity).toarray()
+        stiffness = stiffness_matrix(points, tets, conductivity)
+        assert np.abs(stiffness.toarray() - expected).max() < 1e-13 * np.abs(expected).max()
+    nodal = space(points, tets).assembled(storage, 2, heat_capacity=1e5 * varied) @ np.ones(len(points))
+    np.testing.assert_allclose(lumped_mass(points, tets, 1e5 * varied), nodal, rtol=1e-12)
+
+
+def test_right_angles_couple_nothing_wherever_the_body_stands() -> None:
+    """Nodes that only right angles lie between have no entry, so that matrices of lattices are small."""
+    points, tets = kuhn_mesh()
+    stiffness = stiffness_matrix(points, tets, np.full(len(tets), 1.7))
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    moved = stiffness_matrix(points @ turn + [30.0, -50.0, 10.0], tets, np.full(len(tets), 1.7))
+    assert np.diff(stiffness.indptr).max() == 7 and stiffness.nnz == moved.nnz
+    assert (stiffness != stiffness.T).nnz == 0
+    assert np.abs(stiffness - moved).max() < 1e-11 * stiffness.max()

@@ -5,54 +5,18 @@ import numpy as np
 import pytest
 
 from tests.support.heat_bodies import CONCRETE
-from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.runge_kutta import Step
-from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.fem.time_loop import HeatBalance, solve_heat
-from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Radiation
+from thermoxels_ns.fem.quantities import Places, Quantity, Varying, tabulated
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, HeatFlux, Radiation
 from thermoxels_ns.heat.sky import moving_sun
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 PAPER = TimeSteps(10, 60.0)
-
-
-def heat_content(mesh: TetMesh, material, temperature_c: np.ndarray) -> np.ndarray:
-    """Integral of rho c T, T in kelvin, by the volumes of the tetrahedra: knows nothing of the solver's matrices."""
-    edges = mesh.points_m[mesh.tets[:, 1:]] - mesh.points_m[mesh.tets[:, :1]]
-    volumes = np.linalg.det(edges) / 6.0
-    means = (temperature_c[..., mesh.tets] + 273.15).mean(axis=-1)
-    return material.heat_capacity_j_m3k * means @ volumes
-
-
-@pytest.mark.parametrize("step_seconds", [1e-2, 60.0, 1e9])
-def test_heat_is_conserved(random_body, concrete, step_seconds) -> None:
-    solution = solve_heat(HeatProblem(random_body, concrete), TimeSteps(10, step_seconds))
-    content = heat_content(random_body, concrete, solution.temperature_c)
-    assert np.abs(content / content[0] - 1.0).max() < 1e-12
-    assert solution.energy_residual < 1e-14
-    assert solution.energy_residual_of_spread < 1e-12
-    np.testing.assert_allclose(solution.heat_content_j, content, rtol=1e-12)
-    assert np.ptp(solution.temperature_c[-1]) < np.ptp(solution.temperature_c[0])  # heat did move
-
-
-def test_every_step_satisfies_the_equations(random_body, concrete) -> None:
-    """M (T1 - T0) / dt + K T1 = 0 at every node, independently of how the step was solved."""
-    matrices = assemble(random_body, concrete)
-    solution = solve_heat(HeatProblem(random_body, concrete), PAPER)
-    for before, after in zip(solution.temperature_c, solution.temperature_c[1:]):
-        conducted = matrices.stiffness_w_k @ after
-        balance = matrices.mass_j_k @ (after - before) / 60.0 + conducted
-        assert np.abs(balance).max() < 1e-10 * np.abs(conducted).max()
-
-
-def test_a_long_step_levels_the_temperature_at_the_mean(random_body, concrete) -> None:
-    solution = solve_heat(HeatProblem(random_body, concrete), TimeSteps(1, 1e12))
-    mass = assemble(random_body, concrete).nodal_mass_j_k
-    np.testing.assert_allclose(solution.temperature_c[-1], mass @ random_body.temperature_c / mass.sum(), atol=1e-5)
 
 
 @pytest.mark.parametrize("temperature_c", [-273.15, -40.0, 0.1, 20.0, 1500.3])
@@ -73,9 +37,7 @@ def test_states_that_do_not_fit_into_memory_are_refused(random_body, concrete, m
     nodes = len(random_body.points_m)
     monkeypatch.setattr("thermoxels_ns.fem.time_loop.MAX_STATE_BYTES", 11 * nodes * 8)
     assert len(solve_heat(HeatProblem(random_body, concrete), PAPER).times_s) == 11
-    with pytest.raises(
-        HeatError, match=rf"12 times x {nodes} nodes x 8 bytes = {12 * nodes * 8} .*Take at most 10 steps,"
-    ):
+    with pytest.raises(HeatError, match="Take at most 10 steps,"):
         solve_heat(HeatProblem(random_body, concrete), TimeSteps(11, 60.0))
 
 
@@ -91,25 +53,11 @@ def test_a_body_at_rest_in_the_dark_still_sees_the_sun_rise(concrete, outputs: i
     fine = solve_heat(problem, TimeSteps(4 * 24 * 12, 300.0))
     mean_w = {heat.effect.split(" on ")[0]: float(heat.heat_w.mean()) for heat in days.effects}
     fine_w = {heat.effect.split(" on ")[0]: float(heat.heat_w.mean()) for heat in fine.effects}
-    assert (
-        mean_w["absorbed solar"] == pytest.approx(fine_w["absorbed solar"], rel=0.02) and mean_w["absorbed solar"] > 1.0
-    )
+    assert fine_w["absorbed solar"] > 1.0
+    assert mean_w["absorbed solar"] == pytest.approx(fine_w["absorbed solar"], rel=0.02)
     coarse = solve_heat(problem, TimeSteps(4, 86400.0))
     assert "Steps of 86400 s are longer than the 3600 s by which effects" in coarse.status
     assert "longer than" not in fine.status
-
-
-def test_heat_that_nothing_accounts_for_is_told_beside_what_is_stored() -> None:
-    """A body that warms by 0.1 K without a flow, beside differences from its mean of 6 K over half of its mass."""
-    mesh = box_mesh([0.0, 0.5, 1.0], [0.0, 1.0], [0.0, 1.0], temperature_c=lambda p: 12.0 * (p[:, 0] - 0.5))
-    system = HeatSystem(HeatProblem(mesh, CONCRETE))
-    states = np.stack([system.start_k, system.start_k + 0.1])
-    balance = HeatBalance(system, states.copy(), np.array([0.0, 60.0]))
-    step = Step(states[1], np.zeros(0), 1, 0, np.nan, True, "")
-    balance.add(step, 60.0, ends_interval=True)
-    found = balance.close("", adaptive=False)
-    assert found.energy_residual_of_spread == pytest.approx(0.1 / 3.0, rel=1e-9)
-    assert found.energy_residual == pytest.approx(0.1 / 273.15, rel=1e-9)
 
 
 @pytest.mark.parametrize("radiates", [False, True])
@@ -126,3 +74,76 @@ def test_equal_steps_tell_their_error(radiates) -> None:
     assert f"an error of about {found.time_error_k:.2g} K at most" in found.status
     assert np.isnan(solve_heat(problem, TimeSteps(72, 1200.0)).time_error_k)
     assert "takes two of them" in solve_heat(problem, TimeSteps(1, 1200.0), estimate_steps=True).status
+
+
+def two_plates(step: float = 0.01) -> TetMesh:
+    """Two plates that do not touch, at 20 and 60 C."""
+    x = np.array([0.0, 0.01, 0.02, 0.03])
+    return box_mesh(
+        x,
+        x,
+        [0.0, step],
+        keep=lambda p: np.abs(p[..., 0] - 0.015) > 0.005,
+        temperature_c=lambda p: np.where(p[:, 0] > 0.015, 60.0, 20.0),
+    )
+
+
+@pytest.mark.parametrize("scheme", [BACKWARD_EULER, CRANK_NICOLSON, SDIRK2])
+@pytest.mark.parametrize("step_s", [1e-9, 1e-6, 1e-3])
+def test_newton_takes_few_steps_however_short_the_time_step(concrete, scheme, step_s) -> None:
+    problem = HeatProblem(two_plates(), concrete, effects=(Radiation(("x1",), 0.9, 306.6),))
+    solution = solve_heat(problem, TimeSteps(3, step_s), scheme=scheme)
+    assert solution.newton_iterations.max() <= 3 * len(scheme.nodes)
+    # As long as nothing has changed to speak of, the heat is that of the first moment.
+    around, plate = 306.6 + 273.15, 60.0 + 273.15
+    heat = 0.9 * 5.670374419e-8 * (around**4 - plate**4) * 0.03 * 0.01
+    np.testing.assert_allclose(solution.effects[0].heat_w, heat, rtol=1e-4)
+
+
+def test_newton_ends_near_a_steady_state_and_after_it(concrete) -> None:
+    """Restarts from what is all but steady: the residual begins at round-off and has nowhere to go."""
+    effects = (Radiation(("x1",), 0.9, 306.6), Convection(("x0",), 8.0, 10.0))
+    mesh = box_mesh(*[np.arange(4) * 0.05] * 3, temperature_c=100.0)
+    problem = HeatProblem(mesh, concrete, effects=effects)
+    steady = solve_steady(problem).temperature_c
+    for away in (0.0, 1e-12, 1e-9, 1e-6):
+        near = replace(problem, initial_temperature_c=steady + away * np.sin(np.arange(len(steady))))
+        for time in (AdaptiveSteps(1e5, 1e-4, outputs=3), TimeSteps(3, 1e-6), TimeSteps(3, 1e7)):
+            solution = solve_heat(near, time)
+            assert np.abs(solution.temperature_c[-1] - steady).max() < max(10.0 * away, 1e-8)
+
+
+HOUR_S = 3600.0
+TIMES_S = [0.0, 100.0 * HOUR_S, 101.0 * HOUR_S, 102.0 * HOUR_S, 200.0 * HOUR_S]
+FLASH = [0.0, 0.0, 500.0, 0.0, 0.0]
+
+
+def warmed(flux: Quantity, time: TimeSteps | AdaptiveSteps):
+    mesh = box_mesh(np.linspace(0, 0.2, 5), [0, 0.1], [0, 0.1])
+    return solve_heat(HeatProblem(mesh, CONCRETE, effects=(HeatFlux(("x1",), flux),)), time)
+
+
+def test_a_table_is_straight_from_entry_to_entry_and_held_outside() -> None:
+    table, nowhere = tabulated([10.0, 20.0, 50.0], [1.0, 3.0, 0.0]), Places(np.zeros((1, 3)), np.zeros((1, 3)))
+    assert [table.function(nowhere, time_s) for time_s in (0.0, 10.0, 15.0, 35.0, 99.0)] == [1.0, 1.0, 2.0, 1.5, 0.0]
+    assert table.resolution_s == 10.0 and table.in_time
+
+
+def test_adaptive_steps_do_not_step_over_a_table() -> None:
+    """Two hours of heat in a week: a triangle of 500 W/m2, 1800 kJ/m2 in all."""
+    solution = warmed(tabulated(TIMES_S, FLASH), AdaptiveSteps(TIMES_S[-1], 0.5, outputs=1))
+    brought_j = float(solution.heat_w[0]) * TIMES_S[-1]
+    assert brought_j == pytest.approx(500.0 * HOUR_S * 0.01, rel=0.05)
+    assert "Nothing says" not in solution.status
+
+
+def test_what_may_be_stepped_over_is_said() -> None:
+    def flash(_, time_s: float) -> float:
+        return float(np.interp(time_s, TIMES_S, FLASH))
+
+    missed = warmed(Varying(flash), AdaptiveSteps(TIMES_S[-1], 0.5, outputs=1))
+    assert float(missed.heat_w[0]) == 0.0
+    assert "Nothing says how fast heat flux on x1 may change with time" in missed.status
+    assert "resolution_s" in missed.status and "tabulated" in missed.status
+    seen = warmed(Varying(flash, resolution_s=HOUR_S), AdaptiveSteps(TIMES_S[-1], 0.5, outputs=1))
+    assert float(seen.heat_w[0]) > 0.0 and "Nothing says" not in seen.status

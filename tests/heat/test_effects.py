@@ -8,7 +8,6 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import (
     STEFAN_BOLTZMANN_W_M2K4,
@@ -63,32 +62,6 @@ def test_positive_is_into_the_body(box, concrete, effect, watts) -> None:
     assert np.sign(mean_change) == np.sign(watts)
 
 
-def test_a_fixed_temperature_draws_the_body_to_it(box, concrete) -> None:
-    for fixed_c in (5.0, 40.0):
-        solution = solve_heat(
-            HeatProblem(box, concrete, effects=(FixedTemperature(("x0",), fixed_c),)), TimeSteps(3, 600)
-        )
-        at = np.isclose(box.points_m[:, 0], 0.0)
-        np.testing.assert_array_equal(solution.temperature_c[:, at], fixed_c)
-        assert np.all(np.sign(solution.effects[0].heat_w) == np.sign(fixed_c - 20.0))
-        assert np.all(np.sign(np.diff(solution.temperature_c[:, ~at].mean(axis=1))) == np.sign(fixed_c - 20.0))
-
-
-def test_a_given_flux_makes_its_own_gradient(box, concrete) -> None:
-    """k dT/dx = q across the box once it is steady: 100 W/m2 in at x0, out at x1."""
-    effects = (HeatFlux(("x0",), 100.0), FixedTemperature(("x1",), 0.0))
-    solution = solve_steady(HeatProblem(box, concrete, effects=effects))
-    np.testing.assert_allclose(solution.temperature_c, 100.0 / 1.7 * (0.4 - box.points_m[:, 0]), atol=1e-9)
-
-
-def test_effects_on_one_patch_add_up(box, concrete) -> None:
-    effects = (Convection(("x0",), 8.0, 30.0), Radiation(("x0",), 0.9, 0.0), AbsorbedSolar(("x0",), 0.5, 300.0))
-    together = at_once(box, concrete, *effects)
-    alone = [at_once(box, concrete, effect).heat_w[0] for effect in effects]
-    assert together.heat_w[0] == pytest.approx(sum(alone), rel=1e-6)
-    assert [heat.heat_w[0] for heat in together.effects] == pytest.approx(alone, rel=1e-6)
-
-
 def test_heat_per_patch(box, concrete) -> None:
     heat = at_once(box, concrete, HeatFlux(("x?", "z1"), 100.0)).effects[0]
     assert heat.group_names == ("x0", "x1", "z1")
@@ -97,16 +70,9 @@ def test_heat_per_patch(box, concrete) -> None:
     tags = box.boundary
     assert tags is not None
     factor = np.where(tags.patch == SIDES.index("x1"), 0.5, 1.0)
-    scaled = at_once(
-        replace(box, boundary=replace(tags, area_factor=factor)),
-        concrete,
-        HeatFlux(("x?",), 100.0),
-        Convection(("x1",), 8.0, 30.0),
-        Radiation(("x1",), 0.9, 40.0),
-    )
-    np.testing.assert_allclose(scaled.effects[0].group_heat_w[0], 100.0 * np.array([AREA_X, 0.5 * AREA_X]), rtol=1e-12)
-    plain = at_once(box, concrete, Convection(("x1",), 8.0, 30.0), Radiation(("x1",), 0.9, 40.0))
-    for half, whole in zip(scaled.effects[1:], plain.effects):
+    effects = HeatFlux(("x1",), 100.0), Convection(("x1",), 8.0, 30.0), Radiation(("x1",), 0.9, 40.0)
+    scaled = at_once(replace(box, boundary=replace(tags, area_factor=factor)), concrete, *effects)
+    for half, whole in zip(scaled.effects, at_once(box, concrete, *effects).effects):
         assert half.heat_w[0] == pytest.approx(0.5 * whole.heat_w[0], rel=1e-6)
 
 
@@ -133,14 +99,11 @@ def test_functions_are_told_where_they_are(box, concrete) -> None:
 
 def test_two_temperatures_at_one_node_are_refused(box, concrete) -> None:
     clash = (FixedTemperature(("x0",), 5.0), FixedTemperature(("y0",), 7.0))
-    with pytest.raises(HeatError, match=r"5 C from .* on x0 and 7 C from .* on y0 at node 0"):
+    with pytest.raises(HeatError, match=r"5 C from .* on x0 and 7 C from .* on y0"):
         at_once(box, concrete, *clash)
-    same = (FixedTemperature(("x0",), 5.0), FixedTemperature(("y0",), 5.0))
-    heat = at_once(box, concrete, *same)
+    same = at_once(box, concrete, FixedTemperature(("x0",), 5.0), FixedTemperature(("y0",), 5.0))
     one = at_once(box, concrete, FixedTemperature(("x0", "y0"), 5.0))
-    np.testing.assert_array_equal(heat.temperature_c, one.temperature_c)
-    assert sum(part.heat_w[0] for part in heat.effects) == pytest.approx(one.effects[0].heat_w[0], rel=1e-9)
-    np.testing.assert_allclose([part.heat_w[0] for part in heat.effects], one.effects[0].group_heat_w[0], rtol=1e-9)
+    np.testing.assert_allclose([part.heat_w[0] for part in same.effects], one.effects[0].group_heat_w[0], rtol=1e-9)
 
 
 EVERY = {

@@ -3,6 +3,7 @@ import json
 
 import numpy as np
 import pytest
+import pyvista
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, planes
@@ -12,6 +13,7 @@ from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.results import heat_by_part, heat_results, wall_result
+from thermoxels_ns.heat.vtk_series import remove_heat_series, write_heat_series
 
 BRICK, WOOL = Material("brick", 0.7, 1600.0, 940.0), Material("wool", 0.04, 30.0, 1030.0)
 
@@ -39,16 +41,25 @@ def test_u_values_of_two_walls_side_by_side() -> None:
     assert {part.name: part.area_m2 for part in wall.regions} == pytest.approx({"brick": 2.0, "wool": 6.0})
     assert [(part.name, part.area_m2) for part in wall.patches] == [("x0", pytest.approx(8.0))]
     assert wall.u_value_w_m2k == pytest.approx((2.0 * u["brick"] + 6.0 * u["wool"]) / 8.0, rel=1e-9)
-    assert wall.coupling_w_k == pytest.approx(2.0 * u["brick"] + 6.0 * u["wool"], rel=1e-9)
+    assert wall.coupling_w_k == pytest.approx(8.0 * wall.u_value_w_m2k, rel=1e-9)
     assert wall.heat_w == pytest.approx(30.0 * wall.coupling_w_k, rel=1e-12)
     assert wall.temperature_factor == pytest.approx(1.0 - u["brick"] / 8.0, rel=1e-9)
     assert wall.coldest.point_m[0] == 0.0 and wall.coldest.point_m[1] <= 1.0 and wall.coldest.patches[0] == "x0"
 
 
-def test_of_a_cooled_room_the_warmest_spot_is_the_worst() -> None:
+def test_true_areas_count() -> None:
+    """Triangles that stand for 0.7 of their own area exchange 0.7 of the heat."""
     problem = two_walls()
+    tags = dataclasses.replace(problem.mesh.boundary, area_factor=np.full(len(problem.mesh.facets), 0.7))
+    problem = dataclasses.replace(problem, mesh=dataclasses.replace(problem.mesh, boundary=tags))
+    wall = wall_result(problem, solve_steady(problem), ("x0",), 20.0, -10.0)
+    assert wall.area_m2 == pytest.approx(5.6)
+    assert wall.regions[0].u_value_w_m2k == pytest.approx(1.0 / (1 / 8 + 0.7 * 0.2 / 0.7 + 1 / 25), rel=1e-9)
+
+
+def test_of_a_cooled_room_the_warmest_spot_is_the_worst() -> None:
     effects = (Convection(("x0",), 8.0, 5.0), Convection(("x1",), 25.0, 35.0))
-    problem = dataclasses.replace(problem, effects=effects)
+    problem = dataclasses.replace(two_walls(), effects=effects)
     wall = wall_result(problem, solve_steady(problem), ("x0",), 5.0, 35.0)
     u = 1.0 / (1 / 8 + 0.2 / 0.7 + 1 / 25)
     assert wall.temperature_factor == pytest.approx(1.0 - u / 8.0, rel=1e-9)
@@ -82,9 +93,8 @@ def test_heat_by_patch_effect_and_region_of_a_steady_state() -> None:
 
 @pytest.mark.parametrize("time", [TimeSteps(6, 600.0), AdaptiveSteps(3600.0, 0.1, outputs=6)])
 def test_energy_balance_through_time(time) -> None:
-    mesh = box_mesh(
-        planes(0.0, 0.3, step=0.1), [0.0, 0.2, 0.4], [0.0, 0.3], temperature_c=lambda p: 10.0 + 30.0 * p[:, 0]
-    )
+    axes = planes(0.0, 0.3, step=0.1), [0.0, 0.2, 0.4], [0.0, 0.3]
+    mesh = box_mesh(*axes, temperature_c=lambda p: 10.0 + 30.0 * p[:, 0])
     effects = (
         Convection(("x0",), 8.0, 20.0),
         Radiation(("x1",), 0.9, -20.0),
@@ -104,9 +114,8 @@ def test_energy_balance_through_time(time) -> None:
     surface = sum(effect.heat_w for effect in results.effects if effect.area_m2 is not None)
     assert sum(patch.heat_w for patch in results.patches) == pytest.approx(surface, rel=1e-9)
     assert results.effects[5].area_m2 is None and results.effects[5].groups == pytest.approx({"solid": 500.0 * 0.036})
-    assert results.effects[2].heat_w == pytest.approx(150.0 * 0.12) and results.effects[2].area_m2 == pytest.approx(
-        0.12
-    )
+    assert results.effects[2].heat_w == pytest.approx(150.0 * 0.12)
+    assert results.effects[2].area_m2 == pytest.approx(0.12)
     assert results.times_s[-1] == 3600.0 and len(results.times_s) == 7
 
 
@@ -137,9 +146,7 @@ def test_heat_by_part_agrees_with_the_solver_and_adds_up() -> None:
     )
     problem = HeatProblem(mesh, CONCRETE, effects=effects)
     solution = solve_steady(problem)
-    assert [heat.effect for heat in solution.last_facet_heat] == [
-        solution.effects[number].effect for number in (0, 2, 1, 3)
-    ]
+
     by_patch = heat_by_part(solution, mesh.boundary.patch, len(mesh.boundary.patch_names))
     for number, name in enumerate(mesh.boundary.patch_names):
         columns = [(heat, heat.group_names.index(name)) for heat in solution.effects if name in heat.group_names]
@@ -149,19 +156,6 @@ def test_heat_by_part_agrees_with_the_solver_and_adds_up() -> None:
     assert shuffled.sum() == pytest.approx(by_patch.sum(), abs=1e-9)
 
 
-def test_true_areas_count() -> None:
-    """A triangle that stands for 0.7 of its own area exchanges 0.7 of the heat."""
-    mesh = box_mesh(planes(0.0, 0.2, step=0.1), [0.0, 1.0], [0.0, 1.0])
-    factor = np.full(len(mesh.facets), 0.7)
-    smaller = dataclasses.replace(mesh, boundary=dataclasses.replace(mesh.boundary, area_factor=factor))
-    effects = (Convection(("x0",), 8.0, 20.0), Convection(("x1",), 8.0, 0.0))
-    problem = HeatProblem(smaller, CONCRETE, effects=effects)
-    results = heat_results(problem, solve_steady(problem))
-    assert results.patches[0].area_m2 == pytest.approx(0.7)
-    assert results.patches[0].heat_w_m2 == pytest.approx(results.effects[0].heat_w_m2, rel=1e-12)
-    assert results.regions[0].area_m2 == pytest.approx(0.7 * 2.8)
-
-
 def test_an_insulated_body_has_results() -> None:
     mesh = box_mesh([0.0, 0.1], [0.0, 0.1], [0.0, 0.1], temperature_c=lambda p: 100.0 * p[:, 0])
     problem = HeatProblem(mesh, CONCRETE)
@@ -169,3 +163,25 @@ def test_an_insulated_body_has_results() -> None:
     assert results.effects == () and [patch.heat_w for patch in results.patches] == [0.0] * 6
     assert results.balance.into_body == results.balance.out_of_body == 0.0
     assert results.regions[0].mean_c == pytest.approx(5.0)
+
+
+def test_a_series_reads_back_and_only_it_is_removed(tmp_path, random_body, concrete) -> None:
+    solution = solve_heat(HeatProblem(random_body, concrete), TimeSteps(3, 20.0))
+    paths = write_heat_series(tmp_path / "heat.pvd", random_body, solution)
+    assert [path.relative_to(tmp_path).as_posix() for path in paths] == [
+        "heat.pvd",
+        *(f"heat/step-{number:04d}.vtu" for number in range(4)),
+    ]
+    reader = pyvista.PVDReader(tmp_path / "heat.pvd")
+    assert reader.time_values == [0.0, 20.0, 40.0, 60.0]
+    for number, time_s in enumerate(solution.times_s):
+        reader.set_active_time_value(time_s)
+        grid = reader.read()[0]
+        np.testing.assert_array_equal(grid.point_data["temperature_c"], solution.temperature_c[number])
+        np.testing.assert_allclose(grid.point_data["temperature_k"], solution.temperature_c[number] + 273.15)
+        np.testing.assert_array_equal(grid.points, random_body.points_m)
+        assert grid.n_cells == len(random_body.tets)
+    note = tmp_path / "heat" / "note.txt"
+    note.write_text("mine")
+    remove_heat_series(tmp_path / "heat.pvd")
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["note.txt"]

@@ -1,22 +1,34 @@
 from dataclasses import replace
+from datetime import datetime, timezone
 
 import numpy as np
 import pytest
 
 from tests.support.scene_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Effect, GroundContact, Radiation
-from thermoxels_ns.heat.materials import material
+from thermoxels_ns.heat.materials import material, material_table
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import Ground, InsideAir, OutsideAir, Sky, Sun, Surface
+from thermoxels_ns.heat.scene_fields import (
+    Ground,
+    InsideAir,
+    OutsideAir,
+    Sky,
+    Sun,
+    Surface,
+    inside_coefficient,
+    radiative_coefficient,
+)
 from thermoxels_ns.heat.sky import swinbank_sky_c
 
 ALL = {"*": material("concrete")}
 INSIDE = InsideAir(20.0, "iso-6946-combined")
 OUTSIDE = OutsideAir(0.0, "iso-6946-combined")
 CONVECTION = OutsideAir(0.0, "iso-6946-convection", wind_m_s=4.0)
-SUN = Sun(towards=(0.0, 0.0, 1.0), direct_w_m2=800.0)
+SUN = Sun(towards=(0.0, 0.0, 3.0), direct_w_m2=800.0)
+GROUND = (GroundContact(("exterior-down",), 1.5, 10.0),)
 
 
 def effects(mesh=None, adiabatic=("*",), **named) -> tuple[Effect, ...]:
@@ -108,38 +120,27 @@ def test_sunlight_on_surfaces_that_absorb() -> None:
 
 
 def test_every_patch_is_spoken_of() -> None:
-    with pytest.raises(HeatError, match="nothing on interior-up") as caught:
+    with pytest.raises(HeatError, match=r"interior-up \(3.33 %") as caught:
         effects(adiabatic=("cut",), outside_air=OUTSIDE)
-    assert "interior-up (3.33 % of the surface)" in str(caught.value)
-    assert "write adiabatic: [cut, interior-up, interior-side, interior-down]." in str(caught.value)
+    assert "adiabatic: [cut, interior-up, interior-side, interior-down]" in str(caught.value)
     assert len(effects(adiabatic=("cut",), outside_air=OUTSIDE, inside_air=INSIDE)) == 2
     # A patch without surface may be forgotten.
     assert len(effects(wall(), adiabatic=("cut",), outside_air=OUTSIDE, inside_air=INSIDE)) == 2
-    with pytest.raises(HeatError, match=r"nothing on cut \(13.3 % of the surface\)"):
+    with pytest.raises(HeatError, match=r"cut \(13.3 %"):
         effects(adiabatic=(), outside_air=OUTSIDE, inside_air=INSIDE)
 
 
 @pytest.mark.parametrize(
     ("named", "message"),
     [
-        (
-            {"inside_air": INSIDE, "radiation": (Radiation(("interior-up",), 0.9, 20.0),)},
-            "inside_air: expected radiation once on each patch, got radiation entry 1 on interior-up as well",
-        ),
-        (
-            {"outside_air": OUTSIDE, "ground_contact": (GroundContact(("exterior-down",), 1.5, 10.0),)},
-            "outside_air: expected contact with air or ground once .*, got ground_contact entry 1 on exterior-down",
-        ),
+        ({"inside_air": INSIDE, "radiation": (Radiation(("interior-up",), 0.9, 20.0),)}, "inside_air: .*radiation"),
+        ({"outside_air": OUTSIDE, "ground_contact": GROUND}, "outside_air: .*ground_contact entry 1 on exterior-down"),
         (
             {"convection": (Convection(("interior-*",), 8.0, 20.0), Convection(("*-up",), 8.0, 20.0))},
-            "convection entry 1: .*got convection entry 2 on interior-up as well. Give each of the two its own patches",
+            "convection entry 1: .*convection entry 2 on interior-up",
         ),
         (
-            {
-                "ground_contact": (GroundContact(("exterior-down",), 1.5, 10.0),),
-                "sun": SUN,
-                "surfaces": (Surface(absorptivity=0.6),),
-            },
+            {"ground_contact": GROUND, "sun": SUN, "surfaces": (Surface(absorptivity=0.6),)},
             "ground_contact entry 1: expected contact with the ground alone",
         ),
     ],
@@ -162,28 +163,26 @@ def test_the_sky_may_share_a_view_with_other_surroundings() -> None:
 @pytest.mark.parametrize(
     ("named", "message"),
     [
-        (
-            {"sky": Sky(temperature_c=0.0)},
-            "surfaces: emissivity: expected a number beside sky.* got none. Add surfaces",
-        ),
-        ({"sun": SUN}, "surfaces: absorptivity: expected a number beside sun"),
-        ({"surfaces": (Surface(emissivity=0.9),)}, "surfaces: emissivity: expected sky, or ground with surface_c"),
-        ({"ground": Ground(reflectance=0.2)}, "ground: reflectance: expected a sun"),
-        ({"up": (0.0, 0.0, 0.0)}, "up: expected a direction"),
+        ({"sky": Sky(temperature_c=0.0)}, "surfaces: emissivity"),
+        ({"sun": SUN}, "surfaces: absorptivity"),
+        ({"surfaces": (Surface(emissivity=0.9),)}, "surfaces: emissivity"),
+        ({"ground": Ground(reflectance=0.2)}, "ground: reflectance"),
+        ({"up": (0.0, 0.0, 0.0)}, "up"),
+        ({"materials": {}}, "materials"),
     ],
 )
 def test_what_belongs_together(named, message: str) -> None:
-    with pytest.raises(HeatError, match=message):
-        HeatScene(ALL, **named)
+    with pytest.raises(HeatError, match=f"^{message}: expected"):
+        HeatScene(**{"materials": ALL, **named})
 
 
 def test_patches_that_the_mesh_does_not_have_are_named() -> None:
-    with pytest.raises(HeatError, match=r"outside_air: patches: .*exterior-up, .*cut, got 'roof'. Correct the name"):
+    with pytest.raises(HeatError, match=r"outside_air: patches: .* got 'roof'"):
         effects(outside_air=replace(OUTSIDE, patches=("roof",)))
     with pytest.raises(HeatError, match="surfaces entry 2: patches"):
         effects(sun=SUN, surfaces=(Surface(absorptivity=0.6), Surface(absorptivity=0.6, patches=("roof",))))
     untagged = replace(room(), boundary=None)
-    with pytest.raises(HeatError, match="names or patterns of the patches boundary, got 'exterior-"):
+    with pytest.raises(HeatError, match=r"outside_air: patches: .* got 'exterior-"):
         effects(untagged, outside_air=OUTSIDE)
     assert len(effects(untagged, outside_air=replace(OUTSIDE, patches=("*",)))) == 1
 
@@ -193,10 +192,8 @@ def test_patch_names_with_the_letters_of_patterns() -> None:
     assert mesh.boundary is not None
     names = tuple(f"{name} [*]" for name in mesh.boundary.patch_names)
     mesh = replace(mesh, boundary=replace(mesh.boundary, patch_names=names))
-    (effect,) = effects(
-        mesh, sun=replace(SUN, patches=("*",)), surfaces=(Surface(absorptivity=0.6, patches=("*-up*",)),)
-    )
-    assert isinstance(effect, AbsorbedSolar)
+    roofs = (Surface(absorptivity=0.6, patches=("*-up*",)),)
+    (effect,) = effects(mesh, sun=replace(SUN, patches=("*",)), surfaces=roofs)
     selection = Selection(mesh)
     assert set(selection.facet_patch[selection.facets(effect.patches)]) == {0, 3}
 
@@ -210,12 +207,10 @@ def test_materials_by_region() -> None:
     # One material stays one, which is cheaper to assemble.
     assert scene.problem(mesh).material == brick
     assert HeatScene({"solid": brick, "slab": brick}, adiabatic=("*",)).problem(two).material == brick
-    with pytest.raises(HeatError, match="materials: expected names or patterns of the regions solid, slab, got 'roof'"):
+    with pytest.raises(HeatError, match=r"materials: .* got 'roof'"):
         HeatScene({"roof": brick}, adiabatic=("*",)).problem(mesh)
-    with pytest.raises(HeatError, match=r"materials: .* got none for solid. Add them, or '\*' for all others"):
+    with pytest.raises(HeatError, match=r"materials: .* got none for solid"):
         HeatScene({"slab": brick}, adiabatic=("*",)).problem(two)
-    with pytest.raises(HeatError, match="materials"):
-        HeatScene({})
 
 
 def test_start_and_up() -> None:
@@ -226,3 +221,79 @@ def test_start_and_up() -> None:
     assert scene.problem(mesh).up == (0.0, 0.0, 1.0)
     assert scene.problem(mesh, up=(0.0, 2.0, 0.0)).up == (0.0, 1.0, 0.0)
     assert replace(scene, up=(3.0, 0.0, 0.0)).problem(mesh, up=(0.0, 1.0, 0.0)).up == (1.0, 0.0, 0.0)
+
+
+NOON = datetime(2025, 6, 21, 12, tzinfo=timezone.utc)
+PLACE = {"latitude_deg": 47.0, "longitude_deg": 8.0, "north": (0.0, 1.0, 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: InsideAir(20.0), "coefficient or coefficient_w_m2k"),
+        (lambda: InsideAir(20.0, "iso-6946-combined", 8.0), "coefficient or coefficient_w_m2k"),
+        (lambda: InsideAir(20.0, "iso-6946-separate"), "emissivity"),
+        (lambda: InsideAir(20.0, "iso-6946-combined", patches=()), "patches"),
+        (lambda: InsideAir(-300.0, "iso-6946-combined"), "air_c"),
+        (lambda: InsideAir(float("nan"), "iso-6946-combined"), "air_c"),
+        (lambda: InsideAir(True, "iso-6946-combined"), "air_c"),
+        (lambda: Surface(), "expected emissivity, absorptivity"),
+        (lambda: Surface(emissivity=1.5), "emissivity"),
+        (lambda: Sky(below_air_k=-6.0), "below_air_k"),
+        (lambda: Sun(start=NOON, clear_sky="meinel"), "start"),
+        (lambda: Sun(start=NOON, **PLACE), "clear_sky or direct_w_m2"),
+        (lambda: Sun(start=NOON.replace(tzinfo=None), **PLACE, clear_sky="meinel"), "start"),
+        (lambda: Sun(start=NOON, **{**PLACE, "north": (0.0, 0.0, 0.0)}, clear_sky="meinel"), "north"),
+        (lambda: Sun(towards=(0.0, 0.0, 1.0), latitude_deg=47.0, direct_w_m2=800.0), "latitude_deg"),
+    ],
+)
+def test_sections_say_what_is_wrong(make, named: str) -> None:
+    with pytest.raises(HeatError, match=f"^{named}"):
+        make()
+
+
+@pytest.mark.parametrize(("mean_c", "published"), [(-10.0, 4.13), (10.0, 5.15), (30.0, 6.32)])
+def test_radiation_made_linear(mean_c: float, published: float) -> None:
+    assert round(radiative_coefficient(mean_c, 1.0), 2) == published
+    assert radiative_coefficient(mean_c, 0.5) == 0.5 * radiative_coefficient(mean_c, 1.0)
+
+
+def test_horizontal_reaches_to_30_degrees() -> None:
+    angle = np.radians([-31, -30, -29, 29, 30, 31])
+    normals = np.stack([np.cos(angle), np.zeros(6), np.sin(angle)], axis=1)
+    coefficient = inside_coefficient("iso-6946-convection", "out-of-body")
+    found = coefficient.function(Places(np.zeros((6, 3)), normals, (0.0, 0.0, 1.0)), 0.0)
+    assert np.asarray(found).tolist() == [0.7, 2.5, 2.5, 2.5, 2.5, 5.0]
+
+
+def test_every_row_is_a_material_with_a_source() -> None:
+    table = material_table()
+    assert len(table) >= 25
+    assert list(table) == [material(name).name for name in table]
+    assert all(len(row.source) > 10 for row in table.values())
+    # Light solids are little more than still air, 0.026 W/(m K), metals conduct best, all else lies between.
+    assert all(10 < row.density_kg_m3 < 12000 for row in table.values())
+    metals = {"aluminium", "copper", "steel", "stainless-steel", "lead", "zinc"}
+    for name, row in table.items():
+        low, high = (10.0, 400.0) if name in metals else (0.02, 0.08) if row.density_kg_m3 <= 250.0 else (0.05, 4.0)
+        assert low <= row.conductivity_w_mk <= high, name
+    assert all(100 < row.specific_heat_j_kgk < 2000 for row in table.values())
+
+
+@pytest.mark.parametrize(
+    ("name", "figures"),
+    [
+        ("concrete", (1.7, 2200.0, 880.0)),
+        ("aluminium", (160.0, 2800.0, 880.0)),
+        ("softwood", (0.13, 500.0, 1600.0)),
+        ("mineral-wool", (0.035, 20.0, 1030.0)),
+    ],
+)
+def test_published_rows(name: str, figures: tuple[float, float, float]) -> None:
+    found = material(name)
+    assert (found.conductivity_w_mk, found.density_kg_m3, found.specific_heat_j_kgk) == figures
+
+
+def test_an_unknown_material_lists_the_known_and_suggests_one() -> None:
+    with pytest.raises(HeatError, match=r"^material: .* Did you mean concrete"):
+        material("concret")

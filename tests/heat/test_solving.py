@@ -1,5 +1,6 @@
 from dataclasses import replace
 from datetime import datetime, timezone
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from thermoxels_ns.heat import solving as heat_solving
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
-    Effect,
     FixedTemperature,
     HeatFlux,
     InternalHeat,
@@ -24,46 +24,20 @@ from thermoxels_ns.heat.effects import (
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.sky import moving_sun
 
-
-class Clock:
-    """Stands still until it is told to go on."""
-
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def perf_counter(self) -> float:
-        return self.now_s
+NEXT_SOLUTION = [*((0.9, 0.1 * step, step) for step in range(1, 11)), (2.0, 0.1, 1), (10.0, 0.5, 2)]
+EVER_LONGER = [(10.0, share, step) for step, share in enumerate((1e-4, 1e-3, 0.02, 0.2), 1)]
+"""Steps: seconds that each took, the share of the time that is then done, and their number in the solution."""
 
 
-@pytest.fixture
-def clock(monkeypatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr(heat_solving, "clock", clock)
-    return clock
-
-
-def said(clock: Clock, steps: list[tuple[float, float, int]]) -> list[str]:
-    """What is said of steps: seconds that each took, the share of the time that is then done, and their number."""
-    lines: list[str] = []
-    progress = heat_solving._Progress(lines.append)
+@pytest.mark.parametrize(("steps", "lines", "left_s"), [(NEXT_SOLUTION, 1, 12), (EVER_LONGER, 4, 44)])
+def test_what_is_left_is_told_by_the_last_steps_of_this_solution(monkeypatch, steps, lines, left_s) -> None:
+    now_s, said = [0.0], []
+    monkeypatch.setattr(heat_solving, "clock", SimpleNamespace(perf_counter=lambda: now_s[0]))
+    progress = heat_solving._Progress(said.append)
     for seconds, share, number in steps:
-        clock.now_s += seconds
+        now_s[0] += seconds
         progress(share, number)
-    return lines
-
-
-def test_the_next_solution_begins_when_the_last_one_has_ended(clock) -> None:
-    """As to a tolerance, where one solution follows another."""
-    first = [(0.9, 0.1 * step, step) for step in range(1, 11)]
-    assert said(clock, [*first, (2.0, 0.1, 1), (10.0, 0.5, 2)]) == [
-        "50.00% of the time after 2 steps; about 12 s left."
-    ]
-
-
-def test_what_is_left_is_told_by_the_last_steps(clock) -> None:
-    """Ever longer steps: at the pace from the start on it would be 160 s where 44 s are left."""
-    lines = said(clock, [(10.0, share, step) for step, share in enumerate((1e-4, 1e-3, 0.02, 0.2), 1)])
-    assert len(lines) == 4 and lines[-1] == "20.00% of the time after 4 steps; about 44 s left."
+    assert len(said) == lines and f"about {left_s} s left" in said[-1]
 
 
 AIRS = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0)
@@ -75,29 +49,21 @@ def solved(problem: HeatProblem, time: heat_solving.Time = None, **goals: Any) -
     return heat_solving.solve_problem(problem, time, heat_solving.Goals(**goals))
 
 
-def sun(strength: float) -> Effect:
-    return AbsorbedSolar(("x1",), 0.6, 500.0 * strength)
-
-
-def wind(strength: float) -> Effect:
-    return Convection(("x1",), 20.0 * strength, -5.0)
-
-
-def sky(strength: float) -> Effect:
-    return Radiation(("*",), 0.9 * strength, -30.0)
-
-
-def source(strength: float) -> Effect:
-    return InternalHeat(("*",), 1000.0 * strength)
+BY_STRENGTH = {
+    "sun": lambda strength: AbsorbedSolar(("x1",), 0.6, 500.0 * strength),
+    "wind": lambda strength: Convection(("x1",), 20.0 * strength, -5.0),
+    "sky": lambda strength: Radiation(("*",), 0.9 * strength, -30.0),
+    "source": lambda strength: InternalHeat(("*",), 1000.0 * strength),
+}
 
 
 @pytest.mark.parametrize("time", [None, TimeSteps(5, 36_000.0), AdaptiveSteps(36_000.0, 0.5, outputs=2)], ids=str)
-@pytest.mark.parametrize("make", [sun, wind, sky, source])
-def test_what_is_left_out_brings_little_and_what_brings_more_is_built(make, time) -> None:
+@pytest.mark.parametrize("name", BY_STRENGTH)
+def test_what_is_left_out_brings_little_and_what_brings_more_is_built(name, time) -> None:
     """On a conforming mesh, from far too little to far too much to be left out."""
     left_out = []
     for strength in (1e-6, 1e-3, 1.0):
-        problem = HeatProblem(CONFORMING, CONCRETE, effects=(*AIRS, make(strength)))
+        problem = HeatProblem(CONFORMING, CONCRETE, effects=(*AIRS, BY_STRENGTH[name](strength)))
         found, whole = solved(problem, time), solved(problem, time, leave_out_below=0.0)
         left_out.append(len(found.left_out))
         flows, all_flows = mean_flows_w(found.solution), mean_flows_w(whole.solution)

@@ -12,11 +12,10 @@ import pytest
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, planes
-from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, HeatFlux
-from thermoxels_ns.heat.scene import HeatScene, load_heat_scene
+from thermoxels_ns.heat.scene import load_heat_scene
 from thermoxels_ns.heat.solving import _weak
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -52,10 +51,12 @@ def lines_run(work: Callable[[], Any]) -> int:
     return count
 
 
-def entries(count: int, alike: bool = False) -> tuple[tuple[Convection, ...], tuple[HeatFlux, ...]]:
+def problem(count: int, alike: bool = False) -> HeatProblem:
+    """Convection and a flux on each of many patches, or on all of them every time."""
     names = [("*",) if alike else (f"p{number}",) for number in range(count)]
-    airs = (Convection(name, 5.0, 5.0 + number % 2) for number, name in enumerate(names))
-    return tuple(airs), tuple(HeatFlux(name, 1e-9) for name in names)
+    airs = [Convection(name, 5.0, 5.0 + number % 2) for number, name in enumerate(names)]
+    fluxes = [HeatFlux(name, 1e-9) for name in names]
+    return HeatProblem(many_patches(count), CONCRETE, effects=(*airs, *fluxes))
 
 
 def from_file(folder: Path, count: int) -> Callable[[], Any]:
@@ -66,25 +67,10 @@ def from_file(folder: Path, count: int) -> Callable[[], Any]:
     return lambda: load_heat_scene(path).problem(mesh)
 
 
-def of_problem(work: Callable[[HeatProblem], Any], alike: bool = False) -> Callable[[Path, int], Callable[[], Any]]:
-    def make(_: Path, count: int) -> Callable[[], Any]:
-        effects = sum(entries(count, alike), ())
-        return partial(work, HeatProblem(many_patches(count), CONCRETE, effects=effects))
-
-    return make
-
-
-def of_scene(_: Path, count: int) -> Callable[[], Any]:
-    airs, fluxes = entries(count)
-    return partial(HeatScene({"*": CONCRETE}, convection=airs, heat_flux=fluxes).problem, many_patches(count))
-
-
-WORK = {
-    "labels of effects alike": of_problem(effect_labels, alike=True),
-    "assembling": of_problem(HeatSystem),
-    "leaving out": of_problem(lambda problem: _weak(problem, TimeSteps(2, 60.0), 0.01)),
-    "leaving out, steady": of_problem(lambda problem: _weak(problem, None, 0.01)),
-    "scene": of_scene,
+WORK: dict[str, Callable[[Path, int], Callable[[], Any]]] = {
+    "labels of effects alike": lambda _, count: partial(effect_labels, problem(count, alike=True)),
+    "assembling": lambda _, count: partial(HeatSystem, problem(count)),
+    "leaving out": lambda _, count: partial(_weak, problem(count), TimeSteps(2, 60.0), 0.01),
     "file": from_file,
 }
 
@@ -93,13 +79,6 @@ WORK = {
 def test_twice_the_entries_are_about_twice_the_work(name, tmp_path) -> None:
     few, many = (lines_run(WORK[name](tmp_path, count)) for count in (60, 120))
     assert many < MOST_RATIO * few, (few, many)
-
-
-def test_two_of_many_entries_on_one_patch_are_found() -> None:
-    airs = [Convection((f"p{number}",), 5.0, 5.0) for number in range(200)]
-    airs[150] = Convection(("p151", "p7", "p3"), 5.0, 5.0)
-    with pytest.raises(HeatError, match=r"convection entry 4: expected .* got convection entry 151 on p3 as well"):
-        HeatScene({"*": CONCRETE}, convection=tuple(airs)).problem(many_patches(200))
 
 
 def test_effects_of_one_name_are_numbered_whatever_others_are_called() -> None:

@@ -43,7 +43,6 @@ class Outcome:
 
     hostile: tuple[str, ...]
     excess: float | None
-    told: str = ""
 
     @property
     def verdict(self) -> str:
@@ -108,16 +107,11 @@ def wall(rng: np.random.Generator, hostile: tuple[str, ...], order: int):
     kinds = [str(rng.choice(["convection", "fixed"])) for _ in range(2)]
     resistance = [1.0 / h[i] if kinds[i] == "convection" else 0.0 for i in range(2)]
     total = sum(resistances) + sum(resistance)
-    fluxed = rng.random() < 0.25
-    if fluxed:
-        kinds[0], resistance[0] = "flux", 0.0
-    # T = surface + s (w^2 / 2 - x^2 / 2) / k - ..., from flows q0 into x0 and q1 into x1, q0 + q1 + s w = 0.
-    if fluxed:
-        q0 = apart / total
-    else:
-        # warm - cold = q0 total + s w (w / 2 k + resistance[1])
-        made = source * width * (0.5 * width / conductivity[0] + resistance[1])
-        q0 = (warm - cold - made) / total
+    # Flows q0 into x0 and q1 into x1, q0 + q1 + s w = 0: warm - cold = q0 total + s w (w / 2 k + resistance[1]).
+    made = source * width * (0.5 * width / conductivity[0] + resistance[1])
+    q0 = (warm - cold - made) / total
+    if rng.random() < 0.25:
+        kinds[0], resistance[0], q0 = "flux", 0.0, apart / total
     q1 = -q0 - source * width
     at_end_k = -q1 * resistance[1]  # x1 above the temperature `cold`
 
@@ -172,41 +166,34 @@ def steady_case(seed: int, order: int) -> Outcome:
         if order == 1:
             with suppress(HeatError):
                 solution = replace(solution, error=steady_error(problem, solution))
-    except HeatError as error:
-        return Outcome(hostile, None, str(error))
+    except HeatError:
+        return Outcome(hostile, None)
     kelvin, watts = stated(solution, problem, flows)
     found_w = np.array([heat.heat_w[0] for heat in solution.effects])
     error_k = float(np.max(np.abs(solution.temperature_c - cold - exact_k(x))))
     error_w = float(np.max(np.abs(found_w - flows)))
-    through = 0.5 * float(np.abs(flows).sum())
-    told = f"{error_k:.1e} of {kelvin:.1e} K, {error_w / through:.1e} of {watts / through:.1e} of the flow"
-    return Outcome(hostile, max(error_k / kelvin, error_w / watts), told)
+    return Outcome(hostile, max(error_k / kelvin, error_w / watts))
 
 
 def time_case(seed: int) -> Outcome:
     rng = np.random.default_rng([3, seed])
     hostile = choice(rng)
     scheme = SCHEMES[seed % len(SCHEMES)]
-    kind = ("wave", "heated", "wall")[seed // len(SCHEMES) % 3]
-    make = {"wave": wave, "heated": heated, "wall": still_wall}[kind]
-    count = 3
+    make, count = (wave, heated, still_wall)[seed // len(SCHEMES) % 3], 3
     try:
         problem, step_s, exact_c, flows = make(rng, hostile, scheme)
         steps = AdaptiveSteps(count * step_s, outputs=1) if scheme is None else TimeSteps(count, step_s)
         solution = solve_heat(problem, steps, scheme=scheme)
-    except HeatError as error:
-        return Outcome(hostile, None, f"{kind} {error}")
+    except HeatError:
+        return Outcome(hostile, None)
     kelvin, watts = stated(solution, problem, flows)
     if scheme is None:
         kelvin += _STEPS * solution.time_error_k
-    error_k = float(np.max(np.abs(solution.temperature_c[-1] - exact_c(count))))
-    told = f"{kind}, {'adaptive' if scheme is None else scheme.name}: {error_k:.1e} of {kelvin:.1e} K"
-    excess = error_k / kelvin
+    excess = float(np.max(np.abs(solution.temperature_c[-1] - exact_c(count)))) / kelvin
     if len(flows):
         error_w = max(float(np.max(np.abs(heat.heat_w - flow))) for heat, flow in zip(solution.effects, flows))
         excess = max(excess, error_w / watts)
-        told += f", {error_w / np.abs(flows).max():.1e} of {watts / np.abs(flows).max():.1e} of the flow"
-    return Outcome(hostile, excess, told)
+    return Outcome(hostile, excess)
 
 
 def wave(rng: np.random.Generator, hostile: tuple[str, ...], scheme):
@@ -275,8 +262,7 @@ RUN = {"steady P1": lambda n: steady_case(n, 1), "steady P2": lambda n: steady_c
 def test_no_answer_lies(kind) -> None:
     outcomes = [RUN[kind](seed) for seed in range(CASES[kind])]
     count = Counter(outcome.verdict for outcome in outcomes)
-    lies = [f"{n}: {o.hostile} {o.told}" for n, o in enumerate(outcomes) if o.verdict == "lied"]
-    assert not lies, f"{count}:\n" + "\n".join(lies)
+    assert not {seed: outcome for seed, outcome in enumerate(outcomes) if outcome.verdict == "lied"}, count
     # No lazy refusal: ordinary cases are all answered, most hostile ones too; at the edge digits decide.
     assert all(outcome.verdict == "right" for outcome in outcomes if not outcome.hostile)
     assert abs(count["right"] - ANSWERED[kind]) <= 3, count

@@ -21,16 +21,10 @@ def concrete() -> Material:
 
 
 @pytest.fixture
-def carved_cells() -> np.ndarray:
+def random_body() -> TetMesh:
     """A 6 x 5 x 4 block with a tunnel, a cavity and a bite out of its corner."""
-    cells = np.ones((6, 5, 4), dtype=bool)
+    cells, rng = np.ones((6, 5, 4), dtype=bool), np.random.default_rng(7)
     cells[:, 2, 1] = False
     cells[3, 3, 2] = False
     cells[4:, :2, 2:] = False
-    return cells
-
-
-@pytest.fixture
-def random_body(carved_cells: np.ndarray) -> TetMesh:
-    rng = np.random.default_rng(7)
-    return make_body(carved_cells, 0.05, lambda points: rng.uniform(-15.0, 45.0, len(points)))
+    return make_body(cells, 0.05, lambda points: rng.uniform(-15.0, 45.0, len(points)))

@@ -19,12 +19,6 @@ STEP_S = H**2 / CONCRETE.diffusivity_m2_s
 """Time in which heat crosses a voxel, [s]."""
 
 
-def stuffed(level: np.ndarray, temperature_c: Nodal = 20.0, regions: bool = False) -> TetMesh:
-    """Mesh a level set with patches x0 and x1 on either half, and regions "even" and "odd" in turns from voxel to
-    voxel."""
-    return dressed(tet_mesh(stuff(level), H), temperature_c, regions)
-
-
 def dressed(mesh: TetMesh, temperature_c: Nodal = 20.0, regions: bool = False) -> TetMesh:
     """Give any mesh these patches and regions."""
     corner = mesh.points_m[mesh.facets]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import box_mesh
+from tests.support.heat_problems import nafems_t3
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
@@ -29,23 +29,14 @@ def test_t2_radiation_at_the_end_of_a_rod(conductivity, exact_k, order, parts) -
     assert end_k[0] == pytest.approx(927.0, abs=0.05)
 
 
+HALF_SECONDS = TimeSteps(64, 0.5)
 T3_C = 36.60312
-"""Exact temperature of T3 at x = 0.08 m after 32 s; the printed target is 36.60."""
+"""Exact temperature at x = 0.08 m after 32 s of T3, a rod with a swinging end; the printed target is 36.60."""
 
 
-def t3(parts: int) -> tuple[HeatProblem, np.ndarray]:
-    """A rod at 0 C, one end kept there, the other at 100 sin(pi t / 40); and the nodes at 0.08 m."""
-    mesh = box_mesh(np.linspace(0, 0.1, parts + 1), [0, 0.01], [0, 0.01], temperature_c=0.0)
-    swing = Varying(lambda places, time_s: 100.0 * np.sin(np.pi * time_s / 40.0))
-    effects = (FixedTemperature(("x0",), 0.0), FixedTemperature(("x1",), swing))
-    return HeatProblem(mesh, Material("steel", 35.0, 7200.0, 440.5), effects=effects), np.isclose(
-        mesh.points_m[:, 0], 0.08
-    )
-
-
-def t3_errors(parts: int, scheme: Scheme, step_s: float = 0.5) -> float:
-    problem, nodes = t3(parts)
-    end = solve_heat(problem, TimeSteps(round(32 / step_s), step_s), scheme=scheme).temperature_c[-1, nodes]
+def t3_errors(parts: int, scheme: Scheme | None, time: TimeSteps | AdaptiveSteps = HALF_SECONDS) -> float:
+    problem = nafems_t3(parts)
+    end = solve_heat(problem, time, scheme=scheme).temperature_c[-1, np.isclose(problem.mesh.points_m[:, 0], 0.08)]
     assert np.ptp(end) < 1e-9
     return float(end[0]) - T3_C
 
@@ -64,11 +55,8 @@ def test_t3_with_backward_euler() -> None:
 
 
 def test_t3_with_a_tolerance() -> None:
-    problem, nodes = t3(40)
-    solution = solve_heat(problem, AdaptiveSteps(32.0, 0.02, outputs=1))
-    fine = t3_errors(40, SDIRK2, 0.1)
-    assert solution.temperature_c[-1, nodes][0] - T3_C == pytest.approx(fine, abs=0.02)
-    assert abs(solution.temperature_c[-1, nodes][0] - 36.60) < 0.1
+    error, fine = t3_errors(40, None, AdaptiveSteps(32.0, 0.02, outputs=1)), t3_errors(40, SDIRK2, TimeSteps(320, 0.1))
+    assert error == pytest.approx(fine, abs=0.02) and abs(error) < 0.1
 
 
 @pytest.mark.parametrize(("order", "parts", "halved"), [(1, (10, 20, 40), 0.5), (2, (10, 20), 0.3)])

@@ -6,6 +6,7 @@ import pytest
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, graded, planes
+from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.runge_kutta import SDIRK2
@@ -20,7 +21,8 @@ LAYERS = {"plaster": (0.015, 0.40), "concrete": (0.20, 2.0), "insulation": (0.12
 """Thickness, [m], and conductivity, [W / (m K)], from inside to outside."""
 
 
-def test_u_value_of_a_wall() -> None:
+@pytest.mark.parametrize("order", [1, 2])
+def test_u_value_of_a_wall(order) -> None:
     """R_si 0.13 and R_se 0.04: U = 0.266946 W/(m2 K), q = 8.00839 W/m2 between 20 and -10 C."""
     ends = np.concatenate([[0.0], np.cumsum([thickness for thickness, _ in LAYERS.values()])])
     regions = {
@@ -30,7 +32,7 @@ def test_u_value_of_a_wall() -> None:
     mesh = box_mesh(planes(*ends, step=0.03), [0, 0.5, 1.0], [0, 1.0], regions=regions)
     materials = {name: Material(name, k, 1000.0, 1000.0) for name, (_, k) in LAYERS.items()}
     effects = (Convection(("x0",), 1 / 0.13, 20.0), Convection(("x1",), 1 / 0.04, -10.0))
-    solution = solve_steady(HeatProblem(mesh, materials, effects=effects))
+    solution = solve_steady(HeatProblem(mesh, materials, effects=effects), order=order)
     flux = solution.effects[0].heat_w[0] / 1.0
     assert flux == pytest.approx(8.00839, abs=1e-5) and flux / 30.0 == pytest.approx(0.266946, abs=1e-6)
     assert solution.effects[1].heat_w[0] == pytest.approx(-flux, rel=1e-9)
@@ -48,7 +50,7 @@ def test_u_value_of_a_wall_squashed_in_one_direction(axis, squashed, order) -> N
     mesh = wall_mesh(*sides)
     effects = (Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0))
     if squashed < 1e-6:
-        with pytest.raises(HeatError, match=r"heights of at least 1e-06 of the longest side, got .* flat or inverted"):
+        with pytest.raises(HeatError, match=r"^mesh tets: expected"):
             HeatProblem(mesh, CONCRETE, effects=effects)
         return
     wall = HeatProblem(mesh, CONCRETE, effects=effects)
@@ -63,13 +65,10 @@ def test_u_value_of_a_wall_squashed_in_one_direction(axis, squashed, order) -> N
 @pytest.mark.parametrize("order", [1, 2])
 def test_u_value_of_a_wall_with_next_to_perfect_convection(coefficient, order) -> None:
     """U = k / d where h is next to infinite, or a sentence that asks for a given temperature."""
-    wall = HeatProblem(
-        wall_mesh(0.3, 0.5, 1.0),
-        CONCRETE,
-        effects=(Convection(("x0",), coefficient, 20.0), Convection(("x1",), coefficient, -10.0)),
-    )
+    effects = (Convection(("x0",), coefficient, 20.0), Convection(("x1",), coefficient, -10.0))
+    wall = HeatProblem(wall_mesh(0.3, 0.5, 1.0), CONCRETE, effects=effects)
     if coefficient > 1e9:
-        with pytest.raises(HeatError, match=r"convection coefficient: expected at most 1e.10 times"):
+        with pytest.raises(HeatError, match=r"^convection coefficient: expected"):
             solve_steady(wall, order=order)
         return
     solution = solve_steady(wall, order=order)
@@ -91,9 +90,8 @@ def wall_mesh(x: float, y: float, z: float, **options) -> TetMesh:
 def test_semi_infinite_solid(depth_m, time_s, exact) -> None:
     """The surface jumps from 0 to 1: T = erfc(x / (2 sqrt(a t)))."""
     assert math.erfc(depth_m / (2 * math.sqrt(CONCRETE.diffusivity_m2_s * time_s))) == pytest.approx(exact, abs=1e-7)
-    x = np.unique(
-        np.concatenate([planes(0, 0.2, step=0.0025), graded(0.2, 1.2, finest=0.005, growth=1.3, coarsest=0.1)])
-    )
+    far = graded(0.2, 1.2, finest=0.005, growth=1.3, coarsest=0.1)
+    x = np.concatenate([planes(0, 0.2, step=0.0025), far[1:]])
     mesh = box_mesh(x, [0, 0.05], [0, 0.05], temperature_c=0.0)
     problem = HeatProblem(mesh, CONCRETE, effects=(FixedTemperature(("x0",), 1.0),))
     solution = solve_heat(problem, AdaptiveSteps(time_s, 1e-3, outputs=1))
@@ -103,16 +101,14 @@ def test_semi_infinite_solid(depth_m, time_s, exact) -> None:
     assert solution.energy_residual_of_spread < 1e-9
 
 
-SLAB = {
-    # Biot number: Fourier number, centre, surface
-    0.1: [(1.0, 0.92239, 0.87813)],
-    1.0: [(1.0, 0.53386, 0.34818), (0.2, 0.95064, 0.64339)],
-    10.0: [(1.0, 0.16382, 0.02317)],
-}
-
-
 @pytest.mark.parametrize(
-    ("biot", "fourier", "centre", "surface"), [(b, *row) for b, rows in SLAB.items() for row in rows]
+    ("biot", "fourier", "centre", "surface"),
+    [
+        (0.1, 1.0, 0.92239, 0.87813),
+        (1.0, 1.0, 0.53386, 0.34818),
+        (1.0, 0.2, 0.95064, 0.64339),
+        (10, 1, 0.16382, 0.02317),
+    ],
 )
 def test_slab_with_convection(biot, fourier, centre, surface) -> None:
     """Half of a slab at 1 in air at 0; series of Carslaw and Jaeger."""
@@ -153,3 +149,20 @@ def test_a_small_sphere_cools_as_a_whole() -> None:
     faceted = math.exp(-10 * 3600 * area / (volume * 2200 * 880))
     np.testing.assert_allclose(solution.temperature_c[-1], faceted, atol=1e-4)
     np.testing.assert_allclose(solution.temperature_c[-1], 0.00377818, atol=5e-4)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_closed_spherical_shell(order) -> None:
+    """455.6634 W. With flat facets the error is that of the area, of second order whatever the tetrahedra."""
+    errors = []
+    for parts in (4, 8):
+        mesh = shell_mesh(0.5, 0.6, parts, parts // 4)
+        effects = (Convection(("inside",), 7.69, 20.0), Convection(("outside",), 25.0, -10.0))
+        solution = solve_steady(HeatProblem(mesh, CONCRETE, effects=effects), order=order)
+        assert solution.energy_residual < 1e-9
+        errors.append(float(solution.effects[0].heat_w[0]) / 455.6634 - 1.0)
+    radius = np.linalg.norm(mesh.points_m, axis=1)
+    inner, outer = (float(solution.temperature_c[np.abs(radius - r) < 1e-9].mean()) for r in (0.5, 0.6))
+    assert [inner, outer] == pytest.approx([1.13886, -5.97105], abs=0.1)
+    assert abs(errors[1]) < 3e-3, errors
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.15), f"observed order of {errors}"

@@ -59,7 +59,6 @@ def named(rules: PatchRules, colours: np.ndarray | None = None) -> list[str]:
     ("rule", "changed"),
     [
         ("box: {lower: [0, 0, 0], upper: [1, 1, 1]}", [1, 3, 4]),
-        ("box: {lower: [0, 0, .5], upper: [1, 1, 1]}", [3, 4]),
         ("box: {lower: [-.inf, -.inf, 1.5], upper: [.inf, .inf, .inf]}", [0, 5]),
         ("plane: {point: [0, 0, 1], normal: [0, 0, 7]}", [0, 2, 3, 4, 5]),
         ("plane: {point: [0, 0, 1], normal: [0, 0, -1]}", [1, 2, 3, 4]),
@@ -67,11 +66,9 @@ def named(rules: PatchRules, colours: np.ndarray | None = None) -> list[str]:
         ("only: exterior", [0, 2, 3]),
         ("only: interior", [1, 4]),
         ("only: cut", [5]),
-        ("only: all", [0, 1, 2, 3, 4, 5]),
         ("facing: up", [0, 5]),
         ("facing: side", [2, 3, 4]),
         ("facing: down", [1]),
-        ("facing: any", [0, 1, 2, 3, 4, 5]),
         ("only: exterior, facing: side, box: {lower: [0, 0, 0], upper: [1, 1, 3]}", [3]),
         ("box: {lower: [0, 0, 0], upper: [1, 1, 3]}, plane: {point: [0, 0, 1.5], normal: [0, 0, 1]}", [0]),
         ("only: interior, facing: up", []),
@@ -99,11 +96,7 @@ def test_the_nearest_colour_wins_whatever_the_order(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "distance",
-    [
-        "rgb: [204, 0, 0], max_distance: 51.5",
-        "rgb: [0.8, 0, 0.0], max_distance: 0.202",
-        "rgb: [204.0, 0, 0], max_distance: 51.5",
-    ],
+    ["rgb: [204, 0, 0], max_distance: 51.5", "rgb: [0.8, 0, 0.0], max_distance: 0.202"],
 )
 def test_a_colour_that_is_too_far_is_nobodys(tmp_path: Path, distance: str) -> None:
     names = named(rules_of(tmp_path, f"patches: [{{name: red, nearest_colour: {{{distance}}}}}]"), COLOURS)
@@ -161,12 +154,9 @@ def test_the_example_is_read_and_does_what_its_comments_say() -> None:
         ("patches: [{name: wall, facing: up}, {name: Wall, facing: side}]", "patches entry 2: name"),
         ("regions: [{name: a, facing: up}]", "regions entry 1"),
         ("patches: [{name: a, facing: north}]", "patches entry 1: facing"),
-        ("patches: [{name: a, only: [cut]}]", "patches entry 1: only"),
         ("patches: [{name: a, box: {lower: [0, 0, 1], upper: [1, 1, 1]}}]", "box: corners"),
-        ("patches: [{name: a, box: {lower: [0, 0, 1e-3], upper: [1, 1, 1]}}]", "lower"),
         ("patches: [{name: a, plane: {point: [0, 0, 0], normal: [0, 0, 0]}}]", "plane: point and normal"),
         ("patches: [{name: a, nearest_colour: {rgb: [0, 0, 256]}}]", "rgb"),
-        ("patches: [{name: a, nearest_colour: {rgb: [1, 0, 0]}}]", "rgb"),
         ("patches: [{name: a, nearest_colour: {rgb: [9, 0, 0], max_distance: 0}}]", "max_distance"),
     ],
 )

@@ -1,4 +1,4 @@
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -8,7 +8,6 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.boundary.visibility import facet_views, seen_facets
 from thermoxels_ns.mesh.quality.checks import facet_normals
-from thermoxels_ns.mesh.solid.free_space import first_solid
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
 from thermoxels_ns.mesh.voxel_tets import voxel_surface as surface_of_voxels
 
@@ -60,15 +59,7 @@ def test_a_sphere_is_seen_up_to_its_horizon() -> None:
     assert np.count_nonzero(elevation > 12.0) > 1000
     assert seen[elevation > 12.0].all()
     assert not seen[elevation < -9.0].any()  # as far as the normals of a staircase are off
-    share = (elevation > 0.0).mean()
-    assert seen.mean() == pytest.approx(share, abs=0.08)
-
-
-def test_a_plate_is_seen_from_the_side_of_the_cameras() -> None:
-    centroids, normals = voxel_surface(PLATE)
-    above = views(MIDDLE + np.array([1.0, 0.5, 7.0]), MIDDLE + np.array([-2.0, 2.0, 9.0]))
-    seen = seen_facets(PLATE, above, LATTICE, centroids, normals)
-    assert np.array_equal(seen, normals[:, 2] > 0.5)
+    assert seen.mean() == pytest.approx((elevation > 0.0).mean(), abs=0.08)
 
 
 def test_an_obstacle_casts_its_shadow() -> None:
@@ -91,36 +82,21 @@ def test_an_obstacle_casts_its_shadow() -> None:
     assert seen_facets(cells, beside, LATTICE, centroids, normals)[ground].all()
 
 
-def test_the_image_ends_at_its_borders() -> None:
+@pytest.mark.parametrize(("principal", "middle"), [((200.0, 150.0), (0.0, 0.0)), ((400.0, 300.0), (-8.0, 6.0))])
+def test_the_image_ends_at_its_borders(principal, middle) -> None:
+    """20 voxels away, 400 x 300 pixels at a focal length of 500 pixels show 16 x 12 voxels."""
     centroids, normals = voxel_surface(PLATE)
-    narrow = views(ABOVE, target=LATTICE.index_to_world([16.0, 16.0, 16.0]), focal=500.0)
-    pose = narrow.camera_to_world[0]
+    narrow = replace(views(ABOVE, focal=500.0), centre=np.array([principal]))
     seen = seen_facets(PLATE, narrow, LATTICE, centroids, normals)
-    # 20 voxels away, 400 x 300 pixels at a focal length of 500 pixels show 16 x 12 voxels around the middle.
-    right, up = ((centroids - ABOVE) @ pose[:, k] / H for k in (0, 1))
+    off = np.abs((centroids - ABOVE) @ narrow.camera_to_world[0][:, :2] / H - middle)
     upper = normals[:, 2] > 0.5
-    assert seen[upper & (np.abs(right) < 7.5) & (np.abs(up) < 5.5)].all()
-    assert not seen[upper & ((np.abs(right) > 8.5) | (np.abs(up) > 6.5))].any()
-    assert 2 * 15 * 11 <= np.count_nonzero(seen) <= 2 * 17 * 13
+    assert seen[upper & (off[:, 0] < 7.5) & (off[:, 1] < 5.5)].all()
+    assert not seen[~upper | (off[:, 0] > 8.5) | (off[:, 1] > 6.5)].any()
 
 
-def test_the_principal_point_moves_the_image() -> None:
-    """Columns count from the left, rows from the top: with its middle in a corner, an image shows one quarter."""
-    centroids, normals = voxel_surface(PLATE)
-    whole = views(ABOVE, target=LATTICE.index_to_world([16.0, 16.0, 16.0]))
-    pose = whole.camera_to_world[0]
-    corner = Views(whole.camera_to_world, whole.focal, np.array([[400.0, 300.0]]), whole.size)
-    seen = seen_facets(PLATE, corner, LATTICE, centroids, normals)
-    right, up = ((centroids - ABOVE) @ pose[:, k] / H for k in (0, 1))
-    upper = normals[:, 2] > 0.5
-    assert seen[upper & (right < -0.5) & (up > 0.5)].all()
-    assert not seen[upper & ((right > 0.5) | (up < -0.5))].any()
-
-
-def test_nothing_behind_a_camera_is_seen() -> None:
-    centroids, normals = voxel_surface(PLATE)
-    away = views(ABOVE, target=LATTICE.index_to_world([16.0, 16.0, 50.0]))
-    assert not seen_facets(PLATE, away, LATTICE, centroids, normals).any()
+@pytest.mark.parametrize("cameras", [views(), views(ABOVE, target=2.0 * ABOVE - MIDDLE)], ids=["none", "turned away"])
+def test_cameras_that_do_not_look_see_nothing(cameras) -> None:
+    assert not seen_facets(PLATE, cameras, LATTICE, *voxel_surface(PLATE)).any()
 
 
 def room() -> np.ndarray:
@@ -137,33 +113,6 @@ def test_a_camera_in_a_room_sees_its_walls_and_no_other() -> None:
     inner = np.abs(LATTICE.world_to_index(centroids) - 16.0).max(axis=1) < 9.5
     assert np.array_equal(seen_facets(cells, six, LATTICE, centroids, normals), inner)
     assert 0 < np.count_nonzero(seen_facets(cells, one, LATTICE, centroids, normals)) < np.count_nonzero(inner)
-
-
-def test_a_camera_outside_sees_into_a_room_only_through_its_window() -> None:
-    cells = room()
-    centroids, normals = voxel_surface(cells)
-    camera = LATTICE.index_to_world([60.0, 16.0, 16.0])
-    back = (normals[:, 0] > 0.5) & (LATTICE.world_to_index(centroids)[:, 0] < 8.0)
-    assert not seen_facets(cells, views(camera), LATTICE, centroids, normals)[back].any()
-    cells &= ~block((25, 28), (13, 19), (13, 19))
-    centroids, normals = voxel_surface(cells)
-    index = LATTICE.world_to_index(centroids)
-    back = (normals[:, 0] > 0.5) & (index[:, 0] < 8.0)
-    # From 32 voxels before the window's inner end and 53 before the wall, 6 voxels widen to at most 10.
-    off = np.abs(index[:, 1:] - 16.0).max(axis=1)
-    seen = seen_facets(cells, views(camera), LATTICE, centroids, normals)
-    assert seen[back & (off < 3.5)].all()
-    assert not seen[back & (off > 6.0)].any()
-
-
-def test_a_floater_at_a_camera_does_not_blind_it() -> None:
-    plate, camera = block(WHOLE, WHOLE, (2, 4)), LATTICE.index_to_world([16.5, 16.5, 20.5])
-    centroids, normals = voxel_surface(plate)
-    floater = plate | block((16, 17), (16, 17), (20, 21))
-    looks = views(camera, target=LATTICE.index_to_world([16.5, 16.5, 0.0]))
-    free = seen_facets(plate, looks, LATTICE, centroids, normals)
-    assert np.count_nonzero(free) > 500
-    assert np.array_equal(seen_facets(floater, looks, LATTICE, centroids, normals), free)
 
 
 def test_a_gap_of_one_voxel_can_be_looked_into() -> None:
@@ -188,42 +137,6 @@ def test_more_cameras_see_more_and_their_order_does_not_matter() -> None:
     assert np.array_equal(seen_facets(cells, views(*positions[::-1]), LATTICE, centroids, normals), together)
     assert together.sum() > max(s.sum() for s in each)
     cameras = views(*positions)
-    found = facet_views(
-        cells, LATTICE, cameras.matrices(), cameras.camera_to_world[:, :, 3], cameras.size, centroids, normals
-    )
+    looks = cameras.matrices(), cameras.camera_to_world[:, :, 3], cameras.size
+    found = facet_views(cells, LATTICE, *looks, centroids, normals)
     assert np.array_equal(found.seen[found.group].T, each)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_rays_meet_the_first_voxel_that_they_cross(seed: int) -> None:
-    """Against the way of each ray through each solid voxel, voxel by voxel."""
-    random = np.random.default_rng(seed)
-    shape = tuple(random.integers(1, 40, size=3))
-    cells = random.random(shape) < random.choice([0.002, 0.02, 0.3])
-    cells[tuple(random.integers(0, shape))] = True
-    eye = random.uniform(-1.0, 2.0, 3) * shape
-    ends = random.uniform(-0.3, 1.3, (200, 3)) * shape
-    ends[:60, seed % 3] = eye[seed % 3]  # rays within a plane of voxels,
-    ends[:20, (seed + 1) % 3] = eye[(seed + 1) % 3]  # along an axis,
-    ends[20:30] = np.round(ends[20:30])  # and to lattice corners
-    along = ends - eye
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-
-    solid = np.argwhere(cells)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        faces = [(solid[None] + side - eye) / along[:, None] for side in (0, 1)]
-    near, far = np.fmin(*faces).max(axis=2), np.fmax(*faces).min(axis=2)
-    clear = np.maximum(near, 1.5)
-    crossed = far - clear > 1e-6
-    nearest = np.where(crossed, clear, np.inf).min(axis=1)
-    grazed = np.abs(far - clear).min(axis=1) < 1e-6
-    met = first_solid(cells, eye, along)
-    np.testing.assert_allclose(met[~grazed], nearest[~grazed], rtol=1e-9)
-    assert grazed.mean() < 0.2
-    reach = np.where(np.isfinite(nearest), 0.99 * nearest, 1e3)
-    assert np.isinf(first_solid(cells, eye, along, reach)[~grazed]).all()
-
-
-def test_without_cameras_nothing_is_seen() -> None:
-    cells = block((4, 28), (4, 28), (4, 28))
-    assert not seen_facets(cells, views(), LATTICE, *voxel_surface(cells)).any()

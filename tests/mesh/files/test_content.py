@@ -1,13 +1,19 @@
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
+import trimesh
 
 from thermoxels_ns.core.errors import MeshError, OutputError
-from thermoxels_ns.mesh.files.content import checked_mesh
+from thermoxels_ns.mesh.files.content import checked_mesh, surface_of
 from thermoxels_ns.mesh.files.formats import MESH_FORMATS, mesh_file_paths, write_mesh
 from thermoxels_ns.mesh.files.solvers import HeatStep
+from thermoxels_ns.mesh.files.surface import write_glb, write_ply, write_stl
+from thermoxels_ns.mesh.quality.checks import facet_normals
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 
 STEP = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)
 SUFFIXES = sorted(MESH_FORMATS)
@@ -20,40 +26,35 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("field", "change", "message"),
+    ("field", "change"),
     [
-        ("points_m", lambda a: changed(a, np.nan), "points_m: expected finite"),
-        ("tets", lambda a: changed(a, len(a) * 9), "tets: expected whole numbers from 0"),
-        ("tets", lambda a: a.astype(float), "tets: expected whole numbers"),
-        ("tets", lambda a: a[:0], "tets: expected at least one"),
-        ("facet_tags", lambda a: a[1:], "facet_tags: expected shape"),
-        ("temperature_c", lambda a: a[1:], "temperature_c: expected shape"),
-        ("region", lambda a: changed(a, 3), "region: expected whole numbers from 0 to 2"),
-        ("region_names", lambda a: ("a", "b", "a"), "region_names: expected at least one name, all different"),
-        ("region_names", lambda a: ("a", "b", 'say "c"'), "region_names: expected at least one name"),
-        ("colour", lambda a: a[:, :2], "colour: expected shape"),
+        ("points_m", lambda a: changed(a, np.nan)),
+        ("tets", lambda a: changed(a, len(a) * 9)),
+        ("tets", lambda a: a.astype(float)),
+        ("tets", lambda a: a[:0]),
+        ("facet_tags", lambda a: a[1:]),
+        ("temperature_c", lambda a: a[1:]),
+        ("region", lambda a: changed(a, 3)),
+        ("region_names", lambda a: ("a", "b", "a")),
+        ("region_names", lambda a: ("a", "b", 'say "c"')),
+        ("colour", lambda a: a[:, :2]),
     ],
 )
-def test_a_damaged_mesh_is_refused(tagged_mesh, field, change, message):
+def test_a_damaged_mesh_is_refused(tagged_mesh, field, change):
     damaged = dataclasses.replace(tagged_mesh, **{field: change(getattr(tagged_mesh, field))})
-    with pytest.raises(MeshError, match=message):
+    with pytest.raises(MeshError, match=f"^mesh {field}: expected"):
         checked_mesh(damaged)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_every_format_writes_the_files_that_it_names_and_the_same_bytes_again(tmp_path, tagged_mesh, suffix):
+def test_every_format_writes_the_files_that_it_names_and_the_same_bytes_again(tmp_path, tagged_mesh, box_mesh, suffix):
+    write_mesh(tmp_path / f"untagged{suffix}", box_mesh, heat_step=STEP)
     path, again = (tmp_path / folder / f"house{suffix}" for folder in ("new folder", "another"))
     assert write_mesh(path, tagged_mesh, heat_step=STEP) == mesh_file_paths(path)
     assert {path, *mesh_file_paths(path)} == set(path.parent.iterdir())
     assert all(file.stat().st_size for file in mesh_file_paths(path))
     for first, second in zip(mesh_file_paths(path), write_mesh(again, tagged_mesh, heat_step=STEP)):
         assert first.read_bytes() == second.read_bytes()
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_every_format_writes_a_mesh_without_tags_and_colours(tmp_path, box_mesh, suffix):
-    path = tmp_path / f"box{suffix}"
-    assert write_mesh(path, box_mesh, heat_step=STEP)[0] == path and path.is_file()
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -68,17 +69,6 @@ def test_a_mesh_that_is_refused_leaves_the_old_files(tmp_path, tagged_mesh, suff
     assert set(tmp_path.iterdir()) == set(mesh_file_paths(path))
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_place_that_cannot_be_written_is_named(tmp_path, tagged_mesh, suffix):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="output folder"):
-        write_mesh(tmp_path / "file" / f"house{suffix}", tagged_mesh, heat_step=STEP)
-    (tmp_path / f"house{suffix}").mkdir()
-    with pytest.raises(OutputError, match=f"house{suffix}"):
-        write_mesh(tmp_path / f"house{suffix}", tagged_mesh, heat_step=STEP)
-    assert not [path for path in tmp_path.iterdir() if ".part" in path.name]
-
-
 def test_formats_are_found_by_their_ending():
     assert set(MESH_FORMATS) == {".vtu", ".xdmf", ".msh", ".inp", ".stl", ".ply", ".glb"}
     assert mesh_file_paths("a.b.msh") == [Path("a.b.msh")]
@@ -86,7 +76,105 @@ def test_formats_are_found_by_their_ending():
         mesh_file_paths("house.obj")
 
 
-def test_an_input_file_needs_material_and_times(tmp_path, tagged_mesh):
-    with pytest.raises(MeshError, match="heat_step: expected material and times"):
-        write_mesh(tmp_path / "house.inp", tagged_mesh)
+def colours(read: meshio.Mesh) -> np.ndarray:
+    """Red, green, blue from 0 to 255; meshio reads bytes with a sign."""
+    return np.stack([read.point_data[name].view(np.uint8) for name in ("red", "green", "blue")], axis=1).astype(float)
+
+
+def test_stl_is_the_closed_surface(tmp_path, tagged_mesh):
+    write_stl(tmp_path / "house.stl", tagged_mesh)
+    read = trimesh.load_mesh(tmp_path / "house.stl")
+    assert read.is_watertight
+    assert read.volume == pytest.approx(signed_volumes(tagged_mesh.points_m, tagged_mesh.tets).sum(), rel=1e-5)
+    assert read.triangles == pytest.approx(tagged_mesh.points_m[tagged_mesh.facets], abs=1e-6)
+    # Behind the header, each triangle starts with its normal.
+    raw = np.frombuffer((tmp_path / "house.stl").read_bytes(), dtype=np.uint8)[84:].reshape(-1, 50)
+    normals = raw[:, :12].copy().view("<f4")
+    assert normals == pytest.approx(facet_normals(tagged_mesh.points_m, tagged_mesh.facets), abs=1e-6)
+
+
+def test_stl_far_from_the_origin_is_refused_and_ply_holds_it(tmp_path, tagged_mesh):
+    """At five million metres single precision has steps of half a metre, wider than the triangles."""
+    far = replace(tagged_mesh, points_m=tagged_mesh.points_m + np.array([450_000.3, 5_200_000.4, 300.0]))
+    with pytest.raises(MeshError, match=r"^mesh for \.stl: .*Write \.ply"):
+        write_mesh(tmp_path / "far.stl", far)
+    assert not list(tmp_path.iterdir())
+    write_ply(tmp_path / "far.ply", far)
+    assert np.array_equal(meshio.read(tmp_path / "far.ply").points, surface_of(far.points_m, far.facets).points_m)
+
+
+def test_ply_holds_colours_of_the_photographs_and_temperatures(tmp_path, tagged_mesh):
+    write_ply(tmp_path / "house.ply", tagged_mesh)
+    read = meshio.read(tmp_path / "house.ply")
+    surface = surface_of(tagged_mesh.points_m, tagged_mesh.facets)
+    assert np.array_equal(read.points, surface.points_m)
+    assert np.array_equal(surface.nodes[read.cells_dict["triangle"]], tagged_mesh.facets)
+    assert read.point_data["temperature_c"] == pytest.approx(tagged_mesh.temperature_c[surface.nodes], rel=1e-6)
+    assert np.array_equal(read.point_data["observed"], tagged_mesh.observed[surface.nodes])
+    rgb = colours(read)
+    assert np.abs(rgb / 255.0 - tagged_mesh.colour[surface.nodes]).max() <= 0.5 / 255.0 + 1e-6
+    assert b"comment colours: photographs\n" in (tmp_path / "house.ply").read_bytes()
+
+
+def test_ply_without_photographs_is_coloured_by_temperature(tmp_path, box_mesh):
+    write_ply(tmp_path / "box.ply", box_mesh)
+    read = meshio.read(tmp_path / "box.ply")
+    rgb = colours(read)
+    # Inferno grows brighter from cold to hot throughout.
+    brightness = rgb @ [0.2126, 0.7152, 0.0722]
+    order = np.argsort(read.point_data["temperature_c"])
+    assert np.all(np.diff(brightness[order]) > -1.0)
+    assert brightness[order[-1]] > 4.0 * brightness[order[0]]
+    comment = f"inferno from {box_mesh.temperature_c.min():.6g} to {box_mesh.temperature_c.max():.6g} degrees Celsius"
+    assert comment.encode() in (tmp_path / "box.ply").read_bytes()
+
+
+def read_glb(path: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
+    """Return the surface as it is stored, and the matrix (4, 4) that places it."""
+    scene = trimesh.load_scene(path)
+    (stored,) = scene.geometry.values()
+    return stored, scene.graph.get("surface")[0]
+
+
+def test_trimesh_reads_a_closed_body_that_stands_upright_with_its_temperatures(tmp_path, tagged_mesh):
+    write_glb(tmp_path / "house.glb", tagged_mesh)
+    stored, matrix = read_glb(tmp_path / "house.glb")
+    surface = surface_of(tagged_mesh.points_m, tagged_mesh.facets)
+    assert np.array_equal(stored.vertices, surface.points_m.astype("<f4"))
+    assert np.array_equal(stored.faces, surface.triangles)
+    temperature = tagged_mesh.temperature_c[surface.nodes]
+    assert np.array_equal(stored.vertex_attributes["_TEMPERATURE_C"].ravel(), temperature.astype("<f4"))
+    extras = {"colours": "temperature", "lowest_c": temperature.min(), "highest_c": temperature.max()}
+    assert extras.items() <= stored.metadata.items()
+    placed = stored.copy().apply_transform(matrix)
+    assert placed.is_watertight
+    assert placed.volume == pytest.approx(signed_volumes(tagged_mesh.points_m, tagged_mesh.tets).sum(), rel=1e-5)
+    x, y, z = surface.points_m.T
+    assert placed.vertices == pytest.approx(np.column_stack([x, z, -y]), abs=1e-5)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (0, -1, 0), (1, 0, 0), (0.3, -0.9, 0.4), (0, -3, 1e-3)])
+def test_any_direction_can_be_up(tmp_path, tagged_mesh, up):
+    write_glb(tmp_path / "house.glb", tagged_mesh, up=up)
+    turn = read_glb(tmp_path / "house.glb")[1][:3, :3]
+    assert np.linalg.det(turn) == pytest.approx(1.0)
+    assert turn.T @ turn == pytest.approx(np.eye(3), abs=1e-12)
+    assert turn @ np.array(up) / np.linalg.norm(up) == pytest.approx(np.array([0.0, 1.0, 0.0]), abs=1e-6)
+
+
+def test_far_from_the_origin_the_shape_stays_whole(tmp_path, tagged_mesh):
+    """In national coordinates single precision has steps of half a metre; a translation holds what is beyond it."""
+    up, shift = (0.3, -0.9, 0.4), np.array([450_000.3, 5_200_000.4, 300.0])
+    write_glb(tmp_path / "far.glb", replace(tagged_mesh, points_m=tagged_mesh.points_m + shift), up=up)
+    write_glb(tmp_path / "near.glb", tagged_mesh, up=up)
+    (far, matrix), (near, turn) = (read_glb(tmp_path / name) for name in ("far.glb", "near.glb"))
+    assert not turn[:3, 3].any()
+    expected = trimesh.transform_points(near.vertices + shift, turn)
+    assert trimesh.transform_points(far.vertices, matrix) == pytest.approx(expected, rel=0, abs=2e-6)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 0.0), (0.0, float("nan"), 1.0), (0.0, 1.0)])
+def test_no_direction_is_refused(tmp_path, tagged_mesh, up):
+    with pytest.raises(MeshError, match=r"^up: expected"):
+        write_glb(tmp_path / "house.glb", tagged_mesh, up=up)
     assert not list(tmp_path.iterdir())

@@ -1,32 +1,20 @@
+import dataclasses
 import json
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import pyvista as pv
 
-from thermoxels_ns.mesh.files.vtu import write_boundary_vtp, write_summary, write_vtu
+from tests.support.unreadable import forbid
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.files.content import colour_bytes
+from thermoxels_ns.mesh.files.formats import write_mesh
+from thermoxels_ns.mesh.files.vtu import read_mesh, write_boundary_vtp, write_summary
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX
-
-
-def test_mesh_round_trips_through_pyvista(tmp_path, box_mesh):
-    path = tmp_path / "new" / "mesh.vtu"
-    temperature_c = box_mesh.temperature_c + 1.0  # of a later step
-    write_vtu(path, box_mesh, temperature_c=temperature_c)
-    grid = pv.read(path)
-    assert isinstance(grid, pv.UnstructuredGrid)
-    assert grid.points.dtype == np.float64
-    assert np.array_equal(grid.points, box_mesh.points_m)
-    assert np.array_equal(grid.cells_dict[pv.CellType.TETRA], box_mesh.tets)
-    assert np.array_equal(grid.point_data["temperature_c"], temperature_c)
-    assert np.array_equal(grid.point_data["temperature_k"], temperature_c + 273.15)
-    assert grid.point_data["observed"].dtype == np.uint8
-    assert np.array_equal(grid.point_data["observed"], box_mesh.observed)
-    assert 0 < grid.point_data["observed"].sum() < grid.n_points
-    assert np.array_equal(grid.cell_data["region"], box_mesh.region)
-    assert grid.volume == pytest.approx(3.0)
-    assert [p.name for p in path.parent.iterdir()] == ["mesh.vtu"]
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary
 
 
 def names_in(data: pv.DataSet) -> list[str]:
@@ -66,3 +54,118 @@ def test_summary_keeps_order_and_converts_numpy(tmp_path):
     read = json.loads(text)
     assert list(read) == [*figures, "unit"] and "°C" in text and '\n  "volume": 0.5' in text
     assert (read["counts"], read["bounds"], read["run"]) == ({"tets": 6}, [[1.0, 0.0], [0.0, 1.0]], "a/b")
+
+
+def assert_same(read, written) -> None:
+    for field in dataclasses.fields(written):
+        ours, theirs = getattr(written, field.name), getattr(read, field.name)
+        if isinstance(ours, np.ndarray) and field.name != "colour":
+            assert theirs.dtype == ours.dtype, field.name
+            assert np.array_equal(ours, theirs), field.name
+        elif isinstance(ours, Boundary):
+            assert_same(theirs, ours)
+        elif field.name != "colour":
+            assert ours == theirs, field.name
+
+
+@pytest.mark.parametrize("name", ["mesh.vtu", "my house.vtu"])
+def test_a_tagged_mesh_comes_back_bit_for_bit(tmp_path, tagged_mesh, name) -> None:
+    count = np.random.default_rng(2).integers(0, 9, (len(tagged_mesh.facets), 2))
+    counted = dataclasses.replace(tagged_mesh, boundary=dataclasses.replace(tagged_mesh.boundary, photographs=count))
+    write_mesh(tmp_path / name, counted)
+    read = read_mesh(tmp_path / name)
+    assert_same(read, counted)
+    assert read.colour.dtype == np.float32 and np.abs(read.colour - tagged_mesh.colour).max() <= 0.5 / 255 + 1e-7
+    assert np.array_equal(colour_bytes(read.colour), colour_bytes(tagged_mesh.colour))
+
+
+def test_missing_files_are_named(tmp_path, box_mesh) -> None:
+    with pytest.raises(MeshError, match=r"box\.vtu: expected a file at"):
+        read_mesh(tmp_path / "box.vtu")
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    (tmp_path / "box-boundary.vtp").unlink()
+    with pytest.raises(MeshError, match=r"box-boundary\.vtp: expected a file at"):
+        read_mesh(tmp_path / "box.vtu")
+    with pytest.raises(MeshError, match=r"^mesh file: .* got box\.msh"):
+        read_mesh(tmp_path / "box.msh")
+
+
+@pytest.mark.parametrize("name", ["box.vtu", "box-boundary.vtp"])
+@pytest.mark.parametrize("damage", ["cut short", "text", "empty", "other kind"])
+def test_damaged_files_are_refused(tmp_path, box_mesh, name, damage, capfd) -> None:
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    file, other = tmp_path / name, tmp_path / ("box-boundary.vtp" if name == "box.vtu" else "box.vtu")
+    content = file.read_bytes()
+    if damage == "other kind":
+        shutil.copy(other, file)
+    else:
+        file.write_bytes({"cut short": content[: len(content) // 2], "text": b"not a mesh", "empty": b""}[damage])
+    with pytest.raises(MeshError, match=f"{name}: expected a VTK file"):
+        read_mesh(tmp_path / "box.vtu")
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("array", range(6))
+@pytest.mark.parametrize("what", [b"<?xml ver", b"////////"], ids=["text", "number"])
+def test_a_size_that_no_memory_holds_is_a_damaged_file(tmp_path, box_mesh, array, what) -> None:
+    """VTK would end the process."""
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    file = tmp_path / "box.vtu"
+    content = bytearray(file.read_bytes())
+    begin = content.index(b"_", content.index(b"<AppendedData")) + 1
+    offset = [int(found) for found in re.findall(rb'offset="(\d+)', bytes(content))][array]
+    content[begin + offset : begin + offset + len(what)] = what
+    file.write_bytes(bytes(content))
+    with pytest.raises(MeshError, match=r"box\.vtu: expected a VTK file"):
+        read_mesh(file)
+
+
+def test_a_file_without_our_arrays_is_refused(tmp_path, box_mesh) -> None:
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    grid = pv.read(tmp_path / "box.vtu")
+    del grid.point_data["temperature_c"]
+    grid.save(tmp_path / "box.vtu")
+    with pytest.raises(MeshError, match=r"box\.vtu: .* temperature_c"):
+        read_mesh(tmp_path / "box.vtu")
+
+
+@pytest.mark.parametrize("damage", ["a node moved", "no number", "boundary of another mesh", "region without a number"])
+def test_files_that_say_something_else_are_refused(tmp_path, box_mesh, damage) -> None:
+    file, other = tmp_path / "box.vtu", tmp_path / "other.vtu"
+    write_mesh(file, box_mesh)
+    if damage == "boundary of another mesh":
+        write_mesh(other, dataclasses.replace(box_mesh, points_m=box_mesh.points_m + 1e-3))
+        shutil.copy(tmp_path / "other-boundary.vtp", tmp_path / "box-boundary.vtp")
+    elif damage == "region without a number":
+        file.write_bytes(file.read_bytes().replace(b'NumberOfTuples="1"', b'NumberOfTuples="0"'))
+    else:
+        edited = pv.read(file)
+        edited.points[3, 1] += np.nan if damage == "no number" else 1.0
+        edited.save(file)
+    with pytest.raises(MeshError):
+        read_mesh(file)
+
+
+def test_a_tetrahedron_listed_again_is_refused(tmp_path, box_mesh) -> None:
+    tets = np.concatenate([box_mesh.tets, box_mesh.tets[:1]])
+    again = dataclasses.replace(box_mesh, tets=tets, region=np.concatenate([box_mesh.region, box_mesh.region[:1]]))
+    write_mesh(tmp_path / "mesh.vtu", again)
+    with pytest.raises(MeshError, match=r"mesh.vtu: expected every tetrahedron once"):
+        read_mesh(tmp_path / "mesh.vtu")
+
+
+@pytest.mark.parametrize("missing", [1, 7])
+def test_missing_triangles_of_the_boundary_are_refused(tmp_path, box_mesh, missing) -> None:
+    """Where they are missing no heat would flow."""
+    fewer = dataclasses.replace(box_mesh, facets=box_mesh.facets[missing:], facet_tags=box_mesh.facet_tags[missing:])
+    write_mesh(tmp_path / "mesh.vtu", fewer)
+    with pytest.raises(MeshError, match=rf"mesh-boundary\.vtp: expected .* got {missing} missing"):
+        read_mesh(tmp_path / "mesh.vtu")
+
+
+@pytest.mark.parametrize("name", ["box.vtu", "box-boundary.vtp"])
+def test_a_file_that_may_not_be_read_is_not_called_damaged(tmp_path, box_mesh, monkeypatch, name) -> None:
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    forbid(monkeypatch, name)
+    with pytest.raises(MeshError, match=f"{name}: .* got Permission denied"):
+        read_mesh(tmp_path / "box.vtu")

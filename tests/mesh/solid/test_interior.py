@@ -1,10 +1,13 @@
+from dataclasses import astuple
+
 import numpy as np
 import pytest
 
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid import interior as interior_module
-from thermoxels_ns.mesh.solid.interior import interior
+from thermoxels_ns.mesh.solid.interior import interior, wall_behind
 from thermoxels_ns.mesh.solid.morphology import convex_hull
 
 N = 24
@@ -82,26 +85,16 @@ def test_a_few_strays_below_an_open_underside_do_not_make_it_deeper():
     clean = interior(cells, LATTICE, looking_at(MIDDLE, around()), 0).hidden
     for corner in ((5, 5), (18, 18)):
         cells[(*corner, slice(3, 5))] = True
-    strays = cells.copy()
-    found = interior(strays, LATTICE, looking_at(MIDDLE, around()), 0).hidden
+    found = interior(cells, LATTICE, looking_at(MIDDLE, around()), 0).hidden
     assert clean[:, :, 5].any() and not clean[:, :, :5].any()
     assert not found[:, :, :5].any() and np.array_equal(found, clean)
-    assert convex_hull(strays, of_centres=True)[:, :, 3:5].sum() > 10  # what would be filled
+    assert convex_hull(cells, of_centres=True)[:, :, 3:5].sum() > 10  # what would be filled
 
 
 def test_what_cameras_look_into_is_not_inside():
     cells, inside = cup()
-    from_below = looking_at(MIDDLE, around(height=-60.0))
-    found = interior(cells, LATTICE, from_below, 0)
+    found = interior(cells, LATTICE, looking_at(MIDDLE, around(height=-60.0)), 0)
     assert found.hidden[inside].mean() < 0.35 and not found.hidden[11:13, 11:13, 5:12].any()
-
-
-def test_one_pinhole_that_single_cameras_look_through_does_not_empty_it():
-    cells, inside = cup()
-    cells[5:7, 11, 11] = False
-    eyes = np.vstack((around(20), [(-60.0, 11.5, 11.5)]))
-    found = interior(cells, LATTICE, looking_at(MIDDLE, eyes), 0)
-    assert found.hidden[inside].mean() > 0.99
 
 
 def test_a_plate_and_two_bodies_side_by_side_have_no_inside():
@@ -129,23 +122,14 @@ def test_blocks_give_the_same_inside(monkeypatch):
         assert np.array_equal(found, expected)
 
 
-def half_around(count: int = 20, height: float = 14.0) -> np.ndarray:
-    """Cameras on the side of low x."""
-    angle = np.linspace(0.5 * np.pi + 0.1, 1.5 * np.pi - 0.1, count)
-    return np.column_stack((12 + 60 * np.cos(angle), 12 + 60 * np.sin(angle), np.full(count, height)))
-
-
-def with_holes_far_away() -> tuple[np.ndarray, np.ndarray]:
-    """A thin shell of a box whose side at high x is a chessboard with squares of four voxels; cameras, of which three
-    of 23 look through it."""
+def test_crevices_that_a_few_cameras_see_through_holes_of_the_shell_are_filled():
+    """One side of a box is a chessboard with squares of four voxels; most cameras look at the other side."""
     cells = box(5, 19) & ~box(6, 18)
     y, z = np.indices((14, 14))
     cells[18, 5:19, 5:19] = (y // 4 + z // 4) % 2 == 0
-    return cells, np.vstack((half_around(), [(70.0, 12.0, 12.0), (70.0, 2.0, 16.0), (70.0, 22.0, 8.0)]))
-
-
-def test_crevices_that_a_few_cameras_see_through_holes_of_the_shell_are_filled():
-    cells, eyes = with_holes_far_away()
+    angle = np.linspace(0.5 * np.pi + 0.1, 1.5 * np.pi - 0.1, 20)
+    before = np.column_stack((12 + 60 * np.cos(angle), 12 + 60 * np.sin(angle), np.full(20, 14.0)))
+    eyes = np.vstack((before, [(70.0, 12.0, 12.0), (70.0, 2.0, 16.0), (70.0, 22.0, 8.0)]))
     found = interior(cells, LATTICE, looking_at(MIDDLE, eyes), 1)
     assert not (found.hidden | found.enclosed)[~box(5, 19)].any()
     assert (cells | found.hidden)[box(5, 19)].mean() > 0.88
@@ -158,8 +142,7 @@ def test_the_long_shadow_between_posts_on_a_plate_is_not_their_inside(monkeypatc
     cells[2:70, 9:15, :2] = cells[2:5, 9:15, :10] = cells[67:70, 9:15, :10] = True
     views = looking_at((36.0, 12.0, 5.0), [(500.0, y, 6.0) for y in np.linspace(9.0, 15.0, 7)])
     between = (slice(16, 56), slice(9, 15), slice(6, 10))
-    found = interior(cells, lattice, views, 0)
-    assert found.hidden[between].mean() < 0.05
+    assert interior(cells, lattice, views, 0).hidden[between].mean() < 0.05
     monkeypatch.setattr(interior_module, "SHADOW_SURROUNDED", -1.0)
     assert interior(cells, lattice, views, 0).hidden[between].mean() > 0.8
 
@@ -189,3 +172,50 @@ def test_a_courtyard_stays_open_and_the_building_around_it_is_filled():
     for seal in (0, 1):
         found = interior(building & ~inside, LATTICE, looking_at(MIDDLE, eyes), seal)
         assert inside.sum() > 500 and np.array_equal(found.hidden | found.enclosed, inside)
+
+
+FRONT = [(80.0, 12.0, 12.0), (80.0, 18.0, 8.0), (70.0, 8.0, 14.0)]
+BACK = [(-56.0, 12.0, 12.0), (-56.0, 18.0, 8.0)]
+
+
+def plate(layers: int = 1) -> np.ndarray:
+    cells = np.zeros((N, N, N), dtype=bool)
+    cells[12 : 12 + layers, 2:22, 2:22] = True
+    return cells
+
+
+@pytest.mark.parametrize("thickness", [1.0, 2.0, 3.4, 5.0, 8.0])
+@pytest.mark.parametrize("layers", [1, 2])
+def test_a_plate_seen_from_one_side_grows_to_the_thickness_on_the_other(thickness, layers):
+    cells = plate(layers)
+    added = wall_behind(cells, LATTICE, looking_at(MIDDLE, FRONT), thickness)
+    assert not (added & cells).any()
+    thick = (cells | added)[:, 10:14, 10:14].sum(axis=0)
+    assert (np.abs(thick - max(thickness, layers)) <= 0.51).all()
+    assert not added[12 + layers :].any()  # never towards the cameras
+    assert added[:12].any() == (thickness >= layers + 0.5)
+
+
+def test_a_plate_seen_from_both_sides_does_not_grow():
+    for eyes in (FRONT + BACK, FRONT[:1] + BACK[:1]):
+        added = wall_behind(plate(), LATTICE, looking_at(MIDDLE, eyes), 6.0)
+        assert added[:, 4:20, 4:20].sum() == 0
+
+
+def test_space_that_cameras_look_through_stays_empty():
+    """A second plate shades half of the space behind the first; a camera behind looks through the other half."""
+    cells = plate()
+    views = looking_at((6.0, 12.0, 12.0), [*FRONT, (-56.0, 12.0, 60.0)])
+    added = wall_behind(cells, LATTICE, views, 5.0)
+    assert not added.any() or not added[:12, 8:16, 14:20].any()
+    cells[2, :, :] = True  # now nothing can be seen between them
+    assert wall_behind(cells, LATTICE, views, 5.0)[8:12, 8:16, 8:16].all()
+
+
+def test_it_does_not_reach_a_shadow_beyond_seen_space():
+    """A camera looks along the back of the plate through a slot three voxels wide; nobody looks behind that slot."""
+    front = looking_at(MIDDLE, FRONT[:1])
+    slot = looking_at((10.5, 12.0, 12.0), (10.5, -60.0, 12.0), focal=4800.0)
+    both = Views(*(np.concatenate(pair) for pair in zip(astuple(front), astuple(slot), strict=True)))
+    assert wall_behind(plate(), LATTICE, front, 6.0)[7:12, 10:14, 12].all()
+    assert not wall_behind(plate(), LATTICE, both, 6.0)[:, 10:14, 12].any()

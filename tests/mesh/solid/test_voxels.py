@@ -6,8 +6,117 @@ import pytest
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, SolidStep, select_solid
+from thermoxels_ns.core.snapshot import GridSnapshot, Views
+from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, SolidStep, select_solid, where_cameras_look
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX
+
+
+def ring(radius: float = 1.6, height: float = 0.8) -> Views:
+    """24 cameras around the z axis."""
+    angle = 2.0 * np.pi * np.arange(24) / 24
+    eyes = np.column_stack((radius * np.cos(angle), radius * np.sin(angle), np.full(24, height)))
+    return looking_at((0.0, 0.0, 0.3), eyes, focal=150.0)
+
+
+def box(lattice: Lattice, low, high) -> np.ndarray:
+    centres = lattice.cell_centres()
+    return np.all((centres > low) & (centres < high), axis=-1)
+
+
+def field(lattice: Lattice, cells: np.ndarray, views: Views | None) -> GridSnapshot:
+    ones = np.ones(lattice.shape, dtype=np.float32)
+    return GridSnapshot(lattice, ones, 20.0 * ones, ones, voxel_density=50.0 * cells.astype(np.float32), views=views)
+
+
+WIDE = Lattice.covering((-5.0, -5.0, -0.5), (5.0, 5.0, 3.0), 64)
+TABLE = box(WIDE, (-0.9, -0.9, -0.2), (0.9, 0.9, 0.0))
+OBJECT = box(WIDE, (-0.4, -0.3, 0.0), (0.4, 0.3, 0.9))
+AS_IT_IS = SolidSelection(close_gaps=0, interior="hollow")
+
+
+def test_an_object_stays_with_its_table_and_the_wall_behind_goes():
+    wall = box(WIDE, (-4.9, 4.4, -0.5), (4.9, 4.9, 3.0))
+    solid = select_solid(field(WIDE, TABLE | OBJECT | wall, ring()), AS_IT_IS)
+    assert np.array_equal(solid.cells, TABLE | OBJECT) and np.array_equal(solid.left_out, wall)
+
+
+def test_a_ground_that_runs_on_ends_about_where_cameras_stood():
+    ground = box(WIDE, (-9.0, -9.0, -0.5), (9.0, 9.0, 0.0))
+    solid = select_solid(field(WIDE, ground | OBJECT, ring(2.0, 1.0)), AS_IT_IS)
+    assert (solid.cells >= OBJECT).all()
+    away = np.hypot(*WIDE.cell_centres()[..., :2].transpose(3, 0, 1, 2))
+    assert (solid.cells == ground | OBJECT)[away < 1.5].all() and not solid.cells[away > 3.5].any()
+
+
+def test_a_room_photographed_from_inside_stays_whole():
+    lattice = Lattice.covering((-0.4, -0.4, -0.4), (5.4, 4.4, 2.9), 48)
+    room = ~box(lattice, (0.0, 0.0, 0.0), (5.0, 4.0, 2.5))
+    angle = 2.0 * np.pi * np.arange(24) / 24
+    eyes = np.column_stack((2.5 + 1.2 * np.cos(angle), 2.0 + 1.0 * np.sin(angle), np.full(24, 1.4)))
+    aims = np.column_stack((2.5 - 4.0 * np.cos(angle), 2.0 - 4.0 * np.sin(angle), np.full(24, 1.2)))
+    views = [looking_at(aim, eye) for aim, eye in zip(aims, eyes)]
+    views = Views(*(np.concatenate(part) for part in zip(*(vars(view).values() for view in views))))
+    solid = select_solid(field(lattice, room, views), AS_IT_IS)
+    inner = room & box(lattice, (-0.15, -0.15, -0.15), (5.15, 4.15, 2.65))
+    assert np.mean(solid.cells[inner]) > 0.97
+
+
+def test_cameras_that_look_at_nothing_leave_nothing_out():
+    assert where_cameras_look(OBJECT, WIDE, looking_at((9.0, 0.0, 9.0), (4.0, 0.0, 4.0))).all()
+    assert np.array_equal(select_solid(field(WIDE, OBJECT, None), AS_IT_IS).cells, OBJECT)
+
+
+TURNED = np.array([[0.0, -2.0, 0.0, 10.0], [2.0, 0.0, 0.0, 20.0], [0.0, 0.0, 2.0, 30.0]])
+"""From the lattice to input poses: a quarter turn around z, twice as large, and a shift."""
+
+
+def test_a_box_and_a_point_are_in_the_coordinates_of_the_input_poses():
+    snapshot = field(WIDE, TABLE | OBJECT, ring())
+    # x of the lattice from -0.9 to 0 is y of the input from 18.2 to 20.
+    half = replace(AS_IT_IS, region_box=(0.0, 18.0, 29.0, 20.0, 20.0, 40.0))
+    solid = select_solid(snapshot, half, world_to_input=TURNED)
+    left = WIDE.cell_centres()[..., 0] < 0.0
+    assert np.array_equal(solid.cells, (TABLE | OBJECT) & left)
+    assert np.array_equal(solid.left_out, (TABLE | OBJECT) & ~left)
+    near = replace(AS_IT_IS, region_near=(10.0, 20.0, 30.0, 1.0))
+    ball = np.linalg.norm(WIDE.cell_centres(), axis=-1) < 0.5
+    assert np.array_equal(select_solid(snapshot, near, world_to_input=TURNED).cells, (TABLE | OBJECT) & ball)
+
+
+@pytest.mark.parametrize(
+    "asked", [{"region_box": (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)}, {"region_near": (0.0, 0.0, 0.0, 1.0)}]
+)
+def test_a_region_without_solid_says_where_it_lies_and_the_remedy_works(asked):
+    snapshot = field(WIDE, OBJECT, None)
+    with pytest.raises(MeshError, match=f"^{next(iter(asked))}: expected") as found:
+        select_solid(snapshot, replace(AS_IT_IS, **asked), world_to_input=TURNED)
+    remedy = str(found.value).split("--region-box ")[1].split(",")[0]
+    values = tuple(float(word) for word in remedy.split())
+    solid = select_solid(snapshot, replace(AS_IT_IS, region_box=values), world_to_input=TURNED)
+    assert np.array_equal(solid.cells, OBJECT)
+
+
+def test_a_hollow_house_that_a_box_halves_is_filled_up_to_the_box():
+    """What is left out still hides the inside from the cameras, so the half is as full as the whole would be."""
+    shell = OBJECT & ~box(WIDE, (-0.2, -0.1, 0.2), (0.2, 0.1, 0.7))
+    snapshot = field(WIDE, shell, ring())
+    selection = SolidSelection(close_gaps=0, region_box=(-5.0, -5.0, -1.0, 0.0, 5.0, 3.0))
+    left = WIDE.cell_centres()[..., 0] < 0.0
+    assert np.array_equal(select_solid(snapshot, selection).cells, OBJECT & left)
+
+
+@pytest.mark.parametrize("boundary", ["conforming", "voxel"])
+def test_where_the_region_ends_the_boundary_is_cut(boundary):
+    snapshot = field(WIDE, TABLE | OBJECT, ring())
+    selection = SolidSelection(close_gaps=0, region_box=(-5.0, -5.0, -1.0, 0.0, 5.0, 3.0))
+    mesh = build_mesh(snapshot, selection, np.eye(4), MeshOptions(boundary)).mesh
+    at = mesh.points_m[mesh.facets].mean(axis=1)
+    assert mesh.boundary is not None
+    plane = (np.abs(at[:, 0]) < 0.6 * WIDE.voxel_size) & (mesh.boundary.normal[:, 0] > 0.9)
+    cut = mesh.facet_tags == FACET_BOX
+    assert plane.any() and cut[plane].all() and not cut[np.abs(at[:, 0]) > WIDE.voxel_size].any()
+    assert mesh.boundary.patch_names[mesh.boundary.patch[cut][0]] == "cut"
 
 
 def step_of(solid: SolidCells, name: str) -> SolidStep:
@@ -23,15 +132,22 @@ def cells_along_x(values: list[float]) -> np.ndarray:
     return np.broadcast_to(np.array(layers, dtype=np.float32)[:, None, None], (len(layers), 2, 2))
 
 
-@pytest.mark.parametrize("percentile", [50.0, 75.0, 90.0, 99.0])
+@pytest.mark.parametrize("percentile", [50.0, 99.0])
 def test_percentile_keeps_the_densest_share_of_all_voxels(snapshot_of, percentile):
     density = np.random.default_rng(0).random((11, 11, 11))
     snapshot = snapshot_of(density)
     solid = select_solid(snapshot, SolidSelection(close_gaps=0, density_percentile=percentile, region="all"))
     centre = snapshot.lattice.corner_to_cell_mean(snapshot.density)
     assert solid.cells.sum() == pytest.approx(1000 * (1 - percentile / 100), abs=1)
-    assert centre[solid.cells].min() > centre[~solid.cells].max()
     assert centre[solid.cells].min() >= solid.threshold > centre[~solid.cells].max()
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e30, 3e38])
+def test_selection_does_not_depend_on_the_scale_of_density(snapshot_of, scale):
+    """3e38: the sum of eight corners overflows float32."""
+    pattern, selection = np.random.default_rng(3).random((9, 9, 9)), SolidSelection(density_percentile=90.0)
+    expected, scaled = (select_solid(snapshot_of(pattern * by), selection) for by in (1.0, scale))
+    assert np.isfinite(scaled.threshold) and np.array_equal(scaled.cells, expected.cells)
 
 
 def test_zero_density_is_never_solid(snapshot_of):
@@ -42,9 +158,9 @@ def test_zero_density_is_never_solid(snapshot_of):
 
 def test_empty_names_threshold_maximum_and_remedy(snapshot_of):
     with pytest.raises(MeshError, match=r"threshold 9.*highest density.*is 3\..*--density-threshold"):
-        select_solid(snapshot_of(np.full((3, 3, 3), 3.0)), SolidSelection(close_gaps=0, density_threshold=9.0))
-    with pytest.raises(MeshError, match="none of 8; the highest density"):
-        select_solid(snapshot_of(np.zeros((3, 3, 3))), SolidSelection(close_gaps=0, density_percentile=90.0))
+        select_solid(snapshot_of(np.full((3, 3, 3), 3.0)), SolidSelection(density_threshold=9.0))
+    with pytest.raises(MeshError, match="none of 8"):
+        select_solid(snapshot_of(np.zeros((3, 3, 3))), SolidSelection(density_percentile=90.0))
 
 
 def test_floaters_go_unless_all_is_asked_for(snapshot_of, corner_density):
@@ -53,11 +169,9 @@ def test_floaters_go_unless_all_is_asked_for(snapshot_of, corner_density):
     cells[12, 3, 3] = True
     snapshot = snapshot_of(corner_density(cells))
     solid = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=1.0))
-    assert np.array_equal(solid.cells, cells & (np.arange(14) < 10)[:, None, None])
-    assert solid.component_sizes.tolist() == [1000, 1]
-    region = step_of(solid, "region")
-    assert (region.removed, region.added) == (1, 0) and "1 of 2 bodies in it have less than 1%" in region.remark
-    assert np.array_equal(solid.left_out, cells & ~solid.cells) and solid.within.all()
+    assert np.argwhere(solid.left_out).tolist() == [[12, 3, 3]] and np.array_equal(solid.left_out, cells & ~solid.cells)
+    assert solid.component_sizes.tolist() == [1000, 1] and solid.within.all()
+    assert (step_of(solid, "region").removed, step_of(solid, "region").added) == (1, 0)
     every = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=1.0, region="all"))
     assert np.array_equal(every.cells, cells) and step_of(every, "region").removed == 0 and not every.left_out.any()
 
@@ -74,11 +188,7 @@ def test_cavities_are_filled_unless_the_body_is_to_stay_hollow(snapshot_of):
     snapshot = snapshot_of(density)
     hollow = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=0.4, interior="hollow"))
     filled = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=0.4))
-    missing = 7**3 - int(hollow.cells.sum())
-    assert missing > 0
-    assert filled.cells.all()
-    assert step_of(filled, "interior").added == missing
-    assert f"{missing} voxels of enclosed cavities are filled; the cameras" in step_of(filled, "interior").remark
+    assert filled.cells.all() and step_of(filled, "interior").added == 7**3 - hollow.cells.sum() > 0
     assert [step.name for step in hollow.steps] == ["threshold", "region"]
 
 
@@ -92,46 +202,35 @@ def facade(snapshot_of) -> GridSnapshot:
 
 
 def test_a_wall_thickness_is_in_metres_and_takes_the_place_of_filling(facade):
-    thin = select_solid(facade, SolidSelection(close_gaps=0, density_threshold=15.0))
-    assert thin.cells.sum(axis=0).max() == 1
+    assert select_solid(facade, SolidSelection(close_gaps=0, density_threshold=15.0)).cells.sum(axis=0).max() == 1
     thick = select_solid(facade, SolidSelection(close_gaps=0, density_threshold=15.0, wall_thickness=0.4), 0.2)
     assert (thick.cells[:, 6:10, 6:10].sum(axis=0) == 4).all() and thick.cells[6:10, 8, 8].all()  # 0.4 m = 4 voxels
     assert [step.name for step in thick.steps] == ["threshold", "region", "wall"]
-    wall = step_of(thick, "wall")
-    assert wall.added == thick.cells.sum() - thin.cells.sum() and "0.4 m thick (4 voxels)" in wall.remark
+    assert "0.4 m thick (4 voxels)" in step_of(thick, "wall").remark
 
 
 def test_a_wall_thickness_needs_a_scale_and_cameras(facade):
-    selection = SolidSelection(wall_thickness=0.3)
-    with pytest.raises(MeshError, match=r"wall_thickness.*scale is known.*--metres-per-unit"):
-        select_solid(facade, selection)
-    with pytest.raises(MeshError, match="metres_per_world_unit"):
-        select_solid(facade, selection, 0.0)
-    with pytest.raises(MeshError, match=r"wall_thickness: expected at most the scene box, .* m, got 50 m"):
-        select_solid(facade, SolidSelection(wall_thickness=50.0), 0.2)
-    with pytest.raises(MeshError, match=r"wall_thickness.*training cameras.*leave out --wall-thickness"):
-        select_solid(replace(facade, views=None), selection, 1.0)
+    blind = replace(facade, views=None)
+    for snapshot, thickness, metres in ((facade, 0.3, None), (facade, 50.0, 0.2), (blind, 0.3, 1.0)):
+        with pytest.raises(MeshError, match=r"^wall_thickness"):
+            select_solid(snapshot, SolidSelection(wall_thickness=thickness), metres)
 
 
 @pytest.mark.parametrize(
     "bad",
     [
-        {"density_percentile": -1.0},
         {"density_threshold": -0.1},
         {"voxel_optical_depth": 0.0},
         {"close_gaps": -1},
         {"seal_openings": -1},
-        {"region": "some"},
         {"region_box": (0.0, 0.0, 0.0, 1.0, 0.0, 1.0)},
-        {"region_box": (0.0, 0.0, float("nan"), 1.0, 1.0, 1.0)},
-        {"region_near": (0.0, 0.0, 0.0, 0.0)},
-        {"region_near": (0.0, 0.0, float("inf"), 1.0)},
         {"interior": "filled"},
         {"wall_thickness": 0.0},
     ],
 )
 def test_bad_selection_is_refused(bad):
-    with pytest.raises(MeshError, match=f"^{next(iter(bad))}: expected .*, got .*"):
+    """Others are refused in the tests of the command."""
+    with pytest.raises(MeshError, match=f"^{next(iter(bad))}: expected"):
         SolidSelection(**bad)
 
 
@@ -143,5 +242,3 @@ def test_without_rays_the_default_is_half_an_optical_depth_per_voxel_at_any_reso
         density[0] = 0.45 / voxel  # the first voxel's centre is at 0.4755
         snapshot = GridSnapshot(lattice, density, np.zeros_like(density), np.ones_like(density))
         assert select_solid(snapshot, SolidSelection(close_gaps=0)).cells[:, 0, 0].tolist() == [False, True]
-    with pytest.raises(MeshError, match="lower --voxel-optical-depth"):
-        select_solid(snapshot, SolidSelection(close_gaps=0, voxel_optical_depth=0.55))

@@ -1,22 +1,109 @@
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, centres, tet_mesh
+from tests.support.stuffed_shapes import (
+    ANGLE_BOUNDS_DEG,
+    box_distance,
+    centres,
+    euler_characteristic,
+    num_bodies,
+    tet_mesh,
+    turn,
+    volumes_and_angles,
+)
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.quality.report import check_mesh
-from thermoxels_ns.mesh.stuffing.isosurface import stuff
+from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.quality.report import QualityReport, check_mesh
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
+from thermoxels_ns.mesh.stuffing.lattice import bcc_lattice, coarse_interior
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 2, 1), (1, 4, 5), (4, 3, 5)])
-def test_full_lattice_is_a_box_to_the_last_bit(shape):
-    solid = stuff(np.random.default_rng(1).uniform(0.1, 1.0, shape))
+def sound(solid: StuffedSolid) -> QualityReport:
+    """Measures of a mesh that is conforming, closed and within the promised angles."""
     quality = check_mesh(tet_mesh(solid))
-    a, b, c = shape
+    assert ANGLE_BOUNDS_DEG[0] <= quality.dihedral_range_deg[0] <= quality.dihedral_range_deg[1] <= ANGLE_BOUNDS_DEG[1]
+    return quality
+
+
+WALL = np.array([0.5, 8.0, 7.0])
+"""Half the sides of a wall one voxel thick."""
+
+
+@pytest.mark.parametrize("offset", [0.1, 0.25, 0.4, 0.5])
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 45.0])
+def test_wall_one_voxel_thick_as_signed_distance(degrees, offset):
+    points = centres(24, 24, 24) - [offset, 0.03, 0.07]
+    solid = stuff(np.clip(-box_distance(points @ turn(degrees), WALL), -1.0, 1.0))
+    quality = sound(solid)
+    # At 45 degrees and a quarter of a voxel, two rims of the wall hang on voxels that share an edge only.
+    assert num_bodies(solid) <= 2
+    assert euler_characteristic(solid) == 2 * num_bodies(solid), "a hole through the wall"
+    assert quality.volume_m3 == pytest.approx(8 * WALL.prod(), rel=0.25)
+    assert quality.area_m2 == pytest.approx(8 * (WALL[0] * WALL[1] + WALL[1] * WALL[2] + WALL[0] * WALL[2]), rel=0.1)
+
+
+@pytest.mark.parametrize("tiny", [0.5, 0.1, 1e-3, 1e-9])
+def test_wall_of_one_layer_never_gets_holes(tiny):
+    """However shallow the level says the solid is."""
+    level = np.full((7, 12, 11), -1.0)
+    level[3, 1:-1, 1:-1] = tiny * np.random.default_rng(4).uniform(0.5, 1.0, (10, 9))
+    solid = stuff(level)
+    quality = sound(solid)
+    assert num_bodies(solid) == 1 and euler_characteristic(solid) == 2
+    assert quality.volume_m3 > 0.3 * 90
+
+
+@pytest.mark.parametrize("tiny", [0.5, 0.1, 1e-9])
+def test_gap_of_one_voxel_keeps_bodies_apart(tiny):
+    level = np.ones((9, 8, 7))
+    level[4] = -tiny * np.random.default_rng(5).uniform(0.5, 1.0, (8, 7))
+    solid = stuff(level)
+    sound(solid)
+    # The two bodies meet in points of the gap's border at most.
+    inner = solid.points[solid.facets[~solid.on_box]]
+    middle = np.abs(inner[..., 0] - 4.5)
+    assert middle.min() > 0.1
+    assert euler_characteristic(solid) == 4 and num_bodies(solid) == 2
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "bodies", "volume"), [(slice(1, 5), slice(1, 5), 1, 72), (slice(1, 4), slice(4, 7), 2, 54)]
+)
+def test_bodies_that_touch_along_an_edge_or_at_a_corner(first, second, bodies, volume):
+    level = np.full((8, 8, second.stop + 1), -1.0)
+    level[1:4, 1:4, first] = level[4:7, 4:7, second] = 1.0
+    solid = stuff(level)
+    assert num_bodies(solid) == bodies and (bodies == 1 or euler_characteristic(solid) == 4)
+    assert 0.75 * volume < sound(solid).volume_m3 < volume
+
+
+@pytest.mark.parametrize(("centre", "share"), [((0, 8, 8), 2), ((0, 0, 8), 4), ((0, 0, 0), 8), ((16, 16, 0), 8)])
+def test_ball_cut_by_the_border(centre, share):
+    distance = np.linalg.norm(centres(16, 16, 16) + 8.0 - centre, axis=-1)
+    solid = stuff(np.clip((6.0 - distance) / 1.5, -1.0, 1.0))
+    quality = sound(solid)
+    assert num_bodies(solid) == 1 and euler_characteristic(solid) == 2
+    assert quality.volume_m3 == pytest.approx(4 / 3 * np.pi * 6.0**3 / share, rel=0.04)
+    # Where the surface meets the border the edge is a chamfer about half a voxel wide.
+    on_box = facet_areas(solid.points, solid.facets)[solid.on_box].sum()
+    fans = np.log2(share) * 2 / share
+    assert on_box == pytest.approx(fans * (np.pi * 6.0**2 - 0.5 * 2 * np.pi * 6.0), rel=0.1)
+    assert np.all((solid.points >= 0.0) & (solid.points <= 16.0))
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 5, 7), (6, 1, 1), (4, 3, 5)])
+def test_a_full_lattice_is_a_box_to_the_last_bit_also_one_voxel_wide(shape):
+    full = stuff(np.random.default_rng(1).uniform(0.1, 1.0, shape))
+    quality, (a, b, c) = sound(full), shape
     assert quality.volume_m3 == pytest.approx(a * b * c, rel=1e-14)
     assert quality.area_m2 == pytest.approx(2 * (a * b + b * c + a * c), rel=1e-14)
-    assert solid.on_box.all()
-    assert np.array_equal(solid.points.min(axis=0), [0, 0, 0]) and np.array_equal(solid.points.max(axis=0), shape)
-    assert (quality.dihedral_range_deg[0], quality.dihedral_range_deg[1]) == pytest.approx((45.0, 90.0))
+    assert quality.dihedral_range_deg == pytest.approx((45.0, 90.0)) and full.on_box.all()
+    assert np.array_equal(full.points.min(axis=0), [0, 0, 0]) and np.array_equal(full.points.max(axis=0), shape)
+    random = np.random.default_rng(6).normal(size=shape)
+    random.flat[0] = 1.0
+    assert 0.0 < sound(stuff(random)).volume_m3 <= np.prod(shape)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -56,14 +143,77 @@ RANDOM_LEVELS = {
 def test_any_levels_give_a_sound_mesh(kind, seed):
     random = np.random.default_rng(seed)
     level = RANDOM_LEVELS[kind](random, tuple(random.integers(9, 14, size=3)))
-    solid = stuff(level)
-    quality = check_mesh(tet_mesh(solid))
-    assert ANGLE_BOUNDS_DEG[0] <= quality.dihedral_range_deg[0]
-    assert quality.dihedral_range_deg[1] <= ANGLE_BOUNDS_DEG[1]
+    solid = stuff(level, coarsest=1)
+    sound(solid)
     assert np.all((solid.points >= 0.0) & (solid.points <= level.shape))
+    # Every solid voxel is there: its centre is a node inside the mesh.
+    inside = {tuple(point) for point in solid.points[~solid.on_surface]}
+    assert kind != "binary" or inside >= {tuple(at) for at in np.argwhere(level > 0.0) + 0.5}
 
 
 @pytest.mark.parametrize("level", [np.full((3, 3, 3), -1.0), np.zeros((2, 2, 2)), np.ones((0, 4, 4))])
 def test_nothing_solid(level):
-    with pytest.raises(MeshError, match="level: expected solid voxels, with levels above 0, got none"):
+    with pytest.raises(MeshError, match=r"^level: expected"):
         stuff(level)
+
+
+def ball(cells: int, radius: float, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    distance = np.linalg.norm(centres(cells, cells, cells) - offset, axis=-1)
+    return np.clip((radius - distance) / 1.5, -1.0, 1.0)
+
+
+def blobs(random: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    level = ndimage.gaussian_filter(random.normal(size=shape), 6.0, mode="wrap")
+    return np.clip(level / np.abs(level).max() * 4.0 + 0.8, -1.0, 1.0)
+
+
+def pinholes(random: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Levels without order, some not above 0: points move and edges are cut wherever they may."""
+    level = random.uniform(size=shape) ** 8 + 1e-12
+    return np.where(random.random(shape) < 6e-4, -random.choice([0.0, 1e-9, 0.5, 100.0], size=shape), level)
+
+
+def smallest_numbers(random: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Levels above 0 whose means are 0 by rounding, here and there in a solid."""
+    return np.where(ndimage.gaussian_filter(random.normal(size=shape), 1.5) > 0.06, 5e-324, 0.5)
+
+
+@pytest.mark.parametrize("kind", [blobs, pinholes, smallest_numbers], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_inside_changes_and_the_surface_does_not(kind, seed):
+    random = np.random.default_rng(seed)
+    level = kind(random, tuple(random.integers(27, 34, size=3)))
+    uniform = stuff(level, coarsest=1)
+    volume = signed_volumes(uniform.points, uniform.tets).sum()
+    count = len(uniform.tets)
+    for coarsest in (2, 4, 8):
+        graded = stuff(level, coarsest)
+        quality = check_mesh(tet_mesh(graded), "conforming")
+        # The surface is the same bits in the same order, up to node numbers.
+        assert np.array_equal(graded.points[graded.facets], uniform.points[uniform.facets])
+        assert np.array_equal(graded.on_box, uniform.on_box)
+        assert np.array_equal(graded.points[graded.on_surface], uniform.points[uniform.on_surface])
+        assert quality.volume_m3 == pytest.approx(volume, rel=1e-13)
+        assert "dihedral_within_bounds" not in quality.unmet and quality.num_tets <= count
+        count = quality.num_tets
+    assert count < 0.9 * len(uniform.tets)
+
+
+@pytest.mark.parametrize("coarsest", [2, 4, 8, 16])
+def test_angles_of_the_coarse_part(coarsest):
+    lattice = bcc_lattice(ball(64, 31.0))
+    interior = coarse_interior(lattice, coarsest)
+    points, tets = lattice.positions(np.arange(len(lattice.level))), interior.tets
+    edges = np.linalg.norm(points[tets[:, 1:]] - points[tets[:, :1]], axis=-1)
+    assert min(8, coarsest) <= edges.max() <= coarsest
+    assert signed_volumes(points, tets).min() > 0.0
+    assert volumes_and_angles(points, tets)[1:] == pytest.approx((45.0, 120.0), abs=1e-9)
+
+
+def test_place_in_the_lattice_does_not_matter():
+    level = ball(30, 13.0, (0.3, 0.2, 0.1))
+    here = stuff(level)
+    moved = stuff(np.pad(level, ((5, 0), (1, 7), (0, 3)), constant_values=-1.0))
+    assert len(here.tets) < 0.7 * len(stuff(level, coarsest=1).tets)
+    assert np.array_equal(here.tets, moved.tets) and np.array_equal(here.facets, moved.facets)
+    assert np.allclose(here.points, moved.points - np.array([5, 1, 0]), rtol=0.0, atol=1e-13)
