@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -6,9 +7,10 @@ import numpy as np
 import pytest
 
 from tests.support.known_rig import KnownCapture, known_capture, painted_sky
-from thermoxels_ns.capture.rig.images import prepare_frames
+from thermoxels_ns.capture.rig.images import local_contrast, without_fixed_pattern
 from thermoxels_ns.capture.rig.search import estimate_rig
-from thermoxels_ns.capture.rig_types import RigFrame, RigModel, RigStart, prior_sigmas
+from thermoxels_ns.capture.rig.start import read_rig
+from thermoxels_ns.capture.rig_types import RigFrame, RigStart
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 
@@ -53,6 +55,8 @@ def test_comparing_edges_alone_is_exact_to_a_twentieth_of_a_pixel_and_files_read
     again = estimate_rig(files, sky.visible, sky_start(sky))
     assert again.visible_to_thermal.tobytes() == found.visible_to_thermal.tobytes()
     assert again.thermal_camera == found.thermal_camera
+    negative = with_temperatures(sky, [40.0 - np.asarray(frame.temperature_c) for frame in sky.frames])
+    assert sky.projection_error_px(estimate_rig(negative, sky.visible, sky_start(sky))) < 0.05
 
 
 def test_without_a_ruler_points_fall_in_place_and_the_error_says_what_is_unsure(house: KnownCapture) -> None:
@@ -105,26 +109,13 @@ def test_dead_columns_and_an_odd_number_of_colours_do_no_harm(sky: KnownCapture)
     assert sky.projection_error_px(found) < 0.1
 
 
-def test_slopes_are_the_derivatives_of_what_is_climbed(house: KnownCapture) -> None:
-    prepared = prepare_frames(house.frames[:3], house.visible, house.thermal)
-    rig = RigModel(replace(house.thermal, k1=0.05), house.visible_to_thermal)
-    change = np.array([0.002, -0.003, 0.004, 0.02, -0.01, 0.03, 0.01, 0.4, -0.3, 0.02])
-    points = np.concatenate([frame.points_visible() for frame in house.frames[:2]])
-    slope = np.random.default_rng(0).standard_normal((len(points), 2))
-    exact = rig.pull_back(change, points, slope)
-    score = prepared.score(rig, change, (80, 64), 3.0)
-    total, by_frame = score.slopes(change)
-    climbed = by_frame.sum(axis=0)
-    for number, step in enumerate([1e-5] * 3 + [1e-4] * 3 + [1e-5] + [1e-3] * 2 + [1e-4]):
-        moved = [change.copy(), change.copy()]
-        moved[0][number] += step
-        moved[1][number] -= step
-        ahead, behind = (np.sum(slope * rig.project(one, points)) for one in moved)
-        assert exact[number] == pytest.approx((ahead - behind) / (2 * step), rel=1e-5, abs=1e-4)
-        ahead, behind = (score.slopes(change + 50 * (one - change))[0] for one in moved)
-        scale = prior_sigmas(RigStart(house.thermal), prepared.median_depth)[number]
-        assert climbed[number] * scale == pytest.approx((ahead - behind) / (100 * step) * scale, rel=0.05, abs=5e-3)
-    assert total == pytest.approx(score.value(change), rel=1e-6)
+def test_a_pattern_that_stays_is_taken_out_and_images_without_one_are_as_they_were() -> None:
+    draw = np.random.default_rng(1)
+    scenes = [3.0 * cv2.GaussianBlur(draw.standard_normal((64, 64)), (0, 0), 2.0).astype(np.float32) for _ in range(12)]
+    pattern = 0.5 * draw.standard_normal((64, 64)).astype(np.float32)
+    alone, cleaned = without_fixed_pattern(scenes), without_fixed_pattern([scene + pattern for scene in scenes])
+    assert all(np.array_equal(image, local_contrast(scene)) for image, scene in zip(alone, scenes))
+    assert np.std([image - scene for image, scene in zip(cleaned, alone)]) < 0.5 * pattern.std()
 
 
 def test_errors_name_the_frame_and_what_to_do(sky: KnownCapture, tmp_path: Path) -> None:
@@ -138,3 +129,37 @@ def test_errors_name_the_frame_and_what_to_do(sky: KnownCapture, tmp_path: Path)
     broken.write_bytes(b"no picture")
     with pytest.raises(SceneError, match=r"broken\.jpg: expected a photograph"):
         estimate_rig([replace(f, photograph=broken) for f in sky.frames], sky.visible, start)
+
+
+CAMERA = {"w": 64, "h": 48, "fl_x": 70.0, "fl_y": 70.0, "cx": 32.0, "cy": 24.0}
+
+
+def rig_file(folder, **changed):
+    rig = np.eye(4)
+    rig[:3, 3] = 0.1, 0.0, 0.02
+    content = {"thermal_camera": CAMERA, "rig": rig.tolist(), "metres_per_unit": 0.5, **changed}
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(("ours", "shift"), [(0.5, 0.1), (0.25, 0.2), (None, 0.1)])
+def test_lengths_follow_the_scales(tmp_path, ours, shift):
+    rig = read_rig(rig_file(tmp_path), (64, 48), ours)
+    assert rig.visible_to_thermal[0, 3] == pytest.approx(shift)
+    assert ("converted" in rig.explanation) == (ours is not None)
+
+
+@pytest.mark.parametrize("rig", [np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(3)])
+def test_mirrors_and_other_matrices_are_refused(tmp_path, rig):
+    with pytest.raises(SceneError, match="rig: expected"):
+        read_rig(rig_file(tmp_path, rig=rig.tolist()), (64, 48))
+
+
+@pytest.mark.parametrize("width", [float("inf"), float("nan"), 64.5, 1e400, -float("inf")])
+def test_sizes_are_whole_numbers_of_pixels(tmp_path, width):
+    file = rig_file(tmp_path, thermal_camera={**CAMERA, "w": width})
+    with pytest.raises(SceneError, match=r"transforms.json: thermal_camera"):
+        read_rig(file, (64, 48))
+    rig = read_rig(rig_file(tmp_path, thermal_camera={**CAMERA, "w": 64.0}), (64, 48))
+    assert rig.thermal_camera.width == 64
