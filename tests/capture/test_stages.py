@@ -29,6 +29,8 @@ def capture(tmp_path_factory):
     card = folder / "card"
     write_card(card, COUNT, DRIFT_K, stray=True)
     photograph(card / "lonely.jpg")
+    photograph(card / "shot8-visible.jpg")
+    shutil.copy(card / "shot0-radiometric.tiff", card / "shot8-radiometric.tiff")
     (card / "shot9-visible.jpg").write_bytes(b"")
     before = files_of(folder)
     said = []
@@ -61,15 +63,19 @@ def test_nothing_is_written_outside_the_output_folder(capture):
 
 def test_what_is_left_out_is_named_with_its_reason(capture):
     dropped = capture[2].dropped
-    assert set(dropped) == {f"shot{COUNT}", "lonely.jpg", "shot9-visible.jpg"}
+    assert set(dropped) == {f"shot{COUNT}", "shot8", "lonely.jpg", "shot9-visible.jpg"}
+    assert "too few matches" in dropped[f"shot{COUNT}"] and "32 x 24 pixels" in dropped["shot8"]
     assert "zero bytes" in dropped["shot9-visible.jpg"]
-    assert (len(capture[2].pairs), len(capture[2].scene.frames)) == (COUNT + 1, COUNT)
+    assert (len(capture[2].pairs), len(capture[2].scene.frames)) == (COUNT + 2, COUNT)
 
 
 def test_the_scene_has_the_cameras_of_the_truth(capture):
     found = found_poses(capture[1])
     scale, off_m, off_deg = alignment(found, poses(COUNT))
     assert off_m < 0.01 and off_deg < 0.3
+    assert content(capture[1])["fl_x"] == pytest.approx(VISIBLE.fl_x, rel=0.01)
+    assert len(capture[2].scene.model.points) > 200
+    assert np.median(capture[2].scene.model.sighting_error_px()) < 0.5
     thermal = np.array([entry["thermal_transform_matrix"] for entry in entries(capture[1])])
     apart = np.linalg.norm(thermal[:, :3, 3] - found[:, :3, 3], axis=1) * scale
     assert apart.std() < 1e-6
@@ -196,5 +202,5 @@ def test_the_command(capture, tmp_path, capsys):
     words = ["--skip-bad", "True", "--max-features", "500", "--thermal-field-of-view-deg", str(ANGLE_DEG)]
     assert cli.main(["capture", str(card), "--output", str(scene), *words]) == 0
     out = capsys.readouterr().out
-    assert f"{COUNT} frames of {COUNT + 1} pairs" in out
+    assert f"{COUNT} frames of {COUNT + 2} pairs" in out
     assert "shot9-visible.jpg" in out and f"--data {scene}" in " ".join(out.split())

@@ -16,6 +16,7 @@ from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.scene_box import box_of_cameras, box_of_points
 from thermoxels_ns.data.scene_file import BOUNDS_NAME, read_scene_file
+from thermoxels_ns.data.transforms_json import path_inside
 from thermoxels_ns.mesh.build import apply_transform
 
 
@@ -132,36 +133,6 @@ def test_box_from_cameras_is_where_they_look(scene_folder):
     distance = np.sqrt(17.0)
     np.testing.assert_allclose(box, np.outer([-1, 1], np.full(3, distance * 24 / (1.1 * 24) / 2)), atol=1e-9)
     torch.testing.assert_close(parse(scene.path).scene_box.aabb, torch.tensor([[-1.0] * 3, [1.0] * 3]))
-
-
-@pytest.mark.parametrize("legacy", [False, True])
-def test_box_from_colmap_follows_the_worlds_axes(scene_folder, legacy):
-    """The model is in COLMAP's world; the json may have other axes, as old ns-process-data wrote it."""
-    pycolmap = pytest.importorskip("pycolmap")
-    scene = scene_folder(scene_box=None)
-    axes = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]], float) if legacy else np.eye(3)
-    points = np.random.default_rng(3).uniform([-1, -0.6, -0.3], [1, 0.6, 0.3], (800, 3))
-    folder = scene.path / "colmap" / "sparse" / "0"
-    folder.mkdir(parents=True)
-    (folder / "cameras.txt").write_text("1 PINHOLE 24 18 26 26 12 9\n")
-    lines = []
-    for number, frame in enumerate(scene.meta["frames"], 1):
-        centre = axes.T @ np.array(frame["transform_matrix"])[:3, 3]
-        name = Path(frame["file_path"]).name
-        lines += [f"{number} 1 0 0 0 {-centre[0]} {-centre[1]} {-centre[2]} 1 {name}", ""]
-    (folder / "images.txt").write_text("\n".join(lines) + "\n")
-    rows = [" ".join(map(str, [i + 1, *(axes.T @ p), 0, 0, 0, 0.5])) for i, p in enumerate(points)]
-    (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
-    assert len(pycolmap.Reconstruction(str(folder)).images) == 10
-    scene.rewrite()
-    outputs = parse(scene.path)
-    sides = (outputs.scene_box.aabb[1] - outputs.scene_box.aabb[0]) / outputs.dataparser_scale
-    torch.testing.assert_close(sides, torch.tensor([2.32, 1.52, 0.92]), atol=0.05, rtol=0)
-    for frame in scene.meta["frames"]:
-        frame["transform_matrix"][0][3] += 1.0
-    scene.rewrite()
-    with pytest.raises(SceneError, match="at other places"):
-        parse(scene.path)
 
 
 def test_other_resolution_gives_scaled_thermal_cameras(scene_folder):
@@ -367,6 +338,7 @@ OWN = {"w": 13, "h": 10, "fl_x": 9, "fl_y": 9, "cx": 6, "cy": 5}
         (without("file_path"), "frame 3.*file_path"),
         (of_frame_3(w=25), "frame 3.*25 x 18"),
         (of_frame_3(w=24.5), r"frame 3.*24\.5"),
+        *((of_frame_3(w=size), "frame 3.*intrinsics") for size in (0, -3, 2_000_000, 10**400)),
         (of_frame_3(fl_x=0.0), "frame 3.*focal"),
         (of_frame_3(fl_x=1e308), "frame 3.*fl_x 1e"),
         (of_frame_3(fl_x=True), "frame 3.*true or false"),
@@ -469,6 +441,40 @@ def test_a_sky_far_below_the_bounds_is_no_other_unit(scene_folder):
     all_in(".npy", np.eye(18, 24) - 80.0)(scene)
     scene.rewrite()
     assert parse(scene.path).metadata["temperature_range"].min_c == pytest.approx(-80.0)
+
+
+@pytest.mark.parametrize("name", ["a.tiff", "thermal/a.tiff", "./a.tiff", "thermal\\a.tiff", "a..b/c.jpg"])
+def test_names_inside_are_paths_inside_with_either_slash(tmp_path, name):
+    path = path_inside(tmp_path, name, "frame 3")
+    assert path.is_relative_to(tmp_path.resolve()) and path == path_inside(tmp_path, name.replace("\\", "/"), "x")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../a", "b/../c", "..\\a", "/etc/hostname", "C:\\a", "c:a", "\\\\server\\share\\a", "\\a", "", " ", "a\0b"],
+)
+def test_names_that_lead_out_are_refused_by_where_they_stand(tmp_path, name):
+    with pytest.raises(SceneError, match=r"transforms\.json: frame 3: expected a file inside"):
+        path_inside(tmp_path, name, "transforms.json: frame 3")
+
+
+def test_a_link_to_itself_and_an_endless_name_are_refused(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    for name, said in (("loop/a.tiff", "link"), ("loop", "link|levels"), ("x" * 5000, "too long")):
+        with pytest.raises(SceneError, match=rf"frame 0: expected a file inside.*{said}"):
+            path_inside(tmp_path, name, "frame 0")
+
+
+def test_a_link_that_leads_out_is_refused_and_one_inside_is_not(tmp_path):
+    outside, folder = tmp_path / "outside", tmp_path / "scene"
+    outside.mkdir()
+    folder.mkdir()
+    (folder / "real").mkdir()
+    (folder / "out").symlink_to(outside)
+    (folder / "in").symlink_to(folder / "real")
+    with pytest.raises(SceneError, match="a link to"):
+        path_inside(folder, "out/secret.txt", "frame 0")
+    assert path_inside(folder, "in/a.tiff", "frame 0") == folder.resolve() / "real" / "a.tiff"
 
 
 @pytest.mark.real_data

@@ -10,11 +10,10 @@ import pytest
 from PIL import Image
 
 from tests.support.camera_card import counts, photograph
-from tests.support.flir_file import FlirFile, picture_bytes, segment, smooth_counts
+from tests.support.flir_file import FlirFile, dji_jpeg, picture_bytes, segment, smooth_counts
 from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsError
-from thermoxels_ns.radiometry.decoders import LARGEST_SIDE
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions, read_thermogram
 
 READERS: tuple[Callable[[Path], object], ...] = (
@@ -101,16 +100,8 @@ def test_a_record_outside_the_file_is_refused(tmp_path, offset, length):
         read_thermogram(tmp_path / "a.jpg")
 
 
-@pytest.mark.parametrize("text", ["1\n" * (LARGEST_SIDE + 1), "1,2\n" + "3," * 9000 + "\n"])
-def test_a_table_larger_than_a_thermal_image_is_refused(tmp_path, text):
-    (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(ThermalFileError, match=r"a\.csv"):
-        read_thermogram(tmp_path / "a.csv")
-
-
 def test_a_dji_file_that_is_cut_off_never_reaches_djis_library(tmp_path):
-    plain = picture_bytes()
-    content = plain[:2] + segment(0xE1, b"DJI") + segment(0xE3, bytes(24)) + plain[2:]
+    content = dji_jpeg()
     for name, cut in (("inside.jpg", 40), ("end.jpg", len(content) - 2)):
         (tmp_path / name).write_bytes(content[:cut])
         with pytest.raises(ThermalFileError, match=rf"{name}: expected a whole"):

@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from tests.support.flir_file import FlirFile, picture_bytes, smooth_counts
 from thermoxels_ns.core.errors import ThermalFileError
@@ -236,28 +235,3 @@ def test_real_pairs_have_their_photograph(shared_data):
     assert cv2.imdecode(np.frombuffer(flir.visible, np.uint8), cv2.IMREAD_COLOR).shape == (1944, 2592, 3)
     assert flir.picture_in_picture.real_to_thermal == pytest.approx(3.496, abs=1e-3)
     assert flir.camera.taken_at == datetime(2020, 11, 10, 10, 39, 48, 232000, timezone.utc)
-
-
-LOGOS = {
-    "flir_i7_cc0.jpg": (0.66, 0.02, 1.0, 0.13),
-    "flir_e60_cc0.jpg": (0.8, 0.02, 1.0, 0.1),
-    "flir_infracam_cc0.jpg": (0.74, 0.01, 1.0, 0.11),
-    "flir_sc640_cc0.jpg": (0.8, 0.02, 1.0, 0.11),
-    "flir_t640_mit.jpg": (0.0, 0.92, 0.16, 1.0),
-}
-"""Where the cameras draw their maker's name over the picture: left, top, right, bottom as shares of it."""
-
-
-@pytest.mark.real_data
-@pytest.mark.parametrize("name", LOGOS)
-def test_what_cameras_draw_over_the_picture_is_not_in_the_degrees(shared_data, name):
-    temperature_c = read_thermogram(shared_data / "radiometric" / name).temperature_c
-    height, width = temperature_c.shape
-    with Image.open(shared_data / "radiometric" / name) as image:
-        picture = np.asarray(image.convert("L").resize((width, height), Image.Resampling.BOX), dtype=np.float32)
-    left, top, right, bottom = LOGOS[name]
-    box = np.s_[int(top * height) : int(bottom * height), int(left * width) : int(right * width)]
-    contrast = [(each - cv2.blur(each, (9, 9)))[box].ravel() for each in (picture, temperature_c)]
-    assert picture[box].std() > 40.0  # letters
-    assert temperature_c[box].std() < 1.0
-    assert abs(np.corrcoef(*contrast)[0, 1]) < 0.2

@@ -42,15 +42,13 @@ conditions = st.builds(
 
 def test_a_count_becomes_the_temperature_computed_by_hand():
     # S + O = 8000: R1 / (R2 * 8000) + F = 167.02 (14985.93 / 90.2656 + 1), and 1398.1 / ln 167.02 = 273.17 K.
-    assert E60.temperature_k(14233.0) == pytest.approx(
-        1398.1 / math.log(14985.93 / (0.0112832 * 8000.0) + 1.0), rel=1e-14
-    )
     assert E60.temperature_k(14233.0) == pytest.approx(273.17, abs=0.02)
 
 
-def test_a_signal_below_the_offset_has_no_temperature():
+def test_a_signal_of_nothing_has_no_temperature():
     assert np.isnan(E60.temperature_k([6233.0, 6000.0])).all()
     assert np.isfinite(E60.temperature_k([6234.0])).all()
+    assert np.isnan(LONG_WAVE.temperature_k([0.0, -1.0, 1e-30])).all()
 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=["E60", "i7", "band"])
@@ -70,10 +68,6 @@ def test_the_band_is_the_integral_of_planck():
     for kelvin in (200.0, 288.0, 300.0, 373.0, 900.0):
         exact = quad(spectral, 8.0, 14.0, args=(kelvin,), epsrel=1e-11)[0]
         assert PlanckBand(8.0, 14.0).signal(kelvin) == pytest.approx(exact, rel=1e-6)
-
-
-def test_a_band_signal_of_nothing_has_no_temperature():
-    assert np.isnan(LONG_WAVE.temperature_k([0.0, -1.0, 1e-30])).all()
 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=["E60", "i7", "band"])

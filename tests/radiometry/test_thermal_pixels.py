@@ -22,10 +22,10 @@ def save(path: Path, pixels: np.ndarray) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("suffix", "kind"), [(".png", np.uint16), (".png", np.uint8)])
-def test_bounds_keep_every_step_of_eight_and_sixteen_bits(tmp_path, suffix, kind):
+@pytest.mark.parametrize("kind", [np.uint16, np.uint8])
+def test_bounds_keep_every_step_of_eight_and_sixteen_bits(tmp_path, kind):
     counts = np.arange(np.iinfo(kind).max + 1, dtype=kind).reshape(16, -1)
-    got = read_thermal_file(save(tmp_path / f"a{suffix}", counts), BOUNDS).temperature_c
+    got = read_thermal_file(save(tmp_path / "a.png", counts), BOUNDS).temperature_c
     assert got.dtype == np.float32
     np.testing.assert_allclose(got, -10.0 + counts / counts.max() * 50.0, atol=4e-6)
     assert len(np.unique(got)) == counts.size
@@ -79,10 +79,8 @@ def test_float_tiff_is_celsius_unless_linear(tmp_path):
     np.testing.assert_array_equal(read.temperature_c, np.array([[1.25, np.nan], [np.nan, np.nan]], np.float32))
     assert (read.report.nan, read.report.out_of_range) == (2, 1)
     np.testing.assert_array_equal(read_thermal_file(path, BOUNDS).temperature_c, read.temperature_c)
-    kelvin = ThermalUnit.linear(1.0, -273.15)
-    assert read_thermal_file(save(tmp_path / "k.tif", np.full((2, 2), 293.15, np.float32)), kelvin).temperature_c[
-        0, 0
-    ] == (pytest.approx(20.0, abs=1e-4))
+    kelvin = save(tmp_path / "k.tif", np.full((2, 2), 293.15, np.float32))
+    assert read_thermal_file(kelvin, ThermalUnit.linear(1.0, -273.15)).temperature_c == pytest.approx(20.0, abs=1e-4)
 
 
 def test_npy_and_csv_are_celsius(tmp_path):
@@ -91,9 +89,8 @@ def test_npy_and_csv_are_celsius(tmp_path):
     (tmp_path / "comma.csv").write_text("20.5,-3.25,\n,7.0\n".replace(",\n,", "\nNaN,"))
     (tmp_path / "semicolon.csv").write_text("20,5;-3,25;\n-;7\n", encoding="utf-8-sig")
     for name in ("a.npy", "comma.csv", "semicolon.csv"):
-        np.testing.assert_array_equal(
-            read_thermal_file(tmp_path / name, BOUNDS).temperature_c, values.astype(np.float32)
-        )
+        got = read_thermal_file(tmp_path / name, BOUNDS).temperature_c
+        np.testing.assert_array_equal(got, values.astype(np.float32))
 
 
 def test_below_absolute_zero_is_masked_whatever_the_range(tmp_path):
@@ -106,28 +103,6 @@ def test_counts_without_unit_say_what_to_give(tmp_path):
     path = save(tmp_path / "a.png", np.ones((3, 3), np.uint16))
     with pytest.raises(ThermalFileError, match=r"a\.png.*temperature_bounds\.json"):
         read_thermal_file(path, CELSIUS)
-
-
-@pytest.mark.parametrize("suffix", [".png", ".tiff", ".npy", ".csv", ".jpg"])
-@pytest.mark.parametrize("damage", ["missing", "empty", "truncated", "text"])
-def test_damaged_files_are_named(tmp_path, suffix, damage):
-    path = tmp_path / f"broken{suffix}"
-    pixels = np.random.default_rng(0).integers(0, 255, (64, 64)).astype(np.uint8)
-    if damage == "empty":
-        path.touch()
-    elif damage == "text":
-        path.write_text("this is; no image\n1")
-    elif damage == "truncated":
-        if suffix == ".npy":
-            np.save(path, pixels)
-        elif suffix == ".csv":
-            path.write_text("1,2,3\n4,5")
-        else:
-            save(path, pixels)
-        if suffix != ".csv":
-            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(ThermalFileError, match="broken"):
-        read_thermal_file(path, BOUNDS)
 
 
 @pytest.mark.parametrize("shape", [(4,), (2, 3, 4), (0, 3)])

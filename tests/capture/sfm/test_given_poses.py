@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
+from tests.support.colmap_model import write_colmap_model
 from tests.support.posed_model import CAMERA, ring_model
 from thermoxels_ns.capture.sfm.colmap import model_of_colmap, read_colmap
 from thermoxels_ns.capture.sfm.poses import Poses, fitted_to_photographs, read_given_poses
@@ -86,45 +86,17 @@ def test_distortion_that_the_camera_cannot_hold_is_refused(tmp_path):
         read_given_poses(transforms(tmp_path, k3=0.1), SOURCES)
 
 
-def colmap_model(folder, lens="SIMPLE_RADIAL"):
-    """The same cameras and points in COLMAP's text form."""
-    params = {"SIMPLE_RADIAL": "500 320 240 0.02", "FOV": "500 500 320 240 0.1"}[lens]
-    (folder / "cameras.txt").write_text(f"1 {lens} 640 480 {params}\n")
-    flip = np.diag([1.0, -1.0, -1.0])
-    images, tracks = [], {n: [] for n in range(len(MODEL.points))}
-    for number, name in enumerate(MODEL.frames):
-        pose = MODEL.camera_to_world[number]
-        rotation = (pose[:3, :3] @ flip).T
-        shift = -rotation @ pose[:3, 3]
-        x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-        seen, pixels = MODEL.seen_by(number)
-        images.append(f"{number + 1} {w} {x} {y} {z} {shift[0]} {shift[1]} {shift[2]} 1 {name}-visible.jpg")
-        images.append(" ".join(f"{u} {v} {point + 1}" for point, (u, v) in zip(seen, pixels)))
-        for index, point in enumerate(seen):
-            tracks[point].append(f"{number + 1} {index}")
-    (folder / "images.txt").write_text("\n".join(images) + "\n")
-    rows = [
-        f"{n + 1} {p[0]} {p[1]} {p[2]} {' '.join(map(str, MODEL.colours[n]))} 0.5 {' '.join(tracks[n])}"
-        for n, p in enumerate(MODEL.points)
-        if tracks[n]
-    ]
-    (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
-    return folder
-
-
 def test_a_colmap_model_comes_in_with_its_points(tmp_path):
-    found = read_given_poses(colmap_model(tmp_path), SOURCES).model
+    files = {f"{name}-visible.jpg": name for name in MODEL.frames}
+    write_colmap_model(tmp_path, list(files), MODEL.camera_to_world, CAMERA, MODEL.points, text=True)
+    found = read_given_poses(tmp_path, SOURCES).model
     assert found.camera_to_world == pytest.approx(MODEL.camera_to_world, abs=1e-9)
     assert found.camera == CAMERA
-    assert len(found.points) == len(np.unique(MODEL.sighting_point))
+    assert len(found.points) == len(MODEL.points)
     assert found.sighting_error_px().max() < 1e-6
-    assert len(found.sighting_frame) == len(MODEL.sighting_frame)
+    assert len(found.sighting_frame) == len(MODEL.frames) * len(MODEL.points)
     assert found.point_error_px == pytest.approx(0.5)
-
-
-def test_a_model_of_reduced_photographs_is_scaled_to_the_originals(tmp_path):
-    reconstruction = read_colmap(colmap_model(tmp_path))
-    large = model_of_colmap(reconstruction, {f"{n}-visible.jpg": n for n in MODEL.frames}, (1280, 960))
+    large = model_of_colmap(read_colmap(tmp_path), files, (1280, 960))
     assert (large.camera.fl_x, large.camera.cx, large.camera.k1) == (1000.0, 640.0, 0.02)
     assert large.sighting_error_px().max() < 1e-6
     assert large.point_error_px == pytest.approx(1.0)

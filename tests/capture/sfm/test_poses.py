@@ -1,16 +1,14 @@
-"""Poses of a corner whose truth is known; strays are dropped by name; the same seed gives the same bits."""
-
-from dataclasses import replace
+"""Poses and points of a corner whose truth is known; a capture's poses are compared in `test_stages.py`."""
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from tests.support.textured_room import VISIBLE, alignment, write_card
+from tests.support.textured_room import VISIBLE, write_card
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, image_pairs
 from thermoxels_ns.capture.sfm.poses import add_points, find_poses
-from thermoxels_ns.capture.sfm.sfm_model import SfmModel
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel, SparseDepth
 from thermoxels_ns.core.errors import SceneError
 
 OPTIONS = PoseOptions(max_features=500)
@@ -20,56 +18,9 @@ COUNT = 6
 @pytest.fixture(scope="module")
 def card(tmp_path_factory):
     folder = tmp_path_factory.mktemp("card")
-    truth = write_card(folder, COUNT, stray=True)
+    truth = write_card(folder, COUNT)
     photographs = {path.name.split("-")[0]: path for path in sorted(folder.glob("*.jpg"))}
-    wide = folder / "wide.jpg"
-    Image.new("RGB", (64, 48)).save(wide)
-    return {**photographs, "wide": wide}, truth
-
-
-@pytest.fixture(scope="module")
-def found(card, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("poses")
-    return find_poses(card[0], folder, 430.0, options=OPTIONS), folder
-
-
-def test_poses_and_focal_length_are_those_of_the_truth(card, found):
-    model = found[0].model
-    assert model.frames == tuple(f"shot{n}" for n in range(COUNT))
-    _, off_m, off_deg = alignment(model.camera_to_world, card[1])
-    assert off_m < 0.01
-    assert off_deg < 0.3
-    assert model.camera.fl_x == pytest.approx(VISIBLE.fl_x, rel=0.01)
-    assert (model.camera.width, model.camera.height) == (VISIBLE.width, VISIBLE.height)
-
-
-def test_points_lie_on_the_walls_and_project_to_where_they_were_seen(card, found):
-    model = found[0].model
-    assert len(model.points) > 200
-    error = model.sighting_error_px()
-    assert np.median(error) < 0.5
-    # Every wall is a coordinate plane of the truth's world; take the points there.
-    a, b = model.centres, card[1][:, :3, 3]
-    ac, bc = a - a.mean(axis=0), b - b.mean(axis=0)
-    left, _, right = np.linalg.svd(bc.T @ ac)
-    rotation = left @ np.diag([1, 1, np.sign(np.linalg.det(left @ right))]) @ right
-    scale = alignment(model.camera_to_world, card[1])[0]
-    points = scale * (model.points - a.mean(axis=0)) @ rotation.T + b.mean(axis=0)
-    assert np.median(np.abs(points).min(axis=1)) < 0.01
-
-
-def test_what_does_not_fit_is_dropped_and_named(found):
-    dropped = found[0].dropped
-    assert set(dropped) == {f"shot{COUNT}", "wide"}
-    assert "too few matches" in dropped[f"shot{COUNT}"]
-    assert "64 x 48 pixels" in dropped["wide"]
-
-
-def test_the_same_seed_gives_the_same_bits(card, found, tmp_path):
-    again = find_poses(card[0], tmp_path, 430.0, options=replace(OPTIONS, threads=1)).model
-    assert np.array_equal(again.camera_to_world, found[0].model.camera_to_world)
-    assert np.array_equal(again.points, found[0].model.points)
-    assert again.camera == found[0].model.camera
+    return photographs, truth
 
 
 def test_points_for_poses_that_are_given(card, tmp_path):
@@ -122,3 +73,27 @@ def test_every_pair_is_compared_up_to_a_number_and_neighbours_beyond():
     assert {(n, n + 1) for n in range(499)} <= set(map(tuple, many.tolist()))
     assert (0, 499) in set(map(tuple, many.tolist()))  # a path that returns to its start is closed
     assert set(np.unique(image_pairs(5, "sequential"))) == set(range(5))
+
+
+def test_a_slanted_plane_has_its_own_depth_and_not_that_of_its_nearest_points() -> None:
+    draw = np.random.default_rng(0)
+    rays = np.column_stack([draw.uniform(-0.4, 0.4, (600, 2)), np.ones(600)])
+    normal = np.array([0.5, -0.2, 1.0])
+    inverse = rays @ normal / 5.0
+    depth, distance = SparseDepth(rays / inverse[:, None]).at(asked := rays[:100] * 0.7 + (0.0, 0.0, 0.3))
+    assert np.median(np.abs(depth * (asked @ normal / 5.0) - 1.0)) < 2e-3
+    assert distance.max() < 0.1
+
+
+def test_at_an_outline_the_surface_in_front_counts_and_a_stray_point_does_not() -> None:
+    draw = np.random.default_rng(1)
+    rays = np.column_stack([draw.uniform(-0.4, 0.4, (2000, 2)), np.ones(2000)])
+    depths = np.where(rays[:, 0] < 0.0, 2.0, 10.0)
+    depths[7] = 0.1
+    found, _ = SparseDepth(rays * depths[:, None]).at(np.array([[0.002, y, 1.0] for y in (-0.3, 0.0, 0.3)]))
+    assert found == pytest.approx([2.0] * 3, rel=0.1)
+
+
+def test_without_points_nothing_is_known() -> None:
+    depth, distance = SparseDepth(np.zeros((0, 3))).at(np.ones((2, 3)))
+    assert np.isinf(depth).all() and np.isinf(distance).all()
