@@ -11,6 +11,7 @@ from PIL import Image
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig, refine_poses
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.scene_file import read_scene_file
+from thermoxels_ns.multiview.bundle_adjustment import Tracks, _distances
 from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
@@ -21,15 +22,9 @@ VIEWS = (16, 3)
 def scenes(tmp_path_factory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("scenes")
     off = Imperfections(pose_error_deg=0.3)
+    options = {"own_thermal_camera": True, "progress": False}
     return {
-        name: write_scene(
-            make_scene("house-corner"),
-            folder / name,
-            *VIEWS,
-            imperfections=flaws,
-            own_thermal_camera=True,
-            progress=False,
-        )
+        name: write_scene(make_scene("house-corner"), folder / name, *VIEWS, imperfections=flaws, **options)
         for name, flaws in (("right", Imperfections()), ("off", off))
     }
 
@@ -47,8 +42,6 @@ def pixels_off(poses: np.ndarray, true: np.ndarray, focal: float) -> float:
 
     Of points where the true axes of two neighbouring cameras lead, seen by triangulation from exact sightings.
     """
-    from thermoxels_ns.multiview.bundle_adjustment import Tracks, _distances
-
     draw = np.random.default_rng(0)
     points = draw.uniform((-2, -2, 0.5), (2, 2, 4), (300, 3))
     photograph = np.tile(np.arange(len(true)), len(points))

@@ -194,41 +194,6 @@ def test_what_lies_beyond_the_box_is_found_there_if_at_all_and_not_at_its_far_si
     assert np.count_nonzero(np.abs(points[:, 2] - PLANE) > 0.1) < 0.01 * len(found.depth)
 
 
-def room() -> tuple[Photographs, float]:
-    """Photographs of a textured room from within, in a circle and all looking outwards, and the half of its width."""
-    size, focal, half = 64, 60.0, 0.5
-    column, row = np.meshgrid(*[(np.arange(size) + 0.5 - size / 2) / focal] * 2)
-    matrices, centres, pictures = [], [], []
-    for number in range(24):
-        angle = 2.0 * np.pi * number / 24
-        forward = np.array([np.cos(angle), np.sin(angle), 0.0])
-        turned = np.stack((np.cross(forward, (0.0, 0.0, 1.0)), (0.0, 0.0, -1.0), forward))
-        centre = -0.15 * forward + np.array([0.0, 0.0, 0.05 * (-1) ** number])
-        towards = np.stack((column, row, np.ones_like(row)), -1) @ turned
-        with np.errstate(divide="ignore"):
-            reach = ((np.where(towards > 0.0, half, -half) - centre) / towards).min(-1)
-        at = centre + reach[..., None] * towards
-        waves = [np.sin(41 * at @ way + phase) for way, phase in (((1, 2, 3), 0), ((3, -1, 2), 1), ((-2, 3, 1), 2))]
-        pictures.append(0.5 + 0.1 * np.stack(waves, -1))
-        intrinsics = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-        matrices.append(intrinsics @ np.column_stack((turned, -turned @ centre)))
-        centres.append(centre)
-    colours = np.concatenate(pictures).reshape(-1, 3).astype(np.float32)
-    sizes = np.full((24, 2), size)
-    firsts, thermal = np.arange(24) * size * size, np.full(len(colours), np.nan)
-    return Photographs(np.stack(matrices), np.stack(centres), sizes, firsts, colours, thermal), half
-
-
-def test_depths_of_a_room_from_within_lie_on_its_walls():
-    seen, half = room()
-    found = depths_of(seen, (-half, -half, -half), (half, half, half))
-    sure = np.flatnonzero(np.isfinite(found.depth))
-    lines = feature_rays_to_depths(found)
-    off = np.abs(np.abs(lines.points).max(1) - half)
-    assert len(sure) > 500
-    assert np.quantile(off, 0.9) < 0.05, np.quantile(off, [0.5, 0.9])
-
-
 class Frames(ThermalDataset):
     """A dataset of pictures whose red and green say where a pixel's ray goes: x and y on the plane at depth 1."""
 

@@ -98,16 +98,6 @@ def test_own_thermal_camera_is_a_rigid_offset_with_its_own_lens(tmp_path: Path) 
     assert "thermal_unit" not in content
 
 
-@pytest.mark.real_data
-def test_own_thermal_camera_has_the_keys_of_real_data(tmp_path: Path, shared_data: Path) -> None:
-    real = json.loads((shared_data / "arco" / "transforms.json").read_text())
-    write_scene(make_scene("sphere"), tmp_path, own_thermal_camera=True, thermal_format="tiff", **SMALL)
-    made = transforms(tmp_path)
-    assert set(made["thermal_camera"]) == set(real["thermal_camera"])
-    assert set(made["thermal_unit"]) == set(real["thermal_unit"])
-    assert set(made["frames"][0]) == set(real["frames"][0])
-
-
 def test_noise_and_drift_have_the_size_asked_for_and_are_not_clipped(tmp_path: Path) -> None:
     scene = make_scene("sphere")
     flaws = Imperfections(noise_k=0.5, drift_k=2.0)
