@@ -102,19 +102,13 @@ def test_tracks_say_which_training_photograph_sees_which_point(scene, tmp_path):
     assert len(lines.origins) <= seen[train].sum()
 
 
-def test_an_earlier_scene_is_replaced_and_nothing_else(scene, tmp_path):
+def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(scene, tmp_path, monkeypatch):
     output = prepare_output(tmp_path / "scene")
     write_scene_folder(with_masks(scene), output)
     (output / "notes.txt").write_text("mine")
     write_scene_folder(scene, output)
     assert not (output / "masks").exists()
     assert (output / "notes.txt").read_text() == "mine"
-    assert len(read_scene_file(output).frames) == COUNT
-
-
-def test_an_interrupted_writing_leaves_the_old_scene_whole(scene, tmp_path, monkeypatch):
-    output = prepare_output(tmp_path / "scene")
-    write_scene_folder(scene, output)
     before = (output / "transforms.json").read_bytes()
 
     def stop(*_):

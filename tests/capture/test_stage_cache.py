@@ -15,21 +15,6 @@ from thermoxels_ns.core.checks import hold_folder
 from thermoxels_ns.core.errors import OutputError, SceneError
 
 
-def run_two(folder, first=1, second=1):
-    """Two stages that note that they ran; returns which did."""
-    ran = []
-    cache = StageCache(folder)
-    for name, option in (("pairs", first), ("temperatures", second)):
-        cache.run(name, {"option": option}, lambda where, name=name: ran.append(name) or (where / "x").write_text(name))
-    return ran
-
-
-def test_a_change_runs_this_stage_and_all_later_ones(tmp_path):
-    run_two(tmp_path)
-    assert run_two(tmp_path, second=2) == ["temperatures"]
-    assert run_two(tmp_path, first=2, second=2) == ["pairs", "temperatures"]
-
-
 def test_an_interrupted_stage_finds_what_it_left_and_a_changed_one_does_not(tmp_path):
     def interrupted(where):
         (where / "half").write_text("done")

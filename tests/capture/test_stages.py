@@ -1,17 +1,25 @@
 import json
 import re
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.support.board_pictures import BOARD, board_pairs, write_board_folder
 from tests.support.camera_card import photograph
+from tests.support.posed_model import ring_model
 from tests.support.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
 from thermoxels_ns import cli
+from thermoxels_ns.capture.pairs import Pair
+from thermoxels_ns.capture.rig_types import PARAMETERS, RigEstimate, RigFrame
 from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.capture.sfm.scale_and_up import MetricScale
 from thermoxels_ns.commands.capture import capture_folder
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.reports.capture_page import capture_page, thermal_in_photograph
 
 COUNT = 6
 DRIFT_K = 0.6
@@ -121,6 +129,60 @@ def test_the_page_shows_everything_and_fetches_nothing(capture):
     named = re.sub(r'(xmlns(:\w+)?|rdf:resource)="http[^"]*"', "", page)  # names of what svg is, which nobody fetches
     assert "<script" not in page and "http" not in named.replace("http-equiv", "")
     assert "nan" not in page
+
+
+JPEG = b"\xff\xd8\xff"
+
+
+def page_of(result, name="a", **scene) -> str:
+    """The page of a result in whose scene some things are others, with one picture."""
+    changed = replace(result, scene=replace(result.scene, **scene))
+    return capture_page(changed, [(name, JPEG, JPEG, JPEG, name)], np.linspace(10, 20, 100, dtype=np.float32), 0.0)
+
+
+def words(result, **scene) -> str:
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", page_of(result, **scene)))
+
+
+def test_numbers_on_the_page_have_their_errors(capture):
+    errors = {"rx": 0.003, "ry": 0.004, "rz": 0.012, "log_focal": 0.01, "cx": 0.42, "cy": 0.57}
+    covariance = np.diag([errors.get(name, 0.0) ** 2 for name in PARAMETERS])
+    rig = RigEstimate(Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4), True, "", PARAMETERS, covariance)
+    result = replace(capture[2], start=rig)
+    said = words(result, rig=rig)
+    assert "41.0, 29.0 41.0 ± 0.4, 29.0 ± 0.6 " in said and "70.0 70.0 ± 0.7 " in said
+    assert "turned by 0.00 ± 0.74 degrees" in said
+    assert "41.0, 29.0 41.0, 29.0 " in words(result, rig=replace(rig, parameters=(), covariance=np.zeros((0, 0))))
+    assert f"unknown ({result.scale_missing}); give a length when you export the mesh" in said
+    known = words(result, scale=MetricScale(0.5, 0.01, "GPS."))
+    assert "0.5 ± 0.01 (2.0 %) m per unit" in known and "unknown" not in known
+
+
+def test_names_of_files_are_no_markup(capture):
+    evil = "<script>alert(1)</script>"
+    frames = [replace(frame, camera=evil) for frame in capture[2].scene.frames]
+    pairs = [Pair("a", Path(f"{evil}.jpg"), Path("a.tiff"), evil)]
+    changed = replace(capture[2], source=Path(evil), dropped={evil: evil}, pairs=pairs, scale_missing=evil)
+    text = page_of(changed, evil, frames=frames)
+    assert "<script" not in text
+    assert text.count("&lt;script&gt;") >= 8
+
+
+def test_a_point_of_the_thermal_image_lands_where_the_scene_has_it():
+    """A warm spot at the projection of a scene point appears at that point in the photograph."""
+    model = ring_model(3)
+    seen, pixels = model.seen_by(1)
+    frame = RigFrame("f1", np.zeros((480, 640)), np.zeros((60, 80)), model.camera_to_world[1], model.points[seen], seen)
+    thermal, rig = Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4)
+    rig[:3, 3] = (0.3, -0.1, 0.05)
+    chosen = np.argmin(np.linalg.norm(pixels - (320, 240), axis=1))
+    spot = thermal.project(frame.points_visible()[[chosen]] @ rig[:3, :3].T + rig[:3, 3])[0]
+    x, y = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
+    temperature_c = 20 + 10 * np.exp(-((x - spot[0]) ** 2 + (y - spot[1]) ** 2) / 8)
+    carried = thermal_in_photograph(frame, temperature_c, model.camera, RigEstimate(thermal, rig, True, ""), width=640)
+    row, column = np.unravel_index(np.nanargmax(carried), carried.shape)
+    assert np.hypot(column + 0.5 - pixels[chosen][0], row + 0.5 - pixels[chosen][1]) < 6  # a thermal pixel is 7 wide
+    assert np.isnan(carried).any()
 
 
 def test_a_second_run_takes_everything_from_the_first(capture):

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
-from nerfstudio.scripts.render import _disable_datamanager_setup
 from PIL import Image
 
 from tests.support.scene_folders import look_at_origin
@@ -209,16 +207,6 @@ def test_training_rays_per_image_are_limited(scene_folder, most):
     images = torch.cat([part.camera_indices for part in served.training_rays(RGB_STREAM, most)])
     counts = torch.bincount(images.flatten(), minlength=8)
     assert int(counts.max()) <= most and int(counts.min()) >= min(most / 4, 432)
-
-
-def test_render_script_can_set_it_up_without_data(scene_folder):
-    config = ThermalDataManagerConfig(dataparser=ThermalDataParserConfig(data=scene_folder().path))
-    assert isinstance(config, VanillaDataManagerConfig)
-    config.dataparser.downscale_factor = 2.0  # type: ignore[attr-defined]
-    with _disable_datamanager_setup(config._target):
-        served = config.setup(test_mode="test", device="cpu")
-    assert int(served.eval_dataset.cameras.width[0]) == 12 and served.eval_dataset[0]["image"].shape == (9, 12, 3)
-    assert served.train_pixel_sampler is None and served.get_datapath() == config.dataparser.data
 
 
 def test_photographs_scaled_by_the_datamanager_keep_their_thermal_images(scene_folder):

@@ -80,13 +80,8 @@ def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, tex
     tracks = tracks_of(scene)
     assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
     assert len(tracks.sighting_frame) == 6 * 30
-    outputs = lines_of(scene)
-    lines = outputs.metadata["feature_rays"]
-    centres = outputs.cameras.camera_to_worlds[:, :, 3].double().numpy()
-    nearest = np.linalg.norm(lines.origins[:, None] - centres, axis=2)
+    lines = lines_of(scene).metadata["feature_rays"]
     assert len(lines.points) == 30 and len(lines.origins) == 5 * 30  # the one that evaluates is left out
-    assert nearest.min(axis=1).max() < 1e-5
-    assert lines_of(scene, "val").metadata["feature_rays"] is None
 
 
 @pytest.mark.parametrize("where", COLMAP_FOLDERS)

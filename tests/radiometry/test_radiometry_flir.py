@@ -99,15 +99,10 @@ def test_what_the_file_says_of_the_camera(tmp_path):
     assert (alignment.real_to_thermal, alignment.offset_x, alignment.offset_y) == (3.5, -144, -27)
 
 
-def test_what_the_camera_does_not_say_is_none(tmp_path):
-    flir = read_flir_jpeg(write(tmp_path, FlirFile(smooth_counts(), seconds=0)))
+def test_what_the_camera_does_not_say_is_none_and_humidity_in_percent_is_a_share(tmp_path):
+    flir = read_flir_jpeg(write(tmp_path, FlirFile(smooth_counts(), seconds=0, humidity=40.0)))
     assert flir.visible is None and flir.picture_in_picture is None and flir.camera.taken_at is None
-
-
-def test_humidity_in_percent_is_a_share(tmp_path):
-    share = read_flir_jpeg(write(tmp_path, FlirFile(smooth_counts(), humidity=0.4))).camera.conditions
-    percent = read_flir_jpeg(write(tmp_path, FlirFile(smooth_counts(), humidity=40.0))).camera.conditions
-    assert percent.relative_humidity == pytest.approx(share.relative_humidity, abs=1e-7)
+    assert flir.camera.conditions.relative_humidity == pytest.approx(0.4, abs=1e-7)
 
 
 def test_counts_beyond_the_calibration_are_no_temperatures(tmp_path):

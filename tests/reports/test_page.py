@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.reports.charts import bars, histogram
+from thermoxels_ns.reports.charts import bars, colours, histogram
 from thermoxels_ns.reports.page import _environment, image_address
 
 HOSTILE = "<script>alert('1')</script>\"'&"
@@ -99,3 +99,10 @@ def test_charts_are_the_same_for_the_same_figures_and_none_without_values() -> N
     assert bars(values, "x").startswith("<svg") and bars(values, "x").endswith("</svg>")
     assert histogram(np.array([np.nan]), "x") == "" == bars(np.empty(0), "x")
     assert "<b>" not in histogram(np.arange(4.0), "<b>&\"'")
+
+
+def test_colours_go_from_dark_to_bright_and_nan_is_black() -> None:
+    shown = colours(np.array([[0.0, 5.0, 10.0, np.nan]]), (0.0, 10.0)).sum(axis=2)[0]
+    assert shown[0] < shown[1] < shown[2]
+    assert shown[3] == 0
+    assert (colours(np.full((2, 2), np.nan)) == 0).all()
