@@ -25,8 +25,8 @@ surfaces: [{emissivity: 0.93 +- 0.02}]
 def changed(tmp_path: Path):
     """Write conditions in which one entry is another one, given by its path; None removes it."""
 
-    def change(*keys: str, value: object) -> Path:
-        content = yaml.safe_load(PLAIN)
+    def change(*keys: str, value: object, **more: object) -> Path:
+        content = yaml.safe_load(PLAIN) | more
         at = content
         for key in keys[:-1]:
             at = at[int(key)] if isinstance(at, list) else at.setdefault(key, {})
@@ -83,14 +83,9 @@ def test_bad_conditions_are_one_clear_error(changed, keys, value, named) -> None
 
 
 def test_a_sky_is_none_of_a_room(changed) -> None:
-    path = changed("side", value="inside")
-    content = yaml.safe_load(path.read_text()) | {
-        "film": {"model": "madding", "factor": 1.0},
-        "surroundings": {"sky": {"cloud": 0.5, "dew_point": "0 C"}},
-    }
-    path.write_text(yaml.safe_dump(content))
+    film, sky = {"model": "madding", "factor": 1.0}, {"sky": {"cloud": 0.5, "dew_point": "0 C"}}
     with pytest.raises(AuditError, match=r"surroundings: expected a reflected temperature inside"):
-        load_conditions(path)
+        load_conditions(changed("surroundings", value=sky, side="inside", film=film))
 
 
 @pytest.mark.parametrize(

@@ -63,28 +63,32 @@ def found_poses(scene):
     return np.array([entry["transform_matrix"] for entry in entries(scene)])
 
 
-def test_nothing_is_written_outside_the_output_folder(capture):
-    before, after = capture[3]
-    assert len(before) > 2 * COUNT
-    assert after == before
-
-
-def test_what_is_left_out_is_named_with_its_reason(capture):
-    dropped = capture[2].dropped
+def test_what_is_left_out_is_named_with_its_reason_and_nothing_is_written_elsewhere(capture):
+    dropped, (before, after) = capture[2].dropped, capture[3]
+    assert len(before) > 2 * COUNT and after == before
     assert set(dropped) == {f"shot{COUNT}", "shot8", "lonely.jpg", "shot9-visible.jpg"}
     assert "too few matches" in dropped[f"shot{COUNT}"] and "32 x 24 pixels" in dropped["shot8"]
     assert "zero bytes" in dropped["shot9-visible.jpg"]
     assert (len(capture[2].pairs), len(capture[2].scene.frames)) == (COUNT + 2, COUNT)
 
 
-def test_the_scene_has_the_cameras_of_the_truth(capture):
-    found = found_poses(capture[1])
+def test_the_scene_is_that_of_the_truth_with_z_up(capture):
+    _, folder, result, _ = capture
+    found, meta = found_poses(folder), content(folder)
     scale, off_m, off_deg = alignment(found, poses(COUNT))
     assert off_m < 0.01 and off_deg < 0.3
-    assert content(capture[1])["fl_x"] == pytest.approx(VISIBLE.fl_x, rel=0.01)
-    assert len(capture[2].scene.model.points) > 200
-    assert np.median(capture[2].scene.model.sighting_error_px()) < 0.5
-    thermal = np.array([entry["thermal_transform_matrix"] for entry in entries(capture[1])])
+    assert meta["fl_x"] == pytest.approx(VISIBLE.fl_x, rel=0.01)
+    assert len(result.scene.model.points) > 200
+    assert np.median(result.scene.model.sighting_error_px()) < 0.5
+    assert meta["up"] == pytest.approx([0, 0, 1], abs=1e-9)
+    # Up in each camera's axes, by the scene and by the truth.
+    assert np.degrees(np.arccos(np.einsum("ni,ni->n", found[:, 2, :3], poses(COUNT)[:, 2, :3]))).max() < 2.0
+    drift = result.scene.drift
+    assert drift.used, drift.explanation
+    assert drift.offsets_k == pytest.approx([DRIFT_K * (-1) ** n for n in range(COUNT)], abs=0.1)
+    assert drift.after_k < 0.5 * drift.before_k
+    assert meta["drift"]["disagreement_after_k"] == pytest.approx(drift.after_k)
+    thermal = np.array([entry["thermal_transform_matrix"] for entry in entries(folder)])
     apart = np.linalg.norm(thermal[:, :3, 3] - found[:, :3, 3], axis=1) * scale
     assert apart.std() < 1e-6
     assert apart[0] == pytest.approx(np.linalg.norm(RIG[:3, 3]), abs=0.04)
@@ -100,21 +104,6 @@ def test_the_rig_that_was_found_projects_as_the_true_one(capture):
     found = rig.visible_to_thermal
     seen = rig.thermal_camera.project(points_m / scale @ found[:3, :3].T + found[:3, 3])
     assert np.median(np.linalg.norm(seen - true, axis=1)) < 1.5
-
-
-def test_drift_is_found(capture):
-    drift = capture[2].scene.drift
-    assert drift.used, drift.explanation
-    assert drift.offsets_k == pytest.approx([DRIFT_K * (-1) ** n for n in range(COUNT)], abs=0.1)
-    assert drift.after_k < 0.5 * drift.before_k
-    assert content(capture[1])["drift"]["disagreement_after_k"] == pytest.approx(drift.after_k)
-
-
-def test_z_is_up(capture):
-    assert content(capture[1])["up"] == pytest.approx([0, 0, 1], abs=1e-9)
-    found = found_poses(capture[1])[:, :3, :3]
-    # Up in each camera's axes, by the scene and by the truth.
-    assert np.degrees(np.arccos(np.einsum("ni,ni->n", found[:, 2], poses(COUNT)[:, 2, :3]))).max() < 2.0
 
 
 def test_the_page_shows_everything_and_fetches_nothing(capture):

@@ -56,22 +56,17 @@ def found(seen: Photographs) -> np.ndarray:
 
 
 @pytest.mark.parametrize("turns", [(0,) * 6, (1,) * 6, (3,) * 6, (0, 2, 0, 0, 0, 0)])
-def test_the_sky_is_found_and_neither_wall_nor_ground(turns):
-    seen, is_sky = house(turns=turns)
-    backdrop = found(seen)
-    assert not backdrop[~is_sky].any()
-    assert backdrop[is_sky].mean() > 0.9
-
-
-@pytest.mark.parametrize("turns", [0, 1, 3])
-def test_up_is_found_whatever_the_axes_of_the_world_are(turns):
+def test_the_sky_is_found_and_neither_wall_nor_ground_whatever_the_axes_of_the_world_are(turns):
     """Worlds of structure from motion stand in any direction: a street's sky is not at their z axis."""
-    seen, is_sky = house(turns=(turns,) * 6)
+    seen, is_sky = house(turns=turns)
     tilt = Rotation.from_rotvec([1.3, -0.4, 2.0]).as_matrix()
     matrices = np.concatenate((seen.matrices[:, :, :3] @ tilt.T, seen.matrices[:, :, 3:]), axis=2)
     turned = replace(seen, matrices=matrices, centres=seen.centres @ tilt.T)
-    assert np.allclose(upwards(turned), tilt[:, 2], atol=1e-6)
-    assert found(turned)[is_sky].mean() > 0.9 and not found(turned)[~is_sky].any()
+    if len(set(turns)) == 1:
+        assert np.allclose(upwards(turned), tilt[:, 2], atol=1e-6)
+    for backdrop in (found(seen), found(turned)):
+        assert not backdrop[~is_sky].any()
+        assert backdrop[is_sky].mean() > 0.9
 
 
 def test_a_white_wall_under_a_white_sky_is_none():

@@ -35,18 +35,15 @@ def test_gains_are_found_within_half_a_percent(depths):
     assert np.abs(ratio[seen.max(1) < 1.0] / ratio.mean() - 1.0).max() < 0.02
 
 
-def test_photographs_that_do_not_differ_stay(depths):
+def test_photographs_that_differ_by_noise_alone_stay(depths):
     found = photograph_differences(depths, unknown(depths))
     assert np.abs(found.log_gain).max() < 0.005
     assert not matters(found.log_gain, found.log_gain_error, 0.01)
     assert not matters(found.offset, found.offset_error, 0.0)  # no thermal images: nothing is known
     np.testing.assert_array_equal(found.offset, 0.0)
-
-
-def test_noise_alone_is_no_difference(depths):
     noise = np.random.default_rng(1).normal(0.0, 3.0 / 255.0, depths.photographs.colours.shape)
-    found = photograph_differences(with_colours(depths, depths.photographs.colours + noise), unknown(depths))
-    assert not matters(found.log_gain, found.log_gain_error, 0.01)
+    noisy = photograph_differences(with_colours(depths, depths.photographs.colours + noise), unknown(depths))
+    assert not matters(noisy.log_gain, noisy.log_gain_error, 0.01)
 
 
 def test_offsets_are_found_and_their_mean_is_not(depths):

@@ -41,27 +41,13 @@ def test_of_a_room_seen_from_inside_only_free_voxels_are_carved_and_most_of_them
     assert empty.sum() > 0.6 * free.sum()
 
 
-@pytest.mark.parametrize("resolution", [7, 20, 33])
-def test_no_voxel_that_holds_a_point_is_carved(resolution: int) -> None:
-    lattice = Lattice.covering((-1, -1, -1), (1, 1, 1), resolution)
-    random = np.random.default_rng(resolution)
-    sight = lines(random.uniform(-1.5, 1.5, (6, 3)), random.uniform(-1, 1, (500, 3)))
-    empty = empty_voxels(lattice, sight)
-    held = np.floor(lattice.world_to_index(sight.points)).astype(int)
-    assert empty.any()
-    assert not empty[tuple(held.T)].any()
-
-
-def test_a_point_without_lines_keeps_its_voxel() -> None:
+def test_a_point_without_lines_keeps_its_voxel_and_a_single_one_carves_nothing_however_many_see_it() -> None:
     sight = lines([-0.95, 0.05, 0.05], [[0.87, 0.05, 0.05], [0.88, 0.05, 0.05]])
     assert empty_voxels(BOX, sight)[8, 10, 10]
     doubted = FeatureRays(
         sight.origins, sight.point, np.concatenate((sight.points, [[-0.15, 0.05, 0.05]])), sight.uncertainty
     )
     assert not empty_voxels(BOX, doubted)[8, 10, 10]
-
-
-def test_a_single_point_carves_nothing_however_many_see_it() -> None:
     origins = np.random.default_rng(1).uniform(-0.1, 0.1, (40, 3)) + np.array([-0.8, 0.03, 0.03])
     assert not empty_voxels(BOX, lines(origins, [0.8, 0.05, 0.05])).any()
     assert empty_voxels(BOX, lines(origins, [[0.8, 0.05, 0.05], [0.8, 0.051, 0.05]])).any()
@@ -108,13 +94,6 @@ def test_lines_along_faces_and_from_outside_count_as_any() -> None:
     assert empty.any(axis=(1, 2))[:17].all()
     assert not empty_voxels(BOX, lines([-3.0, 5.0, 0.0], [[3.0, 5.0, 0.0], [3.0, 5.1, 0.0]])).any()
     assert not empty_voxels(BOX, lines(np.zeros((0, 3)), np.zeros((0, 3)))).any()
-
-
-def test_air_is_what_is_free_with_its_six_neighbours() -> None:
-    sight, _ = room()
-    free = np.pad(empty_voxels(BOX, sight), 1, constant_values=True)
-    sides = [np.roll(free, way, axis)[1:-1, 1:-1, 1:-1] for axis in range(3) for way in (-1, 1)]
-    assert np.array_equal(air_voxels(BOX, sight), free[1:-1, 1:-1, 1:-1] & np.logical_and.reduce(sides))
 
 
 def test_a_walk_meets_every_voxel_on_a_ray_and_no_other() -> None:

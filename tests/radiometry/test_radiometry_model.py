@@ -157,10 +157,7 @@ def test_air_hides_an_object_behind_its_own_temperature():
 @pytest.mark.parametrize(
     ("values", "named"),
     [
-        ({"emissivity": 0.0}, "emissivity"),
-        ({"emissivity": 1.01}, "emissivity"),
-        ({"emissivity": math.nan}, "emissivity"),
-        ({"emissivity": True}, "emissivity"),
+        *(({"emissivity": value}, "emissivity") for value in (0.0, 1.01, math.nan, True)),
         ({"relative_humidity": 50.0}, "relative_humidity"),
         ({"relative_humidity": -0.1}, "relative_humidity"),
         ({"distance_m": -1.0}, "distance_m"),

@@ -126,14 +126,6 @@ def test_pixels_that_cannot_be_under_the_settings_are_masked_and_counted(tmp_pat
     assert (got.report.nan, got.report.out_of_range, got.report.pixels) == (1, 1, 3)
 
 
-def test_ends_of_the_scale_and_of_the_valid_range_are_masked(tmp_path):
-    counts = np.array([[0, 750, 65535, 6000]], np.uint16)  # the last one stands for 2127 C
-    path = save_tiff(tmp_path / "a.tiff", counts)
-    got = read_thermogram(path, RadiometryOptions(camera="flir-low-gain"))
-    np.testing.assert_array_equal(np.isfinite(got.temperature_c), [[False, True, False, False]])
-    assert (got.report.saturated, got.report.out_of_range) == (2, 1)
-
-
 @pytest.mark.parametrize(
     ("values", "said"),
     [

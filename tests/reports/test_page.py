@@ -1,4 +1,3 @@
-import base64
 from html.parser import HTMLParser
 from io import BytesIO
 
@@ -69,14 +68,6 @@ def test_a_table_has_its_entries_in_order_without_those_that_are_none() -> None:
     outline = Outline(text)
     assert outline.rows == [["", "W"], ["roof", "12at (1, 2)"], ["wall", "12at (1, 2)"]]
     assert "<small>at (1, 2)</small>" in text and "A note." in outline.words
-
-
-def test_pictures_are_embedded_with_their_captions() -> None:
-    pictures = [(picture("red"), "first"), (picture("blue", "JPEG"), "second")]
-    images = Outline(rendered("{{ parts.gallery(pictures, 'three') }}", pictures=pictures)).images
-    assert [base64.b64decode(str(image["src"]).split("base64,")[1]) for image in images] == [png for png, _ in pictures]
-    assert [image["alt"] for image in images] == ["first", "second"]
-    assert all(str(image["src"]).startswith("data:image/") for image in images)
 
 
 def test_words_stay_words() -> None:

@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from tests.support.textured_room import VISIBLE, write_card
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, image_pairs
 from thermoxels_ns.capture.sfm.poses import add_points, find_poses
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel, SparseDepth
-from thermoxels_ns.core.errors import SceneError
 
 OPTIONS = PoseOptions(max_features=500)
 COUNT = 6
@@ -48,20 +46,6 @@ def test_masked_parts_have_no_features(card, tmp_path):
     some = {name: photographs[name] for name in ("shot0", "shot1", "shot2", "shot3")}
     model = find_poses(some, tmp_path, 430.0, masks, OPTIONS).model
     assert model.sighting_pixel[:, 0].min() > 195
-
-
-def test_photographs_that_show_nothing_in_common_are_an_error_that_says_what_to_do(tmp_path):
-    rng = np.random.default_rng(0)
-    paths = {}
-    for name in "abcd":
-        paths[name] = tmp_path / f"{name}.jpg"
-        Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)).save(paths[name])
-    work = tmp_path / "work"
-    work.mkdir()
-    with pytest.raises(SceneError, match="more overlap"):
-        find_poses(paths, work, options=OPTIONS)
-    with pytest.raises(SceneError, match="at least 3"):
-        find_poses({}, work, options=OPTIONS)
 
 
 def test_every_pair_is_compared_up_to_a_number_and_neighbours_beyond():
