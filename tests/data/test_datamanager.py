@@ -140,23 +140,6 @@ def test_masked_pixels_are_never_drawn(scene_folder):
     assert len(gridded) == 8 * 25
 
 
-def test_intrinsics_of_every_frame_and_rays_without_a_table(scene_folder):
-    scene = scene_folder(distortion=DISTORTION)
-    for number, frame in enumerate(scene.meta["frames"]):
-        frame["fl_x"] = 30.0 + number
-    scene.rewrite()
-    cameras = manager(scene.path).train_dataset.cameras
-    tabled, lean = CameraRays(cameras), CameraRays(cameras, table_limit_bytes=0)
-    assert tabled.has_table and not lean.has_table
-    pixels = torch.arange(len(tabled))
-    reference = all_rays(cameras)
-    for rays in (tabled, lean):
-        columns = rays.columns(pixels)
-        for name in ("origins", "directions", "pixel_area"):
-            torch.testing.assert_close(columns[name], reference[name], atol=1e-6, rtol=2e-3)
-        assert torch.equal(columns["camera_indices"], reference["camera_indices"])
-
-
 def test_optical_axis_of_a_fisheye_lens_is_finite():
     """A pixel centre exactly on the axis, where nerfstudio's rays are 0 / 0."""
     cameras = Cameras(torch.eye(4)[None, :3], 5.0, 5.0, 2.5, 1.5, 5, 3, camera_type=CameraType.FISHEYE)
@@ -166,8 +149,8 @@ def test_optical_axis_of_a_fisheye_lens_is_finite():
         assert all(torch.isfinite(columns[name]).all() for name in ("directions", "pixel_area"))
 
 
-def test_frames_of_different_resolutions(scene_folder):
-    scene = scene_folder(frames=5)
+def test_frames_of_different_resolutions_and_lenses_with_and_without_a_table_of_rays(scene_folder):
+    scene = scene_folder(frames=5, distortion=DISTORTION)
     name = scene.names[0]
     rng = np.random.default_rng(0)
     Image.fromarray(rng.integers(0, 256, (9, 12, 3), dtype=np.uint8)).save(scene.path / "images" / f"{name}.png")
@@ -175,10 +158,17 @@ def test_frames_of_different_resolutions(scene_folder):
     scene.meta["frames"][0].update(w=12, h=9, fl_x=13.0, fl_y=13.5, cx=6.0, cy=4.5)
     scene.rewrite()
     served = manager(scene.path)
+    cameras = served.train_dataset.cameras
     bundle, batch = served.next_train(0)
-    pixels = check_rays(bundle, all_rays(served.train_dataset.cameras))
+    pixels = check_rays(bundle, all_rays(cameras))
     colours = torch.cat([served.train_dataset[i]["image"].reshape(-1, 3) for i in range(4)])
     torch.testing.assert_close(batch["image"], colours[pixels])
+    tabled, lean = CameraRays(cameras), CameraRays(cameras, table_limit_bytes=0)
+    assert tabled.has_table and not lean.has_table
+    for rays in (tabled, lean):
+        columns = rays.columns(torch.arange(len(tabled)))
+        for key, expected in all_rays(cameras).items():
+            torch.testing.assert_close(columns[key], expected, atol=1e-6, rtol=2e-3)
 
 
 def test_training_rays_are_a_regular_subset(scene_folder):

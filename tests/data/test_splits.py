@@ -51,12 +51,6 @@ def test_every_nth_frame_is_held_out_from_the_middle_of_the_interval_on(interval
     assert sorted(split.train + split.val) == list(range(10))
 
 
-@pytest.mark.parametrize("given", [5, ["images/a.jpg", 5], "images/a.jpg"])
-def test_lists_that_are_none_are_refused(given) -> None:
-    with pytest.raises(SceneError, match="test_filenames: expected a list of file names, got"):
-        split_frames(NAMES, {"test_filenames": given}, "auto", 8)
-
-
 def test_names_go_before_lists_and_lists_before_numbers() -> None:
     names = ["frame_eval_1.jpg", "frame_train_1.jpg", "frame_train_2.jpg"]
     lists = {"train_filenames": names[:2], "val_filenames": names[2:]}

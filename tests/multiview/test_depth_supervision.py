@@ -85,15 +85,6 @@ def attributes_of(datamanager: Any, steps: int = SHORTEST_RUN_WITH_DEPTHS) -> An
     return SimpleNamespace(pipeline=SimpleNamespace(datamanager=datamanager), trainer=trainer)
 
 
-def test_without_photographs_in_training_nothing_is_asked(scene, untrained, monkeypatch):
-    pipeline = train(scene, 0, {"sh_degree": None, "thermal_density_gradient": True})
-    boxes = asked_boxes(monkeypatch)
-    follow_depths(pipeline.model, attributes_of(pipeline.datamanager))
-    data = SimpleNamespace(config=SimpleNamespace(streams="thermal"), train_dataset=untrained.datamanager.train_dataset)
-    follow_depths(untrained.model, attributes_of(data))
-    assert boxes == []
-
-
 @pytest.mark.parametrize(
     ("wanted", "steps", "tracks", "weight", "asked"),
     [
@@ -112,6 +103,10 @@ def test_when_photographs_are_asked(scene, monkeypatch, wanted, steps, tracks, w
     boxes.clear()
     follow_depths(pipeline.model, attributes_of(pipeline.datamanager, steps))
     assert len(boxes) == asked
+    boxes.clear()  # where no photographs train
+    data = SimpleNamespace(config=SimpleNamespace(streams="thermal"), train_dataset=pipeline.datamanager.train_dataset)
+    follow_depths(pipeline.model, attributes_of(data, steps))
+    assert boxes == []
 
 
 def test_a_training_follows_depths(scene, capsys):

@@ -28,15 +28,16 @@ def rjpeg(tmp_path: Path) -> Path:
 def library(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """Compile the stand-in; skips where there is no C compiler."""
     compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-    made: dict[tuple[str, ...], Path] = {}
+    made: dict[tuple[object, ...], Path] = {}
 
-    def make(*flags: str) -> Path:
+    def make(*flags: str, source: Path = STUB) -> Path:
         if compiler is None:
             pytest.skip("no C compiler for the stand-in of DJI's library")
-        if flags not in made:
-            made[flags] = tmp_path_factory.mktemp("dirp") / "libdirp.so"
-            subprocess.run([compiler, "-shared", "-fPIC", *flags, "-o", str(made[flags]), str(STUB)], check=True)
-        return made[flags]
+        key = (source, *flags)
+        if key not in made:
+            made[key] = tmp_path_factory.mktemp("dirp") / "libdirp.so"
+            subprocess.run([compiler, "-shared", "-fPIC", *flags, "-o", str(made[key]), str(source)], check=True)
+        return made[key]
 
     return make
 
@@ -48,21 +49,14 @@ def test_without_the_library_the_message_says_what_to_do(rjpeg):
         assert words in str(caught.value)
 
 
-def test_a_wrong_library_is_named(rjpeg, tmp_path):
+def test_a_wrong_library_or_one_of_someone_else_is_named(rjpeg, library, tmp_path):
     (tmp_path / "notes.so").write_text("no library")
     for path, said in ((tmp_path, "nothing there"), (tmp_path / "notes.so", "cannot be loaded")):
         with pytest.raises(ThermalFileError, match=f"dji_library: expected.*{path.name}.*{said}.*--dji-library"):
             read_thermogram(rjpeg, RadiometryOptions(dji_library=path))
-
-
-def test_a_library_of_someone_else_is_refused(rjpeg, library, tmp_path):
-    library()  # skips without a compiler
     (tmp_path / "other.c").write_text("int something(void) { return 0; }")
-    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-    other = tmp_path / "other.so"
-    subprocess.run([str(compiler), "-shared", "-fPIC", "-o", str(other), str(tmp_path / "other.c")], check=True)
     with pytest.raises(ThermalFileError, match=r"another library.*dirp_create_from_rjpeg"):
-        read_thermogram(rjpeg, RadiometryOptions(dji_library=other))
+        read_thermogram(rjpeg, RadiometryOptions(dji_library=library(source=tmp_path / "other.c")))
 
 
 def test_the_librarys_temperatures_and_the_files_settings(rjpeg, library):
@@ -91,12 +85,9 @@ def test_an_older_library_knows_no_air(rjpeg, library):
         read_thermogram(rjpeg, RadiometryOptions(air_c=10.0, dji_library=old))
 
 
-def test_what_the_library_refuses_is_said_in_words(rjpeg, library):
+def test_what_the_library_refuses_is_said_and_an_absurd_size_is_refused_before_it_is_allocated(rjpeg, library):
     with pytest.raises(ThermalFileError, match=r"DJI_0001_T\.JPG.*status -3.*1 to 25 m"):
         read_thermogram(rjpeg, RadiometryOptions(distance_m=60.0, dji_library=library()))
-
-
-def test_an_absurd_size_is_refused_before_it_is_allocated(rjpeg, library):
     with pytest.raises(ThermalFileError, match="30000 x 3"):
         read_thermogram(rjpeg, RadiometryOptions(dji_library=library("-DHUGE_SIZE")))
 

@@ -87,27 +87,23 @@ def test_below_absolute_zero_is_masked_whatever_the_range(tmp_path):
     assert np.isnan(read.temperature_c).tolist() == [[True, False]] and read.report.out_of_range == 1
 
 
-def test_counts_without_unit_say_what_to_give(tmp_path):
-    path = save(tmp_path / "a.png", np.ones((3, 3), np.uint16))
-    with pytest.raises(ThermalFileError, match=r"a\.png.*temperature_bounds\.json"):
-        read_thermal_file(path, CELSIUS)
-
-
-@pytest.mark.parametrize("shape", [(4,), (2, 3, 4), (0, 3)])
-def test_wrong_shapes_are_refused(tmp_path, shape):
-    np.save(tmp_path / "a.npy", np.ones(shape))
-    with pytest.raises(ThermalFileError, match="height, width"):
-        read_thermal_file(tmp_path / "a.npy", CELSIUS)
-
-
-def test_unknown_suffix_and_pages_are_refused(tmp_path):
+def test_counts_without_unit_wrong_shapes_unknown_suffixes_and_pages_are_refused(tmp_path):
+    save(tmp_path / "a.png", np.ones((3, 3), np.uint16))
     (tmp_path / "a.seq").write_bytes(b"x")
-    with pytest.raises(ThermalFileError, match=r"\.npy"):
-        read_thermal_file(tmp_path / "a.seq", CELSIUS)
     page = Image.fromarray(np.ones((3, 3), np.uint16))
     page.save(tmp_path / "two.tiff", save_all=True, append_images=[page])
-    with pytest.raises(ThermalFileError, match="2 pages"):
-        read_thermal_file(tmp_path / "two.tiff", COUNTS)
+    np.save(tmp_path / "row.npy", np.ones(4))
+    np.save(tmp_path / "none.npy", np.ones((0, 3)))
+    for name, unit, said in (
+        *(("a.png", CELSIUS, r"a\.png.*temperature_bounds\.json"), ("a.seq", CELSIUS, r"\.npy")),
+        *(
+            ("two.tiff", COUNTS, "2 pages"),
+            ("row.npy", CELSIUS, "height, width"),
+            ("none.npy", CELSIUS, "height, width"),
+        ),
+    ):
+        with pytest.raises(ThermalFileError, match=said):
+            read_thermal_file(tmp_path / name, unit)
 
 
 def test_dead_pixels_are_stuck_while_their_surroundings_change():

@@ -41,19 +41,15 @@ def offsets_k() -> np.ndarray:
     return offsets - offsets.mean()
 
 
-def test_without_noise_offsets_and_radial_term_are_exact(offsets_k: np.ndarray) -> None:
-    found = drift_of_samples(readings(offsets_k, (1.5, -0.4), noise_k=0.0))
-    assert np.allclose(found.offsets_k, offsets_k, atol=1e-9)
-    assert np.allclose(found.radial, (1.5, -0.4), atol=1e-8)
+@pytest.mark.parametrize(("noise_k", "wrong_share", "limit_k"), [(0.0, 0.0, 1e-8), (0.05, 0.1, 0.1)])
+def test_offsets_are_exact_without_noise_and_a_tenth_of_wrong_readings_does_not_pull_them(
+    offsets_k: np.ndarray, noise_k: float, wrong_share: float, limit_k: float
+) -> None:
+    found = drift_of_samples(readings(offsets_k, (1.5, -0.4), noise_k, wrong_share))
+    assert np.abs(found.offsets_k - offsets_k).max() < limit_k and abs(found.offsets_k.mean()) < 1e-12
+    assert np.allclose(found.radial, (1.5, -0.4), atol=limit_k)
     assert found.used
-    assert found.after_k < 1e-9 < 1.0 < found.before_k
-
-
-def test_a_tenth_of_wrong_readings_does_not_pull_the_offsets(offsets_k: np.ndarray) -> None:
-    found = drift_of_samples(readings(offsets_k, (1.5, -0.4), wrong_share=0.1))
-    assert found.used
-    assert np.abs(found.offsets_k - offsets_k).max() < 0.1
-    assert abs(found.offsets_k.mean()) < 1e-12
+    assert found.after_k < 1e-9 + 2.0 * noise_k < 1.0 < found.before_k
 
 
 def test_noise_alone_calls_for_no_correction() -> None:

@@ -1,4 +1,5 @@
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -135,16 +136,14 @@ def test_lengths_follow_the_scales(tmp_path, ours, shift):
     assert ("converted" in rig.explanation) == (ours is not None)
 
 
-@pytest.mark.parametrize("rig", [np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(3)])
-def test_mirrors_and_other_matrices_are_refused(tmp_path, rig):
-    with pytest.raises(SceneError, match="rig: expected"):
-        read_rig(rig_file(tmp_path, rig=rig.tolist()), (64, 48))
-
-
-@pytest.mark.parametrize("width", [float("inf"), float("nan"), 64.5, 1e400, -float("inf")])
-def test_sizes_are_whole_numbers_of_pixels(tmp_path, width):
-    file = rig_file(tmp_path, thermal_camera={**CAMERA, "w": width})
-    with pytest.raises(SceneError, match=r"transforms.json: thermal_camera"):
-        read_rig(file, (64, 48))
-    rig = read_rig(rig_file(tmp_path, thermal_camera={**CAMERA, "w": 64.0}), (64, 48))
-    assert rig.thermal_camera.width == 64
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        *(({"rig": rig.tolist()}, "rig: expected") for rig in (np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(3))),
+        *(({"thermal_camera": {**CAMERA, "w": w}}, "thermal_camera") for w in (math.inf, math.nan, 64.5, -math.inf)),
+    ],
+)
+def test_mirrors_other_matrices_and_sizes_that_are_no_whole_numbers_are_refused(tmp_path, changes, named):
+    with pytest.raises(SceneError, match=rf"transforms\.json: {named}"):
+        read_rig(rig_file(tmp_path, **changes), (64, 48))
+    assert read_rig(rig_file(tmp_path, thermal_camera={**CAMERA, "w": 64.0}), (64, 48)).thermal_camera.width == 64

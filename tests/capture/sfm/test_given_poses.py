@@ -38,13 +38,15 @@ def test_photographs_are_recognised_by_name(tmp_path, form):
     assert list(found.dropped) == ["other"]
 
 
-def test_poses_that_cannot_be_are_refused_with_their_frame(tmp_path):
+def test_poses_that_cannot_be_and_distortion_that_the_camera_cannot_hold_are_refused(tmp_path):
     path = transforms(tmp_path)
     content = json.loads(path.read_text())
     content["frames"][2]["transform_matrix"] = (MODEL.camera_to_world[2] @ np.diag([-1.0, 1.0, 1.0, 1.0])).tolist()
     path.write_text(json.dumps(content))
     with pytest.raises(SceneError, match="frame 2: transform_matrix"):
         read_given_poses(path, SOURCES)
+    with pytest.raises(SceneError, match="k3 0"):
+        read_given_poses(transforms(tmp_path, k3=0.1), SOURCES)
 
 
 def photographs(folder, sizes):
@@ -66,24 +68,16 @@ def test_poses_of_reduced_photographs_are_those_of_the_originals(tmp_path):
     assert fitted.sighting_error_px() == pytest.approx(2 * MODEL.sighting_error_px(), abs=1e-9)
 
 
-def test_poses_of_cropped_or_turned_photographs_are_refused(tmp_path):
+def test_cropped_or_turned_photographs_are_refused_and_single_ones_of_another_size_left_out(tmp_path):
     for size in ((CAMERA.height, CAMERA.width), (CAMERA.width, CAMERA.height - 8)):
         files = photographs(tmp_path, [size] * len(MODEL.frames))
         with pytest.raises(SceneError, match=rf"proportions of .*got {size[0]} x {size[1]}.*cropped"):
             fitted_to_photographs(Poses(MODEL, {}), files)
-
-
-def test_a_photograph_of_another_size_is_left_out_of_given_poses(tmp_path):
     sizes = [(CAMERA.width, CAMERA.height)] * (len(MODEL.frames) - 1) + [(64, 48)]
     fitted = fitted_to_photographs(Poses(MODEL, {"x": "no pose"}), photographs(tmp_path, sizes))
     assert fitted.model.frames == MODEL.frames[:-1]
     assert fitted.model.camera == CAMERA
     assert set(fitted.dropped) == {"x", MODEL.frames[-1]} and "64 x 48" in fitted.dropped[MODEL.frames[-1]]
-
-
-def test_distortion_that_the_camera_cannot_hold_is_refused(tmp_path):
-    with pytest.raises(SceneError, match="k3 0"):
-        read_given_poses(transforms(tmp_path, k3=0.1), SOURCES)
 
 
 def test_a_colmap_model_comes_in_with_its_points(tmp_path):
