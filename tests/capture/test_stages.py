@@ -12,13 +12,21 @@ from tests.support.camera_card import photograph
 from tests.support.posed_model import ring_model
 from tests.support.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
 from thermoxels_ns import cli
+from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.rig_types import PARAMETERS, RigEstimate, RigFrame
+from thermoxels_ns.capture.scene_writer import TRACKS_NAME, scene_names, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.scale_and_up import MetricScale
+from thermoxels_ns.capture.sfm.scale_and_up import MetricScale, Up
+from thermoxels_ns.capture.stage_cache import prepare_output
 from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.scene_file import read_scene_file
+from thermoxels_ns.data.scene_scale import scale_from_scene_file, up_from_scene_file
+from thermoxels_ns.data.tracks import read_tracks
+from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
 from thermoxels_ns.reports.capture_page import capture_page, thermal_in_photograph
 
 COUNT = 6
@@ -172,6 +180,102 @@ def test_a_point_of_the_thermal_image_lands_where_the_scene_has_it():
     row, column = np.unravel_index(np.nanargmax(carried), carried.shape)
     assert np.hypot(column + 0.5 - pixels[chosen][0], row + 0.5 - pixels[chosen][1]) < 6  # a thermal pixel is 7 wide
     assert np.isnan(carried).any()
+
+
+def test_every_eighth_frame_evaluates_and_the_ends_train():
+    assert [n for n, name in enumerate(scene_names(40)) if "eval" in name] == [4, 12, 20, 28, 36]
+    for count in range(2, 12):
+        sides = ["eval" in name for name in scene_names(count)]
+        assert sum(sides) == 1 or count > 8
+        assert not sides[-1] and len(sides) == count
+
+
+@pytest.fixture
+def written(capture, tmp_path):
+    """The scene with a pixel without temperature, vignetting, a scale and an up of its own; and its new folder."""
+    scene = capture[2].scene
+    temperature_c = np.load(scene.frames[0].thermal)
+    temperature_c[0, 0] = np.nan
+    np.save(tmp_path / "holed.npy", temperature_c)
+    scene = replace(
+        scene,
+        frames=[replace(scene.frames[0], thermal=tmp_path / "holed.npy"), *scene.frames[1:]],
+        drift=replace(scene.drift, radial=(0.5,)),
+        scale=MetricScale(0.5, 0.01, "GPS."),
+        up=Up(np.array([0.0, 0.6, 0.8]), "Measured.", 0.1),
+    )
+    folder = prepare_output(tmp_path / "scene")
+    write_scene_folder(scene, folder)
+    return scene, folder
+
+
+def test_numbers_come_back_as_they_went_in(written):
+    scene, folder = written
+    read = read_scene_file(folder)
+    by_source = {entry["source"]: entry for entry in read.meta["frames"]}
+    for number, frame in enumerate(scene.frames):
+        entry = by_source[frame.photograph_source]
+        assert np.array(entry["transform_matrix"]) == pytest.approx(scene.model.camera_to_world[number])
+        # A scene point: x_thermal = rig @ x_visible, both in OpenCV axes.
+        point = scene.model.points[:1]
+        in_visible = scene.model.in_camera(number, point)
+        thermal_pose = np.array(entry["thermal_transform_matrix"])
+        in_thermal = (point - thermal_pose[:3, 3]) @ thermal_pose[:3, :3] * (1, -1, -1)
+        rig = scene.rig.visible_to_thermal
+        assert in_thermal == pytest.approx(in_visible @ rig[:3, :3].T + rig[:3, 3])
+        written_c = read_thermal_file(folder / entry["thermal_file_path"], read.unit).temperature_c
+        expected = np.load(frame.thermal) - scene.drift.offsets_k[number] - scene.drift.radial_k(160, 128)
+        np.testing.assert_allclose(written_c, expected, atol=1e-4)
+        assert (folder / entry["file_path"]).read_bytes() == frame.photograph.read_bytes()
+    scale = scale_from_scene_file(read.meta)
+    assert scale is not None
+    assert (scale.metres_per_unit, scale.standard_error) == (0.5, 0.01)
+    assert up_from_scene_file(read.meta) == pytest.approx((0.0, 0.6, 0.8))
+    assert read.meta["fl_x"] == scene.model.camera.fl_x
+    assert read.meta["thermal_camera"]["cx"] == scene.rig.thermal_camera.cx
+
+
+def test_tracks_say_which_training_photograph_sees_which_point(written):
+    scene, folder = written
+    outputs = ThermalDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
+    tracks = read_tracks(folder / TRACKS_NAME)
+    assert np.array_equal(tracks.points, scene.model.points)
+    assert np.array_equal(tracks.sighting_point, scene.model.sighting_point)
+    seen = np.bincount(scene.model.sighting_frame, minlength=COUNT)
+    train = [number for number, name in enumerate(tracks.frames) if "train" in name]
+    assert 0.5 * seen[train].sum() < len(outputs.metadata["feature_rays"].origins) <= seen[train].sum()
+
+
+def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, tmp_path, monkeypatch):
+    scene, folder = written
+    overlay = np.ones((VISIBLE.height, VISIBLE.width), dtype=bool)
+    overlay[:40, :100] = False
+    masked = replace(scene, masks=PhotographMasks((VISIBLE.width, VISIBLE.height), overlay))
+    write_scene_folder(masked, folder)
+    assert (folder / "masks").is_dir()
+    (folder / "notes.txt").write_text("mine")
+    write_scene_folder(scene, folder)
+    assert not (folder / "masks").exists()
+    assert (folder / "notes.txt").read_text() == "mine"
+    before = (folder / "transforms.json").read_bytes()
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("thermoxels_ns.capture.scene_writer.write_points", stop)
+    with pytest.raises(KeyboardInterrupt):
+        write_scene_folder(masked, folder)
+    assert (folder / "transforms.json").read_bytes() == before
+    assert len(read_scene_file(folder).frames) == COUNT
+
+
+def test_the_json_has_no_nan(written):
+    scene, folder = written
+    unknown = RigEstimate(scene.rig.thermal_camera, np.eye(4), False, "Kept.")
+    write_scene_folder(replace(scene, rig=unknown, scale=None), folder)
+    content = json.loads((folder / "transforms.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert content["rig_info"]["determined"] is False
+    assert "metres_per_unit" not in content
 
 
 def test_a_second_run_takes_everything_from_the_first(capture):

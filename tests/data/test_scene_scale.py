@@ -1,6 +1,5 @@
 import math
 
-import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
@@ -11,17 +10,6 @@ from thermoxels_ns.data.scene_scale import (
     scale_from_scene_file,
     up_from_scene_file,
 )
-
-
-def test_standard_errors_are_those_of_repeated_measurements():
-    random = np.random.default_rng(7)
-    a, b, distance, tape = np.array([1.0, -2.0, 0.5]), np.array([3.0, 1.0, 4.0]), 8.0, 0.08
-    stated = scale_from_known_distance(tuple(a.tolist()), tuple(b.tolist()), distance, tape)
-    scales = (distance + tape * random.normal(size=200_000)) / np.linalg.norm(b - a)
-    assert stated.standard_error == pytest.approx(scales.std(), rel=0.01)
-    volume, area = 4.0 * stated.metres_per_unit**3, 7.0 * stated.metres_per_unit**2
-    assert stated.volume_standard_error(volume) == pytest.approx((4.0 * scales**3).std(), rel=0.02)
-    assert stated.area_standard_error(area) == pytest.approx((7.0 * scales**2).std(), rel=0.02)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, True, "2"])
@@ -41,17 +29,6 @@ def test_points_and_standard_errors_that_are_none(point, error):
         scale_from_known_distance((0, 0, 0), (1, 0, 0), 1.0, error)
 
 
-def test_scene_file():
-    meta = {"metres_per_unit": 0.25, "metres_per_unit_standard_error": 0.01, "up": [0, -3, 4]}
-    scale = scale_from_scene_file(meta)
-    assert scale is not None
-    assert (scale.metres_per_unit, scale.standard_error) == (0.25, 0.01)
-    assert "transforms.json" in scale.source and up_from_scene_file(meta) == (0.0, -0.6, 0.8)
-    assert scale_from_scene_file({}) is None
-    assert scale_from_scene_file({"up": [0, 1, 0]}) is None and up_from_scene_file({"up": [0, 1, 0]}) == (0, 1, 0)
-    assert up_from_scene_file({}) is None
-
-
 @pytest.mark.parametrize(
     ("meta", "named"),
     [
@@ -67,7 +44,12 @@ def test_bad_scene_file(meta, named):
 
 
 def test_the_user_goes_before_the_scene_file_and_it_says_so():
-    meta = {"metres_per_unit": 0.25}
+    assert scale_from_scene_file({}) is None and up_from_scene_file({}) is None
+    meta = {"metres_per_unit": 0.25, "metres_per_unit_standard_error": 0.01, "up": [0, -3, 4]}
+    chosen = choose_scale(scene_file=meta)
+    assert chosen is not None
+    assert (chosen.metres_per_unit, chosen.standard_error) == (0.25, 0.01)
+    assert "transforms.json" in chosen.source and up_from_scene_file(meta) == (0.0, -0.6, 0.8)
     chosen = choose_scale(option=3.0, scene_file=meta)
     assert chosen is not None
     assert chosen.metres_per_unit == 3.0

@@ -122,16 +122,6 @@ def test_matches_far_from_their_lines_are_none():
     assert by_hand(one, other).points == 11
 
 
-def test_a_track_with_two_features_of_one_photograph_is_none():
-    looks = np.eye(16)
-    between = 0.94 * looks[0] + 0.34 * looks[12]
-    one = {(10.0 * n + 5.0, 5.0 * n + 5.0): looks[n] for n in range(12)}
-    third = {(x - 8.0, y): look for (x, y), look in one.items()} | {(5.0 - 8.0, 5.0): between}
-    assert by_hand(one, {(x - 4.0, y): look for (x, y), look in one.items()}).points == 12
-    doubled = by_hand(one | {(9.0, 5.0): between}, {(x - 4.0, y): look for (x, y), look in one.items()}, third)
-    assert doubled.points == 11
-
-
 def test_features_lie_where_rays_say_that_they_do():
     rows, columns = np.mgrid[:80, :100] + 0.5
     spot = 255.0 * np.exp(-((columns - 40.2) ** 2 + (rows - 31.7) ** 2) / (2.0 * 4.0**2))

@@ -89,13 +89,6 @@ def test_in_surroundings_of_its_own_temperature_nothing_matters(sensor, emissivi
 
 
 @settings(max_examples=60, deadline=None)
-@given(conditions, celsius)
-def test_there_and_back_again(given_conditions, temperature_c):
-    model = RadiometricModel(given_conditions, E60)
-    assert model.temperature_c(model.signal(temperature_c)) == pytest.approx(temperature_c, abs=1e-6)
-
-
-@settings(max_examples=60, deadline=None)
 @given(conditions, conditions, celsius)
 def test_changing_the_settings_and_changing_them_back_changes_nothing(before, after, temperature_c):
     changed = corrected_temperature_c(temperature_c, before, after)

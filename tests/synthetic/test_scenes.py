@@ -6,13 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import tyro
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.camera_rings import look_at
-from thermoxels_ns.synthetic.catalogue import DEVELOPMENT_NAMES, SCENE_NAMES, make_scene
+from thermoxels_ns.synthetic.catalogue import DEVELOPMENT_NAMES, SCENE_NAMES, SceneWord, make_scene
+from thermoxels_ns.synthetic.random_plan import SMALLEST, Plan
+from thermoxels_ns.synthetic.random_scene import FAMILIES
 from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
-from thermoxels_ns.synthetic.solids import BoxSolid
+from thermoxels_ns.synthetic.solids import BoxSolid, SolidUnion, distance_to_box
 
 RANDOM = tuple(f"random-{seed}" for seed in range(15))
 AROUND = (*DEVELOPMENT_NAMES, "house-corner+street", "hot-object+room")
@@ -78,29 +81,6 @@ def test_a_name_means_the_same_scene_on_every_machine(name: str) -> None:
     height = scene.poses(42, 6)[0][0][2, 3]
     temperature = scene.surface_temperature_c(scene.solid.surface_points(10)[0])[0]
     assert (scene.solid.volume, scene.solid.area, height, temperature) == pytest.approx(PINNED[name], rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("name", "points", "degrees"),
-    [
-        ("hot-object", [[-0.36, 0, 0.05], [0.24, -0.04, 0.24], [0.48, 0.38, 0.0]], [66.75, 47.2, 19.06]),
-        (
-            "house-corner",
-            [[-1.8, -2.15, 1.4], [-2.8, -2.5, 1.0], [-2.8, -2.5, 2.625], [0, -3.8, 2.6]],
-            [14, 4.82, 8.02, 1.8],
-        ),
-        ("sphere", [[0, 0, -0.5], [0.3, 0.4, 0]], [20.0, 30.0]),
-        (
-            "courtyard",
-            [[4.25, 0.5, 1.4], [-0.6, 2.3, 1.0], [3.0, -4.4, 1.0], [3.0, -4.24, 1.0]],
-            [39.5, 22.0, 15.0, 5.0],
-        ),
-        ("courtyard", [[-3.9, 0.0, 1.7], [3.9, -0.8, 1.7], [0.0, -1.0, 3.7]], [5.66, 10.34, -1.45]),
-        ("pipes", [[-0.55, -0.41, 0], [0.05, -0.675, 0.3], [0.5, -0.24, 0], [-0.55, 0, 0]], [62, 44, 30, 26]),
-    ],
-)
-def test_temperatures_tell_the_parts_apart(name: str, points: list, degrees: list) -> None:
-    np.testing.assert_allclose(make_scene(name).surface_temperature_c(points), degrees, atol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -196,16 +176,6 @@ def test_a_camera_inside_the_solid_is_an_error() -> None:
         visible_surface_points(scene, [pose], scene.camera(8, 6), *scene.solid.surface_points(10))
 
 
-def test_visibility_counts_views() -> None:
-    scene, camera = make_scene("sphere"), make_scene("sphere").camera(64, 48)
-    poses = [look_at(p, (0, 0, 0)) for p in ((2, 0, 0.1), (0, 2, 0.1), (2, 0.1, 0))]
-    points = np.array([[0.5, 0, 0], [0, 0.5, 0], [-0.5, 0, 0], [0.3, 0.4, 0.0]])
-    counts = sum(
-        visible_surface_points(scene, poses, camera, points, points / 0.5, min_views=n).astype(int) for n in (1, 2, 3)
-    )
-    np.testing.assert_array_equal(counts, [2, 1, 0, 3])
-
-
 def test_names_say_what_stands_behind() -> None:
     scene = make_scene("house-corner+sky=0.55,0.57,0.60+street")
     assert scene.name == "house-corner+sky=0.55,0.57,0.60+street" and scene.around is not None
@@ -260,3 +230,43 @@ def test_a_pane_mirrors_what_lies_along_the_reflected_ray() -> None:
     mirrored = render_view(scene, look_at(pane[0] + 1e-9 * back, pane[0] + back), one, 1).rgb[0, 0]
     paint = scene.colour(pane, [[0.0, -1.0, 0.0]])[0]
     np.testing.assert_allclose(seen, 0.4 * paint + 0.6 * mirrored, atol=1e-4)
+
+
+# Things that rest on something are this close to it, found by the nearest of random points [voxels of the plan].
+CONTACT = 0.06
+
+
+def test_the_command_line_takes_names_and_seeds_and_refuses_others(capsys: pytest.CaptureFixture[str]) -> None:
+    assert tyro.cli(SceneWord, args=["random-3"]) == "random-3"  # type: ignore[call-overload]
+    assert tyro.cli(SceneWord, args=["sphere"]) == "sphere"  # type: ignore[call-overload]
+    with pytest.raises(SystemExit) as stop:
+        tyro.cli(SceneWord, args=["random-03"])  # type: ignore[call-overload]
+    assert stop.value.code == 2
+    assert "random-N" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_nothing_is_thinner_or_closer_than_three_voxels_of_128(seed: int) -> None:
+    scene = make_scene(f"random-{seed}")
+    boxes = scene.solid.parts[0] if isinstance(scene.solid, SolidUnion) else scene.solid
+    voxel = scene.size / 127
+    points, normals = boxes.surface_points(2500, seed=2)
+    for voxels in np.linspace(0.02, 2.99, 12):
+        assert boxes.contains(points - voxels * voxel * normals).all()
+        assert not boxes.contains(points + voxels * voxel * normals).any()
+
+
+@pytest.mark.parametrize(("number", "seed"), list(itertools.product((1, 2), range(4))))
+def test_round_things_keep_their_distance_or_rest_on_something(number: int, seed: int) -> None:
+    plan = Plan(np.random.default_rng([99, seed]))
+    FAMILIES[number].lay_out(plan)
+    boxes = [piece.shape for piece in plan.pieces if isinstance(piece.shape, tuple)]
+    things = [piece.shape for piece in plan.pieces if not isinstance(piece.shape, tuple)]
+    assert len(things) >= 3
+    assert all(2.0 * thing.radius > SMALLEST for thing in things)
+    for thing in things:
+        points = thing.surface_points(20_000, seed=1)[0]
+        gaps = np.array([distance_to_box(points, *box).min() for box in boxes])
+        resting = gaps < CONTACT
+        assert resting.any() and (gaps[~resting] > SMALLEST - CONTACT).all()
+        assert all(other.signed_distance(points).min() > SMALLEST for other in things if other is not thing)
