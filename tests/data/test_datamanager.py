@@ -90,6 +90,7 @@ def test_streams_alone(scene_folder, own_camera):
     count = 32 if own_camera else 64
     assert (bundle.metadata["stream"] == THERMAL_STREAM).all() and len(bundle) == count
     assert served.get_train_rays_per_batch() == count and not batch["image"].any() and batch["thermal"].any()
+    assert set(served.training_views().size[:, 0]) == {12 if own_camera else 24}
 
 
 def test_batches_depend_on_seed_and_step_alone(scene_folder):
@@ -251,12 +252,6 @@ def test_every_pixel_looks_along_its_training_ray(scene_folder, own_camera):
     np.testing.assert_allclose(centres, rays["origins"], atol=1e-6)
     assert views.size.tolist() == [[24, 18]] * 8 + [[12, 10]] * (8 if own_camera else 0)
     assert views.camera_to_world.dtype == views.focal.dtype == views.centre.dtype == np.float64
-
-
-def test_streams_that_do_not_train_have_no_views(scene_folder):
-    scene = scene_folder(own_camera=True, thermal_size=(12, 10))
-    for streams, widths in (("rgb", {24}), ("thermal", {12}), ("both", {24, 12})):
-        assert set(manager(scene.path, "test", streams=streams).training_views().size[:, 0]) == widths
 
 
 def test_a_fisheye_lens_spans_its_angles():
