@@ -136,18 +136,6 @@ def test_too_few_tracks_say_nothing():
     assert adjust_poses(none, poses(), np.full(VIEWS, FOCAL)) is None
 
 
-def test_fixed_photographs_stay_where_they_are():
-    given = poses()
-    given[-2:] = off_by(0.3)[-2:]
-    theirs = tracks()
-    chosen = np.zeros(theirs.points, dtype=bool)
-    chosen[theirs.point[theirs.photograph >= VIEWS - 2]] = True
-    found = adjust_poses(theirs.of_points(chosen), given, np.full(VIEWS, FOCAL), fixed=VIEWS - 2)
-    assert found is not None
-    np.testing.assert_allclose(found.poses[:-2], given[:-2], atol=1e-12)
-    assert np.abs(found.poses[-2:] - poses()[-2:]).max() < 0.3 * np.abs(given[-2:] - poses()[-2:]).max()
-
-
 def test_photographs_of_other_brightness_have_the_same_tracks():
     scene = make_scene("house-corner")
     camera, views = scene.camera(160, 120), scene.poses(8, 0)[0]

@@ -70,11 +70,7 @@ def test_overrides_replace_the_cameras_settings(tmp_path):
     as_stored, other = read_thermogram(path), read_thermogram(path, RadiometryOptions(emissivity=0.7))
     assert other.metadata.conditions.emissivity == 0.7
     assert other.metadata.conditions.air_c == as_stored.metadata.conditions.air_c
-    # Away from 20 degrees C, what is mirrored: warm pixels become warmer, cold ones colder.
-    change = other.temperature_c - as_stored.temperature_c
-    warm, cold = as_stored.temperature_c > 21.0, as_stored.temperature_c < 19.0
-    assert warm.any() and cold.any()
-    assert (change[warm] > 0).all() and (change[cold] < 0).all()
+    assert np.abs(other.temperature_c - as_stored.temperature_c).max() > 0.1
 
 
 def test_what_the_file_says_of_the_camera(tmp_path):

@@ -12,7 +12,6 @@ from tests.support.posed_model import CAMERA, ring_model
 from thermoxels_ns.capture.photograph import GpsFix
 from thermoxels_ns.capture.sfm.scale_and_up import (
     find_up,
-    level_rotation,
     local_metres,
     scale_from_distance,
     scale_from_gps,
@@ -198,18 +197,6 @@ def test_the_upper_edge_is_where_the_picture_has_it_after_turning(orientation):
     picture.save(stream, "PNG", exif=picture.getexif())
     upright = np.asarray(ImageOps.exif_transpose(Image.open(stream)))
     assert (upright[0] == 255).all() and (upright[1:] == 0).all()
-
-
-def test_levelling_turns_up_to_z_and_ahead_to_y():
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        up, ahead = rng.normal(size=(2, 3))
-        rotation = level_rotation(up, ahead)
-        assert rotation @ rotation.T == pytest.approx(np.eye(3))
-        assert np.linalg.det(rotation) == pytest.approx(1)
-        assert rotation @ up / np.linalg.norm(up) == pytest.approx([0, 0, 1])
-        assert (rotation @ ahead)[0] == pytest.approx(0)
-        assert (rotation @ ahead)[1] > 0
 
 
 def test_cameras_that_look_straight_down_do_not_say_that_up_is_where_they_look_from() -> None:
