@@ -41,23 +41,14 @@ def test_solid_lies_in_the_scene_box_with_room_for_two_voxels(name: str) -> None
 
 
 @pytest.mark.parametrize("name", (*SCENE_NAMES, *RANDOM[:10]))
-def test_temperatures_fill_their_bounds_and_are_continuous(name: str) -> None:
+def test_temperatures_fill_their_bounds(name: str) -> None:
     scene = make_scene(name)
     lowest, highest = scene.temperature_bounds_c
-    points, normals = scene.solid.surface_points(20_000, seed=5)
+    points, _ = scene.solid.surface_points(20_000, seed=5)
     surface = scene.surface_temperature_c(points)
     both = np.concatenate([surface, scene.background_temperature_c(unit_directions())])
     assert lowest <= both.min() and both.max() <= highest and np.ptp(both) > 0.9 * (highest - lowest)
-    if name not in RANDOM:  # parts of the others stand side by side
-        return
-    assert 15.0 <= highest - lowest <= 60.0
-    beside = scene.surface_temperature_c(points + 0.01 * scene.size / 127 * along_surface(normals))
-    assert np.abs(beside - surface).max() < 0.02 * (highest - lowest)
-
-
-def along_surface(normals: np.ndarray) -> np.ndarray:
-    along = np.cross(normals, [0.31, 0.55, 0.77])
-    return along / np.linalg.norm(along, axis=1, keepdims=True)
+    assert name not in RANDOM or 15.0 <= highest - lowest <= 60.0
 
 
 # Volume [m3], area [m2], height of the first camera [m], temperature at the first of the surface points [C].

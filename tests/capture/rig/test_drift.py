@@ -52,15 +52,6 @@ def test_offsets_are_exact_without_noise_and_a_tenth_of_wrong_readings_does_not_
     assert found.after_k < 1e-9 + 2.0 * noise_k < 1.0 < found.before_k
 
 
-def test_noise_alone_calls_for_no_correction() -> None:
-    found = drift_of_samples(readings(np.zeros(FRAMES)))
-    assert not found.used
-    assert not found.offsets_k.any()
-    assert found.radial == ()
-    assert found.before_k == found.after_k == pytest.approx(0.05 * np.sqrt(2.0) * 0.6745, rel=0.15)
-    assert "No correction" in found.explanation
-
-
 def test_groups_that_share_no_points_get_mean_zero_each(offsets_k: np.ndarray) -> None:
     found = drift_of_samples(readings(offsets_k, groups=2))
     half = FRAMES // 2
@@ -103,6 +94,7 @@ def test_what_helps_only_the_points_it_was_fitted_to_or_lies_far_below_the_noise
     alone = drift_of_samples(readings(np.zeros(80), points=150, seed=seed))
     offsets_k = 0.01 * np.random.default_rng(seed).standard_normal(12)
     small = drift_of_samples(readings(offsets_k, points=4000, seed=seed))
-    assert not alone.used and not alone.offsets_k.any()
+    assert not alone.used and not alone.offsets_k.any() and alone.radial == ()
+    assert alone.before_k == alone.after_k == pytest.approx(0.05 * np.sqrt(2.0) * 0.6745, rel=0.15)
     assert not small.used and "at points it was not fitted to" in small.explanation
     assert drift_of_samples(readings(5.0 * offsets_k, points=4000, seed=seed)).used
