@@ -150,14 +150,10 @@ def test_what_was_not_measured_never_counts(walls) -> None:
     assert found.whole.u_w_m2k.value == pytest.approx(walls["plain"].u_w_m2k["facade"], rel=1e-6)
     assert found.not_counted_m2["that no thermal ray measured, or not on all of a triangle"] > 0.3
     # A hot edge that leaks into the triangles around it is a rim.
-    leaked = replace(holed, temperature_c=np.where(_ring(holed, hole), 4.0, holed.temperature_c))
-    assert audit(leaked, STATED, UP).defects == ()
-
-
-def _ring(mesh, hole) -> np.ndarray:
     around = np.zeros(len(hole), dtype=bool)
     around[mesh.facets[hole[mesh.facets].any(axis=1)]] = True
-    return around & ~hole
+    leaked = replace(holed, temperature_c=np.where(around & ~hole, 4.0, holed.temperature_c))
+    assert audit(leaked, STATED, UP).defects == ()
 
 
 def test_what_the_conditions_leave_out_is_not_counted(walls) -> None:

@@ -123,10 +123,7 @@ def test_place_lens_and_orientation(tmp_path, altitude_m):
     assert facts.gps.altitude_m == pytest.approx(altitude_m)
     assert facts.focal_px == pytest.approx(40.0)  # 4 mm at 10 pixels per mm
     assert facts.orientation == 6
-
-
-def test_a_photograph_without_tags_says_nothing(tmp_path):
-    facts = read_photograph_facts(photograph(tmp_path / "a.jpg"))
+    facts = read_photograph_facts(photograph(tmp_path / "b.jpg"))  # without tags
     assert (facts.taken_at, facts.gps, facts.focal_px, facts.gimbal_deg, facts.orientation) == (None,) * 4 + (1,)
     assert (facts.width, facts.height) == (32, 24)
 

@@ -98,13 +98,8 @@ def stages_that_ran(card, scene, **more):
     return [line.split()[1] for line in said if line[:2].strip("0123456789") == "/" and "as before" not in line]
 
 
-@pytest.fixture
-def card(tmp_path):
-    return write_pairs(tmp_path / "card", "abcd")
-
-
-def test_every_change_of_the_input_is_noticed(card, tmp_path):
-    scene = tmp_path / "scene"
+def test_every_change_of_the_input_is_noticed(tmp_path):
+    card, scene = write_pairs(tmp_path / "card", "abcd"), tmp_path / "scene"
     everything = ["pairs", "temperatures", "poses"]
     assert stages_that_ran(card, scene) == everything
     assert stages_that_ran(card, scene) == ["poses"]
@@ -120,12 +115,8 @@ def test_every_change_of_the_input_is_noticed(card, tmp_path):
     assert stages_that_ran(card, scene, emissivity=0.9, reflected_c=20.0, seed=1) == ["poses"]
 
 
-@pytest.fixture
-def output(tmp_path):
-    return prepare_output(tmp_path / "scene")
-
-
-def test_a_second_capture_is_refused_and_changes_nothing(tmp_path, output):
+def test_a_second_capture_is_refused_and_changes_nothing(tmp_path):
+    output = prepare_output(tmp_path / "scene")
     (tmp_path / "card").mkdir()
     half = output / ".capture.4711.part.html"
     half.write_text("being written by the first one")

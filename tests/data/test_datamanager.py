@@ -110,14 +110,6 @@ def test_batches_depend_on_seed_and_step_alone(scene_folder):
     assert not torch.equal(manager(scene.path, seed=0).next_train(1)[1]["image"], other)
 
 
-def test_exporters_get_new_rays_for_the_same_step(scene_folder):
-    """nerfstudio's point cloud exporter asks for step 0 until it has enough points, and sets the number of rays."""
-    served = manager(scene_folder().path, mode="test")
-    served.train_pixel_sampler.num_rays_per_batch = 33
-    first, second = served.next_train(0), served.next_train(0)
-    assert len(first[0]) == 33 and not torch.equal(first[1]["image"], second[1]["image"])
-
-
 def test_evaluation_frames_never_train(scene_folder):
     """Every frame's pixels have a colour of their own; a training batch shows the training frames' only."""
     scene = scene_folder()

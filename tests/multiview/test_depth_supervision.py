@@ -9,6 +9,7 @@ from tests.support.boxed_scene import write_boxed_scene
 from tests.support.plane_photographs import EYES, SIZE, photographs
 from tests.support.short_training import train
 from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.core.lattice import input_from_world
 from thermoxels_ns.multiview.evidence import evidence_of_photographs
 from thermoxels_ns.multiview.stereo import (
     ERROR_PLANES,
@@ -18,6 +19,7 @@ from thermoxels_ns.multiview.stereo import (
 from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.callbacks import SHORTEST_RUN_WITH_DEPTHS, follow_depths
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler, feature_ray_loss
+from thermoxels_ns.training.model import ThermoxelsModel
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +32,6 @@ def scene(tmp_path_factory):
 @pytest.fixture(scope="module")
 def untrained(scene):
     return train(scene, 0, {})
-
-
-def rays_of(pipeline, say=print) -> FeatureRays | None:
-    lattice = pipeline.model.grid.lattice
-    found = evidence_of_photographs(pipeline.datamanager.train_dataset, 0.0, lattice.lo, lattice.hi, say)
-    return None if found is None else found.feature_rays
 
 
 def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
@@ -56,27 +52,14 @@ def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
 
 
 def test_most_lines_of_a_scene_end_at_its_surface(untrained):
-    lines = rays_of(untrained)
-    assert lines is not None and len(lines.points) > 200
-    from thermoxels_ns.core.lattice import input_from_world
-
+    lattice = untrained.model.grid.lattice
+    found = evidence_of_photographs(untrained.datamanager.train_dataset, 0.0, lattice.lo, lattice.hi, print)
+    assert found is not None and len(found.feature_rays.points) > 200
     outputs: Any = untrained.datamanager.train_dataparser_outputs
     to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
-    points = lines.points @ to_input[:3, :3].T + to_input[:3, 3]
+    points = found.feature_rays.points @ to_input[:3, :3].T + to_input[:3, 3]
     off = np.abs(make_scene("pipes").solid.signed_distance(points))
     assert np.median(off) < 0.02 and np.quantile(off, 0.9) < 0.06, np.quantile(off, [0.5, 0.9])
-
-
-def asked_boxes(monkeypatch, found=None) -> list:
-    """The boxes in which a training looks for depths, which are then `found`."""
-    boxes: list[Any] = []
-
-    def recorded(dataset, near, lo, hi, say, gains, offsets):
-        boxes.append((lo, hi))
-        return found
-
-    monkeypatch.setattr("thermoxels_ns.training.callbacks.evidence_of_photographs", recorded)
-    return boxes
 
 
 def attributes_of(datamanager: Any, steps: int = SHORTEST_RUN_WITH_DEPTHS) -> Any:
@@ -97,7 +80,9 @@ def attributes_of(datamanager: Any, steps: int = SHORTEST_RUN_WITH_DEPTHS) -> An
     ],
 )
 def test_when_photographs_are_asked(scene, monkeypatch, wanted, steps, tracks, weight, asked):
-    boxes = asked_boxes(monkeypatch)
+    boxes: list[Any] = []
+    asks = "thermoxels_ns.training.callbacks.evidence_of_photographs"
+    monkeypatch.setattr(asks, lambda dataset, near, lo, hi, *more: boxes.append((lo, hi)))
     pipeline = train(scene, 0, {"photo_depth": wanted, "loss_overrides": {"tracks": weight}})
     pipeline.model.feature_ray_sampler = object() if tracks else None  # type: ignore[assignment]
     boxes.clear()
@@ -124,8 +109,6 @@ def test_a_training_follows_depths(scene, capsys):
 
 @pytest.mark.parametrize(("depths", "light"), [("on", COARSE_LIGHT), ("off", 0.0)])
 def test_light_may_pass_depths_but_not_tracks_while_the_lattice_is_coarse(scene, monkeypatch, depths, light):
-    from thermoxels_ns.training.model import ThermoxelsModel
-
     populate, asked = ThermoxelsModel.populate_modules, []
 
     def with_tracks(model):

@@ -133,25 +133,17 @@ def test_quiet_background_is_not_dead():
 
 @pytest.mark.parametrize("big_endian", [False, True])
 def test_a_tiff_of_64_bit_numbers_is_celsius(tmp_path, big_endian):
-    values = np.array([[1.25, -3.5, 20.0], [np.nan, 7.0, 8.0]])
-    path = tmp_path / "a.tiff"
-    if big_endian:
-        write_big_endian_tiff(path, values)
-    else:
-        assert cv2.imwrite(str(path), values)
+    values, path = np.array([[1.25, -3.5, 20.0], [np.nan, 7.0, 8.0]]), tmp_path / "a.tiff"
+    assert cv2.imwrite(str(path), values)
+    if big_endian:  # one strip without compression
+        tags = {256: 3, 257: 2, 258: 64, 259: 1, 262: 1, 273: 0, 277: 1, 278: 2, 279: values.nbytes, 339: 3}
+        tags[273] = 8 + 2 + 12 * len(tags) + 4
+        entries = b"".join(struct.pack(">HHII", tag, 4, 1, value) for tag, value in tags.items())
+        head = b"MM\0*" + struct.pack(">IH", 8, len(tags))
+        path.write_bytes(head + entries + bytes(4) + values.astype(">f8").tobytes())
     for got in (read_thermal_file(path, BOUNDS).temperature_c, read_thermogram(path).temperature_c):
         np.testing.assert_array_equal(got, values.astype(np.float32))
     assert identify(path, tmp_path).role == "thermal"
-
-
-def write_big_endian_tiff(path: Path, values: np.ndarray) -> None:
-    """One strip without compression."""
-    height, width = values.shape
-    tags = {256: width, 257: height, 258: 64, 259: 1, 262: 1, 273: 0, 277: 1, 278: height, 279: values.nbytes, 339: 3}
-    tags[273] = 8 + 2 + 12 * len(tags) + 4
-    entries = b"".join(struct.pack(">HHII", tag, 4, 1, value) for tag, value in tags.items())
-    head = b"MM\0*" + struct.pack(">IH", 8, len(tags))
-    path.write_bytes(head + entries + bytes(4) + values.astype(">f8").tobytes())
 
 
 @pytest.mark.parametrize(

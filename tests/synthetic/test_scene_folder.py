@@ -73,11 +73,8 @@ def test_files_hold_the_pictures_that_the_scene_shows(tmp_path, thermal_format, 
         assert set(thermal) == {"camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"}
         assert (thermal["w"], thermal["h"]) == (20, 16) and thermal["cx"] != 10.0 and "thermal_unit" not in content
         camera = replace(scene.camera(20, 16), **{k: thermal[k] for k in ("fl_x", "fl_y", "cx", "cy")})
-        poses, own_poses = (
-            np.array([frame[key] for frame in content["frames"]])
-            for key in ("transform_matrix", "thermal_transform_matrix")
-        )
-        offsets = np.linalg.inv(poses) @ own_poses
+        offsets = np.linalg.inv([frame["transform_matrix"] for frame in content["frames"]])
+        offsets = offsets @ np.array([frame["thermal_transform_matrix"] for frame in content["frames"]])
         np.testing.assert_allclose(offsets, np.broadcast_to(offsets[0], (5, 4, 4)), atol=1e-12)
         np.testing.assert_allclose(offsets[0][:3, :3] @ offsets[0][:3, :3].T, np.eye(3), atol=1e-12)
         assert 0.005 < np.linalg.norm(offsets[0][:3, 3]) < 0.1
