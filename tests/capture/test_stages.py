@@ -217,7 +217,6 @@ def test_numbers_come_back_as_they_went_in(written):
         np.testing.assert_allclose(written_c, expected, atol=1e-4)
         assert (folder / entry["file_path"]).read_bytes() == frame.photograph.read_bytes()
     scale = scale_from_scene_file(read.meta)
-    assert scale is not None
     assert (scale.metres_per_unit, scale.standard_error) == (0.5, 0.01)
     assert up_from_scene_file(read.meta) == pytest.approx((0.0, 0.6, 0.8))
     assert read.meta["fl_x"] == scene.model.camera.fl_x
@@ -293,7 +292,6 @@ def test_another_scale_runs_only_what_depends_on_it_and_so_does_from_stage(captu
         "2/9 temperatures",
         "3/9 poses",
     ]
-    assert result.scene.scale is not None
     assert content(scene)["metres_per_unit"] == result.scene.scale.metres_per_unit
     assert not result.scene.drift.used
     said.clear()
@@ -313,7 +311,6 @@ def test_a_board_gives_the_rig_and_a_scale_is_needed_for_it(capture, tmp_path):
     more["known_distance"] = ("shot2-visible.jpg", 100.0, 100.0, 380.0, 120.0, 2.0)
     result = capture_folder(card, scene, settings(**more), [].append)
     assert "checker board" in result.scene.rig.explanation
-    assert result.scene.scale is not None
     shift_m = result.scene.rig.visible_to_thermal[:3, 3] * result.scene.scale.metres_per_unit
     assert np.allclose(shift_m, RIG[:3, 3], atol=0.02)
     assert result.scene.rig.thermal_camera.fl_x == pytest.approx(THERMAL.fl_x, rel=0.02)

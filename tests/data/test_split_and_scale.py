@@ -107,15 +107,12 @@ def test_the_user_goes_before_the_scene_file_and_it_says_so():
     assert scale_from_scene_file({}) is None and up_from_scene_file({}) is None
     meta = {"metres_per_unit": 0.25, "metres_per_unit_standard_error": 0.01, "up": [0, -3, 4]}
     chosen = choose_scale(scene_file=meta)
-    assert chosen is not None
     assert (chosen.metres_per_unit, chosen.standard_error) == (0.25, 0.01)
     assert "transforms.json" in chosen.source and up_from_scene_file(meta) == (0.0, -0.6, 0.8)
     chosen = choose_scale(option=3.0, scene_file=meta)
-    assert chosen is not None
     assert chosen.metres_per_unit == 3.0
     assert "user" in chosen.source and "goes before the 0.25 m per unit of transforms.json" in chosen.source
     measured = scale_from_known_distance((0, 0, 0), (2, 0, 0), 1.0, 0.1)
     chosen = choose_scale(known_distance=measured, scene_file=meta)
-    assert chosen is not None
     assert (chosen.metres_per_unit, chosen.standard_error) == (0.5, 0.05)
     assert "goes before" in chosen.source

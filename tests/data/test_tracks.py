@@ -63,9 +63,7 @@ def add_model(folder, where="colmap/sparse/0", frames=None, names=None, focal_fa
 
 
 def tracks_of(folder) -> SparseTracks:
-    tracks = read_colmap_tracks(read_scene_file(folder.path))
-    assert tracks is not None
-    return tracks
+    return read_colmap_tracks(read_scene_file(folder.path))
 
 
 def lines_of(folder, split="train", **options):

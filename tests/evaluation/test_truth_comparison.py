@@ -65,20 +65,14 @@ def exact_mesh(
     return build_mesh(snapshot, selection, world_to_metres, MeshOptions("voxel")).mesh, cells, lattice
 
 
-def compare(*args, **kwargs) -> dict:
-    result = compare_with_truth(*args, **kwargs)
-    assert result is not None
-    return result
-
-
 def test_volume_and_area_of_a_ball_are_those_of_its_voxels(sphere):
     cells, lattice = exact_cells(sphere)
-    result = compare(cells, lattice, IDENTITY, sphere)
+    result = compare_with_truth(cells, lattice, IDENTITY, sphere)
     assert result["volume_m3"] == pytest.approx(np.count_nonzero(cells) * lattice.voxel_size**3)
     assert result["volume_m3"] == pytest.approx(result["true_volume_m3"], rel=0.02)
     hollow = cells.copy()
     hollow[tuple(slice(n // 2 - 3, n // 2 + 3) for n in cells.shape)] = False
-    of_hollow = compare(hollow, lattice, IDENTITY, sphere)
+    of_hollow = compare_with_truth(hollow, lattice, IDENTITY, sphere)
     assert of_hollow["filled_volume_m3"] == result["volume_m3"] > of_hollow["volume_m3"]
     assert of_hollow["area_m2"] == pytest.approx(result["area_m2"] + 6 * 36 * lattice.voxel_size**2)
     # The faces of a digitised convex body cover each of its three shadows twice: 6 pi r^2 for a ball of area 4 pi r^2.
@@ -87,7 +81,7 @@ def test_volume_and_area_of_a_ball_are_those_of_its_voxels(sphere):
 
 def test_cameras_are_found_in_a_mirrored_turned_and_scaled_world(hot_object):
     cells, lattice = exact_cells(hot_object, 24)
-    plain = compare(cells, lattice, IDENTITY, hot_object)
+    plain = compare_with_truth(cells, lattice, IDENTITY, hot_object)
     # The same voxels, turned by 90 degrees around z and counted downwards: a turned mirror image.
     world_to_truth = np.array(
         [[0.0, -0.5, 0.0, 0.3], [0.5, 0.0, 0.0, -0.1], [0.0, 0.0, -0.5, 0.2], [0.0, 0.0, 0.0, 1.0]]
@@ -97,9 +91,9 @@ def test_cameras_are_found_in_a_mirrored_turned_and_scaled_world(hot_object):
     ends = np.array([lattice.hi[0], lattice.lo[1], lattice.hi[2]])
     lo = (np.linalg.inv(world_to_truth) @ np.append(ends, 1.0))[:3]
     other = Lattice(tuple(lo), lattice.voxel_size / 0.5, (ny, nx, nz))
-    assert compare(turned, other, world_to_truth, hot_object) == pytest.approx(plain, abs=2e-3)
+    assert compare_with_truth(turned, other, world_to_truth, hot_object) == pytest.approx(plain, abs=2e-3)
     with pytest.raises(MeshError, match="world_to_truth"):
-        compare(turned, other, np.zeros((4, 4)), hot_object)
+        compare_with_truth(turned, other, np.zeros((4, 4)), hot_object)
 
 
 def test_only_measured_boundary_nodes_near_the_surface_count(hot_object):
@@ -114,23 +108,23 @@ def test_only_measured_boundary_nodes_near_the_surface_count(hot_object):
     temperature_c[far[1::2]] += 100.0
     points_m[far[1::2]] += 10.0
     changed = replace(mesh, temperature_c=temperature_c, observed=observed, points_m=points_m)
-    result = compare(cells, lattice, IDENTITY, hot_object, changed)
+    result = compare_with_truth(cells, lattice, IDENTITY, hot_object, changed)
     kept = mesh.points_m[boundary[len(boundary) // 2 :]]
     near = np.abs(hot_object.scene.solid.signed_distance(kept)) <= 1.5 * lattice.voxel_size
     assert result["temperature_nodes"] == np.count_nonzero(near) > 500
     assert result["temperature_mae_c"] == pytest.approx(0.0, abs=1e-5)
     warmer = replace(mesh, temperature_c=mesh.temperature_c - 2.5)
-    assert compare(cells, lattice, IDENTITY, hot_object, warmer)["temperature_mae_c"] == pytest.approx(2.5)
+    assert compare_with_truth(cells, lattice, IDENTITY, hot_object, warmer)["temperature_mae_c"] == pytest.approx(2.5)
     unseen = replace(mesh, observed=np.zeros_like(mesh.observed))
-    result = compare(cells, lattice, IDENTITY, hot_object, unseen)
+    result = compare_with_truth(cells, lattice, IDENTITY, hot_object, unseen)
     assert (result["temperature_nodes"], result["temperature_mae_c"]) == (0, None)
 
 
 def test_the_comparison_is_in_the_units_of_the_mesh(hot_object):
     mesh, cells, lattice = exact_mesh(hot_object)
     scaled = replace(mesh, points_m=3.0 * mesh.points_m)
-    result = compare(cells, lattice, IDENTITY, hot_object, scaled, metres_per_unit=3.0)
-    plain = compare(cells, lattice, IDENTITY, hot_object, mesh)
+    result = compare_with_truth(cells, lattice, IDENTITY, hot_object, scaled, metres_per_unit=3.0)
+    plain = compare_with_truth(cells, lattice, IDENTITY, hot_object, mesh)
     for names, factor in (
         (("voxel_size_m", "mean_distance_m", "chamfer_m", "hausdorff_m"), 3.0),
         (("area_m2", "true_area_m2", "mesh_area_m2"), 9.0),
@@ -141,17 +135,17 @@ def test_the_comparison_is_in_the_units_of_the_mesh(hot_object):
     # Shares, voxels and temperatures have nothing to do with it.
     assert result == pytest.approx(plain) and not [name for name in plain if name.endswith(("_m", "_m2", "_m3"))]
     volume = float(signed_volumes(scaled.points_m, scaled.tets).sum())
-    assert compare(cells, lattice, IDENTITY, hot_object, scaled, metres_per_unit=3.0)["mesh_volume_m3"] == (
+    assert compare_with_truth(cells, lattice, IDENTITY, hot_object, scaled, metres_per_unit=3.0)["mesh_volume_m3"] == (
         pytest.approx(volume)
     )
     with pytest.raises(MeshError, match="metres_per_unit"):
-        compare(cells, lattice, IDENTITY, hot_object, mesh, metres_per_unit=0.0)
+        compare_with_truth(cells, lattice, IDENTITY, hot_object, mesh, metres_per_unit=0.0)
 
 
 def test_surfaces_that_few_training_cameras_see_are_not_asked_for(hot_object):
     # Nobody sees the table's underside, three tenths of the scene's surface.
     cells, lattice = exact_cells(hot_object, 40)
-    seen = compare(cells, lattice, IDENTITY, hot_object)["true_points_seen"]
+    seen = compare_with_truth(cells, lattice, IDENTITY, hot_object)["true_points_seen"]
     everywhere = hot_object.scene.solid.surface_points(20_000, 0)[0]
     assert seen < 0.8 * len(everywhere)
     two = replace(hot_object, training_poses=hot_object.training_poses[:2])
@@ -163,16 +157,14 @@ def test_truth_comes_from_the_folder_with_training_cameras_only(tmp_path):
     scene = make_scene("sphere")
     write_scene(scene, tmp_path, num_train=5, num_eval=2, width=16, height=12, progress=False)
     known = load_known_truth(tmp_path)
-    assert known is not None
     assert known.scene.name == "sphere"
     np.testing.assert_allclose(known.training_poses, scene.poses(5, 2)[0])
     assert known.camera == scene.camera(16, 12)
     from_json = load_known_truth(tmp_path / "transforms.json")
-    assert from_json is not None
     np.testing.assert_array_equal(from_json.training_poses, known.training_poses)
     cells, lattice = exact_cells(known, 16)
-    by_folder = compare(cells, lattice, IDENTITY, tmp_path)
-    assert by_folder == compare(cells, lattice, IDENTITY, known)
+    by_folder = compare_with_truth(cells, lattice, IDENTITY, tmp_path)
+    assert by_folder == compare_with_truth(cells, lattice, IDENTITY, known)
     assert json.loads(json.dumps(by_folder)) == by_folder
     content = json.loads((tmp_path / "transforms.json").read_text())
     content["frames"] = content["frames"][5:]
@@ -184,7 +176,7 @@ def test_truth_comes_from_the_folder_with_training_cameras_only(tmp_path):
 def test_mesh_of_the_exact_voxels_is_near_the_truth_in_shape_and_temperature(sphere) -> None:
     truth = sphere
     mesh, cells, lattice = exact_mesh(truth, just_inside=True)
-    result = compare(cells, lattice, IDENTITY, truth, mesh)
+    result = compare_with_truth(cells, lattice, IDENTITY, truth, mesh)
     assert result["precision"] == 1.0 and result["recall"] > 0.99
     assert result["mean_distance_m"] == pytest.approx(result["mean_distance_voxels"] * lattice.voxel_size)
     assert result["mean_distance_voxels"] < 0.5 and result["voxel_size_m"] == lattice.voxel_size
@@ -226,7 +218,7 @@ def test_the_solid_of_a_perfectly_trained_scene_is_the_scene(name, resolution, l
     snapshot = shell_that_cameras_see(truth, resolution)
     shell = select_solid(snapshot, SolidSelection(density_threshold=0.5, interior="hollow")).cells
     cells = select_solid(snapshot, SolidSelection(density_threshold=0.5)).cells
-    result = compare(cells, snapshot.lattice, IDENTITY, truth)
+    result = compare_with_truth(cells, snapshot.lattice, IDENTITY, truth)
     assert result["fscore"] > least_fscore and result["fscore_seen"] > least_fscore
     # The wall is 7 voxels thick, the table 5: half a voxel to either side.
     assert result["volume_m3"] == pytest.approx(result["true_volume_m3"], rel=0.13)
@@ -252,9 +244,7 @@ def exact_snapshot(truth: KnownTruth, resolution: int, world_to_input: np.ndarra
 def test_the_figures_are_those_of_the_export(sphere):
     snapshot = exact_snapshot(sphere, 24)
     result = geometry_metrics(snapshot, IDENTITY, sphere)
-    assert snapshot.voxel_density is not None
     exported = compare_with_truth(snapshot.voxel_density > 0, snapshot.lattice, IDENTITY, sphere)
-    assert exported is not None
     assert {name: result[name] for name in SCORES} == {name: exported[name] for name in SCORES}
     assert result["surface_distance_voxels"] == pytest.approx(exported["mean_distance_voxels"])
     assert result["surface_distance_m"] == pytest.approx(exported["mean_distance_m"])
@@ -263,7 +253,6 @@ def test_the_figures_are_those_of_the_export(sphere):
 def test_only_what_the_default_selection_takes_counts(sphere):
     """Fog and a floater change nothing: the largest body of voxels with an optical depth of one half is the surface."""
     snapshot = exact_snapshot(sphere, 32)
-    assert snapshot.voxel_density is not None
     plain = geometry_metrics(snapshot, IDENTITY, sphere)
     density = snapshot.voxel_density.copy()
     density[density == 0] = 0.49 / snapshot.lattice.voxel_size
@@ -287,7 +276,6 @@ def test_coarse_lattices_are_judged_by_the_common_voxel(sphere):
 
 def test_nothing_solid_scores_nothing_and_says_why(sphere):
     snapshot = exact_snapshot(sphere, 16)
-    assert snapshot.voxel_density is not None
     said: list[str] = []
     result = geometry_metrics(
         replace(snapshot, voxel_density=snapshot.voxel_density * 0), IDENTITY, sphere, said.append
@@ -369,7 +357,6 @@ def test_ns_eval_compares_the_trained_density_with_the_scene(pipeline, monkeypat
     world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
     assert not np.allclose(world_to_input, IDENTITY)
     known = load_known_truth(pipeline.datamanager.get_datapath())
-    assert known is not None
     exact = exact_snapshot(known, 48, world_to_input)
     asked = []
     monkeypatch.setattr(

@@ -122,7 +122,6 @@ def test_parallel_planes_are_their_distance_apart_and_temperatures_those_of_the_
     truth = Plane(0.20)
     points = truth.surface_points(500, 0)[0]
     found = surface_distances(slab(mesh_of_cells), truth, points)
-    assert found is not None
     distances = (found.mesh_to_truth, found.truth_to_mesh, found.chamfer, found.hausdorff)
     assert distances == pytest.approx((0.05,) * 4, abs=1e-12)
     assert found.closest_temperature_c == pytest.approx(10.0 + 4.0 * points[:, 0], abs=1e-6)

@@ -228,7 +228,6 @@ def test_read_photographs_are_pinholes(distortion, width, height):
 
 def test_read_photographs_have_their_masks_and_other_lenses_are_left_out():
     read = read_photographs(Frames(600, 450, None, masked=True), most=32, longest_side=400)
-    assert read is not None
     rows = np.isnan(read.colours[: np.prod(read.sizes[0])].reshape(*read.sizes[0][::-1], 3)).all((1, 2))
     assert rows[:75].all() and not rows[76:].any()
     frames, kinds = Frames(60, 40, None), torch.full((40, 1), CameraType.FISHEYE.value)

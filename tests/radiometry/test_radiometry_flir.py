@@ -32,13 +32,6 @@ def write(folder: Path, file: FlirFile, name: str = "FLIR0001.jpg") -> Path:
     return path
 
 
-def expected_celsius(counts: np.ndarray, planck: dict[str, float], emissivity: float, reflected_k: float) -> np.ndarray:
-    """The formula for distance 0, written out once more."""
-    mirrored = planck["r1"] / (planck["r2"] * (math.exp(planck["b"] / reflected_k) - planck["f"])) - planck["o"]
-    own = (counts.astype(float) - (1 - emissivity) * mirrored) / emissivity
-    return planck["b"] / np.log(planck["r1"] / (planck["r2"] * (own + planck["o"])) + planck["f"]) - 273.15
-
-
 @pytest.mark.parametrize("storage", ["raw", "png", "swapped"])
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_counts_survive_every_storage_and_byte_order(tmp_path, storage, order):
@@ -51,12 +44,9 @@ def test_counts_survive_every_storage_and_byte_order(tmp_path, storage, order):
 
 def test_temperatures_are_those_of_the_formula(tmp_path):
     file = FlirFile(smooth_counts())
-    file.settings |= {"distance": 0.0, "emissivity": 0.9, "reflected": 280.0}
+    file.settings |= {"distance": 3.0, "emissivity": 0.9, "reflected": 280.0}
     got = read_thermogram(write(tmp_path, file))
-    emissivity, reflected_k = float(np.float32(0.9)), 280.0
-    np.testing.assert_allclose(
-        got.temperature_c, expected_celsius(file.counts, file.planck, emissivity, reflected_k), atol=2e-5
-    )
+    np.testing.assert_allclose(got.temperature_c, independent(file.jpeg())[1], atol=1e-4)
     assert got.temperature_c.dtype == np.float32 and got.report.masked == 0
 
 
@@ -64,9 +54,8 @@ def test_overrides_replace_the_cameras_settings(tmp_path):
     file = FlirFile(smooth_counts())
     path = write(tmp_path, file)
     apparent = read_thermogram(path, RadiometryOptions(emissivity=1.0, distance_m=0.0))
-    np.testing.assert_allclose(
-        apparent.temperature_c, expected_celsius(file.counts, file.planck, 1.0, 293.15), atol=2e-5
-    )
+    file.settings |= {"emissivity": 1.0, "distance": 0.0}
+    np.testing.assert_allclose(apparent.temperature_c, independent(file.jpeg())[1], atol=1e-4)
     as_stored, other = read_thermogram(path), read_thermogram(path, RadiometryOptions(emissivity=0.7))
     assert other.metadata.conditions.emissivity == 0.7
     assert other.metadata.conditions.air_c == as_stored.metadata.conditions.air_c

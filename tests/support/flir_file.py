@@ -49,7 +49,7 @@ class FlirFile:
         def put(offset: int, codes: str, *values: float) -> None:
             struct.pack_into(self.order + codes, record, offset, *values)
 
-        put(0, "H", 2)
+        put(0, "3H", 2, *self.counts.shape[::-1])
         put(0x20, "6f", *self.settings.values())
         put(0x3C, "f", self.humidity)
         put(0x58, "3f", self.planck["r1"], self.planck["b"], self.planck["f"])

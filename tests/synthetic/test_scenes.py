@@ -185,7 +185,6 @@ def test_other_names_are_refused(name: str) -> None:
 
 def test_what_stands_behind_has_parallax_and_hides_what_is_farther() -> None:
     scene = make_scene("wall-object")
-    assert scene.around is not None
     eye = np.array([0.0, -2.0, 0.1])
     camera, pose = Camera(3, 3, 9.0, 9.0, 1.5, 1.5), look_at(eye, np.add(eye, [0.0, 1.0, 0.0]))
     along_x = dataclasses.replace(scene.around, surface_temperature_c=lambda points: np.asarray(points)[:, 0])
@@ -204,7 +203,6 @@ def test_what_stands_behind_has_parallax_and_hides_what_is_farther() -> None:
 
 def test_a_pane_mirrors_what_lies_along_the_reflected_ray() -> None:
     scene = make_scene("street")
-    assert scene.mirror is not None
     pane, ray = np.array([[-4.0, 0.35, 5.5]]), np.array([0.3, 1.0, 0.1]) / np.linalg.norm([0.3, 1.0, 0.1])
     assert scene.mirror(pane, [[0.0, -1.0, 0.0]])[0] == np.float32(0.6)
     one = Camera(1, 1, 1e4, 1e4, 0.5, 0.5)

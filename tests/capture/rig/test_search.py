@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tests.support.board_pictures import BOARD, board_pairs, write_board_folder
-from tests.support.known_rig import KnownCapture, changes_between, drawn_capture, known_capture, painted_sky, turned
+from tests.support.known_rig import KnownCapture, changes_between, drawn_capture, known_capture, painted_sky
+from tests.support.textured_room import RIG, THERMAL, VISIBLE
 from thermoxels_ns.capture.rig.board import board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.rig.drift import estimate_drift
 from thermoxels_ns.capture.rig.images import local_contrast, without_fixed_pattern
@@ -17,7 +18,6 @@ from thermoxels_ns.capture.rig.start import read_rig
 from thermoxels_ns.capture.rig_types import PARAMETERS, RigEstimate, RigFrame, RigStart
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.scale_and_up import MetricScale
-from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
@@ -197,18 +197,11 @@ def test_points_and_offsets_are_sure_and_each_number_as_sure_as_stated(
     assert np.abs(drift.offsets_k - capture.offsets_k).max() < 0.1
 
 
-BOARD_VISIBLE = Camera(640, 480, 600.0, 600.0, 322.0, 238.0, k1=-0.05)
-BOARD_THERMAL = Camera(160, 128, 150.0, 150.0, 81.0, 63.0)
-TRUE_RIG = np.eye(4)
-TRUE_RIG[:3, :3], TRUE_RIG[:3, 3] = turned(0.7, -1.5, 0.4), (0.09, -0.02, 0.01)
-
-
 @pytest.fixture(scope="module")
 def pairs() -> list[tuple[np.ndarray, np.ndarray]]:
-    return board_pairs(BOARD_VISIBLE, BOARD_THERMAL, TRUE_RIG)
+    return board_pairs(VISIBLE, THERMAL, RIG)
 
 
-BOARD_SIZE = (BOARD_THERMAL.width, BOARD_THERMAL.height)
 SETTINGS = CaptureSettings(thermal_field_of_view_deg=55.0)
 
 
@@ -217,22 +210,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory, pairs: list[tuple[np.ndarra
     return write_board_folder(tmp_path_factory.mktemp("board"), pairs)
 
 
-def of_board(folder: Path, work: Path, size: tuple[int, int] = BOARD_SIZE) -> RigEstimate:
+def of_board(folder: Path, work: Path, size: tuple[int, int] = (THERMAL.width, THERMAL.height)) -> RigEstimate:
     work.mkdir(exist_ok=True)
-    return rig_from_board_photos(folder, BOARD, BOARD_VISIBLE, size, work, SETTINGS, RadiometryOptions())
+    return rig_from_board_photos(folder, BOARD, VISIBLE, size, work, SETTINGS, RadiometryOptions())
 
 
 def test_files_give_focal_length_turn_and_place_in_metres_and_then_in_units(folder: Path, tmp_path: Path) -> None:
     rig = of_board(folder, tmp_path / "work")
     assert rig.determined
-    assert rig.thermal_camera.fl_x == pytest.approx(BOARD_THERMAL.fl_x, rel=0.01)
-    assert np.allclose(rig.visible_to_thermal[:3, 3], TRUE_RIG[:3, 3], atol=0.006)
-    turn = rig.visible_to_thermal[:3, :3] @ TRUE_RIG[:3, :3].T
+    assert rig.thermal_camera.fl_x == pytest.approx(THERMAL.fl_x, rel=0.01)
+    assert np.allclose(rig.visible_to_thermal[:3, 3], RIG[:3, 3], atol=0.006)
+    turn = rig.visible_to_thermal[:3, :3] @ RIG[:3, :3].T
     assert np.degrees(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))) < 0.5
     points = np.random.default_rng(1).uniform((-0.3, -0.2, 0.7), (0.3, 0.2, 1.2), (200, 3))
     pixels = [
         camera.project(points @ pose[:3, :3].T + pose[:3, 3])
-        for camera, pose in ((rig.thermal_camera, rig.visible_to_thermal), (BOARD_THERMAL, TRUE_RIG))
+        for camera, pose in ((rig.thermal_camera, rig.visible_to_thermal), (THERMAL, RIG))
     ]
     assert np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)) < 0.15
     assert 0.0 < rig.projection_sigma_px < 0.3
@@ -243,9 +236,7 @@ def test_files_give_focal_length_turn_and_place_in_metres_and_then_in_units(fold
     assert units.standard_errors["rx"] == rig.standard_errors["rx"]
 
 
-def test_pictures_that_do_not_serve_are_refused(
-    folder: Path, tmp_path: Path, pairs: list[tuple[np.ndarray, np.ndarray]]
-) -> None:
+def test_pictures_that_do_not_serve_are_refused(folder: Path, tmp_path: Path, pairs: list) -> None:
     with pytest.raises(SceneError, match="board pictures"):
         of_board(folder, tmp_path / "a", size=(80, 64))
     empty = tmp_path / "empty"
