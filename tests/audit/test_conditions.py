@@ -55,6 +55,7 @@ def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) 
     ("keys", "value", "named"),
     [
         (("inside", "air"), "0.5 C", r"inside: air: .*no U-value follows"),
+        (("inside", "air"), "-300 C", r"inside: air"),
         (("inside", "air"), 20.0, r"inside: air: .* Write 20\.0 C\."),
         (("outside", "wind"), "-1 m/s", r"outside: wind"),
         (("outside", "wind"), None, r"outside: wind"),
