@@ -1,3 +1,5 @@
+"""Rigs of drawn captures and of checker boards, and those that a file gives."""
+
 import json
 import math
 from dataclasses import replace
