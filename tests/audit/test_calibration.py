@@ -1,5 +1,6 @@
 """Walls whose construction is known are calibrated from their surface temperatures."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -37,7 +38,6 @@ def walls() -> dict[str, Truth]:
 
 def calibrate(truth: Truth, asked: Calibrate, conditions=OFFSET_ALONE, seed: int | None = None) -> Calibration:
     found = audit(photographed(truth, conditions, seed), replace(conditions, calibrate=asked), UP).calibration
-    assert found is not None
     return found
 
 
@@ -50,10 +50,6 @@ def test_exact_readings_give_the_true_conductivity(walls) -> None:
     assert found.misfit_k < 1e-6 and found.moved_most_by == {"conductivity of wall": "outside air"}
     counted = np.isfinite(found.difference_k)
     assert counted.any() and np.abs(found.difference_k[counted]).max() < 1e-2
-
-
-def test_no_calibration_without_being_asked(walls) -> None:
-    assert audit(photographed(walls["plain"], STATED), STATED, UP).calibration is None
 
 
 def test_two_materials_are_told_apart_where_each_has_a_surface(walls) -> None:
@@ -70,7 +66,6 @@ def test_an_offset_of_the_camera_counts_once_for_all_readings(walls) -> None:
     shifted = replace(OFFSET_ALONE, camera=Camera(Measured(0.27), Measured(0.0)), **exact())
     mesh = photographed(walls["plain"], OFFSET_ALONE)
     warmer = audit(mesh, replace(shifted, calibrate=WALL), UP).calibration
-    assert warmer is not None
     ends = [one.found["conductivity of wall"] for one in (stated, warmer)]
     assert ends[0].high == pytest.approx(ends[1].value, rel=0.01) and ends[1].value > 1.05 * ends[0].value
 
@@ -99,37 +94,41 @@ def test_what_is_known_to_a_range_widens_the_answer(walls) -> None:
         assert 0.3 / value + plaster == pytest.approx(0.3 / CONDUCTIVITY["wall"], rel=2e-3)
 
 
-def test_conductivity_and_thickness_of_one_layer_are_refused_with_their_ratio(walls) -> None:
-    """With a wall of 0.6 W/(m K) the layer must resist 0.5 m2 K / W: 2 W/(m K) per metre."""
-    layers = {"insulation": Layer(("room",), Measured(0.1), Measured(0.04))}
-    unknown = Unknown("conductivity", "insulation"), Unknown("thickness", "insulation")
-    asked = replace(WALL, conductivity={"wall": Measured(0.6)}, layers=layers, unknown=unknown)
-    found = calibrate(walls["plain"], asked)
-    assert found.found == {} and found.misfit_k < 1e-3
-    assert "conductivity of insulation" in found.refused and "cannot be told apart: their ratio is, 2" in found.refused
-    assert "W/(m K) per m" in found.refused
+def insulation(thickness_m: float, *unknown: tuple[str, str], wall: float = 0.9) -> dict:
+    return {
+        "conductivity": {"wall": Measured(wall)},
+        "layers": {"insulation": Layer(("room",), Measured(thickness_m), Measured(0.04))},
+        "unknown": tuple(Unknown(*one) for one in unknown),
+    }
 
 
-def test_wall_and_insulation_are_refused_with_what_they_resist_together(walls) -> None:
-    layers = {"insulation": Layer(("room",), Measured(0.02), Measured(0.04))}
-    unknown = Unknown("conductivity", "wall"), Unknown("thickness", "insulation")
-    found = calibrate(walls["plain"], replace(WALL, layers=layers, unknown=unknown))
-    assert "conductivity of wall and thickness of insulation cannot be told apart" in found.refused
+BOTH = ("conductivity", "insulation"), ("thickness", "insulation")
 
 
-def test_what_readings_do_not_show_is_refused(walls) -> None:
-    """A wall that is as warm as the air loses by convection nothing, whatever the coefficient."""
-    asked = replace(WALL, film={"facade": Measured(8.0)}, unknown=(*WALL.unknown, Unknown("film", "facade")))
-    found = calibrate(walls["plain"], asked)
-    assert found.found == {} and ("do not tell the film of facade" in found.refused or "told apart" in found.refused)
-
-
-def test_readings_that_no_wall_explains_are_refused(walls) -> None:
-    """All readings 12 K above what they are: no conductivity makes the outside of a wall warmer than its inside."""
-    warm = replace(OFFSET_ALONE, camera=Camera(Measured(25.0, 0.3), Measured(0.0)))
+@pytest.mark.parametrize(
+    ("changes", "offset_k", "said"),
+    [
+        # With a wall of 0.6 W/(m K) the layer must resist 0.5 m2 K / W.
+        (insulation(0.1, *BOTH, wall=0.6), 0.0, r"conductivity of insulation.* their ratio is, 2.*W/\(m K\) per m"),
+        (
+            insulation(0.02, ("conductivity", "wall"), ("thickness", "insulation")),
+            0.0,
+            "conductivity of wall and thickness of insulation cannot be told apart",
+        ),
+        # A wall as warm as the air loses nothing by convection, whatever the coefficient.
+        (
+            {"film": {"facade": Measured(8.0)}, "unknown": (*WALL.unknown, Unknown("film", "facade"))},
+            0.0,
+            "do not tell the film of facade|told apart",
+        ),
+        ({}, 25.0, "No conductivity of wall explains the readings: however large"),
+    ],
+)
+def test_what_readings_do_not_tell_is_refused(walls, changes, offset_k, said) -> None:
+    stated = replace(OFFSET_ALONE, camera=Camera(Measured(offset_k, 0.3), Measured(0.0)))
     mesh = photographed(walls["plain"], OFFSET_ALONE)
-    found = audit(mesh, replace(warm, calibrate=WALL), UP).calibration
-    assert found is not None and "No conductivity of wall explains the readings: however large" in found.refused
+    found = audit(mesh, replace(stated, calibrate=replace(WALL, **changes)), UP).calibration
+    assert found is not None and found.found == {} and re.search(said, found.refused), found.refused
 
 
 @pytest.mark.parametrize("side", ["outside", "inside"])

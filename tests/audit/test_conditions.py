@@ -25,8 +25,8 @@ surfaces: [{emissivity: 0.93 +- 0.02}]
 def changed(tmp_path: Path):
     """Write conditions in which one entry is another one, given by its path; None removes it."""
 
-    def change(*keys: str, value: object) -> Path:
-        content = yaml.safe_load(PLAIN)
+    def change(*keys: str, value: object, **more: object) -> Path:
+        content = yaml.safe_load(PLAIN) | more
         at = content
         for key in keys[:-1]:
             at = at[int(key)] if isinstance(at, list) else at.setdefault(key, {})
@@ -55,21 +55,18 @@ def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) 
     ("keys", "value", "named"),
     [
         (("inside", "air"), "0.5 C", r"inside: air: .*no U-value follows"),
-        (("inside", "air"), 20.0, r"inside: air: .* Write 20\.0 C\."),
         (("inside", "air"), "-300 C", r"inside: air"),
+        (("inside", "air"), 20.0, r"inside: air: .* Write 20\.0 C\."),
         (("outside", "wind"), "-1 m/s", r"outside: wind"),
         (("outside", "wind"), None, r"outside: wind"),
         (("outside",), {"wind": "1 m/s"}, r"outside: air"),
-        (("surfaces", "0", "emissivity"), 0, r"surfaces entry 1: emissivity"),
         (("surfaces", "0", "emissivity"), "0.99 +- 0.02", r"surfaces entry 1: emissivity"),
         (("surfaces", "0", "emisivity"), 0.9, r"surfaces entry 1: .*Did you mean emissivity"),
-        (("surfaces",), [], r"surfaces"),
         (("surroundings",), {"ground": "1 C"}, r"surroundings: expected either reflected or sky, got neither"),
         (("surroundings", "ground"), "1 C", r"surroundings: ground"),
         (("surroundings",), {"sky": {"cloud": 2, "dew_point": "0 C"}}, r"surroundings: sky: cloud"),
         (("film", "model"), "madding", r"film: model"),
         (("film", "model"), "given", r"film: coefficient"),
-        (("film", "coefficient"), "8 W/(m2 K)", r"film: coefficient"),
         (("film", "factor"), "0.1 +- 0.2", r"film: factor"),
         (("camera", "offset"), None, r"camera: expected the key offset"),
         (("camera", "emissivity"), 0.95, r"camera: reflected"),
@@ -83,14 +80,9 @@ def test_bad_conditions_are_one_clear_error(changed, keys, value, named) -> None
 
 
 def test_a_sky_is_none_of_a_room(changed) -> None:
-    path = changed("side", value="inside")
-    content = yaml.safe_load(path.read_text()) | {
-        "film": {"model": "madding", "factor": 1.0},
-        "surroundings": {"sky": {"cloud": 0.5, "dew_point": "0 C"}},
-    }
-    path.write_text(yaml.safe_dump(content))
+    film, sky = {"model": "madding", "factor": 1.0}, {"sky": {"cloud": 0.5, "dew_point": "0 C"}}
     with pytest.raises(AuditError, match=r"surroundings: expected a reflected temperature inside"):
-        load_conditions(path)
+        load_conditions(changed("surroundings", value=sky, side="inside", film=film))
 
 
 @pytest.mark.parametrize(

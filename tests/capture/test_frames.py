@@ -1,5 +1,7 @@
+import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -7,7 +9,10 @@ from PIL import Image
 from tests.support.camera_card import counts, jpeg_bytes, photograph
 from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.frames import CaptureFrames, read_frames
+from thermoxels_ns.capture.masks import PhotographMasks, find_overlay, mask_files, read_mask
 from thermoxels_ns.capture.pairs import Pair
+from thermoxels_ns.capture.photograph import read_photograph_facts
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 RADIOMETRY = RadiometryOptions()
@@ -66,26 +71,12 @@ def test_a_photograph_inside_a_flir_file_is_taken_out(tmp_path):
     assert not frame.photograph.is_relative_to(card)
 
 
-def bad_files(card: Path) -> dict[str, Pair]:
-    """One pair for each way in which a file can be damaged."""
-    pairs = {name: pair(card, name) for name in ("cut", "zero", "eight", "palette", "text", "wide", "photo")}
-    content = pairs["cut"].thermal.read_bytes()
-    pairs["cut"].thermal.write_bytes(content[: len(content) // 2])
-    pairs["zero"].thermal.write_bytes(b"")
-    Image.new("L", (16, 12), 90).save(pairs["eight"].thermal, format="TIFF")
-    pairs["palette"].thermal.write_bytes(jpeg_bytes(np.zeros((12, 16, 3), np.uint8)))
-    pairs["text"].thermal.write_bytes(b"hello, this is no picture")
-    Image.new("I;16", (30000, 1)).save(pairs["wide"].thermal, format="TIFF")
-    rng = np.random.default_rng(0)
-    whole = photograph(pairs["photo"].photograph, rng.integers(0, 255, (64, 64, 3), dtype=np.uint8)).read_bytes()
-    pairs["photo"].photograph.write_bytes(whole[: len(whole) // 2])
-    return pairs
-
-
 def test_the_rest_goes_on_without_damaged_files(tmp_path):
-    pairs = bad_files(tmp_path / "card")
-    good = pair(tmp_path / "card", "good")
-    frames = read([*pairs.values(), good], tmp_path, skip_bad=True)
+    card = tmp_path / "card"
+    pairs = {name: pair(card, name) for name in ("thermal", "photo")}
+    for path in (pairs["thermal"].thermal, pairs["photo"].photograph):
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    frames = read([*pairs.values(), pair(card, "good")], tmp_path, skip_bad=True)
     assert [frame.name for frame in frames.frames] == ["good"]
     assert set(frames.dropped) == set(pairs)
     assert all(name in why for name, why in frames.dropped.items())
@@ -114,3 +105,92 @@ def test_stuck_pixels_and_the_users_mask_become_nan(tmp_path):
     for frame in frames.frames:
         missing = np.isnan(np.load(frame.thermal))
         assert missing[5, 7] and missing[:, 15].all() and missing.sum() == 13 == frame.masked
+
+
+@pytest.mark.parametrize(("fraction", "microsecond"), [("25", 250000), ("782/1000", 782000), ("x", 0), (None, 0)])
+def test_time_with_its_fraction(tmp_path, fraction, microsecond):
+    facts = read_photograph_facts(photograph(tmp_path / "a.jpg", taken_at="2024:10:30 10:50:43", fraction=fraction))
+    assert (facts.taken_at.second, facts.taken_at.microsecond) == (43, microsecond)
+
+
+@pytest.mark.parametrize("altitude_m", [12.5, -430.5])
+def test_place_lens_and_orientation(tmp_path, altitude_m):
+    path = photograph(tmp_path / "a.jpg", gps=(-33.5, 151.25, altitude_m), orientation=6, focal=(4.0, 100.0))
+    facts = read_photograph_facts(path)
+    assert (facts.gps.latitude_deg, facts.gps.longitude_deg) == pytest.approx((-33.5, 151.25), abs=1e-8)
+    assert facts.gps.altitude_m == pytest.approx(altitude_m)
+    assert facts.focal_px == pytest.approx(40.0)  # 4 mm at 10 pixels per mm
+    assert facts.orientation == 6
+    facts = read_photograph_facts(photograph(tmp_path / "b.jpg"))  # without tags
+    assert (facts.taken_at, facts.gps, facts.focal_px, facts.gimbal_deg, facts.orientation) == (None,) * 4 + (1,)
+    assert (facts.width, facts.height) == (32, 24)
+
+
+@pytest.mark.parametrize("form", ['drone-dji:GimbalPitchDegree="-30.5"', "<drone-dji:GimbalPitchDegree>-30.5</x>"])
+def test_gimbal_angles_of_xmp(tmp_path, form):
+    path = photograph(tmp_path / "a.jpg")
+    content = path.read_bytes()
+    xmp = f'http://ns.adobe.com/xap/1.0/\0<x:xmpmeta {form} drone-dji:GimbalRollDegree="+1.5"/>'.encode()
+    path.write_bytes(content[:2] + b"\xff\xe1" + struct.pack(">H", len(xmp) + 2) + xmp + content[2:])
+    assert read_photograph_facts(path).gimbal_deg == (-30.5, 1.5)
+
+
+def write(folder, number, pixels):
+    path = folder / f"{number}.jpg"
+    Image.fromarray(pixels).save(path, quality=90)
+    return path
+
+
+def scenes(count=10, seed=0):
+    """Different smooth pictures, 320 x 240."""
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        yield cv2.resize(rng.integers(0, 255, (6, 8, 3), dtype=np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+
+
+def test_text_and_a_scale_bar_are_masked(tmp_path):
+    paths, drawn = [], np.zeros((240, 320), dtype=np.uint8)
+    cv2.putText(drawn, "FLIR 21.5", (10, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, 255, 2)
+    cv2.rectangle(drawn, (300, 60), (312, 200), 255, -1)
+    for number, pixels in enumerate(scenes()):
+        pixels[drawn > 0] = 255
+        paths.append(write(tmp_path, number, pixels))
+    use = find_overlay(paths)
+    assert (~use)[drawn > 0].mean() > 0.97
+    far = cv2.dilate(drawn, np.ones((31, 31), np.uint8)) == 0
+    assert use[far].all()
+
+
+def test_what_the_scene_shows_is_no_overlay(tmp_path):
+    """Nothing drawn; still cameras; few photographs; a still patch like its surroundings; stripes, as of a fence."""
+    still = next(scenes(1))
+    few, patch, fence = list(scenes(4)), list(scenes(16)), list(scenes())
+    for pixels in few:
+        pixels[20:40, 20:60] = 255
+    for pixels in patch:
+        pixels[100:130, 100:150] = 127
+    for pixels in fence:
+        pixels[:, np.arange(320) // 8 % 2 == 0] = 255
+    for pictures in (scenes(), [still] * 8, few, patch, fence):
+        assert find_overlay([write(tmp_path, n, pixels) for n, pixels in enumerate(pictures)]) is None
+
+
+def test_the_users_mask_and_the_overlay_both_count(tmp_path):
+    hand = np.full((24, 32), 255, dtype=np.uint8)
+    hand[:, :4] = 0
+    Image.fromarray(hand).save(tmp_path / "IMG_1.png")
+    overlay = np.ones((24, 32), dtype=bool)
+    overlay[:2] = False
+    files = mask_files(tmp_path)
+    masks = PhotographMasks((32, 24), overlay, {"a": files["img_1"]})
+    assert (~masks.of("a")).sum() == 24 * 4 + 2 * 28
+    assert (~masks.of("b")).sum() == 2 * 32
+    assert masks.any and not PhotographMasks((32, 24)).any
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path):
+    Image.new("L", (10, 10)).save(tmp_path / "m.png")
+    with pytest.raises(SceneError, match="a mask of 32 x 24 pixels"):
+        read_mask(tmp_path / "m.png", 32, 24)
+    with pytest.raises(SceneError, match="no folder at"):
+        mask_files(tmp_path / "nowhere")

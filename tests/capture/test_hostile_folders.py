@@ -6,19 +6,11 @@ from pathlib import Path
 import pytest
 
 from tests.support.camera_card import counts, photograph, write_pairs
-from tests.support.flir_file import picture_bytes, segment
+from tests.support.flir_file import dji_jpeg
 from thermoxels_ns.capture.folder_scan import scan_folder, shown_name
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
-
-
-def dji_thermal(path: Path) -> Path:
-    """What tells DJI's R-JPEG: its name in the first segment and counts in the third kind."""
-    plain = picture_bytes()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(plain[:2] + segment(0xE1, b"DJI") + segment(0xE3, bytes(24)) + plain[2:])
-    return path
 
 
 def capture(card: Path, **more: object) -> None:
@@ -53,7 +45,8 @@ def test_a_folder_without_pairs_says_what_is_in_it_and_what_helps(tmp_path, phot
 
 
 def test_a_lone_dji_file_lacks_its_partner_and_djis_library(tmp_path):
-    dji_thermal(tmp_path / "card" / "DJI_0001_T.JPG")
+    (tmp_path / "card").mkdir()
+    (tmp_path / "card" / "DJI_0001_T.JPG").write_bytes(dji_jpeg())
     assert "--dji-library" in no_pairs_said(tmp_path / "card")
     assert "--dji-library" not in no_pairs_said(tmp_path / "card", dji_library=tmp_path / "libdirp.so")
 

@@ -15,21 +15,6 @@ from thermoxels_ns.core.checks import hold_folder
 from thermoxels_ns.core.errors import OutputError, SceneError
 
 
-def run_two(folder, first=1, second=1):
-    """Two stages that note that they ran; returns which did."""
-    ran = []
-    cache = StageCache(folder)
-    for name, option in (("pairs", first), ("temperatures", second)):
-        cache.run(name, {"option": option}, lambda where, name=name: ran.append(name) or (where / "x").write_text(name))
-    return ran
-
-
-def test_a_change_runs_this_stage_and_all_later_ones(tmp_path):
-    run_two(tmp_path)
-    assert run_two(tmp_path, second=2) == ["temperatures"]
-    assert run_two(tmp_path, first=2, second=2) == ["pairs", "temperatures"]
-
-
 def test_an_interrupted_stage_finds_what_it_left_and_a_changed_one_does_not(tmp_path):
     def interrupted(where):
         (where / "half").write_text("done")
@@ -113,13 +98,8 @@ def stages_that_ran(card, scene, **more):
     return [line.split()[1] for line in said if line[:2].strip("0123456789") == "/" and "as before" not in line]
 
 
-@pytest.fixture
-def card(tmp_path):
-    return write_pairs(tmp_path / "card", "abcd")
-
-
-def test_every_change_of_the_input_is_noticed(card, tmp_path):
-    scene = tmp_path / "scene"
+def test_every_change_of_the_input_is_noticed(tmp_path):
+    card, scene = write_pairs(tmp_path / "card", "abcd"), tmp_path / "scene"
     everything = ["pairs", "temperatures", "poses"]
     assert stages_that_ran(card, scene) == everything
     assert stages_that_ran(card, scene) == ["poses"]
@@ -135,12 +115,8 @@ def test_every_change_of_the_input_is_noticed(card, tmp_path):
     assert stages_that_ran(card, scene, emissivity=0.9, reflected_c=20.0, seed=1) == ["poses"]
 
 
-@pytest.fixture
-def output(tmp_path):
-    return prepare_output(tmp_path / "scene")
-
-
-def test_a_second_capture_is_refused_and_changes_nothing(tmp_path, output):
+def test_a_second_capture_is_refused_and_changes_nothing(tmp_path):
+    output = prepare_output(tmp_path / "scene")
     (tmp_path / "card").mkdir()
     half = output / ".capture.4711.part.html"
     half.write_text("being written by the first one")

@@ -1,17 +1,33 @@
 import json
 import re
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.support.board_pictures import BOARD, board_pairs, write_board_folder
 from tests.support.camera_card import photograph
+from tests.support.posed_model import ring_model
 from tests.support.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
 from thermoxels_ns import cli
+from thermoxels_ns.capture.masks import PhotographMasks
+from thermoxels_ns.capture.pairs import Pair
+from thermoxels_ns.capture.rig_types import PARAMETERS, RigEstimate, RigFrame
+from thermoxels_ns.capture.scene_writer import TRACKS_NAME, scene_names, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.capture.sfm.scale_and_up import MetricScale, Up
+from thermoxels_ns.capture.stage_cache import prepare_output
 from thermoxels_ns.commands.capture import capture_folder
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.scene_file import read_scene_file
+from thermoxels_ns.data.scene_scale import scale_from_scene_file, up_from_scene_file
+from thermoxels_ns.data.tracks import read_tracks
+from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
+from thermoxels_ns.reports.capture_page import capture_page, thermal_in_photograph
 
 COUNT = 6
 DRIFT_K = 0.6
@@ -29,6 +45,8 @@ def capture(tmp_path_factory):
     card = folder / "card"
     write_card(card, COUNT, DRIFT_K, stray=True)
     photograph(card / "lonely.jpg")
+    photograph(card / "shot8-visible.jpg")
+    shutil.copy(card / "shot0-radiometric.tiff", card / "shot8-radiometric.tiff")
     (card / "shot9-visible.jpg").write_bytes(b"")
     before = files_of(folder)
     said = []
@@ -53,54 +71,36 @@ def found_poses(scene):
     return np.array([entry["transform_matrix"] for entry in entries(scene)])
 
 
-def test_nothing_is_written_outside_the_output_folder(capture):
-    before, after = capture[3]
-    assert len(before) > 2 * COUNT
-    assert after == before
-
-
-def test_what_is_left_out_is_named_with_its_reason(capture):
-    dropped = capture[2].dropped
-    assert set(dropped) == {f"shot{COUNT}", "lonely.jpg", "shot9-visible.jpg"}
+def test_what_is_left_out_is_named_with_its_reason_and_nothing_is_written_elsewhere(capture):
+    dropped, (before, after) = capture[2].dropped, capture[3]
+    assert len(before) > 2 * COUNT and after == before
+    assert set(dropped) == {f"shot{COUNT}", "shot8", "lonely.jpg", "shot9-visible.jpg"}
+    assert "too few matches" in dropped[f"shot{COUNT}"] and "32 x 24 pixels" in dropped["shot8"]
     assert "zero bytes" in dropped["shot9-visible.jpg"]
-    assert (len(capture[2].pairs), len(capture[2].scene.frames)) == (COUNT + 1, COUNT)
+    assert (len(capture[2].pairs), len(capture[2].scene.frames)) == (COUNT + 2, COUNT)
 
 
-def test_the_scene_has_the_cameras_of_the_truth(capture):
-    found = found_poses(capture[1])
+def test_the_scene_is_that_of_the_truth_with_z_up(capture):
+    _, folder, result, _ = capture
+    found, meta = found_poses(folder), content(folder)
     scale, off_m, off_deg = alignment(found, poses(COUNT))
     assert off_m < 0.01 and off_deg < 0.3
-    thermal = np.array([entry["thermal_transform_matrix"] for entry in entries(capture[1])])
-    apart = np.linalg.norm(thermal[:, :3, 3] - found[:, :3, 3], axis=1) * scale
-    assert apart.std() < 1e-6
-    assert apart[0] == pytest.approx(np.linalg.norm(RIG[:3, 3]), abs=0.04)
-
-
-def test_the_rig_that_was_found_projects_as_the_true_one(capture):
-    rig = capture[2].scene.rig
-    assert rig.determined, rig.explanation
-    scale = alignment(found_poses(capture[1]), poses(COUNT))[0]
-    grid = np.stack(np.meshgrid(np.linspace(60, 420, 7), np.linspace(60, 300, 5)), -1).reshape(-1, 2)
-    points_m = VISIBLE.rays(grid) * 2.5
-    true = THERMAL.project(points_m @ RIG[:3, :3].T + RIG[:3, 3])
-    found = rig.visible_to_thermal
-    seen = rig.thermal_camera.project(points_m / scale @ found[:3, :3].T + found[:3, 3])
-    assert np.median(np.linalg.norm(seen - true, axis=1)) < 1.5
-
-
-def test_drift_is_found(capture):
-    drift = capture[2].scene.drift
+    assert meta["fl_x"] == pytest.approx(VISIBLE.fl_x, rel=0.01)
+    assert len(result.scene.model.points) > 200
+    assert np.median(result.scene.model.sighting_error_px()) < 0.5
+    assert meta["up"] == pytest.approx([0, 0, 1], abs=1e-9)
+    # Up in each camera's axes, by the scene and by the truth.
+    assert np.degrees(np.arccos(np.einsum("ni,ni->n", found[:, 2, :3], poses(COUNT)[:, 2, :3]))).max() < 2.0
+    drift = result.scene.drift
     assert drift.used, drift.explanation
     assert drift.offsets_k == pytest.approx([DRIFT_K * (-1) ** n for n in range(COUNT)], abs=0.1)
     assert drift.after_k < 0.5 * drift.before_k
-    assert content(capture[1])["drift"]["disagreement_after_k"] == pytest.approx(drift.after_k)
-
-
-def test_z_is_up(capture):
-    assert content(capture[1])["up"] == pytest.approx([0, 0, 1], abs=1e-9)
-    found = found_poses(capture[1])[:, :3, :3]
-    # Up in each camera's axes, by the scene and by the truth.
-    assert np.degrees(np.arccos(np.einsum("ni,ni->n", found[:, 2], poses(COUNT)[:, 2, :3]))).max() < 2.0
+    assert meta["drift"]["disagreement_after_k"] == pytest.approx(drift.after_k)
+    assert result.scene.rig.determined, result.scene.rig.explanation
+    thermal = np.array([entry["thermal_transform_matrix"] for entry in entries(folder)])
+    apart = np.linalg.norm(thermal[:, :3, 3] - found[:, :3, 3], axis=1) * scale
+    assert apart.std() < 1e-6
+    assert apart[0] == pytest.approx(np.linalg.norm(RIG[:3, 3]), abs=0.04)
 
 
 def test_the_page_shows_everything_and_fetches_nothing(capture):
@@ -115,6 +115,155 @@ def test_the_page_shows_everything_and_fetches_nothing(capture):
     named = re.sub(r'(xmlns(:\w+)?|rdf:resource)="http[^"]*"', "", page)  # names of what svg is, which nobody fetches
     assert "<script" not in page and "http" not in named.replace("http-equiv", "")
     assert "nan" not in page
+
+
+JPEG = b"\xff\xd8\xff"
+
+
+def page_of(result, name="a", **scene) -> str:
+    """The page of a result in whose scene some things are others, with one picture."""
+    changed = replace(result, scene=replace(result.scene, **scene))
+    return capture_page(changed, [(name, JPEG, JPEG, JPEG, name)], np.linspace(10, 20, 100, dtype=np.float32), 0.0)
+
+
+def words(result, **scene) -> str:
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", page_of(result, **scene)))
+
+
+def test_numbers_on_the_page_have_their_errors(capture):
+    errors = {"rx": 0.003, "ry": 0.004, "rz": 0.012, "log_focal": 0.01, "cx": 0.42, "cy": 0.57}
+    covariance = np.diag([errors.get(name, 0.0) ** 2 for name in PARAMETERS])
+    rig = RigEstimate(Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4), True, "", PARAMETERS, covariance)
+    result = replace(capture[2], start=rig)
+    said = words(result, rig=rig)
+    assert "41.0, 29.0 41.0 ± 0.4, 29.0 ± 0.6 " in said and "70.0 70.0 ± 0.7 " in said
+    assert "turned by 0.00 ± 0.74 degrees" in said
+    assert "41.0, 29.0 41.0, 29.0 " in words(result, rig=replace(rig, parameters=(), covariance=np.zeros((0, 0))))
+    assert f"unknown ({result.scale_missing}); give a length when you export the mesh" in said
+    known = words(result, scale=MetricScale(0.5, 0.01, "GPS."))
+    assert "0.5 ± 0.01 (2.0 %) m per unit" in known and "unknown" not in known
+
+
+def test_names_of_files_are_no_markup(capture):
+    evil = "<script>alert(1)</script>"
+    frames = [replace(frame, camera=evil) for frame in capture[2].scene.frames]
+    pairs = [Pair("a", Path(f"{evil}.jpg"), Path("a.tiff"), evil)]
+    changed = replace(capture[2], source=Path(evil), dropped={evil: evil}, pairs=pairs, scale_missing=evil)
+    text = page_of(changed, evil, frames=frames)
+    assert "<script" not in text
+    assert text.count("&lt;script&gt;") >= 8
+
+
+def test_a_point_of_the_thermal_image_lands_where_the_scene_has_it():
+    """A warm spot at the projection of a scene point appears at that point in the photograph."""
+    model = ring_model(3)
+    seen, pixels = model.seen_by(1)
+    frame = RigFrame("f1", np.zeros((480, 640)), np.zeros((60, 80)), model.camera_to_world[1], model.points[seen], seen)
+    thermal, rig = Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4)
+    rig[:3, 3] = (0.3, -0.1, 0.05)
+    chosen = np.argmin(np.linalg.norm(pixels - (320, 240), axis=1))
+    spot = thermal.project(frame.points_visible()[[chosen]] @ rig[:3, :3].T + rig[:3, 3])[0]
+    x, y = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
+    temperature_c = 20 + 10 * np.exp(-((x - spot[0]) ** 2 + (y - spot[1]) ** 2) / 8)
+    carried = thermal_in_photograph(frame, temperature_c, model.camera, RigEstimate(thermal, rig, True, ""), width=640)
+    row, column = np.unravel_index(np.nanargmax(carried), carried.shape)
+    assert np.hypot(column + 0.5 - pixels[chosen][0], row + 0.5 - pixels[chosen][1]) < 6  # a thermal pixel is 7 wide
+    assert np.isnan(carried).any()
+
+
+def test_every_eighth_frame_evaluates_and_the_ends_train():
+    assert [n for n, name in enumerate(scene_names(40)) if "eval" in name] == [4, 12, 20, 28, 36]
+    for count in range(2, 12):
+        sides = ["eval" in name for name in scene_names(count)]
+        assert sum(sides) == 1 or count > 8
+        assert not sides[-1] and len(sides) == count
+
+
+@pytest.fixture
+def written(capture, tmp_path):
+    """The scene with a pixel without temperature, vignetting, a scale and an up of its own; and its new folder."""
+    scene = capture[2].scene
+    temperature_c = np.load(scene.frames[0].thermal)
+    temperature_c[0, 0] = np.nan
+    np.save(tmp_path / "holed.npy", temperature_c)
+    scene = replace(
+        scene,
+        frames=[replace(scene.frames[0], thermal=tmp_path / "holed.npy"), *scene.frames[1:]],
+        drift=replace(scene.drift, radial=(0.5,)),
+        scale=MetricScale(0.5, 0.01, "GPS."),
+        up=Up(np.array([0.0, 0.6, 0.8]), "Measured.", 0.1),
+    )
+    folder = prepare_output(tmp_path / "scene")
+    write_scene_folder(scene, folder)
+    return scene, folder
+
+
+def test_numbers_come_back_as_they_went_in(written):
+    scene, folder = written
+    read = read_scene_file(folder)
+    by_source = {entry["source"]: entry for entry in read.meta["frames"]}
+    for number, frame in enumerate(scene.frames):
+        entry = by_source[frame.photograph_source]
+        assert np.array(entry["transform_matrix"]) == pytest.approx(scene.model.camera_to_world[number])
+        # A scene point: x_thermal = rig @ x_visible, both in OpenCV axes.
+        point = scene.model.points[:1]
+        in_visible = scene.model.in_camera(number, point)
+        thermal_pose = np.array(entry["thermal_transform_matrix"])
+        in_thermal = (point - thermal_pose[:3, 3]) @ thermal_pose[:3, :3] * (1, -1, -1)
+        rig = scene.rig.visible_to_thermal
+        assert in_thermal == pytest.approx(in_visible @ rig[:3, :3].T + rig[:3, 3])
+        written_c = read_thermal_file(folder / entry["thermal_file_path"], read.unit).temperature_c
+        expected = np.load(frame.thermal) - scene.drift.offsets_k[number] - scene.drift.radial_k(160, 128)
+        np.testing.assert_allclose(written_c, expected, atol=1e-4)
+        assert (folder / entry["file_path"]).read_bytes() == frame.photograph.read_bytes()
+    scale = scale_from_scene_file(read.meta)
+    assert (scale.metres_per_unit, scale.standard_error) == (0.5, 0.01)
+    assert up_from_scene_file(read.meta) == pytest.approx((0.0, 0.6, 0.8))
+    assert read.meta["fl_x"] == scene.model.camera.fl_x
+    assert read.meta["thermal_camera"]["cx"] == scene.rig.thermal_camera.cx
+
+
+def test_tracks_say_which_training_photograph_sees_which_point(written):
+    scene, folder = written
+    outputs = ThermalDataParserConfig(data=folder).setup().get_dataparser_outputs("train")
+    tracks = read_tracks(folder / TRACKS_NAME)
+    assert np.array_equal(tracks.points, scene.model.points)
+    assert np.array_equal(tracks.sighting_point, scene.model.sighting_point)
+    seen = np.bincount(scene.model.sighting_frame, minlength=COUNT)
+    train = [number for number, name in enumerate(tracks.frames) if "train" in name]
+    assert 0.5 * seen[train].sum() < len(outputs.metadata["feature_rays"].origins) <= seen[train].sum()
+
+
+def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, tmp_path, monkeypatch):
+    scene, folder = written
+    overlay = np.ones((VISIBLE.height, VISIBLE.width), dtype=bool)
+    overlay[:40, :100] = False
+    masked = replace(scene, masks=PhotographMasks((VISIBLE.width, VISIBLE.height), overlay))
+    write_scene_folder(masked, folder)
+    assert (folder / "masks").is_dir()
+    (folder / "notes.txt").write_text("mine")
+    write_scene_folder(scene, folder)
+    assert not (folder / "masks").exists()
+    assert (folder / "notes.txt").read_text() == "mine"
+    before = (folder / "transforms.json").read_bytes()
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("thermoxels_ns.capture.scene_writer.write_points", stop)
+    with pytest.raises(KeyboardInterrupt):
+        write_scene_folder(masked, folder)
+    assert (folder / "transforms.json").read_bytes() == before
+    assert len(read_scene_file(folder).frames) == COUNT
+
+
+def test_the_json_has_no_nan(written):
+    scene, folder = written
+    unknown = RigEstimate(scene.rig.thermal_camera, np.eye(4), False, "Kept.")
+    write_scene_folder(replace(scene, rig=unknown, scale=None), folder)
+    content = json.loads((folder / "transforms.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert content["rig_info"]["determined"] is False
+    assert "metres_per_unit" not in content
 
 
 def test_a_second_run_takes_everything_from_the_first(capture):
@@ -143,7 +292,6 @@ def test_another_scale_runs_only_what_depends_on_it_and_so_does_from_stage(captu
         "2/9 temperatures",
         "3/9 poses",
     ]
-    assert result.scene.scale is not None
     assert content(scene)["metres_per_unit"] == result.scene.scale.metres_per_unit
     assert not result.scene.drift.used
     said.clear()
@@ -163,7 +311,6 @@ def test_a_board_gives_the_rig_and_a_scale_is_needed_for_it(capture, tmp_path):
     more["known_distance"] = ("shot2-visible.jpg", 100.0, 100.0, 380.0, 120.0, 2.0)
     result = capture_folder(card, scene, settings(**more), [].append)
     assert "checker board" in result.scene.rig.explanation
-    assert result.scene.scale is not None
     shift_m = result.scene.rig.visible_to_thermal[:3, 3] * result.scene.scale.metres_per_unit
     assert np.allclose(shift_m, RIG[:3, 3], atol=0.02)
     assert result.scene.rig.thermal_camera.fl_x == pytest.approx(THERMAL.fl_x, rel=0.02)
@@ -196,5 +343,5 @@ def test_the_command(capture, tmp_path, capsys):
     words = ["--skip-bad", "True", "--max-features", "500", "--thermal-field-of-view-deg", str(ANGLE_DEG)]
     assert cli.main(["capture", str(card), "--output", str(scene), *words]) == 0
     out = capsys.readouterr().out
-    assert f"{COUNT} frames of {COUNT + 1} pairs" in out
+    assert f"{COUNT} frames of {COUNT + 2} pairs" in out
     assert "shot9-visible.jpg" in out and f"--data {scene}" in " ".join(out.split())

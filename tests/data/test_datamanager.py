@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
-from nerfstudio.scripts.render import _disable_datamanager_setup
 from PIL import Image
 
+from tests.support.scene_folders import look_at_origin
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
-from thermoxels_ns.data.datamanager import ThermalDataManager, ThermalDataManagerConfig
+from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.data.datamanager import ThermalDataManager, ThermalDataManagerConfig, views_of_cameras
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.ray_sampler import CameraRays
 
@@ -90,6 +90,7 @@ def test_streams_alone(scene_folder, own_camera):
     count = 32 if own_camera else 64
     assert (bundle.metadata["stream"] == THERMAL_STREAM).all() and len(bundle) == count
     assert served.get_train_rays_per_batch() == count and not batch["image"].any() and batch["thermal"].any()
+    assert set(served.training_views().size[:, 0]) == {12 if own_camera else 24}
 
 
 def test_batches_depend_on_seed_and_step_alone(scene_folder):
@@ -107,14 +108,6 @@ def test_batches_depend_on_seed_and_step_alone(scene_folder):
     assert not torch.equal(first.next_train(4)[1]["image"], other)
     # Steps and seeds that add up to the same number are different draws.
     assert not torch.equal(manager(scene.path, seed=0).next_train(1)[1]["image"], other)
-
-
-def test_exporters_get_new_rays_for_the_same_step(scene_folder):
-    """nerfstudio's point cloud exporter asks for step 0 until it has enough points, and sets the number of rays."""
-    served = manager(scene_folder().path, mode="test")
-    served.train_pixel_sampler.num_rays_per_batch = 33
-    first, second = served.next_train(0), served.next_train(0)
-    assert len(first[0]) == 33 and not torch.equal(first[1]["image"], second[1]["image"])
 
 
 def test_evaluation_frames_never_train(scene_folder):
@@ -140,23 +133,6 @@ def test_masked_pixels_are_never_drawn(scene_folder):
     assert len(gridded) == 8 * 25
 
 
-def test_intrinsics_of_every_frame_and_rays_without_a_table(scene_folder):
-    scene = scene_folder(distortion=DISTORTION)
-    for number, frame in enumerate(scene.meta["frames"]):
-        frame["fl_x"] = 30.0 + number
-    scene.rewrite()
-    cameras = manager(scene.path).train_dataset.cameras
-    tabled, lean = CameraRays(cameras), CameraRays(cameras, table_limit_bytes=0)
-    assert tabled.has_table and not lean.has_table
-    pixels = torch.arange(len(tabled))
-    reference = all_rays(cameras)
-    for rays in (tabled, lean):
-        columns = rays.columns(pixels)
-        for name in ("origins", "directions", "pixel_area"):
-            torch.testing.assert_close(columns[name], reference[name], atol=1e-6, rtol=2e-3)
-        assert torch.equal(columns["camera_indices"], reference["camera_indices"])
-
-
 def test_optical_axis_of_a_fisheye_lens_is_finite():
     """A pixel centre exactly on the axis, where nerfstudio's rays are 0 / 0."""
     cameras = Cameras(torch.eye(4)[None, :3], 5.0, 5.0, 2.5, 1.5, 5, 3, camera_type=CameraType.FISHEYE)
@@ -166,8 +142,8 @@ def test_optical_axis_of_a_fisheye_lens_is_finite():
         assert all(torch.isfinite(columns[name]).all() for name in ("directions", "pixel_area"))
 
 
-def test_frames_of_different_resolutions(scene_folder):
-    scene = scene_folder(frames=5)
+def test_frames_of_different_resolutions_and_lenses_with_and_without_a_table_of_rays(scene_folder):
+    scene = scene_folder(frames=5, distortion=DISTORTION)
     name = scene.names[0]
     rng = np.random.default_rng(0)
     Image.fromarray(rng.integers(0, 256, (9, 12, 3), dtype=np.uint8)).save(scene.path / "images" / f"{name}.png")
@@ -175,10 +151,17 @@ def test_frames_of_different_resolutions(scene_folder):
     scene.meta["frames"][0].update(w=12, h=9, fl_x=13.0, fl_y=13.5, cx=6.0, cy=4.5)
     scene.rewrite()
     served = manager(scene.path)
+    cameras = served.train_dataset.cameras
     bundle, batch = served.next_train(0)
-    pixels = check_rays(bundle, all_rays(served.train_dataset.cameras))
+    pixels = check_rays(bundle, all_rays(cameras))
     colours = torch.cat([served.train_dataset[i]["image"].reshape(-1, 3) for i in range(4)])
     torch.testing.assert_close(batch["image"], colours[pixels])
+    tabled, lean = CameraRays(cameras), CameraRays(cameras, table_limit_bytes=0)
+    assert tabled.has_table and not lean.has_table
+    for rays in (tabled, lean):
+        columns = rays.columns(torch.arange(len(tabled)))
+        for key, expected in all_rays(cameras).items():
+            torch.testing.assert_close(columns[key], expected, atol=1e-6, rtol=2e-3)
 
 
 def test_training_rays_are_a_regular_subset(scene_folder):
@@ -209,21 +192,84 @@ def test_training_rays_per_image_are_limited(scene_folder, most):
     assert int(counts.max()) <= most and int(counts.min()) >= min(most / 4, 432)
 
 
-def test_render_script_can_set_it_up_without_data(scene_folder):
-    config = ThermalDataManagerConfig(dataparser=ThermalDataParserConfig(data=scene_folder().path))
-    assert isinstance(config, VanillaDataManagerConfig)
-    config.dataparser.downscale_factor = 2.0  # type: ignore[attr-defined]
-    with _disable_datamanager_setup(config._target):
-        served = config.setup(test_mode="test", device="cpu")
-    assert int(served.eval_dataset.cameras.width[0]) == 12 and served.eval_dataset[0]["image"].shape == (9, 12, 3)
-    assert served.train_pixel_sampler is None and served.get_datapath() == config.dataparser.data
-
-
 def test_photographs_scaled_by_the_datamanager_keep_their_thermal_images(scene_folder):
     served = manager(scene_folder().path, camera_res_scale_factor=0.5)
     item = served.eval_dataset[0]
     assert item["image"].shape == (9, 12, 3) and item["thermal"].shape == (18, 24, 1)
     assert int(item["thermal_camera"].width) == 24
+
+
+def cameras(kind: CameraType, width: int, height: int, fx: float, fy: float) -> Cameras:
+    poses = np.stack([look_at_origin(angle)[:3] for angle in (0.3, 2.0)]).astype(np.float32)
+    return Cameras(torch.from_numpy(poses), fx, fy, 0.45 * width, 0.55 * height, width, height, camera_type=kind)
+
+
+def directions(views: Views, number: int) -> np.ndarray:
+    """Unit directions in the world through the centres of all pixels of a view, shape (h, w, 3)."""
+    width, height = views.size[number]
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    across, up = (np.stack((x, y), -1) - views.centre[number]).transpose(2, 0, 1) / views.focal[number][:, None, None]
+    local = np.stack((across, -up, -np.ones_like(x)), -1)
+    local /= np.linalg.norm(local, axis=-1, keepdims=True)
+    return local @ views.camera_to_world[number, :, :3].T
+
+
+def inside(views: Views, number: int, rays: np.ndarray) -> np.ndarray:
+    """Which directions (n, 3) a view sees."""
+    local = rays @ views.camera_to_world[number, :, :3]
+    ahead = local[:, 2] < -1e-9
+    depth = np.where(ahead, -local[:, 2], 1.0)[:, None]
+    pixel = views.centre[number] + views.focal[number] * local[:, :2] * (1, -1) / depth
+    return ahead & ((pixel >= -1e-6) & (pixel <= views.size[number] + 1e-6)).all(axis=1)
+
+
+@pytest.mark.parametrize("own_camera", [False, True])
+def test_every_pixel_looks_along_its_training_ray(scene_folder, own_camera):
+    scene = scene_folder(own_camera=own_camera, thermal_size=(12, 10) if own_camera else None)
+    if own_camera:
+        del scene.meta["thermal_camera"]["k1"]
+        scene.rewrite()
+    served = manager(scene.path, "test")
+    views = served.training_views()
+    ours = [directions(views, number) for number in range(len(views.size))]
+    assert views.camera_to_world.shape == ((16 if own_camera else 8), 3, 4)
+    bundles = list(served.training_rays(RGB_STREAM | THERMAL_STREAM))
+    rays = {
+        name: torch.cat([getattr(bundle, name) for bundle in bundles]).numpy() for name in ("origins", "directions")
+    }
+    np.testing.assert_allclose(np.concatenate([d.reshape(-1, 3) for d in ours]), rays["directions"], atol=2e-6)
+    centres = np.concatenate(
+        [np.broadcast_to(p[:, 3], (d[..., 0].size, 3)) for p, d in zip(views.camera_to_world, ours)]
+    )
+    np.testing.assert_allclose(centres, rays["origins"], atol=1e-6)
+    assert views.size.tolist() == [[24, 18]] * 8 + [[12, 10]] * (8 if own_camera else 0)
+    assert views.camera_to_world.dtype == views.focal.dtype == views.centre.dtype == np.float64
+
+
+def test_a_fisheye_lens_spans_its_angles():
+    """120 and 60 degrees across and along: the border pixels are just within, the image of the pinhole ends there."""
+    lens = cameras(CameraType.FISHEYE, 120, 60, 120 / np.deg2rad(120), 60 / np.deg2rad(60))
+    views = views_of_cameras(lens)
+    for number in range(2):
+        middle_row = lens.generate_rays(number, keep_shape=True).directions[33].numpy()
+        middle_column = lens.generate_rays(number, keep_shape=True).directions[:, 54].numpy()
+        assert inside(views, number, middle_row).all() and inside(views, number, middle_column).all()
+    ends = np.rad2deg(np.arctan2([views.centre[0], views.size[0] - views.centre[0]], views.focal[0]))
+    np.testing.assert_allclose(ends, [[54, 33], [66, 27]], atol=0.5)
+
+
+def test_a_panorama_sees_everything_once():
+    lens = cameras(CameraType.EQUIRECTANGULAR, 64, 32, 32.0, 32.0)
+    views = views_of_cameras(lens)
+    assert views.camera_to_world.shape == (12, 3, 4) and (views.size == 16).all()
+    rays = np.random.default_rng(0).normal(size=(500, 3))
+    for first in (0, 6):
+        seen = np.array([inside(views, number, rays) for number in range(first, first + 6)])
+        assert (seen.sum(axis=0) == 1).all()
+        np.testing.assert_allclose(
+            views.camera_to_world[first : first + 6, :, 3], views.camera_to_world[first, :, 3][None].repeat(6, 0)
+        )
+    np.testing.assert_allclose(np.linalg.det(views.camera_to_world[:, :, :3]), 1.0, atol=1e-6)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

@@ -1,6 +1,5 @@
 """What may not be read is named as such, not as damaged."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -69,23 +68,16 @@ def test_a_file_that_may_not_be_read(tmp_path: Path, monkeypatch, name) -> None:
     refused(lambda: READERS[name](path))
 
 
-@pytest.mark.parametrize(
-    ("part", "suffix"), [("images", ".png"), ("thermal", ".png"), ("thermal", ".npy"), ("mask", ".png")]
-)
-def test_images_of_a_scene(scene_folder, monkeypatch, part, suffix) -> None:
-    def celsius(number: int, shape: tuple[int, int]) -> np.ndarray:
-        return np.full(shape, 20.0 + number, np.float32)
-
-    scene = scene_folder(frames=5, suffix=suffix, counts=celsius if suffix == ".npy" else None)
-    stem = Path(json.loads((scene.path / "transforms.json").read_text())["frames"][0]["file_path"]).stem
-    if part == "mask":
+@pytest.mark.parametrize("name", ["images/{}.png", "thermal/{}.png", "mask_{}.png"])
+def test_images_of_a_scene(scene_folder, monkeypatch, name) -> None:
+    scene = scene_folder(frames=5)
+    if "mask" in name:
         scene.add_masks()
-    forbid(monkeypatch, f"mask_{stem}.png" if part == "mask" else f"{part}/{stem}{suffix}")
+    forbid(monkeypatch, name.format(scene.names[0]))
 
     def read() -> None:
-        outputs = ThermalDataParserConfig(data=scene.path).setup().get_dataparser_outputs("train")
-        data = ThermalDataset(outputs)
-        for number in range(len(outputs.image_filenames)):
+        data = ThermalDataset(ThermalDataParserConfig(data=scene.path).setup().get_dataparser_outputs("train"))
+        for number in range(len(data)):
             data[number]
 
     refused(read)

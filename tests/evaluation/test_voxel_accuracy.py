@@ -1,10 +1,13 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.evaluation.truth_comparison import SurfaceScore, surface_fscore
+from thermoxels_ns.evaluation.truth_comparison import SurfaceScore, sample_facets, surface_distances, surface_fscore
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 from thermoxels_ns.synthetic.solids import Sphere
 
 LATTICE = Lattice.covering((-1, -1, -1), (1, 1, 1), 24)
@@ -39,18 +42,13 @@ def test_half_a_sphere_has_half_the_recall():
     assert score.fscore == pytest.approx(2 * score.precision * score.recall / (score.precision + score.recall))
 
 
-def test_enclosed_cavities_do_not_count():
+def test_enclosed_cavities_and_faces_where_the_box_cuts_do_not_count_for_precision():
     hollow = voxels(SPHERE) & ~voxels(Sphere((0, 0, 0), 0.25))
     assert score_of(hollow)[0].precision == 1.0
-    opened = hollow.copy()
-    opened[12, 12, :12] = False
-    assert score_of(opened)[0].precision < 1.0
-
-
-def test_faces_where_the_box_cuts_do_not_count_for_precision():
-    shape = Sphere((-1.0, 0.0, 0.0), 0.6)
-    score = score_of(voxels(shape), shape, shape.surface_points(500, 0)[0])[0]
-    assert score.precision == 1.0
+    hollow[12, 12, :12] = False
+    assert score_of(hollow)[0].precision < 1.0
+    cut = Sphere((-1.0, 0.0, 0.0), 0.6)
+    assert score_of(voxels(cut), cut, cut.surface_points(500, 0)[0])[0].precision == 1.0
 
 
 def test_what_truly_stands_beside_the_body_counts_neither_way_but_lumps_between_do():
@@ -97,3 +95,48 @@ def test_fewer_than_three_cameras_see_nothing_of_any_boundary():
     few = looking_at((0.0, 0.0, 0.0), [(0.0, 0.0, 6.0), (0.1, 0.0, 6.0)])
     for cells in (voxels(SPHERE), np.zeros(LATTICE.cell_shape, bool), np.ones(LATTICE.cell_shape, bool)):
         assert score_of(cells, views=few)[1] == SurfaceScore()
+
+
+class Plane:
+    def __init__(self, height: float):
+        self.height = height
+
+    def signed_distance(self, points):
+        return points[:, 2] - self.height
+
+    def surface_points(self, n, seed):
+        xy = np.random.default_rng(seed).random((n, 2))
+        return np.column_stack([xy, np.full(n, self.height)]), np.tile([0.0, 0.0, 1.0], (n, 1))
+
+
+def slab(mesh_of_cells) -> TetMesh:
+    """A slab of 4 x 4 x 1 voxels of 0.25 m; only its top counts as surface; temperature 10 + 4 x."""
+    mesh = mesh_of_cells(np.ones((4, 4, 1), dtype=bool), 0.25)
+    top = np.all(mesh.points_m[mesh.facets][:, :, 2] == 0.25, axis=1)
+    return replace(
+        mesh, temperature_c=10.0 + 4.0 * mesh.points_m[:, 0], facet_tags=np.where(top, mesh.facet_tags * 0, FACET_BOX)
+    )
+
+
+def test_parallel_planes_are_their_distance_apart_and_temperatures_those_of_the_closest_point(mesh_of_cells):
+    truth = Plane(0.20)
+    points = truth.surface_points(500, 0)[0]
+    found = surface_distances(slab(mesh_of_cells), truth, points)
+    distances = (found.mesh_to_truth, found.truth_to_mesh, found.chamfer, found.hausdorff)
+    assert distances == pytest.approx((0.05,) * 4, abs=1e-12)
+    assert found.closest_temperature_c == pytest.approx(10.0 + 4.0 * points[:, 0], abs=1e-6)
+
+
+def test_a_mesh_that_is_all_cut_by_the_box_has_no_surface(mesh_of_cells):
+    mesh = mesh_of_cells(np.ones((2, 2, 2), dtype=bool), 0.5)
+    assert np.all(mesh.facet_tags == FACET_BOX)
+    assert surface_distances(mesh, Plane(0.5), np.zeros((1, 3))) is None
+
+
+def test_samples_are_spread_by_area_and_lie_on_the_triangles(mesh_of_cells):
+    mesh = mesh_of_cells(np.ones((3, 1, 1), dtype=bool), 1.0)
+    samples = sample_facets(mesh.points_m, mesh.facets, 14_000)
+    at_end = np.abs(samples[:, 0]) < 1e-12
+    assert np.mean(at_end) == pytest.approx(1 / 14, rel=0.01)
+    on_some_face = np.isclose(samples, [0, 0, 0], atol=1e-12) | np.isclose(samples, [3, 1, 1], atol=1e-12)
+    assert on_some_face.any(axis=1).all()

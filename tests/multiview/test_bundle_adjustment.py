@@ -1,14 +1,13 @@
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.multiview.bundle_adjustment import (
     FEWEST_TRACKS,
     Features,
     Tracks,
-    _placed_like,
+    _distances,
     adjust_poses,
     features_of,
     find_tracks,
@@ -46,14 +45,7 @@ def tracks(noise_px: float = 0.2, points: int = 400, seed: int = 1) -> Tracks:
 
 def inconsistency_px(estimated: np.ndarray) -> float:
     """Median distance between exact sightings and points triangulated from poses: what a reconstruction suffers."""
-    found = adjusted_distance(tracks(noise_px=0.0), estimated)
-    return float(np.median(found))
-
-
-def adjusted_distance(exact: Tracks, estimated: np.ndarray) -> np.ndarray:
-    from thermoxels_ns.multiview.bundle_adjustment import _distances
-
-    return _distances(exact, estimated, np.full(VIEWS, FOCAL))
+    return float(np.median(_distances(tracks(noise_px=0.0), estimated, np.full(VIEWS, FOCAL))))
 
 
 @pytest.mark.parametrize("angle_deg", [0.15, 0.3])
@@ -64,14 +56,9 @@ def test_poses_that_are_off_are_found_fivefold_nearer(angle_deg):
     assert inconsistency_px(found.poses) < 0.2 * inconsistency_px(given)
 
 
-def test_good_poses_stay():
-    assert adjust_poses(tracks(), poses(), np.full(VIEWS, FOCAL)) is None
-
-
 def test_adjusted_poses_stand_where_the_given_ones_do_and_have_their_size():
     given = off_by(0.3)
     found = adjust_poses(tracks(), given, np.full(VIEWS, FOCAL))
-    assert found is not None
     centres, before = found.poses[:, :3, 3], given[:, :3, 3]
     np.testing.assert_allclose(centres.mean(0), before.mean(0), atol=1e-9)
     spread = [np.sqrt(((c - c.mean(0)) ** 2).sum()) for c in (centres, before)]
@@ -81,22 +68,13 @@ def test_adjusted_poses_stand_where_the_given_ones_do_and_have_their_size():
     np.testing.assert_allclose(mean_turn, mean_turn.T, atol=1e-6)
 
 
-def test_the_size_of_the_world_does_not_matter():
-    given, big = off_by(0.3), off_by(0.3)
-    big[:, :3, 3] *= 1000.0
-    found, found_big = (adjust_poses(tracks(), each, np.full(VIEWS, FOCAL)) for each in (given, big))
-    assert found is not None and found_big is not None
-    np.testing.assert_allclose(found_big.poses[:, :3, 3] / 1000.0, found.poses[:, :3, 3], atol=1e-5)
-
-
-def test_where_the_world_begins_does_not_matter():
-    given, far = off_by(0.3), off_by(0.3)
-    shift = np.array([4.5e6, 5.3e6, 120.0])
-    far[:, :3, 3] += shift
-    found, found_far = (adjust_poses(tracks(), each, np.full(VIEWS, FOCAL)) for each in (given, far))
-    assert found is not None and found_far is not None
-    np.testing.assert_allclose(found_far.poses[:, :3, 3] - shift, found.poses[:, :3, 3], atol=1e-5)
-    np.testing.assert_allclose(found_far.poses[:, :3, :3], found.poses[:, :3, :3], atol=1e-6)
+@pytest.mark.parametrize(("unit", "shift"), [(1000.0, (0.0, 0.0, 0.0)), (1.0, (4.5e6, 5.3e6, 120.0))])
+def test_size_and_beginning_of_the_world_do_not_matter(unit, shift):
+    given, other = off_by(0.3), off_by(0.3)
+    other[:, :3, 3] = unit * other[:, :3, 3] + shift
+    found, found_other = (adjust_poses(tracks(), each, np.full(VIEWS, FOCAL)) for each in (given, other))
+    np.testing.assert_allclose((found_other.poses[:, :3, 3] - shift) / unit, found.poses[:, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(found_other.poses[:, :3, :3], found.poses[:, :3, :3], atol=1e-6)
 
 
 @pytest.mark.parametrize("off_px", [3.0, 10.0, 200.0])
@@ -118,17 +96,9 @@ def test_a_photograph_with_hardly_a_feature_stays_nearly_where_it_is():
     kept[few] = False
     seen = Tracks(seen.photograph[kept], seen.point[kept], seen.place[kept])
     found = adjust_poses(seen, given, np.full(VIEWS, FOCAL))
-    assert found is not None
     turn = found.poses[5, :3, :3] @ given[5, :3, :3].T
     assert np.rad2deg(np.arccos((np.trace(turn) - 1.0) / 2.0)) < 1.0
     assert np.linalg.norm(found.poses[5, :3, 3] - given[5, :3, 3]) < 0.05
-
-
-def test_poses_that_differ_as_a_whole_are_brought_back():
-    turned = Rotation.from_rotvec((0.1, -0.2, 0.3)).as_matrix()
-    moved = poses()
-    moved[:, :3, :3], moved[:, :3, 3] = turned @ moved[:, :3, :3], 1.1 * moved[:, :3, 3] @ turned.T + (1.0, 2.0, 3.0)
-    np.testing.assert_allclose(_placed_like(moved, poses()), poses(), atol=1e-9)
 
 
 def by_hand(*photographs: dict[tuple[float, float], np.ndarray]) -> Tracks:
@@ -149,16 +119,6 @@ def test_matches_far_from_their_lines_are_none():
     assert by_hand(one, other).points == 11
 
 
-def test_a_track_with_two_features_of_one_photograph_is_none():
-    looks = np.eye(16)
-    between = 0.94 * looks[0] + 0.34 * looks[12]
-    one = {(10.0 * n + 5.0, 5.0 * n + 5.0): looks[n] for n in range(12)}
-    third = {(x - 8.0, y): look for (x, y), look in one.items()} | {(5.0 - 8.0, 5.0): between}
-    assert by_hand(one, {(x - 4.0, y): look for (x, y), look in one.items()}).points == 12
-    doubled = by_hand(one | {(9.0, 5.0): between}, {(x - 4.0, y): look for (x, y), look in one.items()}, third)
-    assert doubled.points == 11
-
-
 def test_features_lie_where_rays_say_that_they_do():
     rows, columns = np.mgrid[:80, :100] + 0.5
     spot = 255.0 * np.exp(-((columns - 40.2) ** 2 + (rows - 31.7) ** 2) / (2.0 * 4.0**2))
@@ -171,18 +131,6 @@ def test_too_few_tracks_say_nothing():
     assert adjust_poses(few, off_by(0.3), np.full(VIEWS, FOCAL)) is None
     none = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
     assert adjust_poses(none, poses(), np.full(VIEWS, FOCAL)) is None
-
-
-def test_fixed_photographs_stay_where_they_are():
-    given = poses()
-    given[-2:] = off_by(0.3)[-2:]
-    theirs = tracks()
-    chosen = np.zeros(theirs.points, dtype=bool)
-    chosen[theirs.point[theirs.photograph >= VIEWS - 2]] = True
-    found = adjust_poses(theirs.of_points(chosen), given, np.full(VIEWS, FOCAL), fixed=VIEWS - 2)
-    assert found is not None
-    np.testing.assert_allclose(found.poses[:-2], given[:-2], atol=1e-12)
-    assert np.abs(found.poses[-2:] - poses()[-2:]).max() < 0.3 * np.abs(given[-2:] - poses()[-2:]).max()
 
 
 def test_photographs_of_other_brightness_have_the_same_tracks():
@@ -200,18 +148,3 @@ def test_photographs_of_other_brightness_have_the_same_tracks():
         pairs = each.point * 8 + each.photograph
         assert len(np.unique(pairs)) == len(pairs)
         assert np.bincount(each.point).min() >= 2
-
-
-def test_masked_features_do_not_count():
-    picture = np.random.default_rng(0).integers(0, 255, (60, 80)).astype(np.uint8)
-    picture = cv2.GaussianBlur(picture, (0, 0), 2.0)
-    picture = ((picture - picture.min()) * (255.0 / np.ptp(picture))).astype(np.uint8)
-    mask = np.zeros((60, 80), dtype=bool)
-    mask[:, :40] = True
-    assert features_of(picture, mask).pixels[:, 0].max() < 42.0 < features_of(picture).pixels[:, 0].max()
-
-
-def test_a_lens_that_distorts_is_no_pose_error():
-    camera = Camera(160, 120, 150.0, 150.0, 80.0, 60.0, k1=-0.2)
-    pixels = np.array([[10.0, 20.0], [140.0, 100.0]])
-    np.testing.assert_allclose(camera.project(camera.rays(pixels)), pixels, atol=1e-6)

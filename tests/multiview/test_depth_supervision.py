@@ -6,19 +6,20 @@ import pytest
 import torch
 
 from tests.support.boxed_scene import write_boxed_scene
-from tests.support.plane_photographs import EYES, LATTICE, PLANE, SIZE, photographs
+from tests.support.plane_photographs import EYES, SIZE, photographs
 from tests.support.short_training import train
 from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.core.lattice import input_from_world
 from thermoxels_ns.multiview.evidence import evidence_of_photographs
 from thermoxels_ns.multiview.stereo import (
     ERROR_PLANES,
     Depths,
-    depths_of,
     feature_rays_to_depths,
 )
 from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.callbacks import SHORTEST_RUN_WITH_DEPTHS, follow_depths
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler, feature_ray_loss
+from thermoxels_ns.training.model import ThermoxelsModel
 
 
 @pytest.fixture(scope="module")
@@ -31,12 +32,6 @@ def scene(tmp_path_factory):
 @pytest.fixture(scope="module")
 def untrained(scene):
     return train(scene, 0, {})
-
-
-def rays_of(pipeline, say=print) -> FeatureRays | None:
-    lattice = pipeline.model.grid.lattice
-    found = evidence_of_photographs(pipeline.datamanager.train_dataset, 0.0, lattice.lo, lattice.hi, say)
-    return None if found is None else found.feature_rays
 
 
 def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
@@ -56,49 +51,21 @@ def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
         assert error == pytest.approx(ERROR_PLANES * 0.02 * slope, rel=1e-5)
 
 
-def test_lines_end_at_the_plane_that_the_photographs_show():
-    lines = feature_rays_to_depths(depths_of(photographs(), LATTICE.lo, LATTICE.hi))
-    off = np.abs(lines.points[:, 2] - PLANE)
-    assert len(off) > 10_000 and np.quantile(off, 0.95) < 0.02
-
-
 def test_most_lines_of_a_scene_end_at_its_surface(untrained):
-    lines = rays_of(untrained)
-    assert lines is not None and len(lines.points) > 200
-    from thermoxels_ns.core.lattice import input_from_world
-
+    lattice = untrained.model.grid.lattice
+    found = evidence_of_photographs(untrained.datamanager.train_dataset, 0.0, lattice.lo, lattice.hi, print)
+    assert found is not None and len(found.feature_rays.points) > 200
     outputs: Any = untrained.datamanager.train_dataparser_outputs
     to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
-    points = lines.points @ to_input[:3, :3].T + to_input[:3, 3]
+    points = found.feature_rays.points @ to_input[:3, :3].T + to_input[:3, 3]
     off = np.abs(make_scene("pipes").solid.signed_distance(points))
     assert np.median(off) < 0.02 and np.quantile(off, 0.9) < 0.06, np.quantile(off, [0.5, 0.9])
-
-
-def asked_boxes(monkeypatch, found=None) -> list:
-    """The boxes in which a training looks for depths, which are then `found`."""
-    boxes: list[Any] = []
-
-    def recorded(dataset, near, lo, hi, say, gains, offsets):
-        boxes.append((lo, hi))
-        return found
-
-    monkeypatch.setattr("thermoxels_ns.training.callbacks.evidence_of_photographs", recorded)
-    return boxes
 
 
 def attributes_of(datamanager: Any, steps: int = SHORTEST_RUN_WITH_DEPTHS) -> Any:
     first = steps // 2  # of a resumed training the steps before count too
     trainer = SimpleNamespace(_start_step=first, config=SimpleNamespace(max_num_iterations=steps - first))
     return SimpleNamespace(pipeline=SimpleNamespace(datamanager=datamanager), trainer=trainer)
-
-
-def test_without_photographs_in_training_nothing_is_asked(scene, untrained, monkeypatch):
-    pipeline = train(scene, 0, {"sh_degree": None, "thermal_density_gradient": True})
-    boxes = asked_boxes(monkeypatch)
-    follow_depths(pipeline.model, attributes_of(pipeline.datamanager))
-    data = SimpleNamespace(config=SimpleNamespace(streams="thermal"), train_dataset=untrained.datamanager.train_dataset)
-    follow_depths(untrained.model, attributes_of(data))
-    assert boxes == []
 
 
 @pytest.mark.parametrize(
@@ -113,12 +80,18 @@ def test_without_photographs_in_training_nothing_is_asked(scene, untrained, monk
     ],
 )
 def test_when_photographs_are_asked(scene, monkeypatch, wanted, steps, tracks, weight, asked):
-    boxes = asked_boxes(monkeypatch)
+    boxes: list[Any] = []
+    asks = "thermoxels_ns.training.callbacks.evidence_of_photographs"
+    monkeypatch.setattr(asks, lambda dataset, near, lo, hi, *more: boxes.append((lo, hi)))
     pipeline = train(scene, 0, {"photo_depth": wanted, "loss_overrides": {"tracks": weight}})
     pipeline.model.feature_ray_sampler = object() if tracks else None  # type: ignore[assignment]
     boxes.clear()
     follow_depths(pipeline.model, attributes_of(pipeline.datamanager, steps))
     assert len(boxes) == asked
+    boxes.clear()  # where no photographs train
+    data = SimpleNamespace(config=SimpleNamespace(streams="thermal"), train_dataset=pipeline.datamanager.train_dataset)
+    follow_depths(pipeline.model, attributes_of(data, steps))
+    assert boxes == []
 
 
 def test_a_training_follows_depths(scene, capsys):
@@ -136,8 +109,6 @@ def test_a_training_follows_depths(scene, capsys):
 
 @pytest.mark.parametrize(("depths", "light"), [("on", COARSE_LIGHT), ("off", 0.0)])
 def test_light_may_pass_depths_but_not_tracks_while_the_lattice_is_coarse(scene, monkeypatch, depths, light):
-    from thermoxels_ns.training.model import ThermoxelsModel
-
     populate, asked = ThermoxelsModel.populate_modules, []
 
     def with_tracks(model):

@@ -6,10 +6,11 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from tests.support.plane_photographs import EYES, FOCAL, PLANE, SIZE, photographs, texture
+from tests.support.plane_photographs import EYES, FOCAL, LATTICE, PLANE, SIZE, photographs, texture
 from thermoxels_ns.core.threads import set_num_threads
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.multiview import stereo
+from thermoxels_ns.multiview.differences import matters, photograph_differences
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs
 from thermoxels_ns.multiview.stereo import FEWEST_VIEWS, Depths, depths_of, feature_rays_to_depths
 
@@ -29,19 +30,15 @@ def changed(change) -> Photographs:
     return replace(seen, colours=np.ascontiguousarray(colours.reshape(-1, 3), dtype=np.float32))
 
 
-def test_a_plane_is_found_where_it_is():
+def test_a_plane_is_found_where_it_is_whatever_the_brightness_of_photographs():
     found = depths(photographs())
     known = np.isfinite(found.depth)
     off = np.abs(found.depth[known] - TRUE_DEPTH)
     assert found.share > 0.2
     assert np.median(off) < 0.006 and np.quantile(off, 0.95) < np.median(found.error[known])
-
-
-def test_brightness_of_photographs_does_not_move_the_plane():
-    gains = np.exp(np.random.default_rng(3).normal(0.0, 0.2, len(EYES)))
-    found = depths(photographs(gains=gains))
-    assert found.share > 0.2
-    assert np.nanmedian(np.abs(found.depth - TRUE_DEPTH)) < 0.006
+    other = depths(photographs(gains=np.exp(np.random.default_rng(3).normal(0.0, 0.2, len(EYES)))))
+    assert other.share > 0.2
+    assert np.nanmedian(np.abs(other.depth - TRUE_DEPTH)) < 0.006
 
 
 def test_larger_photographs_halve_the_error():
@@ -125,20 +122,7 @@ def subset(chosen: list[int]) -> Photographs:
 def test_too_few_photographs_or_all_from_one_place_say_nothing(chosen):
     assert len(set(chosen)) <= FEWEST_VIEWS
     assert depths(subset(chosen)).share == 0.0
-
-
-@pytest.mark.parametrize("asked, expected", [(True, [1, 0]), (False, [0, 0])])
-def test_only_depths_that_others_confirm_look_through_a_point(asked, expected):
-    nothing = np.zeros((2, 3), np.float32), np.zeros(2, np.float32)
-    cameras = np.tile(np.eye(3, 4), (2, 1, 1)), np.zeros((2, 3)), np.ones((2, 2), int), np.arange(2)
-    depth, error = np.array([1.0, 2.0], np.float32), np.array([0.1, 0.1], np.float32)
-    agreeing, behind = stereo.other_views(Photographs(*cameras, *nothing), depth, error, np.full(2, asked))
-    assert agreeing.tolist() == [0, 0] and behind.tolist() == expected
-
-
-def test_a_camera_that_looks_away_from_the_box_has_no_depths():
-    away = depths_of(photographs(), (-0.5, -0.5, 2.0), (0.5, 0.5, 3.0))
-    assert away.share == 0.0
+    assert depths_of(photographs(), (-0.5, -0.5, 2.0), (0.5, 0.5, 3.0)).share == 0.0  # behind all cameras
 
 
 def plate(noise: float) -> tuple[Photographs, np.ndarray]:
@@ -194,41 +178,6 @@ def test_what_lies_beyond_the_box_is_found_there_if_at_all_and_not_at_its_far_si
     assert np.count_nonzero(np.abs(points[:, 2] - PLANE) > 0.1) < 0.01 * len(found.depth)
 
 
-def room() -> tuple[Photographs, float]:
-    """Photographs of a textured room from within, in a circle and all looking outwards, and the half of its width."""
-    size, focal, half = 64, 60.0, 0.5
-    column, row = np.meshgrid(*[(np.arange(size) + 0.5 - size / 2) / focal] * 2)
-    matrices, centres, pictures = [], [], []
-    for number in range(24):
-        angle = 2.0 * np.pi * number / 24
-        forward = np.array([np.cos(angle), np.sin(angle), 0.0])
-        turned = np.stack((np.cross(forward, (0.0, 0.0, 1.0)), (0.0, 0.0, -1.0), forward))
-        centre = -0.15 * forward + np.array([0.0, 0.0, 0.05 * (-1) ** number])
-        towards = np.stack((column, row, np.ones_like(row)), -1) @ turned
-        with np.errstate(divide="ignore"):
-            reach = ((np.where(towards > 0.0, half, -half) - centre) / towards).min(-1)
-        at = centre + reach[..., None] * towards
-        waves = [np.sin(41 * at @ way + phase) for way, phase in (((1, 2, 3), 0), ((3, -1, 2), 1), ((-2, 3, 1), 2))]
-        pictures.append(0.5 + 0.1 * np.stack(waves, -1))
-        intrinsics = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-        matrices.append(intrinsics @ np.column_stack((turned, -turned @ centre)))
-        centres.append(centre)
-    colours = np.concatenate(pictures).reshape(-1, 3).astype(np.float32)
-    sizes = np.full((24, 2), size)
-    firsts, thermal = np.arange(24) * size * size, np.full(len(colours), np.nan)
-    return Photographs(np.stack(matrices), np.stack(centres), sizes, firsts, colours, thermal), half
-
-
-def test_depths_of_a_room_from_within_lie_on_its_walls():
-    seen, half = room()
-    found = depths_of(seen, (-half, -half, -half), (half, half, half))
-    sure = np.flatnonzero(np.isfinite(found.depth))
-    lines = feature_rays_to_depths(found)
-    off = np.abs(np.abs(lines.points).max(1) - half)
-    assert len(sure) > 500
-    assert np.quantile(off, 0.9) < 0.05, np.quantile(off, [0.5, 0.9])
-
-
 class Frames(ThermalDataset):
     """A dataset of pictures whose red and green say where a pixel's ray goes: x and y on the plane at depth 1."""
 
@@ -277,18 +226,75 @@ def test_read_photographs_are_pinholes(distortion, width, height):
         assert shown[..., 1] == pytest.approx(0.5 + 0.4 * y, abs=0.6 * pixel + 0.004)
 
 
-def test_masks_of_read_photographs():
+def test_read_photographs_have_their_masks_and_other_lenses_are_left_out():
     read = read_photographs(Frames(600, 450, None, masked=True), most=32, longest_side=400)
-    assert read is not None
     rows = np.isnan(read.colours[: np.prod(read.sizes[0])].reshape(*read.sizes[0][::-1], 3)).all((1, 2))
     assert rows[:75].all() and not rows[76:].any()
-
-
-def test_other_lenses_are_left_out():
-    frames = Frames(60, 40, None)
-    kinds = torch.full((40, 1), CameraType.FISHEYE.value)
+    frames, kinds = Frames(60, 40, None), torch.full((40, 1), CameraType.FISHEYE.value)
     frames.cameras.camera_type = kinds
     assert read_photographs(frames) is None
     kinds[3:9] = CameraType.PERSPECTIVE.value
     read = read_photographs(frames)
     assert read is not None and read.centres[:, 0].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
+
+
+@pytest.fixture(scope="module")
+def known():
+    return depths_of(photographs(), LATTICE.lo, LATTICE.hi)
+
+
+def unknown(known) -> np.ndarray:
+    return np.full(len(known.depth), np.nan, np.float32)
+
+
+def with_colours(known, colours):
+    return replace(known, photographs=replace(known.photographs, colours=colours.astype(np.float32)))
+
+
+def test_gains_are_found_within_half_a_percent(known):
+    draw = np.random.default_rng(0)
+    gain = 2.0 ** draw.normal(0.0, 0.2, (len(EYES), 1)) * (1.0 + draw.normal(0.0, 0.03, (len(EYES), 3)))
+    seen = np.clip(known.photographs.colours * gain[known.photographs.numbers], 0.0, 1.0)
+    found = photograph_differences(with_colours(known, seen), unknown(known))
+    true = np.log(gain) - np.log(gain).mean(0)
+    assert np.abs(found.log_gain - true).max() < 0.012
+    assert np.sqrt(np.mean((found.log_gain - true) ** 2)) < 0.005
+    assert matters(found.log_gain, found.log_gain_error, 0.01)
+    again = found.without_gains(replace(known.photographs, colours=seen.astype(np.float32))).colours
+    ratio = again / known.photographs.colours
+    assert np.abs(ratio[seen.max(1) < 1.0] / ratio.mean() - 1.0).max() < 0.02
+
+
+def test_photographs_that_differ_by_noise_alone_stay(known):
+    found = photograph_differences(known, unknown(known))
+    assert np.abs(found.log_gain).max() < 0.005
+    assert not matters(found.log_gain, found.log_gain_error, 0.01)
+    assert not matters(found.offset, found.offset_error, 0.0)  # no thermal images: nothing is known
+    np.testing.assert_array_equal(found.offset, 0.0)
+    noise = np.random.default_rng(1).normal(0.0, 3.0 / 255.0, known.photographs.colours.shape)
+    noisy = photograph_differences(with_colours(known, known.photographs.colours + noise), unknown(known))
+    assert not matters(noisy.log_gain, noisy.log_gain_error, 0.01)
+
+
+def test_offsets_are_found_and_their_mean_is_not(known):
+    offset = np.random.default_rng(2).normal(0.3, 0.03, len(EYES))
+    warm = 0.2 + 0.1 * known.photographs.colours[:, 0] + offset[known.photographs.numbers]
+    found = photograph_differences(known, warm.astype(np.float32))
+    np.testing.assert_allclose(found.offset, offset - offset.mean(), atol=0.002)
+    assert np.all(np.abs(found.offset - (offset - offset.mean())) < 4.0 * found.offset_error + 1e-3)
+    assert matters(found.offset, found.offset_error, 0.003)
+
+
+def test_saturated_pixels_tell_no_gain(known):
+    gain = np.ones((len(EYES), 1))
+    gain[3] = 1.5
+    seen = np.clip(known.photographs.colours * gain[known.photographs.numbers], 0.0, 1.0)
+    found = photograph_differences(with_colours(known, seen), unknown(known))
+    np.testing.assert_allclose(np.exp(found.log_gain[3] - np.delete(found.log_gain, 3, 0).mean(0)), 1.5, rtol=0.015)
+
+
+def test_a_photograph_that_shares_nothing_is_not_known(known):
+    first = known.photographs.numbers == 0
+    found = photograph_differences(replace(known, depth=np.where(first, np.nan, known.depth)), unknown(known))
+    assert found.log_gain_error[0].min() > 1.0 > found.log_gain_error[1:].max()
+    assert np.abs(found.log_gain[0] - found.log_gain[1:].mean(0)).max() < 0.01

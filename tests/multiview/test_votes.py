@@ -1,11 +1,27 @@
+from functools import cache
+
 import numpy as np
 import pytest
 
+from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.multiview.votes import FEWEST_POINTS, MARGIN_VOXELS, air_voxels, around_cameras, votes
+from thermoxels_ns.mesh.boundary.visibility import FacetViews, facet_views
+from thermoxels_ns.mesh.quality.checks import facet_normals
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
+from thermoxels_ns.multiview.photographs import Photographs
+from thermoxels_ns.multiview.stereo import Depths, depths_of
+from thermoxels_ns.multiview.votes import (
+    FEWEST_POINTS,
+    MARGIN_VOXELS,
+    air_voxels,
+    around_cameras,
+    supporting_photographs,
+    votes,
+)
 from thermoxels_ns.synthetic.camera_rings import look_at
+from thermoxels_ns.synthetic.solids import BoxSolid
 
 
 def empty_voxels(lattice: Lattice, rays: FeatureRays) -> np.ndarray:
@@ -41,27 +57,13 @@ def test_of_a_room_seen_from_inside_only_free_voxels_are_carved_and_most_of_them
     assert empty.sum() > 0.6 * free.sum()
 
 
-@pytest.mark.parametrize("resolution", [7, 20, 33])
-def test_no_voxel_that_holds_a_point_is_carved(resolution: int) -> None:
-    lattice = Lattice.covering((-1, -1, -1), (1, 1, 1), resolution)
-    random = np.random.default_rng(resolution)
-    sight = lines(random.uniform(-1.5, 1.5, (6, 3)), random.uniform(-1, 1, (500, 3)))
-    empty = empty_voxels(lattice, sight)
-    held = np.floor(lattice.world_to_index(sight.points)).astype(int)
-    assert empty.any()
-    assert not empty[tuple(held.T)].any()
-
-
-def test_a_point_without_lines_keeps_its_voxel() -> None:
+def test_a_point_without_lines_keeps_its_voxel_and_a_single_one_carves_nothing_however_many_see_it() -> None:
     sight = lines([-0.95, 0.05, 0.05], [[0.87, 0.05, 0.05], [0.88, 0.05, 0.05]])
     assert empty_voxels(BOX, sight)[8, 10, 10]
     doubted = FeatureRays(
         sight.origins, sight.point, np.concatenate((sight.points, [[-0.15, 0.05, 0.05]])), sight.uncertainty
     )
     assert not empty_voxels(BOX, doubted)[8, 10, 10]
-
-
-def test_a_single_point_carves_nothing_however_many_see_it() -> None:
     origins = np.random.default_rng(1).uniform(-0.1, 0.1, (40, 3)) + np.array([-0.8, 0.03, 0.03])
     assert not empty_voxels(BOX, lines(origins, [0.8, 0.05, 0.05])).any()
     assert empty_voxels(BOX, lines(origins, [[0.8, 0.05, 0.05], [0.8, 0.051, 0.05]])).any()
@@ -110,13 +112,6 @@ def test_lines_along_faces_and_from_outside_count_as_any() -> None:
     assert not empty_voxels(BOX, lines(np.zeros((0, 3)), np.zeros((0, 3)))).any()
 
 
-def test_air_is_what_is_free_with_its_six_neighbours() -> None:
-    sight, _ = room()
-    free = np.pad(empty_voxels(BOX, sight), 1, constant_values=True)
-    sides = [np.roll(free, way, axis)[1:-1, 1:-1, 1:-1] for axis in range(3) for way in (-1, 1)]
-    assert np.array_equal(air_voxels(BOX, sight), free[1:-1, 1:-1, 1:-1] & np.logical_and.reduce(sides))
-
-
 def test_a_walk_meets_every_voxel_on_a_ray_and_no_other() -> None:
     draw = np.random.default_rng(3)
     for _ in range(20):
@@ -161,3 +156,118 @@ def test_a_few_wrong_rays_and_cameras_that_show_hardly_anything_tell_nothing():
     rays, views = two_cameras()
     rays.points[0] = (0.01, 0.0, 0.0)
     assert around_cameras(behind, rays, views).all()
+
+
+VOXEL = 0.05
+GRID = Lattice((-1.6, -1.6, -0.4), VOXEL, (65, 65, 65))
+BLOCK, GROUND = ((-0.5, -0.5, 0.4), (0.5, 0.5, 1.2)), ((-1.5, -1.5, -0.2), (1.5, 1.5, 0.0))
+"""The block hangs over the ground, so that it has an underside which cameras above do not see."""
+SOLID = BoxSolid([BLOCK, GROUND])
+SKY = (0.55, 0.6, 0.7)
+EYES = [(3.2 * np.cos(a), 3.2 * np.sin(a), 2.0 - 0.6 * (-1) ** k) for k, a in enumerate(np.arange(20) * np.pi / 10)]
+WIDTH = 240
+
+
+def colours(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Waves of 3 to 12 voxels in all directions; the block's side towards +x is plain."""
+    rng = np.random.default_rng(1)
+    waves = rng.normal(size=(24, 3))
+    waves *= 2 * np.pi / (VOXEL * rng.uniform(3, 12, 24) * np.linalg.norm(waves, axis=1))[:, None]
+    value = np.sin(points @ waves.T + rng.uniform(0, 6, 24)).sum(axis=1) / 12
+    plain = (normals[:, 0] > 0.5) & (points[:, 2] > 0.3)
+    return 0.5 + 0.3 * np.where(plain, 0.2, value)[:, None] * [1.0, 0.9, 0.8]
+
+
+@cache
+def drawn_photographs() -> Photographs:
+    views = looking_at((0.0, 0.0, 0.4), EYES, focal=225.0, size=WIDTH)
+    matrices, centres = views.matrices(), views.camera_to_world[:, :, 3]
+    rng, pictures = np.random.default_rng(0), []
+    side = np.arange(WIDTH) + 0.5
+    pixels = np.stack([*np.meshgrid(side, side), np.ones((WIDTH, WIDTH))], -1).reshape(-1, 3)
+    for matrix, centre in zip(matrices, centres):
+        rays = pixels @ np.linalg.inv(matrix[:, :3]).T
+        distance, normal = SOLID.intersect(centre, rays)
+        picture = np.tile(SKY, (len(rays), 1))
+        met = np.isfinite(distance)
+        picture[met] = colours(centre + distance[met, None] * rays[met], normal[met])
+        pictures.append(picture + rng.normal(0.0, 0.006, picture.shape))
+    firsts = np.arange(len(EYES)) * WIDTH * WIDTH
+    shown = np.concatenate(pictures).astype(np.float32)
+    return Photographs(matrices, centres, views.size, firsts, shown, np.full(len(shown), np.nan, np.float32))
+
+
+@cache
+def depths() -> Depths:
+    return depths_of(drawn_photographs(), (-1.6, -1.6, -0.4), (1.6, 1.6, 2.8))
+
+
+def support(cells: np.ndarray, tracks: FeatureRays | None = None) -> tuple[FacetViews, np.ndarray]:
+    """Views of the surface of voxels, and how many photographs support it."""
+    points, facets, photos = GRID.index_to_world(kuhn_tets(cells)[0]), voxel_facets(cells), drawn_photographs()
+    middle, normals = points[facets].mean(axis=1), facet_normals(points, facets)
+    views = facet_views(cells, GRID, photos.matrices, photos.centres, photos.sizes, middle, normals)
+    found = supporting_photographs(depths(), views.middle, views.seen, VOXEL, tracks)
+    return views, found.sum(axis=1)
+
+
+def true_cells() -> np.ndarray:
+    return SOLID.contains(GRID.cell_centres().reshape(-1, 3)).reshape(GRID.cell_shape)
+
+
+def on_block(views: FacetViews, axis: int, sign: float) -> np.ndarray:
+    """Places on one side of the block, three voxels or more from its edges."""
+    at = views.middle
+    low, high = (np.array(corner) + side * 3 * VOXEL for corner, side in zip(BLOCK, (1, -1)))
+    within = np.all(((at > low) & (at < high)) | (np.arange(3) == axis), axis=1)
+    return within & (at[:, 2] > 0.3) & (sign * views.normal[:, axis] > 0.5)
+
+
+def before(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[FacetViews, np.ndarray, np.ndarray]:
+    """Support of the true solid with a box more in it, and which places lie on that box."""
+    centres = GRID.cell_centres()
+    more = np.all((centres > low) & (centres < high), axis=-1)
+    views, count = support(true_cells() | more)
+    within = (views.middle > np.array(low) - VOXEL / 4) & (views.middle < np.array(high) + VOXEL / 4)
+    return views, count, np.all(within, axis=1)
+
+
+def test_textured_sides_are_supported_a_plain_one_and_the_underside_are_not() -> None:
+    views, count = support(true_cells())
+    seen = views.seen.sum(axis=1)
+    for axis, sign in ((0, -1), (1, 1), (1, -1), (2, 1)):
+        side = on_block(views, axis, sign)
+        assert side.sum() > 100 and np.mean(count[side] >= 3) > 0.95
+    plain, under = on_block(views, 0, 1), on_block(views, 2, -1)
+    assert plain.sum() > 100 and seen[plain].min() >= 5 and np.mean(count[plain] == 0) > 0.95
+    assert under.sum() > 100 and not seen[under].any() and not count[under].any()
+    ground = (views.normal[:, 2] > 0.5) & (views.middle[:, 2] < 0.1)
+    assert np.mean(count[ground] >= 3) > 0.95
+
+
+def test_a_surface_in_free_space_is_not_supported() -> None:
+    """Three voxels before a textured side, five above the ground, and in the sky: photographs see what is behind."""
+    y = BLOCK[0][1]
+    for low, high, axis, sign in (
+        ((-0.4, y - 3 * VOXEL, 0.5), (0.4, y - VOXEL, 1.1), 1, -1),
+        ((-1.4, -1.4, 3 * VOXEL), (-0.9, 1.4, 5 * VOXEL), 2, 1),
+        ((-0.4, -0.1, 1.4), (0.4, 0.1, 1.8), 1, -1),
+    ):
+        views, count, floating = before(low, high)
+        outer = floating & (sign * views.normal[:, axis] > 0.5)
+        assert outer.sum() > 100 and views.seen[outer].sum(axis=1).mean() > 4
+        assert np.mean(count[outer] >= 3) < 0.05
+
+
+def test_tracks_support_what_lies_at_their_points() -> None:
+    """Four photographs saw a corner of a window on the plain side; one of them stands behind the block."""
+    photos, point = drawn_photographs(), np.array([0.5, 0.1, 0.8])
+    from_front = np.flatnonzero(photos.centres[:, 0] > 2.0)[:3]
+    behind = int(photos.centres[:, 0].argmin())
+    origins = photos.centres[[*from_front, behind]]
+    tracks = FeatureRays(origins, np.zeros(4, dtype=np.int64), point[None], np.full(4, 0.01))
+    views, count = support(true_cells(), tracks)
+    plain, off = on_block(views, 0, 1), np.linalg.norm(views.middle - point, axis=1)
+    near = plain & (off < 1.4 * VOXEL)
+    assert near.sum() >= 4 and np.all(count[near] == 3)
+    assert np.mean(count[plain & (off > 1.6 * VOXEL)] == 0) > 0.95

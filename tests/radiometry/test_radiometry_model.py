@@ -42,15 +42,13 @@ conditions = st.builds(
 
 def test_a_count_becomes_the_temperature_computed_by_hand():
     # S + O = 8000: R1 / (R2 * 8000) + F = 167.02 (14985.93 / 90.2656 + 1), and 1398.1 / ln 167.02 = 273.17 K.
-    assert E60.temperature_k(14233.0) == pytest.approx(
-        1398.1 / math.log(14985.93 / (0.0112832 * 8000.0) + 1.0), rel=1e-14
-    )
     assert E60.temperature_k(14233.0) == pytest.approx(273.17, abs=0.02)
 
 
-def test_a_signal_below_the_offset_has_no_temperature():
+def test_a_signal_of_nothing_has_no_temperature():
     assert np.isnan(E60.temperature_k([6233.0, 6000.0])).all()
     assert np.isfinite(E60.temperature_k([6234.0])).all()
+    assert np.isnan(LONG_WAVE.temperature_k([0.0, -1.0, 1e-30])).all()
 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=["E60", "i7", "band"])
@@ -72,10 +70,6 @@ def test_the_band_is_the_integral_of_planck():
         assert PlanckBand(8.0, 14.0).signal(kelvin) == pytest.approx(exact, rel=1e-6)
 
 
-def test_a_band_signal_of_nothing_has_no_temperature():
-    assert np.isnan(LONG_WAVE.temperature_k([0.0, -1.0, 1e-30])).all()
-
-
 @pytest.mark.parametrize("sensor", SENSORS, ids=["E60", "i7", "band"])
 def test_a_black_body_close_by_shows_its_apparent_temperature(sensor):
     near = RadiometricModel(Conditions(emissivity=1.0, distance_m=0.0), sensor)
@@ -92,13 +86,6 @@ def test_in_surroundings_of_its_own_temperature_nothing_matters(sensor, emissivi
     oven = Conditions(emissivity, 35.0, 20.0, 0.7, 35.0, window_transmission=0.8, window_c=35.0)
     signal = RadiometricModel(oven, sensor).signal(35.0)
     assert signal == pytest.approx(float(sensor.signal(35.0 + 273.15)), rel=1e-12)
-
-
-@settings(max_examples=60, deadline=None)
-@given(conditions, celsius)
-def test_there_and_back_again(given_conditions, temperature_c):
-    model = RadiometricModel(given_conditions, E60)
-    assert model.temperature_c(model.signal(temperature_c)) == pytest.approx(temperature_c, abs=1e-6)
 
 
 @settings(max_examples=60, deadline=None)
@@ -163,10 +150,7 @@ def test_air_hides_an_object_behind_its_own_temperature():
 @pytest.mark.parametrize(
     ("values", "named"),
     [
-        ({"emissivity": 0.0}, "emissivity"),
-        ({"emissivity": 1.01}, "emissivity"),
-        ({"emissivity": math.nan}, "emissivity"),
-        ({"emissivity": True}, "emissivity"),
+        *(({"emissivity": value}, "emissivity") for value in (0.0, 1.01, math.nan, True)),
         ({"relative_humidity": 50.0}, "relative_humidity"),
         ({"relative_humidity": -0.1}, "relative_humidity"),
         ({"distance_m": -1.0}, "distance_m"),

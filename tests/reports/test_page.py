@@ -1,14 +1,18 @@
 import base64
+import re
 from html.parser import HTMLParser
 from io import BytesIO
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from thermoxels_ns.audit.draws import Interval
+from thermoxels_ns.commands.demo_results import Compared, Target
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.reports.charts import bars, histogram
-from thermoxels_ns.reports.page import _environment, image_address
+from thermoxels_ns.reports.charts import bars, colours, histogram
+from thermoxels_ns.reports.page import _environment, build_page, image_address
 
 HOSTILE = "<script>alert('1')</script>\"'&"
 
@@ -71,14 +75,6 @@ def test_a_table_has_its_entries_in_order_without_those_that_are_none() -> None:
     assert "<small>at (1, 2)</small>" in text and "A note." in outline.words
 
 
-def test_pictures_are_embedded_with_their_captions() -> None:
-    pictures = [(picture("red"), "first"), (picture("blue", "JPEG"), "second")]
-    images = Outline(rendered("{{ parts.gallery(pictures, 'three') }}", pictures=pictures)).images
-    assert [base64.b64decode(str(image["src"]).split("base64,")[1]) for image in images] == [png for png, _ in pictures]
-    assert [image["alt"] for image in images] == ["first", "second"]
-    assert all(str(image["src"]).startswith("data:image/") for image in images)
-
-
 def test_words_stay_words() -> None:
     source = """{{ parts.warnings([evil]) }}{{ parts.card(evil, evil) }}{{ parts.gallery([(png, evil)]) }}
         {{ parts.box([evil]) }}{% call parts.table("from1", evil) %}{{ parts.head(evil) }}{{ parts.row(evil) }}
@@ -99,3 +95,93 @@ def test_charts_are_the_same_for_the_same_figures_and_none_without_values() -> N
     assert bars(values, "x").startswith("<svg") and bars(values, "x").endswith("</svg>")
     assert histogram(np.array([np.nan]), "x") == "" == bars(np.empty(0), "x")
     assert "<b>" not in histogram(np.arange(4.0), "<b>&\"'")
+
+
+def test_colours_go_from_dark_to_bright_and_nan_is_black() -> None:
+    shown = colours(np.array([[0.0, 5.0, 10.0, np.nan]]), (0.0, 10.0)).sum(axis=2)[0]
+    assert shown[0] < shown[1] < shown[2]
+    assert shown[3] == 0
+    assert (colours(np.full((2, 2), np.nan)) == 0).all()
+
+
+MET = Target("PSNR", 27.0, 26.0, True, "{:.2f} dB", "")
+MISSED = Target("Error", 1.2, 1.0, False, "{:.2f} °C", "In K.")
+
+
+@pytest.fixture
+def shown() -> dict[str, Any]:
+    return {
+        "scene": "house",
+        "photographs": 42,
+        "targets": (MET, MISSED),
+        "others": (("Volume", "0.1 m³"),),
+        "compared": (Compared("door", "W/(m2 K)", 3.6, Interval(4.0, 3.7, 4.2)), Compared("psi", "W/(m K)", 0.7, None)),
+        "inputs": [(picture("white", "JPEG"), picture("black", "JPEG"))],
+        "views": [(f"frame_eval_{n}", [picture(c) for c in ("red", "green", "blue", "yellow")]) for n in (1, 2)],
+        "gradient": ["#000004", "#fcffa4"],
+        "ends_c": [10.0, 30.0],
+        "heat": [picture(colour) for colour in ("grey", "orange", "pink")],
+        "mesh": picture("brown"),
+        "measured": picture("purple"),
+        "seconds": [("Train", 30.0), ("Export", 10.0)],
+        "commands": ["ns-train thermoxels", "ns-eval --load-config 'a b'"],
+        "next_steps": [("ns-viewer --load-config x", "Look at it:")],
+    }
+
+
+def test_results_times_and_commands_are_shown(shown) -> None:
+    text = build_page("demo.html.j2", **shown)
+    outline = Outline(text)
+    for row in (
+        ["PSNR", "27.00 dB", "≥ 26.00 dB", "yes"],
+        ["ErrorIn K.", "1.20 °C", "≤ 1.00 °C", "no"],
+        ["Volume", "0.1 m³"],
+        ["door", "3.60", "4.00 (3.70 to 4.20)\xa0W/(m²\xa0K)", "no"],
+        ["psi", "0.70", "not found", "no"],
+        ["Train", "30.0 s", ""],
+        ["all together", "40.0 s", ""],
+    ):
+        assert row in outline.rows
+    assert re.findall(r"width: ([\d.]+)%\"", text) == ["75.0", "25.0"]
+    assert "width: 0.0%" in build_page("demo.html.j2", **shown | {"seconds": [("Train", 0.0)]})
+    words = outline.words
+    assert "ns-train thermoxels" in words and "ns-eval --load-config 'a b'" in words
+    assert words.index("Look at it:") < words.index("ns-viewer --load-config x")
+    ticks = re.findall(r"<span>([^<]*)</span>", text)
+    assert ticks == ["10.0", "15.0", "20.0", "25.0", "30.0\xa0°C"]
+    assert "audit/audit.html" in text and "audit/audit.html" not in build_page(
+        "demo.html.j2", **shown | {"compared": ()}
+    )
+
+
+def test_every_picture_is_embedded_in_the_order_of_its_place(shown) -> None:
+    images = Outline(build_page("demo.html.j2", **shown)).images
+    contents = [base64.b64decode(str(image["src"]).split("base64,")[1]) for image in images]
+    expected = [*shown["inputs"][0], shown["mesh"], *shown["inputs"][0]]
+    expected += [image for _, pictures in shown["views"] for image in pictures]
+    expected += [*shown["heat"], shown["measured"]]
+    assert contents == expected and all(image["alt"] for image in images)
+
+
+def test_nothing_is_fetched_and_words_stay_words(shown) -> None:
+    text = build_page("demo.html.j2", **shown)
+    assert text == build_page("demo.html.j2", **shown)
+    files = ("scene/", "outputs/", "eval.json", "renders/", "export/", "logs/", "audit/", "survey/")
+    assert all(address.startswith(("data:", *files)) for address in Outline(text).addresses)
+    assert not re.search(r"<script|https?:|@import|url\(|\bon\w+=", text)
+    hostile = {
+        "scene": HOSTILE,
+        "targets": (Target(HOSTILE, 1.0, 1.0, True, HOSTILE.replace("{", ""), HOSTILE),),
+        "others": ((HOSTILE, HOSTILE),),
+        "compared": (Compared(HOSTILE, HOSTILE, 1.0, Interval(1.0, 0.5, 2.0)),),
+        "views": [(HOSTILE, shown["views"][0][1])],
+        "gradient": [HOSTILE, "red"],
+        "seconds": [(HOSTILE, 1.0)],
+        "commands": [HOSTILE],
+        "next_steps": [(HOSTILE, HOSTILE)],
+    }
+    text = build_page("demo.html.j2", **shown | hostile)
+    assert "<script" not in text
+    # Title, heading, target (name, figure, bound, meaning), figures (2), compared (name, unit), view, step, command and
+    # next (2); colours are no words.
+    assert "".join(Outline(text).words).count(HOSTILE) == 15

@@ -1,4 +1,4 @@
-"""Writes FLIR R-JPEG files whose every number is known."""
+"""Writes FLIR R-JPEG files whose every number is known, and what tells DJI's."""
 
 import io
 import struct
@@ -49,7 +49,7 @@ class FlirFile:
         def put(offset: int, codes: str, *values: float) -> None:
             struct.pack_into(self.order + codes, record, offset, *values)
 
-        put(0, "H", 2)
+        put(0, "3H", 2, *self.counts.shape[::-1])
         put(0x20, "6f", *self.settings.values())
         put(0x3C, "f", self.humidity)
         put(0x58, "3f", self.planck["r1"], self.planck["b"], self.planck["f"])
@@ -96,6 +96,12 @@ def picture_bytes(pixels: np.ndarray | None = None, kind: str = "JPEG") -> bytes
     stream = io.BytesIO()
     Image.fromarray(np.full((8, 8, 3), 90, np.uint8) if pixels is None else pixels).save(stream, kind)
     return stream.getvalue()
+
+
+def dji_jpeg(first: bytes = b"DJI") -> bytes:
+    """What tells DJI's R-JPEG: its name in the first segment and counts in the third kind."""
+    plain = picture_bytes()
+    return plain[:2] + segment(0xE1, first) + segment(0xE3, bytes(24)) + plain[2:]
 
 
 def smooth_counts(width: int = 40, height: int = 30) -> np.ndarray:

@@ -1,5 +1,5 @@
-import dataclasses
 import json
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
-from thermoxels_ns.synthetic.imperfections import Imperfections
+from thermoxels_ns.synthetic.imperfections import DrawnFlaws, Imperfections
 from thermoxels_ns.synthetic.raycast import render_view
 from thermoxels_ns.synthetic.scene_folder import load_truth, make_scene, write_scene
 
@@ -55,13 +55,29 @@ def test_layout_is_that_of_thermoscenes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("thermal_format", "name", "within_k"),
-    [("png16", "hot-object", 1e-3), ("tiff", "house-corner", 0.0051), ("npy", "sphere", 2e-6)],
+    ("thermal_format", "name", "within_k", "own"),
+    [
+        ("png16", "hot-object", 1e-3, False),
+        ("tiff", "house-corner", 0.0051, False),
+        ("npy", "sphere", 2e-6, False),
+        ("png16", "hot-object", 1e-3, True),
+    ],
 )
-def test_files_hold_the_pictures_that_the_scene_shows(tmp_path, thermal_format, name, within_k) -> None:
+def test_files_hold_the_pictures_that_the_scene_shows(tmp_path, thermal_format, name, within_k, own) -> None:
     scene = make_scene(name)
-    write_scene(scene, tmp_path, photo_format="png", thermal_format=thermal_format, thermal_width=20, **SMALL)
-    content = transforms(tmp_path)
+    options = {"thermal_format": thermal_format, "thermal_width": 20, "own_thermal_camera": own}
+    write_scene(scene, tmp_path, photo_format="png", **options, **SMALL)
+    content, camera = transforms(tmp_path), scene.camera(20, 15)
+    if own:
+        thermal = content["thermal_camera"]
+        assert set(thermal) == {"camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"}
+        assert (thermal["w"], thermal["h"]) == (20, 16) and thermal["cx"] != 10.0 and "thermal_unit" not in content
+        camera = replace(scene.camera(20, 16), **{k: thermal[k] for k in ("fl_x", "fl_y", "cx", "cy")})
+        offsets = np.linalg.inv([frame["transform_matrix"] for frame in content["frames"]])
+        offsets = offsets @ np.array([frame["thermal_transform_matrix"] for frame in content["frames"]])
+        np.testing.assert_allclose(offsets, np.broadcast_to(offsets[0], (5, 4, 4)), atol=1e-12)
+        np.testing.assert_allclose(offsets[0][:3, :3] @ offsets[0][:3, :3].T, np.eye(3), atol=1e-12)
+        assert 0.005 < np.linalg.norm(offsets[0][:3, 3]) < 0.1
     for frame in content["frames"]:
         path, pose = tmp_path / frame["thermal_file_path"], np.array(frame["transform_matrix"])
         if thermal_format == "png16":
@@ -71,41 +87,10 @@ def test_files_hold_the_pictures_that_the_scene_shows(tmp_path, thermal_format, 
         else:
             unit = content["thermal_unit"]
             celsius = np.asarray(Image.open(path)) * unit["celsius_per_count"] + unit["celsius_offset"]
-        assert np.abs(celsius - render_view(scene, pose, scene.camera(20, 15)).temperature_c).max() < within_k
+        seen = render_view(scene, np.array(frame.get("thermal_transform_matrix", pose)), camera)
+        assert np.abs(celsius - seen.temperature_c).max() < within_k
         rgb = np.asarray(Image.open(tmp_path / frame["file_path"])) / 255.0
         np.testing.assert_allclose(rgb, render_view(scene, pose, scene.camera(40, 30)).rgb, atol=0.5 / 255.0 + 1e-6)
-
-
-def test_own_thermal_camera_is_a_rigid_offset_with_its_own_lens(tmp_path: Path) -> None:
-    scene = make_scene("hot-object")
-    write_scene(scene, tmp_path, own_thermal_camera=True, thermal_width=30, **SMALL)
-    content = transforms(tmp_path)
-    thermal = content["thermal_camera"]
-    assert set(thermal) == {"camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"}
-    assert (thermal["w"], thermal["h"]) == (30, 24)
-    assert thermal["cx"] != 15.0
-    offsets = [
-        np.linalg.inv(f["transform_matrix"]) @ np.array(f["thermal_transform_matrix"]) for f in content["frames"]
-    ]
-    np.testing.assert_allclose(offsets, np.broadcast_to(offsets[0], (5, 4, 4)), atol=1e-12)
-    np.testing.assert_allclose(offsets[0][:3, :3] @ offsets[0][:3, :3].T, np.eye(3), atol=1e-12)
-    assert 0.005 < np.linalg.norm(offsets[0][:3, 3]) < 0.1
-    # The picture is the one that the written pose and intrinsics predict; the bounds give its unit.
-    frame = content["frames"][0]
-    camera = dataclasses.replace(scene.camera(30, 24), **{k: thermal[k] for k in ("fl_x", "fl_y", "cx", "cy")})
-    view = render_view(scene, np.array(frame["thermal_transform_matrix"]), camera)
-    assert np.abs(png_to_celsius(tmp_path, frame) - view.temperature_c).max() < 1e-3
-    assert "thermal_unit" not in content
-
-
-@pytest.mark.real_data
-def test_own_thermal_camera_has_the_keys_of_real_data(tmp_path: Path, shared_data: Path) -> None:
-    real = json.loads((shared_data / "arco" / "transforms.json").read_text())
-    write_scene(make_scene("sphere"), tmp_path, own_thermal_camera=True, thermal_format="tiff", **SMALL)
-    made = transforms(tmp_path)
-    assert set(made["thermal_camera"]) == set(real["thermal_camera"])
-    assert set(made["thermal_unit"]) == set(real["thermal_unit"])
-    assert set(made["frames"][0]) == set(real["frames"][0])
 
 
 def test_noise_and_drift_have_the_size_asked_for_and_are_not_clipped(tmp_path: Path) -> None:
@@ -156,7 +141,7 @@ def test_nothing_stale_stays_of_an_older_scene_not_even_of_an_interrupted_write(
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_scene(dataclasses.replace(scene, surface_temperature_c=broken), tmp_path, **SMALL)
+        write_scene(replace(scene, surface_temperature_c=broken), tmp_path, **SMALL)
     assert not (tmp_path / "transforms.json").exists()
     assert not [p for p in tmp_path.rglob("*") if ".part" in p.name]
     write_scene(scene, tmp_path, **SMALL)
@@ -172,7 +157,6 @@ def test_nothing_stale_stays_of_an_older_scene_not_even_of_an_interrupted_write(
         ({"thermal_format": "jpeg"}, "thermal_format"),
         ({"photo_format": "npy"}, "photo_format"),
         ({"imperfections": Imperfections(noise_k=-1.0)}, "noise_k"),
-        ({"imperfections": Imperfections(drift_k=float("nan"))}, "drift_k"),
         ({"num_train": 0}, "number of views"),
         ({"width": 0}, "^width: "),
         ({"height": 1_000_000}, "^height: "),
@@ -183,3 +167,79 @@ def test_bad_options_say_what_is_wrong_and_write_nothing(tmp_path: Path, options
     with pytest.raises(ThermoxelsError, match=field):
         write_scene(make_scene("sphere"), tmp_path / "new", **{**SMALL, **options})
     assert not (tmp_path / "new").exists()
+
+
+SHAPE = (60, 80)
+POSES = np.stack([np.eye(4)] * 200)
+POSES[:, 2, 3] = 5.0
+
+
+def drawn(**flaws) -> DrawnFlaws:
+    return DrawnFlaws(Imperfections(**flaws), 0, POSES, (0.0, 0.0, 0.0), (10.0, 30.0))
+
+
+def test_gains_multiply_the_photograph():
+    flaws, seen = drawn(exposure_stops=0.3, white_balance=0.03), np.full((*SHAPE, 3), 0.3, np.float32)
+    np.testing.assert_allclose(np.log2(flaws.gains.mean(1)).std(), 0.3, rtol=0.15)
+    spread = (flaws.gains / flaws.gains.mean(1, keepdims=True)).std()
+    np.testing.assert_allclose(spread, 0.03 * np.sqrt(2 / 3), rtol=0.15)
+    np.testing.assert_allclose(flaws.photograph(7, seen).mean((0, 1)) / (0.3 * 255.0), flaws.gains[7], rtol=0.01)
+
+
+def test_poses_are_turned_and_moved_by_as_much_as_asked_for():
+    flaws = drawn(pose_error_deg=0.15)
+    given = flaws.given_poses()
+    cosine = 0.5 * (np.trace(given[:, :3, :3], axis1=1, axis2=2) - 1.0)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    np.testing.assert_allclose(np.sqrt(np.mean(angle**2)), np.sqrt(3) * 0.15, rtol=0.1)
+    np.testing.assert_allclose((given - POSES)[:, :3, 3].std(), np.deg2rad(0.15) * 5.0, rtol=0.1)
+    walk = drawn(pose_error_deg=0.15, pose_correlation=0.95)  # like its neighbours
+    assert np.diff(walk.turns_rad, axis=0).std() < 0.5 * np.diff(flaws.turns_rad, axis=0).std()
+
+
+@pytest.mark.parametrize(
+    "flaw",
+    [{"vignetting": 0.3}, {"noise_counts": 2.0}, {"motion_blur_px": 3.0}, {"rolling_shutter_px": 4.0}],
+)
+def test_flaws_of_photographs_change_photographs_alone(flaw):
+    flaws, warm = drawn(**flaw), np.full(SHAPE, 20.0)
+    seen = np.random.default_rng(0).uniform(0.2, 0.6, (*SHAPE, 3)).astype(np.float32)
+    assert np.abs(flaws.photograph(0, seen) - 255.0 * seen).mean() > 1.0
+    np.testing.assert_array_equal(flaws.thermogram(0, warm), warm)
+
+
+def test_who_walks_by_is_in_the_same_place_of_both_images():
+    flaws = drawn(passers_by=1.0)
+    dark = flaws.photograph(0, np.full((*SHAPE, 3), 0.5, np.float32))[..., 0] < 60
+    assert 0.03 < dark.mean() < 0.3
+    np.testing.assert_array_equal(flaws.thermogram(0, np.full(SHAPE, 20.0)) > 25.0, dark)
+
+
+def test_dead_pixels_read_the_same_in_all_images():
+    flaws = drawn(dead_pixels=0.01)
+    first, second = (flaws.thermogram(n, np.full(SHAPE, value)) for n, value in ((0, 15.0), (1, 25.0)))
+    same = first == second
+    assert 0.003 < same.mean() < 0.03
+
+
+@pytest.mark.parametrize("field", [f.name for f in fields(Imperfections)])
+def test_what_cannot_be_drawn_is_refused(field):
+    with pytest.raises(ThermoxelsError, match=field):
+        replace(Imperfections(), **{field: float("nan")}).check()
+
+
+def test_the_folder_gives_wrong_poses_and_tells_the_truth(tmp_path: Path):
+    scene, flaws = make_scene("sphere"), Imperfections(pose_error_deg=1.0, rig_error_deg=1.0, focal_error=0.01)
+    write_scene(
+        scene, tmp_path, 4, 1, 40, 30, own_thermal_camera=True, imperfections=flaws, photo_format="png", progress=False
+    )
+    content, truth = (json.loads((tmp_path / name).read_text()) for name in ("transforms.json", "truth.json"))
+    poses = np.array(truth["poses"])
+    given = np.array([frame["transform_matrix"] for frame in content["frames"]])
+    assert 0.003 < np.abs(given - poses)[:, :3, :3].max() < 0.1
+    photograph = np.asarray(Image.open(tmp_path / content["frames"][2]["file_path"]))
+    view = render_view(scene, poses[2], scene.camera(40, 30))
+    np.testing.assert_allclose(photograph, 255.0 * view.rgb, atol=0.51)
+    np.testing.assert_allclose(content["fl_x"], 1.01 * scene.camera(40, 30).fl_x)
+    rig = np.linalg.inv(given) @ np.array([frame["thermal_transform_matrix"] for frame in content["frames"]])
+    np.testing.assert_allclose(rig, np.broadcast_to(rig[0], rig.shape), atol=1e-12)

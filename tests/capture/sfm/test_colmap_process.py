@@ -118,7 +118,6 @@ run_in_process(wait_for_ever, (Path(sys.argv[1]),), Path(sys.argv[1]), lambda li
 def test_it_ends_with_the_process_that_started_it(tmp_path, work):
     arguments = [sys.executable, "-c", PARENT, str(tmp_path), str(Path(work.__file__).parent)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
         assert parent.stdout.readline() == "waiting\n"
         parent.kill()
     pid = int((tmp_path / "pid").read_text())

@@ -1,14 +1,17 @@
+import io
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
+from scipy.spatial.transform import Rotation
 
 from tests.support.posed_model import CAMERA, ring_model
 from thermoxels_ns.capture.photograph import GpsFix
 from thermoxels_ns.capture.sfm.scale_and_up import (
+    find_up,
     local_metres,
     scale_from_distance,
     scale_from_gps,
@@ -16,6 +19,7 @@ from thermoxels_ns.capture.sfm.scale_and_up import (
 )
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.synthetic.camera_rings import look_at
 
 UNIT_M = 0.37
 
@@ -34,11 +38,8 @@ def test_lengths_of_degrees_are_those_of_the_ellipsoid():
     local = local_metres([GpsFix(48.0, 11.0, 1.0), GpsFix(48.001, 11.001, None), GpsFix(48.0, 11.0, 3.0)])
     assert local[1, :2] - local[0, :2] == pytest.approx([74.63, 111.20], abs=0.02)
     assert local[:, 2] == pytest.approx([-1, 0, 1])
-
-
-def test_the_date_line_does_not_tear_a_path_apart():
-    local = local_metres([GpsFix(0.0, 179.9999, 0.0), GpsFix(0.0, -179.9999, 0.0)])
-    assert abs(local[1, 0] - local[0, 0]) == pytest.approx(22.26, abs=0.01)
+    across = local_metres([GpsFix(0.0, 179.9999, 0.0), GpsFix(0.0, -179.9999, 0.0)])  # the date line
+    assert abs(across[1, 0] - across[0, 0]) == pytest.approx(22.26, abs=0.01)
 
 
 @pytest.mark.parametrize(("wild_m", "accuracy"), [(0.0, 2e-4), (500.0, 0.03)])
@@ -76,13 +77,18 @@ def test_gps_that_says_nothing_is_not_used(fixes, words):
     assert words in why
 
 
-def test_a_measured_length_on_a_wall_gives_the_scale():
+@pytest.mark.parametrize(("every", "accuracy"), [(0, 1e-3), (8, 0.01)])
+def test_a_measured_length_on_a_wall_gives_the_scale_though_some_points_are_nearer(every, accuracy):
     model = ring_model(unit_m=UNIT_M)
     ends = np.array([[-0.8, 1.0, 0.6], [0.9, 1.0, 1.4]])
     pixels = CAMERA.project(model.in_camera(3, ends / UNIT_M))
     metres = float(np.linalg.norm(ends[1] - ends[0]))
-    scale = scale_from_distance(model, ("IMG_3.jpg", *pixels.ravel(), metres), {"f3": "day/IMG_3.jpg"}, 0.01)
-    assert scale.metres_per_unit == pytest.approx(UNIT_M, rel=1e-3)
+    centre, points = model.centres[3], model.points.copy()
+    if every:  # where the photograph shows them, and at half the depth
+        points[::every] = centre + 0.5 * (points[::every] - centre)
+    known = ("IMG_3.jpg", *pixels.ravel(), metres)
+    scale = scale_from_distance(replace(model, points=points), known, {"f3": "day/IMG_3.jpg"}, 0.01)
+    assert scale.metres_per_unit == pytest.approx(UNIT_M, rel=accuracy)
     assert scale.standard_error == pytest.approx(UNIT_M * 0.01 / metres, rel=0.3)
 
 
@@ -118,19 +124,16 @@ def wall_photographs(model: SfmModel, places: list[float], folder: Path, unit_m:
     return files
 
 
-@pytest.fixture
-def marker_photographs(tmp_path):
+def test_a_marker_gives_the_scale_and_one_that_moved_between_photographs_none(tmp_path):
     model = ring_model(count=4, unit_m=UNIT_M)
-    return model, wall_photographs(model, [0.0] * 4, tmp_path, UNIT_M)
-
-
-def test_a_marker_gives_the_scale(marker_photographs):
-    model, files = marker_photographs
-    scale, why = scale_from_markers(model, files, 0.4, 0.001)
+    scale, why = scale_from_markers(model, wall_photographs(model, [0.0] * 4, tmp_path, UNIT_M), 0.4, 0.001)
     assert scale is not None and scale.standard_error is not None, why
     assert scale.metres_per_unit == pytest.approx(UNIT_M, rel=0.01)
     assert abs(scale.metres_per_unit - UNIT_M) < 4 * scale.standard_error
     assert "1 ArUco marker of 0.4 m (7)" in scale.source
+    moved = wall_photographs(model, [-0.3, 0.3, -0.3, 0.3], tmp_path, UNIT_M)
+    found, why = scale_from_markers(model, moved, 0.4)
+    assert found is None and "[7]" in why
 
 
 def test_places_that_are_a_mirror_image_of_the_path_are_no_scale() -> None:
@@ -140,20 +143,75 @@ def test_places_that_are_a_mirror_image_of_the_path_are_no_scale() -> None:
     assert mirrored is None or mirrored.metres_per_unit < 0.8 * 0.5
 
 
-def test_a_marker_that_moved_between_photographs_is_no_ruler(tmp_path) -> None:
-    model = ring_model(count=4)
-    found, why = scale_from_markers(model, wall_photographs(model, [-0.3, 0.3, -0.3, 0.3], tmp_path), 0.4)
-    assert found is None and "[7]" in why
+SHAKEN = Rotation.from_euler("xyz", [40, -70, 25], degrees=True).as_matrix()
+"""World in which nothing is level; its up is the third column."""
 
 
-def test_a_few_points_far_from_the_wall_do_not_bend_it() -> None:
-    """One in eight points around the ends stands at half the depth."""
-    model = ring_model()
-    ends = np.array([[-0.8, 1.0, 0.6], [0.9, 1.0, 1.4]])
-    pixels = CAMERA.project(model.in_camera(3, ends))
-    known = ("f3", *pixels.ravel(), float(np.linalg.norm(ends[1] - ends[0])))
-    centre = model.camera_to_world[3, :3, 3]
-    points = model.points.copy()
-    points[::8] = centre + 0.5 * (points[::8] - centre)  # where the photograph shows them, and nearer
-    found = scale_from_distance(replace(model, points=points), known, {})
-    assert found.metres_per_unit == pytest.approx(1.0, rel=0.01)
+def held(azimuths_deg, pitches_deg, rolls_deg):
+    """Poses of cameras that are turned, pitched and rolled against gravity, in the shaken world."""
+    poses = []
+    for azimuth, pitch, roll in zip(azimuths_deg, pitches_deg, rolls_deg):
+        a, p = np.radians([azimuth, pitch])
+        ahead = [np.cos(a) * np.cos(p), np.sin(a) * np.cos(p), np.sin(p)]
+        pose = look_at((0.0, 0.0, 0.0), ahead)
+        # A roll to the right, seen from behind, turns the camera clockwise about its view direction.
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", -roll, degrees=True).as_matrix()
+        pose[:3, :3] = SHAKEN @ pose[:3, :3]
+        poses.append(pose)
+    return np.array(poses)
+
+
+def off_deg(up):
+    return np.degrees(np.arccos(np.clip(up.direction @ SHAKEN[:, 2], -1, 1)))
+
+
+def test_up_of_pitch_and_roll_is_exact():
+    azimuths, pitches, rolls = [0, 50, 170, 300], [-30, -80, 10, 0], [0, 5, -12, 90]
+    up = find_up(held(azimuths, pitches, rolls), list(zip(pitches, rolls)), [1] * 4)
+    assert off_deg(up) < 1e-5
+    assert up.spread_deg == pytest.approx(0, abs=1e-5)
+    assert "pitch and roll that 4 photographs state" in up.source
+
+
+@pytest.mark.parametrize(("pitched_deg", "rolled_deg", "limit_deg"), [(-35.0, 0.0, 1e-5), (0.0, 2.0, 1.5)])
+def test_cameras_that_are_pitched_down_or_rolled_one_by_one_still_give_up(pitched_deg, rolled_deg, limit_deg):
+    count = 30
+    rolls = rolled_deg * np.random.default_rng(1).standard_normal(count)
+    up = find_up(held(np.linspace(0, 90, count), [pitched_deg] * count, rolls), [None] * count, [1] * count)
+    assert off_deg(up) < limit_deg
+    assert "held level" in up.source
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_upper_edge_is_where_the_picture_has_it_after_turning(orientation):
+    """Pillow turns a stored picture upright; the edge that is then on top is the one that up points to."""
+    identity = np.eye(4)[None]
+    x, y, _ = find_up(identity, [None], [orientation]).direction.round()
+    stored = np.zeros((4, 4), dtype=np.uint8)
+    rows = {1: slice(0, 1), -1: slice(3, 4), 0: slice(None)}[int(y)]
+    columns = {1: slice(3, 4), -1: slice(0, 1), 0: slice(None)}[int(x)]
+    stored[rows, columns] = 255
+    picture = Image.fromarray(stored)
+    picture.getexif()[274] = orientation
+    stream = io.BytesIO()
+    picture.save(stream, "PNG", exif=picture.getexif())
+    upright = np.asarray(ImageOps.exif_transpose(Image.open(stream)))
+    assert (upright[0] == 255).all() and (upright[1:] == 0).all()
+
+
+def test_cameras_that_look_straight_down_do_not_say_that_up_is_where_they_look_from() -> None:
+    """Their sides are level however they turn; the tops of their pictures all point north, which is what they show."""
+    turns = np.linspace(-20.0, 20.0, 20)
+    poses = np.tile(np.eye(4), (len(turns), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("z", turns[:, None], degrees=True).as_matrix()
+    up = find_up(poses, [None] * len(poses), [1] * len(poses))
+    assert "mean of the photographs' upward directions" in up.source
+    assert up.direction == pytest.approx([0.0, 1.0, 0.0], abs=0.05)
+
+
+def test_photographs_whose_levels_are_wrong_are_outvoted() -> None:
+    """Eight say the same; three that say otherwise do not move it at all."""
+    level = np.array([look_at((0.0, 0.0, 0.0), (np.cos(a), np.sin(a), 0.0)) for a in np.linspace(0.0, 3.0, 11)])
+    angles = [(0.0, 0.0)] * 8 + [(0.0, 60.0), (0.0, 70.0), (50.0, 0.0)]
+    up = find_up(level, angles, [1] * 11)
+    assert up.direction == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)

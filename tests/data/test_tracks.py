@@ -1,0 +1,284 @@
+"""Sparse points and who sees them: from a file of tracks, from a COLMAP model, as lines of sight in training."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.support.colmap_model import write_colmap_model
+from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.colmap_tracks import _matched, read_colmap_tracks
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.scene_box import find_scene_box
+from thermoxels_ns.data.scene_file import read_scene_file
+from thermoxels_ns.data.tracks import (
+    COLMAP_FOLDERS,
+    TRACKS_KEY,
+    SparseTracks,
+    feature_rays,
+    write_tracks,
+)
+
+TAGS = ["train", "train", "eval", "train", "train", "train"]
+NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]
+SCALE, SHIFT = 2.5, np.array([0.3, -4.0, 1.0])
+TURN = Rotation.from_quat([0.1, -0.7, 0.3, 0.64]).as_matrix()
+LEGACY = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])  # the axes that old versions of ns-process-data swapped
+POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3))
+
+
+@pytest.fixture
+def scene(scene_folder):
+    """A scene of six photographs, without points."""
+    return scene_folder(frames=len(NAMES), names=NAMES, scene_box=[[-1, -1, -1], [1, 1, 1]])
+
+
+@pytest.fixture
+def tracked(scene):
+    """The scene with a file of tracks in which all photographs see all points."""
+    files = tuple(entry["file_path"] for entry in scene.meta["frames"])
+    frame, point = (axis.reshape(-1) for axis in np.meshgrid(range(len(files)), range(30), indexing="ij"))
+    tracks = SparseTracks(POINTS, np.full(30, 0.5), files, frame, point)
+    scene.meta[TRACKS_KEY] = "tracks.npz"
+    scene.rewrite()
+    write_tracks(scene.path / "tracks.npz", tracks)
+    return scene, tracks
+
+
+def frames_of(folder, side=""):
+    return [frame for frame in read_scene_file(folder.path).frames if side in frame.name]
+
+
+def add_model(folder, where="colmap/sparse/0", frames=None, names=None, focal_factor=1.0, moved=True, **more) -> None:
+    frames = frames_of(folder) if frames is None else frames
+    lens, names = frames[0].intrinsics, names or [frame.image.name for frame in frames]
+    camera = Camera(lens.width, lens.height, lens.fl_x, lens.fl_y, lens.cx, lens.cy)
+    camera = camera.resized(*(round(side * focal_factor) for side in (lens.width, lens.height)))
+    world = {"turn": TURN, "scale": SCALE, "shift": SHIFT} if moved else {}
+    poses, options = [frame.pose for frame in frames], {"lens": "PINHOLE", **world, **more}
+    write_colmap_model(folder.path / where, names, poses, camera, POINTS, **options)
+
+
+def tracks_of(folder) -> SparseTracks:
+    return read_colmap_tracks(read_scene_file(folder.path))
+
+
+def lines_of(folder, split="train", **options):
+    return ThermalDataParserConfig(data=folder.path, **options).setup().get_dataparser_outputs(split)
+
+
+@pytest.mark.parametrize(("where", "text"), [*((where, False) for where in COLMAP_FOLDERS), (COLMAP_FOLDERS[0], True)])
+@pytest.mark.parametrize("on_a_line", [False, True])
+def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, text, on_a_line):
+    if on_a_line:
+        for number, entry in enumerate(scene.meta["frames"]):
+            for row, across in enumerate((1.0, 2.0, 3.0)):
+                entry["transform_matrix"][row][3] = across * (number - 2.5)
+        scene.rewrite()
+    add_model(scene, where, text=text)
+    tracks = tracks_of(scene)
+    assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
+    assert len(tracks.sighting_frame) == 6 * 30
+    if not on_a_line:
+        lines = lines_of(scene).metadata["feature_rays"]
+        assert len(lines.points) == 30 and len(lines.origins) == 5 * 30  # the one that evaluates is left out
+
+
+@pytest.mark.parametrize("where", COLMAP_FOLDERS)
+@pytest.mark.parametrize("axes", [np.eye(3), LEGACY])
+def test_the_box_is_found_wherever_a_model_may_lie_and_follows_the_worlds_axes(scene_folder, where, axes):
+    scene = scene_folder(frames=len(NAMES), names=NAMES, scene_box=None)
+    add_model(scene, where, moved=False, turn=axes.T)
+    evidence = find_scene_box(read_scene_file(scene.path), None, range(len(NAMES)))
+    box = evidence.box()
+    assert evidence.source == f"the points of {where}"
+    assert (box[0] < POINTS.min(axis=0)).all() and (box[1] > POINTS.max(axis=0)).all() and np.abs(box).max() < 0.6
+    for frame in scene.meta["frames"]:
+        frame["transform_matrix"][0][3] += 1.0
+    scene.rewrite()
+    with pytest.raises(SceneError, match="at other places"):
+        lines_of(scene)
+
+
+def test_without_a_model_and_switched_off_there_are_no_lines(scene):
+    assert lines_of(scene).metadata["feature_rays"] is None
+    add_model(scene)
+    assert lines_of(scene).metadata["feature_rays"] is not None
+    assert lines_of(scene, tracks="given").metadata["feature_rays"] is None
+    assert lines_of(scene, tracks="off").metadata["feature_rays"] is None
+
+
+def test_the_file_that_the_json_names_comes_first(tracked):
+    scene, tracks = tracked
+    add_model(scene)
+    few = tracks.sighting_point < 7
+    some = {"sighting_frame": tracks.sighting_frame[few], "sighting_point": tracks.sighting_point[few]}
+    write_tracks(scene.path / "tracks.npz", replace(tracks, **some))
+    assert len(lines_of(scene).metadata["feature_rays"].points) == 7
+    assert lines_of(scene, tracks="off").metadata["feature_rays"] is None
+
+
+def test_some_wrong_poses_are_left_out_and_named_and_move_nothing(scene, capsys):
+    frames = frames_of(scene)
+    add_model(scene, frames=frames)
+    entry = next(one for one in scene.meta["frames"] if frames[4].image.name in one["file_path"])
+    entry["transform_matrix"][0][3] += 2.0
+    scene.rewrite()
+    tracks = tracks_of(scene)
+    assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
+    assert set(tracks.sighting_frame.tolist()) == {0, 1, 2, 3, 5}
+    assert frames[4].name in capsys.readouterr().out.replace("\n", "")
+
+
+def _outside(scene) -> None:
+    add_model(scene)
+    shutil.move(scene.path / "colmap", scene.path.parent / "outside")
+    (scene.path / "colmap").symlink_to(scene.path.parent / "outside")
+
+
+def _changed(scene, name: str, change, **options) -> None:
+    add_model(scene, **options)
+    path = scene.path / "colmap/sparse/0" / name
+    path.write_bytes(change(path.read_bytes()))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda s, f: add_model(s, frames=f[3:] + f[:3], names=[one.image.name for one in f]), "poses are others"),
+        (lambda s, f: add_model(s, names=[f"other_{n}.jpg" for n in range(6)]), "no photograph of this scene"),
+        (lambda s, f: add_model(s, frames=f[:2]), "too few"),
+        (lambda s, f: _outside(s), "a file inside"),
+        (lambda s, f: _changed(s, "images.bin", lambda _: b"\x07"), "cannot be read"),
+        *(
+            (lambda s, f, name=name, cut=cut: _changed(s, name, cut), f"{name} ends before")
+            for name in ("cameras.bin", "frames.bin", "images.bin", "points3D.bin")
+            for cut in (lambda _: b"", lambda b: b[: int(0.6 * len(b))])
+        ),
+        (lambda s, f: _changed(s, "points3D.bin", lambda b: b[:-1]), "points3D.bin ends before its last entry"),
+        (lambda s, f: _changed(s, "cameras.txt", lambda b: b.replace(b"24 18", b"0 0"), text=True), "0 pixels wide"),
+    ],
+)
+def test_models_that_cannot_be_used_are_left_out_with_a_warning(scene, capsys, spoil, said):
+    spoil(scene, frames_of(scene))
+    assert lines_of(scene).metadata["feature_rays"] is None
+    assert said in " ".join(capsys.readouterr().out.split())
+
+
+def test_errors_are_pixels_of_the_photographs_and_are_computed_where_colmap_did_not(scene):
+    add_model(scene, focal_factor=0.5, error=0.4)
+    assert tracks_of(scene).point_error_px == pytest.approx(0.8)
+    add_model(scene, error=-1.0)
+    assert (tracks_of(scene).point_error_px >= 0.0).all()
+
+
+def test_photographs_of_one_name_are_told_apart_by_their_folders():
+    images = ["left/1.jpg", "right/1.jpg", "2.jpg"]
+    assert _matched(images, ["images/right/1.jpg", "images/left/1.jpg", "images/2.jpg"]) == [(1, 0), (0, 1), (2, 2)]
+    assert _matched(images, ["images/1.jpg", "2.jpg"]) == [(2, 1)]
+    assert _matched(["1.jpg"], ["a/1.jpg", "b/1.jpg"]) == []
+    assert _matched(["1.jpg", "left/1.jpg"], ["images/left/1.jpg", "images/1.jpg"]) == [(1, 0), (0, 1)]
+
+
+def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_world(tracked):
+    folder, tracks = tracked
+    outputs = lines_of(folder)
+    lines = outputs.metadata["feature_rays"]
+    centres = outputs.cameras.camera_to_worlds[:, :, 3].double().numpy()
+    assert len(lines.origins) == 5 * 30
+    nearest = np.linalg.norm(lines.origins[:, None] - centres, axis=2)
+    assert nearest.min(axis=1).max() < 1e-5
+    assert np.bincount(nearest.argmin(axis=1)).tolist() == [30] * 5
+    transform = outputs.dataparser_transform.double().numpy()
+    moved = outputs.dataparser_scale * (tracks.points @ transform[:, :3].T + transform[:, 3])
+    assert lines.points == pytest.approx(moved, abs=1e-6)
+    assert (np.diff(lines.point) >= 0).all()
+    assert lines_of(folder, "val").metadata["feature_rays"] is None
+
+
+def test_a_point_that_its_neighbours_contradict_is_listed_without_lines(tracked):
+    folder, tracks = tracked
+    points = np.zeros((300, 3))  # a wall, seen by the three photographs on one side of it
+    points[:, 1:] = np.random.default_rng(3).uniform(-0.5, 0.5, (300, 2))
+    centres = np.array([np.array(entry["transform_matrix"])[:3, 3] for entry in folder.meta["frames"]])
+    frame, point = (a.reshape(-1) for a in np.meshgrid(np.flatnonzero(centres[:, 0] > 0), range(300), indexing="ij"))
+    tracks = SparseTracks(points, np.full(300, 0.5), tracks.frames, frame, point)
+    write_tracks(folder.path / "tracks.npz", tracks)
+    assert np.bincount(lines_of(folder).metadata["feature_rays"].point).tolist() == [3] * 300
+    middle = int(np.argmin(np.abs(points).sum(axis=1)))
+    points[middle] += 0.1 * (centres[centres[:, 0] > 0].mean(axis=0) - points[middle])
+    write_tracks(folder.path / "tracks.npz", tracks)
+    lines = lines_of(folder).metadata["feature_rays"]
+    assert len(lines.points) == 300
+    assert sorted(set(range(300)) - set(lines.point.tolist())) == [middle]
+
+
+def test_badly_known_points_and_those_behind_a_camera_are_left_out(tracked):
+    folder, tracks = tracked
+    frames = frames_of(folder, "train")
+    error, points = tracks.point_error_px.copy(), tracks.points.copy()
+    error[:4] = 3.0
+    points[4] = np.nan
+    lines = feature_rays(replace(tracks, point_error_px=error, points=points), frames)
+    assert np.array_equal(lines.points, tracks.points[5:])
+    points[4] = frames[0].pose[:3, 3] + 50.0 * frames[0].pose[:3, 2]  # behind one camera, and so seen by nobody
+    lines = feature_rays(replace(tracks, points=points), frames)
+    axis, centres = (np.stack([sign * frame.pose[:3, at] for frame in frames]) for sign, at in ((-1, 2), (1, 3)))
+    camera = np.linalg.norm(lines.origins[:, None] - centres, axis=2).argmin(axis=1)
+    assert ((lines.points[lines.point] - lines.origins) * axis[camera]).sum(axis=1).min() > 0.0
+    # One camera, or cameras at one place, know no distances.
+    for some in (frames[:1], [replace(frame, pose=frames[0].pose) for frame in frames]):
+        assert len(feature_rays(tracks, some).points) == 0
+
+
+def test_the_error_of_a_length_is_that_of_a_triangulation(tracked):
+    folder, _ = tracked
+    frame = frames_of(folder)[0]
+    frames = []
+    for number, x in enumerate((-1.0, 0.0, 1.0)):
+        pose = np.eye(4)
+        pose[:3, 3] = (x, 0.0, 2.0)
+        frames.append(replace(frame, name=str(number), pose=pose))
+    one = SparseTracks(np.zeros((1, 3)), np.ones(1), ("0", "1", "2"), np.arange(3), np.zeros(3, dtype=np.int64))
+    lines = feature_rays(one, frames)
+    angle = 2.0 * np.arctan2(1.0, 2.0)
+    expected = 1.0 / frame.intrinsics.fl_x / np.sin(angle) * np.sqrt([5.0, 4.0, 5.0])
+    assert lines.uncertainty == pytest.approx(expected)
+
+
+def _rewritten(**changes):
+    """Write tracks in which some arrays are others, made of those that are there."""
+    return lambda path, tracks: write_tracks(path, replace(tracks, **{k: make(tracks) for k, make in changes.items()}))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "named"),
+    [
+        (_rewritten(frames=lambda _: tuple(f"other_{n}" for n in range(6))), "photographs of this scene.*other_0"),
+        (_rewritten(points=lambda tracks: tracks.points + np.array([0.0, 0.0, 100.0])), "behind"),
+        (_rewritten(sighting_point=lambda tracks: tracks.sighting_point + 1), "pairs of their numbers"),
+        (lambda path, _: path.write_bytes(b""), "points"),
+        (lambda path, _: path.write_bytes(b"not a zip"), "points"),
+        (lambda path, _: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "points"),
+        (lambda path, tracks: np.savez(path, points=tracks.points), "point_error_px"),
+        (lambda path, _: path.unlink(), "points"),
+    ],
+)
+def test_files_of_tracks_that_cannot_be_used_are_refused(tracked, spoil, named):
+    folder, tracks = tracked
+    spoil(folder.path / "tracks.npz", tracks)
+    with pytest.raises(SceneError, match=rf"tracks\.npz.*{named}"):
+        lines_of(folder)
+
+
+@pytest.mark.parametrize("outside", ["../tracks.npz", "{folder}/../tracks.npz"])
+def test_tracks_outside_the_scene_are_refused(tracked, outside):
+    folder, tracks = tracked
+    write_tracks(folder.path.parent / "tracks.npz", tracks)
+    folder.meta[TRACKS_KEY] = outside.format(folder=folder.path)
+    folder.rewrite()
+    with pytest.raises(SceneError, match=r"tracks_file_path.*tracks\.npz"):
+        lines_of(folder)
