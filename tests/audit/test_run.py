@@ -320,10 +320,6 @@ def test_wrinkles_of_a_reconstructed_wall_are_no_heat_loss_of_a_bridge() -> None
     drawn = 2.0 + 3.0 * np.exp(-(((z - 1.5) / 0.25) ** 2))
     off_m = np.where(flat.points_m[:, 1] == 0.0, np.random.default_rng(4).normal(0.0, 0.02, len(z)), 0.0)
     wrinkled = replace(flat, points_m=flat.points_m + off_m[:, None] * [0.0, 1.0, 0.0])
-    corner = wrinkled.points_m[wrinkled.facets]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    wrinkled = replace(wrinkled, boundary=replace(flat.boundary, normal=normal))
     stated = replace(EXACT, film=Film("iso-6946-combined", Measured(1.0)), surfaces=(Surface(Measured(1.0)),))
     seen = np.zeros(len(z), dtype=bool)
     seen[flat.facets[flat.boundary.seen]] = True

@@ -6,10 +6,10 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, stiffness, tet_mesh
-from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.quality.report import QualityReport, check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
+from thermoxels_ns.mesh.tetrahedra import facet_areas, facet_normals
 
 SMOOTH = ("sphere", "torus")
 SHARP = tuple(name for name in SHAPES if SHAPES[name].sharp_edges)

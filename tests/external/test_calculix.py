@@ -9,7 +9,7 @@ from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_matrices import HeatMatrices, assemble, backward_euler
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.mesh.files.solvers import HeatStep, write_inp
-from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.tetrahedra import facet_areas
 
 pytestmark = pytest.mark.external
 

@@ -3,8 +3,8 @@ import pytest
 
 from tests.support.heat_matrices import assemble, backward_euler
 from thermoxels_ns.mesh.files.solvers import write_xdmf
-from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.tetrahedra import facet_areas
 
 pytestmark = pytest.mark.external
 

@@ -80,9 +80,8 @@ MESHES: Refused = [
     ),
     *(("mesh temperature_c", lambda t=t: body(temperature_c=moved(BOX.temperature_c, 5, t))) for t in (NAN, -274.0)),
     ("mesh temperature_c", lambda: body(temperature_c=BOX.temperature_c[:-1])),
-    *(("boundary area_factor", lambda a=a: tagged(area_factor=a)) for a in (np.zeros(len(BOX.facets)), np.ones(3))),
     ("boundary patch", lambda: tagged(patch=np.full(len(BOX.facets), 7))),
-    ("boundary normal", lambda: tagged(normal=np.full((len(BOX.facets), 3), NAN))),
+    ("boundary patch", lambda: tagged(patch=np.zeros(3, np.int64))),
 ]
 PROBLEMS: Refused = [
     *(

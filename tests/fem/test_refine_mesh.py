@@ -11,9 +11,9 @@ from thermoxels_ns.fem.p1_kernels import TET_EDGES, lumped_mass, stiffness_matri
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space, conduction
-from thermoxels_ns.mesh.quality.checks import boundary_facets, facet_areas
+from thermoxels_ns.mesh.quality.checks import boundary_facets
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 
@@ -35,7 +35,7 @@ def notched() -> TetMesh:
     assert tags is not None
     return replace(
         mesh,
-        boundary=replace(tags, area_factor=np.linspace(0.5, 1.0, len(mesh.facets)), seen=tags.patch % 2 == 0),
+        boundary=replace(tags, seen=tags.patch % 2 == 0),
         colour=np.linspace(0, 1, 3 * len(mesh.points_m), dtype=np.float32).reshape(-1, 3),
         observed=mesh.points_m[:, 0] < 1.5,
     )
@@ -64,7 +64,7 @@ def test_children_inherit() -> None:
     tags, finer = mesh.boundary, fine.boundary
     assert tags is not None and finer is not None and mesh.colour is not None and fine.colour is not None
     np.testing.assert_array_equal(fine.region, np.repeat(mesh.region, 8))
-    for name in ("patch", "area_factor", "seen", "normal"):
+    for name in ("patch", "seen"):
         np.testing.assert_array_equal(getattr(finer, name), np.repeat(getattr(tags, name), 4, axis=0))
     np.testing.assert_array_equal(fine.facet_tags, np.repeat(mesh.facet_tags, 4))
     assert finer.patch_names == tags.patch_names and fine.region_names == mesh.region_names

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.support.heat_meshes import SIDES, box_mesh
+from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
@@ -67,13 +67,6 @@ def test_heat_per_patch(box, concrete) -> None:
     assert heat.group_names == ("x0", "x1", "z1")
     np.testing.assert_allclose(heat.group_heat_w[0], 100.0 * np.array([AREA_X, AREA_X, 0.12]), rtol=1e-12)
     assert heat.heat_w[0] == pytest.approx(heat.group_heat_w.sum(), rel=1e-12)
-    tags = box.boundary
-    assert tags is not None
-    factor = np.where(tags.patch == SIDES.index("x1"), 0.5, 1.0)
-    effects = HeatFlux(("x1",), 100.0), Convection(("x1",), 8.0, 30.0), Radiation(("x1",), 0.9, 40.0)
-    scaled = at_once(replace(box, boundary=replace(tags, area_factor=factor)), concrete, *effects)
-    for half, whole in zip(scaled.effects, at_once(box, concrete, *effects).effects):
-        assert half.heat_w[0] == pytest.approx(0.5 * whole.heat_w[0], rel=1e-6)
 
 
 def test_a_star_is_the_whole_boundary_also_without_tags(box, concrete) -> None:

@@ -47,16 +47,6 @@ def test_u_values_of_two_walls_side_by_side() -> None:
     assert wall.coldest.point_m[0] == 0.0 and wall.coldest.point_m[1] <= 1.0 and wall.coldest.patches[0] == "x0"
 
 
-def test_true_areas_count() -> None:
-    """Triangles that stand for 0.7 of their own area exchange 0.7 of the heat."""
-    problem = two_walls()
-    tags = dataclasses.replace(problem.mesh.boundary, area_factor=np.full(len(problem.mesh.facets), 0.7))
-    problem = dataclasses.replace(problem, mesh=dataclasses.replace(problem.mesh, boundary=tags))
-    wall = wall_result(problem, solve_steady(problem), ("x0",), 20.0, -10.0)
-    assert wall.area_m2 == pytest.approx(5.6)
-    assert wall.regions[0].u_value_w_m2k == pytest.approx(1.0 / (1 / 8 + 0.7 * 0.2 / 0.7 + 1 / 25), rel=1e-9)
-
-
 def test_of_a_cooled_room_the_warmest_spot_is_the_worst() -> None:
     effects = (Convection(("x0",), 8.0, 5.0), Convection(("x1",), 25.0, 35.0))
     problem = dataclasses.replace(two_walls(), effects=effects)

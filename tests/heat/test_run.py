@@ -22,7 +22,7 @@ from thermoxels_ns.heat.run import (
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import InsideAir, OutsideAir
 from thermoxels_ns.heat.solving import Goals
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_normals
 
 CONCRETE = {"*": CONCRETE}
 AIRS = {"inside_air": InsideAir(20.0, "iso-6946-combined"), "outside_air": OutsideAir(0.0, "iso-6946-combined")}
@@ -89,7 +89,7 @@ def test_a_room_without_a_floor_is_named() -> None:
     assert inner_surface_warnings(scene, room(), Z_UP) == ()
     mesh = room()
     assert mesh.boundary is not None
-    floor = (mesh.boundary.normal[:, 2] > 0.5) & np.char.startswith(names_of(mesh), "interior")
+    floor = (facet_normals(mesh.points_m, mesh.facets)[:, 2] > 0.5) & np.char.startswith(names_of(mesh), "interior")
     names = (*mesh.boundary.patch_names, "floor")
     patch = np.where(floor, len(names) - 1, mesh.boundary.patch)
     missing = replace(mesh, boundary=replace(mesh.boundary, patch=patch, patch_names=names))
@@ -157,8 +157,7 @@ def test_parts_that_touch_without_shared_nodes_are_solved_and_said_to_exchange_n
     tags = first.boundary
     assert tags is not None
     patch = np.concatenate([np.where(tags.patch == inner, 2, tags.patch) for inner in (1, 0)])
-    arrays = {name: np.concatenate([getattr(tags, name)] * 2) for name in ("normal", "area_factor", "seen")}
-    mesh = replace(both(first, second), boundary=replace(tags, patch=patch, **arrays))
+    mesh = replace(both(first, second), boundary=replace(tags, patch=patch, seen=np.concatenate([tags.seen] * 2)))
     airs = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0)
     run = run_scene(HeatScene(CONCRETE, convection=airs, adiabatic=("y*", "z*")), mesh, Goals())
     assert "flat" not in run.solution.status

@@ -99,8 +99,6 @@ def test_a_training_follows_depths(scene, capsys):
     followed = train(scene, 6, course).model
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("photographs agree about") == 1
-    assert said.count("step 1: ") and said.count("show plain walls") == 2
-    assert len(followed.wall_depth) == 18 * 160 * 120
     alone = train(scene, 6, {**course, "photo_depth": "off"}).model
     assert "depths:" not in capsys.readouterr().out
     assert followed.feature_ray_sampler is not None and alone.feature_ray_sampler is None

@@ -8,7 +8,7 @@ from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.boundary.visibility import FacetViews, facet_views
-from thermoxels_ns.mesh.quality.checks import facet_normals
+from thermoxels_ns.mesh.tetrahedra import facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import Depths, depths_of

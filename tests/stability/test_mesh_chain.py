@@ -7,10 +7,9 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 from thermoxels_ns.mesh.build import BuiltMesh, MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
-from thermoxels_ns.mesh.voxel_tets import LEAST_AREA_FACTOR
+from thermoxels_ns.mesh.tetrahedra import facet_areas
 
 MODES = ["conforming", "voxel"]
 AS_IT_IS = SolidSelection(density_threshold=0.5, close_gaps=0, region="all", interior="hollow")
@@ -82,11 +81,7 @@ def assert_sound(built: BuiltMesh, mode: str) -> None:
     assert low <= quality.dihedral_range_deg[0] and quality.dihedral_range_deg[1] <= high
     assert mesh.observed.any()
     assert mesh.temperature_c.min() >= 20.0 - 1e-6 and mesh.temperature_c.max() <= 21.0 + 1e-6
-    assert np.linalg.norm(boundary.normal, axis=1) == pytest.approx(np.ones(len(mesh.facets)))
-    assert np.all(np.einsum("ij,ij->i", facet_normals(mesh.points_m, mesh.facets), boundary.normal) > 0.0)
-    assert np.all((boundary.area_factor >= LEAST_AREA_FACTOR) & (boundary.area_factor <= 1.0))
-    area = facet_areas(mesh.points_m, mesh.facets)
-    assert area @ boundary.area_factor <= quality.area_m2 * (1.0 + 1e-12)
+    assert facet_areas(mesh.points_m, mesh.facets).min() > 0.0
     assert boundary.patch.min() >= 0 and boundary.patch.max() < len(boundary.patch_names)
     assert mesh.colour.min() >= 0.0 and mesh.colour.max() <= 1.0
 

@@ -61,9 +61,7 @@ def power(rng: np.random.Generator, low: float, high: float) -> float:
 def turned(mesh: TetMesh, rng: np.random.Generator) -> TetMesh:
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
-    tags = mesh.boundary
-    assert tags is not None
-    return replace(mesh, points_m=mesh.points_m @ turn.T, boundary=replace(tags, normal=tags.normal @ turn.T))
+    return replace(mesh, points_m=mesh.points_m @ turn.T)
 
 
 def layers(

@@ -33,7 +33,7 @@ from thermoxels_ns.heat.effects import Convection, Radiation
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.results import heat_results
 from thermoxels_ns.heat.scene_fields import INSIDE_RESISTANCE_M2K_W
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_normals
 
 UP = (0.0, 0.0, 1.0)
 WALL_M, LENGTH_M, HEIGHT_M = 0.3, 4.0, 3.0
@@ -160,7 +160,9 @@ def photographed(truth: Truth, conditions: Conditions, seed: int | None = None) 
     mesh, draws = truth.mesh, truth.draws
     nodes = np.unique(mesh.facets[mesh.boundary.seen])
     normal = np.zeros((len(mesh.points_m), 3))
-    np.add.at(normal, mesh.facets[mesh.boundary.seen], mesh.boundary.normal[mesh.boundary.seen][:, None])
+    np.add.at(
+        normal, mesh.facets[mesh.boundary.seen], facet_normals(mesh.points_m, mesh.facets)[mesh.boundary.seen][:, None]
+    )
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = normal / np.where(length > 0.0, length, 1.0)
     emissivity = float(draws[emissivity_name(conditions, 0)][0])

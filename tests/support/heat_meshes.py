@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.mesh.quality.checks import boundary_facets
-from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 SIDES = ("x0", "x1", "y0", "y1", "z0", "z1")
@@ -108,13 +108,11 @@ def box_mesh(
 
 
 def _tags(points, facets, axes, patches) -> Boundary:
-    corner = points[facets]
-    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal, centroid = cross / np.linalg.norm(cross, axis=1)[:, None], corner.mean(axis=1)
+    normal, centroid = facet_normals(points, facets), points[facets].mean(axis=1)
     names = (*SIDES, "other", *(name for name in patches if name not in SIDES))
     patch = np.full(len(facets), names.index("other"))
     for side, (axis, end) in zip(SIDES, ((axis, end) for axis in range(3) for end in (0, -1))):
         patch[np.isclose(centroid[:, axis], axes[axis][end], rtol=0, atol=1e-12)] = names.index(side)
     for name, rule in patches.items():
         patch[rule(centroid, normal)] = names.index(name)
-    return Boundary(normal, np.ones(len(facets)), np.ones(len(facets), bool), patch, names)
+    return Boundary(np.ones(len(facets), bool), patch, names)

@@ -4,9 +4,9 @@ from itertools import permutations
 
 import numpy as np
 
-from thermoxels_ns.mesh.quality.checks import boundary_facets, facet_normals
+from thermoxels_ns.mesh.quality.checks import boundary_facets
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_normals
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
 
 
@@ -46,8 +46,6 @@ def house_mesh() -> TetMesh:
         region=(corners[tets].mean(axis=1)[:, 2] < 2.0).astype(np.int64),
         region_names=("walls", "floor slab", "roof"),
         boundary=Boundary(
-            normal=normals,
-            area_factor=random.uniform(0.6, 1.0, len(facets)),
             seen=middle[:, 1] < 3.0,
             patch=patch.astype(np.int64),
             patch_names=("up", "down", "inside", "façade 1", "cut by the box"),

@@ -22,11 +22,9 @@ STEP_S = H**2 / CONCRETE.diffusivity_m2_s
 def dressed(mesh: TetMesh, temperature_c: Nodal = 20.0, regions: bool = False) -> TetMesh:
     """Give any mesh these patches and regions."""
     corner = mesh.points_m[mesh.facets]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     middle = mesh.points_m.mean(axis=0)
     patch = (corner.mean(axis=1)[:, 0] > middle[0]).astype(np.int64)
-    boundary = Boundary(normal, np.ones(len(patch)), np.ones(len(patch), bool), patch, ("x0", "x1"))
+    boundary = Boundary(np.ones(len(patch), bool), patch, ("x0", "x1"))
     nodal = temperature_c(mesh.points_m) if callable(temperature_c) else np.full(len(mesh.points_m), temperature_c)
     mesh = replace(mesh, temperature_c=nodal, boundary=boundary)
     if regions:

@@ -4,8 +4,7 @@ import numpy as np
 
 from tests.support.heat_bodies import make_body
 from thermoxels_ns.mesh.boundary.patches import default_patches
-from thermoxels_ns.mesh.quality.checks import facet_normals
-from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_normals
 
 Z_UP = (0.0, 0.0, 1.0)
 
@@ -27,7 +26,7 @@ def tagged_body(
     normals, middle = facet_normals(corners, mesh.facets), corners[mesh.facets].mean(axis=1)
     beyond = np.floor(middle + 0.5 * normals).astype(int) + 1
     patch, names = default_patches(normals, Z_UP, outside[tuple(beyond.T)], middle[:, 0] < cut_below_x)
-    tags = Boundary(normals, np.ones(len(normals)), np.ones(len(normals), bool), patch, names)
+    tags = Boundary(np.ones(len(normals), bool), patch, names)
     return replace(mesh, region_names=("solid", "slab"), boundary=tags)
 
 
@@ -50,6 +49,6 @@ def wall() -> TetMesh:
     outside[:, 5] = True
     mesh = tagged_body(cells, 0.05, outside)
     assert mesh.boundary is not None
-    across = np.abs(mesh.boundary.normal[:, 1]) < 0.5
+    across = np.abs(facet_normals(mesh.points_m, mesh.facets)[:, 1]) < 0.5
     patch = np.where(across, mesh.boundary.patch_names.index("cut"), mesh.boundary.patch)
     return replace(mesh, boundary=replace(mesh.boundary, patch=patch))

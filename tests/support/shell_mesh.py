@@ -42,11 +42,9 @@ def shell_mesh(
     nodes, tets = every[first], number.ravel()[np.concatenate(blocks)]
     mesh = mesh_from(nodes, tets, temperature_c)
     corner, facets = nodes[mesh.facets], mesh.facets
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
     radius = np.linalg.norm(corner, axis=2)
     patch = np.full(len(facets), 2)
     patch[np.all(np.abs(radius - inner_m) < 1e-9 * outer_m, axis=1)] = 0
     patch[np.all(np.abs(radius - outer_m) < 1e-9 * outer_m, axis=1)] = 1
     seen, names = np.ones(len(facets), bool), ("inside", "outside", "cut")
-    return replace(mesh, boundary=Boundary(normal, np.ones(len(facets)), seen, patch, names))
+    return replace(mesh, boundary=Boundary(seen, patch, names))

@@ -60,11 +60,9 @@ def test_case_1_half_a_square_column(seed) -> None:
         # In the corner the two temperatures meet; the mean spreads the jump evenly.
         return np.where(z > 1.0 - 1e-9, np.where(x < 1e-9, 10.0, 20.0), 0.0)
 
-    points, tags = np.empty_like(mesh.points_m), mesh.boundary
-    assert tags is not None
+    points = np.empty_like(mesh.points_m)
     points[number] = mesh.points_m @ turn.T + away
-    tags = replace(tags, normal=tags.normal @ turn.T)
-    moved = replace(mesh, points_m=points, tets=number[mesh.tets], facets=number[mesh.facets], boundary=tags)
+    moved = replace(mesh, points_m=points, tets=number[mesh.tets], facets=number[mesh.facets])
     fixed = FixedTemperature(("x0", "z0", "z1"), Varying(sides, in_time=False))
     solution = solve_steady(HeatProblem(moved, conductor("any", 1.0), effects=(fixed,)))
     solution = replace(solution, temperature_c=solution.temperature_c[number])

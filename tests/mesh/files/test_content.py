@@ -12,8 +12,8 @@ from thermoxels_ns.mesh.files.content import checked_mesh, surface_of
 from thermoxels_ns.mesh.files.formats import MESH_FORMATS, mesh_file_paths, write_mesh
 from thermoxels_ns.mesh.files.solvers import HeatStep
 from thermoxels_ns.mesh.files.surface import write_glb, write_ply, write_stl
-from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.tetrahedra import facet_normals
 
 STEP = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)
 SUFFIXES = sorted(MESH_FORMATS)

@@ -20,7 +20,7 @@ from thermoxels_ns.mesh.files.solvers import (
     write_msh,
     write_xdmf,
 )
-from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.tetrahedra import facet_areas
 
 STEP = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)
 # Nodes of the faces S1 to S4 of a linear tetrahedron, as the manuals of Abaqus and CalculiX list them.
@@ -106,14 +106,13 @@ def test_names_that_become_one_are_refused(tmp_path, tagged_mesh, names):
     assert not list(tmp_path.iterdir())
 
 
-def test_surfaces_say_how_large_they_truly_are(written, tagged_mesh):
+def test_surfaces_say_how_large_they_are(written, tagged_mesh):
     areas = facet_areas(tagged_mesh.points_m, tagged_mesh.facets)
     for number, name in enumerate(("UP", "DOWN", "INSIDE", "FA_ADE_1")):
         patch = tagged_mesh.boundary.patch == number
-        true = areas[patch] @ tagged_mesh.boundary.area_factor[patch]
         said = [line for line in written if line.startswith("**") and f"PATCH-{name}" in line]
         numbers_said = [float(word) for line in said for word in line.split() if word.replace(".", "").isdigit()]
-        assert numbers_said == pytest.approx([true, areas[patch].sum(), true / areas[patch].sum()], rel=1e-8)
+        assert numbers_said == pytest.approx([areas[patch].sum()], rel=1e-8)
 
 
 def test_groups_carry_names_numbers_and_elements(tmp_path, tagged_mesh):
@@ -155,21 +154,6 @@ def test_a_name_that_gmsh_would_cut_is_refused(tmp_path, tagged_mesh):
     assert not list(tmp_path.iterdir())
 
 
-def test_triangles_carry_true_areas_and_normals(tmp_path, tagged_mesh):
-    """Tag of the element, number of its nodes, then the values at each of them."""
-    write_msh(tmp_path / "house.msh", tagged_mesh)
-    data, count = (tmp_path / "house.msh").read_bytes(), len(tagged_mesh.facets)
-    views = {"area_factor": tagged_mesh.boundary.area_factor[:, None], "normal": tagged_mesh.boundary.normal}
-    for name, values in views.items():
-        width = values.shape[1]
-        head = f'$ElementNodeData\n1\n"{name}"\n1\n0.0\n3\n0\n{width}\n{count}\n'.encode()
-        row = np.dtype([("tag", "<i4"), ("nodes", "<i4"), ("value", "<f8", (3, width))])
-        table = np.frombuffer(data, row, count, data.index(head) + len(head))
-        assert np.array_equal(table["tag"], len(tagged_mesh.tets) + 1 + np.arange(count))
-        assert np.all(table["nodes"] == 3)
-        assert np.array_equal(table["value"], np.repeat(values[:, None], 3, axis=1))
-
-
 def read_grids(path) -> dict[str, pv.UnstructuredGrid]:
     from vtkmodules.vtkIOXdmf2 import vtkXdmfReader
 
@@ -190,8 +174,6 @@ def test_vtk_reads_body_and_boundary(tmp_path, tagged_mesh):
     assert np.array_equal(boundary.cells_dict[pv.CellType.TRIANGLE], tagged_mesh.facets)
     assert np.array_equal(body.cell_data["region"], tagged_mesh.region + 1)
     assert np.array_equal(boundary.cell_data["patch"], tagged_mesh.boundary.patch + 1)
-    assert np.array_equal(boundary.cell_data["area_factor"], tagged_mesh.boundary.area_factor)
-    assert np.array_equal(boundary.cell_data["normal"], tagged_mesh.boundary.normal)
     for grid in grids.values():
         assert np.array_equal(grid.point_data["temperature_c"], tagged_mesh.temperature_c)
         assert np.array_equal(grid.point_data["temperature_k"], tagged_mesh.temperature_c + 273.15)

@@ -13,8 +13,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import colour_bytes
 from thermoxels_ns.mesh.files.formats import write_mesh
 from thermoxels_ns.mesh.files.vtu import read_mesh, write_boundary_vtp, write_summary
-from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, facet_areas, facet_normals
 
 
 def names_in(data: pv.DataSet) -> list[str]:
@@ -39,10 +38,9 @@ def test_tags_come_back_under_their_names(tmp_path, tagged_mesh):
     tags, node = tagged_mesh.boundary, read.point_data["node"]
     assert np.array_equal(node[read.regular_faces], tagged_mesh.facets)
     assert np.array_equal(read.point_data["temperature_c"], tagged_mesh.temperature_c[node])
-    for name in ("normal", "area_factor", "seen", "patch"):
+    for name in ("seen", "patch"):
         assert np.array_equal(read.cell_data[name], getattr(tags, name)), name
-    true_area = facet_areas(tagged_mesh.points_m, tagged_mesh.facets) * tags.area_factor
-    assert read.cell_data["area_m2"] == pytest.approx(true_area, rel=1e-14)
+    assert read.cell_data["area_m2"] == pytest.approx(facet_areas(tagged_mesh.points_m, tagged_mesh.facets), rel=1e-14)
     assert np.array_equal(read.cell_data["on_box"], tagged_mesh.facet_tags == FACET_BOX)
     assert names_in(read) == list(tags.patch_names)
 

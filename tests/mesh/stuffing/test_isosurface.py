@@ -13,11 +13,11 @@ from tests.support.stuffed_shapes import (
     volumes_and_angles,
 )
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.report import QualityReport, check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
 from thermoxels_ns.mesh.stuffing.lattice import bcc_lattice, coarse_interior
+from thermoxels_ns.mesh.tetrahedra import facet_areas
 
 
 def sound(solid: StuffedSolid) -> QualityReport:

@@ -11,11 +11,11 @@ from tests.support.stuffed_shapes import (
     turn,
     volumes_and_angles,
 )
-from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
 from thermoxels_ns.mesh.stuffing.sharp_edges import ANGLES_DEG, Surface, sharpen
+from thermoxels_ns.mesh.tetrahedra import facet_areas, facet_normals
 
 CELLS = 48
 VOXEL = 2.0 / CELLS
