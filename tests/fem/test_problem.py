@@ -103,7 +103,7 @@ EFFECTS: Refused = [
     ("coefficient_w_m2k", lambda: Convection(("*",), -1.0, 20.0)),
     *(("flux_w_m2", lambda f=f: HeatFlux(("*",), f)) for f in (True, np.ones(3), lambda places, time_s: 1.0)),
     ("emissivity", lambda: Radiation(("*",), 1.01, 20.0)),
-    ("surroundings_c", lambda: Radiation(("*",), 0.9, 1e300)),
+    *(("surroundings_c", lambda t=t: Radiation(("*",), 0.9, t)) for t in (1e6, 1e300)),
     ("air_c", lambda: Convection(("*",), 5.0, 1e6)),
     ("resistance_m2k_w", lambda: GroundContact(("*",), 0.0, 10.0)),
     *(("patches", lambda p=p: acting(HeatFlux(p, 1.0))) for p in (("roof",), ("x0", "X?"))),

@@ -116,6 +116,7 @@ def test_a_series_that_ends_before_the_run_is_named(tmp_path, time) -> None:
     path.write_text("hours,air_c\n0,10\n1,12\n")
     airs = {"outside_air": OutsideAir(10.0, "iso-6946-combined", air_series=str(path))}
     (warning,) = unused_settings(HeatScene(CONCRETE, time, **airs))
+    assert warning in run_scene(HeatScene(CONCRETE, time, **airs), room(), Goals()).warnings
     assert "outside_air is from 0 to 1 hours" in warning and "from 0 to 2 hours" in warning
     assert unused_settings(HeatScene(CONCRETE, TimeSteps(60, 60.0), **airs)) == ()
 
@@ -123,6 +124,7 @@ def test_a_series_that_ends_before_the_run_is_named(tmp_path, time) -> None:
 def test_air_that_was_given_in_kelvin_is_named() -> None:
     airs = {"inside_air": InsideAir(293.15, "iso-6946-combined"), "outside_air": AIRS["outside_air"]}
     (warning,) = doubtful_temperatures(HeatScene(CONCRETE, **airs))
+    assert warning in run_scene(HeatScene(CONCRETE, **airs), room(), Goals()).warnings
     assert "The air of inside_air has 293.15 degrees Celsius" in warning and "give air_c: 20." in warning
     assert doubtful_temperatures(HeatScene(CONCRETE, **AIRS)) == ()
 

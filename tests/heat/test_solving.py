@@ -49,6 +49,11 @@ def solved(problem: HeatProblem, time: heat_solving.Time = None, **goals: Any) -
     return heat_solving.solve_problem(problem, time, heat_solving.Goals(**goals))
 
 
+def test_equal_steps_say_what_error_they_make() -> None:
+    found = solved(HeatProblem(CONFORMING, CONCRETE, effects=AIRS), TimeSteps(4, 3600.0)).solution
+    assert "The steps make an error of about" in found.status and np.isfinite(found.time_error_k)
+
+
 BY_STRENGTH = {
     "sun": lambda strength: AbsorbedSolar(("x1",), 0.6, 500.0 * strength),
     "wind": lambda strength: Convection(("x1",), 20.0 * strength, -5.0),

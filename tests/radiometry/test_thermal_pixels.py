@@ -149,8 +149,8 @@ def test_a_tiff_of_64_bit_numbers_is_celsius(tmp_path, big_endian):
 @pytest.mark.parametrize(
     ("name", "pixels", "named"),
     [
-        ("a.tiff", np.full((3, 3), 9, np.int32), "thermal_unit"),
-        ("a.tiff", np.full((3, 3), 9, np.uint16), "thermal_unit"),
+        ("a.tiff", np.full((3, 3), 9, np.int32), "Give in transforms.json .*thermal_unit"),
+        ("a.tiff", np.full((3, 3), 9, np.uint16), "Give in transforms.json .*thermal_unit"),
         ("a.png", np.full((3, 3), 65535, np.uint16), "65535"),
         ("a.png", np.full((3, 3), 255, np.uint8), "255"),
     ],
@@ -164,6 +164,7 @@ def test_a_damaged_header_of_an_array_is_not_quoted(tmp_path):
     np.save(tmp_path / "a.npy", np.ones((3, 3)))
     whole = (tmp_path / "a.npy").read_bytes()
     (tmp_path / "a.npy").write_bytes(whole.replace(b"descr", b"d\n\xffcr"))
-    with pytest.raises(ThermalFileError, match=r"a\.npy: ") as caught:
-        read_thermal_file(tmp_path / "a.npy", CELSIUS)
-    assert "fortran_order" not in str(caught.value)
+    for read in (lambda path: read_thermal_file(path, CELSIUS), read_thermogram):
+        with pytest.raises(ThermalFileError, match=r"a\.npy: ") as caught:
+            read(tmp_path / "a.npy")
+        assert "fortran_order" not in str(caught.value)

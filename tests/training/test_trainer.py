@@ -168,13 +168,16 @@ def test_neither_a_config_nor_ns_viewer_opens_the_viewer(monkeypatch, words, hos
     assert config.viewer.websocket_host == host
 
 
-@pytest.mark.parametrize("name", ["experiment_name", "timestamp", "method_name", "relative_model_dir"])
+@pytest.mark.parametrize("name", ["experiment_name", "timestamp", "method_name", "relative_model_dir", "log"])
 @pytest.mark.parametrize("text", ["../../out", "..", "a/b", "/tmp", "a\\b"])
 def test_a_run_stays_in_the_output_folder(name, text):
     """Typed options and a config.yml set the same fields."""
     config = deepcopy(thermoxels.config)
-    setattr(config, name, Path(text) if name == "relative_model_dir" else text)
-    with pytest.raises(OutputError, match=f"^{name}: "):
+    if name == "log":
+        config.logging.relative_log_dir = Path(text)
+    else:
+        setattr(config, name, Path(text) if name == "relative_model_dir" else text)
+    with pytest.raises(OutputError, match="^logging.relative_log_dir: " if name == "log" else f"^{name}: "):
         config.get_checkpoint_dir()
 
 
@@ -244,6 +247,15 @@ def test_a_full_disk_is_one_line_and_loses_no_checkpoint(scene, tmp_path):
         made.save_checkpoint(20)
     assert [path.name for path in made.checkpoint_dir.iterdir()] == ["step-000000010.ckpt"]
     assert not list(made.checkpoint_dir.parent.glob(".*.part"))
+
+
+def test_a_disk_that_fills_up_while_training_is_one_line(scene, tmp_path):
+    made = trainer(scene, tmp_path, "--steps-per-save", "1", "--max-num-iterations", "3")
+    made.setup()
+    said = r"checkpoint .*: expected room for it, got .* Free space, then train again"
+    with files_end_after(200_000), pytest.raises(OutputError, match=said):
+        made.train()
+    assert not list(tmp_path.rglob("*.ckpt")) and not list(tmp_path.rglob("*.part"))
 
 
 def test_a_disk_without_room_for_a_checkpoint_is_refused_first(scene, tmp_path, monkeypatch):
