@@ -180,11 +180,11 @@ def test_radiation_and_changing_coefficients_in_time(effect) -> None:
     axis = np.linspace(0.0, 0.1, 5)
     mesh = box_mesh(axis, axis, [0.0, 0.025], temperature_c=200.0)
     problem = HeatProblem(mesh, Material("ceramic", 2.0, 2000.0, 900.0), effects=(effect,))
-    found = solve_to_tolerance(problem, Tolerance(3.0), duration_s=1800.0, outputs=4, log=silent)
+    found = solve_to_tolerance(problem, Tolerance(4.0), duration_s=1800.0, outputs=4, log=silent)
     exact = solve_heat(finer(problem, 2), AdaptiveSteps(1800.0, 0.1, outputs=4))
     true = true_error(found, problem, exact)
     assert found.met and found.settings.refinements < 2
-    assert true.temperature_k <= 3.0
+    assert true.temperature_k <= 4.0
     assert 1 / WITHIN < found.settings.error.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
 
 
