@@ -2,6 +2,7 @@ from dataclasses import astuple
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
 
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
@@ -219,3 +220,11 @@ def test_it_does_not_reach_a_shadow_beyond_seen_space():
     both = Views(*(np.concatenate(pair) for pair in zip(astuple(front), astuple(slot), strict=True)))
     assert wall_behind(plate(), LATTICE, front, 6.0)[7:12, 10:14, 12].all()
     assert not wall_behind(plate(), LATTICE, both, 6.0)[:, 10:14, 12].any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_hull_holds_the_voxels_whose_centres_a_triangulation_of_centres_holds(seed):
+    cells = np.random.default_rng(seed).random((12, 9, 10)) < 0.02
+    cells[6, 4, 5] = True
+    inside = Delaunay(np.argwhere(cells)).find_simplex(np.argwhere(np.ones_like(cells))) >= 0
+    assert np.array_equal(convex_hull(cells, of_centres=True).ravel(), inside)
