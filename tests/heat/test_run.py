@@ -89,17 +89,14 @@ def test_a_room_without_a_floor_is_named() -> None:
     assert inner_surface_warnings(scene, room(), Z_UP) == ()
     mesh = room()
     assert mesh.boundary is not None
-    floor = (mesh.boundary.normal[:, 2] > 0.5) & np.char.startswith(names_of(mesh), "interior")
+    floor = (mesh.boundary.normal[:, 2] > 0.5) & np.char.startswith(
+        np.array(mesh.boundary.patch_names)[mesh.boundary.patch], "interior"
+    )
     names = (*mesh.boundary.patch_names, "floor")
     patch = np.where(floor, len(names) - 1, mesh.boundary.patch)
     missing = replace(mesh, boundary=replace(mesh.boundary, patch=patch, patch_names=names))
     (warning,) = inner_surface_warnings(scene, missing, Z_UP)
     assert "a floor of 0 m²: most of the floor is missing" in warning
-
-
-def names_of(mesh: TetMesh) -> np.ndarray:
-    """Name of the patch of each boundary triangle."""
-    return np.array(mesh.boundary.patch_names)[mesh.boundary.patch]
 
 
 @pytest.mark.parametrize(("volume", "said"), [(30.0, False), (60.0, True)])
