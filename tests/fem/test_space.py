@@ -30,22 +30,13 @@ def quadratic(points: np.ndarray) -> np.ndarray:
     return 3.0 + points @ SLOPE + 0.5 * np.einsum("ki,ij,kj->k", points, HESSIAN, points)
 
 
-def crooked_box():
-    """A box of two regions whose inner nodes are off the lattice, so that no angle is right."""
-    mesh = box_mesh(
-        planes(0, 0.5, 1, step=0.25),
-        np.linspace(0, 1, 4),
-        np.linspace(0, 1, 4),
-        regions={"left": lambda p: p[..., 0] < 0.5, "right": lambda p: p[..., 0] > 0.5},
-    )
-    inside = np.all((mesh.points_m > 1e-9) & (mesh.points_m < 1 - 1e-9), axis=1) & (mesh.points_m[:, 0] != 0.5)
-    mesh.points_m[inside] += np.random.default_rng(1).uniform(-0.05, 0.05, (inside.sum(), 3))
-    return mesh
-
-
 def test_a_quadratic_temperature_is_exact() -> None:
     """div(k grad q) + s = 0, with q itself given on the surface."""
-    mesh, k = crooked_box(), 50.0
+    regions = {"left": lambda p: p[..., 0] < 0.5, "right": lambda p: p[..., 0] > 0.5}
+    mesh, k = box_mesh(*(planes(0, 0.5, 1, step=0.25) for _ in range(3)), regions=regions), 50.0
+    # Inner nodes off the lattice, so that no angle is right.
+    inside = np.all((mesh.points_m > 1e-9) & (mesh.points_m < 1 - 1e-9), axis=1) & (mesh.points_m[:, 0] != 0.5)
+    mesh.points_m[inside] += np.random.default_rng(1).uniform(-0.05, 0.05, (inside.sum(), 3))
     given = Varying(lambda places, t: quadratic(places.points_m), in_time=False)
     fixed = (FixedTemperature(("*",), given), InternalHeat(("*",), -k * np.trace(HESSIAN)))
     solution = solve_steady(HeatProblem(mesh, {"left": STEEL, "right": STEEL}, effects=fixed), order=2)

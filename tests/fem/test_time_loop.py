@@ -14,7 +14,6 @@ from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, HeatFlux, Radiation
 from thermoxels_ns.heat.sky import moving_sun
-from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 PAPER = TimeSteps(10, 60.0)
 
@@ -76,22 +75,13 @@ def test_equal_steps_tell_their_error(radiates) -> None:
     assert "takes two of them" in solve_heat(problem, TimeSteps(1, 1200.0), estimate_steps=True).status
 
 
-def two_plates(step: float = 0.01) -> TetMesh:
-    """Two plates that do not touch, at 20 and 60 C."""
-    x = np.array([0.0, 0.01, 0.02, 0.03])
-    return box_mesh(
-        x,
-        x,
-        [0.0, step],
-        keep=lambda p: np.abs(p[..., 0] - 0.015) > 0.005,
-        temperature_c=lambda p: np.where(p[:, 0] > 0.015, 60.0, 20.0),
-    )
-
-
 @pytest.mark.parametrize("scheme", [BACKWARD_EULER, CRANK_NICOLSON, SDIRK2])
 @pytest.mark.parametrize("step_s", [1e-9, 1e-6, 1e-3])
 def test_newton_takes_few_steps_however_short_the_time_step(concrete, scheme, step_s) -> None:
-    problem = HeatProblem(two_plates(), concrete, effects=(Radiation(("x1",), 0.9, 306.6),))
+    """Of two plates that do not touch, at 20 and 60 C."""
+    x, apart = [0.0, 0.01, 0.02, 0.03], lambda p: np.abs(p[..., 0] - 0.015) > 0.005
+    mesh = box_mesh(x, x, x[:2], keep=apart, temperature_c=lambda p: np.where(p[:, 0] > 0.015, 60.0, 20.0))
+    problem = HeatProblem(mesh, concrete, effects=(Radiation(("x1",), 0.9, 306.6),))
     solution = solve_heat(problem, TimeSteps(3, step_s), scheme=scheme)
     assert solution.newton_iterations.max() <= 3 * len(scheme.nodes)
     # As long as nothing has changed to speak of, the heat is that of the first moment.

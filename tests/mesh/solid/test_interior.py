@@ -2,12 +2,14 @@ from dataclasses import astuple
 
 import numpy as np
 import pytest
+from scipy import ndimage
+from scipy.spatial import Delaunay
 
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid import interior as interior_module
-from thermoxels_ns.mesh.solid.interior import interior, wall_behind
+from thermoxels_ns.mesh.solid.interior import interior, wall_behind, winding_number
 from thermoxels_ns.mesh.solid.morphology import convex_hull
 
 N = 24
@@ -163,10 +165,7 @@ def test_a_courtyard_stays_open_and_the_building_around_it_is_filled():
     building = np.zeros((N, N, N), dtype=bool)
     building[3:21, 3:21, 3:12] = True
     building[8:16, 8:16, 5:] = False
-    inside = np.zeros_like(building)
-    inside[1:-1, 1:-1, 1:-1] = building[1:-1, 1:-1, 1:-1]
-    for axis in range(3):
-        inside &= np.roll(building, 1, axis) & np.roll(building, -1, axis)
+    inside = ndimage.binary_erosion(building)
     turn = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
     eyes = np.column_stack((12 + 30 * np.cos(turn), 12 + 30 * np.sin(turn), np.full(20, 80.0)))
     for seal in (0, 1):
@@ -219,3 +218,20 @@ def test_it_does_not_reach_a_shadow_beyond_seen_space():
     both = Views(*(np.concatenate(pair) for pair in zip(astuple(front), astuple(slot), strict=True)))
     assert wall_behind(plate(), LATTICE, front, 6.0)[7:12, 10:14, 12].all()
     assert not wall_behind(plate(), LATTICE, both, 6.0)[:, 10:14, 12].any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_hull_holds_the_voxels_whose_centres_a_triangulation_of_centres_holds(seed):
+    cells = np.random.default_rng(seed).random((12, 9, 10)) < 0.02
+    cells[6, 4, 5] = True
+    inside = Delaunay(np.argwhere(cells)).find_simplex(np.argwhere(np.ones_like(cells))) >= 0
+    assert np.array_equal(convex_hull(cells, of_centres=True).ravel(), inside)
+
+
+@pytest.mark.parametrize("lo", [12, 13])
+def test_a_cube_without_one_of_its_sides_surrounds_its_middle_five_sixths(lo):
+    solid, cube, middle = np.zeros((48, 48, 48), dtype=bool), slice(lo, lo + 24), slice(lo + 11, lo + 13)
+    solid[cube, cube, cube] = True
+    air = ~solid
+    air[cube, cube, :lo] = False  # nothing is known of what is below
+    assert winding_number(solid, air)[middle, middle, middle].mean() == pytest.approx(5 / 6, abs=0.02)
