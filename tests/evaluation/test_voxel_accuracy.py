@@ -12,13 +12,11 @@ from thermoxels_ns.synthetic.solids import Sphere
 
 LATTICE = Lattice.covering((-1, -1, -1), (1, 1, 1), 24)
 H = LATTICE.voxel_size
-TOLERANCE = 1.5 * H
 SPHERE = Sphere((0.0, 0.0, 0.0), 0.6)
-IDENTITY = np.eye(4)
 SEEN = SPHERE.surface_points(2000, 0)[0]
 
 
-def score_of(cells, truth=SPHERE, seen=SEEN, tolerance=TOLERANCE, world_to_truth=IDENTITY, views=None, **more):
+def score_of(cells, truth=SPHERE, seen=SEEN, tolerance=1.5 * H, world_to_truth=np.eye(4), views=None, **more):
     views = from_above() if views is None else views
     return surface_fscore(cells, LATTICE, truth, seen, tolerance, world_to_truth, views, **more)
 
