@@ -16,9 +16,9 @@ SPHERE = Sphere((0.0, 0.0, 0.0), 0.6)
 SEEN = SPHERE.surface_points(2000, 0)[0]
 
 
-def score_of(cells, truth=SPHERE, seen=SEEN, tolerance=1.5 * H, world_to_truth=np.eye(4), views=None, **more):
+def score_of(cells, truth=SPHERE, seen=SEEN, views=None, **more):
     views = from_above() if views is None else views
-    return surface_fscore(cells, LATTICE, truth, seen, tolerance, world_to_truth, views, **more)
+    return surface_fscore(cells, LATTICE, truth, seen, 1.5 * H, np.eye(4), views, **more)
 
 
 def voxels(shape: Sphere) -> np.ndarray:
