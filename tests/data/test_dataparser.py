@@ -229,6 +229,11 @@ def test_a_damaged_photograph_or_one_with_an_alpha_channel_is_refused(scene_fold
         ThermalDataset(parse(scene.path))[1]
 
 
+def bounds_that_are_a_folder(scene) -> None:
+    (scene.path / BOUNDS_NAME).unlink()
+    (scene.path / BOUNDS_NAME).mkdir()
+
+
 def one_of_another_size(scene) -> None:
     Image.fromarray(np.arange(12 * 9, dtype=np.uint16).reshape(9, 12)).save(
         scene.path / "thermal" / "frame_train_003.png"
