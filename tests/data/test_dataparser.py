@@ -305,11 +305,6 @@ def mask_all_but_one(scene) -> None:
     del scene.meta["frames"][0]["mask_path"]
 
 
-def without_thermal_images(scene) -> None:
-    """The remedy names no option: none would help."""
-    shutil.rmtree(scene.path / "thermal")
-
-
 OUTSIDE = ["../a", "b/../c", "..\\a", "/etc/hostname", "C:\\a", "c:a", "\\\\server\\share\\a", "\\a", "", " ", "a\0b"]
 OWN = {"w": 13, "h": 10, "fl_x": 9, "fl_y": 9, "cx": 6, "cy": 5}
 
@@ -344,7 +339,8 @@ OWN = {"w": 13, "h": 10, "fl_x": 9, "fl_y": 9, "cx": 6, "cy": 5}
         (of_frame_3(thermal_camera=OWN), "13 x 10"),
         (of_frame_3(mask_path=None), "frame 3.*mask_path.*None"),
         (mask_all_but_one, "mask_path: .*9 masks for 10 frames"),
-        (without_thermal_images, "10 frames, none with one .*Put them in thermal/"),
+        # The remedy names no option: none would help.
+        (lambda scene: shutil.rmtree(scene.path / "thermal"), "10 frames, none with one .*Put them in thermal/"),
         (one_of_another_size, "frame_train_003.*12 x 9"),
         (look_away, "cameras: .*100% of the 8"),
         (parallel, "--scene-box"),
