@@ -204,8 +204,7 @@ def test_film_models_are_shown_beside_each_other_and_may_be_chosen(walls) -> Non
 
 
 def test_a_room_seen_from_within(walls) -> None:
-    """Surface temperatures inside: heat flow by the coefficient of the solver, temperature factor by the wall's own
-    resistances."""
+    """Heat flow by the coefficient of the solver, temperature factor by the wall's own resistances."""
     truth = walls["plain"]
     names = truth.mesh.boundary.patch_names
     seen = truth.mesh.boundary.patch == names.index("room")

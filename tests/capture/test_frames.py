@@ -15,8 +15,6 @@ from thermoxels_ns.capture.photograph import read_photograph_facts
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
-RADIOMETRY = RadiometryOptions()
-
 
 def pair(folder: Path, name: str, temperature_c: np.ndarray | None = None, **exif) -> Pair:
     return Pair(
@@ -30,7 +28,7 @@ def pair(folder: Path, name: str, temperature_c: np.ndarray | None = None, **exi
 def read(pairs, tmp_path, skip_bad=False, mask=None):
     work = tmp_path / "work"
     work.mkdir(exist_ok=True)
-    return read_frames(pairs, tmp_path / "card", work, RADIOMETRY, skip_bad, mask)
+    return read_frames(pairs, tmp_path / "card", work, RadiometryOptions(), skip_bad, mask)
 
 
 def test_degrees_and_what_the_files_say(tmp_path):

@@ -38,10 +38,7 @@ def split(folder: Path):
 
 
 def pixels_off(poses: np.ndarray, true: np.ndarray, focal: float) -> float:
-    """How far apart two photographs' views of points in the scene's middle are, relative to each other, [pixels].
-
-    Of points where the true axes of two neighbouring cameras lead, seen by triangulation from exact sightings.
-    """
+    """Median distance between exact sightings of points in the scene's middle and these points, triangulated."""
     draw = np.random.default_rng(0)
     points = draw.uniform((-2, -2, 0.5), (2, 2, 4), (300, 3))
     photograph = np.tile(np.arange(len(true)), len(points))

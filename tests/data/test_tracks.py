@@ -70,15 +70,16 @@ def lines_of(folder, split="train", **options):
     return ThermalDataParserConfig(data=folder.path, **options).setup().get_dataparser_outputs(split)
 
 
-@pytest.mark.parametrize(("where", "text"), [*((where, False) for where in COLMAP_FOLDERS), (COLMAP_FOLDERS[0], True)])
-@pytest.mark.parametrize("on_a_line", [False, True])
-def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, text, on_a_line):
+@pytest.mark.parametrize(
+    ("where", "on_a_line"), [*((where, False) for where in COLMAP_FOLDERS), (COLMAP_FOLDERS[0], True)]
+)
+def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, on_a_line):
     if on_a_line:
         for number, entry in enumerate(scene.meta["frames"]):
             for row, across in enumerate((1.0, 2.0, 3.0)):
                 entry["transform_matrix"][row][3] = across * (number - 2.5)
         scene.rewrite()
-    add_model(scene, where, text=text)
+    add_model(scene, where)
     tracks = tracks_of(scene)
     assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
     assert len(tracks.sighting_frame) == 6 * 30

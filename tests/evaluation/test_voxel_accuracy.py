@@ -12,15 +12,13 @@ from thermoxels_ns.synthetic.solids import Sphere
 
 LATTICE = Lattice.covering((-1, -1, -1), (1, 1, 1), 24)
 H = LATTICE.voxel_size
-TOLERANCE = 1.5 * H
 SPHERE = Sphere((0.0, 0.0, 0.0), 0.6)
-IDENTITY = np.eye(4)
 SEEN = SPHERE.surface_points(2000, 0)[0]
 
 
-def score_of(cells, truth=SPHERE, seen=SEEN, tolerance=TOLERANCE, world_to_truth=IDENTITY, views=None, **more):
+def score_of(cells, truth=SPHERE, seen=SEEN, views=None, **more):
     views = from_above() if views is None else views
-    return surface_fscore(cells, LATTICE, truth, seen, tolerance, world_to_truth, views, **more)
+    return surface_fscore(cells, LATTICE, truth, seen, 1.5 * H, np.eye(4), views, **more)
 
 
 def voxels(shape: Sphere) -> np.ndarray:

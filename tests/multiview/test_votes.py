@@ -80,11 +80,7 @@ def test_what_is_carved_ends_before_the_points_by_the_margin_and_the_uncertainty
 
 
 def ground(wrong: float, per_voxel: int = 4, seed: int = 0) -> tuple[FeatureRays, np.ndarray, np.ndarray]:
-    """A floor at z = -0.48, a fifth of a voxel above faces of voxels, seen from above; some points lie below it.
-
-    Returns:
-        The lines, and which voxels hold the floor and which lie between it and the cameras.
-    """
+    """Lines to a floor at z = -0.48, some of whose points lie below it; its voxels, and those before it."""
     random = np.random.default_rng(seed)
     points = np.column_stack((random.uniform(-0.95, 0.95, (400 * per_voxel, 2)), np.full(400 * per_voxel, -0.48)))
     cameras = np.column_stack((random.uniform(-1.5, 1.5, (6, 2)), np.full(6, 0.6)))
