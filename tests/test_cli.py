@@ -75,13 +75,6 @@ def test_an_interrupted_command_has_its_own_status(monkeypatch, capsys):
     assert "Interrupted" in capsys.readouterr().err
 
 
-def test_unknown_scenes_and_options_are_refused():
-    for words in (["synthetic", "moon", "--output-dir", "x"], ["synthetic", "sphere"], ["demo", "--sccene", "sphere"]):
-        with pytest.raises(SystemExit) as stop:
-            cli.main(words)
-        assert stop.value.code == 2
-
-
 @pytest.mark.parametrize(("asked", "seen"), [([], ["another"]), (["default"], ["`torch.jit.script` is deprecated."])])
 def test_one_warning_for_programmers_is_not_shown_unless_warnings_are_asked_for(monkeypatch, asked, seen):
     def warn() -> int:

@@ -18,7 +18,7 @@ errors against the seconds are drawn.
 """
 
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from operator import truediv
@@ -91,10 +91,12 @@ class HeatAccuracy:
     def steady(self, name: str, given: HeatProblem, finest: int, tolerances: tuple[float, ...]) -> list[Row]:
         exact = solve_steady(finer(given, finest), order=2, relative_tolerance=1e-9)
         settings = [(1, 0), (1, 1), (1, 2), (2, 0), (2, 1)] + ([(2, 2)] if finest > 2 else [])
-        by_hand: dict[Setting, Callable[[], Any]] = {
-            (f"P{order}", f"mesh size / {2**refinements}"): partial(
-                solve_steady, finer(given, refinements), order=order, relative_tolerance=1e-8
-            )
+
+        def solved(order: int, refinements: int) -> SteadySolution:
+            return solve_steady(finer(given, refinements), order=order, relative_tolerance=1e-8)
+
+        by_hand = {
+            (f"P{order}", f"mesh size / {2**refinements}"): partial(solved, order, refinements)
             for order, refinements in settings
         }
         nodes = len(given.mesh.points_m)
@@ -120,7 +122,7 @@ class HeatAccuracy:
             solution = solve_heat(finer(given, refinements), times, scheme=scheme)
             return replace(solution, temperature_c=solution.temperature_c[:: steps // OUTPUTS])
 
-        by_hand: dict[Setting, Callable[[], Any]] = {
+        by_hand = {
             (scheme.name, f"mesh size / {2**refinements}, step {DURATION_S / steps:g} s"): partial(
                 march, refinements, scheme, steps
             )
@@ -134,7 +136,7 @@ class HeatAccuracy:
         self,
         name: str,
         given: HeatProblem,
-        by_hand: dict[Setting, Callable[[], Any]],
+        by_hand: Mapping[Setting, Callable[[], Any]],
         tolerances: tuple[float, ...],
         duration_s: float | None,
         error: Callable[[Any], ErrorSize],
@@ -142,7 +144,7 @@ class HeatAccuracy:
         """Rows of all settings by hand and of the driver with each tolerance, which take turns."""
         options: dict[str, Any] = {"duration_s": duration_s, "outputs": OUTPUTS, "log": lambda line: None}
         driven = {("driver", f"{k}"): partial(solve_to_tolerance, given, Tolerance(k), **options) for k in tolerances}
-        seconds, results = take_turns(by_hand | driven, self.repeats)
+        seconds, results = take_turns({**by_hand, **driven}, self.repeats)
         rows, errors = [], {}
         for one in by_hand:
             errors[one] = true = error(results[one])

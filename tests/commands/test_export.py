@@ -330,15 +330,6 @@ def test_files_of_others_and_folders_in_the_place_of_files_are_found_first(ball,
     assert [one.name for one in tmp_path.rglob("*")] == [path.name] and (path.is_dir() or path.read_text() == "mine")
 
 
-def test_leftovers_of_killed_exports_are_removed(small, tmp_path) -> None:
-    (tmp_path / "heat").mkdir()
-    ours = [".mesh.123.part.vtu", ".mesh-measured.9.part.png", ".summary.77.part.json", "heat/.step-0002.123.part.vtu"]
-    others = [".mesh.final.part.vtu", ".holiday.123.part.png", "heat/.notes.1.part.vtu"]
-    for name in [*ours, *others]:
-        (tmp_path / name).touch()
-    assert {*small()["files"], *others} == set(contents(tmp_path))
-
-
 def test_truth_that_cannot_be_used_does_not_cost_the_export(small, tmp_path) -> None:
     def compare(*_):
         raise SceneError("transforms.json: expected a scene. Write it again.")

@@ -8,7 +8,6 @@ import torch
 from tests.reference.two_renderers import random_grid
 from thermoxels_ns.field.harmonics import num_coefficients
 from thermoxels_ns.field.refine import widen_colour
-from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.reference import total_variation
 from thermoxels_ns.training.optimizers import RowAdam, RowRMSprop
 
@@ -72,19 +71,3 @@ def test_optimisers_go_on_as_if_the_columns_had_been_there(make, low, high):
     states = [optimizer.state[grid.sh] for grid, optimizer in pair]
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(values, states[1][name]) for name, values in states[0].items())
-
-
-@pytest.mark.parametrize("saved, built", [(0, 2), (2, 0), (1, 2)])
-def test_a_checkpoint_brings_its_degree_and_leaves_parameters_the_same_objects(saved, built):
-    stored, grid = random_grid(saved, kept=0.5, seed=1), random_grid(built)
-    sh = grid.sh
-    grid.load_state_dict(stored.state_dict())
-    assert grid.sh is sh and grid.sh_degree == saved and torch.equal(grid.sh, stored.sh)
-
-
-@pytest.mark.parametrize("columns", [0, 4, 6, 48])
-def test_a_checkpoint_whose_columns_are_no_harmonics_is_refused(columns):
-    state = random_grid(2).state_dict()
-    state["sh"] = torch.zeros(len(state["sh"]), columns)
-    with pytest.raises(RuntimeError, match="size mismatch for sh"):
-        VoxelGrid(random_grid().lattice, 2).load_state_dict(state)

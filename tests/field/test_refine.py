@@ -113,29 +113,3 @@ def test_dense_views_are_nil_where_nothing_is_kept():
     middle = torch.as_tensor(grid.lattice.cell_centres(), dtype=torch.float32)[grid.kept]
     torch.testing.assert_close(centres[grid.kept], grid.density_at(grid.locate(middle)).detach(), rtol=1e-5, atol=1e-6)
     assert float(grid.corner_values(grid.density.data[:, 0], fill=0.5).view(-1)[~stored].min()) == 0.5
-
-
-@pytest.mark.parametrize("kept", [1.0, 0.3])
-def test_checkpoint_of_a_finer_lattice_loads_into_a_coarse_grid_with_the_same_parameters(kept):
-    fine = random_grid(kept=kept)
-    refine(fine, 2)
-    prune(fine, fine.voxels.cells > 500)
-    coarse = random_grid()
-    density = coarse.density
-    coarse.load_state_dict(fine.state_dict())
-    assert coarse.density is density and coarse.lattice == fine.lattice
-    assert torch.equal(coarse.density, fine.density) and torch.equal(coarse.kept, fine.kept)
-    points = points_inside(coarse)
-    points = points[coarse.locate(points).kept()]
-    assert len(points) and torch.equal(coarse.density_at(coarse.locate(points)), fine.density_at(fine.locate(points)))
-    # It has taken over a copy.
-    fine.density.data += 1.0
-    assert not torch.equal(coarse.density, fine.density)
-
-
-def test_checkpoint_whose_rows_do_not_fit_is_refused():
-    grid = random_grid()
-    state = grid.state_dict()
-    state["cells"] = state["cells"][:-5]
-    with pytest.raises(RuntimeError, match="size mismatch"):
-        random_grid().load_state_dict(state)
