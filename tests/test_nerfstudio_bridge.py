@@ -31,35 +31,38 @@ def method():
     return MethodSpecification(TrainerConfig(method_name="bridge-probe"), description="probe")
 """
 
-MODULES = """
-import contextlib, io, runpy, sys
+ANOTHER_COMMAND = """
+import sys
 import nerfstudio.scripts.train
 print("\\n".join(sys.modules))
-sys.argv, output = ["exporter", "--help"], io.StringIO()
-with contextlib.redirect_stdout(output), contextlib.suppress(SystemExit):
-    runpy.run_module("nerfstudio.scripts.exporter", run_name="__main__", alter_sys=True)
-print("help:", output.getvalue())
+"""
+EXPORTER_AS_MODULE = """
+import runpy, sys
+sys.argv = ["exporter", "--help"]
+runpy.run_module("nerfstudio.scripts.exporter", run_name="__main__", alter_sys=True)
 """
 
 
-def test_other_commands_load_nothing_heavy_and_the_exporter_lists_ours_beside_all_stock_subcommands(tmp_path) -> None:
-    """In a process whose nerfstudio loads a plugin; every ``ns-*`` command does, also where pyvista is missing."""
-    (tmp_path / "bridge_probe.py").write_text(PLUGIN)
+def printed(folder: Path, code: str) -> str:
+    """What a process prints whose nerfstudio loads a plugin that installs the bridge."""
+    (folder / "bridge_probe.py").write_text(PLUGIN)
     plugin = {"NERFSTUDIO_METHOD_CONFIGS": "bridge-probe=bridge_probe:method", "COLUMNS": "160"}
-    path = os.pathsep.join(filter(None, [str(tmp_path), os.environ.get("PYTHONPATH")]))
-    result = subprocess.run(
-        [sys.executable, "-c", MODULES],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=tmp_path,
-        env={**os.environ, **plugin, "PYTHONPATH": path},
-    )
-    modules, _, shown = result.stdout.partition("help:")
-    loaded = modules.split()
+    path = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, **plugin, "PYTHONPATH": path}
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder, env=environment).stdout
+
+
+def test_the_exporter_lists_ours_beside_all_stock_subcommands(tmp_path) -> None:
+    shown = printed(tmp_path, EXPORTER_AS_MODULE)
+    assert [name for name in (*STOCK, "thermoxels-mesh") if name not in shown] == []
+
+
+def test_other_commands_load_nothing_heavy(tmp_path) -> None:
+    """Every ``ns-*`` command imports the plugin, also where pyvista or open3d cannot be imported."""
+    loaded = printed(tmp_path, ANOTHER_COMMAND).split()
     assert {"thermoxels_ns.nerfstudio_bridge", "thermoxels_ns.config"} <= {*loaded}
     assert [name for name in (*HEAVY, *OURS) if name in loaded] == []
-    assert [name for name in (*STOCK, "thermoxels-mesh") if name not in shown] == []
 
 
 EXPORTER = """

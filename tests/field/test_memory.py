@@ -21,31 +21,19 @@ def cube(resolution: int) -> Lattice:
     return Lattice.covering((-1, -1, -1), (1, 1, 1), resolution)
 
 
-def after_training(resolution: int, share: float, sh_degree: int) -> dict[str, float]:
-    """Memory of a process that trains on a shell; see `shell_training.py`."""
-    if not Path("/proc/self/status").exists():
-        pytest.skip("this system does not tell the peak memory of a process in /proc")
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="this system does not tell peak memory in /proc")
+@pytest.mark.parametrize("resolution, share, sh_degree", [(256, 0.05, 2), (64, 1.0, 2), (128, 0.3, 0)])
+def test_training_takes_what_was_predicted(resolution, share, sh_degree):
+    """The peak is at most one and a half of the prediction, and 1.5 GB at 256 voxels of which a twentieth is kept."""
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(TESTS.parent)}
     command = [sys.executable, str(TESTS / "support" / "shell_training.py"), *map(str, (resolution, share, sh_degree))]
     result = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert result.returncode == 0, result.stderr
-    return json.loads(result.stdout.splitlines()[-1])
-
-
-@pytest.mark.parametrize("resolution, share, sh_degree", [(256, 0.05, 2), (64, 1.0, 2), (128, 0.3, 0)])
-def test_training_takes_what_was_predicted(resolution, share, sh_degree):
-    """What stays is at most the prediction and at least half of it; the peak is at most one and a half of it.
-
-    About 10 s at 256 voxels, of which one in twenty is kept: there the peak is at most 1.5 GB above the imports.
-    """
-    found = after_training(resolution, share, sh_degree)
+    found = json.loads(result.stdout.splitlines()[-1])
     assert found["resolution"] == resolution and found["share"] == pytest.approx(share, rel=0.01)
     assert found["rows"] <= found["predicted_rows"] <= 1.5 * found["rows"]
-    assert found["stays"] <= found["predicted"] <= 2.0 * found["stays"]
     above = found["peak"] - found["imports"]
-    assert above - KERNELS <= 1.5 * found["most_predicted"]
-    if resolution == 256:
-        assert above <= 1.5e9, f"{above / 1e9:.2f} GB above the imports"
+    assert above - KERNELS <= 1.5 * found["most_predicted"] and (resolution < 256 or above <= 1.5e9)
 
 
 def test_rows_of_a_full_lattice_are_its_corners():
