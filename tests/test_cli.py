@@ -19,16 +19,6 @@ def test_the_scenes_on_the_command_line_are_those_there_are():
     assert get_args(SceneName) == SCENE_NAMES
 
 
-@pytest.mark.parametrize("command", ["demo", "synthetic"])
-def test_help_of_every_subcommand(command, capsys):
-    with pytest.raises(SystemExit) as stop:
-        cli.main([command, "--help"])
-    assert stop.value.code == 0
-    words = capsys.readouterr().out
-    assert "--output-dir PATH" in words
-    assert all(name in words for name in SCENE_NAMES)
-
-
 def test_help_loads_nothing_heavy():
     script = (
         "import sys\n"

@@ -1,4 +1,4 @@
-"""What each effect costs: time and what was assembled, for a scene with all effects and with each one removed.
+"""What each effect costs: time for a scene with all effects and with each one removed.
 
 Run it on an otherwise idle machine:
 
@@ -27,7 +27,6 @@ from thermoxels_ns.heat.scene import load_heat_scene
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 TOLERANCE = 1e-12
-KINDS = ("stiffness", "mass", "convection", "flux", "radiation", "source", "fixed")
 
 
 @dataclass
@@ -56,12 +55,11 @@ class EffectsCost:
         seconds, solutions = take_turns(
             {name: lambda p=problem: solve_heat(p, steps) for name, problem in problems.items()}, self.repeats
         )
-        print_head("", "s", "of all", "Newton steps", *KINDS)
+        print_head("", "s", "of all", "Newton steps")
         for name, solution in solutions.items():
-            counts = (solution.assembled.counts.get(kind, "") for kind in KINDS)
             median = statistics.median(seconds[name])
             share = median / statistics.median(seconds["all effects"])
-            print_row(name, f"{median:.2f}", f"{share:.2f}", solution.newton_iterations.sum(), *counts)
+            print_row(name, f"{median:.2f}", f"{share:.2f}", solution.newton_iterations.sum())
         self.conduction_only(problems["conduction only"], steps)
 
     def conduction_only(self, problem: HeatProblem, steps: TimeSteps) -> None:

@@ -1,13 +1,11 @@
 """What accuracy costs in meshing: resolution against errors, tetrahedra, seconds and memory, for both boundary modes.
 
-    python tests/benchmarks/mesh_cost.py --csv mesh-cost.csv --plot docs/mesh-cost.png
-    python tests/benchmarks/mesh_cost.py --bodies hot-object --modes voxel --resolutions 128 --csv mesh-cost.csv
+    python tests/benchmarks/mesh_cost.py --plot docs/mesh-cost.png
+    python tests/benchmarks/mesh_cost.py --bodies hot-object --modes voxel --resolutions 128
 
 The fields are exact: at voxel centres the logarithm of the density is the signed distance to a body whose area and
 volume are known. Each case runs in a process of its own, so that its peak memory is its own; the seconds are those of
 `build_mesh` with all tags, 40 cameras on a sphere around the body, the median of `--repeats` runs.
-
-The csv file is written again after every case.
 """
 
 import multiprocessing
@@ -23,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import tyro
-from measuring import logarithmic_panels, print_head, print_row, save, write_rows
+from measuring import logarithmic_panels, print_head, print_row, save
 
 from tests.support.demo_mesh import exact_snapshot
 from tests.support.looking_cameras import looking_at
@@ -120,12 +118,9 @@ def measure(name: str, voxels: int, mode: Any, repeats: int) -> dict[str, Any]:
         "seconds": statistics.median(seconds),
         "peak_mb": peak / 1024,
         "area_error": area / body.area - 1.0,
-        "area_error_of_triangles": quality.area_m2 / body.area - 1.0,
         "volume_error": quality.volume_m3 / body.volume - 1.0,
         "hausdorff_voxels": float(distance.max()) / snapshot.lattice.voxel_size,
         "iou": inside / (quality.volume_m3 + body.volume - inside),
-        "dihedral_min": quality.dihedral_range_deg[0],
-        "dihedral_max": quality.dihedral_range_deg[1],
     }
 
 
@@ -140,9 +135,6 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
             panel.plot(*zip(*dots), color=colour, marker=marker, label=mode) if dots else None
             for row, dot in zip(chosen, dots):
                 panel.annotate(str(row["voxels"]), dot, xytext=(4, 4), textcoords="offset points", fontsize=7)
-            if chosen and key == "area_error" and mode == "voxel":
-                stairs = [(row["seconds"], abs(100 * row["area_error_of_triangles"])) for row in chosen]
-                panel.plot(*zip(*stairs), color=colour, marker="s", ls=":", alpha=0.6, label="voxel, plain area")
         panel.margins(x=0.2)
         panels[0][column].set_title(name)
         panels[1][column].set_xlabel("seconds")
@@ -161,8 +153,6 @@ class MeshCost:
     """Boundaries."""
     repeats: int = 5
     """Runs per median."""
-    csv: Path | None = None
-    """File of all cases."""
     plot: Path | None = None
     """Where the picture goes."""
 
@@ -174,8 +164,6 @@ class MeshCost:
             with spawn.Pool(1) as pool:
                 row = pool.apply(measure, (*case, self.repeats))
             rows.append(row)
-            if self.csv:
-                write_rows(self.csv, rows)
             print_row(
                 *(*case, f"{row['tets']:,}", f"{row['seconds']:.2f}", f"{row['peak_mb']:.0f}"),
                 *(f"{100 * row[name]:+.2f} %" for name in ("area_error", "volume_error")),
@@ -183,8 +171,6 @@ class MeshCost:
             )
         if self.plot:
             plot(rows, self.plot)
-        lowest, highest = min(row["dihedral_min"] for row in rows), max(row["dihedral_max"] for row in rows)
-        print(f"dihedral angles from {lowest:.2f} to {highest:.2f} degrees")
 
 
 if __name__ == "__main__":

@@ -87,13 +87,6 @@ def test_the_next_steps_lead_to_a_heat_report_by_commands_that_exist(scene, weat
     assert (audit.conditions, audit.scene) == (Path("my demo/survey/conditions.yaml"), Path("my demo/scene"))
 
 
-def write_results(folder: Path, images: dict, summary: dict) -> tuple[Path, Path]:
-    paths = folder / "eval.json", folder / "summary.json"
-    paths[0].write_text(json.dumps({"results": images}))
-    paths[1].write_text(json.dumps(summary))
-    return paths
-
-
 @pytest.mark.parametrize(
     ("images", "summary", "name"),
     [
@@ -103,10 +96,9 @@ def write_results(folder: Path, images: dict, summary: dict) -> tuple[Path, Path
     ],
 )
 def test_a_missing_figure_is_named(tmp_path, images, summary, name):
+    (tmp_path / "eval.json").write_text(json.dumps({"results": images}))
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
     with pytest.raises(ThermoxelsError, match=f"{name}: expected"):
-        read_results(*write_results(tmp_path, images, summary))
-    (tmp_path / "eval.json").write_text("{")
-    with pytest.raises(ThermoxelsError, match="readable json"):
         read_results(tmp_path / "eval.json", tmp_path / "summary.json")
 
 

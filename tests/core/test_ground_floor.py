@@ -12,7 +12,6 @@ from thermoxels_ns.core.checks import (
     remove_file,
     remove_stale_temporaries,
     replace_when_done,
-    writable_folder,
 )
 from thermoxels_ns.core.errors import MeshError, OutputError, ThermoxelsError
 from thermoxels_ns.core.units import TemperatureRange
@@ -46,14 +45,6 @@ def test_interrupted_write_leaves_the_old_file_and_no_rubbish(tmp_path):
     with replace_when_done(target) as temporary:
         temporary.write_text("new")
     assert target.read_text() == "new" and os.listdir(tmp_path) == ["mesh.vtu"]
-
-
-def test_folder_that_cannot_be_made_is_refused(tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("in the way")
-    with pytest.raises(OutputError, match="output folder: expected a folder that can be written to"):
-        writable_folder(blocked / "sub")
-    assert writable_folder(tmp_path / "a" / "b").is_dir()
 
 
 def test_errors_of_the_disk_become_output_errors(tmp_path):

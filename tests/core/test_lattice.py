@@ -24,12 +24,6 @@ def test_corners_and_centres_sit_where_the_house_says():
     np.testing.assert_allclose(LATTICE.corner_to_cell_mean(corners @ slope), LATTICE.cell_centres() @ slope)
 
 
-def test_refinement_keeps_every_old_corner():
-    fine = LATTICE.refined(3)
-    np.testing.assert_allclose(fine.corner_positions()[::3, ::3, ::3], LATTICE.corner_positions(), atol=1e-12)
-    np.testing.assert_allclose(fine.hi, LATTICE.hi)
-
-
 @given(
     st.lists(st.floats(-10, 10), min_size=3, max_size=3),
     st.lists(st.floats(0.01, 20), min_size=3, max_size=3),

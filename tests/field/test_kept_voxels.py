@@ -7,7 +7,6 @@ from scipy.ndimage import binary_dilation
 
 from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
 from thermoxels_ns.field.kept_voxels import BLOCK, KeptVoxels
-from thermoxels_ns.render import kernels
 
 
 def lattice_of(shape) -> Lattice:
@@ -75,8 +74,3 @@ def test_nothing_kept(shape):
     voxels = KeptVoxels(lattice_of(shape), [])
     assert len(voxels) == voxels.num_rows == 0 and not voxels.all_kept and not voxels.mask().any()
     assert voxels.number_at(torch.zeros(3, 3, dtype=torch.int64)).tolist() == [-1, -1, -1]
-
-
-def test_kernels_share_the_size_of_blocks():
-    """The compiled march writes it as shifts of 3, 6 and 9 bits."""
-    assert kernels.BLOCK == BLOCK == 1 << 3
