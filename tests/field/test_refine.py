@@ -19,10 +19,6 @@ def points_inside(grid: VoxelGrid, n: int = 300) -> torch.Tensor:
     return lo + torch.rand(n, 3, generator=torch.Generator().manual_seed(3)) * (hi - lo)
 
 
-def at_index(lattice: Lattice, *index: tuple[int, int, int]) -> np.ndarray:
-    return np.sort([np.ravel_multi_index(i, lattice.cell_shape) for i in index])
-
-
 def values_at(grid: VoxelGrid, points: torch.Tensor):
     directions = torch.nn.functional.normalize(points + 3.0, dim=-1)
     at = grid.locate(points)
