@@ -7,10 +7,11 @@ from nerfstudio.cameras.rays import RayBundle
 
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.field.refine import prune
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import Backend, GridSamples, sample_rays
-from thermoxels_ns.training.ray_statistics import backdrop_evidence, field_evidence
+from thermoxels_ns.training.ray_statistics import backdrop_evidence, field_evidence, voxel_weights
 
 
 @dataclass
@@ -54,6 +55,19 @@ def total_weight(scene) -> torch.Tensor:
         samples = scene.sample_rays(bundle.origins, bundle.directions)
         total.index_add_(0, samples.at.number, samples.weight.float())
     return total
+
+
+def test_weight_lies_in_the_surface_and_sums_to_the_rays(backend):
+    """Of the kept voxels alone, in their order: those on one side of the slab are stored."""
+    scene = slab(backend)
+    prune(scene.grid, scene.grid.voxels.cells % 6 < 3)
+    weights, total = voxel_weights(scene, rays_along_minus_x()), total_weight(scene)
+    assert weights.largest.shape == weights.ends.shape == total.shape == (108,)
+    by_layer, ends = total.view(6, 18).sum(1), weights.ends.view(6, 18)
+    assert bool(ends[3].all()) and not bool(ends[:3].any()) and not bool(ends[4:].any())
+    # Density ramps up in the first voxel beyond the last solid corner.
+    assert float(total.sum()) == pytest.approx(800, rel=1e-4) and float(by_layer[3]) > 0.99 * 800
+    assert float(weights.largest.view(6, 18)[3].min()) > 0.9 and float(weights.largest.max()) <= 1.0
 
 
 def test_corner_temperature_is_measured_where_rays_came_and_only_there(backend):
