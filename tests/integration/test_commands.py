@@ -94,6 +94,7 @@ def test_mesh_export_and_heat(trained: Trained, tmp_path):
     assert (mesh.points.min(0) > low - slack).all() and (mesh.points.max(0) < high + slack).all()
     assert abs(summary["heat"]["energy_residual"]) < 1e-9
     assert 0 <= summary["truth"]["fscore"] <= 1
+    assert sum(summary["mesh"]["share_of_area_by_support"].values()) == pytest.approx(1.0)  # photographs were asked
     assert (tmp_path / "mesh.png").stat().st_size > 5000
 
 
