@@ -1,5 +1,3 @@
-import dataclasses
-import json
 import os
 import subprocess
 import sys
@@ -33,118 +31,36 @@ def method():
     return MethodSpecification(TrainerConfig(method_name="bridge-probe"), description="probe")
 """
 
-FORKS = """
-import os, sys, traceback
-from pathlib import Path
-import nerfstudio.engine.trainer, torchmetrics  # what takes long, without the plugin
-
-for script in sorted(Path().glob("job_*.py")):
-    child = os.fork()
-    if child:
-        assert os.waitpid(child, 0)[1] == 0, script.with_suffix(".txt").read_text()
-        continue
-    output = os.open(script.with_suffix(".txt"), os.O_WRONLY | os.O_CREAT)
-    os.dup2(output, 1), os.dup2(output, 2)
-    status = 1
-    try:
-        exec(script.read_text(), {"__name__": "job"})
-        status = 0
-    except BaseException as problem:
-        status = problem.code if isinstance(problem, SystemExit) else traceback.print_exc() or 1
-    finally:
-        sys.stdout.flush()
-        os._exit(status)
-"""
-ARGUMENTS = {
-    "help": ["--help"],
-    "our help": ["thermoxels-mesh", "--help"],
-    "ours": ["thermoxels-mesh", "--load-config", "missing.yml", "--output-dir", "out"],
-    **{name: [name, "--load-config", "missing.yml", "--output-dir", "out"] for name in STOCK},
-}
-NS_EXPORT = f"""
-import contextlib, io, json, sys
-sys.argv = ["ns-export"]
-from nerfstudio.scripts.exporter import entrypoint
-from nerfstudio.utils.rich_utils import CONSOLE
-
-results = {{}}
-for name, arguments in {ARGUMENTS}.items():
-    sys.argv, output = ["ns-export", *arguments], io.StringIO()
-    CONSOLE.file = output
-    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
-        try:
-            outcome = entrypoint()
-        except BaseException as problem:
-            outcome = f"{{type(problem).__name__}}: {{problem}}"
-    results[name] = [outcome, output.getvalue()]
-print(json.dumps(results))
-"""
-AS_MODULE = """
-import runpy, sys
-sys.argv = ["exporter", "--help"]
-runpy.run_module("nerfstudio.scripts.exporter", run_name="__main__", alter_sys=True)
-"""
 ANOTHER_COMMAND = """
 import sys
 import nerfstudio.scripts.train
 print("\\n".join(sys.modules))
 """
+EXPORTER_AS_MODULE = """
+import runpy, sys
+sys.argv = ["exporter", "--help"]
+runpy.run_module("nerfstudio.scripts.exporter", run_name="__main__", alter_sys=True)
+"""
 
 
-@pytest.fixture(scope="module")
-def printed(tmp_path_factory) -> dict[str, str]:
-    """What processes print whose nerfstudio loads a plugin that installs the bridge; forks of one that is loaded."""
-    folder = tmp_path_factory.mktemp("bridge")
+def printed(folder: Path, code: str) -> str:
+    """What a process prints whose nerfstudio loads a plugin that installs the bridge."""
     (folder / "bridge_probe.py").write_text(PLUGIN)
-    for name, code in (("export", NS_EXPORT), ("module", AS_MODULE), ("another", ANOTHER_COMMAND)):
-        (folder / f"job_{name}.py").write_text(code)
-    result = subprocess.run(
-        [sys.executable, "-c", FORKS],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=folder,
-        env={
-            **os.environ,
-            "NERFSTUDIO_METHOD_CONFIGS": "bridge-probe=bridge_probe:method",
-            "PYTHONPATH": os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")])),
-            "COLUMNS": "160",
-        },
-    )
-    assert result.returncode == 0, result.stderr
-    return {path.stem.removeprefix("job_"): path.read_text() for path in folder.glob("job_*.txt")}
+    plugin = {"NERFSTUDIO_METHOD_CONFIGS": "bridge-probe=bridge_probe:method", "COLUMNS": "160"}
+    path = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, **plugin, "PYTHONPATH": path}
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder, env=environment).stdout
 
 
-@pytest.fixture(scope="module")
-def ns_export(printed) -> dict[str, list[str]]:
-    """What the console script ns-export does for each of `ARGUMENTS`: how it ended, and what it printed."""
-    return json.loads(printed["export"].splitlines()[-1])
+def test_the_exporter_lists_ours_beside_all_stock_subcommands(tmp_path) -> None:
+    shown = printed(tmp_path, EXPORTER_AS_MODULE)
+    assert [name for name in (*STOCK, "thermoxels-mesh") if name not in shown] == []
 
 
-def test_help_lists_ours_beside_all_stock_subcommands_and_shows_every_option(ns_export) -> None:
-    options = ["--" + option.name.replace("_", "-") for option in dataclasses.fields(ExportThermoxelsMesh)]
-    for key, words in (("help", [*STOCK, "thermoxels-mesh"]), ("our help", options)):
-        outcome, printed = ns_export[key]
-        assert outcome == "SystemExit: 0"
-        assert [word for word in words if word not in printed] == []
-
-
-def test_stock_subcommands_get_as_far_as_nerfstudios_own_code_and_ours_reports_and_exits(ns_export) -> None:
-    for name in STOCK:
-        assert "FileNotFoundError" in ns_export[name][0] and "missing.yml" in ns_export[name][0], ns_export[name]
-    outcome, printed = ns_export["ours"]
-    assert outcome == "SystemExit: 1"
-    assert "Error: load_config: expected" in printed and "missing.yml" in printed and "Traceback" not in printed
-
-
-def test_hook_works_when_the_exporter_runs_as_a_module(printed) -> None:
-    """As with python -m nerfstudio.scripts.exporter, where the module's name is __main__."""
-    assert "thermoxels-mesh" in printed["module"] and "gaussian-splat" in printed["module"]
-
-
-def test_other_commands_load_nothing_heavy(printed) -> None:
+def test_other_commands_load_nothing_heavy(tmp_path) -> None:
     """Every ``ns-*`` command imports the plugin, also where pyvista or open3d cannot be imported."""
-    loaded = printed["another"].split()
+    loaded = printed(tmp_path, ANOTHER_COMMAND).split()
     assert {"thermoxels_ns.nerfstudio_bridge", "thermoxels_ns.config"} <= {*loaded}
     assert [name for name in (*HEAVY, *OURS) if name in loaded] == []
 

@@ -2,8 +2,8 @@
 
 A dense lattice without skipping: every sample along every ray reads all values of its eight corners, autograd goes back
 through all of them, and RMSprop passes over the whole lattice. Same rays and step length as the fused step, and the
-same colours, temperatures and gradients (tests/reference/test_dense_step.py); what it does not do (distortion, total
-variation) makes it look quicker, not slower.
+same colours, temperatures and gradients (tests/reference/test_fused_rendering.py); what it does not do (distortion,
+total variation) makes it look quicker, not slower.
 """
 
 import time

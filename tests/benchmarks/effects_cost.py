@@ -1,4 +1,4 @@
-"""What each effect costs: time and what was assembled, for a scene with all effects and with each one removed.
+"""What each effect costs: time for a scene with all effects and with each one removed.
 
 Run it on an otherwise idle machine:
 
@@ -6,17 +6,16 @@ Run it on an otherwise idle machine:
 
 A room of concrete with the scene of configs/scene-all-effects.yaml takes equal steps, so that all rows take the same
 number of them. Times are medians; all problems take turns in one process, and compiled kernels are loaded before the
-first. The last table compares conduction alone, without any effect, with plain conjugate gradients on the same
-matrices, without what keeps the mean of a body exact and says how much heat is unbalanced.
+first. The last line compares conduction alone with plain conjugate gradients on the same matrices.
 """
 
 import statistics
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import truediv
 
 import numpy as np
 import tyro
-from measuring import take_turns
+from measuring import print_head, print_row, take_turns
 from scipy import sparse
 
 from tests.support.scene_bodies import tagged_body
@@ -28,7 +27,6 @@ from thermoxels_ns.heat.scene import load_heat_scene
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 TOLERANCE = 1e-12
-KINDS = ("stiffness", "mass", "convection", "flux", "radiation", "source", "fixed")
 
 
 @dataclass
@@ -57,52 +55,39 @@ class EffectsCost:
         seconds, solutions = take_turns(
             {name: lambda p=problem: solve_heat(p, steps) for name, problem in problems.items()}, self.repeats
         )
-        print(f"| | s | of all | Newton steps | {' | '.join(KINDS)} |\n|{'---|' * (4 + len(KINDS))}")
+        print_head("", "s", "of all", "Newton steps")
         for name, solution in solutions.items():
-            counts = solution.assembled.counts
-            shown = " | ".join(str(counts.get(kind, "")) for kind in KINDS)
             median = statistics.median(seconds[name])
             share = median / statistics.median(seconds["all effects"])
-            print(f"| {name} | {median:.2f} | {share:.2f} | {solution.newton_iterations.sum()} | {shown} |")
+            print_row(name, f"{median:.2f}", f"{share:.2f}", solution.newton_iterations.sum())
         self.conduction_only(problems["conduction only"], steps)
 
     def conduction_only(self, problem: HeatProblem, steps: TimeSteps) -> None:
         """Conduction alone, through the effects layer and by hand."""
-        sides: dict[str, Callable[[], np.ndarray]] = {
-            "through effects": lambda: solve_heat(problem, steps, relative_tolerance=TOLERANCE).temperature_c,
-            "plain conjugate gradients": lambda: plainly(problem, steps),
-        }
-        runs = 5 * self.repeats
-        seconds, states = take_turns(sides, runs)
-        print(
-            f"\n| conduction only | s | through effects / this, median of {runs} | all of them "
-            "| largest difference |\n|---|---|---|---|---|"
+        seconds, states = take_turns(
+            {
+                "through effects": lambda: solve_heat(problem, steps, relative_tolerance=TOLERANCE).temperature_c,
+                "plain conjugate gradients": lambda: plainly(problem, steps),
+            },
+            5 * self.repeats,
         )
-        for name, taken in seconds.items():
-            ratios = sorted(ours / other for ours, other in zip(seconds["through effects"], taken))
-            difference = np.abs(states["through effects"] - states[name]).max()
-            print(
-                f"| {name} | {statistics.median(taken):.4f} | {statistics.median(ratios):.3f} "
-                f"| {ratios[0]:.3f} to {ratios[-1]:.3f} | {difference:.1e} K |"
-            )
-
-
-def stiffness_and_mass(problem: HeatProblem) -> tuple[sparse.csr_matrix, np.ndarray]:
-    points, tets = problem.mesh.points_m, problem.mesh.tets
-    stiffness = stiffness_matrix(points, tets, problem.conductivity_w_mk)
-    return stiffness, lumped_mass(points, tets, problem.heat_capacity_j_m3k)
+        ours, plain = seconds.values()
+        ratio = statistics.median(map(truediv, ours, plain))
+        difference = np.abs(states["through effects"] - states["plain conjugate gradients"]).max()
+        print(f"\nconduction only: {ratio:.3f} of plain conjugate gradients, largest difference {difference:.1e} K")
 
 
 def plainly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
     """Backward Euler with the assembled matrices, conjugate gradients and nothing else."""
-    stiffness, mass = stiffness_and_mass(problem)
+    points, tets = problem.mesh.points_m, problem.mesh.tets
+    stiffness = stiffness_matrix(points, tets, problem.conductivity_w_mk)
+    mass = lumped_mass(points, tets, problem.heat_capacity_j_m3k)
     system = sparse.csr_matrix(stiffness + sparse.diags(mass / steps.step_seconds, format="csr"))
     solver = LinearSolver(system, relative_tolerance=TOLERANCE)
-    states = np.empty((steps.steps + 1, len(problem.start_c)))
-    states[0] = problem.start_c
-    for number in range(steps.steps):
-        states[number + 1] = states[number] + solver.solve(-(stiffness @ states[number])).x
-    return states
+    states = [problem.start_c]
+    for _ in range(steps.steps):
+        states.append(states[-1] + solver.solve(-(stiffness @ states[-1])).x)
+    return np.array(states)
 
 
 def room(voxels: int) -> TetMesh:

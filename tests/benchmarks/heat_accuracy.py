@@ -11,27 +11,23 @@ short steps. Then the driver gets each problem with several tolerances: its esti
 and its time with that of the cheapest setting by hand whose true error is within the tolerance, which nobody knows
 beforehand.
 
-Times are processor times. All settings of a problem, by hand and the driver's, take turns in one process: in every
-round each runs once, after one run of each that does not count, so that a disturbance or a change of the processor's
-clock meets all of them alike. What counts is the median of at least seven rounds, or of three for settings that take
-longer than `LONG_S`. The ratio of the driver to a setting by hand is the median of the ratios within the rounds in
-which both ran, and the best setting is the one with the largest such ratio: no lucky run makes a setting the best.
-
-Prints all rows, and writes them to a csv file and the errors against the seconds to a picture.
+Times are processor times. All settings of a problem, by hand and the driver's, take turns in one process. The ratio of
+the driver to a setting by hand is the median of the ratios within the rounds, and the best setting is the one with the
+largest such ratio: no lucky run makes a setting the best. All rows are printed and written to a csv file, and the
+errors against the seconds are drawn.
 """
 
-import gc
 import statistics
-import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from operator import truediv
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
-from measuring import logarithmic_panels, save, write_rows
+from measuring import logarithmic_panels, save, take_turns, write_rows
 
 from tests.support.building_corner import building_corner
 from tests.support.heat_bodies import CONCRETE
@@ -48,9 +44,8 @@ from thermoxels_ns.heat.effects import Convection
 
 DURATION_S = 32.0
 OUTPUTS = 10
-LEAST_REPEATS, LONG_REPEATS = 7, 3
-LONG_S = 1.0
-"""Settings that take longer run in `LONG_REPEATS` rounds only: a disturbance is little of what they take."""
+Setting = tuple[str, str]
+"""Method and how it is set."""
 
 
 @dataclass(frozen=True)
@@ -73,34 +68,13 @@ class Row:
 
 
 @dataclass
-class Contest:
-    """A setting that takes turns with others."""
-
-    method: str
-    setting: str
-    run: Callable[[], Any]
-    seconds: list[float] = field(default_factory=list)
-    """Processor time of each round, [s]."""
-    result: Any = None
-    """Of the last round."""
-
-    @property
-    def median_s(self) -> float:
-        return statistics.median(self.seconds)
-
-    def over(self, other: "Contest") -> float:
-        """Median of the time over that of another setting in the same round."""
-        return statistics.median(mine / its for mine, its in zip(self.seconds, other.seconds))
-
-
-@dataclass
 class HeatAccuracy:
     output: Path = Path("outputs/heat-accuracy.csv")
     """Where the rows go."""
     picture: Path = Path("docs/heat-accuracy.png")
     """Where the picture goes."""
     repeats: int = 7
-    """Rounds of which the median counts; fewer than 7 are not taken."""
+    """Rounds of which the median counts."""
 
     def main(self) -> None:
         rows: list[Row] = []
@@ -117,16 +91,16 @@ class HeatAccuracy:
     def steady(self, name: str, given: HeatProblem, finest: int, tolerances: tuple[float, ...]) -> list[Row]:
         exact = solve_steady(finer(given, finest), order=2, relative_tolerance=1e-9)
         settings = [(1, 0), (1, 1), (1, 2), (2, 0), (2, 1)] + ([(2, 2)] if finest > 2 else [])
-        by_hand = [
-            Contest(
-                f"P{order}",
-                f"mesh size / {2**refinements}",
-                lambda o=order, r=refinements: solve_steady(finer(given, r), order=o, relative_tolerance=1e-8),
-            )
+
+        def solved(order: int, refinements: int) -> SteadySolution:
+            return solve_steady(finer(given, refinements), order=order, relative_tolerance=1e-8)
+
+        by_hand = {
+            (f"P{order}", f"mesh size / {2**refinements}"): partial(solved, order, refinements)
             for order, refinements in settings
-        ]
+        }
         nodes = len(given.mesh.points_m)
-        return self.contest(name, given, by_hand, tolerances, None, lambda s: difference_between(s, exact, nodes))
+        return self.compare(name, given, by_hand, tolerances, None, lambda s: difference_between(s, exact, nodes))
 
     def in_time(self) -> list[Row]:
         name, given = "NAFEMS T3", nafems_t3(10)
@@ -148,69 +122,51 @@ class HeatAccuracy:
             solution = solve_heat(finer(given, refinements), times, scheme=scheme)
             return replace(solution, temperature_c=solution.temperature_c[:: steps // OUTPUTS])
 
-        by_hand = [
-            Contest(
-                scheme.name,
-                f"mesh size / {2**refinements}, step {DURATION_S / steps:g} s",
-                partial(march, refinements, scheme, steps),
+        by_hand = {
+            (scheme.name, f"mesh size / {2**refinements}, step {DURATION_S / steps:g} s"): partial(
+                march, refinements, scheme, steps
             )
             for refinements in range(3)
             for scheme in (BACKWARD_EULER, CRANK_NICOLSON, SDIRK2)
             for steps in (10, 20, 40, 80, 160)
-        ]
-        return self.contest(name, given, by_hand, (2.0, 0.5, 0.15), DURATION_S, error)
+        }
+        return self.compare(name, given, by_hand, (2.0, 0.5, 0.15), DURATION_S, error)
 
-    def contest(
+    def compare(
         self,
         name: str,
         given: HeatProblem,
-        by_hand: list[Contest],
+        by_hand: Mapping[Setting, Callable[[], Any]],
         tolerances: tuple[float, ...],
         duration_s: float | None,
         error: Callable[[Any], ErrorSize],
     ) -> list[Row]:
         """Rows of all settings by hand and of the driver with each tolerance, which take turns."""
         options: dict[str, Any] = {"duration_s": duration_s, "outputs": OUTPUTS, "log": lambda line: None}
-        driven = [
-            Contest("driver", f"{one}", partial(solve_to_tolerance, given, Tolerance(one), **options))
-            for one in tolerances
-        ]
-        self.take_turns([*by_hand, *driven])
+        driven = {("driver", f"{k}"): partial(solve_to_tolerance, given, Tolerance(k), **options) for k in tolerances}
+        seconds, results = take_turns({**by_hand, **driven}, self.repeats)
         rows, errors = [], {}
         for one in by_hand:
-            errors[one.setting, one.method] = true = error(one.result)
-            unknowns = one.result.temperature_c.shape[-1]
-            if isinstance(one.result, SteadySolution):
-                unknowns += len(one.result.edge_temperature_c)
-            cost = unknowns, one.median_s, true.temperature_k, true.heat_flow
-            rows.append(Row(name, one.method, one.setting, *cost))
+            errors[one] = true = error(results[one])
+            unknowns = results[one].temperature_c.shape[-1]
+            if isinstance(results[one], SteadySolution):
+                unknowns += len(results[one].edge_temperature_c)
+            cost = unknowns, statistics.median(seconds[one]), true.temperature_k, true.heat_flow
+            rows.append(Row(name, *one, *cost))
             print(rows[-1], flush=True)
         for tolerance_k, one in zip(tolerances, driven):
-            good = [other for other in by_hand if errors[other.setting, other.method].temperature_k <= tolerance_k]
-            over_best = max((one.over(other) for other in good), default=float("nan"))
-            true, level = error(one.result.solution), one.result.settings
+            good = [seconds[other] for other in by_hand if errors[other].temperature_k <= tolerance_k]
+            ratios = [statistics.median(map(truediv, seconds[one], theirs)) for theirs in good]
+            true, level = error(results[one].solution), results[one].settings
             setting = f"P{level.order}, mesh size / {2**level.refinements}"
             if level.step_tolerance_k is not None:
                 setting += f", steps to {level.step_tolerance_k:.2g} K"
             over_true = level.error.temperature_k / true.temperature_k
-            cost = level.num_nodes, one.median_s, true.temperature_k, true.heat_flow
+            cost = level.num_nodes, statistics.median(seconds[one]), true.temperature_k, true.heat_flow
+            over_best = max(ratios, default=float("nan"))
             rows.append(Row(name, "driver", setting, *cost, tolerance_k, over_true, over_best))
             print(rows[-1], flush=True)
         return rows
-
-    def take_turns(self, all_of_them: list[Contest]) -> None:
-        """Run all in turns, long ones in the first rounds only."""
-        rounds = max(self.repeats, LEAST_REPEATS)
-        for number in range(rounds + 1):
-            for one in all_of_them:
-                if number > LONG_REPEATS and one.median_s > LONG_S:
-                    continue
-                one.result = None
-                gc.collect()
-                begin = time.process_time()
-                one.result = one.run()
-                if number:
-                    one.seconds.append(time.process_time() - begin)
 
     def draw(self, rows: list[Row]) -> None:
         problems = list(dict.fromkeys(row.problem for row in rows))

@@ -3,16 +3,17 @@
     python tests/benchmarks/heat_loss.py outputs/hot-object/thermoxels/TIME/config.yml ...
 
 A body of concrete starts at 20 C in air of 0 C that takes heat from all of its surface with 25 W/(m2 K); the heat it
-has lost after `--hours` (ten equal steps) is compared with that of the exact body, a conforming mesh of the scene's
-signed distance on a lattice `--finer` times as fine. Reconstructions are meshed as an export does by default: voxels
+has lost after an hour (ten equal steps) is compared with that of the exact body, a conforming mesh of the scene's
+signed distance on a lattice 1.5 times as fine. Reconstructions are meshed as an export does by default: voxels
 with the plain area of their faces, voxels with the area factor, and conforming. Scenes with a known truth only.
 """
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
-import measuring  # noqa: F401 - makes tests.support importable
 import numpy as np
+import tyro
+from measuring import print_head, print_row
 
 from tests.support.demo_mesh import exact_snapshot
 from tests.support.heat_bodies import CONCRETE
@@ -27,16 +28,18 @@ from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas
 
+FINER = 1.5  # Lattice of the exact body against that of the reconstruction
+
 
 def exact_mesh(scene, voxels: int) -> TetMesh:
     snapshot = exact_snapshot(scene.solid.signed_distance, Lattice.covering(*scene.scene_box, voxels))
     return build_mesh(snapshot, SolidSelection(density_threshold=1.0, close_gaps=0), np.eye(4)).mesh
 
 
-def heat_lost_j(mesh: TetMesh, hours: float) -> float:
+def heat_lost_j(mesh: TetMesh) -> float:
     start = np.full(len(mesh.points_m), 20.0)
     problem = HeatProblem(mesh, CONCRETE, start, effects=(Convection(("*",), 25.0, 0.0),))
-    solution = solve_heat(problem, TimeSteps(10, 360.0 * hours))
+    solution = solve_heat(problem, TimeSteps(10, 360.0))
     return float(solution.heat_content_j[0] - solution.heat_content_j[-1])
 
 
@@ -44,36 +47,28 @@ def size(mesh: TetMesh) -> tuple[float, float]:
     return float(facet_areas(mesh.points_m, mesh.facets).sum()), float(signed_volumes(mesh.points_m, mesh.tets).sum())
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("configs", type=Path, nargs="+")
-    parser.add_argument("--hours", type=float, default=1.0)
-    parser.add_argument("--finer", type=float, default=1.5)
-    arguments = parser.parse_args()
-    rows = []
-    for config in arguments.configs:
-        trained = load_trained_scene(config)
-        known = load_known_truth(trained.scene_folder)
-        if known is None:
-            raise SystemExit(f"{config}: the exact shape of this scene is not known")
-        exact = exact_mesh(known.scene, round(arguments.finer * max(trained.snapshot.lattice.cell_shape)))
-        truth = heat_lost_j(exact, arguments.hours)
-        area, volume = size(exact)
-        rows.append(
-            f"| {known.scene.name} | exact shape, meshed | {100 * (area / known.scene.solid.area - 1):+.1f} % "
-            f"| {100 * (volume / known.scene.solid.volume - 1):+.1f} % | {truth / 3.6e6:.4g} kWh |"
-        )
-        for mode in ("voxel", "conforming"):
-            mesh = build_mesh(trained.snapshot, SolidSelection(), trained.world_to_input, MeshOptions(mode)).mesh
-            area, volume = size(mesh)
-            lost = heat_lost_j(mesh, arguments.hours)
-            rows.append(
-                f"| {known.scene.name} | {mode} | {100 * (area / known.scene.solid.area - 1):+.1f} % "
-                f"| {100 * (volume / known.scene.solid.volume - 1):+.1f} % | {100 * (lost / truth - 1):+.1f} % |"
-            )
-    print("\n| scene | mesh | area | volume | heat lost |\n|---|---|---:|---:|---:|")
-    print("\n".join(rows))
+@dataclass
+class HeatLoss:
+    configs: tyro.conf.Positional[tuple[Path, ...]]
+    """config.yml of trainings on scenes whose truth is known."""
+
+    def main(self) -> None:
+        print_head("scene", "mesh", "area", "volume", "heat lost")
+        for config in self.configs:
+            trained = load_trained_scene(config)
+            known = load_known_truth(trained.scene_folder)
+            if known is None:
+                raise SystemExit(f"{config}: the exact shape of this scene is not known")
+            meshes = {"exact shape": exact_mesh(known.scene, round(FINER * max(trained.snapshot.lattice.cell_shape)))}
+            for mode in ("voxel", "conforming"):
+                built = build_mesh(trained.snapshot, SolidSelection(), trained.world_to_input, MeshOptions(mode))
+                meshes[mode] = built.mesh
+            truth, true = heat_lost_j(meshes["exact shape"]), known.scene.solid
+            for name, mesh in meshes.items():
+                area, volume = size(mesh)
+                off = (area / true.area - 1.0, volume / true.volume - 1.0, heat_lost_j(mesh) / truth - 1.0)
+                print_row(known.scene.name, name, *(f"{100 * error:+.1f} %" for error in off))
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(HeatLoss).main()

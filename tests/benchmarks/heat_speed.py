@@ -15,6 +15,7 @@ that of a process for each side alone: its peak less what it needs after its imp
 """
 
 import json
+import math
 import statistics
 import subprocess
 import sys
@@ -26,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from measuring import take_turns
+from measuring import print_head, print_row, take_turns
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
@@ -56,17 +57,14 @@ class HeatSpeed:
             print(json.dumps(self.peak_memory_mb()))
             return
         print(f"\nLumped mass, {self.steps} steps of {self.step_seconds:g} s, medians of {self.repeats}\n")
-        print(
-            "| tetrahedra | scikit-fem | ours | ours / scikit-fem | per million tetrahedra "
-            "| memory of scikit-fem | ours | ours / scikit-fem | largest difference |"
+        print_head(
+            *("tetrahedra", "scikit-fem", "ours", "ours / scikit-fem", "per million tetrahedra"),
+            *("memory of scikit-fem", "ours", "ours / scikit-fem", "largest difference"),
         )
-        print("|---|---|---|---|---|---|---|---|---|")
-        for voxels in self.voxels:
-            print(self.row(voxels, alone=False), flush=True)
-        for voxels in self.ours_alone:
-            print(self.row(voxels, alone=True), flush=True)
+        for voxels in (*self.voxels, *self.ours_alone):
+            print_row(*self.row(voxels, alone=voxels in self.ours_alone))
 
-    def row(self, voxels: int, *, alone: bool) -> str:
+    def row(self, voxels: int, *, alone: bool) -> list[str]:
         points, tets = cube(voxels)
         start = temperatures(points)
         sides = {"ours": lambda: self.ours(points, tets, start)}
@@ -78,16 +76,14 @@ class HeatSpeed:
             np.save(Path(folder) / "tets.npy", tets)
             memory = {side: self.in_own_process(side, Path(folder)) for side in sides}
         ours, ours_mb = statistics.median(seconds["ours"]), memory["ours"]
-        per_million = f"{1e6 * ours / len(tets):.2f} s"
-        if alone:
-            return f"| {len(tets):,} | | {ours:.2f} s | | {per_million} | | {ours_mb:.0f} MB | | |"
-        theirs, theirs_mb = statistics.median(seconds["scikit-fem"]), memory["scikit-fem"]
-        difference = np.abs(last["ours"] - last["scikit-fem"]).max()
-        memory_ratio = f"{ours_mb / theirs_mb:.2f}" if theirs_mb > 0 else ""
-        return (
-            f"| {len(tets):,} | {theirs:.2f} s | {ours:.2f} s | {ours / theirs:.2f} | {per_million} "
-            f"| {theirs_mb:.0f} MB | {ours_mb:.0f} MB | {memory_ratio} | {difference:.0e} K |"
-        )
+        theirs = statistics.median(seconds["scikit-fem"]) if not alone else math.nan
+        theirs_mb = memory.get("scikit-fem", math.nan)
+        difference = np.abs(last["ours"] - last["scikit-fem"]).max() if not alone else math.nan
+        return [
+            *(f"{len(tets):,}", f"{theirs:.2f} s", f"{ours:.2f} s", f"{ours / theirs:.2f}"),
+            *(f"{1e6 * ours / len(tets):.2f} s", f"{theirs_mb:.0f} MB", f"{ours_mb:.0f} MB"),
+            *(f"{ours_mb / theirs_mb:.2f}", f"{difference:.0e} K"),
+        ]
 
     def in_own_process(self, side: str, folder: Path) -> float:
         """Peak memory of one side, [MB]."""

@@ -27,10 +27,10 @@ if "tests" not in sys.modules:  # Another distribution may have installed a pack
 
 
 def take_turns(
-    sides: dict[str, Callable[[], Any]], repeats: int, clock: Callable[[], float] = time.process_time
-) -> tuple[dict[str, list[float]], dict[str, Any]]:
+    sides: dict[Any, Callable[[], Any]], repeats: int, clock: Callable[[], float] = time.process_time
+) -> tuple[dict[Any, list[float]], dict[Any, Any]]:
     """Run all sides in turns after one run that does not count; seconds of each run and last results."""
-    seconds: dict[str, list[float]] = {name: [] for name in sides}
+    seconds: dict[Any, list[float]] = {name: [] for name in sides}
     results = {}
     for run in range(repeats + 1):
         for name, side in sides.items():

@@ -1,13 +1,11 @@
 """What accuracy costs in meshing: resolution against errors, tetrahedra, seconds and memory, for both boundary modes.
 
-    python tests/benchmarks/mesh_cost.py --csv mesh-cost.csv --plot docs/mesh-cost.png
-    python tests/benchmarks/mesh_cost.py --bodies hot-object --modes voxel --resolutions 128 --csv mesh-cost.csv
+    python tests/benchmarks/mesh_cost.py --plot docs/mesh-cost.png
+    python tests/benchmarks/mesh_cost.py --bodies hot-object --modes voxel --resolutions 128
 
 The fields are exact: at voxel centres the logarithm of the density is the signed distance to a body whose area and
 volume are known. Each case runs in a process of its own, so that its peak memory is its own; the seconds are those of
 `build_mesh` with all tags, 40 cameras on a sphere around the body, the median of `--repeats` runs.
-
-The csv file is written again after every case.
 """
 
 import multiprocessing
@@ -23,24 +21,22 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import tyro
-from measuring import logarithmic_panels, save, write_rows
+from measuring import logarithmic_panels, print_head, print_row, save
 
 from tests.support.demo_mesh import exact_snapshot
+from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.core.snapshot import GridSnapshot, Views
+from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.evaluation.truth_comparison import sample_facets
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
-from thermoxels_ns.synthetic.camera_rings import look_at
 from thermoxels_ns.synthetic.scene_folder import make_scene
 
 Vector = npt.NDArray[np.float64]
-Mode = Literal["conforming", "voxel"]
-BodyName = Literal["sphere", "slab at 30 degrees", "torus", "house-corner", "hot-object"]
-MODES: tuple[Mode, ...] = ("conforming", "voxel")
-BODIES: tuple[BodyName, ...] = ("sphere", "slab at 30 degrees", "torus", "house-corner", "hot-object")
+MODES = ("conforming", "voxel")
+BODIES = ("sphere", "slab at 30 degrees", "torus", "house-corner", "hot-object")
 
 
 @dataclass(frozen=True)
@@ -79,23 +75,17 @@ def body_named(name: str) -> Body:
 
 
 def snapshot_of(body: Body, voxels: int) -> GridSnapshot:
-    """A field of the exact body, seen from all sides."""
+    """A field of the exact body, seen by 40 cameras on a sphere around it, which look at its middle."""
     low, high = np.array(body.box)
-    views = cameras_around(0.5 * (low + high), 1.5 * float(np.linalg.norm(high - low)), 40)
+    height = 1.0 - 2.0 * (np.arange(40) + 0.5) / 40
+    around, ring = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(40), np.sqrt(1.0 - height**2)
+    outward = np.stack([ring * np.cos(around), ring * np.sin(around), height], axis=1)
+    middle = 0.5 * (low + high)
+    views = looking_at(middle, middle + 1.5 * np.linalg.norm(high - low) * outward, focal=500.0, size=640)
     return exact_snapshot(body.signed_distance, Lattice.covering(*body.box, voxels), views=views)
 
 
-def cameras_around(centre: Vector, reach: float, count: int) -> Views:
-    """Cameras spread over a sphere, all looking at its middle."""
-    height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
-    around = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
-    ring = np.sqrt(1.0 - height**2)
-    back = np.stack([ring * np.cos(around), ring * np.sin(around), height], axis=1)
-    poses = np.stack([look_at(centre + reach * one, centre)[:3] for one in back])
-    return Views(poses, np.full((count, 2), 500.0), np.full((count, 2), 320.0), np.full((count, 2), 640))
-
-
-def measure(name: str, voxels: int, mode: Mode, repeats: int) -> dict[str, Any]:
+def measure(name: str, voxels: int, mode: Any, repeats: int) -> dict[str, Any]:
     """One case; runs in a process of its own."""
     body = body_named(name)
     snapshot = snapshot_of(body, voxels)
@@ -126,11 +116,8 @@ def measure(name: str, voxels: int, mode: Mode, repeats: int) -> dict[str, Any]:
         "peak_mb": peak / 1024,
         "area_error": quality.area_m2 / body.area - 1.0,
         "volume_error": quality.volume_m3 / body.volume - 1.0,
-        "mean_distance_voxels": float(distance.mean()) / snapshot.lattice.voxel_size,
         "hausdorff_voxels": float(distance.max()) / snapshot.lattice.voxel_size,
         "iou": inside / (quality.volume_m3 + body.volume - inside),
-        "dihedral_min": quality.dihedral_range_deg[0],
-        "dihedral_max": quality.dihedral_range_deg[1],
     }
 
 
@@ -157,38 +144,30 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
 class MeshCost:
     resolutions: tuple[int, ...] = (16, 32, 64, 128)
     """Voxels along the longest side."""
-    bodies: tuple[BodyName, ...] = BODIES
+    bodies: tuple[str, ...] = BODIES
     """Bodies."""
-    modes: tuple[Mode, ...] = MODES
+    modes: tuple[Literal["conforming", "voxel"], ...] = MODES
     """Boundaries."""
     repeats: int = 5
     """Runs per median."""
-    csv: Path | None = None
-    """File of all cases."""
     plot: Path | None = None
     """Where the picture goes."""
 
     def main(self) -> None:
         rows = []
         spawn = multiprocessing.get_context("spawn")
-        print("| body | voxels | boundary | tets | s | MB | area | volume | Hausdorff | IoU |")
-        print("|---|---:|---|---:|---:|---:|---:|---:|---:|---:|")
+        print_head("body", "voxels", "boundary", "tets", "s", "MB", "area", "volume", "Hausdorff", "IoU")
         for case in product(self.bodies, self.resolutions, self.modes):
             with spawn.Pool(1) as pool:
                 row = pool.apply(measure, (*case, self.repeats))
             rows.append(row)
-            if self.csv:
-                write_rows(self.csv, rows)
-            print(
-                f"| {row['body']} | {row['voxels']} | {row['mode']} | {row['tets']:,} | {row['seconds']:.2f} "
-                f"| {row['peak_mb']:.0f} | {100 * row['area_error']:+.2f} % | {100 * row['volume_error']:+.2f} % "
-                f"| {row['hausdorff_voxels']:.2f} | {row['iou']:.4f} |",
-                flush=True,
+            print_row(
+                *(*case, f"{row['tets']:,}", f"{row['seconds']:.2f}", f"{row['peak_mb']:.0f}"),
+                *(f"{100 * row[name]:+.2f} %" for name in ("area_error", "volume_error")),
+                *(f"{row['hausdorff_voxels']:.2f}", f"{row['iou']:.4f}"),
             )
         if self.plot:
             plot(rows, self.plot)
-        lowest, highest = min(row["dihedral_min"] for row in rows), max(row["dihedral_max"] for row in rows)
-        print(f"dihedral angles from {lowest:.2f} to {highest:.2f} degrees")
 
 
 if __name__ == "__main__":

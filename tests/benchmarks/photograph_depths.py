@@ -6,8 +6,7 @@
 The photographs are compared as a training compares them, in the box of what they truly see. `body` are pixels that
 truly show the scene's solid, `known` the share of them with a depth; median error and the share that is more than 3 %
 off are relative to the true depth; `sky` is the share of all depths on pixels that show nothing of the solid (the sky,
-or what else stands around), `beside` the same before those go that look like the backdrop beside it. Seconds are those
-of the comparison.
+or what else stands around). Seconds are those of the comparison.
 """
 
 import time
@@ -37,7 +36,7 @@ class PhotographDepths:
     """Synthetic scenes by name."""
 
     def main(self) -> None:
-        print_head("scene", "body", "known", "median error", "over 3 % off", "sky", "beside", "seconds")
+        print_head("scene", "body", "known", "median error", "over 3 % off", "sky", "seconds")
         for name in self.scenes:
             scene = synthetic_scene(name, self.output / name / "scene")
             config = ThermalDataParserConfig(data=self.output / name / "scene", scene_box=scene.scene_box)
@@ -62,12 +61,12 @@ def true_depths(scene: SyntheticScene, photographs: Photographs, transform: np.n
 
 
 def shares(found: Depths, truth: np.ndarray) -> tuple[float, ...]:
-    """The columns of the table from `body` to `beside`."""
-    body, before = np.isfinite(truth), np.isfinite(found.depth)
+    """The columns of the table from `body` to `sky`."""
+    body = np.isfinite(truth)
     known = np.isfinite(depths_before_backdrop(found)[0].depth)
     off = np.abs(found.depth / truth - 1.0)[known & body]
     errors = float(np.median(off)), float(np.mean(off > 0.03))
-    return body.mean(), known[body].mean(), *errors, 1 - body[known].mean(), 1 - body[before].mean()
+    return body.mean(), known[body].mean(), *errors, 1 - body[known].mean()
 
 
 if __name__ == "__main__":

@@ -1,13 +1,9 @@
-"""How far off the depths of real photographs are: trains saharov32 and compares what held-out frames see.
-
-    python tests/benchmarks/real_depths.py --output RUNS
-    python tests/benchmarks/real_depths.py --output RUNS --options --quality draft --pipeline.model.photo-depth off
+"""How far off the depths of real photographs are: compares what held-out frames of a run on saharov32 see.
 
 The scene lies beside the checkout, in ../shared/data/saharov32: photographs of a bronze figure on a granite block, and
-``depth.npz``, depths that another program's multi-view stereo found, good to about 1 %. It is trained and evaluated by
-`ns-train thermoxels` and `ns-eval`; what follows `--options`, which comes last, is handed to `ns-train`. Rays go
-through the middle of each pixel of the depth maps, four times as large as a photograph's, by the cameras of the trained
-run, lens distortion included. Pixels count where there is a depth and the ray meets the lattice's box:
+``depth.npz``, depths that another program's multi-view stereo found, good to about 1 %. Rays go through the middle of
+each pixel of the depth maps, four times as large as a photograph's, by the cameras of the trained run, lens distortion
+included. Pixels count where there is a depth and the ray meets the lattice's box:
 
 - ``depth_error``: median relative error of the rendered depth; ``depth_off_share``: share that is more than 2 % off;
 - ``opaque_share``: share whose ray loses more than half of its light in the box.
@@ -17,26 +13,17 @@ channel of the photograph lies below 0.7, and pixels of the same kind lead from 
 is where up is: the photographs lie on their side.
 """
 
-import json
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from measuring import SHARED_DATA, run_of, run_with_options, train_and_evaluate
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 
-SAHAROV = SHARED_DATA / "saharov32"
 DARKEST_SKY = 0.7  # Least channel of a pixel that shows the sky, 0 to 1
 MOST_OFF = 0.02  # Relative error above which a depth is off
-_SHOWN = (
-    *("depth_error", "depth_off_share", "opaque_share", "sky_filled"),
-    *("psnr", "psnr_8", "psnr_box", "thermal_psnr", "half_transparent"),
-)
 
 
 def sky_of(depth: FloatArray, photograph: FloatArray) -> BoolArray:
@@ -80,25 +67,3 @@ def held_out_depths(config: Path, scene: Path) -> dict[str, float]:
         "opaque_share": float(np.concatenate(opaque).mean()),
         "sky_filled": float(np.concatenate(filled).mean()),
     }
-
-
-@dataclass
-class RealDepths:
-    """Train and judge. `--options ...`, last, goes to ns-train as it is."""
-
-    output: Path
-    """Folder for the run, logs and results."""
-    data: Path = SAHAROV
-    """The scene's folder."""
-
-    def main(self, options: Sequence[str]) -> None:
-        """Print all figures, and write them to ``real-depths.json``."""
-        seconds, figures = train_and_evaluate(self.data, self.output, options)
-        figures |= held_out_depths(run_of(self.output) / "config.yml", self.data) | {"seconds": seconds}
-        text = json.dumps({name: figures[name] for name in (*_SHOWN, "seconds") if name in figures}, indent=1)
-        (self.output / "real-depths.json").write_text(text + "\n", encoding="utf-8")
-        print(text)
-
-
-if __name__ == "__main__":
-    run_with_options(RealDepths)

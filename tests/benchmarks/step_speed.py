@@ -6,8 +6,7 @@ Run it on an otherwise idle machine:
 
 A synthetic house with a thermal camera of its own is trained to the middle of its last stage; then single steps with
 4096 RGB and 4096 thermal rays are timed on one and the same state, and a view of 320 x 240 is rendered. Colour is the
-same from all sides there, as it is for the first four fifths of a training. On a busy machine, `--threads 1 --clock
-processor` counts the time that this process had.
+same from all sides there, as it is for the first four fifths of a training.
 
 Every figure is a median; ratios are against the named baseline of the same run. There are two: the reference (plain
 torch on the same sparse lattice, skipping what is empty), and once a dense step (plain torch on the whole lattice,
@@ -22,7 +21,7 @@ from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from unittest import mock
 
 import torch
@@ -38,13 +37,13 @@ from thermoxels_ns.field.refine import widen_colour
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.training.schedule import schedule_for
 
+SCENE = "house-corner"
+
 
 @dataclass
 class StepSpeed:
     resolutions: tuple[int, ...] = (64, 128, 256)
     """Voxels along the longest side."""
-    scene: str = "house-corner"
-    """Synthetic scene."""
     rays: int = 4096
     """Rays of each stream."""
     steps: int = 600
@@ -55,20 +54,16 @@ class StepSpeed:
     """Finest lattice on which the reference is timed too."""
     threads: int | None = None
     """Threads of the compiled kernels; default: one per processor."""
-    clock: Literal["wall", "processor"] = "wall"
-    """wall: time that passes; processor: time that all threads of this process spend."""
     dense: int = 128
     """The lattice on which a dense step in plain torch is timed too, once; 0: none."""
 
     def main(self) -> None:
         with tempfile.TemporaryDirectory() as folder:
-            scene = write_scene(
-                make_scene(self.scene), Path(folder) / "scene", own_thermal_camera=True, thermal_width=320
-            )
+            scene = write_scene(make_scene(SCENE), Path(folder) / "scene", own_thermal_camera=True, thermal_width=320)
             rows = [self.measure(scene, resolution) for resolution in self.resolutions]
         print(
-            f"\n{self.scene}, {self.rays} RGB + {self.rays} thermal rays, {num_threads()} threads, "
-            f"medians of {self.repeats}, {self.clock} time\n"
+            f"\n{SCENE}, {self.rays} RGB + {self.rays} thermal rays, {num_threads()} threads, "
+            f"medians of {self.repeats}\n"
         )
         print_head(
             *("voxels", "kept", "fused step", "against the lattice before", "reference step", "reference / fused"),
@@ -124,13 +119,9 @@ class StepSpeed:
         voxels = model.grid.voxels
         return {"resolution": resolution, "kept": len(voxels) / voxels.mask().size, **figures}
 
-    def now(self) -> float:
-        """The clock of choice, [s]."""
-        return time.perf_counter() if self.clock == "wall" else time.process_time()
-
     def median(self, work: Callable[[], object]) -> float:
         """Median time of one call, after one that does not count."""
-        return statistics.median(take_turns({"": work}, self.repeats, self.now)[0][""])
+        return statistics.median(take_turns({"": work}, self.repeats, time.perf_counter)[0][""])
 
     def median_of_kernels(self, run: Training) -> float:
         """Time per step that is spent in compiled kernels: renderer forward and backward, and row optimisers."""
@@ -141,11 +132,11 @@ class StepSpeed:
 
         def timed(function):
             def call(*args, **kwargs):
-                start = self.now()
+                start = time.perf_counter()
                 try:
                     return function(*args, **kwargs)
                 finally:
-                    spent[-1] += self.now() - start
+                    spent[-1] += time.perf_counter() - start
 
             return call
 

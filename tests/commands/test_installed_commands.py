@@ -67,19 +67,18 @@ def test_memory_is_that_of_the_command(fake_command, tmp_path):
     Measured from a process of its own: this one may be large, and what it starts would be told to be as large.
     """
     fake_command("work", "x = b'1' * int(sys.argv[1]); del x")
-    script = (
-        "import io, math, pathlib, sys\n"
-        "from rich.console import Console\n"
-        "from thermoxels_ns.commands.installed_commands import run_command\n"
-        f"sys.executable = {str(tmp_path / 'bin' / 'python')!r}\n"
-        f"log = pathlib.Path({str(tmp_path / 'log')!r})\n"
-        "peak = lambda size: run_command(['work', str(size)], log, Console(file=io.StringIO())).peak_memory_gb\n"
-        "print(peak(200_000_000), peak(600_000_000))\n"
-        "large = b'1' * 500_000_000\n"
-        "del large\n"
-        "print(peak(1))\n"
-    )
-    done = subprocess.run([PYTHON, "-c", script], capture_output=True, text=True, check=True)
+    script = f"""
+import io, math, pathlib, sys
+from rich.console import Console
+from thermoxels_ns.commands.installed_commands import run_command
+sys.executable = {str(tmp_path / "bin" / "python")!r}
+peak = lambda size: run_command(['work', str(size)], pathlib.Path('log'), Console(file=io.StringIO())).peak_memory_gb
+print(peak(200_000_000), peak(600_000_000))
+large = b'1' * 500_000_000
+del large
+print(peak(1))
+"""
+    done = subprocess.run([PYTHON, "-c", script], capture_output=True, text=True, check=True, cwd=tmp_path)
     small, large, unknown = map(float, done.stdout.split())
     assert 0.2 < small < 0.3 and 0.6 < large < 0.7
     assert large - small == pytest.approx(0.4, abs=0.01)

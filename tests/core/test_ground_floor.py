@@ -1,9 +1,11 @@
-"""Units, checks and the rename-when-done rule."""
+"""Units, measured values, the lattice, checks and the rename-when-done rule."""
 
 import os
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from thermoxels_ns.core.checks import (
     check_finite,
@@ -12,9 +14,10 @@ from thermoxels_ns.core.checks import (
     remove_file,
     remove_stale_temporaries,
     replace_when_done,
-    writable_folder,
 )
 from thermoxels_ns.core.errors import MeshError, OutputError, ThermoxelsError
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.measured import read_measured
 from thermoxels_ns.core.units import TemperatureRange
 
 
@@ -48,14 +51,6 @@ def test_interrupted_write_leaves_the_old_file_and_no_rubbish(tmp_path):
     assert target.read_text() == "new" and os.listdir(tmp_path) == ["mesh.vtu"]
 
 
-def test_folder_that_cannot_be_made_is_refused(tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("in the way")
-    with pytest.raises(OutputError, match="output folder: expected a folder that can be written to"):
-        writable_folder(blocked / "sub")
-    assert writable_folder(tmp_path / "a" / "b").is_dir()
-
-
 def test_errors_of_the_disk_become_output_errors(tmp_path):
     (tmp_path / "mesh.vtu").mkdir()
     blocked = pytest.raises(OutputError, match=r"mesh\.vtu: expected a file that can be written.*Move away")
@@ -79,3 +74,89 @@ def test_only_temporaries_of_the_given_names_are_stale(tmp_path):
     remove_stale_temporaries(tmp_path, ["mesh.vtu", "step-*.vtu"])
     assert set(os.listdir(tmp_path)) == kept
     remove_stale_temporaries(tmp_path / "absent", ["mesh.vtu"])
+
+
+@pytest.mark.parametrize(
+    ("written", "unit", "value", "off_by"),
+    [
+        ("20.0 +- 0.5 C", "C", 20.0, 0.5),
+        ("20 ± .5 °C", "C", 20.0, 0.5),
+        ("293.15 +/- 0.5 K", "C", 20.0, 0.5),
+        ("-3C", "C", -3.0, 0.0),
+        ("0 +- 1 K", "K", 0.0, 1.0),
+        ("1.5 m/s", "m/s", 1.5, 0.0),
+        ("3.6 +- 1.8 km/h", "m/s", 1.0, 0.5),
+        ("8 +- 1 W/(m² K)", "W/(m2 K)", 8.0, 1.0),
+        ("0.5 W/m2K", "W/(m2 K)", 0.5, 0.0),
+        ("0.93 +- 0.02", "1", 0.93, 0.02),
+        (0.93, "1", 0.93, 0.0),
+        (1, "1", 1.0, 0.0),
+        ("80 +- 5 %", "1", 0.8, 0.05),
+        ("76.8e3 K h", "K d", 3200.0, 0.0),
+    ],
+)
+def test_values_are_read_as_people_write_them(written, unit, value, off_by) -> None:
+    found = read_measured("x", written, unit)
+    assert (found.value, found.off_by) == (pytest.approx(value, abs=1e-12), pytest.approx(off_by, abs=1e-12))
+    assert (found.low, found.high) == (found.value - found.off_by, found.value + found.off_by)
+
+
+@pytest.mark.parametrize(
+    ("written", "unit", "message"),
+    [
+        (20.0, "C", r"air: expected a number with its unit, C, got 20\.0 without one\. Write 20\.0 C\."),
+        ("20 +- 0.5", "C", r"got '20 \+- 0\.5' without one\. Write 20 \+- 0\.5 C\."),
+        ("20 F", "C", r"got '20 F'\. Write 20\.0 \+- 0\.5 C, for example\."),
+        ("0.9 C", "1", r"expected a number without a unit, or in %, got '0\.9 C'"),
+        ("warm", "C", r"expected a number in C, got 'warm'"),
+        (None, "C", r"expected a number in C, got nothing"),
+        (True, "1", r"expected a number, got True"),
+        ("20 +- -0.5 C", "C", r"behind \+- one of at least 0"),
+        ("1e999 C", "C", r"expected a finite number"),
+    ],
+)
+def test_what_is_no_value_is_refused_with_what_helps(written, unit, message) -> None:
+    with pytest.raises(ThermoxelsError, match=message):
+        read_measured("air", written, unit)
+
+
+LATTICE = Lattice((-1.0, 0.25, 3.0), 0.5, (4, 3, 5))
+
+
+@given(st.lists(st.floats(-50, 50), min_size=3, max_size=3))
+def test_index_and_world_are_inverse(index):
+    np.testing.assert_allclose(LATTICE.world_to_index(LATTICE.index_to_world(index)), index, atol=1e-9)
+
+
+def test_corners_and_centres_sit_where_the_house_says():
+    corners = LATTICE.corner_positions()
+    np.testing.assert_array_equal(corners[2, 1, 4], [-1 + 2 * 0.5, 0.25 + 0.5, 3 + 4 * 0.5])
+    np.testing.assert_array_equal(corners[-1, -1, -1], LATTICE.hi)
+    np.testing.assert_array_equal(LATTICE.cell_centres()[0, 0, 0], [-0.75, 0.5, 3.25])
+    assert LATTICE.num_corners == 60 and LATTICE.cell_shape == (3, 2, 4)
+    slope = np.array([1.0, -2.0, 0.5])  # the mean of a linear field is its value at the centre
+    np.testing.assert_allclose(LATTICE.corner_to_cell_mean(corners @ slope), LATTICE.cell_centres() @ slope)
+
+
+@given(
+    st.lists(st.floats(-10, 10), min_size=3, max_size=3),
+    st.lists(st.floats(0.01, 20), min_size=3, max_size=3),
+    st.integers(1, 200),
+)
+def test_covering_covers_and_wastes_less_than_a_voxel(lo, size, resolution):
+    box_lo = np.array(lo)
+    box_hi = box_lo + np.array(size)
+    lattice = Lattice.covering(box_lo, box_hi, resolution)
+    slack = 1e-5 * lattice.voxel_size
+    assert np.all(np.array(lattice.lo) <= box_lo + slack) and np.all(np.array(lattice.hi) >= box_hi - slack)
+    assert max(lattice.cell_shape) == resolution
+    assert np.all(np.array(lattice.hi) - lattice.lo - (box_hi - box_lo) < lattice.voxel_size + slack)
+
+
+@pytest.mark.parametrize(
+    "lo, hi, resolution",
+    [((0, 0, 0), (1, 0, 1), 8), ((0, 0, 0), (1, np.nan, 1), 8), ((0, 0, 0), (1, 1, 1), 0), ((1, 1, 1), (0, 0, 0), 8)],
+)
+def test_boxes_of_no_size_are_refused(lo, hi, resolution):
+    with pytest.raises(ThermoxelsError, match="scene box: expected three finite sides"):
+        Lattice.covering(lo, hi, resolution)

@@ -9,8 +9,6 @@ from typing import Any
 import pytest
 import yaml
 from nerfstudio.configs.method_configs import all_methods
-from nerfstudio.plugins.registry_dataparser import discover_dataparsers
-from nerfstudio.plugins.types import MethodSpecification
 
 from thermoxels_ns import config
 from thermoxels_ns.core.errors import ThermoxelsError
@@ -25,7 +23,6 @@ else:
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 METHODS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.method_configs"]
-DATAPARSERS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.dataparser_configs"]
 
 FILES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
 OTHERS = ("patches-", "scene-", "conditions-", "house-corner-", "materials")
@@ -84,32 +81,16 @@ def test_a_method_goes_through_the_file_that_training_saves(name: str) -> None:
     assert yaml.dump(again) == yaml.dump(ours)
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_an_entry_point_of_a_method_leads_to_it(name: str) -> None:
-    specification = _object(METHODS[name])
-    assert isinstance(specification, MethodSpecification)
-    assert specification.config.method_name == name
-    # What ns-train offers.
-    assert all_methods[name] == specification.config
-
-
 def test_methods_share_no_configuration() -> None:
     assert set(METHOD_FILES) == set(METHODS) - {"thermoxels"}
     seen: set[int] = set()
-    for reference in METHODS.values():
+    for name, reference in METHODS.items():
+        assert all_methods[name] == _object(reference).config  # what ns-train offers
         pipeline = _object(reference).config.pipeline
         parts = {id(pipeline), id(pipeline.datamanager), id(pipeline.datamanager.dataparser), id(pipeline.model)}
         assert len(parts) == 4
         assert not parts & seen
         seen |= parts
-
-
-@pytest.mark.parametrize("name", DATAPARSERS)
-def test_an_entry_point_of_a_dataparser_leads_to_it(name: str) -> None:
-    found, descriptions = discover_dataparsers()
-    specification = _object(DATAPARSERS[name])
-    assert found[name] == specification.config
-    assert descriptions[name] == specification.description
 
 
 @pytest.mark.parametrize(

@@ -27,13 +27,6 @@ def full() -> GridSnapshot:
     )
 
 
-def test_a_sound_snapshot_is_taken_as_it_is():
-    snapshot = full()
-    assert snapshot.evidence is not None
-    nothing_ended = replace(snapshot, evidence=replace(snapshot.evidence, half_depth_density=np.zeros(0, np.float32)))
-    assert nothing_ended.centre_density().sum() == 6.0
-
-
 @pytest.mark.parametrize("part", ["evidence", "views"])
 def test_what_cannot_be_is_refused_by_name(part):
     """Another shape, numbers that are not finite, and numbers beyond what they may be."""

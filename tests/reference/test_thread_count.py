@@ -10,7 +10,6 @@ from tests.support.boxed_scene import write_boxed_scene
 from tests.support.short_training import train_with_optimizers
 from thermoxels_ns.core import threads
 from thermoxels_ns.core.threads import num_threads
-from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, seen_behind
 from thermoxels_ns.synthetic.scene_folder import make_scene
 
 
@@ -85,22 +84,6 @@ def test_a_training_that_refines_and_prunes(scene):
 
 TOO_MANY_FOR_ONE_THREAD = 40_000
 """Rays of a batch whose tensors torch and BLAS split among their threads on every processor."""
-
-
-@pytest.mark.parametrize("make", [SphereImage, SkyTemperature])
-def test_backgrounds_of_large_batches(make):
-    directions = torch.randn(TOO_MANY_FOR_ONE_THREAD, 3, generator=torch.Generator().manual_seed(0))
-    directions = torch.nn.functional.normalize(directions, dim=-1)
-    results = []
-    for count in (1, 2, 3, 5, 7):
-        torch.set_num_threads(count)
-        background = make()
-        (parameter,) = background.parameters()
-        parameter.data = torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1))
-        values = seen_behind(background, directions, directions[:, 0] > -0.9)
-        (gradient,) = torch.autograd.grad((values * torch.sin(values)).sum(), parameter)
-        results.append({"values": values.detach(), "gradient": gradient})
-    assert_same_bits(results)
 
 
 class NoProductOfLongVectors(TorchDispatchMode):

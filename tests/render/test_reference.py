@@ -2,17 +2,15 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
-from torch.nn.functional import normalize
 
 from tests.reference.two_renderers import as_double, in_double, random_grid, random_request
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render import reference
 from thermoxels_ns.render.ray_render import RenderOptions
-from thermoxels_ns.render.reference import ray_weights, sample_box
+from thermoxels_ns.render.reference import sample_box
 
 LO, HI = torch.tensor([-1.0, -1.0, -1.0]), torch.tensor([1.0, 1.0, 1.0])
 
@@ -42,26 +40,6 @@ def test_renders_are_the_sums_of_the_paper():
         assert float(seen.accumulation[r]) == pytest.approx(1.0 - left, abs=1e-12)
         if left < 1.0:
             assert float(seen.depth[r]) == pytest.approx(distance / (1.0 - left), rel=1e-9)
-
-
-def test_gradients_of_the_weights_are_exact():
-    density = (torch.rand(3, 6, dtype=torch.float64) * 5 + 0.1).requires_grad_()
-    deltas = torch.full((3, 6), 0.1, dtype=torch.float64)
-    along = ray_weights(density, deltas)
-    torch.testing.assert_close(along.weights.sum(-1) + along.transmittance, torch.ones(3, dtype=torch.float64))
-    assert torch.autograd.gradcheck(lambda d: tuple(vars(ray_weights(d, deltas)).values()), (density,))
-
-
-def test_infinite_density_over_a_step_of_no_length_has_no_weight():
-    along = ray_weights(torch.tensor([[float("inf"), 1.0]]), torch.tensor([[0.0, 0.1]]))
-    assert float(along.weights[0, 0]) == 0.0
-    assert float(along.weights[0, 1]) == pytest.approx(-np.expm1(-0.1))
-
-
-def test_grazing_an_edge_is_a_miss_of_no_length():
-    origin, direction = torch.tensor([[-2.0, 0.0, 0.0]]), normalize(torch.tensor([[1.0, 1.0, 0.0]]), dim=-1)
-    steps = sample_box(origin, direction, LO, HI, step=0.1)
-    assert float(steps.deltas.sum()) == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("activation", ["relu", "softplus", "exp"])

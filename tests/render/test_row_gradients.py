@@ -2,8 +2,10 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from numba import njit
 
 from tests.reference.two_renderers import (
     EVERYTHING,
@@ -17,7 +19,7 @@ from tests.reference.two_renderers import (
 from thermoxels_ns.core.threads import num_threads, set_num_threads
 from thermoxels_ns.render import fused
 from thermoxels_ns.render.fused import render as fused_render
-from thermoxels_ns.render.kernels import AHEAD
+from thermoxels_ns.render.kernels import AHEAD, prefetch
 from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.training.optimizers import touched_rows
 
@@ -72,3 +74,29 @@ def test_gradients_of_renders_in_one_step_are_summed_in_the_order_of_rows(render
     rows, values = touched_rows(grid.sh.grad)
     assert bool((rows[1:] > rows[:-1]).all())
     torch.testing.assert_close(torch.zeros_like(grid.sh).index_add(0, rows, values).detach(), sum(dense))
+
+
+@njit(error_model="numpy")
+def sum_with_hints(values, rows):
+    total = 0.0
+    for place in range(len(rows)):
+        prefetch(values, rows[place], 1)
+        total += values.flat[0]
+    return total
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int32, np.uint8])
+@pytest.mark.parametrize("shape", [(7,), (7, 3)], ids=["list", "table"])
+def test_hints_read_and_write_nothing(shape, dtype):
+    values = np.arange(2, 2 + np.prod(shape)).reshape(shape).astype(dtype)
+    before = values.copy()
+    rows = np.array([0, 6, 7, -1, 10**6, -(10**6), 2**40, -(2**40)])
+    assert sum_with_hints(values, rows) == 2.0 * len(rows)
+    assert np.array_equal(values, before)
+
+
+def test_hint_is_compiled_in():
+    """A hint that does nothing at all would pass every other test."""
+    sum_with_hints(np.zeros((4, 2), np.float32), np.zeros(3, np.int64))
+    code = "".join(sum_with_hints.inspect_llvm().values())
+    assert "call void @llvm.prefetch" in code

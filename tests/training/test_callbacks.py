@@ -38,8 +38,8 @@ def model_of(**options) -> ThermoxelsModel:
 class Rays:
     """Stands for the data manager: rays along -x onto the slab, and two cameras that have the box in view."""
 
-    def __init__(self, width: float = 0.97):
-        self.width = width
+    def __init__(self, places: torch.Tensor | None = None):
+        self.places = torch.linspace(-0.97, 0.97, 30) if places is None else places
         pose = torch.from_numpy(look_at((3.0, 0.0, 0.0), (0.0, 0.0, 0.0))[:3]).float()
         cameras = Cameras(torch.stack((pose, pose)), fx=50.0, fy=50.0, cx=50.0, cy=50.0, width=100, height=100)
         self.train_dataset = SimpleNamespace(cameras=cameras)
@@ -48,7 +48,7 @@ class Rays:
         self.train_dataset.cameras.camera_to_worlds[:, :, [0, 2]] *= -1.0
 
     def training_rays(self, stream: int, most: int) -> Iterator[RayBundle]:
-        y, z = torch.meshgrid(*[torch.linspace(-self.width, self.width, 30)] * 2, indexing="ij")
+        y, z = torch.meshgrid(*[self.places] * 2, indexing="ij")
         origins = torch.stack((torch.full_like(y, 3.0), y, z), -1).reshape(-1, 3)
         for part in origins.split(400):
             yield RayBundle(part, torch.tensor([-1.0, 0.0, 0.0]).expand_as(part), torch.ones(len(part), 1))
@@ -70,14 +70,7 @@ def test_pruning_keeps_what_rays_see_and_its_neighbours(dilation, layers):
 def test_no_hole_opens_where_no_ray_was_drawn():
     """One ray in four of a fine surface: the voxels between are opaque, and stay."""
     model = model_of(resolutions=(16,))
-
-    class Few(Rays):
-        def training_rays(self, stream: int, most: int) -> Iterator[RayBundle]:
-            y, z = torch.meshgrid(*[torch.arange(-0.9375, 1.0, 0.25)] * 2, indexing="ij")
-            origins = torch.stack((torch.full_like(y, 3.0), y, z), -1).reshape(-1, 3)
-            yield RayBundle(origins, torch.tensor([-1.0, 0.0, 0.0]).expand_as(origins), torch.ones(len(origins), 1))
-
-    prune_by_rays(model, Few(), 0.01, 0)
+    prune_by_rays(model, Rays(torch.arange(-0.9375, 1.0, 0.25)), 0.01, 0)
     first = int(model.grid.kept.any(-1).any(-1).nonzero().max())
     assert bool(model.grid.kept[first - 1].all()), "the first layer that is solid throughout"
 
@@ -130,24 +123,29 @@ def attributes(model: ThermoxelsModel, steps: int) -> TrainingCallbackAttributes
     return TrainingCallbackAttributes(optimizers, None, pipeline, trainer)
 
 
+def steps_of(model: ThermoxelsModel, given: TrainingCallbackAttributes, count: int) -> Iterator[int]:
+    """Run the callbacks of each step, and one of the optimisers after it: they hold what the model does."""
+    callbacks = coarse_to_fine_callbacks(model, given)
+    grids = {"": model.grid} | ({"surroundings_": model.surroundings.grid} if model.surroundings else {})
+    for step in range(count):
+        for callback in callbacks:
+            callback.run_callback(step)
+        yield step
+        for prefix, grid in grids.items():
+            for name, parameter in grid.row_parameters().items():
+                optimizer = given.optimizers.optimizers[prefix + name]
+                assert optimizer.param_groups[0]["params"] == [parameter] == given.optimizers.parameters[prefix + name]
+                parameter.grad = torch.zeros_like(parameter)
+                parameter.grad[: 5 + step] = 1e-9
+                optimizer.step()
+                assert set(optimizer.state) == {parameter}
+                assert all(len(values) == len(parameter) for values in optimizer.state[parameter].values())
+
+
 def test_optimisers_follow_the_schedule():
     """At each change of the lattice every optimiser holds the new parameters, with state of as many rows."""
     model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(5,), thin_at=(7,), prune_dilation=1)
-    given = attributes(model, 10)
-    callbacks = coarse_to_fine_callbacks(model, given)
-    sizes = []
-    for step in range(10):
-        for callback in callbacks:
-            callback.run_callback(step)
-        sizes.append(len(model.grid.voxels))
-        for name, parameter in model.grid.row_parameters().items():
-            optimizer = given.optimizers.optimizers[name]
-            assert optimizer.param_groups[0]["params"] == [parameter] == given.optimizers.parameters[name]
-            parameter.grad = torch.zeros_like(parameter)
-            parameter.grad[: 5 + step] = 1e-9
-            optimizer.step()
-            assert set(optimizer.state) == {parameter}
-            assert all(len(values) == len(parameter) for values in optimizer.state[parameter].values())
+    sizes = [len(model.grid.voxels) for _ in steps_of(model, attributes(model, 10), 10)]
     # The slab fills 4 of 16 layers; its front with a neighbour on either side, then what a surface alone needs.
     assert sizes[:3] == [512] * 3 and sizes[3:5] == [192 * 8] * 2 and sizes[5] == sizes[6] < sizes[4]
     assert sizes[7] == sizes[9] < sizes[6] and model.step == 9
@@ -157,21 +155,11 @@ def test_optimisers_follow_the_schedule():
 def test_surroundings_are_split_where_rays_see_some_and_dropped_where_infinity_explains_all(there):
     model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(5,))
     assert model.surroundings is not None
-    grid = model.surroundings.grid
-    given = attributes(model, 10)
-    callbacks = coarse_to_fine_callbacks(model, given)
-    sizes = []
-    for step in range(6):
-        for callback in callbacks:
-            callback.run_callback(step)
+    grid, sizes = model.surroundings.grid, []
+    for step in steps_of(model, attributes(model, 10), 6):
         if there and step == 0:
             grid.density.data.fill_(1.0)
         sizes.append(len(grid.voxels))
-        for name, parameter in grid.row_parameters().items():
-            optimizer = given.optimizers.optimizers[f"surroundings_{name}"]
-            assert optimizer.param_groups[0]["params"] == [parameter]
-            parameter.grad = torch.ones_like(parameter) * 1e-9
-            optimizer.step()
     assert 0 < sizes[0] < 0.5 * 6 * 48 * 48 * 12, "only what rays cross is kept"
     assert (model.seen_surroundings is not None) == there
     assert sizes[3] > sizes[2] if there else sizes[1:4] == [1, 1, 1], "a third of the way to the first change"
@@ -180,45 +168,33 @@ def test_surroundings_are_split_where_rays_see_some_and_dropped_where_infinity_e
 
 
 @pytest.mark.parametrize("carve", ["auto", "off"])
-def test_air_is_carved_at_the_start_and_after_a_refinement_and_optimisers_follow(carve):
+def test_air_is_carved_at_the_start_and_after_a_refinement(carve):
     """Lines from the middle of one side to points on the other, of which each lattice carves what it can resolve."""
     side = np.linspace(-0.6, 0.6, 13)
     points = np.stack(np.meshgrid([0.93], side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     count = len(points)
     lines = FeatureRays(np.tile([-0.99, 0.01, 0.01], (count, 1)), np.arange(count), points, np.zeros(count))
-    model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(), thin_at=(), prune_threshold=0.0, carve=carve)
+    model = model_of(resolutions=(8, 16), refine_at=(3,), prune_threshold=0.0, carve=carve)
     model.feature_rays = lines
-    given = attributes(model, 10)
-    callbacks = coarse_to_fine_callbacks(model, given)
-    for step in range(4):
-        for callback in callbacks:
-            callback.run_callback(step)
+    for _ in steps_of(model, attributes(model, 10), 4):
         kept, empty = model.grid.kept.numpy(), air_voxels(model.grid.lattice, lines)
-        if carve == "off":
-            assert kept.all()
-        else:
-            assert empty.any() and not (kept & empty).any()
-        for name, parameter in model.grid.row_parameters().items():
-            assert given.optimizers.parameters[name] == [parameter]
-            assert len(parameter) == model.grid.voxels.num_rows
+        assert kept.all() if carve == "off" else empty.any() and not (kept & empty).any()
 
 
-def test_where_a_camera_was_held_is_air_unless_photographs_look_there():
+@pytest.mark.parametrize("looking_there", [True, False])
+def test_where_a_camera_was_held_is_air_unless_photographs_look_there(looking_there):
     """Lines from the middle of the box to points at its sides."""
     points = np.array([[x, y, z] for x in (-0.9, 0.9) for y in (-0.9, 0.0, 0.9) for z in np.linspace(-0.9, 0.9, 6)])
     count = len(points)
-    for looking_there in (True, False):
-        model = model_of(resolutions=(8,), prune_at=(), thin_at=(), prune_threshold=0.0)
-        model.feature_rays = FeatureRays(np.zeros((count, 3)), np.arange(count), points, np.full(count, 1.0))
-        given = attributes(model, 10)
-        if not looking_there:
-            given.pipeline.datamanager.look_away()
-        callbacks = coarse_to_fine_callbacks(model, given)
-        for callback in callbacks:
-            callback.run_callback(0)
-        far = np.linalg.norm(model.grid.lattice.cell_centres(), axis=-1)
-        assert bool(model.grid.kept[torch.from_numpy(far < 0.45)].all()) == looking_there
-        assert bool(model.grid.kept[torch.from_numpy(far > 0.5)].all())
+    model = model_of(prune_threshold=0.0)
+    model.feature_rays = FeatureRays(np.zeros((count, 3)), np.arange(count), points, np.full(count, 1.0))
+    given: Any = attributes(model, 10)
+    if not looking_there:
+        given.pipeline.datamanager.look_away()
+    next(steps_of(model, given, 1))
+    far = np.linalg.norm(model.grid.lattice.cell_centres(), axis=-1)
+    assert bool(model.grid.kept[torch.from_numpy(far < 0.45)].all()) == looking_there
+    assert bool(model.grid.kept[torch.from_numpy(far > 0.5)].all())
 
 
 @pytest.mark.parametrize("voxel_pixels", [0.0, 1.6])
@@ -227,13 +203,8 @@ def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is(voxel_pixels
     budget = {"memory_budget_gb": 0.001, "prune_threshold": 0.0, "voxel_pixels": voxel_pixels}
     model = model_of(resolutions=(8, 32), refine_at=(2,), **budget)
     given: Any = attributes(model, 4)
-    callbacks = coarse_to_fine_callbacks(model, given)
-    for step in range(2):
-        for callback in callbacks:
-            callback.run_callback(step)
     with nullcontext() if voxel_pixels else pytest.raises(MemoryBudgetError, match="32 x 32 x 32"):
-        for callback in callbacks:
-            callback.run_callback(2)
+        assert [*steps_of(model, given, 3)][-1] == 2
     assert model.config.resolutions == ((8,) if voxel_pixels else (8, 32))
     assert given.trainer.saved == ([(8,)] if voxel_pixels else []), "what is resumed knows it"
     assert model.grid.lattice.cell_shape == (8, 8, 8) and model.grid.voxels.all_kept

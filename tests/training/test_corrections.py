@@ -1,11 +1,13 @@
-"""Flaws of cameras that a training finds and corrects, against their truth."""
+"""Flaws of cameras and a plain backdrop, which a training finds, against their truth."""
 
 import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.support.short_training import Training, train
+from thermoxels_ns.nerfstudio_bridge import compare_with_truth
 from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
@@ -68,3 +70,26 @@ def test_nothing_is_corrected_in_a_clean_scene(tmp_path):
     own, other = pipeline.state_dict(), off.state_dict()
     for name in set(own) & set(other):
         np.testing.assert_array_equal(own[name].numpy(), other[name].numpy(), err_msg=name)
+
+
+COURSE = {"resolutions": [16, 32], "refine_at": [120], "prune_at": [220], "photo_depth": "on"}
+
+
+@pytest.fixture(scope="module")
+def grey_sky(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "house"
+    write_scene(make_scene("house-corner+sky=0.55,0.57,0.60"), folder, 20, 1, width=128, height=96, progress=False)
+    path = folder / "transforms.json"
+    wide = {"scene_box": [[-6.7, -8.0, -5.3], [7.7, 6.4, 9.1]]}
+    path.write_text(json.dumps(json.loads(path.read_text()) | wide))
+    return folder
+
+
+def fscore(grey_sky, **options) -> float:
+    return compare_with_truth(train(grey_sky, 300, {**COURSE, **options}, rays=1024))["fscore"]
+
+
+def test_a_grey_sky_does_not_become_a_grey_cloud(grey_sky):
+    """Without what photographs say about it, every image fits and most of the surface is cloud."""
+    assert fscore(grey_sky) > 0.95
+    assert fscore(grey_sky, photo_depth="off") < 0.6

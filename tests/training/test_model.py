@@ -310,30 +310,6 @@ def test_torch_leaves_room_for_other_programs(monkeypatch, environment, expected
     assert torch_asked == ([] if expected is None else [expected, expected]) and kernels_asked == [3, None]
 
 
-def test_both_backends_train_alike():
-    """The same batch through the compiled kernels and through plain torch: outputs, losses and gradients."""
-    found = {}
-    for backend in ("fused", "reference"):
-        model = make(backend=backend, early_stop=0.0, smallest_weight=0.0, distortion_ramp=(0, 1), sh_degree=1).train()
-        model.update_to_step(5)
-        generator = torch.Generator().manual_seed(0)
-        for parameter in model.grid.row_parameters().values():
-            parameter.data += torch.randn(parameter.shape, generator=generator)
-        outputs = model(rays())
-        terms = model.get_loss_dict(outputs, targets())
-        sum(terms.values()).backward()
-        grads = {name: p.grad.to_dense() for name, p in model.named_parameters() if p.grad is not None}
-        found[backend] = (terms, grads, outputs)
-    (terms, grads, outputs), (terms2, grads2, outputs2) = found["fused"], found["reference"]
-    assert terms.keys() == terms2.keys() and grads.keys() == grads2.keys() and len(grads) >= 5
-    for name in ("rgb", "thermal", "accumulation"):
-        torch.testing.assert_close(outputs[name], outputs2[name], rtol=1e-5, atol=1e-5)
-    for name, value in terms.items():
-        torch.testing.assert_close(value, terms2[name], rtol=1e-4, atol=1e-9)
-    for name, gradient in grads.items():
-        assert float((gradient - grads2[name]).norm()) <= 1e-3 * float(grads2[name].norm()), name
-
-
 def test_a_lattice_beyond_the_budget_is_refused_before_it_is_built(monkeypatch):
     monkeypatch.setattr("thermoxels_ns.training.model.VoxelGrid", lambda *_: pytest.fail("the field was built"))
     with pytest.raises(MemoryBudgetError, match=r"4096 x 4096 x 2048 voxels .*--pipeline.model.memory-budget-gb"):

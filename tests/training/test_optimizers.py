@@ -1,5 +1,4 @@
 import copy
-import io
 
 import numpy as np
 import pytest
@@ -78,22 +77,6 @@ def test_each_row_counts_its_own_updates():
     np.testing.assert_allclose((value.detach() - start).numpy(), expected, rtol=1e-10, atol=1e-14)
     np.testing.assert_array_equal(optimizer.state[value]["updates"].numpy(), [len(grads) for grads in history])
     assert len({len(grads) for grads in history}) > 3
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("layout", ["sparse", "dense"])
-def test_rows_without_a_gradient_keep_value_and_state_to_the_last_bit(kind, layout):
-    value = parameter()
-    optimizer = KINDS[kind]([value], lr=0.1)
-    step(optimizer, value, gradient(0))
-    before = value.detach().clone(), copy.deepcopy(dict(optimizer.state[value]))
-    grad = gradient(1, 0.4)
-    touched = torch.zeros(ROWS, dtype=torch.bool)
-    touched[grad.indices()[0]] = True
-    step(optimizer, value, grad if layout == "sparse" else grad.to_dense())
-    assert 5 < int(touched.sum()) < 45
-    for old, new in [(before[0], value.data), *((before[1][k], v) for k, v in optimizer.state[value].items())]:
-        assert torch.equal(old[~touched], new[~touched]) and bool((old[touched] != new[touched]).any())
 
 
 def plain_twin(
@@ -196,26 +179,3 @@ def test_state_follows_split_and_pruned_rows(kind, change):
         rows = torch.tensor([0, len(new) - 1])
         step(optimizer, new, torch.sparse_coo_tensor(rows[None], torch.ones(2, new.shape[1]), new.shape))
         assert (new != before).any(-1).nonzero()[:, 0].tolist() == rows.tolist()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_training_goes_on_bit_for_bit_after_a_checkpoint(kind):
-    grid, optimizers = trained_grid(kind)
-    file = io.BytesIO()
-    torch.save({"grid": grid.state_dict(), **{name: o.state_dict() for name, o in optimizers.items()}}, file)
-    file.seek(0)
-    loaded = torch.load(file, weights_only=True)
-    other = VoxelGrid(Lattice((0.0, 0.0, 0.0), 1.0, (6, 5, 4)), sh_degree=1, temperature_degree=1)
-    resumed = {name: KINDS[kind]([p], lr=0.7) for name, p in other.row_parameters().items()}
-    other.load_state_dict(loaded["grid"])
-    for name, optimizer in resumed.items():
-        optimizer.load_state_dict(loaded[name])
-        assert optimizer.param_groups[0]["lr"] == 0.1
-    for n in range(3):
-        for (name, p), q in zip(grid.row_parameters().items(), other.row_parameters().values()):
-            rows = torch.arange(n, len(p), 2 + n)
-            push = torch.sparse_coo_tensor(rows[None], torch.randn(len(rows), p.shape[1]), p.shape)
-            step(optimizers[name], p, push)
-            step(resumed[name], q, push.clone())
-            assert torch.equal(p, q)
-            assert all(torch.equal(v, resumed[name].state[q][k]) for k, v in optimizers[name].state[p].items())

@@ -80,7 +80,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         raise AuditError(missing, expected="a file", got="none", remedy=remedy)
     begin = clock.perf_counter()
     others = ("summary.json", "quality.json", "series.csv")
-    folder = result_folder(options.output_dir, (ANSWERS, PAGE, SURFACE), (PAGE, ANSWERS), others)
+    folder = result_folder(options.output_dir, (ANSWERS, PAGE, SURFACE), (SURFACE, ANSWERS), others)
     conditions = load_conditions(options.conditions)
     mesh = read_mesh(options.mesh)
     export = read_export_summary(options.mesh, say)

@@ -29,6 +29,7 @@ from thermoxels_ns.radiometry.thermal_pixels import (
     PixelReport,
     ThermalImage,
     ThermalUnit,
+    load_array,
     masked_image,
     read_thermal_file,
     size_of_double_tiff,
