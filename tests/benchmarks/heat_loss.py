@@ -4,8 +4,8 @@
 
 A body of concrete starts at 20 C in air of 0 C that takes heat from all of its surface with 25 W/(m2 K); the heat it
 has lost after an hour (ten equal steps) is compared with that of the exact body, a conforming mesh of the scene's
-signed distance on a lattice 1.5 times as fine. Reconstructions are meshed as an export does by default: voxels
-with the plain area of their faces, voxels with the area factor, and conforming. Scenes with a known truth only.
+signed distance on a lattice 1.5 times as fine. Reconstructions are meshed as an export does by default, and as voxels.
+Scenes with a known truth only.
 """
 
 from dataclasses import dataclass

@@ -113,10 +113,8 @@ def test_a_series_that_ends_before_the_run_is_named(tmp_path, time) -> None:
     path.write_text("hours,air_c\n0,10\n1,12\n")
     airs = {"outside_air": OutsideAir(10.0, "iso-6946-combined", air_series=str(path))}
     (warning,) = unused_settings(HeatScene(CONCRETE, time, **airs))
-    assert (
-        warning
-        in run_scene(HeatScene(CONCRETE, time, adiabatic=("interior*", "cut"), **airs), room(), Goals()).warnings
-    )
+    scene = HeatScene(CONCRETE, time, adiabatic=("interior*", "cut"), **airs)
+    assert warning in run_scene(scene, room(), Goals()).warnings
     assert "outside_air is from 0 to 1 hours" in warning and "from 0 to 2 hours" in warning
     assert unused_settings(HeatScene(CONCRETE, TimeSteps(60, 60.0), **airs)) == ()
 

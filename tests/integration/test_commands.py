@@ -215,7 +215,7 @@ def meshes(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("meshes")
     write_mesh(folder / "room.vtu", room())
     (folder / "hour.yaml").write_text(
-        'materials: {"*": concrete}\ninitial: {temperature_c: 15.0}\ntime: {duration_s: 3600.0, steps: 4}\n'
+        'materials: {"*": concrete}\ninitial: {temperature_c: 15.0}\ntime: {step_seconds: 900.0, steps: 4}\n'
         "inside_air: {air_c: 20.0, coefficient: iso-6946-combined}\n"
         "outside_air: {air_c: -5.0, coefficient: iso-6946-combined}\n"
     )
