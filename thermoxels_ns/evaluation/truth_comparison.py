@@ -155,18 +155,11 @@ class SurfaceDistances:
 
 
 def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArray:
-    """Return points spread evenly by area over triangles, shape (count, 3); the same points every time.
+    """Return points spread by area over triangles, shape (count, 3); the same points every time."""
+    from trimesh import Trimesh
+    from trimesh.sample import sample_surface
 
-    A low-discrepancy sequence (the golden ratio and the plastic number's R2 sequence) walks along the triangles.
-    """
-    total = np.concatenate([[0.0], np.cumsum(facet_areas(points, facets))])
-    number = np.arange(count)
-    which = np.searchsorted(total, (number + 0.5) / count * total[-1], side="right") - 1
-    which = np.clip(which, 0, len(facets) - 1)
-    u, v = np.mod(0.5 + number * 0.7548776662466927, 1.0), np.mod(0.5 + number * 0.5698402909980532, 1.0)
-    u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
-    a, b, c = (points[facets[which, n]] for n in range(3))
-    return a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    return np.asarray(sample_surface(Trimesh(points, facets, process=False), count, seed=0)[0], np.float64)
 
 
 def surface_distances(

@@ -89,10 +89,10 @@ def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatAr
         above.fill_between(times, states.min(axis=1), states.max(axis=1), color="#e9dcd6", label="coldest to hottest")
         above.plot(times, mean_c, label="mean of the volume", color=INK, linewidth=2)
         for name, values in list(zip(probe_names, probes_c.T))[:_MOST_CURVES]:
-            above.plot(times, values, label=_as_written(name))
+            above.plot(times, values, label=name.replace("$", r"\$"))  # no formula
         below.axhline(0.0, color=SOFT, linewidth=0.8)
         for heat in acting:
-            below.stairs(heat.heat_w, times, baseline=None, label=_as_written(heat.effect), linewidth=1.4)
+            below.stairs(heat.heat_w, times, baseline=None, label=heat.effect.replace("$", r"\$"), linewidth=1.4)
         below.stairs(solution.heat_w, times, baseline=None, label="all together: stored", color=INK, linewidth=2)
         below.set_xlabel(f"time [{unit}]")
         below.set_xlim(times[0], times[-1])
@@ -100,11 +100,6 @@ def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatAr
             axis.set_ylabel(label)
             axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8.5)
         return svg_text(figure)
-
-
-def _as_written(name: str) -> str:
-    """Give a name such that matplotlib takes no part of it for a formula."""
-    return name.replace("$", r"\$")
 
 
 def colours(temperature_c: npt.NDArray, limits: tuple[float, float] | None = None) -> npt.NDArray[np.uint8]:

@@ -90,7 +90,7 @@ def test_a_few_strays_below_an_open_underside_do_not_make_it_deeper():
     found = interior(cells, LATTICE, looking_at(MIDDLE, around()), 0).hidden
     assert clean[:, :, 5].any() and not clean[:, :, :5].any()
     assert not found[:, :, :5].any() and np.array_equal(found, clean)
-    assert convex_hull(cells, of_centres=True)[:, :, 3:5].sum() > 10  # what would be filled
+    assert convex_hull(cells)[:, :, 3:5].sum() > 10  # what would be filled
 
 
 def test_what_cameras_look_into_is_not_inside():
@@ -225,7 +225,7 @@ def test_a_hull_holds_the_voxels_whose_centres_a_triangulation_of_centres_holds(
     cells = np.random.default_rng(seed).random((12, 9, 10)) < 0.02
     cells[6, 4, 5] = True
     inside = Delaunay(np.argwhere(cells)).find_simplex(np.argwhere(np.ones_like(cells))) >= 0
-    assert np.array_equal(convex_hull(cells, of_centres=True).ravel(), inside)
+    assert np.array_equal(convex_hull(cells).ravel(), inside)
 
 
 @pytest.mark.parametrize("lo", [12, 13])

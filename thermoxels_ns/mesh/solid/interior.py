@@ -113,7 +113,7 @@ def _hidden(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views
     # The convex hull of every body, strays of which do not count.
     labels, hull = connected(sealed & within), np.zeros_like(sealed)
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
-        hull[box] |= convex_hull(_without_strays(labels[box] == number), of_centres=True)
+        hull[box] |= convex_hull(_without_strays(labels[box] == number))
     if not (hull & ~sealed).any():
         return np.zeros_like(hull)
     shadow = _behind(sealed, lattice, views, SHADOW_SURROUNDED) & hull

@@ -100,8 +100,8 @@ def fill_enclosed(cells: BoolArray) -> BoolArray:
     return (labels != labels[0, 0, 0])[1:-1, 1:-1, 1:-1]
 
 
-def convex_hull(cells: BoolArray, of_centres: bool = False) -> BoolArray:
-    """Return the voxels whose centres lie in the convex hull of the solid voxels: of the cubes, or of their centres.
+def convex_hull(cells: BoolArray) -> BoolArray:
+    """Return the voxels whose centres lie in the convex hull of the centres of the solid voxels.
 
     The hull meets every column of voxels in one interval, so it costs one comparison per column and plane.
     """
@@ -114,9 +114,7 @@ def convex_hull(cells: BoolArray, of_centres: bool = False) -> BoolArray:
     steps = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
     ends_of_columns = [np.column_stack((columns + step, ends)) for step in steps for ends in (first, last)]
     planes = ConvexHull(np.concatenate(ends_of_columns).astype(np.float64)).equations
-    if of_centres:  # the cubes' hull is that of the centres plus half a cube to all sides
-        planes[:, 3] += 0.5 * np.abs(planes[:, :3]).sum(axis=1) - 1e-9
-
+    planes[:, 3] += 0.5 * np.abs(planes[:, :3]).sum(axis=1) - 1e-9  # from the cubes' hull half a cube inwards
     nx, ny, nz = cells.shape
     x, y = np.arange(nx)[:, None] + 0.5, np.arange(ny)[None, :] + 0.5
     low, high = np.full((nx, ny), -np.inf), np.full((nx, ny), np.inf)
