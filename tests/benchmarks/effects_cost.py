@@ -6,27 +6,21 @@ Run it on an otherwise idle machine:
 
 A room of concrete with the scene of configs/scene-all-effects.yaml takes equal steps, so that all rows take the same
 number of them. Times are medians; all problems take turns in one process, and compiled kernels are loaded before the
-first. The last line compares conduction alone with plain conjugate gradients on the same matrices.
+first.
 """
 
 import statistics
 from dataclasses import dataclass, replace
-from operator import truediv
 
 import numpy as np
 import tyro
 from measuring import print_head, print_row, take_turns
-from scipy import sparse
 
 from tests.support.scene_bodies import tagged_body
-from thermoxels_ns.fem.implicit_equation import LinearSolver
-from thermoxels_ns.fem.p1_kernels import lumped_mass, stiffness_matrix
-from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
+from thermoxels_ns.fem.problem import TimeSteps, effect_labels
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.scene import load_heat_scene
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-
-TOLERANCE = 1e-12
 
 
 @dataclass
@@ -60,34 +54,6 @@ class EffectsCost:
             median = statistics.median(seconds[name])
             share = median / statistics.median(seconds["all effects"])
             print_row(name, f"{median:.2f}", f"{share:.2f}", solution.newton_iterations.sum())
-        self.conduction_only(problems["conduction only"], steps)
-
-    def conduction_only(self, problem: HeatProblem, steps: TimeSteps) -> None:
-        """Conduction alone, through the effects layer and by hand."""
-        seconds, states = take_turns(
-            {
-                "through effects": lambda: solve_heat(problem, steps, relative_tolerance=TOLERANCE).temperature_c,
-                "plain conjugate gradients": lambda: plainly(problem, steps),
-            },
-            5 * self.repeats,
-        )
-        ours, plain = seconds.values()
-        ratio = statistics.median(map(truediv, ours, plain))
-        difference = np.abs(states["through effects"] - states["plain conjugate gradients"]).max()
-        print(f"\nconduction only: {ratio:.3f} of plain conjugate gradients, largest difference {difference:.1e} K")
-
-
-def plainly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
-    """Backward Euler with the assembled matrices, conjugate gradients and nothing else."""
-    points, tets = problem.mesh.points_m, problem.mesh.tets
-    stiffness = stiffness_matrix(points, tets, problem.conductivity_w_mk)
-    mass = lumped_mass(points, tets, problem.heat_capacity_j_m3k)
-    system = sparse.csr_matrix(stiffness + sparse.diags(mass / steps.step_seconds, format="csr"))
-    solver = LinearSolver(system, relative_tolerance=TOLERANCE)
-    states = [problem.start_c]
-    for _ in range(steps.steps):
-        states.append(states[-1] + solver.solve(-(stiffness @ states[-1])).x)
-    return np.array(states)
 
 
 def room(voxels: int) -> TetMesh:

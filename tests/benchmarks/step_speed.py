@@ -8,32 +8,27 @@ A synthetic house with a thermal camera of its own is trained to the middle of i
 4096 RGB and 4096 thermal rays are timed on one and the same state, and a view of 320 x 240 is rendered. Colour is the
 same from all sides there, as it is for the first four fifths of a training.
 
-Every figure is a median; ratios are against the named baseline of the same run. There are two: the reference (plain
-torch on the same sparse lattice, skipping what is empty), and once a dense step (plain torch on the whole lattice,
-every sample reading all values of its corners), as in `dense_torch_step.py`.
+Every figure is a median; ratios are against the reference in the same run: plain torch on the same sparse lattice,
+which skips what is empty.
 """
 
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import torch
 import tyro
-from dense_torch_step import dense_step_seconds
 from measuring import print_head, print_row, take_turns
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from tests.support.short_training import Training
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.threads import num_threads
-from thermoxels_ns.field.refine import widen_colour
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.training.schedule import schedule_for
 
@@ -54,8 +49,6 @@ class StepSpeed:
     """Finest lattice on which the reference is timed too."""
     threads: int | None = None
     """Threads of the compiled kernels; default: one per processor."""
-    dense: int = 128
-    """The lattice on which a dense step in plain torch is timed too, once; 0: none."""
 
     def main(self) -> None:
         with tempfile.TemporaryDirectory() as folder:
@@ -67,20 +60,17 @@ class StepSpeed:
         )
         print_head(
             *("voxels", "kept", "fused step", "against the lattice before", "reference step", "reference / fused"),
-            *("dense torch step", "dense / fused", "320 x 240 view", "beside the kernels"),
+            "320 x 240 view",
         )
         before = None
         for row in rows:
             fused = row["fused"]
-            baselines = [
-                cell
-                for name in ("reference", "dense")
-                for cell in ((f"{row[name]:.2f} s", f"{row[name] / fused:.0f}") if row[name] else ("", ""))
-            ]
+            slow = row["reference"]
+            baselines = (f"{slow:.2f} s", f"{slow / fused:.0f}") if slow else ("", "")
             growth = "" if before is None else f"{fused / before:.2f}"
-            beside, view = f"{1.0 - row['kernels'] / fused:.0%}", f"{1e3 * row['view']:.0f} ms"
+            view = f"{1e3 * row['view']:.0f} ms"
             kept = f"{row['kept']:.1%}"
-            print_row(row["resolution"], kept, f"{1e3 * fused:.0f} ms", growth, *baselines, view, beside)
+            print_row(row["resolution"], kept, f"{1e3 * fused:.0f} ms", growth, *baselines, view)
             before = fused
 
     def measure(self, scene: Path, resolution: int) -> dict:
@@ -100,18 +90,13 @@ class StepSpeed:
         with CONSOLE.status(f"{resolution} voxels"):
             run.advance((max((*schedule.prune_at, *schedule.refine_at)) + schedule.thin_at[0]) // 2)
             model, few, all_threads = run.pipeline.model, torch.get_num_threads(), num_threads()
-            figures = {"fused": self.median(run.take_step), "kernels": self.median_of_kernels(run)}
-            figures |= {"reference": 0.0, "dense": 0.0}
+            figures = {"fused": self.median(run.take_step)}
+            figures["reference"] = 0.0
             torch.set_num_threads(all_threads)
             if resolution <= self.reference_up_to:
                 model.config.backend = "reference"
                 figures["reference"] = self.median(run.take_step)
                 model.config.backend = "auto"
-            if resolution == self.dense:
-                whole = deepcopy(model.grid)  # published code stores all harmonics from the start
-                widen_colour(whole, model.config.sh_degree)
-                batch, _ = datamanager.next_train(run.step)
-                figures["dense"] = dense_step_seconds(whole, batch, model.config.steps_per_voxel)
             torch.set_num_threads(few)
             run.pipeline.eval()
             camera = datamanager.eval_dataset.cameras[0:1]
@@ -122,35 +107,6 @@ class StepSpeed:
     def median(self, work: Callable[[], object]) -> float:
         """Median time of one call, after one that does not count."""
         return statistics.median(take_turns({"": work}, self.repeats, time.perf_counter)[0][""])
-
-    def median_of_kernels(self, run: Training) -> float:
-        """Time per step that is spent in compiled kernels: renderer forward and backward, and row optimisers."""
-        from thermoxels_ns.render import fused
-        from thermoxels_ns.training.optimizers import RowOptimizer
-
-        spent = [0.0]
-
-        def timed(function):
-            def call(*args, **kwargs):
-                start = time.perf_counter()
-                try:
-                    return function(*args, **kwargs)
-                finally:
-                    spent[-1] += time.perf_counter() - start
-
-            return call
-
-        optimizers = [one for one in run.optimizers.optimizers.values() if isinstance(one, RowOptimizer)]
-        with ExitStack() as stack:
-            for name in ("forward", "backward"):
-                replaced = staticmethod(timed(getattr(fused._Render, name)))
-                stack.enter_context(mock.patch.object(fused._Render, name, replaced))
-            for optimizer in optimizers:
-                stack.enter_context(mock.patch.object(optimizer, "update_rows", timed(optimizer.update_rows)))
-            for _ in range(self.repeats + 1):
-                spent.append(0.0)
-                run.take_step()
-        return statistics.median(spent[2:])
 
 
 if __name__ == "__main__":

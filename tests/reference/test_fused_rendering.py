@@ -1,15 +1,13 @@
-"""The compiled renderer against its plain torch twin and a dense step, over random grids."""
+"""The compiled renderer against its plain torch twin, over random grids."""
 
-import importlib.util
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch.nn.functional import cosine_similarity, normalize
+from torch.nn.functional import normalize
 
 from tests.reference.two_renderers import (
     EVERYTHING,
@@ -24,12 +22,6 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.render.fused import render as fused_render
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import sample_rays
-
-_PATH = Path(__file__).parents[1] / "benchmarks" / "dense_torch_step.py"
-_SPEC = importlib.util.spec_from_file_location("dense_torch_step", _PATH)
-assert _SPEC is not None and _SPEC.loader is not None
-dense_torch_step = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(dense_torch_step)
 
 ACTIVATIONS = ("relu", "softplus", "exp")
 
@@ -237,24 +229,3 @@ def test_both_backends_list_the_same_samples(case):
 def test_any_pattern_has_the_reference_s_values_and_gradients(case):
     grid, request, options = case
     assert_twins_agree(grid, request, replace(EVERYTHING, steps_per_voxel=options.steps_per_voxel))
-
-
-@pytest.mark.parametrize("sh_degree", [0, 1, 2])
-def test_a_dense_step_gives_the_colours_temperatures_and_gradients_of_the_fused_one(sh_degree: int) -> None:
-    grid = random_grid(sh_degree, activation="exp", seed=3)
-    rays = random_request(grid, 200, mixed=False)
-    dense = dense_torch_step.DenseField(grid, steps_per_voxel=2.0)
-    rgb, thermal = dense.render(rays.origins, rays.directions)
-    options = RenderOptions(steps_per_voxel=2.0, smallest_weight=0.0, early_stop=0.0)
-    seen = fused_render(grid, RayRequest(rays.origins, rays.directions), options)
-    assert seen.rgb is not None and float(rgb.max()) > 0.1
-    assert torch.allclose(rgb, seen.rgb, rtol=1e-5, atol=1e-6)
-    assert torch.allclose(thermal[:, 0], seen.thermal.reshape(-1), rtol=1e-5, atol=1e-6)
-    (rgb.square().sum() + thermal.square().sum()).backward()
-    (seen.rgb.square().sum() + seen.thermal.square().sum()).backward()
-    rows = grid.row_parameters()
-    gradient = torch.cat([rows[name].grad.to_dense() for name in ("density", "sh", "temperature")], dim=1)  # type: ignore[union-attr]
-    mine, theirs = dense.table.grad.double(), gradient.double()
-    corners = torch.from_numpy(grid.voxels.corners)
-    assert float(torch.linalg.norm(mine[corners] - theirs)) < 1e-4 * float(torch.linalg.norm(theirs))
-    assert float(cosine_similarity(mine[corners].reshape(1, -1), theirs.reshape(1, -1))) > 0.9999
