@@ -63,27 +63,27 @@ NEVER = {
 """Other packages that a room does not import, not even inside a function."""
 
 MOST_LINES = {
-    "audit": 2220,
+    "audit": 2230,
     "capture": 4700,
     "commands": 2590,
-    "core": 1670,
+    "core": 1690,
     "data": 2620,
-    "evaluation": 530,
-    "fem": 3590,
+    "evaluation": 515,
+    "fem": 3575,
     "field": 890,
     "heat": 2370,
-    "mesh": 5310,
-    "multiview": 1960,
+    "mesh": 5190,
+    "multiview": 1850,
     "radiometry": 1440,
     "render": 1670,
     "reports": 1270,
     "synthetic": 2810,
-    "training": 2550,
+    "training": 2480,
     "root": 470,
 }
 """Budget of lines of each room, comments and docstrings included: what it had when that was written down and 5 % more.
 Raising one is said in the message of the commit."""
-MOST_TEST_LINES = 32400
+MOST_TEST_LINES = 27300
 
 
 def room_of(module: str) -> str:

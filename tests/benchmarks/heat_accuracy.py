@@ -30,9 +30,8 @@ import tyro
 from measuring import logarithmic_panels, save, take_turns, write_rows
 
 from tests.support.building_corner import building_corner
-from tests.support.heat_bodies import CONCRETE
+from tests.support.heat_bodies import CONCRETE, finer, nafems_t3
 from tests.support.heat_meshes import planes
-from tests.support.heat_problems import finer, nafems_t3
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2

@@ -6,7 +6,7 @@
 
 Each scene is written with each flaw (`thermoxels synthetic` has them as options), trained and evaluated by `ns-train
 thermoxels` and `ns-eval` with their defaults. A line per run: seconds of the whole `ns-train` (they need an otherwise
-idle machine to mean anything), PSNR as given, of the part that the box covers, and with the corrections fitted to the held-out photographs too, thermal
+idle machine to mean anything), PSNR as given, of what the box covers, and with the corrections fitted too, thermal
 error with each held-out image's mean difference removed, F at 1.5 voxels of 128 of the whole surface and of what
 training cameras see, and what the log says was corrected.
 """

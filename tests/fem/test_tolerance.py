@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from tests.support.building_corner import building_corner
-from tests.support.heat_bodies import CONCRETE, STEEL
+from tests.support.heat_bodies import CONCRETE, STEEL, finer, nafems_t3
 from tests.support.heat_meshes import box_mesh, graded
-from tests.support.heat_problems import finer, nafems_t3
 from tests.support.obtuse_bodies import dressed
 from tests.support.shell_mesh import shell_mesh
 from tests.support.stuffed_shapes import SHAPES, tet_mesh

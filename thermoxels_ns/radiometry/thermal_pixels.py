@@ -157,9 +157,7 @@ def read_thermal_file(
         celsius = values.astype(np.float64) / most * unit.scale + unit.offset_c
     else:
         # Of a TIFF's counts cameras mean steps of a fixed size, which bounds do not tell.
-        got = f"{values.dtype} counts and no unit"
-        if unit.kind == "bounds":
-            got = f"{values.dtype} counts of a TIFF and temperature_bounds.json"
+        got = f"{values.dtype} counts " + ("of a TIFF beside bounds" if unit.kind == "bounds" else "and no unit")
         remedy = _COUNTS_REMEDY if unit.kind == "bounds" or suffix in _TIFF_SUFFIXES else _UNIT_REMEDY
         raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
     if no_data is not None:
