@@ -95,6 +95,7 @@ def _all_of(*names: str) -> Without:
 
 MECHANISMS = {
     **MECHANISMS,
+    "hole-rules": _all_of("opened-rays", "opaque-neighbours", "keep-ends"),
     "pruning-rules": _all_of("opened-rays", "opaque-neighbours", "keep-ends", "thinning"),
     "colours-and-distortion": _all_of("mean-colours", "distortion"),
 }
