@@ -180,7 +180,7 @@ def test_what_no_photograph_supports_is_listed_and_not_counted(walls) -> None:
         ({"surfaces": (Surface(Measured(0.9), ("roof",)),)}, "surfaces entry 1: patches"),
         ({"surfaces": (Surface(Measured(0.9), ("facade",)),)}, "surfaces: .* none for window"),
         ({"leave_out": ("glass*",)}, "leave_out"),
-        ({"leave_out": ("*",)}, r"Leave out fewer patches \(leave_out\)"),
+        ({"leave_out": ("*",)}, r"mesh: .*Leave out fewer patches \(leave_out\)"),
         ({"limits": Limits(u={"Facade": Measured(0.3)})}, "limits: u"),
         ({"references": (Reference((2.0, -5.0, 1.0), Measured(1.0)),)}, "references entry 1: at"),
     ],
