@@ -35,7 +35,7 @@ _DJI_PHOTOGRAPHS = ("v", "w")
 _LAST_LETTERS = frozenset({"t", "v", "w", "r"})
 _CLEARLY_NEARER = 2.0
 _CLOCK_STEP_S = 0.5
-"""A nearest file t seconds away is ambiguous if another lies within _CLEARLY_NEARER * t + _CLOCK_STEP_S and the limit."""
+"""A nearest file t seconds away is ambiguous if another is within _CLEARLY_NEARER * t + _CLOCK_STEP_S and the limit."""
 _REMEDY = (
     "Copy photographs and thermal files (FLIR or DJI R-JPEG, radiometric TIFF, .npy, .csv) of the same shots into the "
     "folder, as the camera wrote them; give both of a shot the same name (DJI: _T and _V or _W), or the right time "

@@ -257,7 +257,7 @@ class _Capture:
         return load(folder / "model.npz", SfmModel)
 
     def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, MetricScale | None, str, Up]:
-        """Return model (turned upright unless its poses are given), scale or None, reason for None, and up direction."""
+        """Return the model (turned upright unless its poses are given), scale or None, reason for None, and up."""
         settings = self.settings
         depends = {
             "known": [settings.known_distance, settings.known_distance_error_m],
