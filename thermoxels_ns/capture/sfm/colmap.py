@@ -126,10 +126,8 @@ def model_of_colmap(
 ) -> SfmModel:
     """Convert a pycolmap.Reconstruction into an `SfmModel`.
 
-    The model has the posed images that `frame_of_image` names (image to frame), in that order. `size` is the original
-    photographs' width and height, if the images were reduced. Raises `SceneError` if no image has a pose, or there are
-    several cameras or an unknown lens model.
-    """
+    The model has the posed images named in `frame_of_image`, in that order, at the original photographs' `size` (None:
+    that of the images). Raises `SceneError` if no image has a pose, for several cameras or an unknown lens model."""
     by_name = {image.name: image for image in reconstruction.images.values() if image.has_pose}
     posed = [by_name[name] for name in frame_of_image if name in by_name]
     cameras = {image.camera_id for image in posed}

@@ -47,13 +47,11 @@ def find_poses(
 ) -> Poses:
     """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
 
-    `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length
-    [pixels]. Results of an interrupted run in `folder` are reused. The model has the largest group of photographs that
-    fit together; `dropped` says why the others are missing.
+    `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length.
+    Results of an interrupted run in `folder` are reused. Only the largest group that fits together is in the model.
 
     Raises:
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
-        ThermoxelsError, OutputError: COLMAP ended without a result, or the disk is full (`run_in_process`).
     """
     options = options or PoseOptions()
     if len(photographs) < MIN_FRAMES:
@@ -211,7 +209,7 @@ def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
 
 
 def _frames_of(names: list[str], photographs: Mapping[str, str], path: Path) -> dict[str, str]:
-    """Return frame names by the names in a file of poses, in the photographs' order; unique stems are enough to match."""
+    """Return frames by the `names` in a file of poses, in the photographs' order; unique stems are enough to match."""
     by_file: dict[str, list[str]] = {}
     for frame, source in photographs.items():
         for key in {source, PurePosixPath(source).name, PurePosixPath(source).stem, frame}:
@@ -242,7 +240,7 @@ def _too_few(got: int, what: str) -> SceneError:
 
 
 def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> tuple[SfmModel | None, dict[str, int]]:
-    """Return the model of the largest group that fits together or None; for frames in other groups, their companions."""
+    """Return the model of the largest group that fits together or None; for frames elsewhere, their group size - 1."""
     import pycolmap
 
     found = 2  # COLMAP does not call next_image for the first pair
