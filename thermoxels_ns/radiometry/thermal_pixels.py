@@ -84,7 +84,7 @@ class PixelReport:
     pixels: int = 0  # all pixels read
     nan: int = 0  # pixels that are not a number, infinite or fully transparent in the file
     saturated: int = 0
-    """Pixels at the end of a linear scale (count 0 or 65535 for 16 bit), or outside a FLIR camera's calibrated range."""
+    """Pixels at the end of a linear scale (count 0 or 65535 for 16 bit), or outside FLIR's calibrated range."""
     out_of_range: int = 0  # pixels below absolute zero or outside the valid range
     dead: int = 0  # pixels with valid values that are stuck at one value in all frames
 
@@ -171,10 +171,7 @@ def masked_image(
     valid_range_c: tuple[float, float],
     saturated: BoolArray | None = None,
 ) -> ThermalImage:
-    """Return temperatures [degrees C], shape (height, width), with NaN for masked pixels, and the masked pixels' count.
-
-    Masked are pixels that are not finite, `saturated` (height, width), or outside `valid_range_c`.
-    """
+    """Set temperatures (height, width) [degrees C] to NaN if not finite, saturated or out of range, and count these."""
     if saturated is None:
         saturated = np.zeros(temperature_c.shape, dtype=bool)
     nan = ~np.isfinite(temperature_c) & ~saturated

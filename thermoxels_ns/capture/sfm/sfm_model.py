@@ -104,7 +104,7 @@ class SparseDepth:
         self._tree = KDTree(self._places) if len(ahead) else None
 
     def at(self, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return depths (n,) along rays (n, 3) of depth 1, and distances (n,) at depth 1 to the nearest point, or inf."""
+        """Return depths (n,) along rays (n, 3) of depth 1, and distances (n,) at depth 1 to the nearest point."""
         if self._tree is None:
             return np.full(len(rays), np.inf), np.full(len(rays), np.inf)
         count = min(_NEIGHBOURS, len(self._inverse))
