@@ -121,7 +121,7 @@ def files_below(folder: Path, without: Sequence[Path] = (), say: Callable[[str],
 
 
 def shown_name(path: Path) -> str:
-    """Return the name of a file without characters that cannot be printed."""
+    """Return the name of a file with unprintable characters escaped."""
     return printable(path.name)
 
 

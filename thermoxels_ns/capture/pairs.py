@@ -64,7 +64,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairSearch:
-    """All pairs of a folder, and for every other file the reason why no pair contains it."""
+    """All pairs of a folder, and for every other camera file the reason why no pair contains that file."""
 
     pairs: tuple[Pair, ...]  # sorted by the photographs' paths (`natural_key`), or in the order of the user's list
     unpaired: dict[Path, str] = field(default_factory=dict)  # reason by file

@@ -87,7 +87,7 @@ def open_photograph(path: Path) -> Image.Image:
 
 
 def read_mask(path: Path, width: int, height: int) -> BoolArray:
-    """Return a mask, True where the file is light (128 or more), (height, width); raise `SceneError` if unfit."""
+    """Return a mask (height, width), True where the file is light (128 or more); raise `SceneError` for a bad size."""
     mask = np.asarray(open_photograph(path).convert("L")) >= 128
     if mask.shape != (height, width):
         expected = f"a mask of {width} x {height} pixels, as the images have"

@@ -34,7 +34,8 @@ class RigFrame:
 
     name: str
     photograph: npt.NDArray | Path
-    """Grey or RGB array of any number type, or the photograph's file; in the proportions of the visible camera."""
+    """Grey or RGB array of any number type, or the photograph's file. The size is that of the visible camera, or
+    smaller in the same proportions."""
     temperature_c: npt.NDArray | Path
     """Temperatures [degrees C], shape (height, width), NaN where unknown; or the path of a .npy file of them."""
     camera_to_world: FloatArray  # pose of the visible camera, shape (4, 4), OpenGL axes
@@ -80,7 +81,7 @@ class RigEstimate:
     parameters: tuple[str, ...] = ()
     """Names (of `PARAMETERS`) of the rows and columns of `covariance`. Empty: nothing was estimated."""
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    """Covariance of the changes named in `parameters`, shape (n, n)."""
+    """Covariance of the changes named in `parameters`, shape (n, n); that of the prior if the search found no rig."""
     score_before: float = math.nan
     """Agreement of thermal and visible edges (`RigScore.value`) with the start values, -1 to 1; NaN: not compared."""
     score_after: float = math.nan  # the same agreement with the values returned
@@ -110,7 +111,8 @@ class RigEstimate:
 
 
 def prior_sigmas(start: RigStart, median_depth: float) -> FloatArray:
-    """Return the start's standard deviations of the ten changes, shape (10,); `median_depth` is in world units."""
+    """Return the standard deviations of the ten changes (`PARAMETERS`) that `start` states, shape (10,). If it states
+    none for the shift, that of the shift is 3 % of `median_depth` [world units]."""
     shift = _TRANSLATION_SHARE * median_depth if start.translation_sigma is None else start.translation_sigma
     turn, centre = np.radians(start.rotation_sigma_deg), start.centre_sigma * start.thermal_camera.width
     return np.array([turn] * 3 + [shift] * 3 + [start.focal_sigma, centre, centre, start.k1_sigma])

@@ -123,7 +123,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 def prepare_output(folder: Path) -> Path:
-    """Make the output folder and return its path; raise `OutputError` if other files than a capture's are in it."""
+    """Make the output folder and return its path; raise `OutputError` if it holds files but no earlier capture."""
     folder = writable_folder(folder)
     if not (folder / CACHE_FOLDER).is_dir() and any(folder.iterdir()):
         remedy, got = "Pass another folder with --output.", f"{folder}, which holds other files"

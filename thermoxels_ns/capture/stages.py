@@ -203,7 +203,7 @@ class _Capture:
         return tuple(Pair(name, self.source / a, self.source / b, how) for name, a, b, how in content["pairs"])
 
     def temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
-        """Convert the thermal images to degrees C, extract photographs from files that hold both, and return both."""
+        """Return the frames: thermal images in degrees C, and photographs, extracted where one file holds both."""
         settings, options = self.settings, self.options(RadiometryOptions)
         library = settings.dji_library if settings.dji_library and settings.dji_library.is_file() else None
         depends = {

@@ -103,7 +103,7 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
 def _differences(samples: DriftSamples) -> tuple[IntArray, csr_matrix, FloatArray]:
     """Return the differences of two readings of one point: point numbers (n,), a matrix, and differences (n,) [K].
 
-    The matrix, shape (n, frames + radial terms), times offsets and radial coefficients is the drift's part of each.
+    The matrix, shape (n, frames + radial terms), times offsets and radial coefficients gives the differences by drift.
     """
     pairs = []
     for lag in range(1, _MOST_LAG + 1):
@@ -180,7 +180,7 @@ def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_
 
 
 def _chosen_points(frames: Sequence[RigFrame]) -> tuple[FloatArray, BoolArray]:
-    """Return positions (n, 3) of each frame's most shared points, and (f, n) whether frame f tracks point n."""
+    """Return positions (n, 3) of each frame's most shared points, and a table (frames, n) of who tracks which point."""
     every = np.concatenate([frame.point_ids for frame in frames])
     ids, first, inverse = np.unique(every, return_index=True, return_inverse=True)
     world = np.concatenate([np.asarray(frame.points_world, dtype=np.float64).reshape(-1, 3) for frame in frames])[first]

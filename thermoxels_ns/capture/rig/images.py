@@ -66,7 +66,7 @@ class ThermalEdges:
         return np.stack([_bilinear(plane, pixels) for plane in self._planes[: 3 if slopes else 1]])
 
     def weight_at(self, pixels: FloatArray) -> FloatArray:
-        """Return the weight, 0 to 1, of points at pixels (n, 2), shape (n,); it falls to 0 at the image's border."""
+        """Return the weights, 0 to 1, of points at pixels (n, 2), shape (n,); weights are 0 at the image's border."""
         return _bilinear(np.pad(self.weight, _PADDING), pixels).astype(np.float64)
 
 
@@ -78,9 +78,9 @@ class RigScore:
     sum(w Re a* b) / sqrt(sum(w |a|^2) sum(w |b|^2)) over the points of all frames: 1 if all edges agree, 0 by chance.
     The weights w fall to 0 at the border of the thermal image.
 
-    `slopes`, by which a rig is refined, is of sum(w Re a* b) alone, with weights w that stay while the rig changes. If
-    sum(w |b|^2) or the weights followed the rig, the sum would rise when points move to where b is small, and the
-    focal length would come out half a percent too long.
+    A rig is refined by maximising sum(w Re a* b) alone (`slopes`), with weights w that stay while the rig changes. If
+    the score were divided by a changing sum(w |b|^2), or the weights followed the rig, it would pay to move points to
+    where b is small, and the focal length would come out half a percent too long.
     """
 
     def __init__(
@@ -272,7 +272,7 @@ def without_fixed_pattern(images: Sequence[FloatImage]) -> list[FloatImage]:
 
 
 def local_contrast(image: FloatImage) -> FloatImage:
-    """Return each pixel minus the mean around it, where drift and vignetting do not show; NaN stays NaN."""
+    """Return each pixel minus the mean of its surroundings, free of drift and vignetting, [K]; NaN stays NaN."""
     known = np.isfinite(image)
     filled = np.where(known, image - image[known].mean(dtype=np.float64), 0.0) if known.any() else image
     reach = max(_CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE * image.shape[1])

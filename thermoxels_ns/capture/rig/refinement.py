@@ -196,7 +196,8 @@ class WindowScore:
         self._noise = float(np.median([image.noise_k for image in thermal])) if len(thermal) else 0.0
 
     def agreement(self, change: FloatArray, shift_px: tuple[float, float] = (0.0, 0.0)) -> list[FloatArray]:
-        """Return R2 of every window, one array per frame, thermal images shifted; 0 if a window leaves its image."""
+        """Return R2 of every window, one array (windows,) per frame, with the windows moved by `shift_px` in the
+        thermal image; R2 is 0 if a window leaves the image."""
         result = []
         for windows, thermal in self.frames:
             pixels = self.rig.project(change, windows.points) + shift_px

@@ -113,7 +113,7 @@ def _exit_with_parent() -> None:
 
 
 def _reason(status: int | None, words: str) -> str:
-    """Return why the process ended: its status, with the last line of its output that names an error, or the last."""
+    """Return why the process ended: its exit status, and the last line of output that names an error (or any line)."""
     if status == _KILLED:
         return "it was killed, as systems do where memory runs out (lower --threads, --image-size or --max-features)"
     said = [line for line in words.splitlines() if line.strip()]
@@ -126,8 +126,9 @@ def model_of_colmap(
 ) -> SfmModel:
     """Convert a pycolmap.Reconstruction into an `SfmModel`.
 
-    The model has the posed images named in `frame_of_image`, in that order, at the original photographs' `size` (None:
-    that of the images). Raises `SceneError` if no image has a pose, for several cameras or an unknown lens model."""
+    The model has the posed images that are keys of `frame_of_image`, in that order. `size` is the original photographs'
+    width and height, if the images were reduced. Raises `SceneError` for no pose, several cameras or an unknown lens.
+    """
     by_name = {image.name: image for image in reconstruction.images.values() if image.has_pose}
     posed = [by_name[name] for name in frame_of_image if name in by_name]
     cameras = {image.camera_id for image in posed}

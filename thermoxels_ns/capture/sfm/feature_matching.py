@@ -54,7 +54,7 @@ class ReducedPhotographs:
 def image_pairs(count: int, matching: Matching) -> IntArray:
     """Return the pairs of photographs to match, shape (p, 2): numbers in order of time, smaller first, sorted.
 
-    exhaustive: every pair; sequential: neighbours in time and some far pairs; auto: the former for few photographs.
+    "exhaustive" gives every pair, "sequential" neighbours in time and some far pairs; "auto" chooses by `count`.
 
     >>> image_pairs(3, "exhaustive").tolist()
     [[0, 1], [0, 2], [1, 2]]

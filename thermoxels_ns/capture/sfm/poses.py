@@ -151,7 +151,7 @@ def _reduced(
 ) -> tuple[ReducedPhotographs, tuple[int, int]]:
     """Write photographs for COLMAP, at most `longest` pixels wide and high, and their masks, into `folder`.
 
-    They have no EXIF, by which COLMAP would turn them. Returns the files written, and their width and height.
+    The files have no EXIF, by which COLMAP would turn them. Returns the files, and their width and height [pixels].
     """
     factor = min(1.0, longest / max(size))
     small = max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
@@ -240,7 +240,7 @@ def _too_few(got: int, what: str) -> SceneError:
 
 
 def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> tuple[SfmModel | None, dict[str, int]]:
-    """Return the model of the largest group that fits together or None; for frames elsewhere, their group size - 1."""
+    """Return the model of the largest group of photographs (or None), and the size - 1 of other groups by frame."""
     import pycolmap
 
     found = 2  # COLMAP does not call next_image for the first pair

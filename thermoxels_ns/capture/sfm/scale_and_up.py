@@ -247,9 +247,9 @@ def find_up(
     """Find the direction of up from the pitch and roll that photographs state, else from how cameras are usually held.
 
     A camera with pitch p (0 level, -90 straight down) and roll r against gravity has up at (-sin r cos p, cos r cos p,
-    -sin p) in its axes x right, y up, z back. If no photograph states them, the upper edges of pictures are assumed
-    level: up is normal to the cameras' horizontal axes if these differ enough, else the mean of their vertical axes.
-    `gimbal_deg` is pitch and roll per camera [degrees]; `orientation` is EXIF's, by which the axes are chosen.
+    -sin p) in its axes x right, y up, z back. If no photograph states these angles, pictures are assumed to be level:
+    up is normal to the cameras' horizontal axes if these axes differ enough, else the mean of the vertical axes.
+    `gimbal_deg` is pitch and roll per camera [degrees]; `orientation` is EXIF's, 1 to 8, by which the axes are chosen.
     """
     rotations = camera_to_world[:, :3, :3]
     measured = [i for i, angles in enumerate(gimbal_deg) if angles is not None]
@@ -294,7 +294,7 @@ def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
 
 
 def _robust_mean(directions: FloatArray) -> FloatArray:
-    """Return the unit vector (3,) that is the mean of the half of the directions (n, 3) nearest to it."""
+    """Return the mean direction, a unit vector (3,), of the half of the directions (n, 3) nearest to that mean."""
     mean = directions.sum(axis=0)
     for _ in range(5):
         mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
