@@ -149,7 +149,7 @@ def _records(fff: bytes) -> dict[int, bytes]:
     records = dict[int, bytes]()
     for number in range(min(count, _MOST_RECORDS)):
         kind, _, _, _, offset, length = struct.unpack_from(f"{order}HHIIII", fff, start + 32 * number)
-        # Records may overlap, so only one of each type is copied: a bad file may list a thousand of the whole block.
+        # Only one record of each type is copied: a bad file may list a thousand records that each span the whole block.
         if kind in (_RAW_DATA, _PICTURE, _CAMERA_INFO, _PICTURE_IN_PICTURE) and kind not in records:
             if offset + length > len(fff):
                 raise ValueError(f"a record up to byte {offset + length} of {len(fff)}: the file is cut off")

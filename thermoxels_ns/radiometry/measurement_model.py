@@ -15,7 +15,7 @@ from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin, kelvin_to_celsius
 
 DEFAULT_RELATIVE_HUMIDITY = 0.5
-"""Used if neither file nor user gives it, as cameras do; over a room's distances its effect is below their noise."""
+"""Relative humidity that cameras assume, used if file and user state none; indoors its effect is below the noise."""
 _COLDEST_AIR_C, _HOTTEST_AIR_C = -100.0, 150.0
 _LARGEST_ATTENUATION, _LARGEST_WEIGHT = 1.0, 10.0
 _LARGEST_EXPONENT = 700.0

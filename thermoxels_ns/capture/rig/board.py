@@ -124,7 +124,7 @@ def rig_from_boards(
 
 
 def board_of(settings: CaptureSettings) -> CheckerBoard | None:
-    """Return the board that the settings describe, or None; raise `SceneError` for incomplete options or with --rig."""
+    """Return the board that the settings describe (None: none); raise `SceneError` if incomplete or beside --rig."""
     photos, size, square_m = settings.board_photos, settings.board, settings.board_square_m
     if photos is None and size is None and square_m is None:
         return None

@@ -170,7 +170,7 @@ class CoarseSearch:
     """
 
     def __init__(self, score: RigScore, sigmas: FloatArray, median_depth: float) -> None:
-        """Prepare the search: `sigmas` (10,) of the prior limit it; `median_depth` of the points is in world units."""
+        """Prepare a search at one size, limited by `sigmas` (10,) of the prior; `median_depth` is in world units."""
         camera = score.rig.camera
         self._rig = score.rig
         # The images are padded for shifts, to lengths at which Fourier transforms are fast.

@@ -45,7 +45,7 @@ def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple
     """Find the scale by fitting the cameras' places, shape (n, 3), to their GPS fixes; None and the reason if it fails.
 
     The fit is a similarity by closed-form least squares (Umeyama 1991, equation 42) with Huber's weights. The standard
-    error follows from the scatter of the residuals in the linearised fit. GPS is refused above `_WORST_GPS`.
+    error follows from the residuals of the linearised fit; a relative error above `_WORST_GPS` counts as a failure.
     """
     known = [i for i, fix in enumerate(fixes) if fix is not None]
     if not known:
