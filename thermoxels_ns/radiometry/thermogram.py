@@ -63,7 +63,7 @@ FLIR's two gains was used, so the user must say."""
 
 
 def recognised_camera(make: str | None, model: str | None) -> CameraName | None:
-    """Return the preset (`COUNT_SCALES`) of the camera with this maker and model; None if several presets are possible.
+    """Return the preset (`COUNT_SCALES`) that the maker and model in a file determine; None if the user must choose.
 
     >>> recognised_camera("Workswell", "WIRIS Pro"), recognised_camera("FLIR", "Duo Pro R")
     ('workswell', None)
