@@ -1,1 +1,1 @@
-"""From camera files to a scene that the dataparser reads."""
+"""Converts a folder of camera files to a scene that the dataparser reads."""

@@ -1,4 +1,4 @@
-"""Tells the files of a memory card apart: photographs, thermal images, unreadable ones."""
+"""Sorts the files of a memory card into photographs, thermal images and unreadable files."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 from thermoxels_ns.radiometry.thermal_pixels import size_of_double_tiff
 
 Role = Literal["photograph", "thermal", "both", "thermal picture"]
-"""thermal picture: its name says thermal, but it holds colours and no temperatures."""
+"""What a camera file holds. "both": photograph and temperatures; "thermal picture": colours only, named thermal."""
 
 _PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 SUFFIXES = (*_PICTURES, ".npy", ".csv")
-"""Endings of the files that are read; other files on a card (videos, logs, thumbnails) are only counted."""
+"""Suffixes of the files that are read; other files on a card (videos, logs, thumbnails) are only counted."""
 
 _THERMAL_WORDS = frozenset({"thermal", "radiometric", "temperature", "temperatures", "celsius", "ir", "tir", "lwir"})
 _PHOTOGRAPH_WORDS = frozenset({"visible", "vis", "rgb", "colour", "color", "photo", "photos", "optical"})
@@ -35,22 +35,22 @@ ROLE_WORDS = _THERMAL_WORDS | _PHOTOGRAPH_WORDS | _OTHER_WORDS
 
 @dataclass(frozen=True)
 class CameraFile:
-    """One file by its content."""
+    """One readable camera file and what it holds."""
 
     path: Path
     role: Role
-    taken_at: datetime | None  # as the camera's clock showed it, without a zone
-    dji: bool = False  # whether it is DJI's R-JPEG, which only DJI's own library reads
+    taken_at: datetime | None  # as the camera's clock showed it, without a time zone
+    dji: bool = False  # True for DJI's R-JPEG, which only DJI's own library reads
 
 
 @dataclass(frozen=True)
 class CameraFolder:
-    """Everything that was found in a folder, sorted by name."""
+    """All files of a folder and its subfolders, sorted by name (`natural_key`)."""
 
     folder: Path
     files: tuple[CameraFile, ...]
-    unreadable: dict[Path, str] = field(default_factory=dict)  # why, by file
-    others: int = 0  # files of other kinds, which were not looked at
+    unreadable: dict[Path, str] = field(default_factory=dict)  # reason by file
+    others: int = 0  # number of files with a suffix outside `SUFFIXES`, which were not opened
 
 
 def words_of(name: str) -> tuple[str, ...]:
@@ -64,7 +64,7 @@ def words_of(name: str) -> tuple[str, ...]:
 
 
 def natural_key(path: Path) -> list[tuple[int, str, int]]:
-    """Return a sort key by which numbers in names sort by value: 2 before 10.
+    """Return a sort key for a path that orders numbers in names by value: 2 before 10.
 
     >>> sorted([Path("b10"), Path("b2")], key=natural_key)[0].name
     'b2'
@@ -76,10 +76,10 @@ def natural_key(path: Path) -> list[tuple[int, str, int]]:
 def scan_folder(
     folder: Path, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None
 ) -> CameraFolder:
-    """Identify every picture and table in a folder and its subfolders, except the folders `without`.
+    """Return what every picture and table in a folder and its subfolders is, except in the folders `without`.
 
-    Hidden files and folders, linked folders and pipes are passed over; `say` is told of folders that cannot be opened.
-    A `SceneError` is raised where `folder` is no folder.
+    Hidden files and folders, linked folders and pipes are skipped; `say` reports folders that cannot be opened.
+    Raises `SceneError` if `folder` is no folder.
     """
     if not folder.is_dir():
         remedy = "Pass the folder that the memory card was copied to."
@@ -105,7 +105,7 @@ def scan_folder(
 
 
 def files_below(folder: Path, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None) -> list[Path]:
-    """List the files of a folder and its subfolders, except the folders `without`, sorted by `natural_key`."""
+    """Return the files of a folder and its subfolders, except the folders `without`, sorted by `natural_key`."""
     skipped, files = [path.resolve() for path in without], []
     shut = lambda problem: say(f"passed over: {problem.filename} ({problem.strerror})")  # noqa: E731
     for place, folders, names in os.walk(folder, onerror=shut):
@@ -116,17 +116,17 @@ def files_below(folder: Path, without: Sequence[Path] = (), say: Callable[[str],
             if not name.startswith(".") and not any((here / name).resolve().is_relative_to(each) for each in skipped)
         ]
         files += [here / name for name in names if not name.startswith(".") and (here / name).is_file()]
-    # Names that differ in capitals alone come in one order on every disk.
+    # The second part of the key gives names that differ only in capitals the same order on every disk.
     return sorted(files, key=lambda path: (natural_key(path.relative_to(folder)), path.as_posix()))
 
 
 def shown_name(path: Path) -> str:
-    """Name of a file as it can be printed and written."""
+    """Return the name of a file with unprintable characters escaped."""
     return printable(path.name)
 
 
 def identify(path: Path, folder: Path) -> CameraFile:
-    """Tell by content what a file is, a thermal picture by its name; an error that names it where it is damaged."""
+    """Return what a file holds, by its content (a thermal picture: by its name); raise `ThermoxelsError` if damaged."""
     with errors_name(path, "a camera file that can be decoded"):
         check_file_size(path)
         suffix = path.suffix.lower()
@@ -144,7 +144,7 @@ def identify(path: Path, folder: Path) -> CameraFile:
             return CameraFile(path, "thermal", None)
         else:
             with Image.open(path) as image:
-                # One channel of more than 8 bits, which no photograph is.
+                # A picture with one channel of more than 8 bits is no photograph.
                 if image.mode == "F" or image.mode.startswith("I"):
                     check_thermal_size(path, *image.size)
                     return CameraFile(path, "thermal", read_exif_facts(image).taken_at)
@@ -153,7 +153,7 @@ def identify(path: Path, folder: Path) -> CameraFile:
 
 
 def _named_thermal(path: Path, folder: Path) -> bool:
-    """Whether a name says thermal: by a word in it, by its last letter, or by the nearest folder that says anything."""
+    """Return whether a name ends in the word "t", or the name or else the nearest telling folder says thermal."""
     words = words_of(path.stem)
     if len(words) > 1 and words[-1] == "t":
         return True

@@ -1,4 +1,4 @@
-"""The pairs after reading: photographs, temperatures and what their files say."""
+"""Reads the pairs of a capture: photographs, temperatures and the metadata of their files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from thermoxels_ns.radiometry.thermal_pixels import find_dead_pixels
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions, read_thermogram
 
 _LIST = "frames.json"
-_MOST_FOR_DEAD_PIXELS = 60  # frames that stuck pixels are looked for in: more need memory and say nothing new
+_MOST_FOR_DEAD_PIXELS = 60  # at most so many frames are searched for stuck pixels, to save memory
 
 
 @dataclass(frozen=True)
@@ -29,36 +29,36 @@ class CaptureFrame:
     """One pair of photograph and thermal image after reading."""
 
     name: str
-    photograph: Path  # a file that holds the photograph alone
-    thermal: Path  # a .npy file of float32 degrees C, NaN where there is none
-    photograph_source: str  # the camera's file, relative to the capture
-    thermal_source: str
+    photograph: Path  # a picture file that holds the photograph and no thermal image
+    thermal: Path  # a .npy file of float32 degrees C, shape (height, width), NaN where no temperature is known
+    photograph_source: str  # path of the camera's file with the photograph, relative to the capture folder
+    thermal_source: str  # path of the camera's file with the thermal image, relative to the capture folder
     camera: str | None = None  # maker and model of the thermal camera
     focal_px: float | None = None  # focal length that the photograph states, [pixels]
-    orientation: int = 1  # EXIF's orientation of the photograph
+    orientation: int = 1  # EXIF's orientation of the photograph, 1 to 8
     gps: GpsFix | None = None
     gimbal_deg: tuple[float, float] | None = None  # pitch and roll of the camera, [degrees]
     thermal_focal_px: float | None = None  # focal length that the thermal file states, [thermal pixels]
-    thermal_field_of_view_deg: float | None = None  # horizontal, as the camera states it, [degrees]
+    thermal_field_of_view_deg: float | None = None  # horizontal angle of view that the thermal file states, [degrees]
     picture_in_picture: PictureInPicture | None = None  # factory alignment of FLIR cameras
-    celsius_per_count: float | None = None
-    format: str | None = None  # of the thermal file, by its content
-    conditions: Conditions | None = None  # emissivity and the rest that the temperatures were computed with
-    masked: int = 0  # thermal pixels without a temperature
+    celsius_per_count: float | None = None  # temperature step of one count of the thermal file, [K]
+    format: str | None = None  # format of the thermal file, detected from its content
+    conditions: Conditions | None = None  # emissivity, distance etc. that the temperatures were computed with
+    masked: int = 0  # number of thermal pixels without a temperature
 
 
 @dataclass(frozen=True)
 class CaptureFrames:
-    """The frames that could be read, and why the others could not."""
+    """The frames of a capture that could be read, and the reason for each frame that was left out."""
 
     frames: tuple[CaptureFrame, ...]
-    thermal_size: tuple[int, int]  # width and height of all thermal images
-    dead_pixels: int  # thermal pixels that are stuck at one value in all frames; they are NaN in every frame
-    dropped: dict[str, str] = field(default_factory=dict)  # why, by the frame's name
+    thermal_size: tuple[int, int]  # width and height of all thermal images, [pixels]
+    dead_pixels: int  # number of sensor pixels that are stuck at one value; these are NaN in every frame
+    dropped: dict[str, str] = field(default_factory=dict)  # reason by the name of the frame
 
     @classmethod
     def load(cls, folder: Path, root: Path) -> CaptureFrames:
-        """Read the list of frames from their folder, for a capture in `root`; both may have been moved."""
+        """Read the list that `read_frames` wrote to `folder`; `root` is the capture folder, and both may have moved."""
         content = load_json(folder / _LIST)
         for row in content["frames"]:
             for name, kind in (("gps", GpsFix), ("picture_in_picture", PictureInPicture), ("conditions", Conditions)):
@@ -81,14 +81,14 @@ def read_frames(
     thermal_mask: Path | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> CaptureFrames:
-    """Read all pairs into `folder`: degrees from thermal files, photographs out of files that hold both.
+    """Write each pair's temperatures, and photographs taken out of thermal files, to `folder`; return the frames.
 
-    Pixels of the thermal sensor that are stuck at one value, and those that the user's mask shuts out, become NaN. With
-    `skip_bad` a pair with a file that cannot be read is left out and named.
+    Pixels of the thermal sensor that are stuck at one value, and pixels that the user's mask excludes, become NaN. With
+    `skip_bad` a pair with an unreadable file goes to `dropped`, as thermal images of an unusual size always do.
 
     Raises:
         ThermoxelsError: A file cannot be read and `skip_bad` is off, or no pair is left.
-        OSError: What was read cannot be written.
+        OSError: A result cannot be written.
     """
     (folder / "thermal").mkdir(exist_ok=True)
     (folder / "photographs").mkdir(exist_ok=True)
@@ -98,7 +98,7 @@ def read_frames(
             frame, size = _read(pair, root, folder, radiometry)
             frames.append(frame)
             sizes.append(size)
-        except ThermoxelsError as problem:  # of the files that are read; a full disk is no bad file
+        except ThermoxelsError as problem:  # a fault of a file that is read; a full disk raises OSError
             if not skip_bad:
                 raise
             dropped[pair.name] = str(problem)
@@ -122,7 +122,7 @@ def read_frames(
 
 
 def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -> tuple[CaptureFrame, tuple[int, int]]:
-    """Read one pair and write its files; return the frame with the width and height of its thermal image."""
+    """Read one pair and write its files; return the frame, and width and height of its thermal image."""
     thermogram = read_thermogram(pair.thermal, radiometry)
     photograph, thermal_focal = pair.photograph, None
     if pair.in_one_file:
@@ -185,7 +185,7 @@ def _without_stuck_pixels(
 
 
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:
-    """File formats and the settings behind degrees, as names and texts; the most frequent kind first."""
+    """Return (name, text) rows on thermal file formats and on settings of the temperatures, most frequent first."""
     formats = Counter(
         f.format + ("" if f.celsius_per_count is None else f" with {f.celsius_per_count:.4g} K per count")
         for f in frames

@@ -1,4 +1,4 @@
-"""Masks of photographs: what the user shuts out, and what the camera drew over them."""
+"""Masks of photographs: the user's masks, and overlays such as text and logos that the camera drew."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from thermoxels_ns.capture.photograph import open_photograph, read_mask, read_ph
 from thermoxels_ns.core.arrays import BoolArray
 from thermoxels_ns.core.errors import SceneError
 
-MIN_FRAMES = 8  # fewer photographs cannot tell what is drawn over them from what they all happen to show
-_LOOKED_AT = 40  # photographs that overlays are looked for in
-_SIDE = 800  # longest side at which overlays are looked for, [pixels]
-_STILL = 10.0  # grey levels (of 255) that what is drawn changes by, from JPEG's compression alone
-_ALIVE = 30.0  # grey levels that the surroundings change by at least
-_EDGE = 25.0  # grey levels by which what is drawn stands out from its surroundings in the mean picture
+MIN_FRAMES = 8  # fewer photographs cannot show whether something is an overlay or part of the scene
+_LOOKED_AT = 40  # at most so many photographs are searched for an overlay
+_SIDE = 800  # longest side to which photographs are reduced for that search, [pixels]
+_STILL = 10.0  # an overlay's pixels change by less than this over all photographs, [grey levels of 255]
+_ALIVE = 30.0  # an overlay's surroundings change by more than this on average, [grey levels]
+_EDGE = 25.0  # an overlay differs from its surroundings by more than this in the mean picture, [grey levels]
 _AROUND_SHARE = 0.12  # width of the surroundings, as a share of the longest side
-_MOST_SHARE = 0.2  # more of the picture than this is no overlay but a scene that does not change
+_MOST_SHARE = 0.2  # a larger share of still pixels is no overlay but a scene that does not change
 
 
 @dataclass(frozen=True)
 class PhotographMasks:
-    """Where photographs may be used: everywhere but under what the camera drew and what the user shut out."""
+    """The usable pixels of all photographs: those outside the camera's overlay and inside the user's masks."""
 
     size: tuple[int, int]  # width and height of the photographs, [pixels]
     overlay: BoolArray | None = None
-    """False where the camera drew over all photographs, shape (height, width); None: nowhere."""
+    """Array that is False where the camera drew over all photographs, shape (height, width); None: no overlay."""
     files: Mapping[str, Path] = field(default_factory=dict)
-    """Masks that the user gives, by frame; frames without one may be used everywhere."""
+    """The user's mask files by frame name; a frame without a mask is usable everywhere outside the overlay."""
 
     @property
     def any(self) -> bool:
-        """Whether anything is masked in any photograph."""
+        """True when there is an overlay or at least one mask of the user."""
         return self.overlay is not None or bool(self.files)
 
     def of(self, frame: str) -> BoolArray:
-        """True where a frame's photograph may be used, shape (height, width); a `SceneError` for an unfit mask."""
+        """Return the frame's mask, True where usable, shape (height, width); raise `SceneError` for an unfit file."""
         width, height = self.size
         use = np.ones((height, width), dtype=bool) if self.overlay is None else self.overlay.copy()
         return use & read_mask(self.files[frame], width, height) if frame in self.files else use
 
 
 def find_masks(frames: Sequence[CaptureFrame], folder: Path | None, look_for_overlays: bool) -> PhotographMasks:
-    """Find the overlay and the user's masks for the size that most photographs have.
+    """Return the overlay (if looked for) and the user's masks from `folder` (None: no masks) of the photographs.
 
-    A `SceneError` is raised where a photograph or a mask cannot be read.
+    Only photographs of the most frequent size count. Raises `SceneError` for an unreadable photograph or mask folder.
     """
     sizes = [read_photograph_facts(frame.photograph).size for frame in frames]
     size = max(dict.fromkeys(sizes), key=sizes.count)
@@ -61,7 +61,10 @@ def find_masks(frames: Sequence[CaptureFrame], folder: Path | None, look_for_ove
 
 
 def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str, Path]:
-    """The user's masks by frame: those named like a photograph, or like a frame; a `SceneError` where none is."""
+    """Return the user's mask file of each frame, named like its photograph or frame; frames without one are absent.
+
+    Raises `SceneError` if `folder` does not exist or no mask fits; without `folder` the result is empty.
+    """
     if folder is None:
         return {}
     files = mask_files(folder)
@@ -79,14 +82,11 @@ def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str,
 
 
 def find_overlay(photographs: Sequence[Path]) -> BoolArray | None:
-    """Find what the camera drew over all photographs of one size: text, scales and logos, at the same place in each.
+    """Find text, scales and logos that the camera drew at the same place in all photographs, all of one size.
 
-    A pixel belongs to an overlay if it stays the same in all photographs, stands out from its surroundings in their
-    mean, and the surroundings change. Numbers that change from frame to frame are found by their outlines only.
-
-    Returns:
-        True where the scene shows, shape (height, width) of the photographs; None where nothing is drawn, or where
-        there are too few photographs or they are too much alike to tell.
+    A pixel belongs to the overlay if it stays the same in all photographs, stands out from its surroundings in the mean
+    picture, and these surroundings change. The result is True where the scene shows, shape (height, width); None if no
+    overlay is found, or if the photographs are too few or too similar to tell.
     """
     if len(photographs) < MIN_FRAMES:
         return None
@@ -109,7 +109,7 @@ def find_overlay(photographs: Sequence[Path]) -> BoolArray | None:
 
 
 def mask_files(folder: Path) -> dict[str, Path]:
-    """Masks in a folder by the stem of their names, in small letters; a `SceneError` where there is no such folder."""
+    """Return the masks in a folder by their names' stems in lower case; raise `SceneError` without such a folder."""
     if not folder.is_dir():
         raise SceneError("masks", expected="a folder of masks", got=f"no folder at {folder}", remedy="Check the path.")
     return {

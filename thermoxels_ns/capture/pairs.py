@@ -1,4 +1,4 @@
-"""Which thermal image belongs to which photograph."""
+"""Finds which thermal image belongs to which photograph."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.transforms_json import path_inside
 
 _DJI = re.compile(r"^(?P<head>.*?dji)_(?:(?P<time>\d{14})_)?(?P<number>\d{3,})_(?P<role>[a-z])(?P<tail>.*)$")
-_DJI_LATE_S = 3.0  # the two images of one shot may carry time stamps that differ by so much, [s]
+_DJI_LATE_S = 3.0  # largest difference between the time stamps of the two images of one shot, [s]
 _DJI_PHOTOGRAPHS = ("v", "w")
-"""Letters of DJI's photographs in the order they are taken in; z is a zoom, whose focal length varies."""
+"""Letters of DJI's photographs, preferred letter first. The zoom camera's z is not used: its focal length varies."""
 _LAST_LETTERS = frozenset({"t", "v", "w", "r"})
 _CLEARLY_NEARER = 2.0
 _CLOCK_STEP_S = 0.5
-"""A second candidate must be farther than twice the first one's distance plus half a step of a camera's clock."""
+"""A nearest file t seconds away is ambiguous if another is within _CLEARLY_NEARER * t + _CLOCK_STEP_S and the limit."""
 _REMEDY = (
     "Copy photographs and thermal files (FLIR or DJI R-JPEG, radiometric TIFF, .npy, .csv) of the same shots into the "
     "folder, as the camera wrote them; give both of a shot the same name (DJI: _T and _V or _W), or the right time "
@@ -51,32 +51,32 @@ _DJI_LIBRARY = (
 class Pair:
     """One photograph and its thermal image."""
 
-    name: str  # name of the frame, all different; letters, digits, dot, dash and underscore
+    name: str  # name of the frame, unique in the capture; letters, digits, dot, dash and underscore
     photograph: Path
-    thermal: Path  # the same file where the camera writes both into one
-    how: str  # how they were found to belong together
+    thermal: Path  # the same path as `photograph` where the camera writes both into one file
+    how: str  # the rule or list by which the two files were paired
 
     @property
     def in_one_file(self) -> bool:
-        """Whether the photograph lies inside the thermal file."""
+        """True when photograph and thermal image lie in the same file."""
         return self.photograph == self.thermal
 
 
 @dataclass(frozen=True)
 class PairSearch:
-    """All pairs of a folder, and why the other files are in none."""
+    """All pairs of a folder, and for every other camera file the reason why no pair contains that file."""
 
-    pairs: tuple[Pair, ...]  # in the order they were taken, as far as names tell
-    unpaired: dict[Path, str] = field(default_factory=dict)  # why, by file
+    pairs: tuple[Pair, ...]  # sorted by the photographs' paths (`natural_key`), or in the order of the user's list
+    unpaired: dict[Path, str] = field(default_factory=dict)  # reason by file
 
 
 def search_pairs(
     folder: Path, settings: CaptureSettings, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None
 ) -> PairSearch:
-    """Scan a folder without the folders `without` and pair its files; files that cannot be read are unpaired.
+    """Scan a folder, except the folders `without`, and return its pairs; files that cannot be read are in `unpaired`.
 
     Raises:
-        SceneError: The folder holds no pair, or a file cannot be read and the settings do not skip it.
+        SceneError: The folder holds no pair, or a file cannot be read and `settings.skip_bad` is off.
     """
     found = scan_folder(folder, without, say)
     search = find_pairs(found, settings.time_limit_s, settings.clock_offset_s)
@@ -103,11 +103,11 @@ def search_pairs(
 
 
 def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: float = 0.0) -> PairSearch:
-    """Pair photographs and thermal images: inside one file, by DJI's names, by equal names, by time.
+    """Pair photographs and thermal images by four rules in turn: in one file, DJI's names, equal names, time.
 
-    Equal names are equal after words for the kind of image are dropped: ``10-58-15-636-visible.jpg`` and
-    ``10-58-15-636-radiometric.tiff``, or ``visible/a7.jpg`` and ``thermal/a7.npy``. By time: each the other's nearest,
-    within the limit [s], and no second candidate about as near; the thermal camera's clock is ahead by an offset [s].
+    Names are compared without words for the kind of image: ``10-58-15-636-visible.jpg`` pairs with
+    ``10-58-15-636-radiometric.tiff``. Two files pair by time if each is the other's nearest, at most `time_limit_s`
+    away, and no second file is about as near. The thermal camera's clock is ahead by `clock_offset_s`.
     """
     pairs: list[tuple[CameraFile, CameraFile, str]] = []
     unpaired = dict[Path, str]()
@@ -134,12 +134,12 @@ def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: f
 
 
 def read_pair_list(file: Path, folder: Path) -> PairSearch:
-    """Read the user's pairs: a CSV file with one photograph and its thermal image per line, relative to `folder`.
+    """Read the user's list of pairs, a CSV file with ``photograph,thermal`` per line, paths relative to `folder`.
 
-    A first line without files in it is taken for a heading.
+    If neither name in the first line is a file, that line is skipped as a heading.
 
     Raises:
-        SceneError: The list cannot be read, names a file twice, one that is not there, or one outside the folder.
+        SceneError: The list is unreadable or empty, or names a file twice, a missing file, or one outside `folder`.
     """
     try:
         rows = [row for row in csv.reader(file.read_text(encoding="utf-8-sig").splitlines()) if any(row)]
@@ -173,7 +173,7 @@ _Found = tuple[list[tuple[CameraFile, CameraFile, str]], dict[Path, str]]
 
 
 def _by_dji_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile]) -> _Found:
-    """DJI_0001_T with DJI_0001_V (or _W); where names carry a time, the two may differ by a few seconds."""
+    """Pair DJI_0001_T with DJI_0001_V (or _W); times in the two names may differ by up to `_DJI_LATE_S`."""
     taken: dict[tuple, list[tuple[re.Match[str], CameraFile]]] = defaultdict(list)
     for file in (*photographs, *thermal):
         match = _DJI.match(file.path.stem.lower())
@@ -211,7 +211,7 @@ def _seconds_apart(first: re.Match[str], second: re.Match[str]) -> float:
 
 
 def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], folder: Path) -> _Found:
-    """Pair files whose names are equal, or whose names and folders are where one name occurs more than once."""
+    """Pair files of equal names; where several files share a name, their folders must also be equal (`place`)."""
 
     def place(file: CameraFile) -> tuple[str, ...]:
         folders = file.path.relative_to(folder).parts[:-1]
@@ -244,7 +244,7 @@ def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], 
 
 
 def _shot(stem: str) -> tuple[str, ...]:
-    """What a name says of the shot: its words without those for the kind of image."""
+    """Return the words of a file name (`words_of`) that identify the shot, without words for the kind of image."""
     words = words_of(stem)
     kept = tuple(word for word in words if word not in ROLE_WORDS)
     if len(kept) > 1 and kept[-1] in _LAST_LETTERS:
@@ -280,7 +280,7 @@ def _by_time(
                 why = f"{name}, the nearest in time, is nearer to another or ambiguous"
             explained[file.path] = why
     pairs = []
-    for photo in photos:  # a pair counts only if each is the other's clear choice
+    for photo in photos:  # a pair counts only if each file is the clear choice of the other
         partner, nearest = chosen.get(photo.path, (None, 0.0))
         if partner is not None and chosen.get(partner.path, (None,))[0] is photo:
             pairs.append((photo, partner, f"taken {nearest:.1f} s apart"))
@@ -289,7 +289,7 @@ def _by_time(
 
 
 def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
-    """Names for frames: the shot's, with its folder where two are the same, with a number where that is not enough."""
+    """Return a unique frame name per photograph: the shot's, with folder or number where several shots share one."""
 
     def slug(text: str) -> str:
         return re.sub(r"[^A-Za-z0-9._-]+", "_", text).strip("._-")[:100] or "frame"
@@ -298,7 +298,7 @@ def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
     counted = Counter(stem.lower() for stem in stems)
     places = ["-".join((*path.relative_to(folder).parts[:-1], _without_role(path.stem))) for path in photographs]
     longer = [stem if counted[stem.lower()] == 1 else slug(place) for stem, place in zip(stems, places)]
-    # Files are named by them, and some disks take A and a for one.
+    # Files get these names, and some disks do not distinguish A from a.
     names, taken = [], set[str]()
     for name in longer:
         numbered = chain([name], (f"{name}-{number}" for number in count(2)))
@@ -308,5 +308,5 @@ def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
 
 
 def _without_role(stem: str) -> str:
-    """A name without the words at its end that say the kind of image."""
+    """Return a file name's stem without the words at its end for the kind of image: "a7-thermal" gives "a7"."""
     return re.sub(rf"(?:[\W_]+(?:{'|'.join(ROLE_WORDS | _LAST_LETTERS)}))+$", "", stem, flags=re.IGNORECASE)

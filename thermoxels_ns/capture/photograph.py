@@ -1,4 +1,4 @@
-"""Photographs and what their headers say of time, place, lens and orientation."""
+"""Reads photographs, masks, and the headers of photographs: time, place, lens and orientation."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _FILM_WIDTH_MM = 36.0
 
 @dataclass(frozen=True)
 class GpsFix:
-    """Where a camera says that it was."""
+    """Position of a camera as its GPS receiver states it."""
 
     latitude_deg: float
     longitude_deg: float
@@ -38,28 +38,28 @@ class GpsFix:
 
 @dataclass(frozen=True)
 class PhotographFacts:
-    """What the header of a photograph says; None where it does not say."""
+    """Contents of a photograph's header; a field is None where the header does not state it."""
 
     width: int
     height: int
     exif: ExifFacts
-    taken_at: datetime | None  # with fractions of a second where the file has them, as the camera's clock showed it
+    taken_at: datetime | None  # as the camera's clock showed it, with fractions of a second where the file has them
     focal_px: float | None
-    """Focal length, [pixels], from the lens and the pitch of the sensor, or from its equivalent on 35 mm film."""
+    """Focal length, [pixels], from the lens and the sensor's pixel pitch, else from the equivalent on 35 mm film."""
     orientation: int
-    """EXIF's 1 to 8: how to turn the pixels so that the picture stands upright; 1 where the file does not say."""
+    """EXIF orientation, 1 to 8: how to turn the stored pixels so that the picture stands upright; 1 if not stated."""
     gps: GpsFix | None
     gimbal_deg: tuple[float, float] | None
-    """Pitch (0 level, -90 straight down) and roll of the camera against gravity, [degrees]."""
+    """Pitch (0 is level, -90 looks straight down) and roll of the camera against gravity, [degrees]."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height, [pixels]."""
+        """Width and height of the photograph, [pixels]."""
         return self.width, self.height
 
 
 def read_photograph_facts(path: Path) -> PhotographFacts:
-    """Read a photograph's header; a `SceneError` where it is no picture or claims an absurd size."""
+    """Read a photograph's header; raise `SceneError` if the file is no picture or claims an absurd size."""
     with errors_name(path, _EXPECTED, _REMEDY), Image.open(path) as image:
         width, height = image.size
         facts = read_exif_facts(image)
@@ -81,13 +81,13 @@ def read_photograph_facts(path: Path) -> PhotographFacts:
 
 
 def open_photograph(path: Path) -> Image.Image:
-    """Decode a photograph as its RGB pixels are stored, without EXIF's orientation; a `SceneError` where it is none."""
+    """Return a photograph's RGB pixels as stored, not turned by EXIF; raise `SceneError` if it cannot be decoded."""
     with errors_name(path, _EXPECTED, _REMEDY), Image.open(path) as image:
         return image.convert("RGB")
 
 
 def read_mask(path: Path, width: int, height: int) -> BoolArray:
-    """Read a mask, white (128 and more) where the image may be used; a `SceneError` where its size is another."""
+    """Return a mask (height, width), True where the file is light (128 or more); raise `SceneError` for a bad size."""
     mask = np.asarray(open_photograph(path).convert("L")) >= 128
     if mask.shape != (height, width):
         expected = f"a mask of {width} x {height} pixels, as the images have"
@@ -97,7 +97,7 @@ def read_mask(path: Path, width: int, height: int) -> BoolArray:
 
 
 def _number(value: object) -> float | None:
-    """A finite number of a tag, also of a fraction; None for what is none."""
+    """Return an EXIF value (number or fraction) as a finite float, or None if it is no finite number."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError):
@@ -106,7 +106,7 @@ def _number(value: object) -> float | None:
 
 
 def _with_fraction(taken_at: datetime | None, tags: Mapping[int, Any]) -> datetime | None:
-    """Add the fraction of a second, written as digits after the point or as a fraction."""
+    """Add the fraction of a second from `tags`, stored as digits after the decimal point or as a fraction."""
     if taken_at is None:
         return None
     for tag in _SUBSECOND:
@@ -125,7 +125,7 @@ def _focal_px(tags: Mapping[int, Any], width: int, height: int) -> float | None:
     focal_mm, per_unit, film_mm = (_number(tags.get(tag)) or 0.0 for tag in (_FOCAL_MM, _PLANE_X, _FOCAL_35MM))
     unit_mm = _MM_PER_PLANE_UNIT.get(tags.get(_PLANE_UNIT, 2), math.inf)
     candidates = focal_mm * per_unit / unit_mm, film_mm / _FILM_WIDTH_MM * longest
-    # A lens of 8 to 160 degrees; what is outside was written for another resolution, or is nonsense.
+    # The limits mean lenses of 7 to 157 degrees; values outside belong to another resolution or are wrong.
     return next((px for px in candidates if 0.1 * longest < px < 8.0 * longest), None)
 
 
@@ -134,7 +134,7 @@ def _gps_fix(gps: Mapping[int, Any]) -> GpsFix | None:
     longitude = _degrees(gps.get(4), gps.get(3), "W")
     if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
         return None
-    if latitude == 0.0 and longitude == 0.0:  # what cameras without a fix write
+    if latitude == 0.0 and longitude == 0.0:  # cameras without a fix write zeros
         return None
     altitude = _number(gps.get(6))
     below = gps.get(5) in (1, b"\x01")

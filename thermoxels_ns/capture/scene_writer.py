@@ -1,4 +1,4 @@
-"""The scene folder that the dataparser reads: photographs, temperatures, masks, points and transforms.json."""
+"""Writes the scene folder that the dataparser reads: photographs, temperatures, masks, points, transforms.json."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ POINTS_NAME = "sparse_points.ply"
 TRACKS_NAME = "sparse_tracks.npz"
 _FOLDERS = ("images", "thermal", "masks")
 SCENE_CONTENT = (JSON_NAME, POINTS_NAME, TRACKS_NAME, *_FOLDERS)
-"""Files and folders of a scene in the output folder; masks only where there are any."""
+"""Names of a scene's files and folders in the output folder; the folder masks exists only if the scene has masks."""
 _COPIED = {"JPEG": ".jpg", "PNG": ".png"}
 _MOST_POINT_ERROR_PX = 2.0
 _LEAST_SIGHTINGS = 3
@@ -38,7 +38,7 @@ EVAL_INTERVAL = 8
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that a scene is written from; frames are in the order of the model's."""
+    """Everything that a scene folder is written from; `frames` are in the order of `model.frames`."""
 
     frames: Sequence[CaptureFrame]
     model: SfmModel
@@ -50,7 +50,7 @@ class Scene:
 
 
 def scene_names(count: int) -> list[str]:
-    """Names of a scene's frames, without ending; every 8th evaluates, the ends of the capture train.
+    """Return a scene's frame names without suffix; every 8th frame is for evaluation (of three or more, not the first).
 
     >>> scene_names(5)[3:]
     ['frame_eval_00004', 'frame_train_00005']
@@ -62,7 +62,7 @@ def scene_names(count: int) -> list[str]:
 
 
 def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = lambda _: None) -> None:
-    """Write a scene in place of an earlier one; until its last file, transforms.json, is there, there is none."""
+    """Write a scene into `output` in place of an earlier one; transforms.json comes last and marks it as complete."""
     new = output / CACHE_FOLDER / "new_scene"
     shutil.rmtree(new, ignore_errors=True)
     for name in _FOLDERS if scene.masks.any else _FOLDERS[:2]:
@@ -103,7 +103,7 @@ def write_points(path: Path, points: FloatArray, colours: npt.NDArray[np.uint8])
 
 
 def camera_entries(camera: Camera) -> dict[str, Any]:
-    """A camera as transforms.json has it."""
+    """Return a camera's intrinsics under their names in transforms.json; lengths in pixels."""
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
     values = {name: getattr(camera, name) for name in names}
     return {"camera_model": "OPENCV", "w": camera.width, "h": camera.height, **values}

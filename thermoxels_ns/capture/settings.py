@@ -1,4 +1,4 @@
-"""Options of a capture; light to import, so that the help answers at once."""
+"""Options of a capture. This module is quick to import, so that ``--help`` answers at once."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
 @dataclass
 class CaptureSettings:
-    """All settings of ``thermoxels capture`` but the folders."""
+    """All settings of ``thermoxels capture`` except the input and output folders."""
 
     from_stage: StageName | None = None
-    """Do this stage and all later ones again. Without it only those whose input or options have changed."""
+    """Run this stage and all later stages again. Without it, only stages whose input or options changed run again."""
     skip_bad: bool = False
-    """Leave files out that cannot be read and name them, instead of stopping."""
+    """Leave out and report files that cannot be read, instead of stopping at the first of them."""
     camera: Literal["workswell", "flir-high-gain", "flir-low-gain", "flir-duo", "sensefly"] | None = None
-    """Which camera's counts TIFF files hold. Default: by what the file says, which some files leave open."""
+    """Camera whose counts TIFF or PNG files hold. Default: recognised from the file, which some files do not allow."""
     celsius_per_count: float | None = None
-    """Degrees per count of TIFF, PNG or whole-number NPY files, in place of a camera's."""
+    """Degrees per count of TIFF, PNG or whole-number NPY files, instead of --camera; goes with --celsius-offset."""
     celsius_offset: float | None = None
-    """Temperature of count zero, in degrees C; goes with --celsius-per-count."""
+    """Temperature that count 0 stands for, in degrees C; goes with --celsius-per-count."""
     emissivity: float | None = None
-    """Emissivity of what was photographed, above 0, at most 1. Default: the camera's setting."""
+    """Emissivity of the photographed surfaces, above 0, at most 1. Default: the camera's setting."""
     reflected_c: float | None = None
-    """Apparent temperature of what the objects mirror, in degrees C. Default: the camera's setting."""
+    """Apparent temperature of what the surfaces reflect, in degrees C. Default: the camera's setting."""
     distance_m: float | None = None
-    """From the camera to the objects, for the air between, in metres. Default: the camera's setting."""
+    """Distance from camera to surfaces, to correct for the air between, in metres. Default: the camera's setting."""
     relative_humidity: float | None = None
-    """Of the air, 0 to 1. Default: the camera's setting."""
+    """Relative humidity of the air, 0 to 1. Default: the camera's setting."""
     air_c: float | None = None
     """Air temperature, in degrees C. Default: the camera's setting."""
     dji_library: Path | None = None
@@ -42,50 +42,50 @@ class CaptureSettings:
     """CSV file with one photograph and its thermal image per line, relative to the input folder. Default: pairs are
     found by content, names and times."""
     time_limit_s: float = 1.5
-    """Longest time between the exposures of a pair that is found by its times alone, in seconds."""
+    """Longest time between the two exposures where a pair is found by time alone, in seconds."""
     clock_offset_s: float = 0.0
-    """How far the thermal camera's clock is ahead of that of the photographs, in seconds."""
+    """How far the thermal camera's clock is ahead of the photographs' clock, in seconds."""
     poses: Path | None = None
-    """Poses that exist already: folder of a COLMAP model, or a transforms.json. Default: found from the photographs."""
+    """Known poses: folder of a COLMAP model, or a transforms.json. Default: poses are found from the photographs."""
     matching: Matching = "auto"
-    """Which photographs are compared: each with each, or each with its neighbours in time. auto: each with each up to
-    80 photographs."""
+    """Pairs of photographs to compare. exhaustive: all; sequential: neighbours in time and some far ones; auto:
+    exhaustive up to 80 photographs, else sequential."""
     lens: LensModel = "SIMPLE_RADIAL"
     """Lens model of the photographs, by COLMAP's names. OPENCV fits strong distortion and needs many photographs."""
     image_size: int = 1600
     """Longest side to which photographs are reduced for finding poses, in pixels. The scene keeps the originals."""
     max_features: int = 4000
-    """Features per photograph. More of them find poses in poor texture and take longer."""
+    """Most features per photograph. More features find poses in poorer texture, and take longer."""
     threads: int = 2
-    """Threads for finding poses."""
+    """Number of threads for finding and matching features."""
     seed: int = 0
-    """Of all random choices; the same seed gives the same poses."""
+    """Seed of all random choices; the same seed gives the same poses."""
     known_distance: tuple[str, float, float, float, float, float] | None = None
-    """A length that was measured: name of a photograph, pixel x y of one end, x y of the other, metres."""
+    """A measured length: name of a photograph, pixel x y of one end, pixel x y of the other end, length in metres."""
     known_distance_error_m: float | None = None
-    """Standard error of that length, in metres."""
+    """Standard error of --known-distance, in metres. Default: the length counts as exact."""
     marker_side_m: float | None = None
     """Side of the black square of printed ArUco markers (dictionary 4x4, numbers 0 to 49) in the scene, in metres."""
     marker_error_m: float | None = None
-    """Standard error of that side, in metres."""
+    """Standard error of --marker-side-m, in metres. Default: the side counts as exact."""
     thermal_field_of_view_deg: float | None = None
-    """Horizontal angle of view of the thermal lens, in degrees, where the search for it begins. Default: what the files
-    say."""
+    """Horizontal angle of view of the thermal lens at the start of the search for the rig, in degrees. Default: what
+    the files say."""
     rig: Path | None = None
-    """transforms.json of an earlier capture with the same camera: its thermal camera and rig are used as they are, and
-    lengths follow the two scales where both are known."""
+    """transforms.json of an earlier capture with the same camera: its thermal camera and rig are used unchanged, except
+    that the rig's lengths are converted where both captures have a scale."""
     board_photos: Path | None = None
-    """Folder with pictures of a heated (or foil) checker board, taken by both cameras in at least three places: the rig
-    comes from them instead of from the scene. Needs --board, --board-square-m and a known scale."""
+    """Folder with pictures of a heated (or foil) checker board in at least three places, taken by both cameras: the rig
+    is found from them instead of from the scene. Needs --board, --board-square-m and a known scale."""
     board: str | None = None
-    """Inner corners of that board along both sides, such as 7x5 for 8 x 6 squares."""
+    """Inner corners of the checker board along both sides, such as 7x5 for 8 x 6 squares."""
     board_square_m: float | None = None
-    """Side of one of its squares, in metres."""
+    """Side of one square of the checker board, in metres."""
     drift: Literal["auto", "off"] = "auto"
-    """Correct offsets between thermal images and vignetting, if points that the fit does not see agree better."""
+    """Correct vignetting and offsets between thermal images, if this helps at points that the fit does not use."""
     find_overlays: bool = True
     """Mask text and logos that the camera drew over all photographs."""
     masks: Path | None = None
-    """Folder of masks for photographs, each named like its photograph: white where it may be used."""
+    """Folder of masks, each named like its photograph: white where the photograph may be used."""
     thermal_mask: Path | None = None
-    """One mask for all thermal images: white where they may be used."""
+    """One mask for all thermal images: white where the thermal images may be used."""

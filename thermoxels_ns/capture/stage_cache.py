@@ -23,7 +23,7 @@ from thermoxels_ns.core.json_values import read_json
 
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
-_FORMAT = 2  # of the results; raised when they are kept in another way, so that earlier ones are made again
+_FORMAT = 2  # number of the results' file format; a higher number makes all earlier results invalid
 _KEY_FILE, _DONE_FILE = "key.txt", "seconds.txt"
 _Record = TypeVar("_Record")
 _EXPECTED, _REMEDY = "what an earlier stage of the capture wrote", "Run it again with --from-stage pairs."
@@ -33,27 +33,27 @@ _EXPECTED, _REMEDY = "what an earlier stage of the capture wrote", "Run it again
 class StageCache:
     """Runs stages in order and keeps what they found in ``.capture/`` of the output folder.
 
-    A stage's key is a hash of its name, its options, the files it reads and the key of the stage before it. A stage
-    whose key is the same as last time is not run again. An interrupted stage finds its folder as the interruption left
-    it.
+    A stage's key is a hash of its name, its options, the files that it reads and the key of the stage before. A
+    finished stage whose key is the same as last time is not run again. A stage that was interrupted and has the same
+    key finds its folder as the interruption left it.
     """
 
     folder: Path  # the capture's output folder
     from_stage: StageName | None = None  # run this stage and all later ones, also where nothing has changed
     say: Callable[[str], None] = lambda _: None  # told one line per stage
     seconds: list[tuple[str, float]] = field(default_factory=list)
-    """Stages in order and the time each took, also where it was taken from the cache, [s]."""
+    """Name of each stage and the time [s] it took, in order; for a cached stage, the time of its earlier run."""
     _previous: str = ""
 
     def run(
         self, name: StageName, depends_on: Mapping[str, Any], work: Callable[[Path], None], writes: Sequence[Path] = ()
     ) -> Path:
-        """Run a stage, or take its earlier result; return the folder with the result.
+        """Run a stage, or find its earlier result still valid; return the folder with the result.
 
-        Stages come once each, in order. `depends_on` is everything but the earlier stages that the result depends on,
-        as json can hold it. `work` writes the result into the folder that it is given; that may hold what an
-        interrupted run with the same key left. `writes` are files and folders that the stage writes elsewhere; where
-        one of them is gone, the stage runs again.
+        Call this once per stage, in the order of `STAGES`. `depends_on` names everything that the result depends on
+        besides earlier stages, as values for json. `work` writes the result into the folder passed to it, which may
+        still hold files of an interrupted run with the same key. `writes` are files and folders that the stage writes
+        elsewhere; the stage runs again if one of them is missing.
 
         Raises:
             OutputError: The result cannot be written.
@@ -72,7 +72,7 @@ class StageCache:
             return folder
         remove_file(folder / _DONE_FILE)
         if stale:
-            # The key goes before the files: whoever is killed between them leaves nothing that is taken for whole.
+            # The key is removed first, so that a process killed in between leaves no folder that seems valid.
             remove_file(folder / _KEY_FILE)
             if folder.is_dir():
                 shutil.rmtree(folder)
@@ -89,7 +89,7 @@ class StageCache:
         return folder
 
     def leave_out(self, name: StageName, why: str) -> None:
-        """Say that a stage has nothing to do, so that the numbers of the others have no gap."""
+        """Report that a stage has nothing to do, so that the stage numbers in the output have no gap."""
         self.say(f"{_title(name)}: left out, {why}")
 
 
@@ -98,7 +98,7 @@ def _title(name: StageName) -> str:
 
 
 def fingerprint(paths: Sequence[Path], root: Path) -> list[tuple[str, int, int]]:
-    """Name, size and time of change of files: enough to notice that one was replaced."""
+    """Return name (relative to `root` if inside), size [bytes] and time of change [ns] of each file, sorted."""
     rows = []
     for path in sorted(set(paths)):
         status = path.stat()
@@ -108,7 +108,7 @@ def fingerprint(paths: Sequence[Path], root: Path) -> list[tuple[str, int, int]]
 
 
 def given_fingerprints(paths: Sequence[Path | None]) -> list[tuple[str, int, int]]:
-    """Fingerprints of files that the user names (None: of none); a `SceneError` where one is not there."""
+    """Return the `fingerprint` of files that the user names, ignoring None; raise `SceneError` for a missing file."""
     there = [path for path in paths if path is not None]
     for path in there:
         if not path.is_file():
@@ -118,12 +118,12 @@ def given_fingerprints(paths: Sequence[Path | None]) -> list[tuple[str, int, int
 
 
 def files_of(path: Path) -> list[Path]:
-    """All files of a folder and the folders in it, or the file itself."""
+    """Return all files in a folder and its subfolders, sorted; for a path that is no folder, that path alone."""
     return sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
 
 
 def prepare_output(folder: Path) -> Path:
-    """Make the output folder, or take that of an earlier capture; an `OutputError` where it holds other files."""
+    """Make the output folder and return its path; raise `OutputError` if it holds files but no earlier capture."""
     folder = writable_folder(folder)
     if not (folder / CACHE_FOLDER).is_dir() and any(folder.iterdir()):
         remedy, got = "Pass another folder with --output.", f"{folder}, which holds other files"
@@ -140,19 +140,19 @@ def _read(file: Path) -> str | None:
 
 
 def save(path: Path, record: Any) -> None:
-    """Write a dataclass of arrays, numbers, texts, tuples and perspective cameras as .npz, whole or not at all."""
+    """Write a dataclass (fields: arrays, numbers, texts, tuples, perspective cameras) as .npz, atomically."""
     values = {each.name: getattr(record, each.name) for each in fields(record)}
     for name, value in values.items():
-        if isinstance(value, Camera):  # all but the lens, which comes last
+        if isinstance(value, Camera):  # store all fields except the last one, the lens
             values[name] = tuple(getattr(value, each.name) for each in fields(value)[:-1])
-    packed = io.BytesIO()  # in memory, because numpy's half-made files complain later
+    packed = io.BytesIO()  # in memory: an archive that numpy could not write to disk raises again when it is deleted
     np.savez(packed, **{name: np.asarray(value) for name, value in values.items()})  # type: ignore[arg-type]
     with replace_when_done(path) as temporary:
         temporary.write_bytes(packed.getbuffer())
 
 
 def load(path: Path, kind: type[_Record]) -> _Record:
-    """Read a dataclass that `save` wrote; a `ThermoxelsError` where the file is missing or damaged."""
+    """Read a dataclass of type `kind` that `save` wrote; raise `ThermoxelsError` if the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as opened:
             arrays = {name: opened[name] for name in opened.files}
@@ -163,12 +163,12 @@ def load(path: Path, kind: type[_Record]) -> _Record:
 
 
 def load_json(path: Path) -> Any:
-    """Read json that a stage wrote; a `ThermoxelsError` where it is missing or damaged."""
+    """Read a json file that a stage wrote; raise `ThermoxelsError` if the file is missing or damaged."""
     return read_json(path, _EXPECTED, _REMEDY)
 
 
 def _value(array: np.ndarray, hint: Any) -> Any:
-    """Convert a stored array into the type of its field."""
+    """Return a stored array as the type `hint` of its field: camera, plain value, tuple, or the array itself."""
     if hint is Camera:
         width, height, *numbers = array.tolist()
         return Camera(int(width), int(height), *numbers)

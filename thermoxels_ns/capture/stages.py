@@ -50,9 +50,9 @@ from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError, 
 from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
-PAGE_NAME = "capture.html"  # of the page, in the output folder
-_MOST_NAMED = 10  # files left out that are named while the command runs
-_LEAST_SIGHTINGS = 50  # sightings of scene points below which thermal images and photographs cannot be compared
+PAGE_NAME = "capture.html"  # file name of the report, in the output folder
+_MOST_NAMED = 10  # how many of the files left out are named while the command runs; the page names all
+_LEAST_SIGHTINGS = 50  # with fewer sightings of scene points, thermal images and photographs cannot be compared
 _OVERLAY_FILE = "overlay.npy"
 
 _Options = TypeVar("_Options")
@@ -60,22 +60,22 @@ _Options = TypeVar("_Options")
 
 @dataclass(frozen=True)
 class CaptureResult:
-    """What a capture found; the scene is in the output folder."""
+    """Everything that one finished capture found; `run_capture` also wrote the scene to the folder `output`."""
 
     source: Path
     output: Path
     pairs: Sequence[Pair]
-    dropped: dict[str, str]  # files and frames that are not in the scene, and why
+    dropped: dict[str, str]  # reason by name, for each file and frame that is not in the scene
     read: CaptureFrames
     scene: Scene
-    start: RigEstimate  # where the search for the rig began
-    scale_missing: str  # why there is no scale, where there is none
+    start: RigEstimate  # the rig that the search started from
+    scale_missing: str  # reason why no metric scale was found; empty where a scale was found
     poses_source: str
     seconds: Sequence[tuple[str, float]]  # stages and the time each took, [s]
 
     @property
     def page(self) -> Path:
-        """The page about the capture."""
+        """Path of the HTML page that reports on the capture."""
         return self.output / PAGE_NAME
 
 
@@ -88,11 +88,11 @@ def run_capture(
 ) -> CaptureResult:
     """Turn a folder of camera files into a scene, a page and the stages' results in `output`.
 
-    `write_page` is the last stage; `say` is told how far it is, one line at a time.
+    The last stage calls `write_page`, which writes the report. `say` is called with one line of progress at a time.
 
     Raises:
-        ThermoxelsError: A file cannot be read, there are no pairs or no poses, or an option is out of range.
-        OutputError: The output cannot be written to, its disk is full, or another capture works in it.
+        ThermoxelsError: A file cannot be read, no pairs or no poses are found, or an option is out of range.
+        OutputError: `output` cannot be written to, its disk is full, or another capture is working in it.
     """
     if not source.is_dir():
         scan_folder(source)  # says what is wrong
@@ -108,7 +108,7 @@ def run_capture(
     lock = hold_folder(folder / CACHE_FOLDER / "lock", remedy, say)
     try:
         remove_stale_temporaries(folder, [PAGE_NAME])
-        # Inverses and sums of BLAS depend on the number of its threads; one thread is no slower here.
+        # Results of BLAS depend on its number of threads in the last bits; one thread is no slower here.
         with threadpool_limits(1, "blas"):
             cache = StageCache(folder, settings.from_stage, say)
             return _Capture(source, folder, settings, cache, say, board).run(write_page)
@@ -124,19 +124,19 @@ def run_capture(
 
 @dataclass
 class _Capture:
-    """One capture that is being made; a method for each stage."""
+    """One capture while it runs; each public method runs one stage, except `run` and `options`."""
 
     source: Path
     output: Path
     settings: CaptureSettings
     cache: StageCache
     say: Callable[[str], None]
-    board: CheckerBoard | None = None  # what the user's pictures of a checker board show
+    board: CheckerBoard | None = None  # checker board in the user's pictures; None: the user passes no such pictures
     dropped: dict[str, str] = field(default_factory=dict)
-    """Files and frames that are left out, and why; stages add to it."""
+    """Reason by name, for each file and frame that is left out; the stages add to this dictionary."""
 
     def run(self, write_page: Callable[[CaptureResult], None]) -> CaptureResult:
-        """Run all stages."""
+        """Run all stages in order and return what they found."""
         pairs = self.pairs()
         read = self.temperatures(pairs)
         found = self.poses(read)
@@ -164,12 +164,12 @@ class _Capture:
         return result
 
     def options(self, kind: type[_Options]) -> _Options:
-        """Those of the user's settings that a dataclass of options has fields for."""
+        """Return an instance of `kind`, a dataclass of options, filled with the user's settings of the same names."""
         settings = vars(self.settings)
         return kind(**{each.name: settings[each.name] for each in fields(kind) if each.name in settings})  # type: ignore[arg-type]
 
     def pairs(self) -> tuple[Pair, ...]:
-        """Find which photograph belongs to which thermal image."""
+        """Return the pairs of photograph and thermal image, found in the folder or listed by the user."""
         settings = self.settings
         inside = files_below(self.source, [self.output])
         if settings.pairs is None:
@@ -203,7 +203,7 @@ class _Capture:
         return tuple(Pair(name, self.source / a, self.source / b, how) for name, a, b, how in content["pairs"])
 
     def temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
-        """Read the pairs: degrees from thermal files, photographs out of files that hold both."""
+        """Return the frames: thermal images in degrees C, and photographs, extracted where one file holds both."""
         settings, options = self.settings, self.options(RadiometryOptions)
         library = settings.dji_library if settings.dji_library and settings.dji_library.is_file() else None
         depends = {
@@ -223,7 +223,7 @@ class _Capture:
         return read
 
     def poses(self, read: CaptureFrames) -> SfmModel:
-        """Find camera, poses and scene points, or take those that the user gives."""
+        """Return camera, poses and scene points; they are found from the photographs or given by the user."""
         settings, options = self.settings, self.options(PoseOptions)
         depends = {
             "options": options,
@@ -257,7 +257,7 @@ class _Capture:
         return load(folder / "model.npz", SfmModel)
 
     def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, MetricScale | None, str, Up]:
-        """Find metres per unit and up; turn a model that was found here upright, keep one that was given."""
+        """Return the model (turned upright unless its poses are given), scale or None, reason for None, and up."""
         settings = self.settings
         depends = {
             "known": [settings.known_distance, settings.known_distance_error_m],
@@ -288,7 +288,7 @@ class _Capture:
         return load(folder / "model.npz", SfmModel), scale, content["missing"], Up(**up)
 
     def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[MetricScale | None, str]:
-        """Metres per unit from the surest source that there is; where there is none, why."""
+        """Return metres per unit from a known distance, else markers, else GPS; or None and the reason for None."""
         settings = self.settings
         if settings.known_distance is not None:
             files = {frame.name: frame.photograph_source for frame in frames}
@@ -300,7 +300,7 @@ class _Capture:
         return scale_from_gps(model.centres, [frame.gps for frame in frames])
 
     def board_rig(self, model: SfmModel, read: CaptureFrames) -> RigEstimate | None:
-        """Find the rig in metres where the user has pictures of a checker board; None: there are none."""
+        """Return the rig, lengths in metres, from the user's pictures of a checker board; None without pictures."""
         board, pictures, settings = self.board, self.settings.board_photos, self.settings
         if board is None or pictures is None:
             self.cache.leave_out("board", "no --board-photos")
@@ -324,7 +324,7 @@ class _Capture:
         scale_missing: str,
         board: RigEstimate | None,
     ) -> tuple[RigEstimate, RigEstimate]:
-        """Find the rig, or take the one that the user or a checker board gives."""
+        """Return the rig (found from the images, or given by the user or the board) and the start of its search."""
         settings = self.settings
         angle, metres = settings.thermal_field_of_view_deg, None if scale is None else scale.metres_per_unit
         begin = rig_start(frames, model.camera, read.thermal_size, angle, metres)
@@ -348,7 +348,7 @@ class _Capture:
         return rig, kept_start(begin, "Where the search begins.")
 
     def drift(self, model: SfmModel, frames: list[CaptureFrame], rig: RigEstimate) -> DriftEstimate:
-        """Find how far each thermal image reads too high, unless the user switched that off."""
+        """Return how far each thermal image reads too high; all zeros if switched off or without scene points."""
 
         def work(folder: Path) -> None:
             if self.settings.drift == "off" or len(model.sighting_frame) < _LEAST_SIGHTINGS:

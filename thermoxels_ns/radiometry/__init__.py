@@ -1,1 +1,1 @@
-"""From thermal camera files to degrees Celsius."""
+"""Converts the files of thermal cameras to degrees Celsius."""

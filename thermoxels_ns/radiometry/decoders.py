@@ -1,4 +1,4 @@
-"""Guards picture decoders: sizes are limited, every error names the file; and what headers say of the camera."""
+"""Limits for sizes of files and pictures, errors that name the file, and the facts in EXIF headers."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from PIL import Image
 from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsError
 
 LARGEST_SIDE = 8192
-"""Pixels along a side: four times the largest thermal sensors and super-resolution modes (about 2048)."""
+"""Largest side of a thermal image, [pixels]: four times that of the largest sensors and super-resolution (2048)."""
 JPEG_START, PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _MAKE, _MODEL, _CHANGED_AT, _TAKEN_AT, _EXIF = 271, 272, 306, 36867, 34665
-LARGEST_FILE_BYTES = 2**29  # a table of 4096 x 4096 numbers of 30 characters; camera files are far smaller
+LARGEST_FILE_BYTES = 2**29  # room for a table of 4096 x 4096 numbers of 30 characters; camera files are far smaller
 
 
 @contextmanager
@@ -28,12 +28,12 @@ def errors_name(
     remedy: str = "The file is damaged; copy it from the camera again.",
     error: type[ThermoxelsError] = SceneError,
 ) -> Iterator[None]:
-    """Turn every error of the block into one of type `error` that names the file; our own errors pass as they are.
+    """Turn every exception in the `with` block into an `error` that names `path`; a `ThermoxelsError` passes unchanged.
 
-    `expected` is what the file should be, `remedy` what to do if it is damaged.
+    The message says what the file should be (`expected`) and what to do if the file is damaged (`remedy`).
     """
     try:
-        with warnings.catch_warnings():  # Pillow's name no file; what is wrong with one is an error that does
+        with warnings.catch_warnings():  # Pillow's warnings do not name the file; serious faults raise errors anyway
             warnings.filterwarnings("ignore", module=r"PIL\.")
             yield
     except ThermoxelsError:
@@ -44,7 +44,7 @@ def errors_name(
         remedy = "Reduce the picture; or copy the file again, if it is not so large: its header is damaged."
         raise error(str(path), expected=expected, got=got, remedy=remedy) from problem
     except Exception as problem:  # decoders raise OSError, SyntaxError, KeyError, TypeError, struct.error and others
-        # The operating system's errors have a number, those of decoders have none.
+        # An OSError of the operating system has a number (errno); an OSError of a decoder has none.
         strerror = problem.strerror if isinstance(problem, OSError) else None
         if isinstance(problem, OSError) and problem.errno is not None:
             expected, remedy = "a file that can be read", "Check its permissions and the disk, or copy it again."
@@ -53,7 +53,7 @@ def errors_name(
 
 
 def check_thermal_size(path: Path | str, width: int, height: int) -> None:
-    """Raise a `ThermalFileError` if a thermal file says that it is larger than cameras make them, or has no pixels."""
+    """Raise `ThermalFileError` if the size in a thermal file's header is 0 or above `LARGEST_SIDE` along a side."""
     if not (0 < width <= LARGEST_SIDE and 0 < height <= LARGEST_SIDE):
         expected = f"a thermal image of 1 to {LARGEST_SIDE} pixels a side"
         got = f"a header that says {width} x {height}"
@@ -62,7 +62,7 @@ def check_thermal_size(path: Path | str, width: int, height: int) -> None:
 
 
 def check_file_size(path: Path) -> None:
-    """Raise a `ThermalFileError` if a thermal file is empty or larger than any camera writes."""
+    """Raise `ThermalFileError` if a file is empty or has more than `LARGEST_FILE_BYTES`."""
     size = path.stat().st_size
     if size == 0:
         remedy = "Copy it from the camera again, or remove it."
@@ -74,9 +74,9 @@ def check_file_size(path: Path) -> None:
 
 
 def app_segments(path: Path, whole: bool = False) -> list[tuple[str, bytes]]:
-    """Name (APP1, APP3, ...) and content of a JPEG's segments before the picture, where cameras keep what is none.
+    """Return name (APP1, APP3, ...) and content of a JPEG's application segments, where cameras store their data.
 
-    With `whole` the picture is decoded too, which fails where the file is cut off.
+    With `whole` the picture is decoded too, so that a file that is cut off raises an error.
     """
     with Image.open(path, formats=("JPEG", "MPO")) as image:
         if whole:
@@ -86,7 +86,7 @@ def app_segments(path: Path, whole: bool = False) -> list[tuple[str, bytes]]:
 
 @dataclass(frozen=True)
 class ExifFacts:
-    """What EXIF tags say of camera and time; None where they do not say."""
+    """Camera and time from EXIF tags; a field is None if its tag is missing."""
 
     make: str | None = None
     model: str | None = None
@@ -94,12 +94,12 @@ class ExifFacts:
 
     @property
     def camera(self) -> str | None:
-        """Maker and model."""
+        """Maker and model in one text; None if both are missing."""
         return " ".join(word for word in (self.make, self.model) if word) or None
 
 
 def read_exif_facts(image: Image.Image) -> ExifFacts:
-    """Read the tags of an opened image; its pixels are not touched."""
+    """Return camera and time from the EXIF tags of an opened image, without decoding the pixels."""
     exif = image.getexif()
     tags: Mapping[int, Any] = {**exif, **exif.get_ifd(_EXIF)}
     return ExifFacts(

@@ -1,4 +1,4 @@
-"""DJI's radiometric JPEG, read through DJI's own library."""
+"""Reads DJI's radiometric JPEG through DJI's own library."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class _Resolution(ctypes.Structure):
 
 
 class _Parameters(ctypes.Structure):
-    """Measurement parameters, with room behind them: newer libraries know the air temperature too."""
+    """Measurement parameters of `libdirp`, with spare room: newer libraries also write the air temperature."""
 
     _fields_ = [
         ("distance_m", ctypes.c_float),
@@ -55,26 +55,26 @@ class _Parameters(ctypes.Structure):
 
 @dataclass(frozen=True)
 class DjiImage:
-    """One R-JPEG of a DJI camera after reading."""
+    """Temperatures and metadata of one R-JPEG of a DJI camera."""
 
     temperature_c: Float32Array  # shape (height, width), [degrees C]
-    conditions: Conditions
+    conditions: Conditions  # the settings that the temperatures were computed with
     exif: ExifFacts
 
 
 def is_dji_rjpeg(path: Path) -> bool:
-    """Whether a JPEG is DJI's and holds counts: its photographs have the maker's name, but no APP3 segments."""
+    """Return whether a JPEG names DJI and has APP3 segments with counts, which DJI's photographs do not have."""
     segments = app_segments(path)
     made_by_dji = any(name == "APP1" and b"DJI" in content for name, content in segments)
     return made_by_dji and any(name == "APP3" for name, _ in segments)
 
 
 def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrides) -> DjiImage:
-    """Read a DJI R-JPEG with `libdirp`.
+    """Read temperatures from a DJI R-JPEG with `libdirp`, with the user's settings where `overrides` gives them.
 
-    How DJI's counts become degrees is not public: the Thermal SDK's `libdirp` does it, may not be passed on with other
-    programs, and is free to download. So the user names the library. A `ThermalFileError` is raised where there is
-    none, it is another one, it refuses the file or the parameters, or the file is cut off.
+    How DJI's counts become degrees is not public. `libdirp` of DJI's Thermal SDK converts them; the SDK is free to
+    download but may not be passed on, so the user names the `library`. Raises `ThermalFileError` if the library is
+    missing, another one, or refuses the file or the settings, or if the file is cut off.
     """
     whole = "a whole DJI R-JPEG, as the drone wrote it"
     with errors_name(path, whole, "Copy the file from the drone again.", ThermalFileError):
@@ -107,7 +107,7 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
     size = _Resolution()
     call("dirp_get_rjpeg_resolution", handle, ctypes.byref(size))
     check_thermal_size(path, size.width, size.height)
-    parameters = _Parameters(air_c=math.nan)  # a library that knows it writes over this
+    parameters = _Parameters(air_c=math.nan)  # a library that knows the air temperature overwrites the NaN
     call("dirp_get_measurement_params", handle, ctypes.byref(parameters))
     knows_air = not math.isnan(parameters.air_c)
     percent = parameters.humidity > 1.0

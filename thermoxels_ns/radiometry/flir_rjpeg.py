@@ -1,4 +1,4 @@
-"""FLIR's radiometric JPEG: counts, calibration and settings behind the picture."""
+"""Reads FLIR's radiometric JPEG: the counts, calibration and settings stored beside the picture."""
 
 from __future__ import annotations
 
@@ -20,46 +20,46 @@ from thermoxels_ns.radiometry.decoders import JPEG_START, PNG_START, app_segment
 from thermoxels_ns.radiometry.measurement_model import AirConstants, Conditions, PlanckConstants, RadiometricModel
 
 _RAW_DATA, _PICTURE, _CAMERA_INFO, _PICTURE_IN_PICTURE = 0x01, 0x0E, 0x20, 0x2A
-"""Record types that are read; palettes, measuring tools and voice notes are not."""
+"""Types of the records that are read; palettes, measuring tools, voice notes and others are ignored."""
 _REMEDY = "Copy the file from the camera again; programs that edit pictures drop its thermal part."
 _FLIR_HEADER_BYTES, _IMAGE_HEADER_BYTES = 8, 32
 _FIRST_SEGMENT = re.compile(rb"\xff\xe1..FLIR\0", re.DOTALL)
-_HEAD_BYTES = 2**18  # the first FLIR segment comes after the EXIF segments, each at most 64 KiB
+_HEAD_BYTES = 2**18  # so many first bytes are searched for a FLIR segment: EXIF segments of up to 64 KiB come first
 _MOST_RECORDS = 1000
 
 
 @dataclass(frozen=True)
 class _Record:
-    """The bytes of one record, which has its own byte order."""
+    """The bytes of one record, and the byte order of the record, "<" or ">"."""
 
     content: bytes
     order: str
 
     @classmethod
     def marked(cls, content: bytes) -> _Record:
-        """A record that begins with the number 2 in its byte order."""
+        """Return the record with the byte order in which its first 16-bit number is 2."""
         return cls(content, "<" if content[:2] == b"\2\0" else ">")
 
     def numbers(self, offset: int, codes: str) -> tuple[float, ...]:
-        """Numbers at a byte offset; `codes` are those of `struct`."""
+        """Return the numbers at a byte offset, in the formats `codes` of `struct`."""
         return struct.unpack_from(self.order + codes, self.content, offset)
 
     def text(self, offset: int, length: int) -> str | None:
-        """Text up to the first zero byte; None where there is none."""
+        """Return the text at a byte offset, up to its first zero byte; None if empty."""
         raw = self.content[offset : offset + length].split(b"\0", 1)[0]
         return raw.decode("latin-1").strip() or None
 
 
 @dataclass(frozen=True)
 class PictureInPicture:
-    """How the camera lays its thermal image over the photograph, in its own numbers: start values, no calibration.
+    """Numbers by which a FLIR camera lays its thermal image over the photograph; good start values, no calibration.
 
-    What they mean is not published, and they hold for one distance: things nearer or farther lie elsewhere.
+    The exact meaning of the numbers is not published, and the alignment is right at one distance only.
     """
 
-    real_to_thermal: float  # Real2IR: ratio of the two images' scales
+    real_to_thermal: float  # FLIR's Real2IR, the ratio of the two images' scales
     offset_x: int  # shift of the thermal image's centre to the right, roughly in pixels of the photograph
-    offset_y: int  # the same downwards
+    offset_y: int  # shift of the thermal image's centre downwards, roughly in pixels of the photograph
 
 
 @dataclass(frozen=True)
@@ -68,55 +68,55 @@ class CameraInfo:
 
     planck: PlanckConstants
     air: AirConstants
-    conditions: Conditions  # the camera's own settings when the picture was taken (or edited)
-    raw_range: tuple[int, int]  # counts from and to which the calibration holds
-    field_of_view_deg: float | None  # horizontal, as the camera states it; some state nonsense such as 180
-    model: str | None
-    taken_at: datetime | None
+    conditions: Conditions  # the camera's settings when the picture was taken or last edited
+    raw_range: tuple[int, int]  # lowest and highest count for which the calibration holds
+    field_of_view_deg: float | None  # horizontal angle of view as stated; some cameras state nonsense such as 180
+    model: str | None  # maker and model
+    taken_at: datetime | None  # time of the shutter, with its time zone
 
 
 @dataclass(frozen=True)
 class FlirImage:
-    """One R-JPEG of a FLIR camera after reading."""
+    """Contents of one R-JPEG of a FLIR camera."""
 
-    counts: npt.NDArray[np.uint16]  # what the sensor gave, shape (height, width)
+    counts: npt.NDArray[np.uint16]  # raw counts of the sensor, shape (height, width)
     camera: CameraInfo
-    picture_in_picture: PictureInPicture | None
-    visible: bytes | None  # the photograph that the camera took with it, a JPEG or PNG file's bytes; None: it took none
+    picture_in_picture: PictureInPicture | None  # factory alignment; None if the file has none
+    visible: bytes | None  # bytes of the photograph's JPEG or PNG; None if absent or in another format
 
     @property
     def outside_calibration(self) -> BoolArray:
-        """Pixels whose counts lie outside the range that the camera is calibrated for, shape (height, width)."""
+        """Mask of the pixels with counts outside the camera's calibrated range, shape (height, width)."""
         low, high = self.camera.raw_range
         return (self.counts < low) | (self.counts > high)
 
     def temperature_c(self, conditions: Conditions | None = None) -> Float32Array:
-        """Degrees C, shape (height, width), NaN outside the calibrated range; None: with the camera's settings."""
+        """Return degrees C, shape (height, width), under `conditions` (None: the camera's); NaN if uncalibrated."""
         model = RadiometricModel(conditions or self.camera.conditions, self.camera.planck, self.camera.air)
         temperature_c = model.temperature_c(self.counts)
         return np.where(self.outside_calibration, np.nan, temperature_c).astype(np.float32)
 
 
 def is_flir_jpeg(path: Path) -> bool:
-    """Whether a file is a JPEG with FLIR's segments, by its first bytes (a name says nothing)."""
+    """Return whether a file is a JPEG with FLIR's segments, by its first bytes."""
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
     return head.startswith(JPEG_START) and _FIRST_SEGMENT.search(head) is not None
 
 
 def read_flir_jpeg(path: Path) -> FlirImage:
-    """Read a FLIR R-JPEG.
+    """Read counts, calibration, settings and photograph from a FLIR R-JPEG.
 
-    Read here and not through a library: the one that exists (flyr) is under the EUPL, a copyleft licence, and what is
-    needed are five records whose layout is public; so the formats of most users work without an extra to install.
+    This reader is our own because the library flyr is under the EUPL, a copyleft licence, and because only four kinds
+    of records are needed, whose layout is public.
 
     Raises:
-        ThermalFileError: The file is cut off, a record is missing or damaged, or its size cannot be.
+        ThermalFileError: The file is cut off, a record is missing or damaged, or the image's size is impossible.
     """
     with errors_name(path, "a whole FLIR R-JPEG, as the camera wrote it", _REMEDY, ThermalFileError):
         parts: dict[int, bytes] = {}
         last = 0
-        for name, payload in app_segments(path, whole=True):  # each says its number and the last one's
+        for name, payload in app_segments(path, whole=True):  # bytes 6 and 7: number of this and the last segment
             if name == "APP1" and payload.startswith(b"FLIR\0") and len(payload) > _FLIR_HEADER_BYTES:
                 parts[payload[6]], last = payload[_FLIR_HEADER_BYTES:], max(last, payload[7])
         missing = sorted(set(range(last + 1)) - set(parts))
@@ -131,15 +131,15 @@ def read_flir_jpeg(path: Path) -> FlirImage:
             _counts(path, records[_RAW_DATA]),
             _camera_info(_Record.marked(records[_CAMERA_INFO])),
             None if alignment is None else _picture_in_picture(alignment),
-            picture if picture.startswith((JPEG_START, PNG_START)) else None,  # else it is in the camera's own form
+            picture if picture.startswith((JPEG_START, PNG_START)) else None,  # other formats are the camera's own
         )
 
 
 def _records(fff: bytes) -> dict[int, bytes]:
-    """Content of the wanted records that an FFF block lists, by their types.
+    """Return the content, by record type, of the records in an FFF block that this module reads.
 
-    An R-JPEG carries one FFF block in its APP1 segments. Layout and field offsets are those of the public tag tables of
-    ExifTool (FLIR tags).
+    An R-JPEG has one FFF block, split over its APP1 segments. Layout and field offsets are from ExifTool's public
+    tables of FLIR tags.
     """
     version = {order: struct.unpack_from(f"{order}I", fff, 20)[0] for order in "><"}
     order = next((order for order, number in version.items() if 100 <= number < 200), None)
@@ -149,7 +149,7 @@ def _records(fff: bytes) -> dict[int, bytes]:
     records = dict[int, bytes]()
     for number in range(min(count, _MOST_RECORDS)):
         kind, _, _, _, offset, length = struct.unpack_from(f"{order}HHIIII", fff, start + 32 * number)
-        # Records may overlap: a thousand of them that each claim the whole block are not copied.
+        # Only one record of each type is copied: a bad file may list a thousand records that each span the whole block.
         if kind in (_RAW_DATA, _PICTURE, _CAMERA_INFO, _PICTURE_IN_PICTURE) and kind not in records:
             if offset + length > len(fff):
                 raise ValueError(f"a record up to byte {offset + length} of {len(fff)}: the file is cut off")
@@ -158,10 +158,10 @@ def _records(fff: bytes) -> dict[int, bytes]:
 
 
 def _counts(path: Path, content: bytes) -> npt.NDArray[np.uint16]:
-    """Read the raw counts, stored plainly or as a PNG, shape (height, width).
+    """Return the raw counts, stored as plain numbers or as a PNG, shape (height, width).
 
-    Most cameras write the PNG's 16 bits in the wrong byte order and none says so. A thermal image is smooth, and with
-    its bytes swapped it is noise; so the order with the smaller mean difference between neighbours is right.
+    Most cameras write the PNG's 16-bit numbers in the wrong byte order, and no file states the order. A thermal image
+    is smooth but noise if its bytes are swapped; so the order with smaller differences between neighbours is right.
     """
     record, data = _Record.marked(content), content[_IMAGE_HEADER_BYTES:]
     width, height = (int(number) for number in record.numbers(2, "HH"))
@@ -212,12 +212,12 @@ def _camera_info(record: _Record) -> CameraInfo:
 
 
 def _celsius(kelvin: float) -> float | None:
-    """A temperature, or None where the camera has not set it and writes 0 K."""
+    """Return a temperature in degrees C, or None for the 0 K that a camera writes for a setting it does not have."""
     return float(kelvin_to_celsius(kelvin)) if kelvin != 0.0 else None
 
 
 def _taken_at(record: _Record) -> datetime | None:
-    """Time of the shutter with its zone; None where the clock was never set or the record is of an old kind."""
+    """Return the time of the shutter, with its time zone; None if the clock was never set or the record has no time."""
     try:
         seconds, milliseconds, zone = record.numbers(0x384, "IIh")
         east = timezone(timedelta(minutes=-int(zone)))
@@ -227,7 +227,7 @@ def _taken_at(record: _Record) -> datetime | None:
 
 
 def _picture_in_picture(content: bytes) -> PictureInPicture:
-    """Read the factory alignment; the record has no mark of its byte order."""
+    """Return the factory alignment; the byte order, which the record does not state, is that with a plausible scale."""
     little, big = (_Record(content, order).numbers(0, "fhh") for order in "<>")
     scale, x, y = little if 0.01 < little[0] < 100.0 else big
     return PictureInPicture(scale, int(x), int(y))

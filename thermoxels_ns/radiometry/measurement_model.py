@@ -1,4 +1,4 @@
-"""What a measurement assumes, and the formula of thermal cameras from counts to degrees and back."""
+"""Conditions of a thermal measurement, and the formula from a camera's signal to degrees C and back."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin, kelvin_to_celsius
 
 DEFAULT_RELATIVE_HUMIDITY = 0.5
-"""Where neither file nor user says: what cameras assume; over a room's distances it changes less than their noise."""
+"""Relative humidity that cameras assume, used if file and user state none; indoors its effect is below the noise."""
 _COLDEST_AIR_C, _HOTTEST_AIR_C = -100.0, 150.0
 _LARGEST_ATTENUATION, _LARGEST_WEIGHT = 1.0, 10.0
 _LARGEST_EXPONENT = 700.0
@@ -30,17 +30,17 @@ Floats = npt.NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a temperature was computed with; the defaults make it the apparent temperature (a black body, no air)."""
+    """Settings that temperatures are computed with; the defaults (black body, no air) give apparent temperatures."""
 
     emissivity: float = 1.0
     """Emissivity of the objects in the picture, above 0, at most 1. Plaster, brick, wood, paint: 0.90 to 0.96."""
     reflected_c: float | None = None
-    """Apparent temperature of what the objects mirror, [degrees C]; needed where the emissivity is below 1."""
-    distance_m: float = 0.0  # From the camera to the objects, [m], at least 0
-    relative_humidity: float = DEFAULT_RELATIVE_HUMIDITY  # Of the air, 0 to 1
-    air_c: float | None = None  # Air temperature, [degrees C], -100 to 150; needed where the distance is above 0
-    window_transmission: float = 1.0  # Of a window or filter in front of the lens, above 0, at most 1 (1: none)
-    window_c: float | None = None  # Temperature of that window, [degrees C]; needed where it does not pass everything
+    """Apparent temperature of what the objects reflect, [degrees C]; required if the emissivity is below 1."""
+    distance_m: float = 0.0  # Distance from the camera to the objects, [m], 0 to 100000
+    relative_humidity: float = DEFAULT_RELATIVE_HUMIDITY  # Relative humidity of the air, 0 to 1
+    air_c: float | None = None  # Air temperature, [degrees C], -100 to 150; required if the distance is above 0
+    window_transmission: float = 1.0  # Transmission of a window before the lens, above 0, at most 1 (1: no window)
+    window_c: float | None = None  # Temperature of the window, [degrees C]; required if its transmission is below 1
 
     def __post_init__(self) -> None:
         for name in ("emissivity", "window_transmission"):
@@ -64,7 +64,7 @@ class Conditions:
 
 @dataclass(frozen=True)
 class ConditionOverrides:
-    """What the user knows better than the camera; None keeps what the file says. Units as in `Conditions`."""
+    """The user's settings in place of the camera's; None keeps the file's value. Units are those of `Conditions`."""
 
     emissivity: float | None = None
     reflected_c: float | None = None
@@ -73,11 +73,11 @@ class ConditionOverrides:
     air_c: float | None = None
 
     def __post_init__(self) -> None:
-        # With temperatures for all that may need one, only wrong values raise.
+        # The temperatures that may be required are given here, so that only wrong values raise.
         self.applied_to(Conditions(reflected_c=0.0, air_c=0.0))
 
     def applied_to(self, conditions: Conditions) -> Conditions:
-        """Return `conditions` with the given settings in their place.
+        """Return `conditions` with every field replaced that is not None here.
 
         >>> ConditionOverrides(emissivity=0.9, reflected_c=15.0).applied_to(Conditions()).emissivity
         0.9
@@ -87,7 +87,7 @@ class ConditionOverrides:
 
 
 def conditions_text(conditions: Conditions) -> str:
-    """Say what a temperature was computed with.
+    """Return a text for the report about the conditions that temperatures were computed with.
 
     >>> conditions_text(Conditions(emissivity=0.95, reflected_c=20.0))
     'emissivity 0.95, reflected temperature 20 °C'
@@ -109,7 +109,7 @@ def conditions_text(conditions: Conditions) -> str:
 
 
 def check_between(name: str, value: float, low: float, high: float, expected: str, *, zero: bool = True) -> None:
-    """Raise a `ThermoxelsError` that names the setting if it is no number from `low` to `high` (0 only if `zero`)."""
+    """Raise `ThermoxelsError` if setting `name` is no number from `low` to `high`, or not above 0 with `zero` False."""
     if not (is_number(value) and low <= value <= high and (zero or value > 0)):
         remedy = f"Pass a right --{name.replace('_', '-')}."
         raise ThermoxelsError(name, expected=expected, got=repr(value), remedy=remedy)
@@ -117,13 +117,13 @@ def check_between(name: str, value: float, low: float, high: float, expected: st
 
 @dataclass(frozen=True)
 class PlanckConstants:
-    """Calibration of a sensor: its signal as a function of a black body's temperature."""
+    """Calibration of a sensor: the constants that give its counts as a function of a black body's temperature."""
 
-    r1: float  # gain of the calibration
-    r2: float  # second gain; only R1 / R2 matters
-    b: float  # second radiation constant over the effective wavelength, [K]; 1300 to 1600 for 7.5 to 14 micrometres
-    f: float  # shape; 1 in Planck's law at one wavelength
-    o: float  # offset of the counts (negative in camera files)
+    r1: float  # R1, gain of the calibration
+    r2: float  # R2, second gain; only R1 / R2 matters
+    b: float  # B, second radiation constant over effective wavelength, [K]; 1300 to 1600 for 7.5 to 14 micrometres
+    f: float  # F, shape of the curve; 1 in Planck's law at one wavelength
+    o: float  # O, offset of the counts (negative in camera files)
 
     def __post_init__(self) -> None:
         for name in ("r1", "r2", "b", "f"):
@@ -132,18 +132,18 @@ class PlanckConstants:
             raise ThermoxelsError("Planck constant O", expected="a finite number", got=self.o, remedy=_PLANCK_REMEDY)
 
     def signal(self, temperature_k: npt.ArrayLike) -> Floats:
-        """Counts of a black body, S = R1 / (R2 (exp(B / T) - F)) - O, any shape, float64.
+        """Return the counts of a black body, S = R1 / (R2 (exp(B / T) - F)) - O, any shape, float64.
 
-        Temperatures [K] above 0, and below B / ln F where F is above 1 (thousands of kelvin).
+        The temperatures T [K] must be above 0 and, if F is above 1, below B / ln F (thousands of kelvin).
         """
         temperature_k = np.asarray(temperature_k, dtype=np.float64)
-        with np.errstate(divide="ignore", over="ignore"):  # near absolute zero: no signal but the offset
+        with np.errstate(divide="ignore", over="ignore"):  # near absolute zero only the offset remains
             return self.r1 / (self.r2 * (np.exp(self.b / temperature_k) - self.f)) - self.o
 
     def temperature_k(self, signal: npt.ArrayLike) -> Floats:
-        """Temperature of a black body, T = B / ln(R1 / (R2 (S + O)) + F), [K], any shape, float64.
+        """Return a black body's temperature [K] for counts S, T = B / ln(R1 / (R2 (S + O)) + F), any shape, float64.
 
-        NaN where no temperature gives so small a signal (S + O not above 0).
+        The result is NaN where S + O is not above 0, because no temperature gives so small a signal.
         """
         radiance = np.asarray(signal, dtype=np.float64) + self.o
         radiance = np.where(radiance > 0, radiance, np.nan)
@@ -152,10 +152,10 @@ class PlanckConstants:
 
 @dataclass(frozen=True)
 class PlanckBand:
-    """Planck's law integrated over a band, for cameras that say degrees but not how they got them.
+    """Planck's law integrated over a wavelength band, for cameras that give degrees but not their calibration.
 
-    The curve is tabled: the logarithm of the radiance is nearly a straight line over 1 / T, and the table's straight
-    pieces can be read both ways, so there and back again is exact.
+    The curve is a table of the logarithm of radiance over 1 / T, which is nearly a straight line. The linear pieces of
+    the table are read in both directions, so that `temperature_k` exactly inverts `signal`.
     """
 
     shortest_um: float = 7.5  # lower end of the band, [micrometres]
@@ -163,7 +163,7 @@ class PlanckBand:
 
     @cached_property
     def _table(self) -> tuple[FloatArray, FloatArray]:
-        """1 / T rising, and the logarithm of the radiance, [W / (m2 sr)]."""
+        """Table of 1 / T [1/K], rising, and of the logarithm of the radiance [W / (m2 sr)], each shape (8192,)."""
         inverse_k = np.linspace(1.0 / _HOTTEST_K, 1.0 / _COLDEST_K, _STEPS)
         nodes, weights = np.polynomial.legendre.leggauss(48)
         half = 0.5 * (self.longest_um - self.shortest_um)
@@ -173,7 +173,7 @@ class PlanckBand:
         return inverse_k, np.log(radiance @ strength)
 
     def signal(self, temperature_k: npt.ArrayLike) -> Floats:
-        """Radiance of a black body in the band, [W / (m2 sr)], from 50 to 6000 K, any shape, float64.
+        """Return the radiance [W / (m2 sr)] of a black body in the band; temperatures 50 to 6000 K, any shape, float64.
 
         >>> round(float(PlanckBand().signal(300.0)), 2)
         51.48
@@ -182,7 +182,7 @@ class PlanckBand:
         return np.exp(np.interp(1.0 / np.asarray(temperature_k, dtype=np.float64), inverse_k, logarithm))
 
     def temperature_k(self, signal: npt.ArrayLike) -> Floats:
-        """Temperature of a black body with this radiance, [K]; NaN where it is below that of 50 K or not above 0."""
+        """Return the temperature [K] of a black body with this radiance; NaN for less radiance than at 50 K."""
         inverse_k, logarithm = self._table
         radiance = np.asarray(signal, dtype=np.float64)
         known = radiance >= np.exp(logarithm[-1])
@@ -190,19 +190,19 @@ class PlanckBand:
         return np.where(known, 1.0 / np.interp(falling, logarithm[::-1], inverse_k[::-1]), np.nan)
 
 
-SensorCurve = PlanckConstants | PlanckBand  # a sensor's signal for black bodies, and its inverse
-LONG_WAVE = PlanckBand()  # 7.5 to 13 micrometres, the band of microbolometer cameras
+SensorCurve = PlanckConstants | PlanckBand  # a sensor's signal as a function of a black body's temperature
+LONG_WAVE = PlanckBand()  # the band of microbolometer cameras, 7.5 to 13 micrometres
 
 
 @dataclass(frozen=True)
 class AirConstants:
-    """Transmission of humid air in the sensor's band; the defaults are those that FLIR's files of all cameras hold."""
+    """Constants of the transmission of humid air in the sensor's band; all FLIR files hold the default values."""
 
     alpha1: float = 0.006569  # attenuation of the first part, [1/sqrt(m)]
     alpha2: float = 0.01262  # attenuation of the second part, [1/sqrt(m)]
-    beta1: float = -0.002276  # part of the first attenuation that grows with the root of the water content
-    beta2: float = -0.00667  # part of the second attenuation that grows with the root of the water content
-    x: float = 1.9  # weight of the first part; the second has 1 - x
+    beta1: float = -0.002276  # change of the first attenuation per root of the water content w, see `transmission`
+    beta2: float = -0.00667  # change of the second attenuation per root of the water content w
+    x: float = 1.9  # weight of the first part; the second part has weight 1 - x
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -210,7 +210,7 @@ class AirConstants:
             check_between(field.name, getattr(self, field.name), -limit, limit, f"from {-limit:g} to {limit:g}")
 
     def transmission(self, distance_m: float, air_c: float, relative_humidity: float) -> float:
-        """Share of the object's radiation that reaches the camera, 1 at distance 0 m.
+        """Return the share of the object's radiation that reaches the camera through air, 1 at distance 0 m.
 
         tau = X exp(-sqrt(d) (alpha1 + beta1 sqrt(w))) + (1 - X) exp(-sqrt(d) (alpha2 + beta2 sqrt(w))) with the water
         content w = humidity exp(1.5587 + 0.06939 t - 2.7816e-4 t^2 + 6.8455e-7 t^3), t in degrees C, humidity 0 to 1
@@ -230,16 +230,16 @@ class AirConstants:
 
 @dataclass(frozen=True)
 class RadiometricModel:
-    """A sensor, the air in front of it, and the conditions of a measurement.
+    """Relation between a sensor's signal and an object's temperature, for given air and conditions.
 
-    A sensor's signal for a black body of temperature T is the Planck curve of its calibration,
-    ``S(T) = R1 / (R2 (exp(B / T) - F)) - O``. In front of a real object it sees (FLIR's measurement formula, printed in
-    the manuals of its cameras; Minkina and Dudzik, Infrared Thermography, 2009, equation 2.18)
+    S(T) is the sensor's signal for a black body of temperature T (`sensor`). In front of a real object the sensor gives
+    (FLIR's measurement formula in its manuals; Minkina and Dudzik, Infrared Thermography, 2009, equation 2.18)
 
         S_total = emissivity tau S(T_object) + (1 - emissivity) tau S(T_reflected) + (1 - tau) S(T_air)
 
-    with tau the transmission of the air. The weights add up to one, so a correction of temperatures does not depend on
-    the offset and the scale of S: where a camera hides its constants, the shape of Planck's law in its band will do.
+    with tau the transmission of the air. A window before the lens multiplies these terms by its transmission and adds
+    (1 - transmission) S(T_window). The weights add up to one, so a correction of temperatures does not depend on the
+    offset and scale of S: if a camera hides its constants, the shape of Planck's law in its band is enough.
     """
 
     conditions: Conditions
@@ -247,22 +247,22 @@ class RadiometricModel:
     air: AirConstants = AirConstants()
 
     def signal(self, temperature_c: npt.ArrayLike) -> Floats:
-        """Counts that the sensor gives in front of objects of these temperatures, [degrees C], any shape, float64."""
+        """Return the sensor's signal in front of objects of these temperatures [degrees C], any shape, float64."""
         weight, background = self._weights()
         kelvin = celsius_to_kelvin(np.asarray(temperature_c, dtype=np.float64))
         return weight * self.sensor.signal(kelvin) + background
 
     def temperature_c(self, signal: npt.ArrayLike) -> Floats:
-        """Temperature [degrees C] of the objects that give these counts, any shape: the inverse of `signal`.
+        """Return the temperature [degrees C] of the objects that give this signal, any shape: the inverse of `signal`.
 
-        NaN where reflections and air alone would give more signal than there is.
+        The result is NaN where reflections and air alone would give more than this signal.
         """
         weight, background = self._weights()
         object_signal = (np.asarray(signal, dtype=np.float64) - background) / weight
         return kelvin_to_celsius(self.sensor.temperature_k(object_signal))
 
     def _weights(self) -> tuple[float, float]:
-        """Weight of the object's signal, and the signal of all else."""
+        """Return the weight of the object's signal in the total, and the signal of reflections, air and window."""
         given = self.conditions
         air_c = 0.0 if given.air_c is None else given.air_c
         tau = self.air.transmission(given.distance_m, air_c, given.relative_humidity)
@@ -273,7 +273,7 @@ class RadiometricModel:
             ((1.0 - tau) * optics, given.air_c),
             (1.0 - optics, given.window_c),
         ):
-            if share > 0 and celsius is not None:  # Conditions makes sure that there is one where it is needed
+            if share > 0 and celsius is not None:  # `Conditions` raises if a required temperature is None
                 background += share * float(self.sensor.signal(celsius_to_kelvin(celsius)))
         weight = given.emissivity * tau * optics
         if not weight > 0:
@@ -287,10 +287,10 @@ class RadiometricModel:
 def corrected_temperature_c(
     temperature_c: npt.ArrayLike, before: Conditions, after: Conditions, sensor: SensorCurve = LONG_WAVE
 ) -> Floats:
-    """Temperatures [degrees C] as the camera would have shown them with other settings, any shape, float64.
+    """Return temperatures [degrees C] as the camera would have shown them with other settings, any shape, float64.
 
-    They are turned back into the signal that they were computed from with `before`, and read again with `after`. The
-    sensor's offset and scale do not matter.
+    The settings `before` turn `temperature_c` back into the sensor's signal, and the settings `after` turn that signal
+    into the result. The sensor's offset and scale do not matter.
     """
     signal = RadiometricModel(before, sensor).signal(temperature_c)
     return RadiometricModel(after, sensor).temperature_c(signal)

@@ -1,4 +1,4 @@
-"""Pixels of thermal files by a known unit: degrees Celsius, NaN where nothing was measured or a pixel is stuck."""
+"""Reads the pixels of thermal files, whose unit is known, as degrees Celsius, and finds stuck pixels."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ THERMAL_SUFFIXES = (
     ".tiff",
     ".npy",
     ".csv",
-)  # file types that `read_thermal_file` knows
+)  # suffixes of the file types that `read_thermal_file` reads
 
 _WIDTH, _HEIGHT, _SAMPLE_BITS, _SAMPLE_FORMAT = 256, 257, 258, 339  # tags of TIFF
-_FLOATING = 3  # a sample format
-VALID_RANGE_C = (-100.0, 2000.0)  # temperatures outside are no measurements, [degrees C]
-MIN_FRAMES = 5  # fewer frames than this cannot tell a stuck pixel from a quiet one
-_WINDOW = 2  # half width of the neighbourhood: 5 x 5, so that a dead column or row is still a minority of it
+_FLOATING = 3  # value of TIFF's sample format for floating-point numbers
+VALID_RANGE_C = (-100.0, 2000.0)  # temperatures outside this range count as no measurements, [degrees C]
+MIN_FRAMES = 5  # with fewer frames, no pixel counts as stuck
+_WINDOW = 2  # half width of a neighbourhood of 5 x 5 pixels, in which a dead column or row is a minority
 _EXPECTED = "a readable thermal file"
 _REMEDY = "The file is damaged or not what its suffix says; copy it again or remove its frame."
 _TIFF_SUFFIXES = (".tif", ".tiff")
@@ -47,7 +47,7 @@ _COUNTS_REMEDY = (
 
 @dataclass(frozen=True)
 class ThermalUnit:
-    """How the numbers of a thermal file become degrees Celsius; make one with `bounds`, `linear` or `celsius`."""
+    """Conversion of a thermal file's numbers to degrees Celsius, made by `bounds`, `linear` or `celsius`."""
 
     kind: Literal["bounds", "linear", "celsius"]
     """bounds: counts span min to max; linear: counts times a factor plus an offset; celsius: no conversion."""
@@ -63,37 +63,37 @@ class ThermalUnit:
 
     @classmethod
     def bounds(cls, min_c: float, max_c: float) -> ThermalUnit:
-        """Counts 0 and 255 (8 bit) or 65535 (16 bit) stand for `min_c` and `max_c`, [degrees Celsius]."""
+        """Return a unit in which count 0 is `min_c` and the highest count, 255 or 65535, is `max_c`, [degrees C]."""
         return cls("bounds", scale=max_c - min_c, offset_c=min_c)
 
     @classmethod
     def linear(cls, celsius_per_count: float, celsius_offset: float) -> ThermalUnit:
-        """Temperature is count * `celsius_per_count` + `celsius_offset`."""
+        """Return a unit with temperature = count * `celsius_per_count` + `celsius_offset`, [degrees C]."""
         return cls("linear", scale=celsius_per_count, offset_c=celsius_offset)
 
     @classmethod
     def celsius(cls) -> ThermalUnit:
-        """The file holds degrees Celsius."""
+        """Return the unit of files that hold degrees Celsius."""
         return cls("celsius")
 
 
 @dataclass(frozen=True)
 class PixelReport:
-    """How many pixels were masked and why; reports add up with ``+``."""
+    """Numbers of masked pixels by reason; reports add up with ``+``."""
 
     pixels: int = 0  # all pixels read
-    nan: int = 0  # not a number in the file (also: fully transparent)
+    nan: int = 0  # pixels that are not a number, infinite or fully transparent in the file
     saturated: int = 0
-    """Counts at the end of a linear scale (0 and 65535 for 16 bit): the sensor saw more or less than it can say."""
-    out_of_range: int = 0  # below absolute zero or outside the valid range
-    dead: int = 0  # valid by themselves, but stuck at one value over the whole scene
+    """Pixels at the end of a linear scale (count 0 or 65535 for 16 bit), or outside FLIR's calibrated range."""
+    out_of_range: int = 0  # pixels below absolute zero or outside the valid range
+    dead: int = 0  # pixels with valid values that are stuck at one value in all frames
 
     def __add__(self, other: PixelReport) -> PixelReport:
         return PixelReport(*map(sum, zip(astuple(self), astuple(other))))
 
     @property
     def masked(self) -> int:
-        """All pixels without a usable temperature."""
+        """Number of all pixels without a usable temperature."""
         return self.nan + self.saturated + self.out_of_range + self.dead
 
     def __str__(self) -> str:
@@ -104,21 +104,21 @@ class PixelReport:
 
 @dataclass(frozen=True)
 class ThermalImage:
-    """One thermal file after reading."""
+    """Temperatures of one thermal file, and how many pixels were masked."""
 
-    temperature_c: Float32Array  # shape (height, width), [degrees Celsius], NaN where invalid
+    temperature_c: Float32Array  # shape (height, width), [degrees Celsius], NaN where masked
     report: PixelReport
 
 
 def read_thermal_file(
     path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = VALID_RANGE_C, suffix: str | None = None
 ) -> ThermalImage:
-    """Read a thermal file: PNG, JPG or TIFF counts, float TIFF, FLIR R-JPEG, ``.npy`` or ``.csv``.
+    """Read temperatures from PNG, JPG or TIFF counts, a float TIFF, a FLIR R-JPEG, ``.npy`` or ``.csv``.
 
-    A FLIR R-JPEG is read by the calibration and the settings in it, whatever the unit. Counts need a unit: bounds or
-    linear for PNG and JPG, linear for TIFF. Floating-point TIFF is in degrees Celsius unless the unit is linear.
-    ``.csv`` and floating-point ``.npy`` are always in degrees Celsius; an integer ``.npy`` is counts if the unit is
-    linear. The conversion runs in float64, so 16-bit steps survive. `suffix` reads the file as if its name ended so.
+    A FLIR R-JPEG is converted by the calibration and settings in the file; `unit` is ignored. Counts need a unit:
+    bounds or linear for PNG and JPG, linear for TIFF. A floating-point TIFF is in degrees Celsius unless the unit is
+    linear. ``.csv`` and floating-point ``.npy`` are always in degrees Celsius; an integer ``.npy`` holds counts if the
+    unit is linear, else degrees Celsius. `suffix`, if given, replaces the file name's suffix.
 
     Raises:
         ThermalFileError: The file is missing, damaged, a colour picture, or its counts have no unit.
@@ -156,7 +156,7 @@ def read_thermal_file(
             raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
         celsius = values.astype(np.float64) / most * unit.scale + unit.offset_c
     else:
-        # Of a TIFF's counts cameras mean steps of a fixed size, which bounds do not tell.
+        # Cameras write a TIFF's counts in steps of a fixed size, which bounds do not give.
         got = f"{values.dtype} counts " + ("of a TIFF beside bounds" if unit.kind == "bounds" else "and no unit")
         remedy = _COUNTS_REMEDY if unit.kind == "bounds" or suffix in _TIFF_SUFFIXES else _UNIT_REMEDY
         raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
@@ -171,7 +171,7 @@ def masked_image(
     valid_range_c: tuple[float, float],
     saturated: BoolArray | None = None,
 ) -> ThermalImage:
-    """Mask temperatures (height, width) that are none, [degrees C], or beyond the calibration, and count them."""
+    """Set temperatures (height, width) [degrees C] to NaN if not finite, saturated or out of range, and count these."""
     if saturated is None:
         saturated = np.zeros(temperature_c.shape, dtype=bool)
     nan = ~np.isfinite(temperature_c) & ~saturated
@@ -184,7 +184,7 @@ def masked_image(
 
 
 def _check_there(path: Path, suffix: str) -> None:
-    """Raise a `ThermalFileError` where there is no file, an empty one, or one of an unknown type."""
+    """Raise `ThermalFileError` if the file is missing or empty, or its suffix is unknown."""
     if not path.is_file():
         remedy = "Restore the file, or remove the frame or pass --missing-thermal skip."
         raise ThermalFileError("thermal file", expected=f"a file at {path}", got="nothing there", remedy=remedy)
@@ -197,10 +197,10 @@ def _check_there(path: Path, suffix: str) -> None:
 
 
 def load_array(path: Path) -> npt.NDArray[Any]:
-    """Map a .npy file of numbers into memory; `ThermalFileError` if it is none, or damaged."""
+    """Return the memory-mapped array of a .npy file; raise `ThermalFileError` if damaged or not of real numbers."""
     try:
         values = np.load(path, mmap_mode="r", allow_pickle=False)
-    except ValueError as problem:  # whose text is the header itself
+    except ValueError as problem:  # numpy's message may contain the whole header, so it is not shown
         raise _damaged(path, "a header that is no array's, or fewer numbers than it says") from problem
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fui":
         raise _damaged(path, f"an array of type {getattr(values, 'dtype', type(values))}")
@@ -208,7 +208,7 @@ def load_array(path: Path) -> npt.NDArray[Any]:
 
 
 def _read_npy(path: Path) -> npt.NDArray[Any]:
-    values = load_array(path)  # mapped: its size is checked before it is read
+    values = load_array(path)  # memory-mapped: the size is checked before the numbers are read
     if values.ndim >= 2 and values.size:
         check_thermal_size(path, values.shape[1], values.shape[0])
     values = np.array(values)
@@ -216,7 +216,7 @@ def _read_npy(path: Path) -> npt.NDArray[Any]:
 
 
 def _read_csv(path: Path) -> FloatArray:
-    """Read rows of numbers split by commas or semicolons; empty cells and nan, NA, null, - are NaN."""
+    """Return a table of numbers, split by commas or semicolons; empty cells and nan, NA, null, none, - are NaN."""
     text = path.read_text(encoding="utf-8-sig")
     semicolons = ";" in text
     rows = []
@@ -238,9 +238,9 @@ def _number(cell: str) -> float:
 
 
 def _read_image(path: Path) -> tuple[npt.NDArray[Any], BoolArray | None]:
-    """Read the shades of a grey picture, and which of its pixels are transparent."""
+    """Return the counts of a grey picture (height, width), and a mask of its transparent pixels (None: no alpha)."""
     pixels = None
-    size = size_of_double_tiff(path)  # of numbers of 64 bits, which Pillow does not open
+    size = size_of_double_tiff(path)  # Pillow cannot open a TIFF of 64-bit numbers
     if size is not None:
         check_thermal_size(path, *size)
     else:
@@ -253,10 +253,10 @@ def _read_image(path: Path) -> tuple[npt.NDArray[Any], BoolArray | None]:
             image.load()  # raises on truncated data
             if image.mode in ("L", "F") or image.mode.startswith("I"):
                 pixels = np.asarray(image)
-                # Some versions of Pillow hold counts of 16 bits in 32; and some files have the other byte order.
+                # Some versions of Pillow return 16-bit counts as 32 bits; some files have the other byte order.
                 short = image.mode == "I" and image.format == "PNG"
                 pixels = pixels.astype(np.uint16 if short else pixels.dtype.newbyteorder("="))
-    if pixels is None:  # colours, of which Pillow keeps 8 bits
+    if pixels is None:  # a colour picture, of which Pillow would keep only 8 bits, or a 64-bit TIFF
         pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise _damaged(path, "an image that cannot be decoded")
@@ -272,7 +272,7 @@ def _read_image(path: Path) -> tuple[npt.NDArray[Any], BoolArray | None]:
 
 
 def size_of_double_tiff(path: Path) -> tuple[int, int] | None:
-    """Width and height of a TIFF of one channel of 64-bit floating-point numbers; None for other files."""
+    """Return width and height of a TIFF with one channel of 64-bit floating-point numbers; None for other files."""
     with path.open("rb") as stream:
         head = stream.read(8)
         if not head.startswith((b"II*\0", b"MM\0*")):
@@ -289,12 +289,12 @@ def _damaged(path: Path, problem: object) -> ThermalFileError:
 
 
 def find_dead_pixels(stack: Float32Array) -> BoolArray:
-    """Find pixels that show exactly one value in every frame while their surroundings change.
+    """Return a mask (height, width) of pixels that are stuck at one value, from temperatures (frames, height, width).
 
-    A stuck pixel alone is no proof: where the image border always shows the same cold sky, or in a scene of one
-    temperature, live pixels are constant too. So three things must hold: the pixel has one finite value in all
-    frames; fewer than half of all pixels do; and the median of the 5 x 5 pixels around it differs from its value in
-    at least half of the frames. Temperatures (frames, height, width) to (height, width); fewer than 5 frames tell none.
+    A constant value alone is no proof: live pixels are constant too where the image border always shows the same cold
+    sky, or in a scene of one temperature. A pixel is stuck if three things hold: the pixel has the same finite value in
+    all frames; fewer than half of all pixels are constant; and the median of the 5 x 5 pixels around the pixel differs
+    from its value in at least half of the frames. With fewer than 5 frames, no pixel counts as stuck.
     """
     frames, height, width = stack.shape
     dead = np.zeros((height, width), dtype=bool)

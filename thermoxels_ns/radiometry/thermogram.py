@@ -1,4 +1,4 @@
-"""Any thermal camera file as degrees and what it says beside; found by content."""
+"""Reads any thermal camera file, recognised by its content, as degrees C and metadata."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ COUNT_SCALES: dict[CameraName, tuple[ThermalUnit, str]] = {
     "flir-duo": (ThermalUnit.linear(0.01, -273.15), "FLIR Duo R (the first one)"),
     "sensefly": (ThermalUnit.linear(0.01, -100.0), "senseFly thermoMAP and Duet T"),
 }
-"""What counts mean and which cameras write them so, from the makers' manuals. A file does not tell FLIR's two gains
-apart, so the user says which."""
+"""Unit of the counts and names of the cameras, by preset, from the makers' manuals. A file does not state which of
+FLIR's two gains was used, so the user must say."""
 
 
 def recognised_camera(make: str | None, model: str | None) -> CameraName | None:
-    """Find the preset of a camera by what its file says of it; None where the file leaves a choice.
+    """Return the preset (`COUNT_SCALES`) that the maker and model in a file determine; None if the user must choose.
 
     >>> recognised_camera("Workswell", "WIRIS Pro"), recognised_camera("FLIR", "Duo Pro R")
     ('workswell', None)
@@ -76,36 +76,36 @@ def recognised_camera(make: str | None, model: str | None) -> CameraName | None:
 
 @dataclass(frozen=True)
 class ThermogramMetadata:
-    """What a thermal file says besides its temperatures; None: it does not say."""
+    """What a thermal file states besides its temperatures; a field is None if the file does not state it."""
 
-    format: ThermogramFormat  # by content, not by name
+    format: ThermogramFormat  # detected from the content, not from the name
     camera: str | None = None  # maker and model
     field_of_view_deg: float | None = None
-    """Horizontal, of the thermal lens, as the camera states it; some state nonsense such as 180."""
+    """Horizontal angle of view of the thermal lens as the camera states it; some state nonsense such as 180."""
     conditions: Conditions | None = None
-    """Those that the temperatures were computed with: the camera's, with the user's in their place."""
+    """Conditions that the temperatures were computed with: the camera's, or the user's where these were given."""
     picture_in_picture: PictureInPicture | None = None  # factory alignment of photograph and thermal image
-    celsius_per_count: float | None = None  # step of the file's counts, [K], where they are linear in temperature
+    celsius_per_count: float | None = None  # temperature step of one count, [K]; None if counts are not linear in it
 
 
 @dataclass(frozen=True)
 class Thermogram:
-    """One thermal image in degrees."""
+    """One thermal image in degrees C, with the metadata of its file."""
 
-    temperature_c: Float32Array  # shape (height, width), [degrees C], NaN where the camera measured nothing
+    temperature_c: Float32Array  # shape (height, width), [degrees C], NaN where masked
     metadata: ThermogramMetadata
-    report: PixelReport  # how many pixels are NaN and why
+    report: PixelReport  # numbers of masked pixels by reason
 
 
 @dataclass(frozen=True)
 class RadiometryOptions(ConditionOverrides):
-    """How camera files are turned into degrees."""
+    """Options for converting camera files to degrees C; raise `ThermalFileError` if they contradict each other."""
 
     camera: CameraName | None = None
-    """Which camera's counts a TIFF holds (None: by what the file says, which some files leave open)."""
+    """Camera whose counts a TIFF or PNG holds (None: recognised from the file, which some files do not allow)."""
     celsius_per_count: float | None = None
-    """Degrees per count of a TIFF, PNG or whole-number NPY, in place of a camera's."""
-    celsius_offset: float | None = None  # Temperature of count zero, [degrees C]; goes with --celsius-per-count
+    """Degrees per count of a TIFF, PNG or whole-number NPY, instead of `camera`."""
+    celsius_offset: float | None = None  # Temperature of count 0, [degrees C]; goes with --celsius-per-count
     dji_library: Path | None = None
     """Path of DJI's libdirp.so or libdirp.dll, for DJI R-JPEG (from the DJI Thermal SDK)."""
 
@@ -120,32 +120,32 @@ class RadiometryOptions(ConditionOverrides):
             remedy = "Leave --camera or --celsius-per-count and --celsius-offset out."
             got = f"the preset {self.camera} and {self.celsius_per_count} K per count"
             raise ThermalFileError("camera", expected="a preset or a scale of your own", got=got, remedy=remedy)
-        _ = self.given_unit  # a scale of 0 raises here and not at the first file
+        _ = self.given_unit  # so that a scale of 0 raises here, not when the first file is read
 
     @property
     def given_unit(self) -> ThermalUnit | None:
-        """Meaning of counts as the user says it: a scale or a preset; None: not said."""
+        """Unit of counts from the user's scale or camera preset; None if neither is given."""
         if self.celsius_per_count is not None and self.celsius_offset is not None:
             return ThermalUnit.linear(self.celsius_per_count, self.celsius_offset)
         return COUNT_SCALES[self.camera][0] if self.camera is not None else None
 
 
 def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> Thermogram:
-    """Read a thermal camera file as degrees C.
+    """Return the temperatures and metadata of a thermal camera file. The format decides how degrees C are computed:
 
-    | format | degrees by |
+    | format | degrees from |
     |---|---|
     | FLIR R-JPEG | the counts and the Planck constants in the file |
     | DJI R-JPEG | DJI's own library, where the user has it |
     | TIFF, 16-bit PNG | a camera preset or the user's scale; floats are degrees C |
     | NPY, CSV | degrees C; whole numbers in NPY need a scale |
 
-    A picture (palette JPEG, 8-bit PNG) is refused: its colours cannot be turned back into temperatures.
+    A picture (palette JPEG, 8-bit PNG) is refused, because its colours cannot be turned back into temperatures.
 
     Raises:
-        ThermalFileError: The file is missing, empty, damaged, absurdly large, a picture without temperatures or of no
-            known format, or its counts have no known unit.
-        ThermoxelsError: The options cannot be, such as an emissivity above 1.
+        ThermalFileError: The file is missing, empty, damaged, absurdly large, a picture without temperatures or of an
+            unknown format, or its counts have no known unit.
+        ThermoxelsError: The options contradict the file's conditions, e.g. an emissivity below 1 without reflected_c.
     """
     options = options or RadiometryOptions()
     try:
@@ -169,7 +169,7 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
 
 
 def detect_format(path: Path) -> ThermogramFormat:
-    """Tell the format of a thermal file by its content; a `ThermalFileError` where it is none that holds degrees."""
+    """Return the format of a thermal file by its content; raise `ThermalFileError` if it holds no temperatures."""
     if not path.is_file():
         got, remedy = "nothing there", "Check the path."
         raise ThermalFileError("thermal file", expected=f"a file at {path}", got=got, remedy=remedy)
@@ -179,7 +179,7 @@ def detect_format(path: Path) -> ThermogramFormat:
     found: ThermogramFormat | None = next((name for start, name in _STARTS.items() if head.startswith(start)), None)
     if found is not None:
         return found
-    if _TEXT.fullmatch(head) and _NUMBERS.match(head) and re.search(rb"[0-9]", head):  # as tables of numbers start
+    if _TEXT.fullmatch(head) and _NUMBERS.match(head) and re.search(rb"[0-9]", head):  # a table of numbers
         return "CSV"
     expected = "a FLIR or DJI R-JPEG, a TIFF, a 16-bit PNG, or a table of degrees C (.npy, .csv)"
     got, remedy = f"none of them: it starts with {head[:8]!r}", "Export it from the camera's program in one of these."
@@ -198,7 +198,7 @@ def detect_format(path: Path) -> ThermogramFormat:
 def _read_stored(
     path: Path, found: ThermogramFormat, options: RadiometryOptions
 ) -> tuple[ThermalImage, ThermogramMetadata]:
-    """Read a format that holds apparent temperatures, or counts linear in them."""
+    """Read a file of apparent temperatures or of counts linear in temperature; correct for the user's conditions."""
     unit, exif = options.given_unit, ExifFacts()
     if found in ("TIFF", "PNG"):
         unit, exif = _unit_of_image(path, options)
@@ -214,7 +214,7 @@ def _read_stored(
     conditions = options.applied_to(Conditions())
     per_count = unit.scale if found in ("TIFF", "PNG") and unit.kind == "linear" else None
     metadata = ThermogramMetadata(found, exif.camera, conditions=conditions, celsius_per_count=per_count)
-    if conditions != Conditions():  # pixels that are no temperature under other conditions count as out of range
+    if conditions != Conditions():  # pixels that have no temperature under the new conditions count as out of range
         corrected_c = corrected_temperature_c(image.temperature_c, Conditions(), conditions)
         again = masked_image(corrected_c, VALID_RANGE_C)
         lost = again.report.masked - image.report.masked
@@ -224,10 +224,9 @@ def _read_stored(
 
 
 def _unit_of_image(path: Path, options: RadiometryOptions) -> tuple[ThermalUnit, ExifFacts]:
-    """Unit of a TIFF or PNG, and what its tags say.
+    """Return the unit of a TIFF or PNG (the user's, else the one recognised from the file), and the facts in its tags.
 
-    What the user says comes before what the file says. Refused are pictures of 8 bits or in colour, and counts that may
-    mean several things.
+    Raises `ThermalFileError` for pictures with 8 bits or in colour, and for counts whose unit is unknown.
     """
     unit = options.given_unit
     with errors_name(path, "a readable TIFF or PNG", error=ThermalFileError):

@@ -1,1 +1,1 @@
-"""Where the thermal camera sits beside the visible one, and how its reading drifts."""
+"""Finds where the thermal camera sits beside the visible camera, and how the thermal camera's readings drift."""

@@ -1,4 +1,4 @@
-"""The rig from pictures of a heated checker board that both cameras see."""
+"""Finds the rig from pictures of a heated checker board that both cameras see."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 _SIZE = re.compile(r"(\d{1,3})\s*[xX]\s*(\d{1,3})")
-_SHIFTS = slice(3, 6)  # of a rig's ten parameters, those that are lengths
+_SHIFTS = slice(3, 6)  # places of the shift, which is a length, among a rig's ten parameters
 
 _FEWEST_BOARDS = 3
 _CORNER_SIGMA_PX = 0.3
@@ -35,11 +35,11 @@ _LARGEST_ENLARGEMENT = 6
 
 @dataclass(frozen=True)
 class CheckerBoard:
-    """A board of dark and light squares."""
+    """A board of dark and light squares, described by the corners where four squares meet (inner corners)."""
 
-    columns: int  # inner corners along the longer side; one less than squares
+    columns: int  # inner corners along the longer side, one less than the squares there
     rows: int  # inner corners along the shorter side
-    square_m: float  # side of a square [m]
+    square_m: float  # side of one square [m]
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or self.columns == self.rows or not self.square_m > 0.0:
@@ -50,15 +50,15 @@ class CheckerBoard:
 
     @property
     def corners(self) -> FloatArray:
-        """Inner corners on the board, row by row, shape (n, 3) [m]."""
+        """Positions of the inner corners on the board, row by row, shape (n, 3) [m]; the third coordinate is 0."""
         grid = np.stack(np.meshgrid(np.arange(self.columns), np.arange(self.rows)), axis=-1).reshape(-1, 2)
         return np.column_stack([grid * self.square_m, np.zeros(len(grid))])
 
 
 def find_board(image: npt.NDArray, board: CheckerBoard) -> FloatArray | None:
-    """Find the board's inner corners in grey values or temperatures (height, width), to a fraction of a pixel.
+    """Find the board's inner corners in grey values or temperatures, shape (height, width), to a fraction of a pixel.
 
-    Their order is that of `CheckerBoard.corners`, from one of the two ends, shape (n, 2); None: no board.
+    Returns the pixels (n, 2) in the order of `CheckerBoard.corners` or the reverse; None if no board is found.
     """
     values = np.asarray(image, dtype=np.float32)
     if not np.isfinite(values).any():
@@ -79,18 +79,18 @@ def find_board(image: npt.NDArray, board: CheckerBoard) -> FloatArray | None:
 def rig_from_boards(
     pairs: Sequence[tuple[npt.NDArray, npt.NDArray]], visible: Camera, start: RigStart, board: CheckerBoard
 ) -> RigEstimate:
-    """Find the rig, in metres, from photographs (grey) and temperatures of a checker board in different places.
+    """Find the rig, lengths in metres, from pairs (grey photograph, temperatures) of a checker board in several places.
 
-    The photograph and the visible camera say where the board is; robust least squares (Huber's loss) moves the thermal
-    camera until the corners fall where the thermal image shows them, held weakly by the start (lengths in metres).
-    With the board in fewer than three pairs the start is returned, `determined` False.
+    Each photograph and the visible camera give the place of the board. Robust least squares (Huber's loss) then moves
+    the thermal camera until the corners fall where the thermal images show them; `start` (lengths in metres) is the
+    prior. If fewer than three pairs show the board to both cameras, the start is returned, with `determined` False.
     """
     points, seen = [], []
     for photograph, temperature_c in pairs:
         there, here = find_board(photograph, board), find_board(temperature_c, board)
         if there is None or here is None:
             continue
-        if np.dot(there[-1] - there[0], here[-1] - here[0]) < 0.0:  # warm squares may be the light ones or the dark
+        if np.dot(there[-1] - there[0], here[-1] - here[0]) < 0.0:  # the two orders are opposite
             here = here[::-1]
         plane = np.ascontiguousarray(visible.rays(there)[:, :2])
         _, turn, shift = cv2.solvePnP(board.corners, plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
@@ -124,7 +124,7 @@ def rig_from_boards(
 
 
 def board_of(settings: CaptureSettings) -> CheckerBoard | None:
-    """The board that the options describe, None where they name none; a `SceneError` where they are not whole."""
+    """Return the board that the settings describe (None: none); raise `SceneError` if incomplete or beside --rig."""
     photos, size, square_m = settings.board_photos, settings.board, settings.board_square_m
     if photos is None and size is None and square_m is None:
         return None
@@ -148,10 +148,10 @@ def rig_from_board_photos(
     radiometry: RadiometryOptions,
     say: Callable[[str], None] = lambda _: None,
 ) -> RigEstimate:
-    """Find the rig, lengths in metres, from a folder with photographs and thermal images of a board.
+    """Find the rig, lengths in metres, from the folder `source` with photographs and thermal images of a board.
 
-    Its files are paired and read like those of the capture, into `folder`. A `SceneError` is raised where there are no
-    pairs, they come from another camera, or fewer than three show the board to both cameras.
+    The files are paired and read like the capture's, and the results are written to `folder`. Raises `SceneError` if
+    there are no pairs, image sizes differ from the capture's, or fewer than three pairs show the board to both cameras.
     """
     found = search_pairs(source, settings, say=say).pairs
     read = read_frames(found, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
@@ -174,7 +174,7 @@ def rig_from_board_photos(
 
 
 def in_scene_units(rig: RigEstimate, scale: MetricScale | None, missing: str) -> RigEstimate:
-    """Turn a rig in metres into one in units of the scene; a `SceneError` where the scene's scale is unknown."""
+    """Convert a rig's lengths from metres to scene units; raise `SceneError` (reason: `missing`) without a scale."""
     if scale is None:
         expected = "a known scale, because a board gives the distance of the lenses in metres"
         remedy = "Pass --known-distance or --marker-side-m; poses that were found are kept."

@@ -1,4 +1,4 @@
-"""Drift and vignetting of a thermal camera, from scene points that many images show."""
+"""Estimates drift and vignetting of a thermal camera from scene points that many thermal images show."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ _RADIAL_TERMS = 2
 _HUBER = 1.345
 _MAD_TO_SIGMA = 1.4826
 _ITERATIONS = 30
-_CONVERGED_K = 1e-3  # Offsets are right to 0.03 K or less
+_CONVERGED_K = 1e-3  # the fit ends when no unknown changes by more; offsets are uncertain by more than this anyway
 _HELD_OUT_EVERY = 5
 _MOST_LAG = 6
-"""How many readings before it, of the same point, each reading is compared with."""
+"""Each reading of a point is compared with at most so many earlier readings of the same point."""
 _FEWEST_POINTS = 50
 _GAIN_OF_OFFSETS, _GAIN_OF_RADIAL = 0.05, 0.01
 _RIDGE = 1e-9
 
 _FEWEST_PER_FRAME, _SHARE_PER_FRAME = 1000, 0.5
-"""Points of each frame that are read, those that most frames share first. These lie together and can all be wrong: of
-36 frames with 15,000 points each, offsets from 1000 were wrong by up to 0.35 K, from the half by up to 0.08 K."""
+"""How many of a frame's points are read: the number or the share, whichever is more; points that most frames share come
+first. Such points lie close together: for 36 frames of 15,000 points, offsets erred by 0.35 K (1000), 0.08 K (half)."""
 _BLUR_PX = 1.0
 _SMOOTH_SHARE = 0.4
 _DEPTH_TOLERANCE = 0.03
@@ -41,18 +41,18 @@ _BORDER_PX = 2.0
 def estimate_drift(
     frames: Sequence[RigFrame], thermal_camera: Camera, visible_to_thermal: npt.ArrayLike
 ) -> DriftEstimate:
-    """Find one offset per thermal image and a radial term, if the images call for them.
+    """Find one offset per thermal image and a radial term, if they make the readings of scene points agree better.
 
     An uncooled camera reads some kelvin too high or too low from image to image, and warmer or colder towards the
-    corners. A scene point has one temperature, so what its readings differ by shows both.
+    corners. A scene point has one temperature, so differences between its readings show both errors.
 
     Reading of point i in frame f = temperature_i + offset_f + c1 r^2 + c2 r^4 + error. Offsets and coefficients are
-    fitted to the differences of two readings of one point by robust least squares (Huber's loss, reweighted), mean
-    offset 0. The correction is fitted to four fifths of the points and kept only if it lowers the differences at the
-    others; without that gain it is all zeros, with `used` False and the reason.
+    fitted to differences of two readings of one point by robust least squares (Huber's loss, reweighted), mean offset
+    0. As a test, four fifths of the points are fitted: if that does not lower the differences at the other points, the
+    result has offsets of zero, `used` False and the reason.
 
     Raises:
-        SceneError: A thermal image cannot be read or has not the camera's size.
+        SceneError: A thermal image does not have the camera's size.
     """
     if len(frames) < 2:
         return no_drift(len(frames), f"No correction: {len(frames)} frame: there is nothing to compare it with.")
@@ -60,19 +60,19 @@ def estimate_drift(
 
 
 def no_drift(frames: int, why: str, before_k: float = np.nan) -> DriftEstimate:
-    """No correction, and a sentence that says why."""
+    """Return a `DriftEstimate` without correction for so many frames; `why` is its explanation."""
     return DriftEstimate(np.zeros(frames), (), before_k, before_k, False, why)
 
 
 def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
-    """Find the drift from readings of scene points; see `estimate_drift`."""
+    """Find the drift from readings of scene points, as `estimate_drift` describes."""
     frames = samples.num_frames
     points = int(samples.point[-1]) + 1 if len(samples.point) else 0
     if points < _FEWEST_POINTS:
         seen = f"only {points} scene points are seen by two thermal images (at least {_FEWEST_POINTS})"
         return no_drift(frames, f"No correction: {seen}.")
     point, design, difference_k = _differences(samples)
-    share = 1.0 / np.bincount(samples.point)[point]  # a point with many readings has more differences than it knows
+    share = 1.0 / np.bincount(samples.point)[point]  # weight: a point's differences outnumber its readings
     held_out = point % _HELD_OUT_EVERY == _HELD_OUT_EVERY - 1
     before_k = float(np.median(np.abs(difference_k[held_out])))
     after = []
@@ -101,9 +101,9 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
 
 
 def _differences(samples: DriftSamples) -> tuple[IntArray, csr_matrix, FloatArray]:
-    """Differences of two readings of one point: the point, what drift adds as a row of a matrix, and the kelvin.
+    """Return the differences of two readings of one point: point numbers (n,), a matrix, and differences (n,) [K].
 
-    The columns of the matrix, shape (n, frames + radial terms), belong to the offsets and the radial coefficients.
+    The matrix, shape (n, frames + radial terms), times offsets and radial coefficients gives the differences by drift.
     """
     pairs = []
     for lag in range(1, _MOST_LAG + 1):
@@ -121,12 +121,12 @@ def _differences(samples: DriftSamples) -> tuple[IntArray, csr_matrix, FloatArra
 
 
 def _fit(design: csr_matrix, difference_k: FloatArray, share: FloatArray, unknowns: int) -> FloatArray:
-    """Solve for the unknowns (columns) by reweighted least squares with Huber's loss, each row counted by its share."""
+    """Solve design @ x = difference_k for x by robust least squares (Huber's loss), rows weighted by `share`."""
     solution, weight, used = np.zeros(unknowns), share, share > 0.0
     for _ in range(_ITERATIONS):
         weighted = design.multiply(weight[:, None]).tocsr()
         before = solution
-        # Minimum norm: every group of frames that shares points gets mean offset 0.
+        # lstsq gives the solution of least norm: in each group of frames that share points, the mean offset is 0.
         solution = np.linalg.lstsq((weighted.T @ design).toarray(), weighted.T @ difference_k, rcond=_RIDGE)[0]
         if float(np.abs(solution - before).max()) < _CONVERGED_K:
             break
@@ -138,7 +138,7 @@ def _fit(design: csr_matrix, difference_k: FloatArray, share: FloatArray, unknow
 
 @dataclass(frozen=True, eq=False)
 class DriftSamples:
-    """Readings of scene points, sorted by point, then by frame. Only points with at least two readings."""
+    """Readings of scene points, sorted by point, then by frame; every point has at least two readings."""
 
     point: IntArray  # number of the point, 0 to points - 1, shape (n,)
     frame: IntArray  # number of the frame, shape (n,)
@@ -150,9 +150,9 @@ class DriftSamples:
 def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_thermal: FloatArray) -> DriftSamples:
     """Read the temperature of scene points in all thermal images that see them.
 
-    A frame sees a point if structure from motion found it there, or if the point lies in its image at the depth
-    that the frame's own points have around it. Points on steep temperature edges are left out, because there a
-    pixel's error in place is a large error in degrees.
+    A frame sees a point if structure from motion found the point in that frame, or if the point falls into the image
+    at the depth of the frame's own points nearby. Points on steep temperature edges are left out, because there a
+    small error in place is a large error in temperature.
     """
     world, tracked = _chosen_points(frames)
     columns = []
@@ -180,7 +180,7 @@ def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_
 
 
 def _chosen_points(frames: Sequence[RigFrame]) -> tuple[FloatArray, BoolArray]:
-    """World positions (n, 3) of the points that most frames share, some from every frame, and who tracks them."""
+    """Return positions (n, 3) of each frame's most shared points, and a table (frames, n) of who tracks which point."""
     every = np.concatenate([frame.point_ids for frame in frames])
     ids, first, inverse = np.unique(every, return_index=True, return_inverse=True)
     world = np.concatenate([np.asarray(frame.points_world, dtype=np.float64).reshape(-1, 3) for frame in frames])[first]
@@ -198,8 +198,8 @@ def _chosen_points(frames: Sequence[RigFrame]) -> tuple[FloatArray, BoolArray]:
 
 
 def _read(image: Float32Array, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Temperatures (n,) at pixel positions (n, 2), slightly smoothed, and how steep the image is there [K/pixel]."""
-    smooth = cv2.GaussianBlur(image, (0, 0), _BLUR_PX, borderType=cv2.BORDER_REPLICATE)  # NaN spreads, and is left out
+    """Return slightly smoothed temperatures (n,) at pixels (n, 2), and the slope there (n,) [K/pixel]."""
+    smooth = cv2.GaussianBlur(image, (0, 0), _BLUR_PX, borderType=cv2.BORDER_REPLICATE)  # NaN spreads; left out later
     gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125)
     gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125)
     place = pixels[:, ::-1].T - 0.5

@@ -1,4 +1,4 @@
-"""Edges of photographs and thermal images at one size after another, and how well a rig makes them agree."""
+"""Edges of photographs and thermal images at several sizes, and the score of how well a rig makes them agree."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _MOST_POINTS = 6_000
 _STRONGEST_SHARE = 0.35
 _WEAKEST_EDGE = 0.05
 FARTHEST_FROM_POINT = 0.06
-"""Distance on the plane at depth 1 to the next scene point, beyond which an edge's depth is not known."""
-SURE_DISTANCE = 0.01  # distance on that plane up to which an edge's depth is that of the scene points around it
+"""If the nearest scene point is farther from an edge (on the plane at depth 1), the edge's depth counts as unknown."""
+SURE_DISTANCE = 0.01  # at this distance on the plane at depth 1, the weight of an edge has fallen to a half
 _EDGE_REACH = 2.0  # half the width of an edge, in standard deviations of its blur
 _MARGIN_SHARE = 0.15
 _FINER = 1.23
@@ -34,7 +34,7 @@ _ASPECT_TOLERANCE = 0.02
 _GRADIENT_SIGMA_PX = 1.2
 _NOISE_FACTOR = 3.0
 _STRONG_PERCENTILE, _SMALLEST_SHARE = 98.0, 3e-3
-"""Below this share of the strong edges' |z| an image without noise counts as flat."""
+"""In an image without noise, an edge of `_SMALLEST_SHARE` of the strong edges' |z| counts a half (`edge_field`)."""
 _CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE = 6.0, 0.02
 _FEWEST_FOR_PATTERN = 8
 _PATTERN_CORRELATION = 0.25
@@ -45,64 +45,64 @@ _PADDING = 2
 
 @dataclass(frozen=True, eq=False)
 class EdgePoints:
-    """Edges of one photograph as points in front of its camera."""
+    """Edge pixels of one photograph, as points in space."""
 
-    points: FloatArray  # shape (n, 3), the visible camera's OpenCV axes
-    value: npt.NDArray[np.complex64]  # edge values, shape (n,)
+    points: FloatArray  # positions in the visible camera's OpenCV axes, shape (n, 3) [world units]
+    value: npt.NDArray[np.complex64]  # edge values (`edge_field`), each times its trust in the depth, shape (n,)
 
 
 class ThermalEdges:
-    """Edge values of one thermal image and all that is needed to sample them smoothly."""
+    """Edge values (`edge_field`) of one thermal image, which can be sampled between pixel centres."""
 
     def __init__(self, field: npt.NDArray[np.complex64]) -> None:
-        """Take edge values, shape (height, width)."""
+        """Store edge values, shape (height, width), and their slopes."""
         self.field = field
         self.weight: Float32Array = np.minimum.outer(*map(_ramp, field.shape)).astype(np.float32)
         padded = np.pad(field, _PADDING)  # zeros around, so that everything outside reads 0
         self._planes = padded, np.gradient(padded, axis=1), np.gradient(padded, axis=0)
 
     def sample(self, pixels: FloatArray, *, slopes: bool = False) -> npt.NDArray[np.complex64]:
-        """Edge values at pixels (n, 2) and, if asked for, their slopes along x and y, shape (1 or 3, n); 0 outside."""
+        """Return edge values (1, n) at pixels (n, 2), with `slopes` also derivatives by x and y (3, n); 0 outside."""
         return np.stack([_bilinear(plane, pixels) for plane in self._planes[: 3 if slopes else 1]])
 
     def weight_at(self, pixels: FloatArray) -> FloatArray:
-        """How much points at pixel positions (n, 2) count, shape (n,); 0 outside the image."""
+        """Return the weights, 0 to 1, of points at pixels (n, 2), shape (n,); weights are 0 at the image's border."""
         return _bilinear(np.pad(self.weight, _PADDING), pixels).astype(np.float64)
 
 
 class RigScore:
-    """The score of all frames at one size of the thermal images.
+    """Score of how well a rig makes the edges of all frames agree, at one size of the thermal images.
 
-    Every photograph becomes a set of points in front of its camera, where its edges are, each with an edge value a.
-    The rig says where they fall in the thermal image, whose edge value there is b. The score is
+    The edges of every photograph are points in front of its camera, each with an edge value a. A rig projects each
+    point into the thermal image, whose edge value there is b. The score of the rig is
     sum(w Re a* b) / sqrt(sum(w |a|^2) sum(w |b|^2)) over the points of all frames: 1 if all edges agree, 0 by chance.
+    The weights w fall to 0 at the border of the thermal image.
 
-    What is maximised is the sum(w Re a* b) alone, with weights w that fall to 0 at the border of the thermal image and
-    do not follow the rig. The points lie only where photographs have edges, so the last factor is no constant of the
-    thermal images, and points at the border come and go: with either of them it pays to move points to where b is
-    small, and the focal length comes out half a percent too long.
+    A rig is refined by maximising sum(w Re a* b) alone (`slopes`), with weights w that stay while the rig changes. If
+    the score were divided by a changing sum(w |b|^2), or the weights followed the rig, it would pay to move points to
+    where b is small, and the focal length would come out half a percent too long.
     """
 
     def __init__(
         self, edges: Sequence[EdgePoints], thermal: Sequence[ThermalEdges], rig: RigModel, around: FloatArray
     ) -> None:
-        """Take edges of photographs and thermal images, what changes count from, and where the weights are taken."""
+        """Store the edges of each frame and the start `rig`; the weights are those at the ten changes `around`."""
         self.edges, self.thermal, self.rig = edges, thermal, rig
         self._weights = [t.weight_at(rig.project(around, e.points)) for e, t in zip(edges, thermal)]
         self._own = sum(float(w @ np.abs(e.value) ** 2) for e, w in zip(edges, self._weights))
         self._norm = self._sums(around)[1]
 
     def around(self, change: FloatArray) -> RigScore:
-        """Same images, the points' weights taken at another place."""
+        """Return the score of the same images with the points' weights taken at the ten changes `change`."""
         return RigScore(self.edges, self.thermal, self.rig, change)
 
     def value(self, change: FloatArray) -> float:
-        """Score of all frames together."""
+        """Return the score, -1 to 1, of the rig with the ten changes `change`, over all frames."""
         product, norm = self._sums(change)
         return product / norm
 
     def _sums(self, change: FloatArray) -> tuple[float, float]:
-        """Weighted sum of Re a* b, and sqrt(sum(w |a|^2) sum(w |b|^2))."""
+        """Return the two parts of the score: sum(w Re a* b), and sqrt(sum(w |a|^2) sum(w |b|^2))."""
         product, other = 0.0, 0.0
         for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
             (value,) = thermal.sample(self.rig.project(change, one.points))
@@ -111,7 +111,7 @@ class RigScore:
         return product, float(np.sqrt(max(self._own * other, _TINY)))
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
-        """What is maximised, and its derivative split by the frames that it comes from, shape (frames, 10)."""
+        """Return sum(w Re a* b) / norm, the norm fixed, and each frame's part of its derivative, shape (frames, 10)."""
         total, rows = 0.0, []
         for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
             sampled = thermal.sample(self.rig.project(change, one.points), slopes=True)
@@ -123,16 +123,16 @@ class RigScore:
 
 @dataclass(frozen=True, eq=False)
 class PreparedFrame:
-    """One frame, read and checked."""
+    """Images and depths of one frame, read and checked."""
 
-    grey: FloatImage  # photograph, shape (height, width)
+    grey: FloatImage  # grey values of the photograph, shape (height, width)
     contrast: FloatImage  # local contrast of the temperatures, shape (height, width) of the thermal camera [K]
-    depth: SparseDepth
+    depth: SparseDepth  # depth seen by the visible camera, from the frame's scene points
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedFrames:
-    """All frames and both cameras, ready to be compared at any size."""
+    """All frames and both cameras; `score` compares the images at any size."""
 
     frames: tuple[PreparedFrame, ...]
     visible: Camera
@@ -140,13 +140,13 @@ class PreparedFrames:
     median_depth: float  # of all scene points [world units]
 
     def sizes(self) -> list[tuple[int, int]]:
-        """Sizes of the thermal images to go through, coarse to fine; the last one is the full size."""
+        """Return the sizes (width, height) of thermal images to compare at, from coarse to the full size."""
         width, height = self.thermal.width, self.thermal.height
         halvings = max(round(np.log2(max(width / _COARSEST_WIDTH, 1.0))), 0)
         return [(round(width / 2**k), round(height / 2**k)) for k in range(halvings, -1, -1)]
 
     def score(self, rig: RigModel, change: npt.NDArray, size: tuple[int, int], blur_px: float) -> RigScore:
-        """Make the score at one size; `change` says about where in the thermal image the points lie."""
+        """Return the score of rigs near `change` (ten changes of `rig`) at one size and blur of the thermal images."""
         level = rig.at_size(*size)
         edges, thermal = [], []
         for frame in self.frames:
@@ -156,8 +156,8 @@ class PreparedFrames:
         return RigScore(edges, thermal, level, change)
 
     def _edge_points(self, frame: PreparedFrame, level: RigModel, change: npt.NDArray, blur_px: float) -> EdgePoints:
-        """The strongest edges of a photograph, in pixels somewhat smaller than the thermal image's."""
-        # Pixels of the same size would fall onto each other at whole shifts, which interpolation then prefers.
+        """Return the strongest edges of a photograph that is reduced to pixels a little smaller than thermal pixels."""
+        # With pixels of the same size, the score would prefer whole-pixel shifts, where interpolation blurs nothing.
         height, width = frame.grey.shape
         same = level.camera.fl_x / self.visible.resized(width, height).fl_x
         scale = min(_FINER * same, 1.0)
@@ -174,8 +174,8 @@ class PreparedFrames:
         rays, (rows, columns) = rays[keep], place[keep].T
         depth, distance = frame.depth.at(rays)
         known = distance < FARTHEST_FROM_POINT
-        # An edge's weight is the same across its width: where only one side of an outline has scene points, a weight
-        # that falls across the outline would move it.
+        # An edge's trust is constant across its width. Otherwise, where only one side of an outline has scene points,
+        # the trust would fall across the outline and shift the edge.
         trust = np.zeros(field.shape, np.float32)
         trust[rows, columns] = 1.0 / (1.0 + (distance / SURE_DISTANCE) ** 4)
         reach = 2 * int(np.ceil(_EDGE_REACH * (blur_px * scale / same + 1.0))) + 1
@@ -187,7 +187,7 @@ class PreparedFrames:
 
 
 def prepare_frames(frames: Sequence[RigFrame], visible: Camera, thermal: Camera) -> PreparedFrames:
-    """Read the images of all frames, take out the thermal camera's fixed pattern and check sizes (`SceneError`)."""
+    """Read the images of all frames and remove the fixed pattern; raise `SceneError` for a wrong size or bad file."""
     temperatures = [read_temperatures(frame, thermal) for frame in frames]
     prepared, depths = [], []
     for frame, contrast in zip(frames, without_fixed_pattern(temperatures)):
@@ -198,7 +198,7 @@ def prepare_frames(frames: Sequence[RigFrame], visible: Camera, thermal: Camera)
 
 
 def read_temperatures(frame: RigFrame, camera: Camera) -> FloatImage:
-    """Temperatures of a frame as an array of the thermal camera's size [degrees C]."""
+    """Return a frame's temperatures [degrees C], shape (height, width) of `camera`; raise `SceneError` for another."""
     source = frame.temperature_c
     image = np.load(source, allow_pickle=False) if isinstance(source, Path) else np.asarray(source)
     if image.shape != (camera.height, camera.width):
@@ -209,7 +209,7 @@ def read_temperatures(frame: RigFrame, camera: Camera) -> FloatImage:
 
 
 def read_photograph(frame: RigFrame, camera: Camera) -> FloatImage:
-    """Photograph of a frame as grey values; EXIF's orientation is not applied, as in structure from motion."""
+    """Return a frame's photograph as grey values, not turned by EXIF; raise `SceneError` for other proportions."""
     source = frame.photograph
     if isinstance(source, Path):
         image = np.asarray(open_photograph(source).convert("L"))
@@ -225,16 +225,16 @@ def read_photograph(frame: RigFrame, camera: Camera) -> FloatImage:
 
 
 def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0) -> npt.NDArray[np.complex64]:
-    """Edges of an image as complex numbers of magnitude 0 to 1 and twice the edge's angle, shape (height, width).
+    """Return complex edge values of magnitude 0 (no edge) to 1 and twice the edge's angle, shape (height, width).
 
-    A warm thing may be bright or dark, so the sign of an edge says nothing; its place and its direction do. The squared
-    complex gradient (gx + i gy)^2 has the edge's strength and twice its angle, so an edge and its negative are equal.
+    A warm object may be bright or dark, so the sign of an edge says nothing; only place and direction count. The
+    squared gradient z = (gx + i gy)^2 is the same for an edge and its negative.
 
-    Strong edges all count as 1 and noise as little: z / (|z| + c) with c a multiple of the median of |z|, the
-    level of noise in an image that is mostly flat. NaN pixels and what lies next to them count as no edge.
+    The edge value is z / (|z| + c), so strong edges all count nearly 1 and noise counts little; c is a multiple of the
+    median of |z|, which is the level of noise in a mostly flat image. NaN pixels and pixels near them count as no edge.
 
-    `blur_px` is the standard deviation of the blur that follows: how far apart two edges may lie to be found, in pixels
-    of which `pixels_per_pixel` of the image make one.
+    The edge values are then blurred by the standard deviation `blur_px`, so that edges agree from that far apart. Its
+    unit is one coarse pixel, as wide as `pixels_per_pixel` pixels of the image.
     """
     bad = ~np.isfinite(image)
     filled = np.where(bad, np.float32(np.nanmedian(image) if not bad.all() else 0.0), image).astype(np.float32)
@@ -256,10 +256,10 @@ def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0)
 
 
 def without_fixed_pattern(images: Sequence[FloatImage]) -> list[FloatImage]:
-    """Local contrasts of images without what stays in place while the camera moves.
+    """Return the `local_contrast` of each image [K] without the sensor's fixed pattern.
 
-    Rows, columns and single pixels may read differently. The pattern is the median local contrast over the images. It
-    is taken out only where two halves of the images agree on it.
+    Rows, columns and single pixels of a sensor may read differently. The pattern is the median local contrast over the
+    images, and is subtracted only if there are enough images and its medians over two halves of them correlate.
     """
     contrast = [local_contrast(image) for image in images]
     if len(contrast) < _FEWEST_FOR_PATTERN:
@@ -272,7 +272,7 @@ def without_fixed_pattern(images: Sequence[FloatImage]) -> list[FloatImage]:
 
 
 def local_contrast(image: FloatImage) -> FloatImage:
-    """Difference of each pixel to its surroundings, in which drift and vignetting do not show; NaN stays NaN."""
+    """Return each pixel minus the mean of its surroundings, free of drift and vignetting, [K]; NaN stays NaN."""
     known = np.isfinite(image)
     filled = np.where(known, image - image[known].mean(dtype=np.float64), 0.0) if known.any() else image
     reach = max(_CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE * image.shape[1])
@@ -282,12 +282,12 @@ def local_contrast(image: FloatImage) -> FloatImage:
 
 
 def _bilinear(padded: npt.NDArray, pixels: FloatArray) -> npt.NDArray:
-    """Sample a plane with zeros around at pixel positions (n, 2) of the plane without them; NaN reads 0."""
+    """Sample a plane padded by `_PADDING` zeros at pixels (n, 2) counted without the padding; NaN pixels read 0."""
     place = np.nan_to_num(pixels, nan=-9.0)[:, ::-1].T + (_PADDING - 0.5)
     return ndimage.map_coordinates(padded, place, order=1, mode="nearest")
 
 
 def _ramp(length: int) -> FloatArray:
-    """0 near both ends, where edges are not known well, and 1 from a small share of the length on."""
+    """Return weights for a row of pixels, shape (length,): 0 near both ends, where edges are unsure, rising to 1."""
     distance = np.minimum(np.arange(length) + 0.5, length - np.arange(length) - 0.5) - _BORDER_PX
     return np.clip(distance / max(_BORDER_SHARE * length, 2.0), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Maximises scores of rigs, and refines a rig by windows of thermal images that follow the photographs."""
+"""Maximises scores of rigs, and refines a rig by small windows in which temperature follows brightness."""
 
 from __future__ import annotations
 
@@ -19,47 +19,47 @@ _DIFFERENCE_PX = 0.05
 _MOST_STEPS = 20
 _GRADIENT_TOLERANCE = 3e-2
 THERMAL_BLUR_PX = 0.6
-"""Blur of both images before they are compared, so that interpolation between thermal pixels does not show."""
+"""Standard deviation of a blur of both images, so that interpolation does not matter [thermal pixels]."""
 _NOISE_TO_MEDIAN = 0.6745
 _NOISE_KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6.0
 _SMALLEST_VARIANCE = 1e-8
 _STEP_PX = 1e-3
 _BLOCKS = 4
-"""Contributions to a slope are summed over this many times as many parts of every image, which count as independent."""
+"""Every image is divided into _BLOCKS x _BLOCKS parts, whose contributions to a slope count as independent."""
 _PITCH = 1.3  # pixels of the reduced photograph per thermal pixel
 _WINDOW_PX = 1.0
 _LENS_BLURS_PX = (0.0, 0.5, 0.8, 1.2, 1.6)
-"""Blurs of the thermal camera that are tried, beside the pixel itself [thermal pixels]."""
+"""Standard deviations of the thermal lens's blur that are tried; the pixel's own blur is added [thermal pixels]."""
 _BLUR_FRAMES, _BLUR_WINDOWS = 8, 1000
-"""From how many frames and windows of each the blur is chosen, and whether windows agree at all is seen."""
+"""Number of frames, and of windows in each, that choose the blur and test whether windows agree at all."""
 _MOST_WINDOWS = 3000
-_AGREEMENT = 0.9  # R2 from which on a window counts
+_AGREEMENT = 0.9  # a window counts if its R2 (`WindowScore`) is above this
 _REACHES_PX = (0.5, 0.25, 0.0, 0.0)
-"""How far around its place a window may agree to count, in every round [thermal pixels]."""
+"""In each round, a window counts if it agrees somewhere within this distance along x and y [thermal pixels]."""
 _FEWEST_WINDOWS = 150
 _ABOVE_CHANCE = 3.0
 _ELSEWHERE_PX = 5.0
 _MOST_SHIFT_PX = 2.0
 _CORRELATED_FRAMES = 6
-"""Frames that count as one. In five drawn captures of 36 frames the turn was wrong by 0.09 degrees (median) with 6, by
-0.22 where all counted as one; where none did, no better in the four that were tried."""
+"""Number of frames that together count as one independent frame. In five drawn captures of 36 frames the turn erred by
+0.09 degrees (median) with 6 and by 0.22 with all frames as one; with 1, four of these captures erred no less."""
 _STATED_SHARE = 0.25
-"""Share of the windows' information that the covariance states. In drawn captures with known rigs the errors of the
-principal point, which the turn follows, were one to two times what the scatter of the windows says."""
+"""Share of the windows' information that the covariance is computed from. In drawn captures with known rigs, principal
+point and turn erred by one to two times the standard errors that follow from the scatter of the windows."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigPosterior:
-    """A score of rigs together with what is known of the ten changes before the images are looked at."""
+    """A score of rigs combined with a prior, the standard deviations of the ten changes (`PARAMETERS`)."""
 
     score: RigScore | WindowScore
-    sigmas: FloatArray  # prior standard deviations of the changes, shape (10,); changes of 0 are kept at 0
-    median_depth: float  # of the scene points [world units]
+    sigmas: FloatArray  # prior standard deviations of the changes, shape (10,); a change with 0 stays 0
+    median_depth: float  # median depth of the scene points [world units]
     correlated: float = 1.0
-    """How many parts of the score show the same things, so that their scatter counts that many times."""
+    """Number of parts of the score that show the same things; the variance of the score's slope is multiplied by it."""
 
     def maximum(self, change: FloatArray) -> FloatArray:
-        """Maximise weight * score - 0.5 * sum((change / sigma)^2) from `change` on (BFGS)."""
+        """Return the ten changes that maximise weight * score - sum((change / sigma)^2) / 2 (BFGS from `change`)."""
         free = self.sigmas > 0.0
         z = change[free] / self.sigmas[free]
         weight, information = self._information(z)
@@ -75,7 +75,7 @@ class RigPosterior:
         return self._full(z + root @ best.x)
 
     def covariance(self, change: FloatArray, stated_share: float = 1.0) -> FloatArray:
-        """Covariance of the ten changes at a maximum from a share of the information there, shape (10, 10)."""
+        """Return the covariance (10, 10) of the ten changes at a maximum, using a share of the score's information."""
         free = self.sigmas > 0.0
         _, information = self._information(change[free] / self.sigmas[free])
         inverse = np.linalg.inv(stated_share * information + np.eye(len(information)))
@@ -93,12 +93,12 @@ class RigPosterior:
         return value, (parts * self.sigmas)[:, self.sigmas > 0.0]
 
     def _information(self, z: FloatArray) -> tuple[float, FloatArray]:
-        """Weight of the score and the information that the weighted score has, in prior standard deviations.
+        """Return the weight of the score and its information matrix, weight * H, for changes z in prior sigmas.
 
-        The weight makes the score's curvature H the information that the score carries: with G the scatter of the
-        parts' contributions to the slope, the covariance of the maximum alone is H^-1 G H^-1 (Huber 1967, parts taken
-        as independent), which (weight * H)^-1 equals if weight * G = H. The median over H's principal directions is
-        taken, because those that the images hardly determine have no reliable ratio.
+        H is the curvature of the score. With G the scatter of the parts' contributions to the slope, the covariance of
+        the score's maximum is H^-1 G H^-1 (Huber 1967, parts taken as independent). This equals (weight * H)^-1 if
+        weight * G = H. The weight is the median over H's principal directions, because the ratio is unreliable in
+        directions that the images hardly determine.
         """
         camera = self.score.rig.camera
         turn, shift = 1.0 / camera.fl_x, self.median_depth / camera.fl_x
@@ -115,89 +115,89 @@ class RigPosterior:
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Windows of one photograph as points in front of its camera, with what temperatures are fitted by in each."""
+    """Small windows of one photograph, each k points in space, with the functions that temperatures are fitted by."""
 
-    points: FloatArray  # shape (n, 3), the visible camera's OpenCV axes
-    index: IntArray  # which points each window has, shape (windows, k)
+    points: FloatArray  # points of all windows, in the visible camera's OpenCV axes, shape (n, 3) [world units]
+    index: IntArray  # indices into `points` of each window's points, shape (windows, k)
     plain: FloatArray  # orthonormal basis of weighted planes a + b x + c y, the same in all windows, shape (k, 3)
     bright: FloatArray
-    """The photograph in every window, orthogonal to the planes and of length 1, weighted, shape (windows, k)."""
+    """Weighted brightness of every window, orthogonal to the planes and of length 1, shape (windows, k)."""
     weight: FloatArray  # square roots of the weights of a window's points, shape (k,)
-    trust: FloatArray  # how much each window counts, shape (windows,)
+    trust: FloatArray  # weight of each window in the likelihood, 0 to 1, shape (windows,)
 
     @property
     def middle(self) -> IntArray:
-        """The point in the middle of each window, shape (windows,)."""
+        """Index into `points` of the middle point of each window, shape (windows,)."""
         return self.index[:, self.index.shape[1] // 2]
 
     def chosen(self, keep: npt.NDArray) -> Windows:
-        """Some of the windows only, by mask or number."""
+        """Return only the windows that `keep`, a mask or indices, selects."""
         used, index = np.unique(self.index[keep], return_inverse=True)
         index = index.reshape(-1, self.index.shape[1])
         return Windows(self.points[used], index, self.plain, self.bright[keep], self.weight, self.trust[keep])
 
 
 class SmoothThermal:
-    """A thermal image as cubic splines: its values and slopes between the pixels."""
+    """A thermal image's local contrast, slightly blurred, as a cubic spline that gives values between pixels."""
 
     def __init__(self, contrast: FloatImage) -> None:
-        """Take local contrasts, shape (height, width) [K]; NaN where there is none."""
+        """Fit the spline to local contrasts, shape (height, width) [K]; NaN where unknown."""
         bad = ~np.isfinite(contrast)
-        # From second differences along both axes at once (Immerkaer 1996).
+        # The noise is estimated from second differences along both axes at once (Immerkaer 1996).
         curved = np.abs(ndimage.convolve(contrast.astype(np.float64), _NOISE_KERNEL, mode="nearest"))
         curved = curved[np.isfinite(curved)]
         self.noise_k = float(np.median(curved)) / _NOISE_TO_MEDIAN if len(curved) else 0.0
-        """Standard deviation of the noise from pixel to pixel [K]."""
+        """Standard deviation of the pixels' independent noise [K]."""
         filled = np.where(bad, 0.0, contrast).astype(np.float64)
         smooth = cv2.GaussianBlur(filled, (0, 0), THERMAL_BLUR_PX, borderType=cv2.BORDER_REFLECT)
         self._spline = np.asarray(ndimage.spline_filter(smooth, order=3, mode="mirror"))
         good = np.logical_not(ndimage.binary_dilation(bad, np.ones((5, 5))))
         self._good = np.pad(good[1:-1, 1:-1], 1).astype(np.float64)
         self.shape = contrast.shape
-        """Height and width."""
+        """Height and width of the image, [pixels]."""
 
     def usable(self, pixels: FloatArray) -> BoolArray:
-        """Which pixel positions (n, 2) lie in the image, one pixel from its border and away from missing pixels."""
+        """Return a mask (n,) of the pixels (n, 2) that lie inside the image's border and away from missing pixels."""
         return ndimage.map_coordinates(self._good, _place(pixels), order=0, mode="constant") > 0.0
 
     def value(self, pixels: FloatArray) -> FloatArray:
-        """Local contrast at pixel positions (n, 2), shape (n,) [K]."""
+        """Return the local contrast at pixel positions (n, 2), shape (n,) [K]."""
         sampled = ndimage.map_coordinates(self._spline, _place(pixels), order=3, prefilter=False, mode="nearest")
         return np.asarray(sampled)
 
     def slope(self, pixels: FloatArray) -> FloatArray:
-        """Its derivatives along x and y, shape (n, 2) [K/pixel]."""
+        """Return the derivatives of `value` along x and y at pixel positions (n, 2), shape (n, 2) [K/pixel]."""
         steps = (_STEP_PX, 0.0), (0.0, _STEP_PX)
         rises = [self.value(pixels + step) - self.value(pixels - step) for step in steps]
         return np.column_stack(rises) / (2.0 * _STEP_PX)
 
 
 def _place(pixels: FloatArray) -> FloatArray:
-    """Pixel positions (n, 2) as rows and columns (2, n) of an array; NaN becomes a place outside."""
+    """Return pixel positions (n, 2) as array rows and columns (2, n); NaN becomes a place outside the image."""
     return np.nan_to_num(pixels, nan=-9.0)[:, ::-1].T - 0.5
 
 
 class WindowScore:
-    """The log likelihood of rigs, from the windows of all frames.
+    """Log likelihood of a rig, up to a factor, from the windows of all frames.
 
-    In a window of about three thermal pixels a photograph mostly shows two materials, and so does the thermal image:
-    there the temperature is t = a + b x + c y + d p of the photograph's brightness p, seen as blurred as the thermal
-    camera sees it. With R2 the share of the temperature's variance about a + b x + c y that d p explains, the
-    likelihood of a rig is sum(-n / 2 log(1 - R2)) over the windows. Gains d are free in every window, so warm may be
-    bright or dark; a window that shows more than two materials fits badly, and where it is left out it pulls the rig
-    nowhere.
+    A window of about three thermal pixels mostly shows two materials. Its temperatures then are t = a + b x + c y + d p
+    with p the photograph's brightness, blurred as the thermal camera blurs. R2 is the share of the temperature's
+    variance about a + b x + c y that d p explains. A window's log likelihood is -n / 2 log(1 - R2) for n independent
+    readings; the score takes n = 1 times the window's trust, because `RigPosterior` finds the factor. The gain d is
+    free in every window, so warm may be bright or dark. A window of more than two materials should be left out.
     """
 
     def __init__(self, windows: Sequence[Windows], thermal: Sequence[SmoothThermal], rig: RigModel) -> None:
-        """Take windows of photographs, thermal images of the same frames and what changes count from."""
+        """Store the windows of each photograph, the thermal images of the same frames and the start `rig`."""
         self.frames, self.rig = list(zip(windows, thermal)), rig
         self.count = sum(len(each.index) for each in windows)
-        """Number of windows."""
-        # The same floor for all windows: no window counts as known better than the noise allows.
+        """Number of windows in all frames."""
+        # One noise level for all images: no window counts as more certain than the noise allows.
         self._noise = float(np.median([image.noise_k for image in thermal])) if len(thermal) else 0.0
 
     def agreement(self, change: FloatArray, shift_px: tuple[float, float] = (0.0, 0.0)) -> list[FloatArray]:
-        """R2 of every window, moved by `shift_px`, by frame; 0 where a window leaves the thermal image."""
+        """Return R2 of every window, one array (windows,) per frame, with the windows moved by `shift_px` in the
+        thermal image; R2 is 0 if a window leaves the image."""
         result = []
         for windows, thermal in self.frames:
             pixels = self.rig.project(change, windows.points) + shift_px
@@ -206,7 +206,7 @@ class WindowScore:
         return result
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
-        """Log likelihood per window, and its derivative by parts of the images, shape (parts, 10)."""
+        """Return the score, a mean over windows, and each image part's share of its derivative, shape (parts, 10)."""
         total, rows, share = 0.0, [np.zeros((0, 10))], 0.5 / max(self.count, 1)
         for windows, thermal in self.frames:
             pixels = self.rig.project(change, windows.points)
@@ -229,8 +229,8 @@ class WindowScore:
         return total, np.concatenate(rows)
 
     def _fit(self, windows: Windows, temperature: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Temperatures in each window without their plane (weighted), how much of the photograph is in them, and their
-        sum of squares with the noise that is in it at least."""
+        """Return each window's weighted temperatures less their plane, (windows, k); the gain d of its brightness,
+        (windows,); and the sum of squares of the former plus a floor for noise, (windows,)."""
         value = temperature[windows.index] * windows.weight
         value = value - (value @ windows.plain) @ windows.plain.T
         gain = np.einsum("wk,wk->w", windows.bright, value)
@@ -241,19 +241,18 @@ class WindowScore:
 def refine(
     prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: FloatArray
 ) -> tuple[FloatArray, FloatArray, int] | None:
-    """Move a rig that is right to about a pixel to where the windows agree best.
+    """Move a rig that is right to about a pixel to where the windows of photographs and thermal images agree best.
 
     The comparison of edges leaves a bias of some tenths of a pixel, because edges in a photograph and in a thermal
-    image are not of the same strength. Windows that one gain explains almost wholly do not have it; they are chosen
-    anew after each maximisation. Frames show the same things, so up to six together count as one in the standard errors
-    and against the prior.
+    image differ in strength. Windows with R2 above `_AGREEMENT` do not have this bias; they are chosen anew before each
+    maximisation. Frames show the same things, so `_CORRELATED_FRAMES` count as one in the weight of the images.
 
     Returns:
-        The ten changes, their covariance (10, 10) and the number of windows that agree; None where too few windows
-        agree, or hardly more than by chance.
+        The ten changes, their covariance (10, 10) and the number of windows that agree; None if too few windows agree,
+        if hardly more agree than by chance, or if points would move by `_MOST_SHIFT_PX` or more (median).
     """
     visible, frames = prepared.visible, prepared.frames
-    same = rig.camera.fl_x / visible.fl_x  # pixels of the photograph that are as wide as a thermal pixel
+    same = rig.camera.fl_x / visible.fl_x  # scale that makes the photograph's pixels as wide as thermal pixels
     scale = min(_PITCH * same, *(frame.grey.shape[1] / visible.width for frame in frames))
     pitch, reduced = scale / same, visible.resized(*(max(round(n * scale), 8) for n in (visible.width, visible.height)))
     shape = reduced.height, reduced.width
@@ -263,7 +262,7 @@ def refine(
 
     def windows_of(number: int, lens_blur_px: float, most: int) -> Windows:
         grey = cv2.resize(frames[number].grey, shape[::-1], interpolation=cv2.INTER_AREA)
-        # The thermal pixel is a box of 1, the reduced photograph's one of 1 / pitch; a box of w has variance w^2 / 12.
+        # A pixel is a box: of width 1 in the thermal image, 1 / pitch in the photograph; width w has variance w^2 / 12.
         variance = THERMAL_BLUR_PX**2 + lens_blur_px**2 + (1.0 - 1.0 / pitch**2) / 12.0
         blurred = cv2.GaussianBlur(grey, (0, 0), np.sqrt(max(variance, 0.01)) * pitch, borderType=cv2.BORDER_REPLICATE)
         depth, distance = surfaces[number]
@@ -320,16 +319,16 @@ def choose_windows(
     window_px: float,
     most: int,
 ) -> Windows:
-    """Choose the windows of a photograph with most contrast.
+    """Return the windows of a photograph with the most contrast.
 
     Args:
-        photograph: Brightness, as blurred as the thermal camera sees it, shape (height, width).
-        points: Points that its pixels see, shape (height * width, 3), the visible camera's OpenCV axes.
-        usable: Pixels that windows may have, shape (height, width).
-        trust: How much a window counts that has its middle at a pixel, shape (height * width,).
+        photograph: Brightness, blurred as the thermal camera blurs, shape (height, width).
+        points: Scene point at each pixel in the visible camera's OpenCV axes, shape (height * width, 3).
+        usable: True for pixels that a window may contain, shape (height, width).
+        trust: Trust in a window whose middle is at each pixel, shape (height * width,).
         pitch: Pixels of this photograph per thermal pixel.
         window_px: Standard deviation of a window's weights [thermal pixels].
-        most: How many windows to choose at most.
+        most: Largest number of windows.
     """
     sigma, reach = window_px * pitch, int(np.ceil(2.0 * window_px * pitch))
     down, across = (axis.ravel() for axis in np.mgrid[-reach : reach + 1, -reach : reach + 1])

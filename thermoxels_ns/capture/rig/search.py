@@ -1,4 +1,4 @@
-"""Finds the rig (thermal lens and pose beside the visible camera) from images."""
+"""Finds the rig (the thermal lens and its pose relative to the visible camera) from the images of a capture."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ def estimate_rig(
 ) -> RigEstimate:
     """Find the thermal camera's intrinsics and the fixed transform from the visible to the thermal camera.
 
-    The photographs' edges are carried into the thermal images through the scene points of structure from motion, and
-    the rig is moved until they lie on the thermal edges, coarse to fine, over all frames together. Frames (in the order
-    they were taken) with fewer than 12 points are left out; of more than 40 an even choice is used. Where the images
-    cannot tell, the start is returned, `determined` False.
+    The scene points of structure from motion give the depth of the photographs' edges. The rig is moved until these
+    edges, projected into the thermal images of all frames, lie on the thermal edges; `refine` then improves it. Frames
+    (in the order they were taken) with fewer than 12 points are left out, and of more than 40 frames an even choice is
+    used. If the images do not determine the rig, the start is returned, with `determined` False.
 
     Raises:
-        SceneError: No frame has scene points, or an image cannot be read or does not have the size of its camera.
+        SceneError: No frame has 12 scene points, an image cannot be read, or its size does not fit its camera.
     """
     usable = [frame for frame in frames if np.count_nonzero(frame.points_visible()[:, 2] > 0.0) >= _FEWEST_POINTS]
     if not usable:
@@ -116,7 +116,7 @@ def estimate_rig(
     before, covariance = score.value(unchanged), RigPosterior(score, sigmas, depth).covariance(change)
 
     def rejection(change: FloatArray, covariance: FloatArray) -> str | None:
-        """Say why a rig is not to be trusted; None if nothing speaks against it."""
+        """Return why a rig is too far from the start or too uncertain; None if it is acceptable."""
         free = sigmas > 0.0
         far = np.abs(change[free]) / sigmas[free]
         if far.max() > _FARTHEST_SIGMAS:
@@ -152,7 +152,7 @@ def estimate_rig(
 
 
 def _projection_sigma(prepared: PreparedFrames, rig: RigModel, change: FloatArray, covariance: FloatArray) -> float:
-    """Median standard error of where scene points fall [thermal pixels], both axes together."""
+    """Return the median standard error of where points at the median depth fall, both axes together [pixels]."""
     camera = prepared.thermal
     grid = np.linspace(0.05, 0.95, 12)
     pixels = np.array(list(product(grid, grid))) * (camera.width, camera.height)
@@ -163,17 +163,17 @@ def _projection_sigma(prepared: PreparedFrames, rig: RigModel, change: FloatArra
 
 
 class CoarseSearch:
-    """Compares all shifts of the photographs' edges at once, for a range of focal lengths and rolls.
+    """Search over focal length, roll and all shifts of the thermal image for the rigs with the best edge scores.
 
-    A small turn of the thermal camera shifts its image; so for one focal length and roll the scores of all turns are
-    cross-correlations, which Fourier transforms give together.
+    A small turn of the thermal camera shifts its image. For one focal length and roll, the scores of all shifts are
+    cross-correlations, which Fourier transforms compute at once.
     """
 
     def __init__(self, score: RigScore, sigmas: FloatArray, median_depth: float) -> None:
-        """Take the score at the coarsest size, the ten standard deviations and the points' depth [world units]."""
+        """Prepare a search at one size, limited by `sigmas` (10,) of the prior; `median_depth` is in world units."""
         camera = score.rig.camera
         self._rig = score.rig
-        # Lengths that Fourier transforms are fast at, with room for shifts.
+        # The images are padded for shifts, to lengths at which Fourier transforms are fast.
         rows, columns = (int(fft.next_fast_len(int(_PADDING * n)) or 0) for n in (camera.height, camera.width))
         self._shape: tuple[int, int] = (rows, columns)
         content = [float(np.sum(np.abs(edges.field) ** 2 * edges.weight)) for edges in score.thermal]
@@ -187,7 +187,7 @@ class CoarseSearch:
         self._rolls = _steps(_REACH_SIGMAS * float(sigmas[2]), _STEP_PX / corner_px)
 
     def best(self) -> list[_Found]:
-        """Find the best few places that differ, best first, as scores and the ten changes."""
+        """Return the best few rigs that differ in turn by `_APART_PX` or more, best first: scores and ten changes."""
         found = self._found([self._spectra(edges.field, edges.weight) for edges in self._thermal])
         kept: list[_Found] = []
         for score, change in sorted(found, key=lambda each: -each[0]):
@@ -197,7 +197,7 @@ class CoarseSearch:
         return kept[:_CANDIDATES]
 
     def best_by_chance(self) -> float:
-        """Highest score that the same search finds if edges of the same scales lie anywhere (noise, random phases)."""
+        """Return the highest score that the search finds by chance: thermal edges with their phases randomised."""
         draw = np.random.default_rng(0)
         highest = 0.0
         for _ in range(_CHANCE_DRAWS):
@@ -210,12 +210,12 @@ class CoarseSearch:
         return highest
 
     def _spectra(self, field: npt.NDArray, weight: npt.NDArray) -> _Spectra:
-        """Fourier transforms of a thermal image's edge values, weights and edge strengths."""
+        """Return the Fourier transforms of weighted edge values, weights, and weighted edge strengths of an image."""
         planes = field * weight, weight, np.abs(field) ** 2 * weight
         return tuple(np.asarray(fft.fft2(plane.astype(np.complex64), s=self._shape)) for plane in planes)
 
     def _found(self, spectra: Sequence[_Spectra]) -> list[_Found]:
-        """The best shifts for every focal length and roll."""
+        """Return the best shifts for every focal length and roll, as scores and ten changes."""
         found: list[_Found] = []
         for log_focal, roll in product(self._focals, self._rolls):
             change = np.zeros(len(PARAMETERS))
@@ -224,7 +224,7 @@ class CoarseSearch:
         return found
 
     def _surface(self, spectra: Sequence[_Spectra], change: FloatArray) -> FloatArray:
-        """Score for every whole shift of the thermal image, shape (rows, columns), shift 0 at [0, 0]."""
+        """Return the score for every whole-pixel shift of the thermal image, (rows, columns); shift 0 is at [0, 0]."""
         sums = np.zeros((3, *self._shape), np.complex64)
         for edges, thermal in zip(self._edges, spectra):
             for total, plane, spectrum in zip(sums, self._splat(edges, change), thermal):
@@ -234,7 +234,7 @@ class CoarseSearch:
         return agreement / np.sqrt(np.where(enough, np.maximum(overlap * strengths, 1e-12), np.inf))
 
     def _splat(self, edges: EdgePoints, change: FloatArray) -> tuple[npt.NDArray, npt.NDArray, npt.NDArray]:
-        """Edge values, their power and their number in each pixel of the padded image, around which shifts wrap."""
+        """Return sums of edge values, their power and their number in each padded pixel, where shifts wrap around."""
         rows, columns = self._shape
         pixels = np.nan_to_num(self._rig.project(change, edges.points), nan=-1e6)
         x, y = np.floor(pixels[:, 0]).astype(np.int64), np.floor(pixels[:, 1]).astype(np.int64)
@@ -248,7 +248,7 @@ class CoarseSearch:
         return real + np.complex64(1j) * imaginary, power, count
 
     def _best_shifts(self, surface: FloatArray, change: FloatArray) -> list[_Found]:
-        """The highest places of one surface within reach, as turns of the camera."""
+        """Return the highest scores of one surface within reach, each with `change` turned by its shift."""
         across, down = (int(np.ceil(reach)) for reach in self._reach_px)
         window = np.roll(surface, (down, across), axis=(0, 1))[: 2 * down + 1, : 2 * across + 1]
         focal = np.array([self._rig.camera.fl_x, self._rig.camera.fl_y]) * np.exp(change[6])
@@ -262,6 +262,6 @@ class CoarseSearch:
 
 
 def _steps(reach: float, step: float) -> FloatArray:
-    """Values from -reach to reach, at most `step` apart, with 0 among them."""
+    """Return values from -reach to reach, evenly spaced at most `step` apart, with 0 among them."""
     count = int(np.ceil(reach / step))
     return np.linspace(-reach, reach, 2 * count + 1) if count else np.zeros(1)

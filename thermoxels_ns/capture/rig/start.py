@@ -1,4 +1,4 @@
-"""Start of the search for a rig, from what the camera files say."""
+"""Start of the search for a rig, from the metadata of the camera files."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
 
 _MOST_ERROR_PX = 4.0
-"""Points that project farther than this from where they were seen are not used, [pixels of the photographs]."""
+"""Scene points with a larger mean reprojection error are not used, [pixels of the photographs]."""
 _FROM_LENS, _FROM_FLIR, _FROM_ANGLE, _FROM_USER, _GUESSED = 0.03, 0.06, 0.1, 0.05, 0.25
-"""Standard deviations of the thermal focal length by where it comes from, as shares of it."""
+"""Standard deviation of the thermal focal length, as a share of it, for each source of the value."""
 BASELINE_SIGMA_M = 0.1
-"""Standard deviation of the thermal lens's place beside the other one, along each axis, where metres are known, [m]."""
-_BELIEVED_DEG = (3.0, 150.0)  # angles of view that are believed; some cameras state nonsense
+"""Standard deviation of the thermal lens's place relative to the visible lens, along each axis, [m]."""
+_BELIEVED_DEG = (3.0, 150.0)  # angles of view outside these limits are ignored; some cameras state nonsense
 
 
 def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame]:
-    """Return photograph, thermal image, pose and visible scene points of each of the model's frames, in their order."""
+    """Return a `RigFrame` for each frame of the model, in the model's order; badly projecting points are left out."""
     by_name = {frame.name: frame for frame in frames}
     good = model.point_error_px <= _MOST_ERROR_PX
     result = []
@@ -47,9 +47,10 @@ def rig_start(
     field_of_view_deg: float | None = None,
     metres_per_unit: float | None = None,
 ) -> RigStart:
-    """Guess the thermal camera from the user's angle of view, its lens, FLIR's alignment or its angle of view.
+    """Return a guess of the thermal camera and the rig; a known `metres_per_unit` limits the shift of the lenses.
 
-    Where `metres_per_unit` is known, the lenses of a pair of cameras are known to lie close together.
+    The focal length follows from the first that is known: `field_of_view_deg`, the thermal files' focal length, FLIR's
+    alignment of the two pictures, the thermal files' angle of view, the photographs' angle of view.
     """
     width, height = thermal_size
     transform = np.eye(4)
@@ -91,10 +92,9 @@ def rig_start(
 
 
 def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float | None = None) -> RigEstimate:
-    """Read a rig that was found before: ``thermal_camera`` and ``rig`` of a transforms.json.
+    """Read ``thermal_camera`` and ``rig`` of an earlier capture's transforms.json.
 
-    Where the json has a scale and this capture too, lengths are converted. A `SceneError` is raised where one is
-    missing or no camera of this size, or no rotation and shift.
+    Lengths are converted if both captures have a scale. Raises `ThermoxelsError` for a bad file or another image size.
     """
     content: Any = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("thermal_camera"), dict):
@@ -116,6 +116,6 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
 
 
 def kept_start(start: RigStart, why: str) -> RigEstimate:
-    """Return the start value as an estimate that is not determined, with the reason."""
+    """Return the start as a `RigEstimate` with `determined` False; its explanation begins with `why`."""
     text = f"{why} The start value is kept: {start.source}."
     return RigEstimate(start.thermal_camera, start.visible_to_thermal, False, text)

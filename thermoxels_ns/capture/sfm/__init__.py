@@ -1,1 +1,1 @@
-"""Camera poses from photographs by structure from motion, and their scale."""
+"""Finds camera poses from photographs by structure from motion, the scale of the model, and up."""

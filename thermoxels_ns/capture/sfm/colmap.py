@@ -1,4 +1,4 @@
-"""COLMAP: it runs in a process of its own that says why it stopped, and its models become ours."""
+"""Runs COLMAP in a process of its own, reports why that process stopped, and converts COLMAP's models."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _Result = TypeVar("_Result")
 _KILLED = -int(getattr(signal, "SIGKILL", 9))
 _FATAL_ONLY = 3
 _FULL_BYTES = 1_000_000
-"""Free space up to which a disk is taken for the reason why a program ended: programs write whole pages."""
+"""With less free space, a full disk is taken as the reason why COLMAP ended: programs write whole pages."""
 _FIELDS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
@@ -35,22 +35,22 @@ _FIELDS = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
-"""COLMAP's lens models that ours can hold, and the order of their numbers."""
+"""The lens models of COLMAP that `Camera` can hold, and the order of their parameters; f is both focal lengths."""
 
 
 def run_in_process(
     work: Callable[..., _Result], arguments: tuple[Any, ...], folder: Path, say: Say = lambda _: None
 ) -> _Result:
-    """Call ``work(*arguments, say)`` in a new process, wait for its end and return what it returned.
+    """Call ``work(*arguments, say)`` in a new process, wait for its end and return the result of `work`.
 
     On some errors, such as a thread that cannot write, COLMAP aborts its process; the caller's process survives that.
-    The new process ends with the caller's, also where the caller's is killed. `work` is a function at the top of a
-    module; its arguments and its result can be pickled.
+    If the caller's process ends or is killed, the new process ends too. `work` must be a function at the top of a
+    module, and its arguments and result must be picklable.
 
     Raises:
         OutputError: The process ended because the disk of `folder` is full.
-        ThermoxelsError: `work` raised one, or the process ended without a result.
-        OSError: `work` raised one.
+        ThermoxelsError: `work` raised this error, or the process ended without a result.
+        OSError: `work` raised this error.
     """
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe(duplex=False)
@@ -58,7 +58,7 @@ def run_in_process(
     child = context.Process(target=_serve, args=(there, log, work, arguments), daemon=True)
     child.start()
     there.close()
-    ended: tuple[Any, Exception | None] | None = None  # what it returned, and what it raised
+    ended: tuple[Any, Exception | None] | None = None  # the result of `work`, and the error that `work` raised
     try:
         with suppress(EOFError):
             while ended is None:
@@ -87,12 +87,12 @@ def run_in_process(
 
 
 def _serve(pipe: Connection, log: Path, work: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Call `work` in the new process and send its result or error; what COLMAP prints goes into the file `log`."""
+    """Call `work` in the new process and send its result or error; COLMAP's output goes to the file `log`."""
     with log.open("ab") as file:
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    import pycolmap  # brings a BLAS of its own, whose sums depend on the number of its threads
+    import pycolmap  # has its own BLAS, whose sums depend on its number of threads: imported before threadpool_limits
 
     log_of_colmap: Any = pycolmap.logging
     log_of_colmap.minloglevel = _FATAL_ONLY
@@ -113,7 +113,7 @@ def _exit_with_parent() -> None:
 
 
 def _reason(status: int | None, words: str) -> str:
-    """Say why the process ended: the last line that names an error, else its last one, else its status."""
+    """Return why the process ended: its exit status, and the last line of output that names an error (or any line)."""
     if status == _KILLED:
         return "it was killed, as systems do where memory runs out (lower --threads, --image-size or --max-features)"
     said = [line for line in words.splitlines() if line.strip()]
@@ -124,10 +124,10 @@ def _reason(status: int | None, words: str) -> str:
 def model_of_colmap(
     reconstruction: Any, frame_of_image: Mapping[str, str], size: tuple[int, int] | None = None
 ) -> SfmModel:
-    """Turn a pycolmap reconstruction into our model, in the order of `frame_of_image` and without other images.
+    """Convert a pycolmap.Reconstruction into an `SfmModel`.
 
-    `size` is the photographs' width and height where the model was made from smaller ones. A `SceneError` is raised
-    where no frame has a pose, or there are several cameras or an unknown lens model.
+    The model has the posed images that are keys of `frame_of_image`, in that order. `size` is the original photographs'
+    width and height, if the images were reduced. Raises `SceneError` for no pose, several cameras or an unknown lens.
     """
     by_name = {image.name: image for image in reconstruction.images.values() if image.has_pose}
     posed = [by_name[name] for name in frame_of_image if name in by_name]
@@ -154,7 +154,7 @@ def model_of_colmap(
     poses, frames, seen, pixels = [], [], [], []
     for index, image in enumerate(posed):
         poses.append(camera_to_world(image))
-        # A track may hold two features of one photograph; the first one is kept.
+        # A scene point may have two features in one photograph; only the first feature is kept.
         own = {number[f.point3D_id]: f.xy for f in reversed(image.points2D) if f.has_point3D()}
         order = sorted(own)
         frames += [index] * len(order)
@@ -174,7 +174,7 @@ def model_of_colmap(
 
 
 def read_colmap(folder: Path) -> Any:
-    """Read a COLMAP model's folder; a `SceneError` where it holds no readable model."""
+    """Return the model in a COLMAP folder as pycolmap.Reconstruction; raise `SceneError` if none is readable."""
     try:
         return read_model(folder)
     except SceneError as problem:

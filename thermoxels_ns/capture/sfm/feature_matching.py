@@ -1,4 +1,4 @@
-"""Features of the photographs and their matches, in COLMAP's database."""
+"""Finds features of the photographs and their matches, and stores both in COLMAP's database."""
 
 from __future__ import annotations
 
@@ -15,46 +15,46 @@ from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import replace_when_done
 
-EXHAUSTIVE_UP_TO = 80  # photographs up to which every pair is matched; the time grows with the square of their number
+EXHAUSTIVE_UP_TO = 80  # auto matching compares all pairs up to this number of photographs; time grows with its square
 _NEIGHBOURS = 8
-"""Sequential matching: each photograph is matched with so many that follow it, and with those 2, 4, 8, ... times as far
-away."""
+"""Sequential matching: each photograph is matched with the next `_NEIGHBOURS`, and with those 2, 4, 8, ... times
+`_NEIGHBOURS` places ahead."""
 _ANCHORS = 40
-"""Sequential matching: so many photographs spread over the capture are matched with each other, so that a path that
-returns to its start is closed."""
+"""Sequential matching: so many photographs, spread over the capture, are also matched with each other, so that a path
+that returns to its start is closed."""
 _CHUNK = 8
 _PAIR_CHUNK = 200
 
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """How poses are found."""
+    """Options of structure from motion; `CaptureSettings` has fields of the same names."""
 
     image_size: int = 1600  # Longest side to which photographs are reduced for features, [pixels]
-    max_features: int = 4000
-    matching: Matching = "auto"  # Which photographs are compared
-    lens: LensModel = "SIMPLE_RADIAL"
-    seed: int = 0  # Of all random choices; the same one gives the same bits
-    threads: int = 2  # Of features and matching
+    max_features: int = 4000  # Most features per photograph
+    matching: Matching = "auto"  # Which pairs of photographs are compared, see `image_pairs`
+    lens: LensModel = "SIMPLE_RADIAL"  # COLMAP's name of the lens model
+    seed: int = 0  # Seed of all random choices; the same seed gives the same bits
+    threads: int = 2  # Number of threads for finding and matching features
 
 
 @dataclass(frozen=True)
 class ReducedPhotographs:
-    """Photographs as COLMAP gets them, and the database of their features and matches."""
+    """Files that COLMAP reads and writes: reduced photographs, their masks, and a database of features and matches."""
 
-    database: Path  # COLMAP's file, made where it does not exist; its folder is written to
+    database: Path  # COLMAP's database file, made if it does not exist; COLMAP also writes to its folder
     images: Path  # folder of the reduced photographs, all of one size
     frame_of_image: Mapping[str, str]
-    """Frame by the name of its photograph in that folder, in the order they were taken."""
+    """Frame name by file name in `images`, in the order the photographs were taken."""
     size: tuple[int, int]
-    """Width and height of the photographs as they are, [pixels]; those in the folder may be smaller."""
-    masks: Path | None = None  # folder of pictures that are black where no feature is looked for; None: everywhere
+    """Width and height of the original photographs, [pixels]; the photographs in `images` may be smaller."""
+    masks: Path | None = None  # folder of pictures that are black where features are not used; None: no masks
 
 
 def image_pairs(count: int, matching: Matching) -> IntArray:
-    """Pairs (p, 2) of numbers of photographs, in the order they were taken, to compare; smaller first, sorted.
+    """Return the pairs of photographs to match, shape (p, 2): numbers in order of time, smaller first, sorted.
 
-    Every pair (exhaustive); neighbours in time and some far ones (sequential); or by their number (auto).
+    "exhaustive" gives every pair, "sequential" neighbours in time and some far pairs; "auto" chooses by `count`.
 
     >>> image_pairs(3, "exhaustive").tolist()
     [[0, 1], [0, 2], [1, 2]]
@@ -72,10 +72,10 @@ def image_pairs(count: int, matching: Matching) -> IntArray:
 def fill_database(
     photographs: ReducedPhotographs, camera: Camera, known_focal: bool, options: PoseOptions, say: Callable[[str], None]
 ) -> None:
-    """Find features in photographs and match them; what an interrupted run has done is not done again.
+    """Find features in photographs and match them, adding to what an interrupted run left in the database.
 
-    `camera` is the start value of their lens at their reduced size; `known_focal` says that its focal length is more
-    than a guess.
+    `camera` is the start value of the lens, at the size of the reduced photographs; `known_focal` is True if its focal
+    length is stated by photographs or poses, not guessed.
     """
     arguments = photographs, camera, known_focal, options
     run_in_process(_find_and_match, arguments, photographs.database.parent, say)
@@ -93,7 +93,7 @@ def _find_and_match(
         reader.mask_path = str(photographs.masks)
     extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=options.threads)
     extraction.sift.max_num_features = options.max_features
-    for start in range(0, len(names), _CHUNK):  # COLMAP passes over those that have features
+    for start in range(0, len(names), _CHUNK):  # COLMAP skips photographs that already have features
         some = names[start : start + _CHUNK]
         given: dict[str, Any] = {"reader_options": reader, "extraction_options": extraction}
         pycolmap.extract_features(database, photographs.images, some, **given)
@@ -113,7 +113,7 @@ def _find_and_match(
 
 
 def as_colmap(camera: Camera, lens: LensModel) -> Any:
-    """A camera as COLMAP has it, with one of its lens models and the number 1."""
+    """Return a camera as a pycolmap.Camera with number 1 and the given lens model."""
     import pycolmap
 
     numbers = [camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
@@ -123,7 +123,7 @@ def as_colmap(camera: Camera, lens: LensModel) -> Any:
 
 
 def _add_images(photographs: ReducedPhotographs, camera: Camera, lens: LensModel, known_focal: bool) -> None:
-    """Number the photographs in their order; else the threads that look for features would number them by chance."""
+    """Create the database with photographs numbered in order; the feature threads would number them by chance."""
     import pycolmap
 
     if photographs.database.is_file():

@@ -1,4 +1,4 @@
-"""Where the camera stood: structure from motion on the photographs, or poses that the user gives."""
+"""Finds the poses of the photographs by structure from motion, or reads poses that the user gives."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.data.transforms_json import path_inside, read_intrinsics, read_pose
 
-MIN_FRAMES = 3  # fewer photographs are no reconstruction
+MIN_FRAMES = 3  # smallest number of photographs that are reconstructed
 _SAID_EVERY = 10
-_GUESSED_FOCAL = 1.0  # of the longest side, where the photograph does not say: a lens of 53 degrees
+_GUESSED_FOCAL = 1.0  # focal length as a share of the longest side, if no photograph states one: a 53 degree lens
 _JPEG_QUALITY = 95
 _DATABASE = "features.db"
 
 
 @dataclass(frozen=True)
 class Poses:
-    """The poses found, and the photographs without one."""
+    """The poses that were found or given, and the frames without a pose."""
 
     model: SfmModel
-    dropped: Mapping[str, str]  # why, by the frame's name
+    dropped: Mapping[str, str]  # reason by the frame's name
 
 
 def find_poses(
@@ -45,10 +45,10 @@ def find_poses(
     options: PoseOptions | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Poses:
-    """Find camera and poses from photographs of one camera alone (incremental structure from motion by COLMAP).
+    """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
 
-    `photographs` are files by the frame's name, in the order they were taken. What an interrupted run left in `folder`
-    is used. The largest group of photographs that fit together is found, and why the others are not in it.
+    `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length.
+    Results of an interrupted run in `folder` are reused. Only the largest group that fits together is in the model.
 
     Raises:
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
@@ -85,9 +85,9 @@ def add_points(
     options: PoseOptions | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> SfmModel:
-    """Find the points that at least two photographs with known poses share; camera and poses stay as they are.
+    """Return the model `given` with scene points that at least two photographs show; lens and poses stay unchanged.
 
-    The photographs have the size of their camera.
+    The photographs must have the size of `given.camera`. Results of an interrupted run in `folder` are reused.
     """
     options = options or PoseOptions()
     size, posed = (given.camera.width, given.camera.height), {name: photographs[name] for name in given.frames}
@@ -97,11 +97,11 @@ def add_points(
 
 
 def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
-    """Read poses from a COLMAP model's folder or a transforms.json; their world stays as it is.
+    """Read poses, in their own world coordinates, from a COLMAP model's folder or a transforms.json.
 
-    `photographs` are the camera's files, relative to the capture, by the frame's name. The model of a transforms.json
-    has no points; the frames without a pose are named. A `SceneError` is raised where nothing readable is there, no
-    photograph is in it, it has several cameras, or a name in it leads out of its folder.
+    `photographs` maps frame names to the camera's files, relative to the capture. The model of a transforms.json has no
+    points. Frames without a pose are in `dropped`. Raises `ThermoxelsError` if `path` is missing or unreadable, names
+    none of the photographs, has several cameras, or has a name that leads out of its folder.
     """
     if path.is_dir():
         reconstruction = read_colmap(path)
@@ -117,9 +117,9 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
 
 
 def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Poses:
-    """Express given poses in the pixels of the photographs; they may come from photographs that were reduced.
+    """Convert camera and pixels of given poses to the size of the photographs, which may have been reduced for them.
 
-    Frames whose photographs have another size than most are left out; other proportions are a `SceneError`.
+    Frames whose photographs have another size than most go to `dropped`. Raises `SceneError` for other proportions.
     """
     size, other = common_size({name: photographs[name] for name in poses.model.frames})
     dropped = dict(poses.dropped) | other
@@ -137,7 +137,7 @@ def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Pose
 
 
 def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, str]]:
-    """Find the width and height that most photographs have, and why frames of another size are left out."""
+    """Return the width and height that most photographs have, and a reason for each frame of another size."""
     sizes = {name: read_photograph_facts(path).size for name, path in photographs.items()}
     if not sizes:
         raise _too_few(0, "photographs")
@@ -149,9 +149,9 @@ def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[
 def _reduced(
     photographs: Mapping[str, Path], folder: Path, size: tuple[int, int], longest: int, masks: PhotographMasks | None
 ) -> tuple[ReducedPhotographs, tuple[int, int]]:
-    """Write the photographs for COLMAP, smaller and without EXIF, by which it would turn them; and their masks.
+    """Write photographs for COLMAP, at most `longest` pixels wide and high, and their masks, into `folder`.
 
-    The photographs' width and height become `longest` pixels at most; the second part of the result has them.
+    The files have no EXIF, by which COLMAP would turn them. Returns the files, and their width and height [pixels].
     """
     factor = min(1.0, longest / max(size))
     small = max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
@@ -209,7 +209,7 @@ def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
 
 
 def _frames_of(names: list[str], photographs: Mapping[str, str], path: Path) -> dict[str, str]:
-    """Frame by name in a file of poses, in the photographs' order; a stem will do where it is clear."""
+    """Return frames by the `names` in a file of poses, in the photographs' order; unique stems are enough to match."""
     by_file: dict[str, list[str]] = {}
     for frame, source in photographs.items():
         for key in {source, PurePosixPath(source).name, PurePosixPath(source).stem, frame}:
@@ -240,10 +240,10 @@ def _too_few(got: int, what: str) -> SceneError:
 
 
 def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> tuple[SfmModel | None, dict[str, int]]:
-    """Largest group of photographs that fit together (None: none do), and with how many others those elsewhere do."""
+    """Return the model of the largest group of photographs (or None), and the size - 1 of other groups by frame."""
     import pycolmap
 
-    found = 2  # the first pair comes without a call
+    found = 2  # COLMAP does not call next_image for the first pair
 
     def next_image() -> None:
         nonlocal found
@@ -269,7 +269,7 @@ def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> 
 
 
 def _triangulate(matched: ReducedPhotographs, posed: SfmModel, seed: int, say: Callable[[str], None]) -> SfmModel:
-    """Find the points that photographs with known camera (at their own size) and poses share; those of `posed` go."""
+    """Return `posed` with points triangulated from the matches, in place of its own points."""
     import pycolmap
 
     say("poses: given; looking for points")
@@ -312,7 +312,7 @@ def _options(seed: int) -> Any:
     options.random_seed = seed
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
-    # Sums over threads come in any order, and their last bits decide which point is kept: one thread, same result.
+    # One thread gives the same result each time: sums over threads vary in the last bits, which can decide on a point.
     options.num_threads = 1
     options.mapper.num_threads = 1
     options.min_model_size = MIN_FRAMES

@@ -1,4 +1,4 @@
-"""Metres per unit of a model (from GPS, a measured distance or markers), and which way is up."""
+"""Finds the metres per unit of a model (from GPS, a measured distance or markers), and the direction of up."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import SceneError
 
 _EARTH_RADIUS_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563
-_WORST_GPS = 0.3  # relative standard error above which GPS says nothing of the scale
+_WORST_GPS = 0.3  # largest relative standard error of a scale from GPS that is accepted
 _LEAST_FIXES = 4
-_NEAR_POINTS = 12  # scene points around a pixel that its depth is taken from
-_NEAR_SHARE = 0.08  # how far they may lie from it, as a share of the photograph's longest side
+_NEAR_POINTS = 12  # most scene points around a pixel that the pixel's depth is computed from
+_NEAR_SHARE = 0.08  # largest distance of these points from the pixel, as a share of the photograph's longest side
 _MARKER_DICTIONARY = cv2.aruco.DICT_4X4_50
 _MARKER_ERROR_PX = 2.0
-"""Corners of a marker that miss their rays by more than this (median) are no marker at rest, [pixels]."""
+"""A marker whose corners miss their rays by more than this (median) counts as moved and is not used, [pixels]."""
 
 _UP_OF_ORIENTATION = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
-"""Where the upper edge of the upright picture lies in the stored one (x right, y up), by EXIF's orientation."""
-_ROLLED_DEG = 2.0  # how far from level people hold the sides of a picture, standard deviation, [degrees]
-_BELIEVED_DEG = 5.0  # standard error up to which the common normal of the cameras' level axes is believed, [degrees]
+"""Direction to the upper edge of the upright picture in the stored picture (x right, y up), by EXIF's orientation."""
+_ROLLED_DEG = 2.0  # standard deviation of how level people hold a picture's sides, [degrees]
+_BELIEVED_DEG = 5.0  # largest accepted standard error of the common normal of the cameras' level axes, [degrees]
 
 
 @dataclass(frozen=True)
 class MetricScale:
-    """Metres per unit of the model."""
+    """How many metres one unit of the model has, and how that was found."""
 
     metres_per_unit: float
-    standard_error: float | None  # [m per unit]; None where it is unknown
-    source: str  # a sentence
+    standard_error: float | None  # standard error of `metres_per_unit`, [m per unit]; None: unknown
+    source: str  # sentence for the report that says what the scale comes from
 
 
 def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple[MetricScale | None, str]:
-    """Fit the cameras' places, shape (n, 3), to their GPS fixes by a similarity; None and why where that fails.
+    """Find the scale by fitting the cameras' places, shape (n, 3), to their GPS fixes; None and the reason if it fails.
 
-    Closed-form least squares (Umeyama 1991, equation 42) with Huber's weights. The standard error is that of the scale
-    in the linearised fit, from the scatter of the residuals.
+    The fit is a similarity by closed-form least squares (Umeyama 1991, equation 42) with Huber's weights. The standard
+    error follows from the residuals of the linearised fit; a relative error above `_WORST_GPS` counts as a failure.
     """
     known = [i for i, fix in enumerate(fixes) if fix is not None]
     if not known:
@@ -75,7 +75,7 @@ def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple
 
 
 def local_metres(fixes: Sequence[GpsFix]) -> FloatArray:
-    """Positions east, north and up of the mean of all fixes, shape (n, 3), [m]; the earth is an ellipsoid (WGS 84)."""
+    """Return each fix east, north and up of the mean fix, (n, 3), [m]; a missing altitude counts as the mean."""
     latitude = np.radians([fix.latitude_deg for fix in fixes])
     longitude = np.radians([fix.longitude_deg for fix in fixes])
     heights = [fix.altitude_m for fix in fixes]
@@ -98,20 +98,20 @@ def scale_from_distance(
     photograph_of: Mapping[str, str],
     standard_error_m: float | None = None,
 ) -> MetricScale:
-    """Find the scale from a length that was measured between two points that one photograph shows.
+    """Find the scale from the measured distance between two points that one photograph shows.
 
-    The depth at a pixel is that of a plane through the scene points around it: inverse depth is linear in the pixel,
-    fitted by weighted least squares.
+    The depth at each of the two pixels is that of a plane through the scene points around the pixel: inverse depth is
+    linear in the pixel, fitted by weighted least squares.
 
     Args:
         model: Poses and scene points.
-        known: Name of the photograph or its frame, x and y of the one end and of the other [pixels], and metres.
-        photograph_of: The photograph's file by frame.
-        standard_error_m: Standard error of the length [m]; None counts as 0.
+        known: Name of the photograph or its frame, x and y of one end, x and y of the other [pixels], distance [m].
+        photograph_of: Photograph's file, relative to the capture, by frame name.
+        standard_error_m: Standard error of the distance [m]; None counts as 0.
 
     Raises:
         ThermoxelsError: The photograph has no pose, a pixel lies outside or has no scene points around it, or the
-            distance is no length.
+            distance is not above 0.
     """
     name, x0, y0, x1, y1, metres = known
     check_positive("known distance", metres, "Pass the measured length in metres.")
@@ -134,10 +134,10 @@ def scale_from_distance(
 def scale_from_markers(
     model: SfmModel, photographs: Mapping[str, Path], side_m: float, standard_error_m: float | None = None
 ) -> tuple[MetricScale | None, str]:
-    """Find the scale from printed ArUco markers (4 x 4 cells, numbers 0 to 49) of known side [m]; None and why without.
+    """Find the scale from printed ArUco markers (4 x 4 cells, numbers 0 to 49) of known side; or None and a reason.
 
-    A marker's corners are triangulated from all photographs that show it (linear least squares of the rays). Every
-    marker gives four sides; the standard error is that of their mean, or of the corners' scatter where that is larger.
+    A marker's corners are triangulated from all photographs that show the marker (linear least squares of the rays).
+    Every marker gives four sides; the standard error combines that of the sides' mean with `standard_error_m`.
     """
     check_positive("marker side", side_m, "Pass the side of the black square in metres.")
     seen: dict[int, list[tuple[int, FloatArray]]] = {}
@@ -178,7 +178,7 @@ def scale_from_markers(
 
 
 def _similarity(model: FloatArray, metres: FloatArray, weight: FloatArray) -> tuple[float, FloatArray]:
-    """Scale of the best similarity from model to metres, and each point's distance from it, [m]."""
+    """Return the scale of the best similarity from model to metres, and each point's residual (n,), [m]."""
     share = weight / weight.sum()
     a, b = model - share @ model, metres - share @ metres
     left, size, right = np.linalg.svd((b * share[:, None]).T @ a)
@@ -189,7 +189,7 @@ def _similarity(model: FloatArray, metres: FloatArray, weight: FloatArray) -> tu
 
 
 def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
-    """World point that a pixel shows, and its standard error along the ray as a vector."""
+    """Return the world point (3,) that a pixel shows, and its standard error as a vector (3,) along the ray."""
     camera = model.camera
     if not (0 <= pixel[0] <= camera.width and 0 <= pixel[1] <= camera.height):
         remedy = "Count x to the right and y down from the upper left corner."
@@ -212,14 +212,14 @@ def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> t
         off = np.abs(table @ plane - inverse)
         keep = off <= 3.0 * 1.4826 * float(np.median(off)) + 1e-12
     at, usual = float(plane[0]), float(np.median(inverse))
-    at = at if at > 0.25 * usual else usual  # a plane that runs away behind the points tells no depth
+    at = at if at > 0.25 * usual else usual  # a plane far behind the points gives no depth; take their median
     ray = model.ray(index, np.asarray(pixel))
     error = float(np.sqrt(np.mean(off[keep] ** 2))) / at**2 / math.sqrt(max(int(keep.sum()) - 3, 1))
     return model.centres[index] + ray / at, ray * error
 
 
 def _triangulate(model: SfmModel, views: Sequence[tuple[int, npt.NDArray]]) -> tuple[FloatArray, FloatArray]:
-    """Point nearest to all rays, shape (3,), and how far it projects from each pixel, shape (views,), [pixels]."""
+    """Return the point nearest to all rays, shape (3,), and its reprojection errors, shape (views,), [pixels]."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for index, pixel in views:
         ray = model.ray(index, pixel)
@@ -233,30 +233,30 @@ def _triangulate(model: SfmModel, views: Sequence[tuple[int, npt.NDArray]]) -> t
 
 @dataclass(frozen=True)
 class Up:
-    """A direction and how it was found."""
+    """Direction of up in the model, and how it was found."""
 
     direction: FloatArray  # unit vector in the model's coordinates, shape (3,)
-    source: str  # a sentence
+    source: str  # sentence for the report that says how the direction was found
     spread_deg: float | None
-    """Median angle between `direction` and those of single photographs, [degrees]; None where these say nothing."""
+    """Median deviation of single photographs from `direction`, [degrees]; None: unknown."""
 
 
 def find_up(
     camera_to_world: FloatArray, gimbal_deg: Sequence[tuple[float, float] | None], orientation: Sequence[int]
 ) -> Up:
-    """Find up from the cameras' own levels, else from how cameras are usually held.
+    """Find the direction of up from the pitch and roll that photographs state, else from how cameras are usually held.
 
-    A camera pitched by p and rolled by r against gravity has up at (-sin r cos p, cos r cos p, -sin p) in its axes
-    x right, y up, z back: pitch 0 is level, -90 looks straight down. Without such angles it is assumed that people hold
-    the sides of a picture level: up is normal to the cameras' x axes where these turn enough, else the mean of their
-    y axes. `gimbal_deg` is pitch and roll per camera [degrees], `orientation` EXIF's per photograph.
+    A camera with pitch p (0 level, -90 straight down) and roll r against gravity has up at (-sin r cos p, cos r cos p,
+    -sin p) in its axes x right, y up, z back. If no photograph states these angles, pictures are assumed to be level:
+    up is normal to the cameras' horizontal axes if these axes differ enough, else the mean of the vertical axes.
+    `gimbal_deg` is pitch and roll per camera [degrees]; `orientation` is EXIF's, 1 to 8, by which the axes are chosen.
     """
     rotations = camera_to_world[:, :3, :3]
     measured = [i for i, angles in enumerate(gimbal_deg) if angles is not None]
     if measured:
         local = []
         for pitch, roll in (map(math.radians, angles) for angles in gimbal_deg if angles is not None):
-            # Rolled clockwise as seen from behind, the camera finds up to its left.
+            # A camera that is rolled clockwise, as seen from behind, has up to its left.
             local.append((-math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch), -math.sin(pitch)))
         each = np.einsum("nij,nj->ni", rotations[measured], np.array(local))
         up = _robust_mean(each)
@@ -277,7 +277,7 @@ def find_up(
 
 
 def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
-    """Return the rotation (3, 3) that turns `up` to z and the level part of `ahead` to y; any level axis where it is 0.
+    """Return the rotation (3, 3) that turns `up` to z and the level part of `ahead` (if 0, any level axis) to y.
 
     >>> level_rotation([0, 1, 0], [0, 0, -1]).round(9).tolist()
     [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
@@ -294,7 +294,7 @@ def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
 
 
 def _robust_mean(directions: FloatArray) -> FloatArray:
-    """Return the mean of the half of the directions that lies nearer to it, a unit vector (3,)."""
+    """Return the mean direction, a unit vector (3,), of the half of the directions (n, 3) nearest to that mean."""
     mean = directions.sum(axis=0)
     for _ in range(5):
         mean = mean / max(float(np.linalg.norm(mean)), 1e-12)

@@ -1,4 +1,4 @@
-"""Result of structure from motion: one camera, its poses and scene points, and depths between these."""
+"""Result of structure from motion: one lens, the poses and scene points; and depth interpolated between points."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from thermoxels_ns.core.camera import Camera
 
 _NEIGHBOURS = 12
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.9, 0.1
-_ONE_SURFACE = 0.04  # scatter about a plane, as a share of the inverse depth, up to which points belong to one surface
-_SLOPE_RIDGE = 0.1  # holds the slope of a plane through points that lie on a line, or far away on one side
+_ONE_SURFACE = 0.04  # largest scatter of one surface's points about a plane, as a share of their inverse depth
+_SLOPE_RIDGE = 0.1  # keeps a plane's slope small if the points are on a line, or all far away on one side
 
 
 @dataclass(frozen=True)
 class SfmModel:
-    """Poses of the photographs and the points that they share, in one arbitrary unit of length.
+    """Poses of the photographs and the scene points that they share, in one arbitrary unit of length.
 
-    Sightings are a list: sighting s says that frame `sighting_frame[s]` shows point `sighting_point[s]` at pixel
-    `sighting_pixel[s]`. They are sorted by frame, then by point.
+    Sighting number s is: frame `sighting_frame[s]` shows point `sighting_point[s]` at pixel `sighting_pixel[s]`. The
+    sightings are sorted by frame, then by point.
     """
 
     frames: tuple[str, ...]  # names of the frames that have a pose, in order, all different
-    camera: Camera  # the photographs' lens
-    camera_to_world: FloatArray  # shape (f, 4, 4), camera axes x right, y up, z back, as transforms.json has them
-    points: FloatArray  # shape (n, 3), in world units; empty where poses were given without points
+    camera: Camera  # lens of all photographs, at their original size
+    camera_to_world: FloatArray  # poses, shape (f, 4, 4), camera axes x right, y up, z back, as in transforms.json
+    points: FloatArray  # scene points, shape (n, 3), in world units; n is 0 if poses were given without points
     colours: npt.NDArray[np.uint8]  # red, green and blue of the points, shape (n, 3)
     point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
-    sighting_frame: IntArray
-    sighting_point: IntArray  # indices into `frames` and `points`, each shape (s,)
+    sighting_frame: IntArray  # index into `frames`, shape (s,)
+    sighting_point: IntArray  # index into `points`, shape (s,)
     sighting_pixel: FloatArray  # where the frame shows the point, shape (s, 2), [pixels of the photographs]
 
     @property
     def centres(self) -> FloatArray:
-        """Where the cameras stood, shape (f, 3)."""
+        """Positions of the cameras in the world, shape (f, 3)."""
         return self.camera_to_world[:, :3, 3]
 
     def seen_by(self, frame: int) -> tuple[IntArray, FloatArray]:
-        """Indices (m,) of the points that a frame shows, and their pixels (m, 2)."""
+        """Return the indices (m,) of the points that frame number `frame` shows, and their pixels (m, 2)."""
         first, last = np.searchsorted(self.sighting_frame, [frame, frame + 1])
         return self.sighting_point[first:last], self.sighting_pixel[first:last]
 
     def in_camera(self, frame: int, points: npt.ArrayLike) -> FloatArray:
-        """Express world points (m, 3) in a frame's camera axes x right, y down, z ahead."""
+        """Return world points (m, 3) in a frame's camera axes x right, y down, z ahead, shape (m, 3)."""
         pose = self.camera_to_world[frame]
         return (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3] @ OPENGL_FROM_OPENCV[:3, :3]
 
     def ray(self, frame: int, pixel: npt.NDArray[np.floating]) -> FloatArray:
-        """Return the point, less the camera's place, that a pixel (2,) of a frame sees at depth 1, shape (3,)."""
+        """Return the vector (3,), in world axes, from the camera to what a frame's pixel (2,) sees at depth 1."""
         pose = self.camera_to_world[frame]
         return (self.camera.rays(pixel[None]) * (1.0, -1.0, -1.0))[0] @ pose[:3, :3].T
 
     def sighting_error_px(self) -> FloatArray:
-        """Distance between where each point is seen and where it projects to, shape (s,), [pixels]."""
+        """Return the distance between each sighting's pixel and its point's projection, shape (s,), [pixels]."""
         errors = [np.zeros(0)]
         for frame in range(len(self.frames)):
             seen, pixels = self.seen_by(frame)
@@ -67,14 +67,14 @@ class SfmModel:
         return np.concatenate(errors)
 
     def moved(self, rotation: FloatArray, origin: FloatArray) -> SfmModel:
-        """Same model in other axes: p_new = rotation (p - origin); `rotation` (3, 3), `origin` (3,) in old axes."""
+        """Return the model in new axes: p_new = rotation (p - origin), with `rotation` (3, 3) and `origin` (3,)."""
         poses = self.camera_to_world.copy()
         poses[:, :3, :3] = rotation @ poses[:, :3, :3]
         poses[:, :3, 3] = (poses[:, :3, 3] - origin) @ rotation.T
         return replace(self, camera_to_world=poses, points=(self.points - origin) @ rotation.T)
 
     def without(self, names: Sequence[str]) -> SfmModel:
-        """Same model without some frames; its points stay, also those that only they saw."""
+        """Return the model without some frames; all points stay, also points that no remaining frame shows."""
         keep = np.array([name not in set(names) for name in self.frames], dtype=bool)
         number = np.cumsum(keep) - 1
         stays = keep[self.sighting_frame]
@@ -89,22 +89,22 @@ class SfmModel:
 
 
 class SparseDepth:
-    """Depth over the image plane at depth 1, from the nearest of the scene points around.
+    """Depth of the scene in any direction from one camera, interpolated between the nearest scene points.
 
     The inverse depth of a plane is linear in the image, so a plane through the points gives the depth of a surface that
-    is seen at a slant. Where the points lie on two surfaces, the one in front counts: edges that both bands show are
+    is seen at a slant. If the points lie on two surfaces, the surface in front counts: edges that both bands show are
     mostly outlines, and an outline belongs to the surface in front. Single points that lie far too near do not count.
     """
 
     def __init__(self, points: FloatArray) -> None:
-        """Take points (n, 3) in OpenCV camera axes; those not ahead of the camera are left out."""
+        """Store points (n, 3) in OpenCV camera axes; points that are not ahead of the camera are left out."""
         ahead = points[points[:, 2] > 0.0]
         self._inverse = 1.0 / ahead[:, 2]
         self._places = ahead[:, :2] * self._inverse[:, None]
         self._tree = KDTree(self._places) if len(ahead) else None
 
     def at(self, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Depth (n,) for rays (n, 3) of depth 1, and distance to the next point on that plane; inf without points."""
+        """Return depths (n,) along rays (n, 3) of depth 1, and distances (n,) at depth 1 to the nearest point."""
         if self._tree is None:
             return np.full(len(rays), np.inf), np.full(len(rays), np.inf)
         count = min(_NEIGHBOURS, len(self._inverse))
@@ -121,7 +121,7 @@ class SparseDepth:
 
 
 def _plane(offset: FloatArray, inverse: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Inverse depth where the offset (n, k, 2) is 0 on planes through weighted points, and their scatter; (n,)."""
+    """Return inverse depths (n,) at offset 0 of planes fitted to k points each, and the points' scatter (n,)."""
     reach = np.sqrt(np.mean(offset**2, axis=(1, 2)))[:, None, None] + 1e-12
     weight = weight / (1.0 + np.sum((offset / reach) ** 2, axis=2))
     total = weight.sum(axis=1)
