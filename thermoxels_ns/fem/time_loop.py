@@ -339,7 +339,7 @@ def _check_stores(problem: HeatProblem) -> None:
 
 
 def _room_for_states(num_times: int, num_nodes: int) -> Vector:
-    """Return an empty array, shape (num_times, num_nodes); raise `HeatError` if it needs more than the memory allowed."""
+    """Return an empty array, shape (num_times, num_nodes); raise `HeatError` if it needs more memory than allowed."""
     needed = num_times * num_nodes * 8
     try:
         if needed <= MAX_STATE_BYTES:
