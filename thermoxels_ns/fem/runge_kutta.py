@@ -88,7 +88,7 @@ class RungeKutta:
         self._equations: dict[tuple[float, float], ImplicitEquation] = {}
 
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
-        """Take one step from `start_k`, (n,), [K], relative to the reference; `Step.converged` tells if it succeeded."""
+        """Take one step from `start_k`, (n,), [K], relative to the reference; `Step.converged` tells if that worked."""
         system, scheme = self._system, self.scheme
         states: list[Vector] = []
         inner_w: list[Vector] = []

@@ -84,8 +84,8 @@ class EnergyBalance:
     """The energy balance of a body, in `unit`: stored = into_body - out_of_body + residual."""
 
     unit: str  # J through time, W in a steady state
-    into_body: float  # Sum of all heat that flows into the body, by effect, patch or region, and interval
-    out_of_body: float  # Sum of all heat that flows out of the body, at least 0
+    into_body: float  # Heat that flows in, summed over intervals and over the patches or regions of all effects
+    out_of_body: float  # Heat that flows out, summed in the same way, at least 0
     stored: float  # Change of the body's heat content; 0 in a steady state
     residual: float  # stored - into_body + out_of_body: stored heat that no heat flow accounts for
     relative_residual: float
@@ -252,7 +252,7 @@ def _balance(solution: Solution, lengths: Vector) -> EnergyBalance:
     )
 
 
-_LEAST_DIFFERENCE_K = 1e-6  # Difference between the two airs below which there is no wall
+_LEAST_DIFFERENCE_K = 1e-6  # Difference between the two airs below which there is no wall, [K]
 
 
 @dataclass(frozen=True)
@@ -320,8 +320,8 @@ def wall_result(
     """Return the heat flow, U-value and coldest spot of a body between two airs.
 
     These are figures of a wall only if nothing but the two airs acts: sunlight or a cold sky would count as heat
-    through the wall. `inside` names the patches that face the air inside, of some area; `inside_c` and `outside_c`
-    differ."""
+    through the wall. `inside` names the patches that face the air inside; their area and the difference are not 0.
+    """
     difference_k = inside_c - outside_c
     selection, mesh = problem.selection, problem.mesh
     inner = matching_facets(selection, inside)
