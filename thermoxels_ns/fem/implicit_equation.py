@@ -228,7 +228,7 @@ class ImplicitEquation:
         self._solvers: dict[float, LinearSolver] = {}
 
     def solve(self, start_k: Vector, time_s: float, given_w: Vector | None = None) -> ImplicitSolution:
-        """Solve for T at `time_s`, the stage's end, from `start_k`, T_0, shape (n,), [K]; `given_w` is (n,), [W].
+        """Solve for T at `time_s` from `start_k`, T_0, (n,), [K]; `given_w` is the heat of earlier stages, (n,), [W].
 
         Emitted heat grows with the temperature and its slope is symmetric, so the solution is the one minimum of a
         convex energy. Newton's direction leads downhill, and a line search finds the length to go as the zero of an

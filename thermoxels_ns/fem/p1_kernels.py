@@ -83,7 +83,7 @@ def stiffness_matrix(
     (`tests/benchmarks/heat_speed.py`). A tetrahedron whose faces opposite nodes i and j have the outward area vectors
     n_i and n_j adds k n_i . n_j / (9 V), or 0 if the angle between these faces is right up to round-off of the
     coordinates. `points_m` has shape (n, 3), [m], `tets` (t, 4), checked by `refuse_flat_tets`; the conductivity has
-    shape (t,), [W / (m K)], above 0; `edges` None: they are found.
+    shape (t,), [W / (m K)], above 0; `edges` None: `mesh_edges` finds them.
 
     >>> corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     >>> (6 * stiffness_matrix(corner, np.array([[0, 1, 2, 3]]), np.ones(1))).toarray().round(12).tolist()
@@ -235,7 +235,7 @@ def _add_capacities(points, tets, capacity, scale, nodal):
 
 @kernel
 def _unique_edges(tets, end, other, first, mark):
-    """Return the number of edges; fills `first` and the beginning of `other` as in `MeshEdges`."""
+    """Fill `first` and the beginning of `other` as in `MeshEdges`, and return the number of edges."""
     num_nodes = len(mark)
     for t in range(len(tets)):
         for a in range(3):
@@ -257,7 +257,7 @@ def _unique_edges(tets, end, other, first, mark):
                 mark[other[k]] = node
                 other[kept] = other[k]
                 kept += 1
-        # A node has few edges, and they are almost in order: insertion sort.
+        # Insertion sort, because the few edges of a node are almost in order.
         for k in range(first[node] + 1, kept):
             high, place = other[k], k
             while place > first[node] and other[place - 1] > high:

@@ -56,7 +56,7 @@ class TimeSteps:
 
     @property
     def lengths_s(self) -> tuple[FloatArray, ...]:
-        """Lengths of the steps in each interval, [s]: as temperatures are kept after each step, one step each."""
+        """Lengths of the steps in each interval, [s]: one step each, because temperatures are kept after every step."""
         return (np.array([self.step_seconds]),) * self.steps
 
 
@@ -70,8 +70,8 @@ class AdaptiveSteps:
 
     duration_s: float  # Time over which to follow the body, [s], above 0
     tolerance_k: float = 0.05
-    """Largest error of any temperature that the steps may make, as estimated from their embedded pair, [K]. The
-    default is half of what building physics asks of a temperature (ISO 10211: 0.1 K)."""
+    """Largest error of any temperature that the steps may make, by the estimate of the scheme, [K]. The default is half
+    of the error that building physics allows (ISO 10211: 0.1 K)."""
     outputs: int = 10  # Number of equal intervals at whose ends temperatures are kept
 
     def __post_init__(self) -> None:
@@ -190,7 +190,7 @@ class Conductor(Protocol):
 
 @dataclass(frozen=True)
 class HeatProblem:
-    """A body that conducts and stores heat, its start, and the effects that act on it; `HeatError` if unfit.
+    """A body with materials, start and effects; raises `HeatError` if the parts do not fit together.
 
     Inside rho c dT/dt = div(k grad T) plus any source, and T = T0 at the start. Where no effect acts, the boundary is
     insulated: k grad T . n = 0, n being the outward normal.

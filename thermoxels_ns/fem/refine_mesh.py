@@ -13,11 +13,11 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 
 def refine_mesh(mesh: TetMesh) -> TetMesh:
-    """Return the mesh of the same body with all edges halved and eight tetrahedra for each; it is conforming again.
+    """Return a conforming mesh of the same body with all edges halved: each tetrahedron becomes eight.
 
-    Cutting off the four corners of a tetrahedron leaves four children of its shape and an octahedron. The octahedron is
-    cut into four along the diagonal, of three, for which the largest angle between faces is smallest. Children of the
-    tetrahedra of a Kuhn cube are Kuhn tetrahedra again, and no angle becomes obtuse.
+    Cutting off its four corners makes a tetrahedron into four children of the same shape and an octahedron. Of the
+    three diagonals of the octahedron, it is cut into four along that for which the largest angle between faces is
+    smallest. Children of the six tetrahedra of a cube (Kuhn) are such tetrahedra again, so no angle becomes obtuse.
 
     Nodes keep their numbers; the middles of the edges follow in the order of `mesh_edges`. Children inherit regions,
     tags and patches and stand in the order of their parents. Temperatures and colours of new nodes are means, and a new

@@ -184,7 +184,7 @@ class SolutionNodes:
     quadratic: bool  # True if the tetrahedra that were solved are quadratic
 
     def of_facets(self, values: npt.NDArray) -> npt.NDArray:
-        """Return values for the boundary triangles of `mesh`, shape (f, ...), from those of the mesh solved on."""
+        """Return `values`, given per boundary triangle that was solved, per triangle of `mesh`, shape (f, ...)."""
         return np.repeat(values, _CHILD_FACETS, axis=0) if self.quadratic else values
 
 

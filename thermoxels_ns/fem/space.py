@@ -197,5 +197,5 @@ def sums_by_number(numbers: Numbers, values: npt.NDArray, count: int) -> Vector:
     >>> sums_by_number(np.array([2, 0, 2]), np.array([1.0, 5.0, 3.0]), 4).tolist()
     [5.0, 0.0, 4.0, 0.0]
     """
-    # Without values, numpy counts in whole numbers.
+    # `np.bincount` of empty arrays returns integers, hence the conversion.
     return np.bincount(numbers, values, count).astype(np.float64, copy=False)

@@ -62,7 +62,7 @@ class Pieces:
         return np.bincount(self.number, weights=nodal, minlength=self.count).astype(np.float64, copy=False)
 
     def at_nodes(self, values: Vector) -> Vector:
-        """Return the value of its piece at each node, shape (n,); with one piece, `values` itself, shape (1,)."""
+        """Return at each node the value of the node's piece, shape (n,); with one piece `values` itself, shape (1,)."""
         return values[self.number] if self.count > 1 else values
 
     def without_means(self, nodal: Vector) -> Vector:
@@ -242,7 +242,7 @@ class HeatSystem:
         return (*found, *(FacetHeat(*part) for part in self.fixed.facet_heat_w(kept_w)))
 
     def exchanging_pieces(self, time_s: float) -> BoolArray:
-        """Return True for each piece with convection, radiation or fixed nodes, which set its level, shape (p,)."""
+        """Return True for each piece whose temperature convection, radiation or fixed nodes determine, shape (p,)."""
         marks = self.pieces.touched(self.fixed.nodes)
         for form in self.surface_forms:
             marks |= self.pieces.touched(form.exchanging_nodes(time_s))

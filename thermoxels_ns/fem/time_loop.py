@@ -95,7 +95,7 @@ def solve_heat(
 
 @dataclass(frozen=True)
 class _Taken:
-    """A step that was accepted, its error being small enough."""
+    """A step that was taken and need not be repeated."""
 
     step: Step  # Outcome of the step
     step_s: float  # Length of the step, [s]
@@ -137,7 +137,7 @@ class _TimeLoop:
         return self._given(start_k, self._time)
 
     def _given(self, start_k: Vector, time: TimeSteps | GivenSteps) -> Iterator[_Taken]:
-        """Take steps of known lengths."""
+        """Take the equal or given steps of `time`; raises `HeatError` if a step's solver does not converge."""
         relative_k, count, total = start_k, 0, sum(map(len, time.lengths_s))
         for now_s, lengths_s in zip(time.times_s.tolist(), time.lengths_s):
             for number, step_s in enumerate(lengths_s, start=1):
@@ -150,7 +150,7 @@ class _TimeLoop:
                 relative_k, now_s = step.relative_k, now_s + step_s
 
     def _adaptive(self, start_k: Vector, time: AdaptiveSteps) -> Iterator[_Taken]:
-        """Take steps as long as their estimated errors allow."""
+        """Take steps as long as their estimated errors allow; raises `HeatError` if no step is short enough."""
         relative_k, now_s, wished_s = start_k, 0.0, self._first_length(start_k, time)
         for end_s in time.times_s[1:].tolist():
             while now_s < end_s:
@@ -258,7 +258,7 @@ class HeatBalance:
         return sentence
 
     def close(self, status: str, *, adaptive: bool) -> HeatSolution:
-        """Return the balanced solution; `states_k` becomes degrees Celsius in place, because it may be large."""
+        """Return the solution with the account of its heat; states become degrees Celsius in place, to save memory."""
         system, states_k, times_s, heat_j = self._system, self._states, self._times, self._heat_j
         mass = system.nodal_mass_j_k
         total_mass = float(mass.sum())
@@ -303,7 +303,7 @@ def _share(part: float, whole: float) -> float:
 
 
 def _fitted(wished_s: float, left_s: float) -> float:
-    """Return the length of the next step, [s], in an interval of which `left_s` is left: never a long and a tiny step.
+    """Return the length of the next step, [s]: `left_s`, which ends the interval, or at most half of `left_s`.
 
     >>> [_fitted(wished, 10.0) for wished in (12.0, 8.0, 3.0)]
     [10.0, 5.0, 3.0]

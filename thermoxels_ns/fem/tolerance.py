@@ -173,7 +173,7 @@ def richardson(apart: ErrorSize, left: ErrorSize) -> tuple[ErrorSize, ErrorSize]
 
 
 def difference_between(coarse: Solution, fine: Solution, num_nodes: int) -> ErrorSize:
-    """Return the largest differences of two solutions with equal times; their first `num_nodes` nodes are the same."""
+    """Return the largest differences between two solutions with equal times and the same first `num_nodes` nodes."""
     return _error_size(_compared(fine, num_nodes) - _compared(coarse, num_nodes), fine)
 
 
@@ -243,7 +243,7 @@ class _Run:
         return f"{what}, more than the {describe_bytes(self._memory_bytes)} allowed (--memory-gb)"
 
     def close(self, failure: str, allow_unmet: bool) -> ToleratedSolution:
-        """Return the smallest solution whose error is allowed; if `failure` says why there is none, return the best.
+        """Return the smallest solution within the tolerance, or if `failure` says why there is none the most exact one.
 
         Raises:
             HeatError: There is a `failure` and `allow_unmet` is False, or nothing was solved at all.

@@ -320,7 +320,7 @@ def wall_result(
     """Return the heat flow, U-value and coldest spot of a body between two airs.
 
     These are figures of a wall only if nothing but the two airs acts: sunlight or a cold sky would count as heat
-    through the wall. `inside` names the patches that face the air inside; their area and the difference are not 0.
+    through the wall. `inside` names the patches, of area above 0, that face the air inside; both airs differ.
     """
     difference_k = inside_c - outside_c
     selection, mesh = problem.selection, problem.mesh

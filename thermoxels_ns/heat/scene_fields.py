@@ -113,7 +113,7 @@ Patches: TypeAlias = Annotated[tuple[str, ...], Field(min_length=1)]
 
 @record(HeatError)
 class _Air:
-    """Air whose temperature is a number, or changes with time as a file says; raises `HeatError` if that is unfit."""
+    """Air whose temperature is a number, or changes with time as a file says; `HeatError` if the file is unfit."""
 
     air_c: Celsius  # Temperature of the air, [degrees Celsius], at least -273.15
     air_series: str | None = field(default=None, kw_only=True)
@@ -190,7 +190,7 @@ class OutsideAir(_Air):
 
 @record(HeatError)
 class Surface:
-    """Emissivity and absorptivity of patches; sky, ground and sun act only on patches that have these."""
+    """Emissivity of patches, which sky and ground act on, and absorptivity of patches, which the sun acts on."""
 
     emissivity: Fraction | None = None
     """Emissivity for long-wave radiation, 0 to 1; None: the patches exchange no radiation with sky and ground."""
@@ -277,14 +277,14 @@ class Sun:
 
 
 def read_air_series(path: str) -> Varying:
-    """Read the temperature of air over time from a csv file; `HeatError` if it is unfit, as if times do not ascend."""
+    """Read the temperature of air over time from a csv file; `HeatError` if the file or the order of times is wrong."""
     table = air_series_table(path)
     Bounds("air_c", "degrees Celsius", -ZERO_CELSIUS_K, HOTTEST_C).check(table[:, 1])
     return tabulated(3600.0 * table[:, 0], table[:, 1])
 
 
 def air_series_table(path: str) -> FloatArray:
-    """Read hours and air_c, shape (k, 2), of a csv file, in any order and range; `HeatError` if it cannot be read."""
+    """Read hours and air_c, shape (k, 2), from a csv file, without a check of order or range; `HeatError` if unfit."""
     try:
         lines = [line for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip(" ,")]
     except (OSError, UnicodeDecodeError) as problem:

@@ -44,7 +44,7 @@ def sky_view(normals: FloatArray, up: Vector) -> FloatArray:
 
 
 def ground_view(normals: FloatArray, up: Vector) -> FloatArray:
-    """Return the share of ground in the view of surfaces, (1 - cos tilt) / 2, shape (k,); arguments as in `sky_view`."""
+    """Return the share of ground in the view of surfaces, (1 - cos tilt) / 2, shape (k,): 1 less `sky_view`."""
     return 1.0 - sky_view(normals, up)
 
 
@@ -128,7 +128,7 @@ def sun_position(moment: datetime, latitude_deg: float, longitude_deg: float) ->
 
 
 def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
-    """Return the unit vector towards the sun in the coordinates of `up` and `north`, whose part along `up` is ignored.
+    """Return the unit vector to the sun in the coordinates of `up` and `north`; only the level part of `north` counts.
 
     Raises `HeatError` if `up` and `north` are parallel.
     """
@@ -145,7 +145,7 @@ def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
 
 
 def air_mass(elevation_deg: float) -> float:
-    """Return light's path length through the air over that at the zenith, at 0 to 90 degrees (Kasten, Young 1989)."""
+    """Return the path of light through the air over the path at the zenith, at 0 to 90 degrees (Kasten, Young 1989)."""
     return 1.0 / (math.sin(math.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.07995) ** -1.6364)
 
 
@@ -184,7 +184,7 @@ def facet_irradiance(
 
 
 def fixed_sun(towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0) -> Varying:
-    """Return the irradiance of facets by a sun that stands still in a direction, for `AbsorbedSolar.irradiance_w_m2`."""
+    """Return the irradiance of facets by a sun that stands at `towards`, for `AbsorbedSolar.irradiance_w_m2`."""
     x, y, z = _unit(towards).tolist()
     return Varying(
         lambda places, _: facet_irradiance(places.normals, places.up, (x, y, z), sunlight, ground_reflectance),

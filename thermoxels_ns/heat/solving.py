@@ -227,8 +227,8 @@ def _largest_w(
 def _looks(effect: Effect, time: Time, kept_s: Vector) -> list[float]:
     """Return times, [s], at which to evaluate an effect so that no change is missed; empty if no times would do.
 
-    These are the ends of equal steps, summed up as the time loop does, or in adaptive steps, which may evaluate an
-    effect at any time, two per `resolution_s`; an effect constant in time has the times `kept_s`.
+    With equal steps these are their ends, added up as in the time loop. With adaptive steps, which may evaluate an
+    effect at any time, there are two times per `resolution_s`. If the effect or body does not change: `kept_s`.
     """
     quantities = [effect.bounded(name) for name in effect.bounds]
     if time is None or not any(quantity.in_time for quantity in quantities):
