@@ -134,7 +134,7 @@ class LinearSolver:
         levels = smoothed_aggregation_solver(
             self._scaled,
             B=(1.0 / self._scale)[:, None],
-            strength=("symmetric", {"theta": 0.05}),  # type: ignore[arg-type]  # flat cells couple across alone
+            strength=("symmetric", {"theta": 0.05}),  # type: ignore[arg-type]  # flat cells couple through their thickness
             smooth=("jacobi", {"weighting": "local"}),
             presmoother=("gauss_seidel", {"sweep": "forward"}),
             postsmoother=("gauss_seidel", {"sweep": "backward"}),
@@ -381,7 +381,7 @@ class ImplicitEquation:
             return 1.0
         left, right = 0.0, 1.0
         for _ in range(_MOST_SEARCHES):
-            # The zero may lie many powers of ten below 1: a cold body that sees a hot one has next to no slope.
+            # The zero may lie many powers of ten below 1: in a cold body, radiation's slope is next to 0.
             middle = 0.25 * right if left == 0.0 else 0.5 * (left + right)
             value = rise(middle)
             if abs(value) <= _ENOUGH * -start:

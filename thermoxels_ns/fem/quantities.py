@@ -81,10 +81,10 @@ Quantity: TypeAlias = float | Varying  # One number for all places and times, or
 class Bounds:
     """The range of values that a quantity may have, with the quantity's name and unit for messages."""
 
-    name: str  # Name of the field, for messages
-    unit: str  # Its unit, for messages
-    low: float = -math.inf  # Smallest value
-    high: float = math.inf  # Largest value
+    name: str  # Name of the quantity, for messages
+    unit: str  # Unit of the quantity, for messages
+    low: float = -math.inf  # Smallest allowed value
+    high: float = math.inf  # Largest allowed value
     above_low: bool = False  # True if `low` itself is refused
     varies: bool = True  # True if the quantity may be a `Varying`
     remedy: str = ""  # Advice to a user whose value is refused; empty: an example of a value in the unit

@@ -1,4 +1,4 @@
-"""What a heat computation returns, and its temperatures on a mesh that can be shown."""
+"""Solutions of heat problems, and their temperatures on a mesh that can be shown."""
 
 from __future__ import annotations
 
@@ -85,11 +85,11 @@ class HeatSolution:
 
     times_s: FloatArray  # Time of each state, the start first, shape (s + 1,), [s]
     temperature_c: FloatArray
-    """Nodal temperatures, shape (s + 1, n), [degrees Celsius]. Surfaces with a fixed temperature have it from the
-    start."""
+    """Nodal temperatures, shape (s + 1, n), [degrees Celsius]. Nodes of fixed temperature have this temperature already
+    at the start."""
     heat_w: FloatArray
-    """Net heat flow into the body during each interval, measured as the change of its heat content over it,
-    shape (s,), [W], positive into the body. Behind an insulated boundary it is 0 up to round-off."""
+    """Mean net heat flow into the body in each interval, the change of the heat content over the interval's length,
+    shape (s,), [W]. In a body with insulated boundary and without sources the flow is 0 up to round-off."""
     heat_content_j: FloatArray
     """Heat content above absolute zero at each time, 1^T M T with T in kelvin, shape (s + 1,), [J]."""
     energy_residual: float

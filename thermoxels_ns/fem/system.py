@@ -1,4 +1,4 @@
-"""The discrete heat equation, M dT/dt + (K + R) T = load + radiation(T)."""
+"""The discrete heat equation, M dT/dt + (K + R) T = load + radiation(T), the load with convection's h T_ambient."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class HeatSystem:
         self.space: Space = Space(problem.selection, order=order)
         """The unknowns at the nodes, and the integrals over triangles and tetrahedra."""
         self.num_nodes: int = self.space.num_nodes
-        """Number of nodes; with quadratic tetrahedra the mesh's nodes come first and then its edges."""
+        """Number of nodes; with quadratic tetrahedra the mesh's nodes come first, then the middles of its edges."""
         forms = effect_forms(problem, self.space, self.reference_c, self.assembled)
         self._convection, self._loads, self._radiation = forms.convection, forms.loads, forms.radiation
         self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*forms.convection, *forms.radiation)

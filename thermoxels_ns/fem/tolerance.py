@@ -22,7 +22,7 @@ Vector = FloatArray
 DEFAULT_MEMORY_BYTES = 4 * 2**30  # Most memory that a solution may need, [bytes]
 HALVED = 0.3
 """Share of an error that is left after the mesh size or the steps are halved. Theory says 1/4 where temperatures are
-smooth, and 0.4 at the edges of a notch of a right angle, where they behave as r^(2/3)."""
+smooth, and 0.4 at the edges of a notch of a right angle, where temperatures behave as r^(2/3)."""
 _LEFT = {1: ErrorSize(HALVED, HALVED), 2: ErrorSize(0.2, 0.2)}
 """Share of an error left after halving, by order of the tetrahedra; for order 2 theory says 1/8, and 0.4 at a notch."""
 TO_QUADRATIC = ErrorSize(0.2, 0.1)
@@ -37,7 +37,7 @@ _STEPS_OVER_ERROR = 6.0
 """Tolerance of the first, adaptive steps over the allowed error: steps controlled to 1 K make an error of 0.03 to
 0.07 K in all, because conduction damps the errors of earlier steps."""
 _AIM = 0.95  # Share of the allowed error that the next choice of mesh and steps may be expected to make
-_MOST_HALVINGS = 8  # Halvings of the mesh size or of the steps beyond which nothing is tried
+_MOST_HALVINGS = 8  # Most halvings of the mesh size, and most of the steps, that are tried
 _MESH_COST, _STEP_COST = 10.0, 2.0  # Factors by which halving the mesh size, and halving the steps, raise the cost
 _BYTES_PER_TET, _BYTES_PER_FACET = {1: 400.0, 2: 2600.0}, {1: 600.0, 2: 4000.0}
 """Most memory by order of the tetrahedra, [bytes], measured with convection and radiation; about half without both."""
@@ -48,11 +48,11 @@ class Tolerance:
     """Errors that a user allows, above 0; None: any error. `HeatError` if both are None or one is not above 0."""
 
     temperature_k: float | None = 0.05
-    """Largest error of the temperature at any node of the mesh, [K]. The default is half of what building physics asks
-    of a temperature (ISO 10211: 0.1 K)."""
+    """Largest error of the temperature at any node of the mesh, [K]. The default is half of the error that building
+    physics allows (ISO 10211: 0.1 K)."""
     heat_flow: float | None = None
     """Largest error of the mean heat flow that any effect brings, as a share of all heat that flows through the body;
-    0.01 is what building physics asks for (ISO 10211)."""
+    building physics allows 0.01 (ISO 10211)."""
 
     def __post_init__(self) -> None:
         given = [value for value in (self.temperature_k, self.heat_flow) if value is not None]
