@@ -134,7 +134,7 @@ class LinearSolver:
         levels = smoothed_aggregation_solver(
             self._scaled,
             B=(1.0 / self._scale)[:, None],
-            strength=("symmetric", {"theta": 0.05}),  # type: ignore[arg-type]  # flat cells couple through their thickness
+            strength=("symmetric", {"theta": 0.05}),  # type: ignore[arg-type]  # flat cells couple across alone
             smooth=("jacobi", {"weighting": "local"}),
             presmoother=("gauss_seidel", {"sweep": "forward"}),
             postsmoother=("gauss_seidel", {"sweep": "backward"}),

@@ -110,7 +110,7 @@ class HeatScene:
         return self.time is None
 
     def problem(self, mesh: TetMesh, *, up: Vector | None = None) -> HeatProblem:
-        """Return the heat problem on a mesh; `up` (None: z) serves a scene without `up`. `HeatError` if the mesh is unfit."""
+        """Return the heat problem on a mesh; `up` (None: z) serves a scene without `up`. Raises as `effects` does."""
         initial = None if self.initial_c is None else np.full(len(mesh.points_m), self.initial_c)
         return HeatProblem(mesh, self._material(mesh), initial, self.effects(mesh), self.up or up or _Z_UP)
 
