@@ -1,4 +1,4 @@
-"""Convection, radiation, fluxes, sources and fixed temperatures as vectors and matrices."""
+"""Forms: convection, radiation, fluxes, sources and fixed temperatures as vectors and matrices of the nodes."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from thermoxels_ns.fem.space import Space, sums_by_number
 Vector = FloatArray
 
 COLDEST_SLOPE_K = 1e-2
-"""Below this temperature the slope of radiation is that at it, so that no Newton matrix is singular, [K]."""
+"""Lowest temperature for which the slope of radiation is evaluated, so that no Newton matrix is singular, [K]."""
 _SAME_TEMPERATURE_K = 1e-9  # Two effects may fix the same node if their temperatures differ by no more than this, [K]
-_KEPT_TIMES = 4  # Times whose values are kept: those of the stages of a step, whose start has ended the one before
+_KEPT_TIMES = 4  # Number of times whose values `at_time` keeps, enough for the stages of a step
 
 T = TypeVar("T")
 
 
 def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], most: int = _KEPT_TIMES) -> T:
-    """Look up the value at a time, or compute it and keep it instead of the oldest one."""
+    """Return the value at a time from `kept`, or compute and keep it; beyond `most` values the oldest is dropped."""
     if time_s not in kept:
         value = compute(time_s)
         while len(kept) >= most:
@@ -43,15 +43,15 @@ def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], 
 
 @BilinearForm
 def heat_transfer(u, v, w):
-    """Convection, or radiation's slope, per kelvin: h u v, [W / K]."""
+    """Return the integrand h u v of a convection matrix or of the slope of radiation; `w.coefficient` is h."""
     return w.coefficient * u * v
 
 
 class _Boundary(ABC):
-    """Boundary triangles of a term: integrals over them by scikit-fem, and their grouping by patch.
+    """The k boundary triangles on which a term acts: integrals over the triangles, and their grouping by patch.
 
-    Temperatures come as differences from a reference, which keeps round-off relative to the differences. Every form
-    also gives its heat flow per patch or region, evaluated as the equations do, so that balances close to round-off.
+    Temperatures are relative to a reference, so that round-off is relative to their differences. Every form returns
+    heat flows per patch, evaluated as in the equations, so that balances close to round-off.
     """
 
     def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
@@ -59,11 +59,11 @@ class _Boundary(ABC):
         self.effect, self.kind, self.facets, self._reference_c = effect, term.kind, facets, reference_c
         self.quantities, self._factor = term.quantities, term.factor
         self.load_in_time = any(quantity.in_time for quantity in term.quantities)
-        """Whether the heat of the term changes with time at one temperature."""
+        """True if the heat flow changes with time even while the body's temperatures stay constant."""
         self.basis = space.surface(facets)
         self.nodes = space.facet_nodes(facets)
         self._numbers, self._space = self.nodes.T.ravel(), space
-        # `basis.interpolate` would find gradients, too.
+        # Values only: `basis.interpolate` would compute gradients, too.
         self._shapes = np.stack([np.asarray(field)[0] for (field,) in self.basis.basis])
         self.places = selection.facet_places(facets)
         used, self.group = np.unique(selection.facet_patch[facets], return_inverse=True)
@@ -71,23 +71,23 @@ class _Boundary(ABC):
         self._kept: dict[int, dict[float, Vector]] = {}
 
     def at(self, number: int, time_s: float) -> Vector:
-        """Ask for a quantity of the term at each triangle, shape (k, 1): it is even over the triangle."""
+        """Return quantity `number` of the term, one value per triangle (taken at its centroid), shape (k, 1)."""
         quantity, kept = self.quantities[number], self._kept.setdefault(number, {})
         return at_time(kept, time_s if quantity.in_time else 0.0, lambda t: quantity.at(self.places, t)[:, None])
 
     def surface_k(self, relative_k: Vector) -> Vector:
-        """Temperature at the points of integration, shape (k, q)."""
+        """Return the temperature at the q points of integration of each triangle, shape (k, q), from that of nodes."""
         nodal = relative_k[self.nodes]
         return nodal if self._space.order == 1 else np.einsum("ka,aq->kq", nodal, self._shapes)
 
     def vector(self, flux_w_m2: Vector) -> Vector:
-        """Entries integral(q phi_i), [W]; q at the points or even over each triangle."""
+        """Return integral(q phi_i) for each node i, shape (n,), [W]; the flux q has shape (k, q) or (k, 1)."""
         heat_w = flux_w_m2 * self.basis.dx
         shares = heat_w.T if self._space.order == 1 else np.einsum("kq,aq->ak", heat_w, self._shapes)
         return sums_by_number(self._numbers, shares.ravel(), self._space.num_nodes)
 
     def matrix(self, coefficient_w_m2k: Vector) -> sparse.csr_matrix:
-        """Entries integral(h phi_i phi_j), [W / K]; diagonal if points of integration are the nodes."""
+        """Return integral(h phi_i phi_j), shape (n, n), [W / K]; diagonal if points of integration are the nodes."""
         if self._space.order == 1:
             matrix = sparse.csr_matrix(sparse.diags(self.vector(coefficient_w_m2k), format="csr"))
         else:
@@ -98,68 +98,68 @@ class _Boundary(ABC):
 
     @abstractmethod
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat flux into the body at the points of integration, or even over each triangle, [W / m2]."""
+        """Return the heat flux into the body, [W / m2], at the points of integration (k, q), or per triangle (k, 1)."""
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat flow into the body through each triangle, shape (k,), [W]."""
+        """Return the heat flow into the body through each triangle, shape (k,), [W]."""
         return (self.flux_w_m2(relative_k, time_s) * self.basis.dx).sum(axis=1)
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat flow into the body through each patch, [W]."""
+        """Return the heat flow into the body through each patch of `groups`, shape (g,), [W]."""
         return sums_by_number(self.group, self.part_heat_w(relative_k, time_s), len(self.groups))
 
 
 class _Exchange(_Boundary):
-    """Exchange with surroundings; the quantities are its strength and the temperature of the surroundings."""
+    """Exchange of heat with surroundings: quantity 0 is its strength, quantity 1 the temperature of surroundings."""
 
     def strength(self, time_s: float) -> Vector:
-        """Convection's h, [W / (m2 K)], or radiation's sigma eps, [W / (m2 K4)], at each triangle, shape (k, 1)."""
+        """Return convection's h, [W / (m2 K)], or radiation's sigma eps, [W / (m2 K4)], per triangle, shape (k, 1)."""
         return self._factor * self.at(0, time_s)
 
     def surroundings_k(self, time_s: float) -> Vector:
-        """Temperature of the surroundings at each triangle, relative to the reference, shape (k, 1), [K]."""
+        """Return the temperature of the surroundings per triangle, relative to the reference, shape (k, 1), [K]."""
         return self.at(1, time_s) - self._reference_c
 
     def exchanging_nodes(self, time_s: float) -> IntArray:
-        """Nodes whose temperature its surroundings pull on: the strength is above 0 there."""
+        """Return the nodes, ascending, that exchange heat with the surroundings, the strength being above 0."""
         return np.unique(self.nodes[self.strength(time_s)[:, 0] > 0.0])
 
 
 class ConvectionForm(_Exchange):
-    """Convection and ground contact, h (T_ambient - T): a matrix and a load (a Robin boundary condition)."""
+    """Convection or ground contact, flux h (T_ambient - T): a matrix and a load (a Robin boundary condition)."""
 
     @property
     def matrix_in_time(self) -> bool:
-        """Whether h, and with it the matrix, changes with time."""
+        """True if h, and with it the matrix, changes with time."""
         return self.quantities[0].in_time
 
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix:
-        """Entries integral(h phi_i phi_j), [W / K]."""
+        """Return integral(h phi_i phi_j), shape (n, n), [W / K]: heat that nodes lose per kelvin."""
         return self.matrix(self.strength(time_s))
 
     def load(self, time_s: float) -> Vector:
-        """Entries integral(h T_ambient phi_i), relative to the reference, shape (n,), [W]."""
+        """Return integral(h T_ambient phi_i), T_ambient being relative to the reference, shape (n,), [W]."""
         return self.vector(self.strength(time_s) * self.surroundings_k(time_s))
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
-        """h (T_ambient - T), [W / m2]."""
+        """Return the flux into the body, h (T_ambient - T), at the points of integration, shape (k, q), [W / m2]."""
         return self.strength(time_s) * (self.surroundings_k(time_s) - self.surface_k(relative_k))
 
 
 class FluxForm(_Boundary):
-    """A given heat flux, the product of its quantities: a load."""
+    """A given heat flux q into the body, the product of the term's quantities: a load."""
 
     def load(self, time_s: float) -> Vector:
-        """Entries integral(q phi_i), [W]."""
+        """Return integral(q phi_i) for each node i, shape (n,), [W]."""
         return self.vector(self.flux_w_m2(np.zeros(0), time_s))
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
-        """The flux, [W / m2], whatever the temperature."""
+        """Return the flux into the body, shape (k, 1), [W / m2]; `relative_k` has no influence."""
         return math.prod((self.at(number, time_s) for number in range(len(self.quantities))), start=np.ones(1))
 
 
 class SourceForm:
-    """A given heat source: a load."""
+    """A given heat source s in tetrahedra, [W / m3]: a load."""
 
     def __init__(self, effect: str, term: Term, space: Space, _: float) -> None:
         self.effect, self.kind, self._tets, self._space = effect, term.kind, term.parts, space
@@ -172,36 +172,36 @@ class SourceForm:
         self.load_in_time = self._source.in_time
 
     def load(self, time_s: float) -> Vector:
-        """Entries integral(s phi_i), [W]."""
+        """Return integral(s phi_i) for each node i, shape (n,), [W]."""
         return self._space.source_load(self._tets, self.part_heat_w(np.zeros(0), time_s))
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat set free at each point of integration, [W], whatever the temperature."""
+        """Return the heat set free at each point of integration, [W]; `relative_k` has no influence."""
         return self._source.at(self._places, time_s) * self._volumes
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat set free in each region, [W]."""
+        """Return the heat set free in each region of `groups`, shape (g,), [W]; `relative_k` has no influence."""
         return sums_by_number(self._group, self.part_heat_w(np.zeros(0), time_s), len(self.groups))
 
 
 class RadiationForm(_Exchange):
-    """sigma eps (T_s^4 - T^4): a load that depends on the temperature, and its exact slope.
+    """Radiation, flux sigma eps (T_s^4 - T^4) into the body: a load that depends on the temperature, and its slope.
 
-    Below absolute zero, where only the iterations of a solver can get to, T^4 stands for |T|^3 T: the law is then
-    monotone everywhere, the equations are those of a convex minimum, and their solution is unique.
+    Temperatures below absolute zero, which occur only within a solver's iterations, count as |T|^3 T instead of T^4.
+    The law is then monotone everywhere, the equations are those of a convex minimum, and their solution is unique.
     """
 
     def load(self, relative_k: Vector, time_s: float) -> Vector:
-        """Entries integral(sigma eps (T_s^4 - T^4) phi_i), [W]."""
+        """Return integral(sigma eps (T_s^4 - T^4) phi_i) for each node i, shape (n,), [W]."""
         return self.vector(self.flux_w_m2(relative_k, time_s))
 
     def slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
-        """Minus the derivative of the load, entries integral(4 sigma eps T^3 phi_i phi_j), [W / K]."""
+        """Return minus the derivative of the load, integral(4 sigma eps T^3 phi_i phi_j), shape (n, n), [W / K]."""
         kelvin = self.surface_k(relative_k) + self._reference_c + ZERO_CELSIUS_K
         return self.matrix(4.0 * self.strength(time_s) * np.maximum(np.abs(kelvin), COLDEST_SLOPE_K) ** 3)
 
     def flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
-        """Sigma eps (T_s^4 - T^4), [W / m2]."""
+        """Return the flux into the body, sigma eps (T_s^4 - T^4), at points of integration, shape (k, q), [W / m2]."""
         surface, around = self.surface_k(relative_k), self.surroundings_k(time_s)
         t, s = (kelvin + self._reference_c + ZERO_CELSIUS_K for kelvin in (surface, around))
         # s^4 - t^4 = (s - t) (s + t) (s^2 + t^2): no digits are lost where both are close.
@@ -211,7 +211,7 @@ class RadiationForm(_Exchange):
 
 
 class FixedForm:
-    """Given temperatures: nodes that are no unknowns, and the shares of their heat that belong to each patch."""
+    """Given temperatures of the nodes of k boundary triangles; these nodes are no unknowns."""
 
     def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
         selection = space.selection
@@ -223,20 +223,20 @@ class FixedForm:
         used, self.group = np.unique(selection.facet_patch[term.parts], return_inverse=True)
         self.groups = tuple(selection.patch_names[number] for number in used)
         self.area_m2: Vector = selection.facet_area_m2[term.parts]
-        """Area of each triangle, shape (k,), to share a node's heat by."""
+        """Area of each triangle, shape (k,), [m2], by which a node's heat is shared among triangles."""
 
     def surroundings_k(self, time_s: float) -> Vector:
-        """Temperatures of `nodes`, relative to the reference, [K]."""
+        """Return the given temperatures of `nodes`, relative to the reference, shape (len(nodes),), [K]."""
         return self._temperature.at(self._places, time_s) - self.reference_c
 
 
 class FixedNodes:
-    """All nodes that any effect fixes."""
+    """All d nodes whose temperature any effect fixes, and how their heat is shared among triangles and patches."""
 
     def __init__(self, forms: Sequence[FixedForm], num_nodes: int) -> None:
         self._forms = tuple(forms)
         self.nodes: IntArray = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.nodes for f in forms)]))
-        """Their numbers, ascending, shape (d,)."""
+        """Numbers of the fixed nodes, ascending, shape (d,)."""
         self.groups: tuple[tuple[str, str], ...] = tuple(
             (form.effect, patch) for form in forms for patch in form.groups
         )
@@ -246,7 +246,7 @@ class FixedNodes:
 
     @cached_property
     def facet_shares(self) -> sparse.csr_matrix:
-        """Share of each node's heat that belongs to each triangle, by area, those of one effect after the other's."""
+        """Share of each fixed node's heat by triangle, in proportion to area; rows: triangles, effect after effect."""
         if not self._forms:
             return sparse.csr_matrix((0, 0))
         owners = np.concatenate([form.owners for form in self._forms])
@@ -258,7 +258,7 @@ class FixedNodes:
 
     @cached_property
     def shares(self) -> sparse.csr_matrix:
-        """Share of each node's heat that belongs to each group, shape (g, d)."""
+        """Share of each fixed node's heat that belongs to each entry of `groups`, shape (g, d)."""
         if not self._forms:
             return sparse.csr_matrix((0, 0))
         counts = np.cumsum([0, *(len(form.groups) for form in self._forms)])
@@ -268,7 +268,7 @@ class FixedNodes:
         return sparse.csr_matrix(sums @ self.facet_shares)
 
     def facet_heat_w(self, kept_w: Vector) -> list[tuple[str, IntArray, Vector]]:
-        """Effect, triangles and the heat flow into the body through each, [W], from that at `nodes`, shape (d,)."""
+        """Return effect, triangles and heat flow into the body through each, [W], from that at `nodes`, shape (d,)."""
         heat_w, begin, found = self.facet_shares @ kept_w, 0, []
         for form in self._forms:
             found.append((form.effect, form.facets, heat_w[begin : begin + len(form.owners)]))
@@ -277,13 +277,13 @@ class FixedNodes:
 
     @cached_property
     def free(self) -> IntArray:
-        """Nodes that are not fixed, ascending."""
+        """Numbers of the nodes that are not fixed, ascending."""
         free = np.ones(self._num_nodes, dtype=bool)
         free[self.nodes] = False
         return np.flatnonzero(free)
 
     def temperature_k(self, time_s: float) -> Vector:
-        """Temperatures of `nodes`, relative to the reference, shape (d,), [K]; `HeatError` if two effects differ."""
+        """Return the temperatures of `nodes`, relative to the reference, (d,), [K]; `HeatError` if effects disagree."""
         return at_time(self._kept, time_s, self._temperature_k)
 
     def _temperature_k(self, time_s: float) -> Vector:
@@ -309,26 +309,26 @@ class FixedNodes:
 
 @dataclass(frozen=True)
 class EffectForms:
-    """Forms by what they do to the heat equation, each in the order of the effects; loads are given heat alone."""
+    """The forms of a problem by their part in the heat equation, each in the order of the effects."""
 
     convection: tuple[ConvectionForm, ...]
-    loads: tuple[FluxForm | SourceForm, ...]
+    loads: tuple[FluxForm | SourceForm, ...]  # Heat that does not depend on the temperature
     radiation: tuple[RadiationForm, ...]
     fixed: tuple[FixedForm, ...]
 
     @property
     def exchanging(self) -> tuple[ConvectionForm | FluxForm | SourceForm | RadiationForm, ...]:
-        """Forms that heat flows through other than by fixed nodes: convection, loads, radiation."""
+        """All forms but the fixed temperatures: convection, then loads, then radiation."""
         return (*self.convection, *self.loads, *self.radiation)
 
 
 def effect_forms(
     problem: HeatProblem, space: Space, reference_c: float, assembled: Assembled | None = None
 ) -> EffectForms:
-    """Turn effects into terms and terms into forms; what acts nowhere has none.
+    """Return the forms of a problem's effects; an effect that acts on no triangle or tetrahedron gets no form.
 
-    `assembled` counts fixed temperatures, which are ready at once. Raises `HeatError` if the mesh lacks a patch or
-    region of an effect.
+    Temperatures are relative to `reference_c`. `assembled` counts only fixed temperatures here; the system counts the
+    other forms. Raises `HeatError` if the mesh lacks a patch or region of an effect.
     """
     made = {
         "convection": ConvectionForm,

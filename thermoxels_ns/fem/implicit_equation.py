@@ -1,4 +1,4 @@
-"""The implicit equation of a Runge-Kutta stage or a steady state, by Newton's method."""
+"""Solver of the implicit equation of a Runge-Kutta stage or of a steady state, by Newton's method."""
 
 from __future__ import annotations
 
@@ -19,58 +19,58 @@ from thermoxels_ns.fem.system import NOTHING, HeatSystem
 Vector = FloatArray
 
 MOST_UNBALANCED = 1e-3
-"""Share of the heat flow that may be unbalanced, round-off included, in an answer: a tenth of what the geometry of a
-reconstruction leaves uncertain of it."""
+"""Largest unbalanced heat of a converged solution, round-off included, as a share of the heat flow through the body: a
+tenth of the uncertainty that the geometry of a reconstruction leaves."""
 _BALANCED, _BALANCED_OVER_TOLERANCE = 1e-9, 1e3
-"""The share at which Newton's method ends; over the tolerance of the linear solver, if that is more."""
+"""Newton's method ends at an unbalanced share of the first, or of the second times the linear tolerance if larger."""
 MAX_ITERATIONS, MOST_CORRECTIONS = 60, 6
-"""Newton steps before giving up with radiation and without."""
+"""Most steps of Newton's method before the solver gives up: the first with radiation, the second without."""
 _ESTIMATE_TOLERANCE = 1e-3  # Relative tolerance of the linear solver for error estimates
 _NEWTON_TOLERANCE = 1e-6
-"""The same in a step of Newton's method with radiation: the next step corrects the rest."""
+"""Relative tolerance of the linear solver in a Newton step with radiation: the next step corrects the error left."""
 _SAFE = 0.1
 """Largest change in a Newton step, as a share of the absolute temperature, at which a full step is taken without a line
 search: the slope of radiation, 4 sigma eps T^3, then changes by no more than a third."""
 _SETTLED = 1e-5
 """Largest change in a Newton step, as a share of the absolute temperature, after which the method may end: the error
-left is about the square of it."""
+left is about the square of this share."""
 _ENOUGH = 0.5
-"""The line search ends where the slope of the energy along the step has fallen to this share of what it was at its
-start, or has changed sign and is no larger than that."""
+"""The line search ends where the slope of the energy along the step is, whatever its sign, at most this share of the
+size of the slope at the start of the step."""
 _MOST_SEARCHES = 200  # Bisections of the line search
 _EPS = float(np.finfo(np.float64).eps)
 _ROUND_OFF = 8.0 * _EPS  # Round-off of a sum as a share of the sum of sizes
 PATIENCE = 1500
-"""Iterations with the diagonal after which multigrid takes over where they stand: it is dear to set up, and its
-iterations hardly grow with the mesh, with flat cells or with contrasts."""
-PATIENCE_WHEN_REPEATED = 800  # The same for a matrix that is used again, when its set-up is paid once
-MOST_ITERATIONS = 300  # With multigrid, which takes 15 to 50 where it helps
+"""Most iterations with the diagonal as preconditioner; multigrid then continues from the same x. Multigrid is slow to
+set up, but its number of iterations hardly grows with the mesh, with flat cells or with contrasts."""
+PATIENCE_WHEN_REPEATED = 800  # Iterations in one solve above which the next solves begin with multigrid
+MOST_ITERATIONS = 300  # Most iterations with multigrid, which takes 15 to 50 where it helps
 LAST_ITERATIONS = 20_000
-"""Iterations with the diagonal at the end: multigrid stalls on quadratic tetrahedra 100 times as long as high, these do
-not."""
-_PER_UNKNOWN = 10  # The same per unknown: without round-off one would be enough
-_BLOCK = 1 << 16  # Entries that are scaled at a time, to save memory
+"""Most iterations with the diagonal after multigrid failed: on quadratic tetrahedra 100 times as long as high multigrid
+stalls and the diagonal does not."""
+_PER_UNKNOWN = 10  # Most of these last iterations per unknown: without round-off one would be enough
+_BLOCK = 1 << 16  # Entries of the matrix that are scaled at a time, to save memory
 
 
 @dataclass(frozen=True)
 class LinearSolution:
-    """A solution x of A x = b, shape (n,); the status is a sentence."""
+    """The outcome of `LinearSolver.solve`."""
 
-    x: Vector
-    iterations: int
-    converged: bool  # Whether the iterations came to the tolerance
-    status: str
+    x: Vector  # Solution of A x = b, shape (n,)
+    iterations: int  # Iterations of conjugate gradients
+    converged: bool  # True if the residual fell to the tolerance
+    status: str  # Sentence on preconditioner and iterations
 
 
 class LinearSolver:
-    """Solver for A x = b with one symmetric positive definite matrix and many right-hand sides.
+    """Solver for A x = b with one symmetric positive definite matrix A and many right-hand sides b.
 
-    Iterations are those of D^-1/2 A D^-1/2, whose diagonal is 1, and end when its residual has fallen to a share of
-    what it was: nodes count by the temperature that their heat would change, not by their size.
+    Conjugate gradients solve the system of D^-1/2 A D^-1/2, D being the diagonal of A, until the norm of its residual
+    is at most `relative_tolerance` times that of D^-1/2 b. The scaling keeps large cells from outweighing small ones.
     """
 
     def __init__(self, matrix: sparse.csr_matrix, *, relative_tolerance: float = 1e-12) -> None:
-        """Scale A; raises `HeatError` if entries are not finite or the diagonal is not above 0."""
+        """Scale `matrix`, A; raises `HeatError` if an entry is not finite or a diagonal entry is not above 0."""
         diagonal = matrix.diagonal()
         if not (np.all(np.isfinite(matrix.data)) and np.all(diagonal > 0)):
             expected, bad = "finite entries and a diagonal above 0", np.count_nonzero(~np.isfinite(matrix.data))
@@ -88,8 +88,8 @@ class LinearSolver:
         self._slow = False
 
     def solve(self, right_hand_side: Vector) -> LinearSolution:
-        """Solve A x = b."""
-        # In units of its largest entry, so that the squares in the norms neither overflow nor vanish.
+        """Solve A x = b for b of shape (n,); a failure is not raised but told by `LinearSolution.converged`."""
+        # b is divided by its largest entry, so that the squares in the norms neither overflow nor vanish.
         b = self._scale * right_hand_side
         unit = float(np.max(np.abs(b), initial=0.0)) or 1.0
         x, count, converged = np.zeros_like(b), 0, False
@@ -125,9 +125,9 @@ class LinearSolver:
 
     @cached_property
     def _multigrid(self) -> LinearOperator:
-        """Smoothed aggregation by pyamg for the scaled matrix, symmetric and without its random starts.
+        """Return pyamg's smoothed aggregation for the scaled matrix, a symmetric and deterministic preconditioner.
 
-        Row sums stand for estimates of a spectral radius, and what is even in A is even over the scale here.
+        Row sums ("local") replace a random estimate of the spectral radius; B is a constant x in scaled unknowns.
         """
         from pyamg import smoothed_aggregation_solver
 
@@ -152,88 +152,88 @@ def _threads() -> ThreadpoolController:
 
 @dataclass(frozen=True)
 class Residual:
-    """Heat that is not balanced at some temperatures."""
+    """Heat that an implicit equation leaves unbalanced at trial temperatures: inflow less the heat that is stored."""
 
-    heat_w: Vector  # At each node, 0 at fixed ones, shape (n,), [W]
+    heat_w: Vector  # Unbalanced heat at each node, 0 at fixed nodes, shape (n,), [W]
     piece_w: Vector
-    """In each piece without fixed nodes, without the round-off of what is conducted inside, shape (p,), [W]."""
-    moved_w: Vector  # Sum of the sizes of what is exchanged and stored in each piece, shape (p,), [W]
+    """Unbalanced heat of each connected piece, without conduction and its round-off; 0 with fixed nodes; (p,), [W]."""
+    moved_w: Vector  # Sum of the sizes of all heat exchanged and stored in each piece, shape (p,), [W]
     flows_w: float  # Heat that flows through the body or is stored in it, [W]
-    round_off_w: float  # What floating point leaves of the sums of all nodes, [W]
+    round_off_w: float  # Round-off to expect in the sum over all free nodes, [W]
 
     @cached_property
     def unbalanced_w(self) -> float:
-        """Sum of the sizes of what is not balanced at nodes, [W].
+        """Sum over the nodes of the size of the unbalanced heat, [W].
 
-        No effect's heat flow is wrong by more, where the matrix has no entry above 0 off its diagonal: heat that is put
-        in at a node leaves through all effects together.
+        If the matrix has no entry above 0 off its diagonal, no effect's heat flow is wrong by more than this sum,
+        because heat put in at a node leaves through all effects together.
         """
         return float(np.sum(np.abs(self.heat_w)))
 
     @cached_property
     def floating_w(self) -> float:
-        """Sum of the sizes of what is not balanced in pieces without fixed nodes, [W]."""
+        """Sum over the pieces without fixed nodes of the size of the unbalanced heat, [W]."""
         return float(np.sum(np.abs(self.piece_w)))
 
     @cached_property
     def is_round_off(self) -> bool:
-        """Whether the residual is nothing but round-off, at all nodes together and in every piece."""
+        """True if the residual is nothing but round-off, both summed over all nodes and in every piece."""
         in_pieces = bool(np.all(np.abs(self.piece_w) <= _ROUND_OFF * self.moved_w))
         return in_pieces and self.unbalanced_w <= self.round_off_w
 
 
 @dataclass(frozen=True)
 class ImplicitSolution:
-    """Temperatures that solve an implicit equation, if it converged; the status is a sentence."""
+    """The outcome of `ImplicitEquation.solve`: its temperatures solve the equation only if `converged` is True."""
 
-    relative_k: Vector  # Relative to the system's reference, shape (n,), [K]
+    relative_k: Vector  # Temperatures T, relative to `HeatSystem.reference_c`, shape (n,), [K]
     change_k: Vector
-    """T - T_0 as it was solved for, shape (n,), [K]: the difference of the temperatures has lost its last digits."""
-    unbalanced_w: float  # Heat that is unbalanced at all nodes, round-off included, [W]
+    """The change T - T_0 as solved for, shape (n,), [K]; a difference of temperatures would lose its last digits."""
+    unbalanced_w: float  # Sum of the sizes of the unbalanced heat at all nodes, plus round-off, [W]
     flows_w: float  # Heat that flows through the body or is stored in it, [W]
-    iterations: int
-    newton_iterations: int  # 0 without radiation
-    converged: bool
-    status: str
+    iterations: int  # Iterations of the linear solver
+    newton_iterations: int  # Steps of Newton's method; 0 without radiation
+    converged: bool  # True if the iterations ended and the heat balances
+    status: str  # Sentence on how the iterations ended
 
 
 class ImplicitEquation:
     """Solver of M (T - T_0) / step = given + load - (K + R) T + radiation(T); step = inf: the steady state.
 
-    A stage of a diagonally implicit Runge-Kutta scheme has this form; `given` is what earlier stages add. The unknown
-    is the change T - T_0, which keeps round-off relative to the change. Where radiation is absent the matrix and its
-    preconditioner are made once and serve every step of the same length.
+    M is the mass, K the stiffness and R the convection matrix; the load holds convection's h T_ambient, too. A stage of
+    a diagonally implicit Runge-Kutta scheme has this form, `given` being the heat from earlier stages. The unknown is
+    T - T_0, so that round-off is relative to the change. Without radiation one matrix serves all steps of one length.
 
-    Conduction moves heat within a connected piece and never out of it: what a piece without fixed nodes stores and
-    exchanges sets its mean change. In long steps of insulated pieces the matrix is all but singular, and the linear
-    solver would lose that mean; so the mean is solved for apart from the rest.
+    Conduction moves heat within a connected piece and never out of it, so the heat that a piece without fixed nodes
+    stores and exchanges sets its mean change. In long steps of insulated pieces the matrix is all but singular, and the
+    linear solver would lose this mean; therefore the mean is solved for apart from the rest.
     """
 
     def __init__(self, system: HeatSystem, time_s: float, step_s: float, *, relative_tolerance: float) -> None:
-        """Assemble the matrix at a time, for a step of a length, [s]; infinite for a steady state."""
+        """Assemble M / step + K + R at `time_s` for steps of length `step_s`, [s]; inf stands for the steady state."""
         self._system, self._step_s, self._relative_tolerance = system, step_s, relative_tolerance
         convection = system.convection_matrix(time_s)
         self._row_sums_w_k: Vector = np.zeros(system.num_nodes)
-        """Row sums of M / step + R, shape (n,), [W / K]: of the matrix too, because those of K are 0, but exact."""
+        """Row sums of the matrix, shape (n,), [W / K]; summed over M / step + R alone, as the row sums of K are 0."""
         if convection is not None:
             self._row_sums_w_k += convection @ np.ones(system.num_nodes)
         self._sizes_w_k: Vector = system.stiffness.diagonal() + self._row_sums_w_k
-        """Diagonal of K + R, about, whose round-off counts, shape (n,), [W / K]."""
+        """About the diagonal of K + R, shape (n,), [W / K], from which round-off is estimated."""
         if np.isfinite(step_s):
             self._row_sums_w_k += system.nodal_mass_j_k / step_s
         self._matrix: sparse.csr_matrix = self._free_block(system.matrix(time_s, step_s))
-        """M / step + K + R between free nodes."""
+        """The rows and columns of M / step + K + R that belong to free nodes, [W / K]."""
         self._floating: BoolArray = ~system.pieces.touched(system.fixed.nodes)
-        """Pieces without fixed nodes, shape (p,)."""
+        """True for each piece without fixed nodes, shape (p,)."""
         self._solvers: dict[float, LinearSolver] = {}
 
     def solve(self, start_k: Vector, time_s: float, given_w: Vector | None = None) -> ImplicitSolution:
-        """Find the temperatures at the end from T_0, shape (n,), [K]; earlier stages give `given_w`, shape (n,), [W].
+        """Solve for T at `time_s` from `start_k`, T_0, (n,), [K]; `given_w` is the heat of earlier stages, (n,), [W].
 
-        Radiation grows with the temperature and its slope is symmetric, so the solution is the one minimum of a convex
-        energy. Newton's direction always leads down, and how far to go is a search for the zero of one increasing
-        function along it: no damping factor is guessed, and the method converges from any start. Without radiation its
-        first step is the solution, and further ones correct what the linear solver left.
+        Emitted heat grows with the temperature and its slope is symmetric, so the solution is the one minimum of a
+        convex energy. Newton's direction leads downhill, and a line search finds the length to go as the zero of an
+        increasing function. So no damping factor is guessed, and the method converges from any start. Without radiation
+        the first step is the solution, and further steps correct the error of the linear solver.
         """
         fixed, nonlinear, change_k = self._system.fixed, self._system.nonlinear, np.zeros(self._system.num_nodes)
         if len(fixed.nodes):
@@ -262,7 +262,7 @@ class ImplicitEquation:
             status = f"Newton's method {'ended' if settled else 'stopped'} after {count} steps. {status}"
         now_k, uncertain_w, flows_w = start_k + change_k, rest.unbalanced_w + rest.round_off_w, rest.flows_w
         if not uncertain_w <= MOST_UNBALANCED * flows_w:
-            # What two effects bring to and take from the same node is not in the sum over nodes.
+            # The sum over nodes misses heat that one effect brings to a node and another effect takes from this node.
             groups_w = self._system.group_heat_w(now_k, time_s)
             flows_w = max(flows_w, 0.5 * float(np.sum(np.abs(groups_w))))
         balances = rest.is_round_off or uncertain_w <= MOST_UNBALANCED * flows_w or self._is_still(now_k, rest, time_s)
@@ -277,16 +277,16 @@ class ImplicitEquation:
         )
 
     def damped(self, heat_w: Vector, piece_w: Vector, relative_k: Vector, time_s: float) -> Vector:
-        """Solve (M / step + K + R + slope of radiation) e = heat roughly, for error estimates; shape (n,), [K].
+        """Estimate e, shape (n,), [K], of (M / step + K + R + slope of radiation at `relative_k`) e = `heat_w`.
 
-        `piece_w` is the heat of each piece without the round-off of conduction; the slope is that at `relative_k`.
+        `piece_w`, shape (p,), [W], sums `heat_w` over each piece without conduction and its round-off.
         """
         return self._correction(heat_w, piece_w, relative_k, time_s, _ESTIMATE_TOLERANCE)[0]
 
     def _correction(
         self, heat_w: Vector, piece_w: Vector, relative_k: Vector, time_s: float, tolerance: float
     ) -> tuple[Vector, LinearSolution]:
-        """Solve for a change, shape (n,), [K], that takes up heat (as in `Residual`), radiation made linear there."""
+        """Solve for the change, (n,), [K], that takes up heat (as in `Residual`), radiation linear at `relative_k`."""
         row_sums_w_k, pieces = self._row_sums_w_k, self._system.pieces
         if self._system.nonlinear:
             slope = self._system.radiation_slope(relative_k, time_s)
@@ -304,7 +304,7 @@ class ImplicitEquation:
         def share(left_w: Vector) -> Vector:
             return pieces.at_nodes(np.where(self._floating, left_w / held_w_k, 0.0))
 
-        # In multiples of the row sums, this shifts the solution by a constant in each piece.
+        # Taking a multiple of the row sums from the heat shifts the solution by a constant in each piece.
         rest_w = heat_w - share(pieces.sums(heat_w)) * row_sums_w_k
         if np.sum(np.abs(rest_w)) <= _ROUND_OFF * np.sum(np.abs(heat_w)):
             rest_w = np.zeros_like(rest_w)
@@ -321,13 +321,13 @@ class ImplicitEquation:
         return sparse.csr_matrix(matrix[fixed.free][:, fixed.free]) if len(fixed.nodes) else matrix
 
     def _everywhere(self, free: Vector) -> Vector:
-        """Put 0 at the fixed nodes."""
+        """Return values at all nodes, shape (n,), from values at the free nodes; fixed nodes get 0."""
         full = np.zeros(self._system.num_nodes)
         full[self._system.fixed.free] = free
         return full
 
     def _residual(self, start_k: Vector, change_k: Vector, time_s: float, given_w: Vector | None) -> Residual:
-        """Heat that is not balanced after a change of the temperatures, shape (n,), [K]."""
+        """Return the heat that is unbalanced at the temperatures `start_k` + `change_k`, both of shape (n,), [K]."""
         system, now_k = self._system, start_k + change_k
         pieces, conducted_w = system.pieces, system.conducted_heat(now_k)
         kept_w, moved_w = np.zeros(system.num_nodes), np.zeros(system.num_nodes)
@@ -349,7 +349,7 @@ class ImplicitEquation:
         return Residual(heat_w, piece_w, pieces.sums(moved_w), 0.5 * flows_w, round_off_w)
 
     def _is_still(self, now_k: Vector, rest: Residual, time_s: float) -> bool:
-        """Whether next to nothing flows: all temperatures are equal, or each piece is level and balanced as a whole."""
+        """Return whether next to no heat flows: all temperatures are equal, or every piece is level and balanced."""
         system, pieces = self._system, self._system.pieces
         if system.is_still(now_k, time_s):
             return True
@@ -359,12 +359,12 @@ class ImplicitEquation:
         return level and bool(np.all(balanced | (rest.moved_w <= equal_k * pieces.sums(self._row_sums_w_k))))
 
     def _is_short(self, now_k: Vector, direction: Vector, share: float) -> bool:
-        """Whether no absolute temperature changes by more than a share of it."""
+        """Return whether `direction` changes no absolute temperature by more than `share` of it."""
         kelvin = now_k + self._system.reference_c + ZERO_CELSIUS_K
         return bool(np.all(np.abs(direction) <= share * np.maximum(np.abs(kelvin), COLDEST_SLOPE_K)))
 
     def _length(self, now_k: Vector, direction: Vector, heat_w: Vector, time_s: float) -> float:
-        """Find how much of a direction to go: all of it, or about to where the energy along it is least."""
+        """Return the share of a Newton direction to go: 1, or about the share at which the energy is least."""
         if self._is_short(now_k, direction, _SAFE):
             return 1.0
         free = self._at_free(direction)
@@ -372,7 +372,7 @@ class ImplicitEquation:
         constant, curvature = np.sum(direction * (heat_w - radiated_w)), np.sum(free * (self._matrix @ free))
 
         def rise(length: float) -> float:
-            """Slope of the energy along the direction: minus the power of the residual."""
+            """Return the slope of the energy at this length: minus the sum of residual times direction."""
             then_w = self._system.radiation_load(now_k + length * direction, time_s)
             return float(length * curvature - constant - np.sum(direction * then_w))
 
@@ -381,7 +381,7 @@ class ImplicitEquation:
             return 1.0
         left, right = 0.0, 1.0
         for _ in range(_MOST_SEARCHES):
-            # The zero may lie many powers of ten below 1: a cold body that sees a hot one has next to no slope.
+            # The zero may lie many powers of ten below 1: in a cold body, radiation's slope is next to 0.
             middle = 0.25 * right if left == 0.0 else 0.5 * (left + right)
             value = rise(middle)
             if abs(value) <= _ENOUGH * -start:

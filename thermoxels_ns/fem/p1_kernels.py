@@ -1,4 +1,4 @@
-"""Compiled stiffness and lumped mass of linear tetrahedra (P1), and the edges of a mesh."""
+"""Compiled loops for the stiffness and lumped mass of linear tetrahedra (P1), and for the edges of a mesh."""
 
 from __future__ import annotations
 
@@ -19,37 +19,37 @@ Numbers = IntArray
 
 _REMEDY = "Build the mesh with thermoxels_ns.mesh."
 FLATTEST = 1e-6
-"""Least height of a tetrahedron over its size: what flatter ones conduct across is lost to round-off beside what they
-conduct through, which is the square of it times as much."""
+"""Least height of a tetrahedron over its size. In a flatter one, conduction along its plane is lost to round-off beside
+conduction through its thickness, which is 1 / `FLATTEST`^2 times as large."""
 _ANGLE_ROUND_OFF = 16.0 * np.finfo(np.float64).eps
-"""Round-off of the cosine of an angle per largest coordinate over the tetrahedron's size; an estimate from above."""
+"""Upper estimate of the round-off of the cosine of an angle, for a tetrahedron as large as its largest coordinate."""
 TET_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
-"""Ends of the edges of a tetrahedron, in scikit-fem's order."""
-FACET_EDGES = np.array([(0, 1), (1, 2), (0, 2)])  # Ends of the edges of a triangle, in scikit-fem's order
+"""Local numbers of the two ends of each edge of a tetrahedron, in scikit-fem's order."""
+FACET_EDGES = np.array([(0, 1), (1, 2), (0, 2)])  # The same for the edges of a triangle
 
 
 @dataclass(frozen=True)
 class MeshEdges:
-    """Every edge of a tetrahedral mesh once, at its smaller node number: a strict upper triangle."""
+    """The e edges of a tetrahedral mesh of n nodes, each listed once, in the order of smaller, then larger node."""
 
-    first: IntArray  # Edges of node i stand at first[i] to first[i + 1]; shape (n + 1,)
-    other: npt.NDArray[np.int32]  # The larger node number of each edge, ascending for each smaller one, shape (e,)
+    first: IntArray  # Edges whose smaller node is i have numbers first[i] to first[i + 1] - 1; shape (n + 1,)
+    other: npt.NDArray[np.int32]  # The larger node number of each edge, shape (e,)
 
     @property
     def num_nodes(self) -> int:
-        """Number of nodes, also those without an edge."""
+        """Number of nodes, including nodes without an edge."""
         return len(self.first) - 1
 
     def smaller_nodes(self) -> npt.NDArray[np.int32]:
-        """The smaller node number of each edge, shape (e,)."""
+        """Return the smaller node number of each edge, shape (e,)."""
         return np.repeat(np.arange(self.num_nodes, dtype=np.int32), np.diff(self.first))
 
     def midpoints(self, nodal: FloatArray) -> FloatArray:
-        """Means of the values at both ends of each edge, shape (e, ...)."""
+        """Return the mean of the values at both ends of each edge, shape (e, ...), from values at nodes, (n, ...)."""
         return 0.5 * (nodal[self.smaller_nodes()] + nodal[self.other])
 
     def numbers(self, elements: IntArray, ends: IntArray) -> IntArray:
-        """Number the edges, shape (k, j), of tetrahedra or triangles; `ends` are the local nodes of each, shape (j, 2).
+        """Return the numbers of the edges of elements, (k, j); `ends` is `TET_EDGES` or `FACET_EDGES`, (j, 2).
 
         >>> edges = mesh_edges(np.array([[3, 0, 2, 1]]), 4)
         >>> edges.numbers(np.array([[0, 2, 3]]), FACET_EDGES).tolist()
@@ -61,7 +61,7 @@ class MeshEdges:
 
 
 def mesh_edges(tets: IntArray, num_nodes: int) -> MeshEdges:
-    """Find the edges of a mesh in ascending order, in time and memory that grow with the number of tetrahedra.
+    """Return the edges of a mesh in ascending order, in time and memory proportional to the number of tetrahedra.
 
     >>> edges = mesh_edges(np.array([[3, 0, 2, 1], [1, 2, 4, 3]]), 5)
     >>> np.column_stack([edges.smaller_nodes(), edges.other]).tolist()
@@ -80,10 +80,10 @@ def stiffness_matrix(
     """Assemble K, entries k * integral(grad phi_i . grad phi_j), shape (n, n), [W / K], symmetric bit for bit.
 
     The result is that of `space.conduction` through scikit-fem, in a tenth of the time and of the memory of whole runs
-    (`tests/benchmarks/heat_speed.py`). In a tetrahedron with faces opposite i and j of outward area vectors n_i and
-    n_j, the entry is k n_i . n_j / (9 V), and 0 where the angle between the faces is right up to round-off of the
-    coordinates. Nodes have shape (n, 3), [m], the conductivity (t,), [W / (m K)], above 0; `refuse_flat_tets` accepts
-    the tetrahedra, shape (t, 4).
+    (`tests/benchmarks/heat_speed.py`). A tetrahedron whose faces opposite nodes i and j have the outward area vectors
+    n_i and n_j adds k n_i . n_j / (9 V), or 0 if the angle between these faces is right up to round-off of the
+    coordinates. `points_m` has shape (n, 3), [m], `tets` (t, 4), checked by `refuse_flat_tets`; the conductivity has
+    shape (t,), [W / (m K)], above 0; `edges` None: `mesh_edges` finds them.
 
     >>> corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     >>> (6 * stiffness_matrix(corner, np.array([[0, 1, 2, 3]]), np.ones(1))).toarray().round(12).tolist()
@@ -94,7 +94,7 @@ def stiffness_matrix(
     coupling = np.zeros(len(edges.other))
     _add_couplings(points_m, tets, conductivity_w_mk, 1.0 / unit_m, edges.first, edges.other, coupling)
     coupling *= unit_m
-    # A constant has no gradient: what couples a node to the others sums to 0.
+    # A constant temperature has no gradient, so each row sums to 0.
     diagonal = np.zeros(edges.num_nodes)
     diagonal -= np.bincount(edges.smaller_nodes(), coupling, edges.num_nodes)
     diagonal -= np.bincount(edges.other, coupling, edges.num_nodes)
@@ -105,10 +105,10 @@ def stiffness_matrix(
 
 
 def lumped_mass(points_m: Vector, tets: Numbers, heat_capacity_j_m3k: Vector) -> Vector:
-    """Compute rho c * integral(phi_i) for every node, the row sums of the mass matrix, shape (n,), [J / K].
+    """Return rho c * integral(phi_i) for every node i, the row sums of the mass matrix, shape (n,), [J / K].
 
-    With non-obtuse tetrahedra, such as those of a lattice, backward Euler with this mass keeps every temperature
-    within the initial range for any step length (Li and Huang, arXiv 1209.5657). The heat capacity has shape (t,).
+    With non-obtuse tetrahedra, such as those of a lattice, backward Euler with this mass keeps every temperature within
+    the initial range for any step length (Li and Huang, arXiv 1209.5657). The capacity, (t,), is in [J / (m3 K)].
     """
     points_m, tets, unit_m = _prepared(points_m, tets)
     nodal = np.zeros(len(points_m))
@@ -117,7 +117,7 @@ def lumped_mass(points_m: Vector, tets: Numbers, heat_capacity_j_m3k: Vector) ->
 
 
 def refuse_flat_tets(points_m: Vector, tets: Numbers) -> None:
-    """Raise `HeatError` if points or tetrahedra have the wrong shape or range, or tetrahedra are inverted or flat."""
+    """Raise `HeatError` if arrays have wrong shapes, numbers are out of range, or tetrahedra are inverted or flat."""
     check_shape("mesh points", points_m, (None, 3), _REMEDY, HeatError)
     check_finite("mesh points", points_m, _REMEDY, HeatError)
     check_shape("mesh tets", tets, (None, 4), _REMEDY, HeatError)
@@ -133,7 +133,7 @@ def refuse_flat_tets(points_m: Vector, tets: Numbers) -> None:
 
 
 def _prepared(points_m: Vector, tets: Numbers) -> tuple[Vector, Numbers, float]:
-    """Arrays for the kernels, and the power of 2 above all coordinates: in that unit nothing over- or underflows."""
+    """Return arrays for the kernels, and the power of 2 above all coordinates, a unit in which nothing overflows."""
     reach = float(np.max(np.abs(points_m), initial=0.0))
     unit_m = float(np.exp2(np.frexp(reach)[1])) if reach else 1.0
     return np.ascontiguousarray(points_m, np.float64), np.ascontiguousarray(tets, np.int64), unit_m
@@ -141,7 +141,7 @@ def _prepared(points_m: Vector, tets: Numbers) -> tuple[Vector, Numbers, float]:
 
 @kernel
 def _sides(points, tet, scale):
-    # Unsigned, here and below: no test for negative numbers.
+    # Node numbers are unsigned, here and below, which saves a test for negative indices.
     o, a = points[np.uint64(tet[0])], points[np.uint64(tet[1])]
     b, c = points[np.uint64(tet[2])], points[np.uint64(tet[3])]
     return (
@@ -168,7 +168,7 @@ def _size(a, b, c):
 
 @kernel
 def _is_flat(a, b, c):
-    """Whether a tetrahedron of these sides is inverted, or its least height no more than `FLATTEST` of its size."""
+    """Return whether a tetrahedron with these sides is inverted or its least height at most `FLATTEST` of its size."""
     n1, n2, n3 = _cross(b, c), _cross(c, a), _cross(a, b)
     n0 = (n1[0] + n2[0] + n3[0], n1[1] + n2[1] + n3[1], n1[2] + n2[2] + n3[2])
     largest = math.sqrt(max(_dot(n0, n0), _dot(n1, n1), _dot(n2, n2), _dot(n3, n3)))  # twice the area of a face
@@ -177,7 +177,7 @@ def _is_flat(a, b, c):
 
 @kernel
 def _place(first, other, node, neighbour):
-    """Number of the edge between two nodes, by bisection."""
+    """Return the number of the edge between two nodes, found by bisection."""
     low, high = np.uint64(min(node, neighbour)), max(node, neighbour)
     begin, end = np.uint64(first[low]), np.uint64(first[low + np.uint64(1)])
     while begin < end:
@@ -210,7 +210,7 @@ def _add_couplings(points, tets, conductivity, scale, first, other, coupling):
     for t in range(len(tets)):
         tet = tets[t]
         a, b, c = _sides(points, tet, scale)
-        # Inward normals of the faces opposite each node, twice the face's area long.
+        # Inward normals of the face opposite each node, of twice this face's area in length.
         n1, n2, n3 = _cross(b, c), _cross(c, a), _cross(a, b)
         n0 = (-n1[0] - n2[0] - n3[0], -n1[1] - n2[1] - n3[1], -n1[2] - n2[2] - n3[2])
         normals = (n0, n1, n2, n3)
@@ -235,7 +235,7 @@ def _add_capacities(points, tets, capacity, scale, nodal):
 
 @kernel
 def _unique_edges(tets, end, other, first, mark):
-    """Returns the number of edges; `first` and the beginning of `other` are those of `MeshEdges`."""
+    """Fill `first` and the beginning of `other` as in `MeshEdges`, and return the number of edges."""
     num_nodes = len(mark)
     for t in range(len(tets)):
         for a in range(3):
@@ -243,7 +243,7 @@ def _unique_edges(tets, end, other, first, mark):
                 end[min(tets[t, a], tets[t, b]) + 1] += 1
     for node in range(num_nodes):
         end[node + 1] += end[node]
-    # Each edge moves the end of its bucket: afterwards end[i] is where the bucket of i + 1 begins.
+    # end[i], where the edges of node i begin, moves with each edge stored and at last is where those of i + 1 begin.
     for t in range(len(tets)):
         for a in range(3):
             for b in range(a + 1, 4):
@@ -257,7 +257,7 @@ def _unique_edges(tets, end, other, first, mark):
                 mark[other[k]] = node
                 other[kept] = other[k]
                 kept += 1
-        # A node has few edges, and they are almost in order: insertion sort.
+        # Insertion sort, because the few edges of a node are almost in order.
         for k in range(first[node] + 1, kept):
             high, place = other[k], k
             while place > first[node] and other[place - 1] > high:

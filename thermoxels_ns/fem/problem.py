@@ -1,4 +1,4 @@
-"""A heat problem: which body, made of what, at which temperatures, over which time."""
+"""A heat problem: body, materials, start and effects; and the time steps in which a solver follows a body."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 MOST_CONTRAST = 1e9
-"""Largest conductivity over the smallest of a body; beyond, what the worse one conducts is lost to round-off."""
-_MOST = 10_000_000  # Steps or kept times; a minute each for nineteen years
+"""Most that the largest conductivity of a body may be over the smallest; above it, round-off swamps the smaller one."""
+_MOST = 10_000_000  # Most steps or kept times: nineteen years in steps of a minute
 
 
 @dataclass(frozen=True)
 class TimeSteps:
-    """Equal steps in time.
+    """Equal time steps.
 
     >>> TimeSteps(3, 20.0).times_s.tolist()
     [0.0, 20.0, 40.0, 60.0]
@@ -46,32 +46,32 @@ class TimeSteps:
 
     @property
     def duration_s(self) -> float:
-        """Time that the body is followed for, [s]."""
+        """Time over which the body is followed, [s]."""
         return self.steps * self.step_seconds
 
     @property
     def times_s(self) -> FloatArray:
-        """Start, then the end of every step, shape (steps + 1,), [s]."""
+        """Time 0, then the end of every step, shape (steps + 1,), [s]."""
         return np.arange(self.steps + 1, dtype=np.float64) * self.step_seconds
 
     @property
     def lengths_s(self) -> tuple[FloatArray, ...]:
-        """Lengths of the steps in each interval at whose ends temperatures are kept, [s]."""
+        """Lengths of the steps in each interval, [s]: one step each, because temperatures are kept after every step."""
         return (np.array([self.step_seconds]),) * self.steps
 
 
 @dataclass(frozen=True)
 class AdaptiveSteps:
-    """Steps as long as a tolerance allows.
+    """Time steps as long as a tolerance allows.
 
     >>> AdaptiveSteps(3600.0, outputs=3).times_s.tolist()
     [0.0, 1200.0, 2400.0, 3600.0]
     """
 
-    duration_s: float  # Time to follow the body for, [s], above 0
+    duration_s: float  # Time over which to follow the body, [s], above 0
     tolerance_k: float = 0.05
-    """Largest error of any temperature that the steps may make, as estimated from their embedded pair, [K]. The
-    default is half of what building physics asks of a temperature (ISO 10211: 0.1 K)."""
+    """Largest error of any temperature that the steps may make, by the estimate of the scheme, [K]. The default is half
+    of the error that building physics allows (ISO 10211: 0.1 K)."""
     outputs: int = 10  # Number of equal intervals at whose ends temperatures are kept
 
     def __post_init__(self) -> None:
@@ -81,34 +81,33 @@ class AdaptiveSteps:
 
     @property
     def times_s(self) -> FloatArray:
-        """Start, then the end of every interval, shape (outputs + 1,), [s]."""
+        """Time 0, then the end of every interval, shape (outputs + 1,), [s]."""
         return np.linspace(0.0, self.duration_s, self.outputs + 1)
 
 
 @dataclass(frozen=True)
 class GivenSteps:
-    """Steps of given lengths, such as those of an adaptive computation, halved.
+    """Time steps of given lengths, such as the halved steps of an adaptive computation.
 
     >>> GivenSteps(6.0, (np.array([1.0, 2.0]), np.array([3.0])), 0.1).halved().lengths_s[0].tolist()
     [0.5, 0.5, 1.0, 1.0]
     """
 
-    duration_s: float  # Time to follow the body for, [s]
+    duration_s: float  # Time over which to follow the body, [s]
     lengths_s: tuple[FloatArray, ...]
-    """Lengths of the steps in each of some equal intervals at whose ends temperatures are kept, [s]."""
+    """Lengths of the steps in each interval, [s]; temperatures are kept at the ends of the (equal) intervals."""
     tolerance_k: float
-    """Tolerance of the adaptive steps that these came from, [K]. A step whose temperatures leave their range by more
-    than a thousandth of it is repeated with backward Euler."""
+    """Tolerance of the adaptive steps from which these lengths come, [K]; the steps themselves do not depend on it."""
 
     def halved(self, times: int = 1) -> GivenSteps:
-        """Halve every step so many times."""
+        """Return these steps with every step halved `times` times."""
         parts = 2**times
         lengths_s = tuple(np.repeat(interval_s / parts, parts) for interval_s in self.lengths_s)
         return GivenSteps(self.duration_s, lengths_s, self.tolerance_k)
 
     @property
     def times_s(self) -> FloatArray:
-        """Start, then the end of every interval, [s]."""
+        """Time 0, then the end of every interval, shape (len(lengths_s) + 1,), [s]."""
         return np.linspace(0.0, self.duration_s, len(self.lengths_s) + 1)
 
 
@@ -119,24 +118,25 @@ def _check_count(name: str, value: int, remedy: str) -> None:
 
 @dataclass(frozen=True)
 class Term:
-    """What an effect adds to the heat equation besides conduction and storage; positive is into the body."""
+    """The term that an effect adds to the heat equation; heat flows and fluxes are positive into the body."""
 
     kind: Literal["convection", "flux", "radiation", "source", "fixed"]
-    parts: IntArray  # Numbers of boundary triangles, of a source of tetrahedra, shape (k,)
+    parts: IntArray  # Numbers of the boundary triangles, or for a source of the tetrahedra, that it acts on, shape (k,)
     quantities: tuple[Bounded, ...]
-    """convection: h and T_ambient in h (T_ambient - T); flux: what it is the product of; radiation: eps and T_s in
-    factor eps (T_s^4 - T^4), temperatures in kelvin; source: [W / m3]; fixed: the temperature of the nodes."""
-    factor: float = 1.0  # Stefan-Boltzmann constant of radiation, [W / (m2 K4)]
+    """convection: h, T_ambient of the flux h (T_ambient - T); flux: the factors whose product is the flux; radiation:
+    eps, T_s of the flux factor eps (T_s^4 - T^4); source: heat, [W / m3]; fixed: temperature of the nodes. Quantities
+    hold temperatures in degrees Celsius."""
+    factor: float = 1.0  # Stefan-Boltzmann constant for radiation, [W / (m2 K4)]; no other kind uses it
 
 
 class Effect(ABC):
-    """Something that a heat problem may contain besides conduction: checked input that knows its own term.
+    """Something that acts on a body, such as convection: checked input that `term` turns into a `Term`.
 
-    A dataclass whose fields are quantities, or names of `patches` or `regions` that it acts on.
+    A subclass is a dataclass; its fields are quantities, and the names of the `patches` or `regions` that it acts on.
     """
 
-    kind: ClassVar[str]  # What it is called in reports
-    bounds: ClassVar[dict[str, Bounds]]  # Which fields are quantities, and their range
+    kind: ClassVar[str]  # Name of this kind of effect in reports
+    bounds: ClassVar[dict[str, Bounds]]  # Names of the fields that are quantities, each with the range of its values
 
     def __post_init__(self) -> None:
         for name in ("patches", "regions"):
@@ -152,20 +152,20 @@ class Effect(ABC):
 
     @property
     def label(self) -> str:
-        """Name of the effect in reports: its kind and where it acts."""
+        """Name of the effect in reports: its kind and `where`, such as "convection on exterior-*"."""
         return f"{self.kind} on {', '.join(self.where)}"
 
     def bounded(self, name: str) -> Bounded:
-        """Give one of the quantities of the effect with its range."""
+        """Return the quantity in the field `name` with its range."""
         return Bounded(getattr(self, name), self.bounds[name])
 
     @abstractmethod
     def term(self, selection: Selection) -> Term:
-        """Give the term of the effect in the heat equation; `HeatError` if the mesh lacks a patch or region of it."""
+        """Return the effect's term in the heat equation; raise `HeatError` if the mesh lacks one of its parts."""
 
 
 def _checked_names(field: str, names: object) -> tuple[str, ...]:
-    """Return names as a tuple; a single text is refused because its letters would be taken for names."""
+    """Return names as a tuple; raise `HeatError` for a single text, whose letters would be taken for names."""
     listed = tuple(names) if isinstance(names, (tuple, list)) else ()
     if not listed or not all(isinstance(name, str) and name.strip() for name in listed):
         remedy = f'Write {field}=("name",), for example.'
@@ -175,7 +175,7 @@ def _checked_names(field: str, names: object) -> tuple[str, ...]:
 
 @runtime_checkable
 class Conductor(Protocol):
-    """What the solver asks of a material, such as `heat.materials.Material`: two numbers above 0."""
+    """A material as the solver sees it, such as `heat.materials.Material`: two numbers above 0."""
 
     @property
     def conductivity_w_mk(self) -> float:
@@ -190,19 +190,19 @@ class Conductor(Protocol):
 
 @dataclass(frozen=True)
 class HeatProblem:
-    """Heat in a body: conduction, storage, and the effects that the scene calls for.
+    """A body with materials, start and effects; raises `HeatError` if the parts do not fit together.
 
-    rho c dT/dt = div(k grad T) inside, T = T0 at the start; where no effect acts on the boundary it is insulated,
-    k grad T . n = 0.
+    Inside rho c dT/dt = div(k grad T) plus any source, and T = T0 at the start. Where no effect acts, the boundary is
+    insulated: k grad T . n = 0, n being the outward normal.
     """
 
     mesh: TetMesh  # The body
     material: Conductor | Mapping[str, Conductor]
-    """What all of it is made of, or one material per name of a region of the mesh."""
+    """Material of the whole body, or a mapping from the name of each region of the mesh to its material."""
     initial_temperature_c: FloatArray | None = None
-    """Nodal temperature at the start, shape (n,), [degrees Celsius]; None: the mesh's own. A steady solver starts its
-    iterations from it."""
-    effects: tuple[Effect, ...] = ()  # What acts on the body; several may act on one patch
+    """Nodal temperature at the start, shape (n,), [degrees Celsius]; None: that of the mesh. A steady solver starts its
+    iterations from this temperature."""
+    effects: tuple[Effect, ...] = ()  # Effects that act on the body; several may act on one patch
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Direction that points up, for effects that depend on it
 
     def __post_init__(self) -> None:
@@ -223,12 +223,12 @@ class HeatProblem:
 
     @cached_property
     def selection(self) -> Selection:
-        """The named parts of the mesh."""
+        """The patches and regions of the mesh by name, with their geometry."""
         return Selection(self.mesh, self.up)
 
     @property
     def resolution_s(self) -> float:
-        """Longest time between two looks at the effects that tells how they change in between, [s]."""
+        """Longest time between two evaluations of the effects that misses no change, [s]; inf if none is known."""
         return min((e.bounded(name).resolution_s for e in self.effects for name in e.bounds), default=math.inf)
 
     @property
@@ -303,7 +303,7 @@ class HeatProblem:
 
 
 def effect_labels(problem: HeatProblem) -> tuple[str, ...]:
-    """Names of a problem's effects for reports, all different: a second one of the same kind and place is numbered."""
+    """Return the names of the effects for reports, all different: a second effect with the same label gets " (2)"."""
     numbers: dict[str, int] = {}
     for own in (effect.label for effect in problem.effects):
         label, number = own, numbers.get(own, 1)

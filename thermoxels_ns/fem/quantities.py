@@ -1,4 +1,4 @@
-"""Values that physics is made of: one number, or a function of place and time."""
+"""Physical quantities: each is one number, or a function of place and time, with a range of allowed values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from thermoxels_ns.core.errors import HeatError
 
 @dataclass(frozen=True)
 class Places:
-    """Where a quantity is asked for: centroids of boundary triangles or of tetrahedra, or nodes."""
+    """The k places where a quantity is evaluated: centroids of boundary triangles, points in tetrahedra, or nodes."""
 
     points_m: FloatArray  # Positions, shape (k, 3), [m]
     normals: FloatArray  # Outward unit normals of the surface, shape (k, 3); 0 inside the body
@@ -36,26 +36,26 @@ class Varying:
     """
 
     function: Callable[[Places, float], npt.ArrayLike]
-    """Takes the places and the time in seconds since the start; returns one number per place, shape (k,), or one for
-    all."""
-    in_time: bool = True  # Whether the numbers change with time. False: they are asked for once, at the time 0
+    """Function of the places and of the time in seconds since the start; it returns one number per place, shape (k,),
+    or one number for all places."""
+    in_time: bool = True  # True if the numbers change with time; False: they are always those at the time 0
     resolution_s: float = math.inf
-    """Numbers this far apart in time say how they change in between, above 0, [s]; steps that are chosen by their error
-    are no longer. Infinite: nobody knows, and what happens between two such steps is missed."""
+    """Longest time between two evaluations that misses no change, above 0, [s]; no adaptive step is longer. Infinite:
+    this time is not known, and changes within a step are missed."""
 
 
 def tabulated(times_s: npt.ArrayLike, values: npt.ArrayLike) -> Varying:
-    """Make a quantity that changes with time as a table says, in straight lines from entry to entry.
+    """Return a quantity that is interpolated linearly between the entries of a table of times and values.
 
-    It is held at the first and the last entry before and after them. Adaptive steps are no longer than the shortest
-    time between two entries, so that none is stepped over.
+    Before the first entry it has the first value, after the last entry the last value. Adaptive steps are no longer
+    than the shortest time between two entries, so that no entry is stepped over.
 
     Args:
         times_s: Times, ascending, at least two, shape (k,), [s].
-        values: What it is at these times, shape (k,).
+        values: Values of the quantity at these times, shape (k,).
 
     Raises:
-        HeatError: The table is none.
+        HeatError: The times do not ascend, shapes differ, or an entry is no finite number.
 
     >>> tabulated([0.0, 3600.0, 7200.0], [10.0, 20.0, 10.0]).resolution_s
     3600.0
@@ -79,18 +79,18 @@ Quantity: TypeAlias = float | Varying  # One number for all places and times, or
 
 @dataclass(frozen=True)
 class Bounds:
-    """The values that a quantity may have, by its name and unit."""
+    """The range of values that a quantity may have, with the quantity's name and unit for messages."""
 
-    name: str  # Name of the field, for messages
-    unit: str  # Its unit, for messages
-    low: float = -math.inf  # Smallest value
-    high: float = math.inf  # Largest value
-    above_low: bool = False  # Whether `low` itself is refused
-    varies: bool = True  # Whether it may be a `Varying`
-    remedy: str = ""  # What to do instead of a value that is refused; empty: an example in the unit
+    name: str  # Name of the quantity, for messages
+    unit: str  # Unit of the quantity, for messages
+    low: float = -math.inf  # Smallest allowed value
+    high: float = math.inf  # Largest allowed value
+    above_low: bool = False  # True if `low` itself is refused
+    varies: bool = True  # True if the quantity may be a `Varying`
+    remedy: str = ""  # Advice to a user whose value is refused; empty: an example of a value in the unit
 
     def check(self, value: npt.ArrayLike) -> FloatArray:
-        """Return the values as an array if all are finite and in range, else raise `HeatError`."""
+        """Return values as an array of the same shape if all are finite and in range, else raise `HeatError`."""
         try:
             values = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
@@ -103,7 +103,7 @@ class Bounds:
         return values
 
     def check_quantity(self, quantity: Quantity) -> Quantity:
-        """Return a number as a float if it is in range, a `Varying` as it is, and raise `HeatError` for all else."""
+        """Return a number in range as a float, and a `Varying` unchanged; raise `HeatError` for anything else."""
         if isinstance(quantity, Varying) and self.varies:
             return quantity
         if callable(quantity) or isinstance(quantity, (Varying, str)) or np.ndim(quantity) != 0:
@@ -131,28 +131,28 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Bounded:
-    """A quantity with its range, ready to be asked."""
+    """A quantity with its range, which `at` evaluates and checks."""
 
-    quantity: Quantity  # A number or a function
-    bounds: Bounds  # What it may be
+    quantity: Quantity  # A number or a `Varying`
+    bounds: Bounds  # Range of its values
 
     @property
     def in_time(self) -> bool:
-        """Whether the quantity changes with time."""
+        """True if the quantity changes with time."""
         return isinstance(self.quantity, Varying) and self.quantity.in_time
 
     @property
     def unresolved(self) -> bool:
-        """Whether the quantity changes with time and nobody knows how fast."""
+        """True if the quantity changes with time and its `resolution_s` is not known."""
         return self.in_time and math.isinf(self.resolution_s)
 
     @property
     def resolution_s(self) -> float:
-        """How far apart in time numbers may be that say how it changes in between, [s]."""
+        """`Varying.resolution_s` of a quantity that changes with time, [s]; else infinite."""
         return self.quantity.resolution_s if isinstance(self.quantity, Varying) and self.in_time else math.inf
 
     def at(self, places: Places, time_s: float) -> FloatArray:
-        """Compute the quantity at places, shape (k,).
+        """Return the quantity at k places and a time, shape (k,).
 
         Raises:
             HeatError: A function returned the wrong shape, or values out of range.

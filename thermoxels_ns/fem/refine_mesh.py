@@ -13,15 +13,15 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 
 def refine_mesh(mesh: TetMesh) -> TetMesh:
-    """Halve all edges of a mesh; it stays conforming, and the body stays the same.
+    """Return a conforming mesh of the same body with all edges halved: each tetrahedron becomes eight.
 
-    A tetrahedron loses its four corners to children of its own shape. What remains is an octahedron, cut into four
-    along the one of its three diagonals that leaves the smallest largest angle between faces. Where a tetrahedron is
-    one of the six of a cube (Kuhn), so are its children, and no angle becomes obtuse.
+    Cutting off its four corners makes a tetrahedron into four children of the same shape and an octahedron. Of the
+    three diagonals of the octahedron, it is cut into four along that for which the largest angle between faces is
+    smallest. Children of the six tetrahedra of a cube (Kuhn) are such tetrahedra again, so no angle becomes obtuse.
 
-    Nodes keep their numbers; the middles of `mesh_edges` follow. Children inherit regions, tags and patches and
-    stand in the order of their parents; temperatures and colours of new nodes are means, and a new node counts as
-    observed if both ends of its edge are.
+    Nodes keep their numbers; the middles of the edges follow in the order of `mesh_edges`. Children inherit regions,
+    tags and patches and stand in the order of their parents. Temperatures and colours of new nodes are means, and a new
+    node counts as observed if both ends of its edge are observed.
     """
     edges = mesh_edges(mesh.tets, len(mesh.points_m))
     num_nodes, low, high = len(mesh.points_m), edges.smaller_nodes(), edges.other
@@ -53,15 +53,15 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
 
 
 def refined_values(mesh: TetMesh, nodal: FloatArray) -> FloatArray:
-    """Interpolate values of a mesh's nodes to those of the refined one."""
+    """Return values at the nodes of `refine_mesh(mesh)` from `nodal`, the values at the nodes of `mesh`."""
     return np.concatenate([nodal, mesh_edges(mesh.tets, len(mesh.points_m)).midpoints(nodal)])
 
 
-_OPPOSITE = ((4, 9), (6, 8), (7, 5))  # Middles of opposite edges: 4 to 9 are those of `TET_EDGES`
+_OPPOSITE = ((4, 9), (6, 8), (7, 5))  # Pairs of middles of opposite edges; numbers 4 to 9 follow `TET_EDGES`
 
 
 def _children() -> IntArray:
-    """Local nodes (corners, then middles of `TET_EDGES`) of the children for each diagonal, shape (3, 8, 4)."""
+    """Return the local nodes of the 8 children for each of 3 diagonals, shape (3, 8, 4); 4 to 9 are middles."""
     middle = {frozenset(map(int, ends)): 4 + number for number, ends in enumerate(TET_EDGES)}
     corners = [[i if j == i else middle[frozenset((i, j))] for j in range(4)] for i in range(4)]
     place = np.vstack([np.zeros(3), np.eye(3)])
@@ -79,12 +79,12 @@ def _children() -> IntArray:
 _CHILDREN = _children()
 _FACET_CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 """Local nodes of a triangle's children: 0 to 2 are the corners and 3 to 5 the middles of `FACET_EDGES`."""
-_TIE = 1e-9  # Cosines that differ by less are the same
+_TIE = 1e-9  # Cosines that differ by at most this count as equal
 
 
 @kernel
 def _choose_diagonals(points, local, children, chosen):
-    """Finds the diagonal whose four children have the largest smallest cosine of an angle between faces."""
+    """Set `chosen` of each tetrahedron to the diagonal for which the largest angle between faces is smallest."""
     normal = np.empty((4, 3))
     side = np.empty((3, 3))
     for t in range(len(local)):
@@ -108,7 +108,7 @@ def _choose_diagonals(points, local, children, chosen):
                     for x in range(3):
                         normal[i, x] /= length
                     for j in range(i):
-                        # Inward normals: the angle between the faces is what they lack to a half turn.
+                        # The angle between two faces is 180 degrees less the angle between their inward normals.
                         cosine = 0.0
                         for x in range(3):
                             cosine -= normal[i, x] * normal[j, x]

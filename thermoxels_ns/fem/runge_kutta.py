@@ -13,27 +13,27 @@ from thermoxels_ns.fem.system import HeatSystem
 
 Vector = FloatArray
 
-_KEPT_EQUATIONS = 2  # Implicit equations, one for each length of a stage, whose matrices are kept
-_SAME_LENGTH = 1e-12  # Relative difference up to which two lengths are one
+_KEPT_EQUATIONS = 2  # Number of implicit equations that are kept with their matrices, each for one length of a stage
+_SAME_LENGTH = 1e-12  # Relative difference up to which two lengths of a stage count as equal
 
 
 @dataclass(frozen=True)
 class Scheme:
-    """Coefficients of a scheme.
+    """A diagonally implicit Runge-Kutta scheme, given by its coefficients a, b and c.
 
-    A scheme is its table of coefficients (Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.6).
-    Each stage i solves M (T_i - T_n) = dt * sum_j a_ij F(T_j), F being the net heat flow into the nodes, and M (T_n+1 -
-    T_n) = dt * sum_j b_j F(T_j): the heat that flows in during a step is the sum of the stages' flows, so the balance
-    of heat closes whatever the step length.
+    Notation is that of Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.6. Each stage i solves
+    M (T_i - T_n) = dt * sum_j a_ij F(T_j), F being the net heat flow into the nodes; the step ends with M (T_n+1 - T_n)
+    = dt * sum_j b_j F(T_j). So the heat stored in a step is the weighted sum of the stages' flows, and the balance of
+    heat closes at any step length.
     """
 
-    name: str
-    order: int  # Order of the error at the end as a power of the step length
+    name: str  # Name of the scheme, for messages
+    order: int  # Order p: at a given time the error is proportional to the step length to the power p
     nodes: tuple[float, ...]  # c: time of each stage as a share of the step
     weights: tuple[tuple[float, ...], ...]
-    """a: lower triangle, one row per stage; the last row is b. A stage whose row is all 0 is the start."""
+    """a, lower triangular, a row per stage; the last row is b. A stage whose row is all 0 is the start of the step."""
     estimate: tuple[float, ...] | None = None
-    """Weights of the heat flows at the start and of all stages in a scheme one order higher; None: no estimate."""
+    """Weights of a scheme one order higher for the flows at the start and in each stage; None: no error estimate."""
 
     @property
     def ends(self) -> tuple[float, ...]:
@@ -42,9 +42,9 @@ class Scheme:
 
 
 def _sdirk2() -> Scheme:
-    """Alexander's two-stage scheme (SIAM Journal on Numerical Analysis 14, 1977), gamma = 1 - 1 / sqrt(2), L-stable.
+    """Return Alexander's L-stable two-stage scheme (SIAM J. Numer. Anal. 14, 1977), gamma = 1 - 1 / sqrt(2).
 
-    The estimate adds the flow at the start and meets the conditions of third order for constant loads.
+    Its estimate also uses the flow at the start, and is of third order if loads are constant.
     """
     gamma = 1.0 - 1.0 / math.sqrt(2.0)
     second = (1.0 - gamma) * gamma + gamma
@@ -55,40 +55,40 @@ def _sdirk2() -> Scheme:
 
 
 BACKWARD_EULER = Scheme("backward Euler", 1, (1.0,), ((1.0,),))
-"""First order. With lumped masses and non-obtuse tetrahedra no temperature ever leaves the range of what it came from
-and of what surrounds it, however long the step."""
+"""Scheme of first order. With lumped masses and non-obtuse tetrahedra no temperature leaves the range of the start and
+of the surroundings, however long the step."""
 CRANK_NICOLSON = Scheme("Crank-Nicolson", 2, (0.0, 1.0), ((0.0, 0.0), (0.5, 0.5)))
-"""Second order, but it does not damp: after a jump, long steps overshoot by up to the jump itself. No command uses it:
-it is the reference that the published NAFEMS benchmark T3 is compared with."""
+"""Scheme of second order without damping: after a jump, long steps overshoot by up to the jump itself. No command uses
+this scheme; tests compare it with the published NAFEMS benchmark T3."""
 SDIRK2 = _sdirk2()
-"""Second order and L-stable: it damps what a step is too long to follow. Very long steps may overshoot by 1 or 2 % of a
-jump."""
+"""Scheme of second order, L-stable: changes too fast for the step length are damped. Very long steps may overshoot by
+1 or 2 % of a jump."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """The outcome of a step; converged: all stages were solved; the status is a sentence."""
+    """The outcome of `RungeKutta.step`."""
 
-    relative_k: Vector  # Temperatures at its end, relative to the system's reference, shape (n,), [K]
-    group_heat_w: Vector  # Mean heat flow into the body of each group of the system, shape (g,), [W]
-    iterations: int
-    newton_iterations: int
+    relative_k: Vector  # Temperatures at the end of the step, relative to the system's reference, shape (n,), [K]
+    group_heat_w: Vector  # Mean heat flow into the body of each of the system's `groups`, shape (g,), [W]
+    iterations: int  # Iterations of the linear solver in all stages
+    newton_iterations: int  # Steps of Newton's method in all stages; 0 without radiation
     error_k: float
     """Estimated largest error that the step made, [K]; NaN if the scheme has no estimate or none was asked for."""
-    converged: bool
-    status: str
-    unbalanced_w: float = 0.0  # Heat that is unbalanced at all nodes in its stages, [W]
+    converged: bool  # True if all stages were solved; if False, `relative_k` is useless and heat flows are NaN
+    status: str  # Sentence on the solver in the last stage
+    unbalanced_w: float = 0.0  # Sum of the heat left unbalanced in the stages, [W]
 
 
 class RungeKutta:
-    """Takes steps of any length; matrices and preconditioners of the lengths used last are kept."""
+    """Takes single steps of any length with a scheme; matrices of the last used lengths are kept."""
 
     def __init__(self, system: HeatSystem, scheme: Scheme, *, relative_tolerance: float) -> None:
         self.scheme, self._system, self._relative_tolerance = scheme, system, relative_tolerance
         self._equations: dict[tuple[float, float], ImplicitEquation] = {}
 
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
-        """Take one step from `start_k`, shape (n,), [K], relative to the reference; estimate its error if asked."""
+        """Take one step from `start_k`, (n,), [K], relative to the reference; `Step.converged` tells if that worked."""
         system, scheme = self._system, self.scheme
         states: list[Vector] = []
         inner_w: list[Vector] = []
@@ -118,7 +118,7 @@ class RungeKutta:
         return Step(states[-1], heat_w, iterations, newton_iterations, error_k, True, status, unbalanced_w)
 
     def _heat(self, start_k: Vector, states: list[Vector], time_s: float, step_s: float) -> Vector:
-        """Mean heat flow of each group: the stages' flows, and what the balance of the fixed nodes leaves."""
+        """Return each group's mean heat flow, [W]; fixed nodes get the heat that balances storage and other flows."""
         system, scheme = self._system, self.scheme
         if not system.groups:
             return np.zeros(0)
@@ -131,7 +131,7 @@ class RungeKutta:
         return np.concatenate([flows, fixed.shares @ kept_w])
 
     def _error(self, start_k: Vector, inner_w: list[Vector], time_s: float, step_s: float) -> float:
-        """Largest error by the scheme of the next order; sums over pieces come from what they exchange."""
+        """Return the largest error, [K], from the scheme of the next order; sums over pieces leave conduction out."""
         system, scheme = self._system, self.scheme
         assert scheme.estimate is not None
         implicit = scheme.weights[-1][-1]
@@ -147,7 +147,7 @@ class RungeKutta:
 
     def _equation(self, time_s: float, step_s: float) -> ImplicitEquation:
         time_s = time_s if self._system.matrix_in_time else 0.0
-        # Lengths that are differences of times differ in the last digits.
+        # Lengths computed as differences of times differ in the last digits.
         alike = (
             key for key in self._equations if key[0] == time_s and math.isclose(key[1], step_s, rel_tol=_SAME_LENGTH)
         )
@@ -162,7 +162,7 @@ class RungeKutta:
 
 
 def _weighted(weights: list[float], vectors: list[Vector]) -> Vector | None:
-    """Weighted sum, None of nothing."""
+    """Return the weighted sum of vectors; None if there are none."""
     total: Vector | None = None
     for weight, vector in zip(weights, vectors):
         total = weight * vector if total is None else total + weight * vector

@@ -16,17 +16,17 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas, facet_normals
 
 
 class Selection:
-    """The named parts of a mesh and their geometry."""
+    """A mesh's patches and regions, which effects name, and the geometry of its f boundary triangles."""
 
     def __init__(self, mesh: TetMesh, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> None:
-        """Check the tags of a mesh (`HeatError`); `up` is a unit vector, which functions of place are told."""
+        """Check the tags of a mesh (`HeatError` if they do not fit); `up` is a unit vector, passed on in `Places`."""
         self.mesh, self.up = mesh, up
         self._check()
         tags = mesh.boundary
         self.patch_names: tuple[str, ...] = ("boundary",) if tags is None else tags.patch_names
         """Names of the patches; a mesh without tags has one, "boundary"."""
         self.facet_patch: IntArray = np.zeros(len(mesh.facets), np.int64) if tags is None else tags.patch
-        """Index into `patch_names`, shape (f,)."""
+        """Patch of each boundary triangle, as an index into `patch_names`, shape (f,)."""
 
     @cached_property
     def facet_area_m2(self) -> FloatArray:
@@ -39,20 +39,20 @@ class Selection:
         return facet_normals(self.mesh.points_m, self.mesh.facets)
 
     def facets(self, patterns: tuple[str, ...]) -> IntArray:
-        """Number the boundary triangles of the patches that match any pattern; each must match one, or `HeatError`."""
+        """Return the numbers of the triangles of patches that match any pattern; `HeatError` if a pattern has none."""
         return np.flatnonzero(_matching("patches", patterns, self.patch_names)[self.facet_patch])
 
     def tets(self, patterns: tuple[str, ...]) -> IntArray:
-        """Number the tetrahedra of the regions that match any pattern; each must match one, or `HeatError`."""
+        """Return the numbers of the tetrahedra of regions that match any pattern; `HeatError` if a pattern has none."""
         return np.flatnonzero(_matching("regions", patterns, self.mesh.region_names)[self.mesh.region])
 
     def facet_places(self, facets: IntArray) -> Places:
-        """Give the centroids of boundary triangles."""
+        """Return the centroids of boundary triangles as places with outward normals."""
         centroids = self.mesh.points_m[self.mesh.facets[facets]].mean(axis=1)
         return Places(centroids, self.facet_normal[facets], self.up)
 
     def tet_places(self, tets: IntArray) -> Places:
-        """Give the centroids of tetrahedra."""
+        """Return the centroids of tetrahedra as places without normals."""
         centroids = self.mesh.points_m[self.mesh.tets[tets]].mean(axis=1)
         return Places(centroids, np.zeros_like(centroids), self.up)
 
@@ -75,7 +75,7 @@ def _check_indices(name: str, indices: IntArray, count: int, remedy: str) -> Non
 
 
 def matching_names(names: Collection[str], pattern: str) -> list[str]:
-    """Names that a pattern means; one without `*`, `?` and `[` is a name itself, which only has to be there.
+    """Return the names that match a pattern; without `*`, `?` and `[` the pattern matches only the name equal to it.
 
     >>> [matching_names(["wall-7", "wall"], pattern) for pattern in ("wall-7", "wall*", "Wall")]
     [['wall-7'], ['wall-7', 'wall'], []]
@@ -86,7 +86,7 @@ def matching_names(names: Collection[str], pattern: str) -> list[str]:
 
 
 def _matching(field: str, patterns: tuple[str, ...], names: tuple[str, ...]) -> BoolArray:
-    """Mark the names that match any pattern; each pattern must match one. Letters count as upper and lower case."""
+    """Return True for each name that matches any pattern, case-sensitively; `HeatError` if a pattern matches none."""
     chosen = np.zeros(len(names), dtype=bool)
     for pattern in patterns:
         matches = matching_names(names, pattern)

@@ -1,4 +1,4 @@
-"""What a heat computation returns, and its temperatures on a mesh that can be shown."""
+"""Solutions of heat problems, and their temperatures on a mesh that can be shown."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Vector = FloatArray
 
 @dataclass
 class Assembled:
-    """Forms that were assembled, by kind; what a problem does not call for has no entry.
+    """Counts and times of the forms that were assembled, by kind; a kind that was not assembled has no entry.
 
     >>> assembled = Assembled()
     >>> with assembled.form("stiffness"):
@@ -38,7 +38,7 @@ class Assembled:
 
     @contextmanager
     def form(self, kind: str) -> Iterator[None]:
-        """Count what is assembled inside."""
+        """Return a context that counts and times the assembly of one form of this kind."""
         start = time.perf_counter()
         yield
         self.seconds[kind] = self.seconds.get(kind, 0.0) + time.perf_counter() - start
@@ -49,71 +49,71 @@ class Assembled:
 class EffectHeat:
     """Heat that one effect brings into the body."""
 
-    effect: str  # What it is and where it acts
+    effect: str  # Label of the effect, from `effect_labels`
     heat_w: FloatArray
     """Mean heat flow into the body during each interval, as the scheme evaluates it, shape (s,), [W]; negative where
     heat leaves. A steady state has one interval."""
-    group_names: tuple[str, ...]  # Names of the patches, or for a source of the regions, that it acts on
-    group_heat_w: FloatArray  # The same for each of them, shape (s, g), [W]
+    group_names: tuple[str, ...]  # Names of the patches, or for a source of the regions, that the effect acts on
+    group_heat_w: FloatArray  # `heat_w` of each patch or region alone, shape (s, g), [W]
 
 
 @dataclass(frozen=True)
 class FacetHeat:
     """Heat that one effect brings into the body through single boundary triangles, at one moment."""
 
-    effect: str
+    effect: str  # Label of the effect, from `effect_labels`
     facets: IntArray  # Numbers of the triangles, shape (k,)
-    heat_w: FloatArray  # Heat flow into the body through each, shape (k,), [W]
+    heat_w: FloatArray  # Heat flow into the body through each triangle, shape (k,), [W]
 
 
 @dataclass(frozen=True)
 class ErrorSize:
-    """Errors of a solution."""
+    """Sizes of the errors of a solution."""
 
     temperature_k: float  # Largest error of the temperature at the nodes of the given mesh, [K]
     heat_flow: float
     """Largest error of the mean heat flow of an effect, as a share of all heat that flows through the body."""
 
     def describe(self) -> str:
-        """Describe both errors in words."""
+        """Return both errors as text, such as "0.05 K and 1 % of the heat flow"."""
         return f"{self.temperature_k:.2g} K and {100.0 * self.heat_flow:.2g} % of the heat flow"
 
 
 @dataclass(frozen=True)
 class HeatSolution:
-    """Temperatures over time and the account of the heat."""
+    """Temperatures of n nodes over s intervals of time, and the account of the heat."""
 
     times_s: FloatArray  # Time of each state, the start first, shape (s + 1,), [s]
     temperature_c: FloatArray
-    """Nodal temperatures, shape (s + 1, n), [degrees Celsius]. Surfaces with a fixed temperature have it from the
-    start."""
+    """Nodal temperatures, shape (s + 1, n), [degrees Celsius]. Nodes of fixed temperature have this temperature already
+    at the start."""
     heat_w: FloatArray
-    """Net heat flow into the body during each interval, measured as the change of its heat content over it,
-    shape (s,), [W], positive into the body. Behind an insulated boundary it is 0 up to round-off."""
+    """Mean net heat flow into the body in each interval, the change of the heat content over the interval's length,
+    shape (s,), [W]. In a body with insulated boundary and without sources the flow is 0 up to round-off."""
     heat_content_j: FloatArray
     """Heat content above absolute zero at each time, 1^T M T with T in kelvin, shape (s + 1,), [J]."""
     energy_residual: float
-    """Largest change of the heat content that no heat flow accounts for, relative to the heat content or to all heat
-    exchanged, whichever is more."""
+    """Largest change of the heat content that no heat flow accounts for, relative to the heat content at the start or
+    to all heat exchanged, whichever is more."""
     energy_residual_of_spread: float
     """The same change relative to the heat stored in the initial differences, sum m_i |T_i - mean T|, plus all heat
-    exchanged: the stricter measure. 0 where nothing is unaccounted for."""
-    status: str
+    exchanged, which makes the measure stricter; 0 if heat flows account for every change."""
+    status: str  # Sentences on how the steps converged
     iterations: IntArray  # Iterations of the linear solver in each interval, shape (s,)
     effects: tuple[EffectHeat, ...] = ()  # Heat that each effect of the problem brought, in the order of the problem
     newton_iterations: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
-    steps: int = 0
+    steps: int = 0  # Number of steps
     step_lengths_s: tuple[FloatArray, ...] = ()  # Lengths of the steps in each interval, [s]
     time_error_k: float = float("nan")
-    """Estimated largest error of the steps at any temperature, [K]: of adaptive ones their estimates added up, of equal
-    ones by steps of twice the length, if asked for; else NaN."""
+    """Estimated largest error that the steps make in any temperature, [K]. Adaptive steps: the sum of their estimates;
+    equal steps: from steps of twice the length, if asked for; else NaN."""
     unbalanced_w: float = 0.0  # Most heat that a step left unbalanced at all nodes, round-off included, [W]
     overshoot_k: float = 0.0
-    """How far any temperature left the range of the start and of the surroundings, [K]; 0 up to 0.01 K."""
+    """Most by which a temperature left the range of the start and of the surroundings, [K]; 0 if at most 0.01 K."""
     last_facet_heat: tuple[FacetHeat, ...] = ()
-    """Heat flow of each effect through boundary triangles at the end; fixed nodes count as if they stored nothing."""
-    assembled: Assembled = field(default_factory=Assembled)
+    """Heat flow of each effect through boundary triangles at the end, as if fixed nodes stored nothing."""
+    assembled: Assembled = field(default_factory=Assembled)  # Counts and times of the assembly
 
 
 @dataclass(frozen=True)
@@ -122,26 +122,26 @@ class SteadySolution:
 
     temperature_c: FloatArray  # Temperatures of the mesh's nodes, shape (n,), [degrees Celsius]
     effects: tuple[EffectHeat, ...]
-    """Heat that each effect of the problem brings, in the order of the problem; they add up to 0."""
-    energy_residual: float  # Sum of all heat flows, which should be 0, relative to the sum of their sizes
-    status: str
-    iterations: int
+    """Heat that each effect of the problem brings, in the order of the problem; the heat flows add up to 0."""
+    energy_residual: float  # Half the size of the sum of all heat flows, which should be 0, over the heat that flows
+    status: str  # Sentences on how the iterations converged
+    iterations: int  # Iterations of the linear solver
     newton_iterations: int  # Steps of Newton's method; 0 without radiation
-    assembled: Assembled  # What was assembled
+    assembled: Assembled  # Counts and times of the assembly
     edge_temperature_c: FloatArray = field(default_factory=lambda: np.zeros(0))
     """Temperatures of the middles of the mesh's edges, in the order of `mesh_edges`, shape (e,), [degrees Celsius];
     empty with linear tetrahedra."""
     unbalanced_w: float = 0.0
-    """Heat that is unbalanced at all nodes, round-off included, [W]; heat flows are uncertain by no more."""
-    overshoot_k: float = 0.0  # How far any temperature is out of the range of the surroundings, [K]; 0 up to 0.01 K
+    """Heat that is unbalanced at all nodes, round-off included, [W]; no heat flow is more uncertain than this."""
+    overshoot_k: float = 0.0  # Most by which a temperature is out of the surroundings' range, [K]; 0 if at most 0.01 K
     last_facet_heat: tuple[FacetHeat, ...] = ()  # Heat flow of each effect through boundary triangles
-    error: ErrorSize | None = None  # Estimated errors of the mesh, see `tolerance.steady_error`; None: not estimated
+    error: ErrorSize | None = None  # Errors of the mesh as `tolerance.steady_error` estimates them; None: no estimate
 
 
 def heat_by_effect(
     effects: Sequence[str], groups: Iterable[tuple[str, str]], group_heat_w: FloatArray
 ) -> tuple[EffectHeat, ...]:
-    """Sort heat flows, shape (s, g), [W], of groups, each an effect and a patch or region, by effect."""
+    """Return the heat of each of `effects` from that of groups (effect, patch or region), shape (s, g), [W]."""
     columns: dict[str, list[tuple[int, str]]] = {effect: [] for effect in effects}
     for number, (owner, name) in enumerate(groups):
         columns[owner].append((number, name))
@@ -154,18 +154,18 @@ def heat_by_effect(
 
 Solution: TypeAlias = HeatSolution | SteadySolution  # What either solver returns
 
-_CHILD_FACETS = 4
-_EQUAL = 1e-9  # Temperatures that differ by less than this share of the absolute temperature are equal
+_CHILD_FACETS = 4  # Triangles into which `refine_mesh` cuts a triangle
+_EQUAL = 1e-9  # Temperatures that differ by at most this share of the absolute temperature count as equal
 
 
 def mean_flows_w(solution: Solution) -> dict[str, float]:
-    """Give the mean heat flow into the body of each effect over all times, [W]."""
+    """Return the mean heat flow into the body over all times by effect, [W]."""
     lengths = np.diff(solution.times_s) if isinstance(solution, HeatSolution) else np.ones(1)
     return {heat.effect: float(lengths @ heat.heat_w / lengths.sum()) for heat in solution.effects}
 
 
 def share_of_heat(heat_w: float, solution: Solution) -> float:
-    """Give a heat flow as a share of all heat that flows through the body on average; 0 where nothing flows."""
+    """Return a heat flow as a share of all heat that flows through the body on average; 0 if temperatures are equal."""
     level_k = float(np.abs(solution.temperature_c).max()) + ZERO_CELSIUS_K
     if heat_w == 0.0 or float(np.ptp(solution.temperature_c)) <= _EQUAL * level_k:
         return 0.0
@@ -175,21 +175,21 @@ def share_of_heat(heat_w: float, solution: Solution) -> float:
 
 @dataclass(frozen=True)
 class SolutionNodes:
-    """A mesh with a temperature at every node, and whether the tetrahedra that were solved are quadratic."""
+    """All temperatures of a solution on a mesh of linear tetrahedra with a node for each unknown."""
 
     mesh: TetMesh
-    """The mesh that was solved; of quadratic tetrahedra with all edges halved, for their unknowns on edges."""
+    """The mesh that was solved; for quadratic tetrahedra refined once, which puts a node at the middle of each edge."""
     times_s: Vector  # Times, shape (s,), [s]; 0 alone for a steady state
     states_c: Vector  # Nodal temperatures, shape (s, n), [degrees Celsius]
-    quadratic: bool
+    quadratic: bool  # True if the tetrahedra that were solved are quadratic
 
     def of_facets(self, values: npt.NDArray) -> npt.NDArray:
-        """Give values of the boundary triangles that were solved to those of the mesh, shape (f, ...)."""
+        """Return `values`, given per boundary triangle that was solved, per triangle of `mesh`, shape (f, ...)."""
         return np.repeat(values, _CHILD_FACETS, axis=0) if self.quadratic else values
 
 
 def solution_nodes(problem: HeatProblem, solution: Solution) -> SolutionNodes:
-    """Put a solution on a mesh of linear tetrahedra without losing any of its temperatures."""
+    """Return all temperatures of a solution of `problem` on a mesh of linear tetrahedra."""
     if isinstance(solution, HeatSolution):
         return SolutionNodes(problem.mesh, solution.times_s, solution.temperature_c, False)
     if not len(solution.edge_temperature_c):

@@ -29,29 +29,29 @@ Vector = FloatArray
 Numbers = IntArray
 
 _CORNERS = (np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.full(3, 1.0 / 6.0))
-"""Quadrature at the corners of the reference triangle."""
-_EXACT = 4  # Degree up to which integrals over triangles are exact otherwise: products of quadratic functions
-_BLOCK = 2_000  # Tetrahedra that scikit-fem sees at a time: its arrays, 4 kB each, then fit into a processor's cache
+"""Quadrature at the corners of the reference triangle, for linear tetrahedra: points and weights."""
+_EXACT = 4  # Degree of exact integrals over triangles of quadratic tetrahedra: products of two quadratic functions
+_BLOCK = 2_000  # Tetrahedra assembled at a time, so that scikit-fem's arrays, 4 kB per tetrahedron, fit into a cache
 
 
 @BilinearForm
 def conduction(u, v, w):
-    """k grad u . grad v, [W / K]."""
+    """Return the integrand k grad u . grad v of the stiffness; `w.conductivity` is k, [W / (m K)]."""
     return w.conductivity * dot(u.grad, v.grad)
 
 
 class Space:
-    """Unknowns at the mesh's nodes and, of quadratic tetrahedra, at the middles of its edges after them.
+    """The n unknowns of a body: one per node of the mesh, then, for quadratic tetrahedra, one per middle of an edge.
 
-    Matrices of quadratic tetrahedra come from scikit-fem, of linear ones from the compiled loops of `p1_kernels`.
-    Convection and radiation are evaluated at the nodes of linear tetrahedra, which keeps temperatures in the range of
-    the surroundings, and integrated over the triangles of quadratic ones. Quadratic tetrahedra are for steady states:
-    lumping their mass would give the corners negative masses, and with the consistent mass temperatures leave their
-    range in steps below about h^2 / diffusivity.
+    Scikit-fem assembles the matrices of quadratic tetrahedra, `p1_kernels` those of linear ones. Convection and
+    radiation are evaluated at the nodes of linear tetrahedra, which keeps temperatures in the range of the
+    surroundings, and are integrated over the triangles of quadratic ones. Quadratic tetrahedra serve steady states
+    only: lumping their mass would make the masses of corners negative, and with the consistent mass temperatures leave
+    their range in steps below about h^2 / diffusivity.
     """
 
     def __init__(self, selection: Selection, *, order: int = 1) -> None:
-        """Choose linear (order 1) or quadratic (order 2) tetrahedra."""
+        """Choose linear (`order` 1) or quadratic (2) tetrahedra; raises `HeatError` for any other order."""
         if order not in (1, 2):
             remedy = "Use 1 for linear tetrahedra or 2 for quadratic ones."
             raise HeatError("order", expected="1 or 2", got=repr(order), remedy=remedy)
@@ -60,12 +60,12 @@ class Space:
 
     @cached_property
     def edges(self) -> MeshEdges:
-        """The edges of the mesh."""
+        """The edges of the mesh, found when first asked for."""
         return mesh_edges(self.selection.mesh.tets, len(self.selection.mesh.points_m))
 
     @property
     def num_nodes(self) -> int:
-        """Number of unknowns."""
+        """Number of unknowns, n."""
         return len(self.selection.mesh.points_m) + (len(self.edges.other) if self.order == 2 else 0)
 
     @property
@@ -74,15 +74,15 @@ class Space:
         return self.from_mesh_nodes(self.selection.mesh.points_m)
 
     def from_mesh_nodes(self, nodal: Vector) -> Vector:
-        """Give unknowns what is linear between the mesh's nodes, shape (n, ...)."""
+        """Return values at the unknowns, shape (n, ...), from values at the mesh's nodes; edges get means."""
         return nodal if self.order == 1 else np.concatenate([nodal, self.edges.midpoints(nodal)])
 
     def tet_nodes(self) -> Numbers:
-        """Nodes of each tetrahedron, corners first, then the middles of `TET_EDGES`, shape (t, m)."""
+        """Return the unknowns of each tetrahedron, corners first, then the middles of `TET_EDGES`, shape (t, m)."""
         return self._element_nodes(self.selection.mesh.tets, TET_EDGES)
 
     def facet_nodes(self, facets: Numbers) -> Numbers:
-        """Nodes of boundary triangles, corners first, then the middles of `FACET_EDGES`, shape (k, m)."""
+        """Return the unknowns of k boundary triangles: corners, then the middles of `FACET_EDGES`, shape (k, m)."""
         return self._element_nodes(self.selection.mesh.facets[facets], FACET_EDGES)
 
     def _element_nodes(self, corners: Numbers, ends: Numbers) -> Numbers:
@@ -91,16 +91,16 @@ class Space:
         return np.concatenate([corners, len(self.selection.mesh.points_m) + self.edges.numbers(corners, ends)], axis=1)
 
     def stiffness(self, conductivity_w_mk: Vector) -> sparse.csr_matrix:
-        """K, entries integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]; one conductivity per tetrahedron."""
+        """Return K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]; the conductivity has shape (t,)."""
         mesh = self.selection.mesh
         if self.order == 1:
             return stiffness_matrix(mesh.points_m, mesh.tets, conductivity_w_mk, edges=self.edges)
         return self.assembled(conduction, 2, conductivity=conductivity_w_mk)
 
     def assembled(self, form: BilinearForm, degree: int, **tet_values: Vector) -> sparse.csr_matrix:
-        """Assemble a form by scikit-fem, symmetric bit for bit.
+        """Return the matrix of a form, (n, n), assembled by scikit-fem and symmetric bit for bit.
 
-        `degree` is that of the polynomials; parameters have shape (t,).
+        Quadrature is exact for polynomials of `degree`; `tet_values` are parameters of the form, each of shape (t,).
         """
         points_m, tets, nodes = self.selection.mesh.points_m, self.selection.mesh.tets, self.tet_nodes()
         parts = []
@@ -124,10 +124,10 @@ class Space:
         return sparse.csr_matrix(upper + sparse.triu(upper, 1, format="csr").T)
 
     def surface(self, facets: Numbers) -> Basis:
-        """Boundary triangles as a scikit-fem basis whose unknowns are the body's.
+        """Return a scikit-fem basis on boundary triangles, whose unknowns are those of the body.
 
-        Only values are integrated over it, never gradients. So each triangle may lie in a plane of its own, as a right
-        triangle of the area that it stands for.
+        Only values are integrated over this basis, never gradients. So each triangle may be replaced by a right
+        triangle of the same area in a plane of its own.
         """
         leg = np.sqrt(2.0 * np.maximum(self.selection.facet_area_m2[facets], np.finfo(np.float64).tiny))
         none = np.zeros_like(leg)
@@ -141,7 +141,7 @@ class Space:
         return basis
 
     def source_points(self, tets: Numbers) -> tuple[Places, Vector]:
-        """Places where sources in tetrahedra are asked, those of one after the other, and the volume of each, [m3]."""
+        """Return the places where sources are evaluated, q per tetrahedron, and their volumes, shape (k q,), [m3]."""
         points, weights = self._source_rule
         barycentric = np.concatenate([1.0 - points.sum(axis=0, keepdims=True), points])
         corners = self.selection.mesh.points_m[self.selection.mesh.tets[tets]]
@@ -150,7 +150,7 @@ class Space:
         return Places(places, np.zeros_like(places), self.selection.up), volumes
 
     def source_load(self, tets: Numbers, point_w: Vector) -> Vector:
-        """Spread heat at the points of `source_points` over the nodes, shape (n,), [W]."""
+        """Spread the heat at the points of `source_points`, shape (k q,), [W], over the nodes, shape (n,), [W]."""
         points, weights = self._source_rule
         nodes = self.tet_nodes()[tets].T
         shapes = np.stack([self.element.lbasis(points, i)[0] * np.ones(len(weights)) for i in range(len(nodes))])
@@ -159,17 +159,17 @@ class Space:
 
     @property
     def _source_rule(self) -> tuple[Vector, Vector]:
-        """Points and weights that integrate polynomials of the elements' degree exactly."""
+        """Points and weights in the reference tetrahedron that are exact for polynomials of degree `order`."""
         return get_quadrature(RefTet, self.order)
 
     def tet_volumes_m3(self, tets: Numbers) -> Vector:
-        """Volumes of tetrahedra, shape (k,), [m3]."""
+        """Return the volumes of k tetrahedra, shape (k,), [m3]."""
         corner = self.selection.mesh.points_m[self.selection.mesh.tets[tets]]
         side = corner[:, 1:] - corner[:, :1]
         return np.einsum("ti,ti->t", side[:, 0], np.cross(side[:, 1], side[:, 2])) / 6.0
 
     def node_places(self, nodes: Numbers) -> Places:
-        """Give the positions of nodes, with the mean normal of the boundary around them."""
+        """Return the positions of nodes, each with the mean normal of the boundary around the node (0 inside)."""
         total = self._normals[nodes]
         length = np.sqrt(np.einsum("ki,ki->k", total, total))[:, None]
         normals = np.divide(total, length, out=np.zeros_like(total), where=length > 0.0)
@@ -177,7 +177,7 @@ class Space:
 
     @cached_property
     def _normals(self) -> Vector:
-        """Sums of the normals around each node by area, shape (n, 3), [m2]."""
+        """Sum over the boundary triangles around each node of normal times area, shape (n, 3), [m2]."""
         selection = self.selection
         owners = self.facet_nodes(np.arange(len(selection.mesh.facets)))
         weighted = np.repeat(selection.facet_normal * selection.facet_area_m2[:, None], owners.shape[1], axis=0)
@@ -185,17 +185,17 @@ class Space:
 
 
 def _dofs(mesh: MeshTet | MeshTri, linear: ElementTetP1 | ElementTriP1, nodes: Numbers, count: int) -> Dofs:
-    """Numbers of unknowns in scikit-fem's terms, but ours: its own search for edges takes ten times as long."""
+    """Return our numbers of unknowns, `nodes`, as scikit-fem's `Dofs`: its own search for edges is ten times slower."""
     dofs = Dofs(mesh, linear)
     dofs.element_dofs, dofs.N = np.ascontiguousarray(nodes.T, dtype=np.int32), count
     return dofs
 
 
 def sums_by_number(numbers: Numbers, values: npt.NDArray, count: int) -> Vector:
-    """Add up values that have the same number; the sums of the numbers 0 to count - 1.
+    """Return the sum of the values that have each of the numbers 0 to count - 1, shape (count,).
 
     >>> sums_by_number(np.array([2, 0, 2]), np.array([1.0, 5.0, 3.0]), 4).tolist()
     [5.0, 0.0, 4.0, 0.0]
     """
-    # Without values, numpy counts in whole numbers.
+    # `np.bincount` of empty arrays returns integers, hence the conversion.
     return np.bincount(numbers, values, count).astype(np.float64, copy=False)

@@ -1,4 +1,4 @@
-"""Steady states: where heat flow balances at every node, without steps in time."""
+"""Steady states: temperatures at which the heat flow balances at every node, found without steps in time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from thermoxels_ns.fem.system import HeatSystem
 
 Vector = FloatArray
 
-OVERSHOOT_K = 0.01  # How far out of its range a temperature may be without a word, [K]
+OVERSHOOT_K = 0.01  # Distance out of its range up to which a temperature is not reported, [K]
 
 
 def solve_steady(
@@ -23,21 +23,21 @@ def solve_steady(
     order: int = 1,
     relative_tolerance: float = 1e-12,
 ) -> SteadySolution:
-    """Find the temperatures at which the effects of a problem balance, div(k grad T) + s = 0.
+    """Find the temperatures at which the effects of a problem balance: div(k grad T) + s = 0, s being a source.
 
     With linear tetrahedra without obtuse angles no temperature leaves the range of the surroundings, unless a flux or
-    source drives it out. Where one does leave it, the status says by how much.
+    source drives it out. If a temperature leaves this range without such a cause, the status says by how much.
 
     Args:
-        problem: Body, materials and effects, those that change with time as at the start. Its initial temperatures are
-            where iterations start.
+        problem: Body, materials and effects; effects that change with time act as at the time 0. Iterations start
+            from the initial temperatures.
         order: 1 for linear tetrahedra; 2 for quadratic ones, which have eight times as many unknowns and an error that
             falls with the cube of the mesh size where the solution is smooth, but may overshoot the surroundings.
-        relative_tolerance: Of the linear solver, and of Newton's method if there is radiation.
+        relative_tolerance: Relative tolerance of the linear solver, and of Newton's method if there is radiation.
 
     Raises:
-        HeatError: A piece of the body exchanges heat with nothing whose temperature is known, two effects fix one node
-            differently, or the solver does not converge.
+        HeatError: A connected piece of the body has neither convection, radiation nor a fixed temperature, two effects
+            fix one node differently, the solver does not converge, or a temperature is below absolute zero.
     """
     system = HeatSystem(problem, order=order)
     _check_held(system)
@@ -67,8 +67,8 @@ def solve_steady(
 
 
 def _overshoot(system: HeatSystem, relative_k: Vector) -> tuple[float, str]:
-    """By how much temperatures are out of the range of the surroundings, [K], and a sentence on it, or nothing."""
-    low, high = system.surroundings_k(0.0)  # a steady state does not know its start
+    """Return how far temperatures leave the range of the surroundings, [K], and a sentence on this; else (0, "")."""
+    low, high = system.surroundings_k(0.0)  # a steady state does not depend on its start
     beyond_k = np.maximum(low - relative_k, relative_k - high)
     outside = int(np.count_nonzero(beyond_k > OVERSHOOT_K))
     if not outside:
@@ -81,13 +81,13 @@ def _overshoot(system: HeatSystem, relative_k: Vector) -> tuple[float, str]:
 
 
 def heat_of_groups_w(system: HeatSystem, relative_k: Vector) -> Vector:
-    """Heat flow into the body of each group in a steady state, fixed nodes included, shape (g,), [W]."""
+    """Return the heat flow into the body of each of the system's `groups` in a steady state, shape (g,), [W]."""
     kept_w = -system.net_heat_at_fixed(relative_k, 0.0)
     return np.concatenate([system.group_heat_w(relative_k, 0.0), system.fixed.shares @ kept_w])
 
 
 def refuse_too_cold(system: HeatSystem, relative_k: Vector) -> None:
-    """Raise `HeatError` for temperatures below absolute zero."""
+    """Raise `HeatError` if a temperature is below absolute zero; `relative_k` has shape (n,)."""
     coldest_k = float(relative_k.min()) + system.reference_c + ZERO_CELSIUS_K
     if coldest_k < -1e-6:
         raise HeatError(
@@ -98,7 +98,7 @@ def refuse_too_cold(system: HeatSystem, relative_k: Vector) -> None:
 
 
 def _check_held(system: HeatSystem) -> None:
-    """Raise `HeatError` for a body of which a piece may have any temperature in a steady state."""
+    """Raise `HeatError` if a connected piece has nothing that sets its temperature in a steady state."""
     loose = np.flatnonzero(~system.exchanging_pieces(0.0))
     if len(loose):
         remedy = "Remove the piece, give its boundary an effect, or follow it through time instead."
@@ -108,7 +108,7 @@ def _check_held(system: HeatSystem) -> None:
 
 
 def _largest(system: HeatSystem, chosen: IntArray) -> str:
-    """Say where the largest of some pieces is."""
+    """Return words on the size and place of the largest of the pieces `chosen`."""
     sizes = np.bincount(system.pieces.number, minlength=system.pieces.count)
     piece = int(chosen[np.argmax(sizes[chosen])])
     points = system.space.points_m[system.pieces.number == piece]

@@ -1,4 +1,4 @@
-"""The discrete heat equation, M dT/dt + (K + R) T = load + radiation(T)."""
+"""The discrete heat equation, M dT/dt + (K + R) T = load + radiation(T), the load with convection's h T_ambient."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from thermoxels_ns.fem.space import Space
 Vector = FloatArray
 
 MOST_TIMES_CONDUCTION = 1e10
-"""Largest convection at a node over what the cells around it conduct: more is a given temperature in all but name, and
-the difference from the air, by which heat flows, would be lost to round-off."""
+"""Largest ratio of the heat per kelvin that convection takes from a node to that which its cells conduct. Above it, the
+surface practically has the temperature of the air, and their difference would be lost to round-off."""
 NOTHING = 1e-9
-"""Differences below this share of the absolute temperature let no heat flow to speak of."""
+"""Differences of temperature below this share of the absolute temperature let no heat flow to speak of."""
 _LEAST = float(np.finfo(np.float64).tiny)
-_KEPT_RANGES = 64  # Times at which the range of the surroundings is kept
+_KEPT_RANGES = 64  # Number of times for which the range of the surroundings is kept
 
 
 class Pieces:
-    """Numbers of the connected pieces that a body's nodes belong to, and sums over them.
+    """The p connected pieces of a body: the piece of each of the n nodes, and sums over the pieces.
 
     >>> pieces = Pieces(sparse.csr_matrix([[2.0, -2.0, 0.0], [-2.0, 2.0, 0.0], [0.0, 0.0, 0.0]]))
     >>> pieces.count, pieces.sums(np.array([1.0, 2.0, 4.0])).tolist()
@@ -47,74 +47,74 @@ class Pieces:
     """
 
     def __init__(self, stiffness: sparse.csr_matrix) -> None:
-        """Find the pieces between which a symmetric matrix has no entry."""
+        """Find the pieces: the sets of nodes between which the symmetric matrix has no entry."""
         count, number = connected_components(stiffness, directed=False)
         self.count = int(count)
-        """How many there are."""
+        """Number of pieces, p."""
         self.number: npt.NDArray[np.int32] = number
         """Number of each node's piece, shape (n,)."""
         self._sizes = np.bincount(number, minlength=self.count)
 
     def sums(self, nodal: Vector) -> Vector:
-        """Add up over each piece, shape (p,)."""
+        """Return the sum of nodal values over each piece, shape (p,)."""
         if self.count == 1:
             return np.array([np.sum(nodal)])
         return np.bincount(self.number, weights=nodal, minlength=self.count).astype(np.float64, copy=False)
 
     def at_nodes(self, values: Vector) -> Vector:
-        """Values of the pieces where their nodes are; one value for all nodes if there is one piece."""
+        """Return at each node the value of the node's piece, shape (n,); with one piece `values` itself, shape (1,)."""
         return values[self.number] if self.count > 1 else values
 
     def without_means(self, nodal: Vector) -> Vector:
-        """Subtract the mean of each piece, shape (n,)."""
+        """Return nodal values less the mean of their piece, shape (n,)."""
         return nodal - self.at_nodes(self.sums(nodal) / self._sizes)
 
     def touched(self, nodes: IntArray) -> BoolArray:
-        """Mark the pieces that have any of the nodes, shape (p,)."""
+        """Return True for each piece that contains any of the nodes, shape (p,)."""
         marks = np.zeros(self.count, dtype=bool)
         marks[self.number[nodes]] = True
         return marks
 
 
 class HeatSystem:
-    """What schemes and the steady solver ask of a problem. Constant parts are assembled once, when first asked for.
+    """The matrices and vectors of a `HeatProblem` that time schemes and the steady solver need, n nodes.
 
-    Temperatures are held relative to `reference_c`, so that round-off is relative to their differences.
+    Constant parts are assembled once. Temperatures are relative to `reference_c`, which keeps round-off small.
     """
 
     def __init__(self, problem: HeatProblem, *, order: int = 1) -> None:
-        """Turn effects into terms and forms, and assemble the stiffness of linear or quadratic tetrahedra."""
+        """Turn effects into forms and assemble the stiffness; `order` 1: linear tetrahedra, 2: quadratic ones."""
         self.problem, self.assembled = problem, Assembled()
         start = problem.start_c
         # The middle of the range, not the mean: exact for a uniform temperature.
         self.reference_c: float = 0.5 * (float(start.min()) + float(start.max()))
-        """What temperatures are relative to, [degrees Celsius]."""
+        """Reference temperature: the middle of the range at the start, [degrees Celsius]."""
         self.space: Space = Space(problem.selection, order=order)
-        """The nodes, and how what happens becomes numbers on them."""
+        """The unknowns at the nodes, and the integrals over triangles and tetrahedra."""
         self.num_nodes: int = self.space.num_nodes
-        """Number of nodes; with quadratic tetrahedra the mesh's nodes come first and then its edges."""
+        """Number of nodes; with quadratic tetrahedra the mesh's nodes come first, then the middles of its edges."""
         forms = effect_forms(problem, self.space, self.reference_c, self.assembled)
         self._convection, self._loads, self._radiation = forms.convection, forms.loads, forms.radiation
         self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*forms.convection, *forms.radiation)
-        """Heat flows through the surface that depend on its temperature."""
+        """Convection and radiation: the forms whose heat flow depends on the temperature of the surface."""
         self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
         """Nodes whose temperature is given."""
         with self.assembled.form("stiffness"):
             self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
-            """K, shape (n, n), [W / K]."""
+            """Stiffness K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
         self.pieces: Pieces = Pieces(self.stiffness)
-        """Connected pieces of the body."""
+        """Connected pieces of the body, between which no heat is conducted."""
         self.matrix_in_time: bool = any(form.matrix_in_time for form in self._convection)
-        """Whether the matrix of the linear part changes with time."""
+        """True if the convection matrix R changes with time."""
         self.nonlinear: bool = bool(self._radiation)
-        """Whether there is radiation."""
+        """True if there is radiation."""
         self.exchanges: bool = bool(forms.exchanging)
-        """Whether heat flows into the body other than through fixed nodes."""
+        """True if there is convection, radiation, a flux or a source."""
         self.groups: tuple[tuple[str, str], ...] = (
             *((form.effect, group) for form in forms.exchanging for group in form.groups),
             *self.fixed.groups,
         )
-        """Effect and patch or region of each heat flow of `group_heat_w`, then of each of the fixed nodes."""
+        """Effect and patch or region of each heat flow of `group_heat_w`, then effect and patch of `fixed.groups`."""
         self._convection_at: dict[float, sparse.csr_matrix | None] = {}
         self._loads_at: dict[float, Vector] = {}
         self._ambient_at: dict[float, Vector] = {}
@@ -122,7 +122,7 @@ class HeatSystem:
 
     @property
     def start_k(self) -> Vector:
-        """Temperatures at the start, relative to the reference, shape (n,), [K]."""
+        """Temperatures at the start, relative to `reference_c`, shape (n,), [K]."""
         return self.space.from_mesh_nodes(self.problem.start_c - self.reference_c)
 
     @cached_property
@@ -133,9 +133,9 @@ class HeatSystem:
             return lumped_mass(mesh.points_m, mesh.tets, self.problem.heat_capacity_j_m3k)
 
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix | None:
-        """R, heat that convection takes from each node per kelvin, shape (n, n), [W / K]; None without convection.
+        """Return R, the heat that convection takes from each node per kelvin, (n, n), [W / K]; None without convection.
 
-        Raises `HeatError` if it is more than `MOST_TIMES_CONDUCTION` of what the cells conduct.
+        Raises `HeatError` if R is more than `MOST_TIMES_CONDUCTION` times K on the diagonal.
         """
         return at_time(self._convection_at, time_s if self.matrix_in_time else 0.0, self._sum_of_convection)
 
@@ -154,7 +154,7 @@ class HeatSystem:
         return total
 
     def matrix(self, time_s: float, step_s: float) -> sparse.csr_matrix:
-        """M / step + K + R, shape (n, n), [W / K]; without M for a step without end."""
+        """Return M / step + K + R, shape (n, n), [W / K]; for `step_s` = inf return K + R."""
         convection = self.convection_matrix(time_s)
         matrix = self.stiffness if convection is None else sparse.csr_matrix(self.stiffness + convection)
         if np.isinf(step_s):
@@ -162,7 +162,7 @@ class HeatSystem:
         return sparse.csr_matrix(matrix + sparse.diags(self.nodal_mass_j_k / step_s, format="csr"))
 
     def load(self, time_s: float) -> Vector:
-        """Heat that does not depend on the temperature, fluxes and sources, shape (n,), [W]."""
+        """Return the heat of fluxes and sources into each node, (n,), [W]; convection's h T_ambient is not included."""
         return self._sum_of_loads(self._loads, self._loads_at, time_s)
 
     def _sum_of_loads(
@@ -178,7 +178,7 @@ class HeatSystem:
         return at_time(kept, time_s if any(form.load_in_time for form in forms) else 0.0, add_up)
 
     def radiation_load(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat radiated into the body, shape (n,), [W]."""
+        """Return the net heat that radiation brings to each node, shape (n,), [W]."""
         total = np.zeros(self.num_nodes)
         for form in self._radiation:
             with self.assembled.form("radiation"):
@@ -186,7 +186,7 @@ class HeatSystem:
         return total
 
     def radiation_slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
-        """Minus the exact derivative of `radiation_load`, shape (n, n), [W / K]."""
+        """Return minus the derivative of `radiation_load` by the temperatures, shape (n, n), [W / K]."""
         total = sparse.csr_matrix((self.num_nodes, self.num_nodes))
         for form in self._radiation:
             with self.assembled.form("radiation"):
@@ -194,7 +194,7 @@ class HeatSystem:
         return total
 
     def exchange_parts(self, relative_k: Vector, time_s: float) -> list[Vector]:
-        """Heat from outside into each node: load, R (T_air - T) and radiation(T), each of shape (n,), [W]."""
+        """Return `load`, then the heat of convection and of radiation into each node if there is any, (n,), [W]."""
         parts, convection = [self.load(time_s)], self.convection_matrix(time_s)
         if convection is not None:
             parts.append(self._sum_of_loads(self._convection, self._ambient_at, time_s) - convection @ relative_k)
@@ -203,37 +203,37 @@ class HeatSystem:
         return parts
 
     def exchanged_heat(self, relative_k: Vector, time_s: float) -> Vector:
-        """Sum of the `exchange_parts`, shape (n,), [W]."""
+        """Return the sum of `exchange_parts`: the heat from outside into each node, shape (n,), [W]."""
         return np.sum(self.exchange_parts(relative_k, time_s), axis=0)
 
     def conducted_heat(self, relative_k: Vector) -> Vector:
-        """Heat that flows from each node to its neighbours, K T, shape (n,), [W].
+        """Return K T, the heat that flows from each node to its neighbours, shape (n,), [W].
 
-        The mean of each piece, which conducts nothing, is taken from T first, so that it leaves no round-off.
+        The mean of each piece is subtracted from T first: it conducts nothing, but would leave round-off.
         """
         return self.stiffness @ self.pieces.without_means(relative_k)
 
     def net_heat(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat into each node from outside and from its neighbours, shape (n,), [W].
+        """Return the heat into each node from outside and from its neighbours, shape (n,), [W].
 
-        What keeps fixed nodes fixed is not in it.
+        The heat that keeps fixed nodes at their temperature is not included.
         """
         return self.exchanged_heat(relative_k, time_s) - self.conducted_heat(relative_k)
 
     def net_heat_at_fixed(self, relative_k: Vector, time_s: float) -> Vector:
-        """`net_heat` at the fixed nodes only, shape (d,), [W]."""
+        """Return `net_heat` at the fixed nodes only, shape (d,), [W]."""
         nodes = self.fixed.nodes
         if len(nodes) == 0:
             return np.zeros(0)
         return self.exchanged_heat(relative_k, time_s)[nodes] - self._fixed_rows @ self.pieces.without_means(relative_k)
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat flow into the body of each group but those of fixed nodes, [W]."""
+        """Return the heat flow into the body of each entry of `groups` before those of fixed nodes, shape (g,), [W]."""
         forms = (*self._convection, *self._loads, *self._radiation)
         return np.concatenate([np.zeros(0), *(form.group_heat_w(relative_k, time_s) for form in forms)])
 
     def facet_heat(self, relative_k: Vector, time_s: float) -> tuple[FacetHeat, ...]:
-        """Heat flow of each effect but sources through boundary triangles, as if fixed nodes stored nothing."""
+        """Return the heat flow of each effect but sources through its triangles, as if fixed nodes stored nothing."""
         forms = [
             form for form in (*self._convection, *self._loads, *self._radiation) if not isinstance(form, SourceForm)
         ]
@@ -242,29 +242,29 @@ class HeatSystem:
         return (*found, *(FacetHeat(*part) for part in self.fixed.facet_heat_w(kept_w)))
 
     def exchanging_pieces(self, time_s: float) -> BoolArray:
-        """Mark the pieces whose temperature convection, radiation or fixed nodes hold, shape (p,)."""
+        """Return True for each piece whose temperature convection, radiation or fixed nodes determine, shape (p,)."""
         marks = self.pieces.touched(self.fixed.nodes)
         for form in self.surface_forms:
             marks |= self.pieces.touched(form.exchanging_nodes(time_s))
         return marks
 
     def is_still(self, relative_k: Vector, time_s: float) -> bool:
-        """Whether all temperatures, those around included, differ by no more than `NOTHING` of the absolute one."""
+        """Return whether temperatures of body and surroundings differ by at most `NOTHING` times the absolute one."""
         ends = np.array([*self.surroundings_k(time_s), relative_k.min(), relative_k.max()])
         ends = ends[np.isfinite(ends)]
         level_k = float(np.abs(ends).max()) + abs(self.reference_c + ZERO_CELSIUS_K)
         return float(np.ptp(ends)) <= NOTHING * level_k
 
     def allowed_range_k(self, start_k: tuple[float, float], times_s: tuple[float, ...]) -> tuple[float, float]:
-        """Range that temperatures cannot leave in a step: from the start's and all surroundings' at these times.
+        """Return the lowest and highest temperature, [K], of `start_k` and of all surroundings at `times_s`.
 
-        A source or flux opens it on the side that it pushes to.
+        No temperature leaves this range in a step. A flux or source makes its end -inf (cooling) or inf (heating).
         """
         ends = [start_k, *map(self.surroundings_k, times_s)]
         return min(low for low, _ in ends), max(high for _, high in ends)
 
     def surroundings_k(self, time_s: float) -> tuple[float, float]:
-        """Range of all that surrounds the body at a time, [K]; kept for some of the last times that were asked for."""
+        """Return the lowest and highest temperature around the body, [K]; -inf or inf with a flux or source."""
         return at_time(self._ranges_at, time_s, self._surroundings_k, most=_KEPT_RANGES)
 
     def _surroundings_k(self, time_s: float) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""The time loop: temperatures of a body in equal, given or adaptive steps."""
+"""The time loop: it follows the temperatures of a body in equal, given or adaptive steps."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ Vector = FloatArray
 Steps = TimeSteps | AdaptiveSteps | GivenSteps
 
 MAX_STATE_BYTES = 4 * 2**30
-"""Most memory that the temperatures of all times may take, [bytes]; every time is also a file of an export."""
+"""Most memory that the temperatures of all kept times may take, [bytes]; each time is also a file of an export."""
 STEP_SHARE = 0.1
-"""Share of the tolerance that one step may use. Conduction forgets errors, so that those of many steps do not add up
-to their sum."""
-_SAFETY = 0.9  # Share of the longest step that meets the tolerance, by its estimate, that the next one is made
+"""Largest estimated error of one step, as a share of the tolerance. Conduction damps errors, so that the errors of many
+steps make less than their sum."""
+_SAFETY = 0.9  # Length of the next step as a share of the longest step that is estimated to meet the tolerance
 _SHRINK, _GROW = 0.2, 5.0
-"""Least and most that one step changes the length of the next."""
+"""Least and largest factor between the lengths of one step and the next."""
 _KEEP_BELOW = 1.25  # Factor below which a step is not lengthened, so that its matrices serve again
 _SHORTEST = 1e-15  # Shortest step as a share of the duration
 LEAST_CAPACITY_J_M3K = 1.0
 """Heat capacity per volume below which a body stores nothing to speak of: a thousandth of that of air, [J / (m3 K)]."""
-_NOTHING = 1e-9  # Share of the heat content above absolute zero that is no exchange of heat to speak of
+_NOTHING = 1e-9  # Share of the heat content above absolute zero below which an exchange of heat is negligible
 
 
 def solve_heat(
@@ -44,20 +44,20 @@ def solve_heat(
     estimate_steps: bool = False,
     progress: Callable[[float, int], None] | None = None,
 ) -> HeatSolution:
-    """Follow the temperatures of a body through time.
+    """Follow the temperatures of a body through time, and account for the heat that each effect brings.
 
     Masses are lumped. With backward Euler and tetrahedra without obtuse angles no temperature leaves the range of the
-    start and of the surroundings at any step length, unless a flux or source drives it out. Where one does leave it,
-    the status says by how much.
+    start and of the surroundings at any step length, unless a flux or source drives it out. If a temperature leaves
+    this range without such a cause, the status says by how much.
 
     Args:
         problem: Body, materials, initial temperatures and effects; without effects the boundary is insulated.
         time: Equal steps, steps as long as a tolerance allows, or steps of given lengths.
         scheme: The scheme in time; None: backward Euler for equal steps, otherwise SDIRK2. Adaptive steps need a scheme
             with an estimate.
-        relative_tolerance: Of the linear solver in each step.
-        estimate_steps: Tell the error of equal steps too (`time_error_k`), by steps of twice the length beside them,
-            which takes about half as long again. Adaptive steps tell it anyway.
+        relative_tolerance: Relative tolerance of the linear solver in each step.
+        estimate_steps: Estimate the error of equal steps (`time_error_k`), too, by solving again with steps of twice
+            the length, which takes half as long again. Adaptive steps always have an estimate, given steps never.
         progress: Called after every step with the share of the duration that is done and the number of steps.
 
     Raises:
@@ -95,18 +95,18 @@ def solve_heat(
 
 @dataclass(frozen=True)
 class _Taken:
-    """A step that was accepted."""
+    """A step that was taken and need not be repeated."""
 
-    step: Step
-    step_s: float  # Its length, [s]
-    ends_interval: bool  # Whether temperatures are kept at its end
+    step: Step  # Outcome of the step
+    step_s: float  # Length of the step, [s]
+    ends_interval: bool  # True if the step ends an interval, where temperatures are kept
 
 
 def _error_of_equal_steps(found: HeatSolution, doubled: HeatSolution | None, order: int) -> HeatSolution:
-    """Tell the error of equal steps by steps of twice their length (Richardson 1911).
+    """Return `found` with the error of its equal steps, from steps of twice their length (Richardson 1911).
 
-    Steps of half the length leave 1 / 2^p of the error of a scheme of order p, so that both differ by 2^p - 1 of the
-    error of the shorter ones.
+    Halving the steps of a scheme of order p leaves 1 / 2^p of the error, so the two solutions differ by 2^p - 1 times
+    the error of the shorter steps. `doubled` None: the status says why there is no estimate.
     """
     if doubled is None:
         why = "steps of twice the length fail" if found.steps > 1 else "it takes two of them"
@@ -121,23 +121,23 @@ def _error_of_equal_steps(found: HeatSolution, doubled: HeatSolution | None, ord
 
 
 class _TimeLoop:
-    """Takes one step after the other; no adaptive step is longer than effects can be followed by."""
+    """Takes one step after the other; no adaptive step is longer than `HeatProblem.resolution_s`."""
 
     def __init__(self, system: HeatSystem, scheme: Scheme, time: Steps, relative_tolerance: float) -> None:
         self._system, self._scheme, self._time = system, scheme, time
         self.runge_kutta = RungeKutta(system, scheme, relative_tolerance=relative_tolerance)
         self._allowed_k = STEP_SHARE * time.tolerance_k if isinstance(time, AdaptiveSteps) else np.inf
         self.repeated = 0
-        """Steps that were repeated with a shorter length."""
+        """Number of steps that were repeated with a shorter length."""
 
     def steps(self, start_k: Vector) -> Iterator[_Taken]:
-        """Take all steps; raises `HeatError` where one fails."""
+        """Take all steps from `start_k`, shape (n,), [K]; raises `HeatError` if a step fails."""
         if isinstance(self._time, AdaptiveSteps):
             return self._adaptive(start_k, self._time)
         return self._given(start_k, self._time)
 
     def _given(self, start_k: Vector, time: TimeSteps | GivenSteps) -> Iterator[_Taken]:
-        """Take steps of known lengths."""
+        """Take the equal or given steps of `time`; raises `HeatError` if a step's solver does not converge."""
         relative_k, count, total = start_k, 0, sum(map(len, time.lengths_s))
         for now_s, lengths_s in zip(time.times_s.tolist(), time.lengths_s):
             for number, step_s in enumerate(lengths_s, start=1):
@@ -150,7 +150,7 @@ class _TimeLoop:
                 relative_k, now_s = step.relative_k, now_s + step_s
 
     def _adaptive(self, start_k: Vector, time: AdaptiveSteps) -> Iterator[_Taken]:
-        """Take steps as long as their estimated errors allow."""
+        """Take steps as long as their estimated errors allow; raises `HeatError` if no step is short enough."""
         relative_k, now_s, wished_s = start_k, 0.0, self._first_length(start_k, time)
         for end_s in time.times_s[1:].tolist():
             while now_s < end_s:
@@ -167,7 +167,7 @@ class _TimeLoop:
                 now_s = end_s if step_s == left_s else now_s + step_s
                 relative_k = step.relative_k
                 next_s = step_s * (factor if factor > _KEEP_BELOW else min(factor, 1.0))
-                # A step cut short by an interval's end says nothing against the length wished for.
+                # A good step that was cut short by an interval's end is no reason to shorten the length wished for.
                 wished_s = max(next_s, wished_s) if step_s < wished_s and factor >= 1.0 else next_s
                 yield _Taken(step, step_s, now_s == end_s)
 
@@ -181,7 +181,7 @@ class _TimeLoop:
         return float(np.clip(time.tolerance_k / fastest, _SHORTEST * time.duration_s, interval_s))
 
     def _factor(self, step: Step) -> float:
-        """How much longer the next step may be."""
+        """Return the length of the next step over that of this one, from `_SHRINK` to `_GROW`."""
         if not step.converged or not np.isfinite(step.error_k):
             return _SHRINK
         if step.error_k == 0.0:
@@ -199,14 +199,14 @@ class _TimeLoop:
 
 
 class HeatBalance:
-    """The account of a computation: states at the ends of intervals, and the heat that flowed in between."""
+    """The account of a computation: temperatures at the ends of intervals, and the heat that flowed in between."""
 
     def __init__(self, system: HeatSystem, states_k: Vector, times_s: Vector) -> None:
-        """Begin with room for the states, shape (s + 1, n), [K], the first one given, and their times, [s]."""
+        """Begin the account; `states_k`, (s + 1, n), [K], holds the start and room for the states at `times_s`, [s]."""
         self._system, self._states, self._times = system, states_k, times_s
         self._done = self._steps = self._most_iterations = 0
         self.followed_s = 0.0
-        """Sum of the steps so far, [s]."""
+        """Time that the steps so far have covered, [s]."""
         self._heat_j = np.zeros((len(times_s) - 1, len(system.groups)))
         self._exchanged_j = np.zeros(len(times_s) - 1)
         self._iterations = np.zeros((len(times_s) - 1, 2), dtype=np.int64)
@@ -218,11 +218,11 @@ class HeatBalance:
 
     @property
     def steps(self) -> int:
-        """Number of steps so far."""
+        """Number of steps that were added so far."""
         return self._steps
 
     def add(self, step: Step, step_s: float, *, ends_interval: bool) -> None:
-        """Count a step of a length, [s]; at the end of an interval its temperatures are kept."""
+        """Add a step of length `step_s`, [s], to the account; if it ends an interval, keep its temperatures."""
         row = self._done
         self._lengths_s[row].append(step_s)
         self._heat_j[row] += step_s * step.group_heat_w
@@ -241,13 +241,13 @@ class HeatBalance:
             self._states[self._done] = step.relative_k
 
     def _overshoot_of(self, relative_k: Vector, step_s: float) -> float:
-        """How far temperatures after a step are out of the range of the start and of all surroundings so far, [K]."""
+        """Return how far temperatures after a step leave the range of the start and of all surroundings so far, [K]."""
         times = self.followed_s, self.followed_s + step_s
         self._range_k = low, high = self._system.allowed_range_k(self._range_k, times)
         return max(low - float(relative_k.min()), float(relative_k.max()) - high)
 
     def success(self, repeated: int) -> str:
-        """Describe how the steps converged, and by how much any temperature left its range."""
+        """Return sentences on how the steps converged and by how much any temperature left its range."""
         sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
         sentence += f" {repeated} more were repeated with a shorter length." if repeated else ""
         if self._overshooting:
@@ -258,7 +258,7 @@ class HeatBalance:
         return sentence
 
     def close(self, status: str, *, adaptive: bool) -> HeatSolution:
-        """Balance the heat and convert to degrees Celsius, in place because the states may be large."""
+        """Return the solution with the account of its heat; states become degrees Celsius in place, to save memory."""
         system, states_k, times_s, heat_j = self._system, self._states, self._times, self._heat_j
         mass = system.nodal_mass_j_k
         total_mass = float(mass.sum())
@@ -268,7 +268,7 @@ class HeatBalance:
         unexplained = float(np.max(np.abs(relative_content - relative_content[0] - supplied)))
         exchanged = float(self._exchanged_j.sum())
         mean = relative_content[0] / total_mass
-        # Not by BLAS, whose sum depends on the number of its threads.
+        # Summed without BLAS, whose sum depends on the number of its threads.
         spread = float(np.sum(mass * np.abs(states_k[0] - mean)))
         scale = max(float(content[0]), exchanged)
         spread_scale = max(spread + exchanged, _NOTHING * float(content[0]))
@@ -296,14 +296,14 @@ class HeatBalance:
 
 
 def _share(part: float, whole: float) -> float:
-    """Part of a whole; nothing of nothing is 0, something of nothing is infinite."""
+    """Return part / whole; 0 if the part is 0, infinite if only the whole is 0."""
     if part == 0.0:
         return 0.0
     return part / whole if whole > 0.0 else float("inf")
 
 
 def _fitted(wished_s: float, left_s: float) -> float:
-    """Fit a step into what is left of an interval: two even steps to its end rather than a long and a tiny one.
+    """Return the length of the next step, [s]: `left_s`, which ends the interval, or at most half of `left_s`.
 
     >>> [_fitted(wished, 10.0) for wished in (12.0, 8.0, 3.0)]
     [10.0, 5.0, 3.0]
@@ -312,7 +312,7 @@ def _fitted(wished_s: float, left_s: float) -> float:
 
 
 def _skips(problem: HeatProblem, time: Steps) -> str:
-    """Say that steps may be too long to see how an effect changes, or nothing."""
+    """Return a sentence if steps may be too long to see how an effect changes, else ""."""
     if not isinstance(time, TimeSteps):
         labelled = zip(effect_labels(problem), problem.effects)
         names = [label for label, effect in labelled if any(effect.bounded(name).unresolved for name in effect.bounds)]
@@ -339,7 +339,7 @@ def _check_stores(problem: HeatProblem) -> None:
 
 
 def _room_for_states(num_times: int, num_nodes: int) -> Vector:
-    """Array for the temperatures of all times; `HeatError` says how much memory they need if that is too much."""
+    """Return an empty array, shape (num_times, num_nodes); raise `HeatError` if it needs more memory than allowed."""
     needed = num_times * num_nodes * 8
     try:
         if needed <= MAX_STATE_BYTES:

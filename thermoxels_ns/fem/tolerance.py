@@ -1,4 +1,4 @@
-"""Solve a heat problem to a tolerance: solve, halve the mesh size or the steps, and compare (Richardson)."""
+"""Solving a heat problem to a tolerance: solve, halve the mesh size or the steps, and compare (Richardson)."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ Vector = FloatArray
 DEFAULT_MEMORY_BYTES = 4 * 2**30  # Most memory that a solution may need, [bytes]
 HALVED = 0.3
 """Share of an error that is left after the mesh size or the steps are halved. Theory says 1/4 where temperatures are
-smooth, and 0.4 at the edges of a notch of a right angle, where they behave as r^(2/3)."""
+smooth, and 0.4 at the edges of a notch of a right angle, where temperatures behave as r^(2/3)."""
 _LEFT = {1: ErrorSize(HALVED, HALVED), 2: ErrorSize(0.2, 0.2)}
-"""The same by the order of the tetrahedra; of quadratic ones 1/8 where temperatures are smooth, 0.4 at a notch."""
+"""Share of an error left after halving, by order of the tetrahedra; for order 2 theory says 1/8, and 0.4 at a notch."""
 TO_QUADRATIC = ErrorSize(0.2, 0.1)
-"""Shares of the errors of linear tetrahedra, of temperatures and of heat flows, that quadratic ones of the same size
-leave: they are 0.02 to 0.5 and 0.002 to 0.25 where temperatures are smooth and where they are singular."""
+"""Error of quadratic tetrahedra as a share of the error of linear ones on the same mesh, for temperatures and for heat
+flows; from smooth to singular temperatures these shares range from 0.02 to 0.5 and from 0.002 to 0.25."""
 MARGIN = 1.3
-"""How much larger than estimated an error may be: 1.23 times where a material insulates 1e8 times better than the one
-beside it along the flow, which is the worst case known."""
+"""Factor by which an error may exceed its estimate. The worst case known is 1.23, where a material insulates 1e8 times
+better than the material beside it along the flow."""
 _STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
-"""Of the linear solver: its error is far below any estimate here."""
+"""Relative tolerances of the linear solver for steady states and for steps: its error is far below any estimate."""
 _STEPS_OVER_ERROR = 6.0
-"""Tolerance of the first, adaptive steps over the allowed error: steps that are controlled to 1 K make an error of 0.03
-to 0.07 K in all, because conduction forgets."""
-_AIM = 0.95  # Share of the allowed error that a solution is chosen to make
-_MOST_HALVINGS = 8  # Halvings of the mesh size or of the steps beyond which nothing is tried
-_MESH_COST, _STEP_COST = 10.0, 2.0  # How much more half the mesh size and half the steps cost
+"""Tolerance of the first, adaptive steps over the allowed error: steps controlled to 1 K make an error of 0.03 to
+0.07 K in all, because conduction damps the errors of earlier steps."""
+_AIM = 0.95  # Share of the allowed error that the next choice of mesh and steps may be expected to make
+_MOST_HALVINGS = 8  # Most halvings of the mesh size, and most of the steps, that are tried
+_MESH_COST, _STEP_COST = 10.0, 2.0  # Factors by which halving the mesh size, and halving the steps, raise the cost
 _BYTES_PER_TET, _BYTES_PER_FACET = {1: 400.0, 2: 2600.0}, {1: 600.0, 2: 4000.0}
-"""Most memory by the order of the tetrahedra, measured with convection and radiation; without radiation about half."""
+"""Most memory by order of the tetrahedra, [bytes], measured with convection and radiation; about half without both."""
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Errors that a user allows, above 0; what is None does not matter, but one is given."""
+    """Errors that a user allows, above 0; None: any error. `HeatError` if both are None or one is not above 0."""
 
     temperature_k: float | None = 0.05
-    """Largest error of the temperature at any node of the mesh, [K]. The default is half of what building physics asks
-    of a temperature (ISO 10211: 0.1 K)."""
+    """Largest error of the temperature at any node of the mesh, [K]. The default is half of the error that building
+    physics allows (ISO 10211: 0.1 K)."""
     heat_flow: float | None = None
     """Largest error of the mean heat flow that any effect brings, as a share of all heat that flows through the body;
-    0.01 is what building physics asks for (ISO 10211)."""
+    building physics allows 0.01 (ISO 10211)."""
 
     def __post_init__(self) -> None:
         given = [value for value in (self.temperature_k, self.heat_flow) if value is not None]
@@ -61,12 +61,12 @@ class Tolerance:
             raise HeatError("tolerance", expected="temperature_k, heat_flow or both, above 0", got=got, remedy=remedy)
 
     def excess(self, error: ErrorSize) -> float:
-        """Error over what is allowed, whichever is worse, with `MARGIN`; at most 1 is good."""
+        """Return the larger ratio of an error, times `MARGIN`, to its allowed value; at most 1 is good."""
         pairs = (error.temperature_k, self.temperature_k), (error.heat_flow, self.heat_flow)
         return MARGIN * max(found / allowed for found, allowed in pairs if allowed is not None)
 
     def describe(self) -> str:
-        """Describe the allowed errors in words."""
+        """Return the allowed errors as text, such as "0.05 K and 1 % of the heat flow"."""
         parts = [] if self.temperature_k is None else [f"{self.temperature_k:g} K"]
         parts += [] if self.heat_flow is None else [f"{100.0 * self.heat_flow:g} % of the heat flow"]
         return " and ".join(parts)
@@ -74,7 +74,7 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class Level:
-    """A solution on the way."""
+    """One of the solutions that `solve_to_tolerance` computes: its mesh, steps and estimated errors."""
 
     order: int  # 1 for linear tetrahedra, 2 for quadratic ones
     refinements: int  # How often the size of the given mesh was halved
@@ -84,7 +84,7 @@ class Level:
     seconds: float  # Time to solve it, [s]
 
     def describe(self) -> str:
-        """Describe the solution and its errors in a line."""
+        """Return a line on mesh, steps and estimated errors of the solution."""
         mesh = "given mesh" if self.refinements == 0 else f"mesh size halved {self.refinements}x"
         steps = "" if self.step_tolerance_k is None else f", steps to {self.step_tolerance_k:.2g} K"
         return (
@@ -95,16 +95,16 @@ class Level:
 
 @dataclass(frozen=True)
 class ToleratedSolution:
-    """A solution with what is known of its error."""
+    """A solution with estimates of its errors; the outcome of `solve_to_tolerance`."""
 
-    solution: Solution  # Temperatures and heat flows. Nodes of the given mesh come first
-    problem: HeatProblem  # What was solved: the given problem, or the same on a finer mesh
+    solution: Solution  # Temperatures and heat flows; nodes of the given mesh come first
+    problem: HeatProblem  # The problem that was solved: the given problem, or the same on a finer mesh
     tolerance: Tolerance  # Errors that were allowed
-    settings: Level  # Order, refinements and steps that were chosen, and the estimated errors
+    settings: Level  # Order, refinements and steps of `solution`, and its estimated errors
     met: bool  # Whether the estimated errors are within the tolerance
     status: str  # The outcome as a sentence, with the estimate and the seconds
-    seconds: float  # Time for all, [s]
-    levels: tuple[Level, ...]  # All solutions on the way, the last one is `settings`
+    seconds: float  # Time for all solutions together, [s]
+    levels: tuple[Level, ...]  # All solutions that were computed; the last entry is `settings`
 
 
 def solve_to_tolerance(
@@ -120,24 +120,24 @@ def solve_to_tolerance(
 ) -> ToleratedSolution:
     """Solve a problem with order, mesh size and time steps whose estimated error is allowed.
 
-    The difference of two solutions tells their errors, because the finer one has a known share of the error of the
-    coarser one left (Richardson 1911): `TO_QUADRATIC` or `HALVED`.
+    The difference of two solutions tells the errors of both, because the error of the finer solution is a known share
+    of the error of the coarser one (Richardson 1911): `TO_QUADRATIC` or `HALVED`.
 
-    A steady state is solved with linear and then quadratic tetrahedra on the given mesh; as long as the error is too
-    large, quadratic ones of half the size follow, or linear ones if the solver fails on quadratic ones. In time
-    tetrahedra stay linear: three solutions, on the given mesh, with all steps halved, and on a mesh of half the size,
-    tell the errors of mesh and steps, which are added with their signs, node by node; then both are made as fine as the
-    tolerance asks for. What flat facets lack of a round body's area is not estimated.
+    A steady state is solved with linear and then with quadratic tetrahedra on the given mesh; while the error is too
+    large, quadratic ones of half the size follow, or linear ones if the solver fails on quadratic ones. Through time
+    tetrahedra stay linear. Three solutions, on the given mesh, with all steps halved, and on a mesh of half the size,
+    tell the errors of mesh and steps, which are added with their signs node by node; then both are made as fine as the
+    tolerance asks for. The area that flat facets miss of a round body is not estimated.
 
     Args:
         problem: Body, materials, initial temperatures and effects.
         tolerance: Allowed errors.
-        duration_s: Time to follow the body for, [s]; None: its steady state.
+        duration_s: Time to follow the body for, [s], which needs `tolerance.temperature_k`; None: the steady state.
         outputs: Number of equal intervals at whose ends temperatures are kept and compared.
         memory_bytes: Most memory that a solution may need, [bytes].
         allow_unmet: Return the best solution that fits into memory, with `met` False, instead of raising.
-        log: Takes a line per solution and one on the outcome; print by default.
-        progress: As in `solve_heat`, of each solution through time.
+        log: Called with a line on each solution and a line on the outcome; print by default.
+        progress: Called in each solution through time as `progress` of `solve_heat`.
 
     Raises:
         HeatError: The tolerance cannot be met within the memory, or a solution fails.
@@ -151,9 +151,9 @@ def solve_to_tolerance(
 
 
 def steady_error(problem: HeatProblem, solution: SteadySolution) -> ErrorSize:
-    """Estimate the errors of a solution of linear tetrahedra by quadratic ones on the same mesh.
+    """Estimate the errors of a steady solution of linear tetrahedra by solving with quadratic ones on the same mesh.
 
-    Raises `HeatError` where quadratic tetrahedra fail.
+    Raises `HeatError` if the solution with quadratic tetrahedra fails.
     """
     start = replace(problem, initial_temperature_c=solution.temperature_c)
     finer = solve_steady(start, order=2, relative_tolerance=_STEADY_TOLERANCE)
@@ -161,9 +161,9 @@ def steady_error(problem: HeatProblem, solution: SteadySolution) -> ErrorSize:
 
 
 def richardson(apart: ErrorSize, left: ErrorSize) -> tuple[ErrorSize, ErrorSize]:
-    """Estimate the errors of a coarser and a finer solution from their difference.
+    """Estimate the errors of a coarser and of a finer solution from their difference `apart`.
 
-    If the finer one has a share `left` of the error of the coarser one, they differ by 1 - left of it.
+    If the finer error is `left` times the coarser error, the solutions differ by (1 - left) times the coarser error.
 
     >>> richardson(ErrorSize(0.75, 0.5), ErrorSize(0.25, 0.0))
     (ErrorSize(temperature_k=1.0, heat_flow=0.5), ErrorSize(temperature_k=0.25, heat_flow=0.0))
@@ -173,28 +173,28 @@ def richardson(apart: ErrorSize, left: ErrorSize) -> tuple[ErrorSize, ErrorSize]
 
 
 def difference_between(coarse: Solution, fine: Solution, num_nodes: int) -> ErrorSize:
-    """Compare two solutions at the same times at the first `num_nodes` nodes, which they share."""
+    """Return the largest differences between two solutions with equal times and the same first `num_nodes` nodes."""
     return _error_size(_compared(fine, num_nodes) - _compared(coarse, num_nodes), fine)
 
 
 def _compared(solution: Solution, num_nodes: int) -> Vector:
-    """Temperatures of the first `num_nodes` nodes at all times, then the mean heat flow of each effect."""
+    """Return the temperatures of the first `num_nodes` nodes at all times, then each effect's mean heat flow, flat."""
     flows_w = np.array(list(mean_flows_w(solution).values()))
     return np.concatenate([solution.temperature_c[..., :num_nodes].ravel(), flows_w])
 
 
 def _error_size(error: Vector, solution: Solution) -> ErrorSize:
-    """Largest errors of a solution from those of its `_compared` values."""
+    """Return the largest errors of a solution from the errors of its `_compared` values."""
     errors, first_flow = np.abs(error), len(error) - len(solution.effects)
     largest_w = float(np.max(errors[first_flow:], initial=0.0))
     return ErrorSize(float(np.max(errors[:first_flow])), share_of_heat(largest_w, solution))
 
 
 def peak_bytes(problem: HeatProblem, *, order: int = 1, refinements: int = 0, times: int = 1) -> float:
-    """Forecast the most memory that a solution takes besides the problem itself, [bytes].
+    """Return a forecast of the most memory that a solution takes besides the problem itself, [bytes].
 
-    Every refinement makes eight tetrahedra of each; `times` are those whose temperatures are kept. Interpreter and
-    libraries, about 150 MB, come on top.
+    Each of the `refinements` makes eight tetrahedra of one; `times` is the number of times whose temperatures are kept.
+    Interpreter and libraries take about 150 MB more.
     """
     mesh = problem.mesh
     volume = _BYTES_PER_TET[order] * len(mesh.tets) + 8.0 * times * len(mesh.points_m)
@@ -202,7 +202,7 @@ def peak_bytes(problem: HeatProblem, *, order: int = 1, refinements: int = 0, ti
 
 
 def describe_bytes(amount: float) -> str:
-    """Give an amount of memory in GiB or MiB.
+    """Return an amount of memory as text in GiB or MiB.
 
     >>> describe_bytes(3 * 2**30), describe_bytes(266000.0)
     ('3 GiB', '0.25 MiB')
@@ -211,7 +211,7 @@ def describe_bytes(amount: float) -> str:
 
 
 class _Run:
-    """The solutions so far."""
+    """The course of one `solve_to_tolerance`: the solutions so far, and the choice among them."""
 
     def __init__(self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable) -> None:
         self.given, self.tolerance, self._memory_bytes, self.say = problem, tolerance, memory_bytes, log
@@ -220,11 +220,11 @@ class _Run:
 
     @property
     def met(self) -> bool:
-        """Whether the error of a solution is allowed."""
+        """True if the estimated error of any solution so far is allowed."""
         return any(self.tolerance.excess(level.error) <= 1.0 for level, _, _ in self.solved)
 
     def add(self, problem: HeatProblem, solution: Solution, seconds: float, error: ErrorSize, refinements: int) -> None:
-        """Keep a solution, with its estimated errors and the number of times that the mesh size was halved for it."""
+        """Keep a solution with its estimated errors; `refinements` is how often the mesh size was halved for it."""
         steady = isinstance(solution, SteadySolution)
         edges = len(solution.edge_temperature_c) if steady else 0
         nodes, steps_k = solution.temperature_c.shape[-1] + edges, None if steady else solution.time_error_k
@@ -233,7 +233,7 @@ class _Run:
         self.say(level.describe())
 
     def lacks_memory(self, order: int, refinements: int, times: int = 1) -> str:
-        """Forecast the memory of a solution, mesh size halved so often; return why it does not fit, or nothing."""
+        """Return why a solution with the mesh size halved `refinements` times does not fit in memory, "" if it does."""
         needed = peak_bytes(self.given, order=order, refinements=refinements, times=times)
         where = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
         what = f"P{order} on {where} needs about {describe_bytes(needed)}"
@@ -243,10 +243,10 @@ class _Run:
         return f"{what}, more than the {describe_bytes(self._memory_bytes)} allowed (--memory-gb)"
 
     def close(self, failure: str, allow_unmet: bool) -> ToleratedSolution:
-        """Choose the smallest solution whose error is allowed, or else the best; `failure` says why none is.
+        """Return the smallest solution within the tolerance, or if `failure` says why there is none the most exact one.
 
         Raises:
-            HeatError: The tolerance was not met, or nothing was solved at all.
+            HeatError: There is a `failure` and `allow_unmet` is False, or nothing was solved at all.
         """
         if not self.solved:
             remedy = "Allow more memory (--memory-gb), or use a coarser mesh."
@@ -273,14 +273,14 @@ class _Run:
 
 
 def _halved(problem: HeatProblem, start: Solution | None = None) -> HeatProblem:
-    """The same on a mesh of half the size, which starts from its own start or from a steady solution."""
+    """Return the problem on a mesh of half the size; it starts from `start`, or if None from its own start."""
     nodal, edges = (problem.start_c if start is None else start.temperature_c), getattr(start, "edge_temperature_c", ())
     start_c = np.concatenate([nodal, edges]) if len(edges) else refined_values(problem.mesh, nodal)
     return replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
 
 
 def _solve_steady(run: _Run) -> str:
-    """Find a steady state that is good enough; returns why that was not possible, or nothing."""
+    """Add steady solutions to `run` until one is within the tolerance; return why none can be, or ""."""
 
     def solve(problem: HeatProblem, order: int) -> tuple[SteadySolution, float]:
         begin_s = time.perf_counter()
@@ -317,9 +317,9 @@ def _solve_steady(run: _Run) -> str:
 
 
 def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, int], None] | None) -> str:
-    """Follow a body through time well enough; returns why that was not possible, or nothing.
+    """Add solutions through time to `run` until one is within the tolerance; return why none can be, or "".
 
-    The error of m halvings of the mesh and j of the steps is of_mesh * HALVED^m + of_steps * HALVED^j.
+    After m halvings of the mesh size and j of the steps the error is of_mesh * HALVED^m + of_steps * HALVED^j.
     """
     failure = run.lacks_memory(1, 1, len(steps.times_s))
     if failure:

@@ -1,4 +1,4 @@
-"""Effects that a scene may name: convection, radiation, sunlight, sources and others."""
+"""Effects that a scene may name: convection, radiation, sunlight, sources and others; n is the outward normal."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from thermoxels_ns.fem.selection import Selection
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8  # Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]
 
 HOTTEST_C = 10_000.0
-"""Highest temperature of surroundings, [degrees Celsius]: the surface of the sun has 5500. Above it a unit is wrong."""
+"""Highest temperature that is accepted, [degrees Celsius]; above it a unit is wrong: the sun's surface has 5500."""
 _ABSOLUTE_ZERO_C = -ZERO_CELSIUS_K
 
 
 @dataclass(frozen=True)
 class SurfaceEffect(Effect):
-    """What acts on patches of the boundary.
+    """An effect on patches of the boundary.
 
-    Of all effects, temperatures are in degrees Celsius, and a positive heat flux goes into the body. A value is a
-    number or a `Varying`, which is asked at the centroids of boundary triangles (sources: of tetrahedra; fixed
-    temperatures: at nodes).
+    In all effects temperatures are in degrees Celsius, and a positive heat flux goes into the body. A quantity is a
+    number or a `Varying`, which is evaluated at centroids of boundary triangles (fixed temperatures: at nodes;
+    sources: at points in tetrahedra).
     """
 
     patches: tuple[str, ...]  # Names of boundary patches, or patterns such as exterior-*; * is the whole boundary
@@ -30,15 +30,15 @@ class SurfaceEffect(Effect):
 
 @dataclass(frozen=True)
 class FixedTemperature(SurfaceEffect):
-    """A surface kept at a temperature."""
+    """A surface that is kept at a given temperature."""
 
-    temperature_c: Quantity  # Temperature of the surface, [degrees Celsius], at least -273.15. Asked at the nodes
+    temperature_c: Quantity  # Temperature of the surface, [degrees Celsius], at least -273.15; evaluated at nodes
 
     kind = "fixed temperature"
     bounds = {"temperature_c": Bounds("temperature_c", "degrees Celsius", _ABSOLUTE_ZERO_C, HOTTEST_C)}
 
     def term(self, selection: Selection) -> Term:
-        """T = T_fixed at the nodes of the patches."""
+        """Return the term that fixes T = `temperature_c` at the nodes of the patches."""
         return Term("fixed", selection.facets(self.patches), (self.bounded("temperature_c"),))
 
 
@@ -52,7 +52,7 @@ class HeatFlux(SurfaceEffect):
     bounds = {"flux_w_m2": Bounds("flux_w_m2", "W/m2")}
 
     def term(self, selection: Selection) -> Term:
-        """k grad T . n = q."""
+        """Return the term of the given heat flux into the body, k grad T . n = `flux_w_m2`."""
         return Term("flux", selection.facets(self.patches), (self.bounded("flux_w_m2"),))
 
 
@@ -70,7 +70,7 @@ class Convection(SurfaceEffect):
     }
 
     def term(self, selection: Selection) -> Term:
-        """k grad T . n = h (T_air - T)."""
+        """Return the term of the heat flux into the body, k grad T . n = h (T_air - T)."""
         quantities = self.bounded("coefficient_w_m2k"), self.bounded("air_c")
         return Term("convection", selection.facets(self.patches), quantities)
 
@@ -95,14 +95,14 @@ class Radiation(SurfaceEffect):
     }
 
     def term(self, selection: Selection) -> Term:
-        """k grad T . n = sigma eps (T_s^4 - T^4), temperatures in kelvin."""
+        """Return the term of the heat flux into the body, k grad T . n = sigma eps (T_s^4 - T^4), T in kelvin."""
         quantities = self.bounded("emissivity"), self.bounded("surroundings_c")
         return Term("radiation", selection.facets(self.patches), quantities, self.stefan_boltzmann_w_m2k4)
 
 
 @dataclass(frozen=True)
 class AbsorbedSolar(SurfaceEffect):
-    """Sunlight that a surface takes up."""
+    """Sunlight that a surface absorbs."""
 
     absorptivity: Quantity  # Share of the sunlight that the surface absorbs, 0 to 1
     irradiance_w_m2: Quantity  # Sunlight that falls on the surface, [W / m2] of the surface itself, at least 0
@@ -114,7 +114,7 @@ class AbsorbedSolar(SurfaceEffect):
     }
 
     def term(self, selection: Selection) -> Term:
-        """k grad T . n = absorptivity times irradiance."""
+        """Return the term of the heat flux into the body, k grad T . n = absorptivity times irradiance."""
         factors = self.bounded("absorptivity"), self.bounded("irradiance_w_m2")
         return Term("flux", selection.facets(self.patches), factors)
 
@@ -133,7 +133,7 @@ class GroundContact(SurfaceEffect):
     }
 
     def term(self, selection: Selection) -> Term:
-        """k grad T . n = (T_ground - T) / R."""
+        """Return the term of the heat flux into the body, k grad T . n = (T_ground - T) / R, R the resistance."""
         coefficient = Bounds("1 / resistance_m2k_w", "W/(m2 K)", 0.0)
         conductance = Bounded(coefficient.check_quantity(1.0 / self.resistance_m2k_w), coefficient)
         return Term("convection", selection.facets(self.patches), (conductance, self.bounded("ground_c")))
@@ -141,14 +141,14 @@ class GroundContact(SurfaceEffect):
 
 @dataclass(frozen=True)
 class InternalHeat(Effect):
-    """Heat set free inside the body."""
+    """Heat that is set free inside the body."""
 
     regions: tuple[str, ...]  # Names of regions, or patterns; * is the whole body
-    source_w_m3: Quantity  # Heat source, [W / m3]; negative takes heat out
+    source_w_m3: Quantity  # Heat set free per volume, [W / m3]; a negative value takes heat out
 
     kind = "internal heat"
     bounds = {"source_w_m3": Bounds("source_w_m3", "W/m3")}
 
     def term(self, selection: Selection) -> Term:
-        """Rho c dT/dt = div(k grad T) + s."""
+        """Return the term of the source s = `source_w_m3` in rho c dT/dt = div(k grad T) + s."""
         return Term("source", selection.tets(self.regions), (self.bounded("source_w_m3"),))

@@ -1,4 +1,4 @@
-"""What a body is made of, and the table of building materials in ``configs/materials.yaml``."""
+"""Materials of bodies, and the table of building materials in ``configs/materials.yaml``."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ class Material:
 
 @record(HeatError)
 class MaterialRow(Material):
-    """A row of the table: design values for conditions as in a building, and where they come from."""
+    """A row of the table of building materials: design values for conditions in buildings, and their source."""
 
-    source: Text
+    source: Text  # Publication from which the values are taken
 
 
 def with_names(content: Any) -> Any:
-    """Put the keys of materials in a file into them, as their names."""
+    """Return a file's mapping of materials with each key as the `name` of its entry; other content is unchanged."""
     if not isinstance(content, dict):
         return content
     return {key: {**entry, "name": key} if isinstance(entry, dict) else entry for key, entry in content.items()}
@@ -58,7 +58,7 @@ def with_names(content: Any) -> Any:
 
 @cache
 def material_table() -> dict[str, MaterialRow]:
-    """Read the rows of ``configs/materials.yaml`` by name."""
+    """Read the rows of ``configs/materials.yaml`` by name, once."""
     file = configs_folder() / "materials.yaml"
     return as_record(file.name, with_names(read_yaml(file)), dict[str, MaterialRow])
 
@@ -80,7 +80,7 @@ def material(name: str) -> Material:
 
 
 def materials_by_region(problem: HeatProblem) -> dict[str, Material]:
-    """Give the materials of a problem by the names of its regions that have a tetrahedron."""
+    """Return the material of each region of a problem by name; regions without a tetrahedron are left out."""
     names = [problem.mesh.region_names[number] for number in np.unique(problem.mesh.region)]
     made_of = {
         name: problem.material[name] if isinstance(problem.material, Mapping) else problem.material for name in names

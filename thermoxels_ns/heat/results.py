@@ -1,4 +1,4 @@
-"""Heat flows by patch, effect, region and wall, hottest and coldest spots, energy balance."""
+"""Results of a solution: heat flows by patch, effect, region and wall, hottest and coldest spots, energy balance."""
 
 from __future__ import annotations
 
@@ -29,90 +29,90 @@ Vector = FloatArray
 
 @dataclass(frozen=True)
 class Spot:
-    """A node, its temperature and place, and the patches that it lies on (none inside the body)."""
+    """A node of the mesh with its temperature at one time."""
 
-    temperature_c: float
-    point_m: tuple[float, float, float]
-    time_s: float  # When, [s]; 0 in a steady state
-    node: int  # Its number in the mesh, from 0
-    patches: tuple[str, ...]
+    temperature_c: float  # Temperature of the node, [degrees Celsius]
+    point_m: tuple[float, float, float]  # Position of the node, [m]
+    time_s: float  # Time of the temperature, [s]; 0 in a steady state
+    node: int  # Number of the node in the mesh, from 0
+    patches: tuple[str, ...]  # Names of the patches that the node lies on; empty inside the body
 
 
 @dataclass(frozen=True)
 class PatchResult:
-    """A part of the surface: area, mean heat flow into the body over all times, temperatures at the end."""
+    """The results on one patch of the surface."""
 
-    patch: str
-    area_m2: float
-    heat_w: float
-    heat_w_m2: float
+    patch: str  # Name of the patch
+    area_m2: float  # Area, [m2]
+    heat_w: float  # Mean heat flow into the body over all times, [W]
+    heat_w_m2: float  # `heat_w` per area, [W / m2]
     last_heat_w: float  # Mean heat flow into the body during the last interval, [W]
-    mean_c: float
-    coldest: Spot
-    hottest: Spot
+    mean_c: float  # Mean temperature of the surface at the end, [degrees Celsius]
+    coldest: Spot  # Coldest node at the end
+    hottest: Spot  # Hottest node at the end
 
 
 @dataclass(frozen=True)
 class EffectResult:
-    """What acts on the body: mean heat flow into it over all times, area it acts on (None: a source inside)."""
+    """The heat that one effect brings into the body."""
 
-    effect: str
-    heat_w: float
-    area_m2: float | None
-    heat_w_m2: float | None
+    effect: str  # Label of the effect
+    heat_w: float  # Mean heat flow into the body over all times, [W]
+    area_m2: float | None  # Area that the effect acts on, [m2]; None for a source inside
+    heat_w_m2: float | None  # `heat_w` per area, [W / m2]; None without area
     last_heat_w: float  # Mean heat flow into the body during the last interval, [W]
-    groups: dict[str, float]  # Mean heat flow over all times by patch, of a source by region, [W]
+    groups: dict[str, float]  # Mean heat flow into the body over all times by patch, or for a source by region, [W]
 
 
 @dataclass(frozen=True)
 class RegionResult:
-    """A part of the volume, such as all of one material; heat flow and temperatures are those at the end."""
+    """The results in one region of the volume; heat flow and temperatures are those at the end."""
 
-    region: str
-    material: str
-    volume_m3: float
-    area_m2: float  # True area of its own surface, [m2]; where it touches other regions does not count
-    heat_w: float  # Heat flow into the body through its own surface at the end, [W]; negative where heat is lost
-    heat_w_m2: float
-    mean_c: float
-    min_c: float
-    max_c: float
+    region: str  # Name of the region
+    material: str  # Name of its material
+    volume_m3: float  # Volume, [m3]
+    area_m2: float  # True area of the boundary triangles of the region, [m2], without its contact with other regions
+    heat_w: float  # Heat flow into the body through these triangles, [W]; negative if heat is lost
+    heat_w_m2: float  # `heat_w` per area, [W / m2]; 0 without area
+    mean_c: float  # Mean temperature over the volume, [degrees Celsius]
+    min_c: float  # Lowest temperature of a node, [degrees Celsius]
+    max_c: float  # Highest temperature of a node, [degrees Celsius]
 
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Stored = in - out."""
+    """The energy balance of a body, in `unit`: stored = into_body - out_of_body + residual."""
 
     unit: str  # J through time, W in a steady state
-    into_body: float
-    out_of_body: float
+    into_body: float  # Heat that flows in, summed over intervals and over the patches or regions of all effects
+    out_of_body: float  # Heat that flows out, summed in the same way, at least 0
     stored: float  # Change of the body's heat content; 0 in a steady state
-    residual: float  # Stored - in + out: what nothing accounts for
+    residual: float  # stored - into_body + out_of_body: stored heat that no heat flow accounts for
     relative_residual: float
-    """The solver's own measure of it: its largest size relative to the heat content or to all heat exchanged."""
+    """The residual as a ratio, from the solver: `energy_residual` of `HeatSolution` or of `SteadySolution`."""
     unbalanced_w: float
-    """Heat that the solver left unbalanced at all nodes, round-off included, [W]: no heat flow is uncertain by more.
-    Through time that of the worst step."""
+    """Heat that the solver left unbalanced at all nodes, round-off included, [W], through time in the worst step. No
+    heat flow is more uncertain than this."""
 
 
 @dataclass(frozen=True)
 class HeatResults:
-    """What people ask of a solution. Heat flows are positive into the body; spots are those of all nodes and times."""
+    """The results of a solution that people ask for; heat flows are positive into the body."""
 
-    status: str
+    status: str  # Sentences on how the solver converged
     times_s: tuple[float, ...]  # Times of the kept temperatures, [s]; 0 alone for a steady state
     patches: tuple[PatchResult, ...]
     effects: tuple[EffectResult, ...]
     regions: tuple[RegionResult, ...]
     balance: EnergyBalance
     overshoot_k: float
-    """How far any temperature left the range of what surrounds the body, and of its start, [K]; 0 up to 0.01 K."""
-    coldest: Spot
-    hottest: Spot
+    """Most by which a temperature left the range of the surroundings and the start, [K]; 0 if at most 0.01 K."""
+    coldest: Spot  # Coldest of all nodes and times
+    hottest: Spot  # Hottest of all nodes and times
 
 
 def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes | None = None) -> HeatResults:
-    """Compute what people ask of a solution: temperatures of all unknowns, heat flows as the solver evaluates them."""
+    """Return the results of a solution of `problem`; `nodes` are its `solution_nodes`, None: they are made here."""
     nodes = solution_nodes(problem, solution) if nodes is None else nodes
     times, states, selection = nodes.times_s, nodes.states_c, Selection(nodes.mesh, problem.up)
     lengths = np.diff(times) if len(times) > 1 else np.ones(1)
@@ -130,12 +130,12 @@ def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes 
 
 
 def region_behind_facets(mesh: TetMesh) -> IntArray:
-    """Give the region of the tetrahedron behind each boundary triangle, shape (f,)."""
+    """Return the number of the region behind each boundary triangle, shape (f,)."""
     return mesh.region[facet_owners(mesh.tets, mesh.facets)[0]]
 
 
 def volume_shares(mesh: TetMesh) -> Vector:
-    """Give the share of the volume around each node, shape (n,)."""
+    """Return each node's share of the volume, shape (n,), with sum 1: a quarter of each tetrahedron around it."""
     weights = np.bincount(
         mesh.tets.ravel(), np.repeat(signed_volumes(mesh.points_m, mesh.tets) / 4.0, 4), len(mesh.points_m)
     )
@@ -143,7 +143,7 @@ def volume_shares(mesh: TetMesh) -> Vector:
 
 
 def _spot(selection: Selection, nodes: SolutionNodes, time: int, node: int) -> Spot:
-    """Describe a node at the time with a number, -1 for the end."""
+    """Return the spot of a node at index `time` of `SolutionNodes.times_s`; -1 is the end."""
     touching = np.any(selection.mesh.facets == node, axis=1)
     patches = tuple(selection.patch_names[number] for number in np.unique(selection.facet_patch[touching]))
     x, y, z = selection.mesh.points_m[node].tolist()
@@ -236,7 +236,7 @@ def _regions(
 
 def _balance(solution: Solution, lengths: Vector) -> EnergyBalance:
     steady = isinstance(solution, SteadySolution)
-    # By patch: what comes in through one and leaves through another must not cancel in the sum of an effect.
+    # Flows are summed by patch: heat in through one patch and out through another must not cancel.
     flows = np.concatenate([np.zeros((len(lengths), 0)), *(heat.group_heat_w for heat in solution.effects)], axis=1)
     energies = flows * lengths[:, None]
     into, out = float(energies[energies > 0.0].sum()), -float(energies[energies < 0.0].sum())
@@ -252,47 +252,47 @@ def _balance(solution: Solution, lengths: Vector) -> EnergyBalance:
     )
 
 
-_LEAST_DIFFERENCE_K = 1e-6
+_LEAST_DIFFERENCE_K = 1e-6  # Difference between the two airs below which there is no wall, [K]
 
 
 @dataclass(frozen=True)
 class WallPart:
-    """A part of the inner surface."""
+    """A part of a wall's inner surface: one patch, or the triangles of one region."""
 
-    name: str
-    area_m2: float
-    heat_w: float  # Heat flow into it from the inside, [W]
-    u_value_w_m2k: float  # Heat flow per area and difference of the airs, [W / (m2 K)]
+    name: str  # Name of the patch or region
+    area_m2: float  # Area of the part, [m2]
+    heat_w: float  # Heat flow into the part from the inside, [W]
+    u_value_w_m2k: float  # Heat flow per area and per difference between the temperatures of the airs, [W / (m2 K)]
 
 
 @dataclass(frozen=True)
 class WallResult:
-    """A body as a wall between two airs; areas, heat flows and the coldest spot are those of its inner surface."""
+    """A body as a wall between the air inside and the air outside, in a steady state."""
 
-    inside_c: float
-    outside_c: float
-    area_m2: float
-    heat_w: float
+    inside_c: float  # Temperature of the air inside, [degrees Celsius]
+    outside_c: float  # Temperature of the air outside, [degrees Celsius]
+    area_m2: float  # Area of the inner surface, [m2]
+    heat_w: float  # Heat flow into the inner surface, [W]
     coupling_w_k: float  # Thermal coupling coefficient, heat flow per difference of the airs (ISO 10211: L_3D), [W / K]
     u_value_w_m2k: float
-    """The same per area of the inner surface, [W / (m2 K)]. For a plane wall this is its U-value (ISO 6946); at corners
-    and thermal bridges it is a mean that depends on which surface is measured."""
+    """`coupling_w_k` per area of the inner surface, [W / (m2 K)]. For a plane wall this is its U-value (ISO 6946); with
+    corners and thermal bridges the value is a mean that depends on which surface is measured."""
     temperature_factor: float
-    """f_Rsi = (T_si,min - T_e) / (T_i - T_e) at the coldest spot of the inner surface: 1 is as warm as the air inside.
-    It depends on the resistance of the inner surface; for the risk of mould ISO 13788 asks for 0.25 m2 K/W, a
-    coefficient of 4 W/(m2 K), where ISO 6946 takes 0.10 to 0.17 for the loss of heat."""
-    coldest: Spot
-    patches: tuple[WallPart, ...]
-    regions: tuple[WallPart, ...]
+    """f_Rsi = (T_si,min - T_e) / (T_i - T_e) at `coldest`: 1 is as warm as the air inside. The factor depends on the
+    resistance of the inner surface. For the risk of mould ISO 13788 asks for 0.25 m2 K/W, a coefficient of 4 W/(m2 K);
+    ISO 6946 takes 0.10 to 0.17 m2 K/W for the loss of heat."""
+    coldest: Spot  # Coldest node of the inner surface; the hottest if it is warmer outside
+    patches: tuple[WallPart, ...]  # Parts of the inner surface by patch
+    regions: tuple[WallPart, ...]  # Parts of the inner surface by region
 
 
 def wall_of_scene(
     scene: HeatScene, problem: HeatProblem, solution: Solution, nodes: SolutionNodes, *, doubtful: bool
 ) -> WallResult | str:
-    """See a body as a wall, if its steady state between two airs of different temperature is asked for.
+    """Return a body as a wall if its steady state between two airs was asked for, else why it is no wall.
 
-    `doubtful`: the airs probably act on other surfaces than was meant. Returns the wall, or why there is none although
-    there are two airs, a sentence; "" without two airs.
+    The reason is a sentence; it is "" through time, without two airs, or if both have the same temperature. `doubtful`
+    is True if the airs probably act on other surfaces than was meant; there is no wall then.
     """
     inside, outside = scene.inside_air, scene.outside_air
     if not isinstance(solution, SteadySolution) or inside is None or outside is None:
@@ -317,10 +317,10 @@ def wall_result(
     outside_c: float,
     nodes: SolutionNodes | None = None,
 ) -> WallResult:
-    """Work out what a body between two airs lets through.
+    """Return the heat flow, U-value and coldest spot of a body between two airs.
 
-    The figures are those of a wall only if nothing but the two airs acts: sunlight or a cold sky count as heat
-    through it. `inside` names the patches that face the inside, some of which have area; the airs differ.
+    These are figures of a wall only if nothing but the two airs acts: sunlight or a cold sky would count as heat
+    through the wall. `inside` names the patches, of area above 0, that face the air inside; both airs differ.
     """
     difference_k = inside_c - outside_c
     selection, mesh = problem.selection, problem.mesh
@@ -339,14 +339,14 @@ def wall_result(
     area, heat = sum(part.area_m2 for part in patches), sum(part.heat_w for part in patches)
     shown = solution_nodes(problem, solution) if nodes is None else nodes
     every_c, inner_nodes = shown.states_c[-1], np.unique(shown.mesh.facets[shown.of_facets(inner)])
-    # At the rim of a hole both airs touch one node, which is no spot of the inner surface.
+    # At the rim of a hole both airs touch the same node, which does not count as a spot of the inner surface.
     outer = np.zeros(len(mesh.facets), dtype=bool)
     for effect in problem.effects:
         if isinstance(effect, Convection) and effect.air_c != inside_c:
             outer[selection.facets(effect.patches)] = True
     away = np.setdiff1d(inner_nodes, shown.mesh.facets[shown.of_facets(outer & ~inner)])
     inner_nodes = away if len(away) else inner_nodes
-    # The worst spot: the coldest if it is colder outside, else the hottest.
+    # The worst spot is the coldest node if it is colder outside, else the hottest node.
     worst = int(inner_nodes[np.argmin(np.sign(difference_k) * every_c[inner_nodes])])
     spot = _spot(Selection(shown.mesh, problem.up), shown, -1, worst)
     return WallResult(
@@ -364,15 +364,15 @@ def wall_result(
 
 
 def matching_facets(selection: Selection, patterns: Sequence[str]) -> BoolArray:
-    """Mark the boundary triangles of patches whose names match one of some names or patterns, shape (f,)."""
+    """Return True for each boundary triangle whose patch matches a name or pattern, shape (f,)."""
     matching = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in selection.patch_names]
     return np.array(matching, dtype=bool)[selection.facet_patch]
 
 
 def heat_by_part(solution: Solution, part: IntArray, count: int) -> Vector:
-    """Add up the heat flow into the body through parts of the surface at the end, shape (p,), [W].
+    """Return the heat flow into the body through each part of the surface at the end, shape (count,), [W].
 
-    `part` is the number of the part, below `count`, of each boundary triangle of the mesh that was solved, shape (f,).
+    `part`, shape (f,), is the number of the part, below `count`, of each boundary triangle of the mesh solved on.
     """
     total = np.zeros(count)
     for heat in solution.last_facet_heat:

@@ -1,4 +1,4 @@
-"""The course, warnings and result of a heat run: a scene on a mesh."""
+"""A heat run: a scene is put on a mesh and solved, with probes, warnings and results."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ Vector = FloatArray
 
 
 _OUTSIDE = 1e-9
-"""How far outside a tetrahedron, as a share of its height, a point may be and still count as on its face."""
+"""Distance outside a tetrahedron, as a share of its height, up to which a point counts as on its face."""
 
 
 @dataclass(frozen=True)
 class Probes:
-    """Points in a body and how their temperature follows from that of the nodes."""
+    """The p points in a body where temperatures are followed, with the weights of the nodes around each point."""
 
     points_m: FloatArray  # Positions, shape (p, 3), [m]
     nodes: IntArray  # Nodes of the tetrahedron around each point, shape (p, 4)
-    weights: FloatArray  # Barycentric coordinates in it, shape (p, 4); each row adds up to 1
+    weights: FloatArray  # Barycentric coordinates of each point in its tetrahedron, shape (p, 4), sum 1
 
     def at(self, nodal: Vector) -> Vector:
-        """Interpolate nodal values, shape (..., n), to the points, shape (..., p)."""
+        """Return values at the points, shape (..., p), interpolated from values at the nodes, shape (..., n)."""
         return np.einsum("...pa,pa->...p", nodal[..., self.nodes], self.weights)
 
 
 def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
-    """Find the tetrahedron around each point, shape (p, 3), [m]; raises `HeatError` if one lies outside the body.
+    """Return probes at points, shape (p, 3), [m]; raises `HeatError` if a point lies outside the body.
 
     >>> corner, none = np.vstack([np.zeros(3), np.eye(3)]), np.zeros((0, 3), np.int64)
     >>> tets, seen = np.array([[0, 1, 2, 3]]), np.ones(4, bool)
@@ -72,7 +72,7 @@ def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
     for number, point in enumerate(points):
         near = np.flatnonzero(np.all((low <= point + slack) & (high >= point - slack), axis=1))
         shares = _barycentric(corner[near], point)
-        # On a face or at a node several tetrahedra have it: the one it lies deepest in, the first of equals.
+        # A point on a face or node lies in several tetrahedra: take the one it lies deepest in, the first of equals.
         best = int(np.argmax(shares.min(axis=1))) if len(near) else -1
         if best < 0 or shares[best].min() < -_OUTSIDE:
             raise _outside(mesh, number, point)
@@ -82,7 +82,7 @@ def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
 
 
 def _barycentric(corner: Vector, point: Vector) -> Vector:
-    """Barycentric coordinates of a point in tetrahedra, shape (k, 4)."""
+    """Return the barycentric coordinates of a point in k tetrahedra with corners (k, 4, 3), shape (k, 4)."""
     sides = corner[:, 1:] - corner[:, :1]
     others = np.linalg.solve(np.swapaxes(sides, 1, 2), (point - corner[:, 0])[..., None])[..., 0]
     return np.concatenate([1.0 - others.sum(axis=1, keepdims=True), others], axis=1)
@@ -101,24 +101,24 @@ def _outside(mesh: TetMesh, number: int, point: Vector) -> HeatError:
 
 @dataclass(frozen=True)
 class HeatRun:
-    """All that a run found out; warnings are what looks wrong about the scene on this mesh, a sentence or two each."""
+    """The outcome of `run_scene`: the problems, the solution, its results and the warnings."""
 
-    scene: HeatScene
-    problem: HeatProblem  # The problem with all that the scene names, on the given mesh
-    solved: HeatProblem  # What was solved: without what is left out, and, if a tolerance asked for it, on a finer mesh
-    nodes: SolutionNodes  # All temperatures of the solution on a mesh that has a node for each
-    left_out: tuple[LeftOut, ...]  # What brings too little heat to be built
-    accuracy: ToleratedSolution | None  # What is known of the error; None if no tolerance was given
-    warnings: tuple[str, ...]
-    solution: Solution
-    results: HeatResults
+    scene: HeatScene  # The scene that was run
+    problem: HeatProblem  # The problem with all effects of the scene, on the given mesh
+    solved: HeatProblem  # The problem that was solved: without `left_out`, and perhaps refined to meet a tolerance
+    nodes: SolutionNodes  # All temperatures of the solution, on a mesh with a node for each unknown
+    left_out: tuple[LeftOut, ...]  # Effects that were left out because they bring too little heat
+    accuracy: ToleratedSolution | None  # Solution with estimated errors; None if no tolerance was given
+    warnings: tuple[str, ...]  # Sentences on what looks wrong about the scene on this mesh
+    solution: Solution  # Temperatures and heat flows
+    results: HeatResults  # Results of the solution
     wall: WallResult | None
-    """The body as a wall, if its steady state between two airs was asked for and nothing else acts."""
-    no_wall: str  # Why there is no wall although there are two airs, a sentence; else empty
+    """The body as a wall; None unless a steady state between two airs was asked for and no other effect acts."""
+    no_wall: str  # Sentence on why there is no wall although there are two airs; else empty
     mean_c: Vector  # Mean temperature of the volume at each time, shape (s,), [degrees Celsius]
-    probes: Probes
-    probes_c: Vector  # Temperatures there, shape (s, p), [degrees Celsius]
-    seconds: Mapping[str, float]  # Time that each part took, [s]
+    probes: Probes  # Points where temperatures are followed, in the mesh of `nodes`
+    probes_c: Vector  # Temperatures at `probes`, shape (s, p), [degrees Celsius]
+    seconds: Mapping[str, float]  # Time that each part took, [s]: "solve" and "answers"
 
 
 def run_scene(
@@ -131,11 +131,11 @@ def run_scene(
     export: Mapping[str, Any] | None = None,
     say: Say = lambda _: None,
 ) -> HeatRun:
-    """Put a scene around a body, solve it, and work out what people ask.
+    """Put a scene on a mesh, solve the problem, and return the solution with results and warnings.
 
-    `up`, None: z, counts if the scene does not say. Temperatures are followed at `probes_m`, shape (p, 3); warnings
-    look at `export`, the summary of the export that the mesh comes from; `say` gets lines of progress. Raises
-    `HeatError` if the scene does not fit the mesh, a probe lies outside, or the solver fails.
+    `up`, None: z, is used if the scene has none. Temperatures are followed at `probes_m`, shape (p, 3), [m]. Warnings
+    also use `export`, the summary of the export that wrote the mesh; `say` is called with lines of progress. Raises
+    `HeatError` if the scene does not fit the mesh, a probe lies outside the body, or the solver fails.
     """
     start = clock.perf_counter()
     problem = scene.problem(mesh, up=up)
@@ -182,7 +182,7 @@ def run_scene(
 
 
 def mesh_error_in_words(solution: Solution) -> str:
-    """Say what the mesh's error is without a tolerance, as far as the solution itself tells."""
+    """Return words on the error of the mesh of a solution without tolerance: its estimate, if there is one."""
     error = solution.error if isinstance(solution, SteadySolution) else None
     if error is None:
         return "not estimated; --tolerance estimates it"
@@ -192,20 +192,20 @@ def mesh_error_in_words(solution: Solution) -> str:
 _KELVIN_OF_AIR = (173.15, 373.15)  # Temperatures of air that are likely in kelvin and hardly so in degrees Celsius
 _COS_45 = float(np.sqrt(0.5))
 _LEAST_OF_A_ROOM = 0.1
-"""Share of its surface that a room has on walls and floor at least: of a cube they are five sixths."""
-_LEAST_FLOOR = 0.5  # Share of its ceiling that a room's floor has at least
-_THICKNESS_OFF = 0.2  # Share by which walls may come out thicker or thinner than asked without a word
+"""Least share of a room's inner surface that walls and floor make up; in a cube they make up five sixths."""
+_LEAST_FLOOR = 0.5  # Least area of a room's floor over that of its ceiling
+_THICKNESS_OFF = 0.2  # Relative difference from the asked thickness of walls above which there is a warning
 _INWARDS = -0.2
-"""Mean cosine between the normals of a surface and the directions away from its middle: 0.8 to 1 for a body seen from
-around it, 0 for a plane, -0.8 to -1 for a room seen from within."""
+"""Value of `_outwards` below which a surface faces inwards, as that of a room does. Typical values: 0.8 to 1 for a body
+seen from around, 0 for a plane, -0.8 to -1 for a room seen from within."""
 
 
 def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str, ...]:
-    """Find what a scene's default patches mean on a mesh for which they were not meant.
+    """Return warnings if the default patches of the scene's two airs do not suit the mesh.
 
-    Which surfaces are inside is known from what no camera saw. That is wrong for a body that was filled, of
-    which only the underside remains unseen, and for a room that was photographed from within, whose inner
-    surface is what was seen. A scene that names patches of its own is trusted.
+    By default, surfaces that no camera saw are inside. This is wrong for a body that was filled, of which only the
+    underside is unseen, and for a room that was photographed from within, whose inner surface was seen. Airs whose
+    patches the scene names are not checked.
     """
     selection = Selection(mesh, up)
     inside, outside = matching_facets(selection, INSIDE), matching_facets(selection, OUTSIDE)
@@ -231,7 +231,7 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
 
 
 def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str, ...]:
-    """Find rims of holes, where the inner surface touches the outer one, and rooms without a floor."""
+    """Return warnings on rims of holes, where the inner surface touches the outer one, and on missing floors."""
     if scene.inside_air is None or scene.outside_air is None:
         return ()
     selection = Selection(mesh, up)
@@ -258,7 +258,7 @@ def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tu
 
 
 def unused_settings(scene: HeatScene) -> tuple[str, ...]:
-    """Say what a scene gives and its question does not ask for, or asks for and does not give."""
+    """Return warnings on an initial temperature of a steady scene and on air series that are too short."""
     if scene.time is None:
         if scene.initial_c is None:
             return ()
@@ -282,7 +282,7 @@ def unused_settings(scene: HeatScene) -> tuple[str, ...]:
 
 
 def doubtful_temperatures(scene: HeatScene) -> tuple[str, ...]:
-    """Name airs that are so hot in degrees Celsius that they were probably given in kelvin."""
+    """Return warnings on airs so hot in degrees Celsius that they were probably given in kelvin."""
     airs = [("inside_air", scene.inside_air), ("outside_air", scene.outside_air)]
     airs += [(f"convection entry {number}", entry) for number, entry in enumerate(scene.convection, start=1)]
     return tuple(
@@ -294,7 +294,7 @@ def doubtful_temperatures(scene: HeatScene) -> tuple[str, ...]:
 
 
 def body_warnings(mesh: TetMesh) -> tuple[str, ...]:
-    """Find nodes at one place, which no heat crosses, and bodies that lie in each other."""
+    """Return a warning on bodies that overlap, or else on different nodes at one place, between which no heat flows."""
     twins, inside, warnings = count_twin_nodes(mesh.points_m), count_tets_in_other_bodies(mesh), []
     if inside:
         warnings.append(
@@ -310,7 +310,7 @@ def body_warnings(mesh: TetMesh) -> tuple[str, ...]:
 
 
 def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ...]:
-    """Warn that the walls of a hollow export, by its summary, are as thick as photographs happened to make them."""
+    """Return a warning on the thickness of walls if `export`, the summary of the mesh's export, is of a shell."""
     options, mesh = export.get("options"), export.get("mesh")
     if scene.inside_air is None or not isinstance(options, dict) or not isinstance(mesh, dict):
         return ()
@@ -336,14 +336,14 @@ def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ..
 
 
 def _has_rooms(selection: Selection, inside: BoolArray) -> bool:
-    """Whether enough of a surface faces up or sideways to be that of rooms."""
+    """Return whether enough of the triangles marked in `inside` face up or sideways to be walls and floor of rooms."""
     area = selection.facet_area_m2[inside]
     level = selection.facet_normal[inside] @ np.array(selection.up) / np.linalg.norm(selection.up)
     return float(area[level > -_COS_45].sum()) > _LEAST_OF_A_ROOM * float(area.sum())
 
 
 def _outwards(selection: Selection, chosen: BoolArray) -> float:
-    """Mean cosine between normals and the directions away from the middle; 0 of nothing."""
+    """Return the mean cosine between normals and the directions away from the middle of a surface; 0 if it is empty."""
     area = selection.facet_area_m2[chosen]
     if not float(area.sum()) > 0.0:
         return 0.0

@@ -1,4 +1,4 @@
-"""A heat scene: materials, surroundings and time, from a yaml file or not; it becomes a problem on a mesh.
+"""A heat scene: materials, surroundings and time, made in code or read from a yaml file, and its problem on a mesh.
 
 ``configs/scene-all-effects.yaml`` explains every key of a file.
 """
@@ -56,18 +56,18 @@ _PATCHES_OF_THEIR_OWN = "Give each of the two its own patches: [names]."
 
 @record(HeatError)
 class HeatScene:
-    """What a scene file names. What it does not name is not built."""
+    """A heat scene: materials, surroundings and time. Only effects that the scene names are built."""
 
     materials: Annotated[Mapping[str, Material], Field(min_length=1)]
-    """What regions of the mesh are made of, by name or pattern; of several that match a region, the last one holds."""
+    """Materials by name or pattern of the mesh's regions; if several patterns match a region, the last one holds."""
     time: TimeSteps | AdaptiveSteps | None = None
-    """How the body is followed through time; None: its steady state is asked for."""
+    """Time steps in which the body is followed; None: the steady state is asked for."""
     initial_c: Celsius | None = None
-    """Temperature of the whole body at the start, [degrees Celsius]; None: that of the photographs."""
-    up: Direction | None = None  # Direction that points up in the coordinates of the mesh; None: as the mesh says
+    """Temperature of the whole body at the start, [degrees Celsius]; None: temperatures of the photographs."""
+    up: Direction | None = None  # Direction that points up in the coordinates of the mesh; None: see `problem`
     inside_air: InsideAir | None = None  # The air of a room
     outside_air: OutsideAir | None = None  # The open air and its wind
-    surfaces: tuple[Surface, ...] = ()  # How surfaces radiate to sky and ground and absorb sunlight; later entries hold
+    surfaces: tuple[Surface, ...] = ()  # Emissivity and absorptivity by patches; for one patch the last entry holds
     sky: Sky | None = None  # The sky that surfaces radiate to
     ground: Ground | None = None  # The ground that surfaces see
     sun: Sun | None = None  # The sun
@@ -75,12 +75,12 @@ class HeatScene:
     heat_flux: tuple[HeatFlux, ...] = ()  # Given heat fluxes, positive into the body
     convection: tuple[Convection, ...] = ()  # Further air, such as a second room, with given coefficients
     radiation: tuple[Radiation, ...] = ()  # Long-wave exchange with surroundings of one temperature
-    absorbed_solar: tuple[AbsorbedSolar, ...] = ()  # Sunlight that falls on surfaces alike, wherever they face
+    absorbed_solar: tuple[AbsorbedSolar, ...] = ()  # Sunlight of given strength, whatever way the surfaces face
     ground_contact: tuple[GroundContact, ...] = ()  # Surfaces that touch the ground
     internal_heat: tuple[InternalHeat, ...] = ()  # Heat set free inside
     adiabatic: tuple[str, ...] = ("cut",)
-    """Patches that no heat crosses, by name or pattern. Every patch is named here or has something act on it."""
-    description: str = ""  # What the scene is, for reports
+    """Patches that no heat crosses, by name or pattern. A patch with area must be named here or have an effect."""
+    description: str = ""  # Description of the scene, for reports
 
     def __post_init__(self) -> None:
         if self.sky is not None and self.sky.needs_air and self.outside_air is None:
@@ -106,19 +106,19 @@ class HeatScene:
 
     @property
     def steady(self) -> bool:
-        """Whether the steady state is asked for."""
+        """True if the steady state is asked for, `time` being None."""
         return self.time is None
 
     def problem(self, mesh: TetMesh, *, up: Vector | None = None) -> HeatProblem:
-        """Put the scene around a body; `up` counts if the scene does not say, None: z. Raises what `effects` does."""
+        """Return the heat problem on a mesh; `up` (None: z) serves a scene without `up`. Raises as `effects` does."""
         initial = None if self.initial_c is None else np.full(len(mesh.points_m), self.initial_c)
         return HeatProblem(mesh, self._material(mesh), initial, self.effects(mesh), self.up or up or _Z_UP)
 
     def effects(self, mesh: TetMesh) -> tuple[Effect, ...]:
-        """Build what the scene names, and nothing else.
+        """Return the effects that the scene names.
 
-        Raises `HeatError` if the mesh lacks a patch that the scene names, a patch has nothing act on it and is not
-        named adiabatic, or two entries count the same exchange.
+        Raises `HeatError` if the mesh lacks a patch that the scene names, a patch has no effect and is not named
+        adiabatic, or two entries count the same exchange of heat.
         """
         patches = ScenePatches(mesh)
         named = self._named_effects(patches)
@@ -128,7 +128,7 @@ class HeatScene:
         return (*(effect for _, effect in named), *self.internal_heat)
 
     def _named_effects(self, patches: ScenePatches) -> list[tuple[str, Effect]]:
-        """Effects on the surface, each with the entry of the scene that it comes from."""
+        """Return the effects on the surface, each after the name of the scene's entry from which it comes."""
         named: list[tuple[str, Effect]] = []
         if self.inside_air is not None:
             named.append(("inside_air", self.inside_air.convection()))
@@ -192,7 +192,7 @@ class HeatScene:
         return replace(air, function=lambda places, time_s: above(float(np.max(air.function(places, time_s)))))
 
     def _check_counted_once(self, where: list[tuple[str, set[str]]]) -> None:
-        """Refuse two kinds of air on one patch, and radiation in a coefficient beside radiation of its own."""
+        """Raise `HeatError` for two contacts with air or ground, or radiation counted twice, on one patch."""
         touching = ("inside_air", "outside_air", "convection", "ground_contact")
         contacts = [(name, patches) for name, patches in where if name.startswith(touching)]
         check_disjoint("contact with air or ground", contacts, _PATCHES_OF_THEIR_OWN)
@@ -224,7 +224,7 @@ _Time = Annotated[Annotated[TimeSteps, Tag("equal")] | Annotated[AdaptiveSteps, 
 
 @cache
 def _file_record() -> type:
-    """The keys of a file: those of `HeatScene`, with three differences."""
+    """Return the record of a file's keys: those of `HeatScene` with the differences that `load_heat_scene` names."""
     hints = get_type_hints(HeatScene, include_extras=True)
     own = [(one.name, hints[one.name], one) for one in fields(HeatScene)]
     return make_dataclass("Scene", [
@@ -237,18 +237,18 @@ def _file_record() -> type:
 
 
 def heat_scene_names() -> list[str]:
-    """List the names that `load_heat_scene` knows."""
+    """Return the names of the scenes in the package, sorted, which `load_heat_scene` accepts."""
     return sorted(path.stem.removeprefix("scene-") for path in configs_folder().glob("scene-*.yaml"))
 
 
 @raising(HeatError)
 def load_heat_scene(name: Path | str) -> HeatScene:
-    """Read a heat scene from a yaml file, or by the name of one that the package brings, such as ``winter-night``.
+    """Read a heat scene from a yaml file, or from the package by a name such as ``winter-night``.
 
-    A file has the fields of `HeatScene` as keys, with three differences: materials are names of the table or
-    three figures, the start is ``initial: photographs`` or ``initial: {temperature_c: 15}``, and a scene has
-    either ``steady: true`` or ``time:`` with the fields of `TimeSteps` or of `AdaptiveSteps`. Raises `HeatError` for
-    what is wrong in it.
+    The keys of a file are the fields of `HeatScene`, with three differences: a material is a name of the table or
+    three figures, the start is ``initial: photographs`` or ``initial: {temperature_c: 15}``, and a scene has either
+    ``steady: true`` or ``time:`` with the fields of `TimeSteps` or of `AdaptiveSteps`. Raises `HeatError` if the name
+    is not known or the content is wrong.
     """
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
@@ -290,7 +290,7 @@ def _given(value: Value | None) -> Value:
 
 
 class ScenePatches:
-    """The patches of a mesh by name, and how much surface each has."""
+    """The patches of a mesh by name, with the area of each."""
 
     def __init__(self, mesh: TetMesh) -> None:
         selection = Selection(mesh)
@@ -299,7 +299,7 @@ class ScenePatches:
         """True area of each patch by its name, [m2]."""
 
     def matching(self, name: str, patterns: Sequence[str]) -> set[str]:
-        """Give the patches that match any pattern of the entry `name`; raises `HeatError` if one matches none."""
+        """Return the patches that match any pattern of the entry `name`; `HeatError` if a pattern matches none."""
         found: set[str] = set()
         for pattern in patterns:
             matches = set(matching_names(self.area_m2, pattern))
@@ -313,9 +313,9 @@ class ScenePatches:
     def of_surfaces(
         self, surfaces: Sequence[Surface], value: Callable[[Surface], float | None], allowed: set[str] | None = None
     ) -> list[tuple[tuple[str, ...], float]]:
-        """Group the patches, written as patterns, by a property of their surfaces; the last entry holds.
+        """Return groups of patches, written as patterns, whose surfaces share a property, each with its value.
 
-        `value` gives the property, None if a surface has none; only `allowed` patches count, None: all.
+        `value` returns the property of a surface or None; the last entry for a patch holds; `allowed` None: any patch.
         """
         chosen: dict[str, float] = {}
         for number, surface in enumerate(surfaces, start=1):
@@ -329,7 +329,7 @@ class ScenePatches:
         return [(tuple(names), number) for number, names in groups.items()]
 
     def check_all_named(self, acting: set[str], adiabatic: Sequence[str]) -> None:
-        """Refuse a patch with area that a scene says nothing about: it would be insulated without a word."""
+        """Raise `HeatError` for a patch with area that is neither in `acting` nor adiabatic: it was forgotten."""
         whole = sum(self.area_m2.values())
         forgotten = [
             patch
@@ -347,7 +347,7 @@ class ScenePatches:
 
 
 def check_disjoint(what: str, entries: Sequence[tuple[str, set[str]]], remedy: str) -> None:
-    """Refuse entries, given by name and patches, of which two act on one patch."""
+    """Raise `HeatError` if two of the entries, given as name and patches, act on the same patch."""
     taken: dict[str, str] = {}
     for second, elsewhere in entries:
         for first in sorted({taken[patch] for patch in elsewhere & taken.keys()})[:1]:
@@ -358,5 +358,5 @@ def check_disjoint(what: str, entries: Sequence[tuple[str, set[str]]], remedy: s
 
 
 def _as_pattern(name: str) -> str:
-    """Make a pattern that matches a name and nothing else."""
+    """Return a pattern that matches a name and nothing else."""
     return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in name)

@@ -1,4 +1,4 @@
-"""The sections of a heat scene, checked when they are made."""
+"""The sections of a heat scene, checked when they are made: air, surfaces, sky, ground and sun."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying, tabu
 from thermoxels_ns.heat.effects import HOTTEST_C, STEFAN_BOLTZMANN_W_M2K4, Convection
 from thermoxels_ns.heat.sky import Vector
 
-HeatDirection: TypeAlias = Literal["up", "horizontal", "down"]  # Where heat flows to
+HeatDirection: TypeAlias = Literal["up", "horizontal", "down"]  # Direction in which heat flows
 HeatFlow: TypeAlias = Literal["into-body", "out-of-body"]
-"""Into the body: the air is warmer than the surface, as in a heated room; out of it: the air is colder."""
+"""into-body: the air is warmer than the surface, as in a heated room; out-of-body: the air is colder."""
 InsideCoefficient = Literal["iso-6946-combined", "iso-6946-separate", "iso-6946-convection"]
 OutsideCoefficient = Literal["iso-6946-combined", "iso-6946-separate", "iso-6946-convection", "thermoxels-original"]
 
 INSIDE_RESISTANCE_M2K_W: Mapping[HeatDirection, float] = MappingProxyType(
     {"up": 0.10, "horizontal": 0.13, "down": 0.17}
 )
-"""Rsi, resistance between a room and its surfaces, [m2 K / W] (ISO 6946)."""
+"""Rsi, resistance between a room and its surfaces by the direction of the heat flow, [m2 K / W] (ISO 6946)."""
 OUTSIDE_RESISTANCE_M2K_W = 0.04
 """Rse, resistance between a surface and the open air, [m2 K / W] (ISO 6946), for all directions."""
 INSIDE_CONVECTION_W_M2K: Mapping[HeatDirection, float] = MappingProxyType({"up": 5.0, "horizontal": 2.5, "down": 0.7})
-"""hci, convection alone inside, [W / (m2 K)] (ISO 6946)."""
+"""hci, coefficient of convection alone in a room by the direction of the heat flow, [W / (m2 K)] (ISO 6946)."""
 
-_HORIZONTAL = 0.5 + 1e-9  # sine of 30 degrees, which is horizontal whatever its rounding
+_HORIZONTAL = 0.5 + 1e-9  # Sine of 30 degrees, up to which a heat flow counts as horizontal, with room for round-off
 
 
 def inside_coefficient(
     name: InsideCoefficient, heat_flow: HeatFlow = "into-body", mean_c: float = 20.0, emissivity: float = 0.9
 ) -> Varying:
-    """Make the coefficient of surfaces in a room by their orientation, for `Convection.coefficient_w_m2k`.
+    """Return the coefficient of surfaces in a room by their orientation, for `Convection.coefficient_w_m2k`.
 
-    ISO 6946 tells three directions of the heat flow apart, because warm air rises; "horizontal" is up to 30
-    degrees off. Combined coefficients (1 / Rsi) hold convection and radiation between surfaces of emissivity
-    0.9; hci is convection alone, to which separate ones add hr at `mean_c`, the mean temperature of surface and
-    room.
+    ISO 6946 distinguishes three directions of the heat flow, because warm air rises; "horizontal" includes flows up to
+    30 degrees off. iso-6946-combined is 1 / Rsi, convection and radiation between surfaces of emissivity 0.9;
+    iso-6946-convection is hci; iso-6946-separate is hci + hr, hr being `radiative_coefficient` at `mean_c`, the mean
+    temperature of surface and room.
     """
     directions: tuple[HeatDirection, ...] = ("up", "horizontal", "down")
     if name == "iso-6946-combined":
@@ -66,11 +66,11 @@ def inside_coefficient(
 def outside_coefficient(
     name: OutsideCoefficient, wind_m_s: float = 4.0, mean_c: float = 0.0, emissivity: float = 0.9
 ) -> float:
-    """Give the coefficient of surfaces in the open air, [W / (m2 K)].
+    """Return the coefficient of surfaces in the open air at a wind speed v, [W / (m2 K)].
 
-    1 / Rse (combined), 4 + 4 v + hr (separate), 4 + 4 v (convection), or 18.6 v^0.605 of the original
-    Thermoxels code, which is 0 in calm air and about twice the value of ISO 6946 in wind; hr at the mean of
-    surface and surroundings.
+    It is 1 / Rse (iso-6946-combined), 4 + 4 v + hr (-separate), 4 + 4 v (-convection), or 18.6 v^0.605 of the original
+    Thermoxels code, which is 0 in calm air and about twice the value of ISO 6946 in wind. hr is
+    `radiative_coefficient` at `mean_c`, the mean temperature of surface and surroundings.
 
     >>> outside_coefficient("iso-6946-combined")
     25.0
@@ -84,7 +84,7 @@ def outside_coefficient(
 
 
 def radiative_coefficient(mean_c: float, emissivity: float) -> float:
-    """Radiation made linear, hr = 4 eps sigma Tm^3, [W / (m2 K)] (ISO 6946).
+    """Return the coefficient of linearised radiation, hr = 4 eps sigma Tm^3, [W / (m2 K)] (ISO 6946).
 
     >>> round(radiative_coefficient(10.0, 1.0), 2)
     5.15
@@ -92,10 +92,10 @@ def radiative_coefficient(mean_c: float, emissivity: float) -> float:
     return 4.0 * emissivity * STEFAN_BOLTZMANN_W_M2K4 * celsius_to_kelvin(mean_c) ** 3
 
 
-OUTSIDE = ("exterior-*",)  # Patches that what is outside acts on, unless others are named
-INSIDE = ("interior-*",)  # Patches that the air inside acts on, unless others are named
+OUTSIDE = ("exterior-*",)  # Default patches of outside air, surfaces and sun
+INSIDE = ("interior-*",)  # Default patches of the air inside
 
-WITH_RADIATION = ("iso-6946-combined", "iso-6946-separate")  # Coefficients that hold radiation as well
+WITH_RADIATION = ("iso-6946-combined", "iso-6946-separate")  # Coefficients that include radiation
 
 
 def _direction(vector: Vector) -> Vector:
@@ -113,20 +113,20 @@ Patches: TypeAlias = Annotated[tuple[str, ...], Field(min_length=1)]
 
 @record(HeatError)
 class _Air:
-    """Air whose temperature is a number, or changes with time as a file says."""
+    """Air whose temperature is a number, or changes with time as a file says; `HeatError` if the file is unfit."""
 
     air_c: Celsius  # Temperature of the air, [degrees Celsius], at least -273.15
     air_series: str | None = field(default=None, kw_only=True)
-    """A csv file beside the scene with the columns hours (since the start) and air_c: the temperature as time goes, in
-    straight lines, held before and after; air_c is then what coefficients are taken at. A sky that follows the air
-    follows it too."""
+    """A csv file beside the scene with the columns hours (since the start) and air_c. The temperature is interpolated
+    linearly, and constant before the first and after the last line; named coefficients still use the field `air_c`. A
+    sky whose temperature follows the air follows this series, too."""
 
     def __post_init__(self) -> None:
-        _ = self.temperature  # refuses a file that cannot be read
+        _ = self.temperature  # raises `HeatError` for a file that cannot be read
 
     @property
     def temperature(self) -> Quantity:
-        """The temperature as time goes, [degrees Celsius]."""
+        """Temperature of the air, constant or changing with time, [degrees Celsius]."""
         return self.air_c if self.air_series is None else read_air_series(self.air_series)
 
 
@@ -139,18 +139,18 @@ class InsideAir(_Air):
     convection and radiation together), iso-6946-separate (hci + 4 eps sigma T^3 at the temperature of the air), or
     iso-6946-convection (hci alone, for scenes that name radiation themselves)."""
     coefficient_w_m2k: AtLeastZero | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
-    emissivity: Fraction | None = None  # Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else
+    emissivity: Fraction | None = None  # Emissivity of the surfaces, 0 to 1, needed by iso-6946-separate alone
     heat_flow: HeatFlow = "into-body"
     """into-body: the air is warmer than the surfaces, as in a heated room, and loses most to the ceiling; out-of-body:
-    it is colder. Named coefficients depend on it."""
-    patches: Patches = INSIDE  # Patches that it acts on, by name or pattern
+    the air is colder. Named coefficients depend on this field."""
+    patches: Patches = INSIDE  # Patches that the air acts on, by name or pattern
 
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
 
     def convection(self) -> Convection:
-        """Make the convection between the air and the body."""
+        """Return the convection between the air of the room and the body."""
         coefficient: Quantity | None = self.coefficient_w_m2k
         if self.coefficient is not None:
             coefficient = inside_coefficient(self.coefficient, self.heat_flow, self.air_c, self.emissivity or 0.0)
@@ -164,13 +164,13 @@ class OutsideAir(_Air):
 
     coefficient: OutsideCoefficient | None = None
     """Heat transfer coefficient: iso-6946-combined (1 / Rse = 25, convection and radiation together), iso-6946-separate
-    (4 + 4 v, and 4 eps sigma T^3 at the temperature of the air), iso-6946-convection (4 + 4 v alone, for scenes that
-    name radiation themselves), or thermoxels-original (18.6 v^0.605, convection alone)."""
+    (4 + 4 v + 4 eps sigma T^3 at the temperature of the air), iso-6946-convection (4 + 4 v alone, for scenes that
+    name radiation themselves), or thermoxels-original (18.6 v^0.605, convection alone); v is the wind speed."""
     coefficient_w_m2k: AtLeastZero | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
     wind_m_s: AtLeastZero | None = None
-    """Wind speed beside the surfaces, [m / s], for the coefficients that depend on it and for no other."""
-    emissivity: Fraction | None = None  # Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else
-    patches: Patches = OUTSIDE  # Patches that it acts on, by name or pattern
+    """Wind speed v beside the surfaces, [m / s]; needed by all named coefficients but iso-6946-combined."""
+    emissivity: Fraction | None = None  # Emissivity of the surfaces, 0 to 1, needed by iso-6946-separate alone
+    patches: Patches = OUTSIDE  # Patches that the air acts on, by name or pattern
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -179,7 +179,7 @@ class OutsideAir(_Air):
         _check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
 
     def convection(self) -> Convection:
-        """Make the convection between the air and the body."""
+        """Return the convection between the open air and the body."""
         coefficient = self.coefficient_w_m2k
         if self.coefficient is not None:
             wind, emissivity = self.wind_m_s or 0.0, self.emissivity or 0.0
@@ -190,13 +190,13 @@ class OutsideAir(_Air):
 
 @record(HeatError)
 class Surface:
-    """How surfaces radiate and absorb; sky, ground and sun act on those that are named so."""
+    """Emissivity of patches, which sky and ground act on, and absorptivity of patches, which the sun acts on."""
 
     emissivity: Fraction | None = None
-    """Emissivity for long-wave radiation, 0 to 1; without it they do not radiate to sky and ground."""
-    absorptivity: Fraction | None = None  # Share of the sunlight that they absorb, 0 to 1; without it they take up none
+    """Emissivity for long-wave radiation, 0 to 1; None: the patches exchange no radiation with sky and ground."""
+    absorptivity: Fraction | None = None  # Share of the sunlight that the patches absorb, 0 to 1; None: no sunlight
     patches: Patches = OUTSIDE
-    """Patches, by name or pattern; of several entries for one patch, the later one holds."""
+    """Patches, by name or pattern; if several entries give a property of one patch, the last one holds."""
 
     def __post_init__(self) -> None:
         if self.emissivity is None and self.absorptivity is None:
@@ -205,30 +205,30 @@ class Surface:
 
 @record(HeatError)
 class Sky:
-    """The sky that surfaces radiate to. One of the three ways to give its temperature is needed."""
+    """The sky to which surfaces radiate; exactly one of the three fields must be given."""
 
-    temperature_c: Celsius | None = None  # Its effective temperature, [degrees Celsius], at least -273.15
-    model: Literal["swinbank"] | None = None  # swinbank: a clear sky, 0.0552 T^1.5 of the outside air in kelvin
+    temperature_c: Celsius | None = None  # Effective temperature of the sky, [degrees Celsius], at least -273.15
+    model: Literal["swinbank"] | None = None  # swinbank: a clear sky, 0.0552 T^1.5 for T of the outside air in kelvin
     below_air_k: AtLeastZero | None = None
-    """How much colder it is than the outside air, [K]; 6 is common for skies with some clouds (Whillier 1967)."""
+    """Temperature of the outside air minus that of the sky, [K]; 6 is common with some clouds (Whillier 1967)."""
 
     def __post_init__(self) -> None:
         _check_one(temperature_c=self.temperature_c, model=self.model, below_air_k=self.below_air_k)
 
     @property
     def needs_air(self) -> bool:
-        """Whether the temperature of the sky follows from that of the outside air."""
+        """True if the temperature of the sky is computed from that of the outside air."""
         return self.temperature_c is None
 
 
 @record(HeatError)
 class Ground:
-    """The ground that surfaces see."""
+    """The ground to which surfaces radiate and which reflects sunlight; at least one field must be given."""
 
     surface_c: Celsius | None = None
-    """Temperature of its surface, [degrees Celsius], at least -273.15; without it nothing radiates to the ground."""
+    """Temperature of the ground's surface, [degrees Celsius], at least -273.15; None: nothing radiates to it."""
     reflectance: Fraction | None = None
-    """Share of the sunlight that it reflects, 0 to 1 (grass 0.2, fresh snow 0.8); without it, it reflects none."""
+    """Share of the sunlight that the ground reflects, 0 to 1 (grass 0.2, fresh snow 0.8); None: it reflects none."""
 
     def __post_init__(self) -> None:
         if self.surface_c is None and self.reflectance is None:
@@ -237,9 +237,9 @@ class Ground:
 
 @record(HeatError)
 class Sun:
-    """Sunlight: from a date and place, or from a direction; as strong as given, or as under a clear sky.
+    """Sunlight: the sun moves from `start` or stands still at `towards`; its strength is given or that of a clear sky.
 
-    No part of the body shades another.
+    No part of the body shades another part.
     """
 
     start: AwareDatetime | None = None
@@ -258,7 +258,7 @@ class Sun:
     """Direct light on a surface that faces the sun, [W / m2], at least 0, as long as the sun is up."""
     diffuse_w_m2: AtLeastZero = 0.0
     """Light from the sky on a surface that faces up, [W / m2], at least 0, as long as the sun is up."""
-    patches: Patches = OUTSIDE  # Patches that it may reach, by name or pattern
+    patches: Patches = OUTSIDE  # Patches that sunlight may reach, by name or pattern
 
     def __post_init__(self) -> None:
         _check_one(start=self.start, towards=self.towards)
@@ -277,14 +277,14 @@ class Sun:
 
 
 def read_air_series(path: str) -> Varying:
-    """Read the temperature of air from a csv file with the columns hours and air_c; raises `HeatError`."""
+    """Read the temperature of air over time from a csv file; `HeatError` if the file or the order of times is wrong."""
     table = air_series_table(path)
     Bounds("air_c", "degrees Celsius", -ZERO_CELSIUS_K, HOTTEST_C).check(table[:, 1])
     return tabulated(3600.0 * table[:, 0], table[:, 1])
 
 
 def air_series_table(path: str) -> FloatArray:
-    """Hours, ascending, and temperatures of a csv file, shape (k, 2); raises `HeatError`."""
+    """Read hours and air_c, shape (k, 2), from a csv file, without a check of order or range; `HeatError` if unfit."""
     try:
         lines = [line for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip(" ,")]
     except (OSError, UnicodeDecodeError) as problem:
@@ -308,7 +308,7 @@ def _check_coefficient(named: str | None, number: float | None, emissivity: floa
 
 
 def _check_one(**values: object) -> None:
-    """Exactly one of the fields must be given."""
+    """Raise `HeatError` unless exactly one of the fields is given."""
     given = [name for name, value in values.items() if value is not None]
     if len(given) != 1:
         names = list(values)
@@ -325,5 +325,5 @@ def _check_only_if(name: str, value: float | None, needed: bool, coefficient: st
 
 
 def unclear(name: str, expected: str, got: object, remedy: str) -> HeatError:
-    """Make the error for an entry of a scene."""
+    """Return the error for an entry of a scene."""
     return HeatError(name, expected=expected, got=got, remedy=remedy)

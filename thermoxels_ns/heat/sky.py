@@ -1,4 +1,4 @@
-"""Sky, ground and sun: long-wave exchange, where the sun stands, and the sunlight that reaches a facet."""
+"""Sky, ground and sun: long-wave exchange, the position of the sun, and the sunlight that reaches a facet."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from thermoxels_ns.fem.quantities import Places, Quantity, Varying
 Vector = tuple[float, float, float]
 
 SOLAR_CONSTANT_W_M2 = 1353.0
-"""Sunlight above the air at the mean distance of the sun, [W / m2]: the value that Meinel's fit was made with. (Today's
-is 1361.)"""
+"""Sunlight above the atmosphere at the mean distance of the sun, [W / m2]: the value on which Meinel's fit is based.
+The modern value is 1361."""
 
-_RESOLUTION_S = 3600.0  # The sun moves by 15 degrees in this time
-_EPOCH = datetime(2000, 1, 1, 12, tzinfo=timezone.utc)
+_RESOLUTION_S = 3600.0  # Resolution of the moving sun, [s]: in this time the sun moves by 15 degrees
+_EPOCH = datetime(2000, 1, 1, 12, tzinfo=timezone.utc)  # Moment from which the sun's formulae count days
 
 
 def swinbank_sky_c(air_c: float) -> float:
-    """Temperature of a clear sky from that of the air, T_sky = 0.0552 T_air^1.5 in kelvin (Swinbank 1963).
+    """Return the temperature of a clear sky, [degrees Celsius]: T_sky = 0.0552 T_air^1.5 in kelvin (Swinbank 1963).
 
     A cloudy sky is nearly as warm as the air.
 
@@ -35,7 +35,7 @@ def swinbank_sky_c(air_c: float) -> float:
 
 
 def sky_view(normals: FloatArray, up: Vector) -> FloatArray:
-    """Share of the view of surfaces that is sky, (1 + cos tilt) / 2, shape (k,); normals point out, shape (k, 3).
+    """Return the share of sky in the view of surfaces, (1 + cos tilt) / 2, shape (k,); outward normals, shape (k, 3).
 
     >>> sky_view(np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, -1]]), (0.0, 0.0, 1.0)).tolist()
     [1.0, 0.5, 0.0]
@@ -44,17 +44,17 @@ def sky_view(normals: FloatArray, up: Vector) -> FloatArray:
 
 
 def ground_view(normals: FloatArray, up: Vector) -> FloatArray:
-    """Share of the view of surfaces that is ground, (1 - cos tilt) / 2, shape (k,)."""
+    """Return the share of ground in the view of surfaces, (1 - cos tilt) / 2, shape (k,): 1 less `sky_view`."""
     return 1.0 - sky_view(normals, up)
 
 
 def outdoor_radiation(
     emissivity: float, *, sky_c: Quantity | None = None, ground_c: float | None = None
 ) -> tuple[Quantity, Quantity]:
-    """Make the emissivity and the surroundings of a `Radiation` to the sky, the ground or both, [degrees Celsius].
+    """Return the emissivity and `surroundings_c`, [degrees Celsius], of a `Radiation` to the sky, the ground or both.
 
-    With both, T_s^4 = F_sky T_sky^4 + F_ground T_ground^4: one effect that is exactly the sum of two. With one
-    alone, the emissivity is multiplied by its view factor, and the rest of the view exchanges nothing.
+    With both, T_s^4 = F_sky T_sky^4 + F_ground T_ground^4, which makes one effect exactly the sum of two. With sky or
+    ground alone, the emissivity is multiplied by its view factor F; the rest of the view exchanges nothing.
     """
     if sky_c is not None and ground_c is not None:
         varying = sky_c if isinstance(sky_c, Varying) else Varying(lambda *_: sky_c, in_time=False)
@@ -74,28 +74,28 @@ def outdoor_radiation(
 
 @dataclass(frozen=True)
 class SunPosition:
-    """The sun as seen from a place; its distance in astronomical units."""
+    """The position of the sun as seen from a place on the ground."""
 
     azimuth_deg: float  # Direction along the horizon, clockwise from north, [degrees], 0 to 360
     elevation_deg: float
-    """Height over the horizon, [degrees]; refraction, which lifts it by 0.5 degrees at the horizon and by 0.1 at 10
-    degrees, is left out."""
-    distance_au: float
+    """Height over the horizon, [degrees]. Refraction is left out: it would lift the sun by 0.5 degrees at the horizon
+    and by 0.1 degrees at a height of 10 degrees."""
+    distance_au: float  # Distance, [astronomical units]
 
 
 @dataclass(frozen=True)
 class Sunlight:
-    """Strength of the sunlight."""
+    """The strength of the sunlight, direct and diffuse."""
 
-    direct_w_m2: float  # On a surface that faces the sun, [W / m2], at least 0
-    diffuse_w_m2: float  # From the sky on a surface that faces up, [W / m2], at least 0
+    direct_w_m2: float  # Direct light on a surface that faces the sun, [W / m2], at least 0
+    diffuse_w_m2: float  # Diffuse light from the sky on a surface that faces up, [W / m2], at least 0
 
 
 def sun_coordinates(moment: datetime) -> tuple[float, float, float]:
-    """Compute right ascension and declination, [degrees], and distance, [au], of the sun by the low-precision formulae
-    of the Astronomical Almanac (US Naval Observatory).
+    """Return right ascension and declination, [degrees], and distance, [astronomical units], of the sun.
 
-    They are within 1 arc minute from 1800 to 2200. The moment has a time zone.
+    The formulae are the low-precision ones of the Astronomical Almanac (US Naval Observatory): from 1800 to 2200 angles
+    are right to 1 arc minute. `moment` has a time zone.
     """
     days = _days(moment)
     anomaly = math.radians(357.529 + 0.98560028 * days)
@@ -108,7 +108,7 @@ def sun_coordinates(moment: datetime) -> tuple[float, float, float]:
 
 
 def sun_position(moment: datetime, latitude_deg: float, longitude_deg: float) -> SunPosition:
-    """Compute where the sun stands at a moment with a time zone, within 0.02 degrees from 1800 to 2200.
+    """Return the sun's position at a moment with a time zone, right to 0.02 degrees from 1800 to 2200.
 
     >>> noon = sun_position(datetime(2025, 6, 21, 12, 2, tzinfo=timezone.utc), 47.0, 0.0)
     >>> round(noon.azimuth_deg), round(noon.elevation_deg, 1)
@@ -128,9 +128,9 @@ def sun_position(moment: datetime, latitude_deg: float, longitude_deg: float) ->
 
 
 def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
-    """Turn a position into a unit vector from the mesh to the sun; the part of `north` along `up` is left out.
+    """Return the unit vector to the sun in the coordinates of `up` and `north`; only the level part of `north` counts.
 
-    Raises `HeatError` if they are parallel.
+    Raises `HeatError` if `up` and `north` are parallel.
     """
     upward, northward = _unit(up), _unit(north)
     level = northward - (northward @ upward) * upward
@@ -145,16 +145,16 @@ def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
 
 
 def air_mass(elevation_deg: float) -> float:
-    """Length of the light's way through the air, relative to the zenith, 0 to 90 degrees (Kasten and Young 1989)."""
+    """Return the path of light through the air over the path at the zenith, at 0 to 90 degrees (Kasten, Young 1989)."""
     return 1.0 / (math.sin(math.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.07995) ** -1.6364)
 
 
 def meinel_clear_sky(elevation_deg: float, distance_au: float = 1.0) -> Sunlight:
-    """Estimate the sunlight under a clear sky at sea level; none if the sun is below the horizon.
+    """Return the sunlight under a clear sky at sea level, estimated to a tenth; 0 if the sun is below the horizon.
 
-    Direct: E0 * 0.7^(AM^0.678) with air mass AM (Meinel and Meinel 1976). Diffuse: E0 sin(h) (0.271 - 0.294
-    tau), tau being the transmitted share of the direct light (Liu and Jordan 1960). Real clear days differ from
-    it by a tenth.
+    Direct light is E0 * 0.7^(AM^0.678) with the air mass AM (Meinel and Meinel 1976). Diffuse light is E0 sin(h)
+    (0.271 - 0.294 tau), h being the elevation and tau the transmitted share of direct light (Liu and Jordan 1960). E0
+    is `SOLAR_CONSTANT_W_M2` / `distance_au`^2.
     """
     if elevation_deg <= 0.0:
         return Sunlight(0.0, 0.0)
@@ -167,12 +167,12 @@ def meinel_clear_sky(elevation_deg: float, distance_au: float = 1.0) -> Sunlight
 def facet_irradiance(
     normals: FloatArray, up: Vector, towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0
 ) -> FloatArray:
-    """Compute the sunlight that falls on facets, [W / m2] of the facet, shape (k,); none shades another.
+    """Return the sunlight that falls on facets, per area of the facet, shape (k,), [W / m2]; no facet shades another.
 
-    Direct light by the cosine of its angle; diffuse light alike from all of the sky, by (1 + cos tilt) / 2;
-    what the ground reflects, alike to all sides, by (1 - cos tilt) / 2 (Liu and Jordan 1963). `normals` are
-    outward unit vectors, shape (k, 3); `up` and `towards` (the sun) are unit vectors. A sun below the horizon
-    gives 0.
+    Direct light counts by the cosine of its angle to the normal, diffuse light by (1 + cos tilt) / 2, and light that
+    the ground reflects by (1 - cos tilt) / 2 (Liu and Jordan 1963: sky and ground are alike in all directions).
+    `normals` are outward unit vectors, shape (k, 3); `up` and `towards` (to the sun) are unit vectors. If the sun is
+    below the horizon, all values are 0.
     """
     height = float(np.dot(up, towards))
     if height <= 0.0:
@@ -184,7 +184,7 @@ def facet_irradiance(
 
 
 def fixed_sun(towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0) -> Varying:
-    """Make the irradiance of facets by a sun that stands still in a direction, for `AbsorbedSolar.irradiance_w_m2`."""
+    """Return the irradiance of facets by a sun that stands at `towards`, for `AbsorbedSolar.irradiance_w_m2`."""
     x, y, z = _unit(towards).tolist()
     return Varying(
         lambda places, _: facet_irradiance(places.normals, places.up, (x, y, z), sunlight, ground_reflectance),
@@ -200,10 +200,10 @@ def moving_sun(
     sunlight: Sunlight | None = None,
     ground_reflectance: float = 0.0,
 ) -> Varying:
-    """Make the irradiance of facets by the sun at a date and place, for `AbsorbedSolar.irradiance_w_m2`.
+    """Return the irradiance of facets by the sun at a date and place, for `AbsorbedSolar.irradiance_w_m2`.
 
-    `start` is the date and time, with a time zone, of the time 0; north and east are positive; `north` points there in
-    the coordinates of the mesh; without `sunlight` it is as strong as `meinel_clear_sky` estimates.
+    `start` is the moment of the time 0, with a time zone. Latitudes north and longitudes east are positive. `north` is
+    the direction north in the coordinates of the mesh. Without `sunlight` the light is that of `meinel_clear_sky`.
     """
 
     def irradiance(places: Places, time_s: float) -> FloatArray:
@@ -225,7 +225,7 @@ def _later(start: datetime, time_s: float) -> datetime:
 
 
 def _days(moment: datetime) -> float:
-    """Days since noon of 1 January 2000."""
+    """Return the days since noon of 1 January 2000, UTC."""
     return (moment - _EPOCH).total_seconds() / 86400.0
 
 

@@ -1,4 +1,4 @@
-"""Solve a problem without the effects that do not matter, with its own steps on its mesh or to a tolerance."""
+"""Solving a heat problem without its negligible effects, either on its mesh with its steps or to a tolerance."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from thermoxels_ns.fem.tolerance import (
 
 Vector = FloatArray
 Say = Callable[[str], None]
-Time = TimeSteps | AdaptiveSteps | None  # How a body is followed; None: its steady state
+Time = TimeSteps | AdaptiveSteps | None  # Time steps in which a body is followed; None: its steady state
 
 LEAVE_OUT_BELOW = 0.005
-"""Share of all heat that flows that effects which are left out may bring together: half of what building physics asks
-of a heat flow (ISO 10211: 1 %)."""
+"""Largest share of all heat that the effects left out may bring together: half of the error that building physics
+allows for a heat flow (ISO 10211: 1 %)."""
 MOST_ESTIMATED = 300_000
-"""Tetrahedra up to which the error of the mesh is estimated without being asked for: quadratic ones take some 60 times
-as long as linear ones (131,712: 5.4 s instead of 0.09 s)."""
-MOST_ATTEMPTS = 4  # Solutions with something left out, after which nothing is left out any more
-SAY_EVERY_S = 10.0  # Time between two lines of progress, [s]
+"""Most tetrahedra for which the error of the mesh is estimated without being asked for. The estimate solves with
+quadratic tetrahedra, which take 60 times as long as linear ones (131,712 tetrahedra: 5.4 s instead of 0.09 s)."""
+MOST_ATTEMPTS = 4  # Most solutions with effects left out; the next solution leaves out nothing
+SAY_EVERY_S = 10.0  # Least time between two lines of progress, [s]
 _LEAST_TIMES, _MOST_TIMES = 241, 200_001
-"""Least and most times at which an effect is asked for that the solver may ask for at any time."""
+"""Least and most times at which `_looks` has an effect evaluated in adaptive steps."""
 
 _BOUNDS = {
     "tolerance_k": Bounds("tolerance", "K", 0.0, above_low=True, remedy="Pass --tolerance 0.05."),
@@ -56,15 +56,15 @@ _BOUNDS = {
 
 @dataclass(frozen=True)
 class Goals:
-    """How exact a solution must be, and what it may take; raises `HeatError` if a number is out of range."""
+    """The errors and the memory that a solution may have; raises `HeatError` if numbers are out of range or clash."""
 
-    tolerance_k: float | None = None  # Largest error of any temperature, [K]; None: any
+    tolerance_k: float | None = None  # Largest allowed error of any temperature, [K]; None: any error
     flow_tolerance: float | None = None
-    """Largest error of the mean heat flow of any effect, as a share of all heat; None: any."""
+    """Largest allowed error of the mean heat flow of any effect, as a share of all heat; None: any error."""
     leave_out_below: float | None = None
-    """Share of all heat below which effects are left out together; None: `LEAVE_OUT_BELOW`, or 0 beside a tolerance."""
-    memory_gb: float | None = 4.0  # Most memory that solving may take, [GiB]; None: any
-    allow_unmet: bool = False  # Whether the best that fits into the memory will do if a tolerance cannot be met
+    """Share of all heat that effects left out may bring together; None: `LEAVE_OUT_BELOW`, or 0 beside a tolerance."""
+    memory_gb: float | None = 4.0  # Most memory that solving may take, [GiB]; None: any amount
+    allow_unmet: bool = False  # True: if a tolerance cannot be met, return the best solution that fits into memory
 
     def __post_init__(self) -> None:
         for name, bounds in _BOUNDS.items():
@@ -76,12 +76,12 @@ class Goals:
 
     @property
     def estimated(self) -> bool:
-        """Whether the error has to be known."""
+        """True if a tolerance is given, so that errors must be estimated."""
         return self.tolerance_k is not None or self.flow_tolerance is not None
 
     @property
     def left_out_share(self) -> float:
-        """Share of all heat that effects which are left out may bring together."""
+        """Largest share of all heat that the effects left out may bring together."""
         if self.leave_out_below is not None:
             return self.leave_out_below
         return 0.0 if self.estimated else LEAVE_OUT_BELOW
@@ -92,7 +92,7 @@ class Goals:
         return np.inf if self.memory_gb is None else self.memory_gb * 2**30
 
     def check_fits(self, time: Time) -> None:
-        """Raise `HeatError` for a tolerance of heat flows alone beside a duration: it does not choose the steps."""
+        """Raise `HeatError` if time steps are to be chosen by a tolerance of heat flows without one of temperature."""
         if time is not None and self.flow_tolerance is not None and self.tolerance_k is None:
             expected = "--tolerance beside it if the scene has a duration"
             remedy = "Pass --tolerance too: steps in time are chosen by it."
@@ -101,29 +101,29 @@ class Goals:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An effect that was left out."""
+    """An effect that was left out because it brings too little heat."""
 
-    effect: str
-    heat_w: float  # Largest heat flow that it would bring to or take from the body that was solved at any time, [W]
-    share: float  # The same as a share of all heat that flows through the body on average
+    effect: str  # Label of the effect
+    heat_w: float  # Largest heat flow, in or out, that the effect would have at the temperatures found, [W]
+    share: float  # `heat_w` as a share of all heat that flows through the body on average
 
 
 @dataclass(frozen=True)
 class SolvedProblem:
-    """A solution, what it is one of, and what is known of its error (None without a tolerance)."""
+    """The outcome of `solve_problem`."""
 
     problem: HeatProblem
-    """What was solved last: without what is left out, and perhaps on a finer mesh than the given one."""
-    solution: Solution
-    left_out: tuple[LeftOut, ...]
-    accuracy: ToleratedSolution | None
+    """The problem that was solved: without the effects left out, and perhaps on a finer mesh than the given one."""
+    solution: Solution  # Temperatures and heat flows
+    left_out: tuple[LeftOut, ...]  # Effects that were left out
+    accuracy: ToleratedSolution | None  # The solution with estimated errors; None without a tolerance
 
 
 def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lambda _: None) -> SolvedProblem:
-    """Leave out what does not matter, and solve the rest; `say` gets one line of progress at a time.
+    """Solve a problem without its negligible effects; `say` is called with lines of progress.
 
-    What brings little heat at any temperature that the surroundings have is left out at first. At the solution it is
-    asked for again, and what brings more than `goals.left_out_share` of all heat is taken in and all solved again.
+    Effects that bring little heat at any temperature of start and surroundings are left out at first. If at the
+    solution these bring more than `goals.left_out_share` of all heat, the largest are taken in, and all solved again.
 
     Raises `HeatError` if it needs more memory than allowed, the solver fails, or the tolerance cannot be met.
     """
@@ -135,7 +135,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
             expected, got = f"at most {describe_bytes(goals.memory_bytes)}", f"about {describe_bytes(needed)}"
             remedy = "Pass a larger --memory-gb, fewer steps or outputs, or export a coarser mesh."
             raise HeatError("memory of the heat problem", expected=expected, got=got, remedy=remedy)
-    # To a tolerance steps are chosen by their error, whatever the scene says.
+    # With a tolerance, steps are adaptive even if the scene asks for equal ones.
     asked = AdaptiveSteps(time.duration_s) if goals.estimated and time is not None else time
     labels, left = effect_labels(problem), _weak(problem, asked, goals.left_out_share)
     for attempt in range(MOST_ATTEMPTS + 1):
@@ -154,7 +154,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
             return _with_mesh_error(found, goals)
         through_w = 0.5 * sum(map(abs, mean_flows_w(found.solution).values()))
         brings_w = _largest_w(problem, left, asked, found.solution)
-        # The least stay left out, as long as all of them together bring no more than allowed.
+        # The smallest effects stay left out, as many as together bring no more heat than allowed.
         order = sorted(left, key=brings_w.__getitem__)
         total_w = np.cumsum([brings_w[n] for n in order])
         still = [n for n, sum_w in zip(order, total_w) if sum_w <= goals.left_out_share * through_w]
@@ -171,7 +171,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
 
 
 def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
-    """Number the effects that together have no more than a share of the power of the others."""
+    """Return the numbers of the weakest effects, which together have at most `share` of the power of the others."""
     power_w = _largest_w(problem, range(len(problem.effects)), time)
     total_w = sum(power for power in power_w.values() if np.isfinite(power))
     weak, left_w = list[int](), 0.0
@@ -185,10 +185,10 @@ def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
 def _largest_w(
     problem: HeatProblem, chosen: Sequence[int], time: Time, found: Solution | None = None
 ) -> dict[int, float]:
-    """Sum of the sizes of the heat flows of each effect through its triangles or in its tetrahedra, at its worst time.
+    """Return by number of each `chosen` effect the sum of the sizes of its heat flows, at its worst time, [W].
 
-    At the temperatures that were found, otherwise at the coldest and the warmest that the start and the surroundings
-    have. What fixes temperatures is infinite, and so is what may change between two looks without a word how fast.
+    Temperatures are those of `found`, or if it is None the coldest and the warmest of start and surroundings. The sum
+    is infinite for fixed temperatures, and for effects that may change in time at an unknown rate.
     """
     reference_c, num_nodes = float(problem.start_c.mean()), len(problem.mesh.points_m)
     forms = effect_forms(problem, Space(problem.selection), reference_c)
@@ -225,10 +225,10 @@ def _largest_w(
 
 
 def _looks(effect: Effect, time: Time, kept_s: Vector) -> list[float]:
-    """Times at which to ask for an effect, [s], to miss nothing; none if no times would do.
+    """Return times, [s], at which to evaluate an effect so that no change is missed; empty if no times would do.
 
-    Equal steps ask at their ends, as they add them up. Adaptive steps may ask at any time: we ask twice in the time
-    that a quantity resolves.
+    With equal steps these are their ends, added up as in the time loop. With adaptive steps, which may evaluate an
+    effect at any time, there are two times per `resolution_s`. If the effect or body does not change: `kept_s`.
     """
     quantities = [effect.bounded(name) for name in effect.bounds]
     if time is None or not any(quantity.in_time for quantity in quantities):
@@ -261,7 +261,7 @@ def _solve(problem: HeatProblem, time: Time, goals: Goals, say: Say) -> SolvedPr
 
 
 def _with_mesh_error(found: SolvedProblem, goals: Goals) -> SolvedProblem:
-    """Estimate the error of the mesh of a steady state, if quadratic tetrahedra are few, fit in memory and succeed."""
+    """Add an estimate of the mesh's error to a steady state if tetrahedra are few, fit in memory and can be solved."""
     fits = len(found.problem.mesh.tets) <= MOST_ESTIMATED and peak_bytes(found.problem, order=2) <= goals.memory_bytes
     if isinstance(found.solution, SteadySolution) and found.accuracy is None and fits:
         with suppress(HeatError):
@@ -271,9 +271,9 @@ def _with_mesh_error(found: SolvedProblem, goals: Goals) -> SolvedProblem:
 
 
 class _Progress:
-    """Says every now and then how far a solution has come, and what is left at the pace since the last line.
+    """Calls `say` every `SAY_EVERY_S` with the share of time done, and the time left at the pace since the last line.
 
-    Steps that are chosen by their error begin short: the pace from the start on would tell too long a time.
+    Adaptive steps begin short, so that the pace since the start would promise too long a time.
     """
 
     def __init__(self, say: Say) -> None:
@@ -281,7 +281,7 @@ class _Progress:
         self._called_s = self._said_s = clock.perf_counter()
 
     def __call__(self, share: float, steps: int) -> None:
-        """Take the share of the duration that is done, and the number of steps."""
+        """Note the share of the duration that is done and the number of steps; say a line if the last one is old."""
         if share < self._share:  # the next solution has begun
             self._said_share, self._said_s = 0.0, self._called_s
         self._share, self._called_s = share, clock.perf_counter()

@@ -1,4 +1,4 @@
-"""A heat computation as .vtu files and the .pvd that lists them."""
+"""Files of a computation through time: a .vtu file per kept time, and the .pvd file that lists them all."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ STEP_PATTERN = "step-*.vtu"  # Names of the files of a series
 def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution) -> list[Path]:
     """Write ``NAME.pvd`` and ``NAME/step-0000.vtu`` and so on, which ParaView and pyvista open as one series.
 
-    The .pvd is written last, so it never lists a file that is not there. Steps left over from a longer earlier
-    series are removed. Returns all paths, the .pvd first; raises `OutputError` if a file cannot be written.
+    `pvd` is the path of ``NAME.pvd``, which is written last, so that all files it lists exist. Files left over from a
+    longer earlier series are removed. Returns all paths, the .pvd first; raises `OutputError` if writing fails.
     """
     pvd = Path(pvd)
     writable_folder(pvd.parent)
@@ -40,13 +40,13 @@ def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution) ->
 
 
 def heat_series_paths(pvd: Path | str, num_states: int) -> list[Path]:
-    """Name the files that `write_heat_series` writes for so many states, the .pvd first."""
+    """Return the paths that `write_heat_series` writes for `num_states` kept times, the .pvd first."""
     pvd = Path(pvd)
     return [pvd, *(pvd.with_suffix("") / f"step-{number:04d}.vtu" for number in range(num_states))]
 
 
 def remove_heat_series(pvd: Path | str) -> None:
-    """Remove a series written by `write_heat_series`, if there is one, or raise `OutputError`."""
+    """Remove a series that `write_heat_series` wrote, if there is one; raise `OutputError` if that fails."""
     pvd = Path(pvd)
     remove_file(pvd)
     folder = pvd.with_suffix("")
