@@ -49,7 +49,7 @@ class BccLattice:
 
     @cached_property
     def offsets(self) -> IntArray:
-        """Return what steps to the 14 neighbours add to the flat index of a centre (row 0) or corner (1), shape (2, 14)."""
+        """Return what steps to the 14 neighbours add to the flat index, shape (2, 14): of a centre, of a corner."""
         strides = np.array(self.strides)
         along = DIRECTIONS[:6].astype(np.int64) @ strides
         # Centre i of the first block lies half a voxel below corner i of the second, along each axis.
