@@ -261,9 +261,9 @@ def edge_planes(surface: Surface) -> Planes:
 def _planes_beside(surface: Surface, nodes: IntArray, tree: KDTree, centroids: FloatArray, facets: IntArray) -> Planes:
     """Return the planes of the flat triangles near some nodes, without nodes that have less than two planes.
 
-    Triangles are sorted by their normals around three seeds: the nearest triangle's normal, the normal that differs
-    most from the first seed, and the normal that differs most from both. If the triangles of any seed do not lie in a
-    plane, the node gets no plane. `tree` holds the `centroids` of the flat triangles, whose numbers are `facets`.
+    Triangles are sorted by their normals around three seeds: the nearest normal, the one that differs most from it, and
+    the one that differs most from both. If the triangles of a seed do not lie in a plane, the node gets no plane.
+    `tree` holds the `centroids` of the flat triangles, whose numbers are `facets`.
     """
     distance, found = map(np.asarray, tree.query(surface.points[nodes], k=_NEAREST, distance_upper_bound=_REACH))
     several = np.flatnonzero(np.count_nonzero(np.isfinite(distance), axis=1) >= 2 * _LEAST_FACETS)
