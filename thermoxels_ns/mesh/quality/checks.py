@@ -174,8 +174,7 @@ def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
 def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
     """Return the number of pairs of triangles that share an edge and lie in one plane on the same side of the edge.
 
-    Such pairs are at cracks: where faces of neighbours do not match, both are boundary triangles, one upon the other.
-    `sides` is `group_sides(facets)`.
+    Such pairs show cracks, where faces of neighbours do not match and lie one upon the other. `sides`: `group_sides`.
     """
     normals = facet_normals(points, facets)
     facet, side = np.divmod(sides.order, 3)
