@@ -42,9 +42,9 @@ class CameraCounts:
 def count_cameras(cells: BoolArray, lattice: Lattice, views: Views) -> CameraCounts:
     """Count for each voxel the cameras that see it, of `MOST_CAMERAS` at most; solid voxels `cells` block the view.
 
-    The space around each camera is divided into six pyramids, one per side of the lattice. In each pyramid, rays that
-    are one voxel apart at the far end are followed from layer to layer. They meet a layer in a regular grid, so the ray
-    of a voxel takes two look-ups, one per axis. The cost is two or three passes over the lattice per camera.
+    The space around each camera is six pyramids, one per side of the lattice. In each, rays that are one voxel apart at
+    the far end are followed from layer to layer. They meet a layer in a regular grid, so that the ray of a voxel takes
+    one look-up per axis. The cost is two or three passes over the lattice per camera.
     """
     chosen = np.arange(len(views.focal))
     if len(chosen) > MOST_CAMERAS:
@@ -165,8 +165,8 @@ def first_solid(
 ) -> FloatArray:
     """Return the distance at which rays from `eye` along unit vectors (n, 3) enter a solid voxel, shape (n,), [voxels].
 
-    The distance is infinite for rays that meet none up to `reach`. Parts of voxels within `CLEAR_OF_CAMERA` of the eye,
-    a point in corner indices, block no ray.
+    It is infinite for rays that meet none within `reach`. Solid nearer to the eye (a point in corner indices) than
+    `CLEAR_OF_CAMERA` blocks no ray.
     """
     found = np.empty(len(directions))
     reach = np.broadcast_to(np.asarray(reach, dtype=np.float64), len(directions))
