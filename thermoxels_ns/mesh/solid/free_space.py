@@ -163,10 +163,9 @@ def _runs(number: IntArray, count: int) -> list[tuple[slice, IntArray]]:
 def first_solid(
     cells: BoolArray, eye: FloatArray, directions: FloatArray, reach: FloatArray | float = np.inf
 ) -> FloatArray:
-    """Return the distance at which rays from `eye` along unit vectors (n, 3) enter a solid voxel, shape (n,), [voxels].
+    """Return the distances (n,), [voxels], from `eye` (corner indices) along unit vectors (n, 3) to the first solid.
 
-    It is infinite for rays that meet none within `reach`. Solid nearer to the eye (a point in corner indices) than
-    `CLEAR_OF_CAMERA` blocks no ray.
+    Rays that meet none within `reach` get infinity. Solid nearer to `eye` than `CLEAR_OF_CAMERA` blocks no ray.
     """
     found = np.empty(len(directions))
     reach = np.broadcast_to(np.asarray(reach, dtype=np.float64), len(directions))
