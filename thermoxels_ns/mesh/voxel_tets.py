@@ -67,7 +67,7 @@ def lattice_edges(cells: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def voxel_facets(cells: BoolArray) -> IntArray:
-    """Return the boundary triangles of `kuhn_tets`, halves of the faces of solid to empty voxels, outwards, (f, 3).
+    """Return the boundary triangles of `kuhn_tets`, (f, 3), normals outwards: two per face between solid and empty.
 
     Each face is cut along the diagonal from its lowest to its highest corner, as `kuhn_tets` does.
 

@@ -201,7 +201,7 @@ def apply_patches(
         normals: Outward unit normals in the axes of the centroids, shape (f, 3).
         up: Up direction in the axes of the centroids.
         seen: True where some camera sees the triangle, shape (f,).
-        on_box: True where the scene box cuts the solid, shape (f,).
+        on_box: True where the scene box or the region of an export cuts the solid, shape (f,).
         colours: Red, green, blue in [0, 1] of each triangle, shape (f, 3); None if not known.
 
     Raises:

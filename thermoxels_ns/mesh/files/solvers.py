@@ -60,7 +60,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
             mesh.topology.create_connectivity(2, 3)
             patches = file.read_meshtags(mesh, name="facets")
 
-    The .h5 is written first. An old .xdmf is removed before the new one is written, since it does not fit the new .h5.
+    The .h5 is written first; there is no .xdmf until it is complete. Raises `OutputError` if `path` ends in .h5.
     """
     import h5py
 

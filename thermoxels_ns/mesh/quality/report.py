@@ -97,7 +97,7 @@ class QualityReport:
     num_tets: int
     num_edges: int
     num_facets: int
-    num_box_facets: int  # boundary triangles where the scene box cuts the solid
+    num_box_facets: int  # number of boundary triangles with the tag `FACET_BOX`
     volume_m3: float  # sum of the signed volumes, [m^3]
     area_m2: float  # sum of the boundary triangles' areas, [m^2]
     edge_length_m: tuple[float, float, float]  # shortest, mean and longest edge, [m]

@@ -17,7 +17,7 @@ from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow, repeated
 
-LARGEST_PASS = 4_000_000  # in lattices with more voxels, `_hidden` has one answer for a block of 2^3, 4^3, ...
+LARGEST_PASS = 4_000_000  # with more voxels than this, `_hidden` has one answer per block of 2^3, 4^3, ... voxels
 SHADOW_SURROUNDED = 0.1
 """Least winding number, in the seen surfaces, of inside space that the shell hides from cameras. The number is up to
 one half behind a surface seen from one side only, and at most 0 in the shadow before a wall."""
@@ -27,7 +27,7 @@ STRAY_SHARE = 0.005
 _fast_length = cast(Callable[[int], int], fft.next_fast_len)
 MARGIN = 0.25  # the winding number is set to 0 at this share of the lattice's size outside the lattice, on each side
 THINNEST_GROWN = 1.5
-"""A wall thinner than this, [voxels], gets no voxel behind the seen one, whose neighbour has its middle deeper."""
+"""Least thickness of a wall that gets voxels behind the seen one, [voxels]: the next voxel's middle is this deep."""
 
 
 @dataclass(frozen=True)

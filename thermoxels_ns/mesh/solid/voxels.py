@@ -43,7 +43,7 @@ In nine synthetic scenes with a street or room around, this keeps all of the sce
 in synthetic rooms seen from inside it keeps 99.7 % of what two photographs see."""
 CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # share of an image's sides that counts as its middle, and rays along each side
 NEAREST_SHARE = 0.25  # a camera's distance to what it was pointed at is this quantile of the rays' lengths
-FEWEST_CAMERAS = 0.1  # quantile of the visibility of what cameras are pointed at that stands for "shown well"
+FEWEST_CAMERAS = 0.1  # quantile of the visibility of what cameras are pointed at; `LEAST_SHARE` refers to it
 MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` has one answer for a block of 2^3, 4^3, ...
 
 
@@ -101,8 +101,8 @@ class SolidStep:
     """One step on the way from density to solid voxels, and what it changed."""
 
     name: str  # threshold, close gaps, region, wall or interior
-    added: int  # voxels that it made solid
-    removed: int  # voxels that it made empty
+    added: int  # number of voxels that the step made solid
+    removed: int  # number of voxels that the step made empty
     remark: str  # one or two sentences on how and why
 
 
@@ -114,7 +114,7 @@ class SolidCells:
     level: Float32Array  # what `level_of` returns: trilinear between voxel centres, its zero is the surface
     threshold: float  # least density at the centre of a voxel that counts as dense, [1 / world unit]
     explanation: str  # which rule chose the threshold, and why
-    steps: tuple[SolidStep, ...]  # what each step did, in order; the first is the threshold
+    steps: tuple[SolidStep, ...]  # all steps in order; the first is the threshold
     component_sizes: IntArray  # number of voxels of each body in the region after gaps were closed, largest first
     within: BoolArray  # True for voxels, solid or not, in the region; the solid is cut at its border
     left_out: BoolArray  # True for dense voxels and closed gaps outside the region or in bodies that were too small

@@ -120,8 +120,8 @@ def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
 def _keep_sheets(centres: npt.NDArray[np.floating], corners: npt.NDArray[np.floating]) -> None:
     """Raise corners to 0 where a solid layer of one voxel would get holes; lower them to 0 where a gap of one would.
 
-    Four solid centres in a square make a hole if the two corners above and below the middle of the square are both not
-    above 0, unless both are exactly 0: the middle lies on the long edge between these two corners. Likewise for gaps.
+    The middle of a square of four solid centres lies on the long edge between the corners above and below. If neither
+    corner is above 0, the square is a hole, unless both are exactly 0. Likewise for gaps and squares of empty centres.
     """
     solid = centres > 0.0
     for layer, side in ((~solid, -1.0), (solid, 1.0)):
@@ -184,7 +184,7 @@ class WarpedLattice:
 
 
 def warp(lattice: BccLattice, buried: BoolArray) -> WarpedLattice:
-    """Find where the surface cuts edges, and move points that are too close to a cut onto the surface.
+    """Return the lattice after points close to the surface were moved onto it, and the cuts of the edges left.
 
     Between a point inside and one outside, the cut is where the linearly interpolated level is 0. A point with cuts
     nearer than alpha (`ALPHA_INSIDE`, `ALPHA_OUTSIDE`) times the edge moves to the nearest cut and gets sign 0, and its
@@ -203,7 +203,7 @@ def warp(lattice: BccLattice, buried: BoolArray) -> WarpedLattice:
         crosses = sign[neighbour] < 0
         touches |= crosses
         touched[neighbour[crosses]] = True
-    # Points inside with a neighbour outside, and points outside with one inside.
+    # These are the points inside with a neighbour outside, and the points outside with a neighbour inside.
     inside, outside = inner[touches], np.flatnonzero(touched)
 
     moved, moved_to = [], []
@@ -257,7 +257,7 @@ def _cut_shares(lattice: BccLattice, sign: npt.NDArray[np.int8], points: IntArra
     return share
 
 
-# The sides of a face lie between its corners 0-1, 1-2, 2-3 and 3-0, counter-clockwise seen from where its axis points.
+# Corners of a face across x, counter-clockwise seen from +x, and outward directions of its sides 0-1, 1-2, 2-3, 3-0.
 _CORNERS = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])
 _OUTWARD = np.array([[0, 0, -1], [0, 1, 0], [0, 0, 1], [0, -1, 0]])
 
@@ -275,7 +275,7 @@ def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
     levels: list[BoolArray] = []
     size, whole = 1, cells
     while size < largest:
-        # A cube of one voxel touches any cube of two; larger ones need neighbours of at least half their size.
+        # A cube of two voxels may touch single voxels; larger cubes need neighbours of at least half their size.
         halves = whole if size == 1 else shrink(whole, 3)
         halves = np.pad(halves, [(0, n % 2) for n in halves.shape])
         nx, ny, nz = (n // 2 for n in halves.shape)
@@ -376,7 +376,7 @@ class _Points:
     origin: int  # flat index of the lowest corner of cube (0, 0, 0)
     per_cube: IntArray  # flat steps from a cube to the next along x, y, z
     centre: int  # flat step from a cube's lowest corner to its centre
-    ahead: int  # flat step from a cube to the one ahead: one edge along the axis
+    ahead: int  # flat step from a cube to the next along the axis
     corners: IntArray  # flat steps from a cube's lowest corner to the corners of its low face across the axis, (4,)
 
     @classmethod
