@@ -31,29 +31,29 @@ class Synthetic:
     """Write a synthetic scene, whose shape and temperature are known exactly, as photographs and thermal images."""
 
     scene: tyro.conf.Positional[SceneWord]
-    """Which scene. random-N and wild-N are made from the seed N; wild ones have smooth, plain or textured surroundings,
-    and some have plain walls, mirroring panes or a thin railing. After the name, in any order: +sky=R,G,B for a sky or
-    backdrop of one colour (0 to 1), +street for houses and trees around, +room for a room around, +white for white
-    plaster under a white sky (house-corner alone); for example house-corner+sky=0.55,0.57,0.60 or random-3+street."""
+    """Name of the scene. random-N and wild-N are made from the seed N; wild scenes have smooth, plain or textured
+    surroundings, and some have plain walls, mirroring panes or a thin railing. After the name, in any order: +sky=R,G,B
+    for a sky or backdrop of one colour (0 to 1), +street for houses and trees around, +room for a room around, +white
+    for white plaster under a white sky (house-corner only); for example house-corner+sky=0.55,0.57,0.60 or
+    random-3+street."""
     output_dir: Path
     """Folder for the scene, in the ThermoScenes layout; made if it does not exist. An earlier synthetic scene in it is
     replaced."""
     num_train: int = 42
-    """Training views."""
+    """Number of training views."""
     num_eval: int = 6
-    """Held-out views, half-way between training views."""
+    """Number of held-out views, which are half-way between training views."""
     width: int = 320
     """Width of the photographs, [pixels]."""
     height: int = 240
     """Height of the photographs, [pixels]."""
     thermal_width: int | None = None
-    """Width of the thermal images, [pixels]; that of the photographs by default, half of it with
-    --own-thermal-camera True."""
+    """Width of the thermal images, [pixels]; by default `width`, or half of it with --own-thermal-camera True."""
     thermal_format: Literal["png16", "tiff", "npy"] = "png16"
-    """16-bit PNG that spans the temperature bounds, 16-bit TIFF of centikelvin counts, or float32 numpy in degrees
-    Celsius."""
+    """Format of the thermal images: 16-bit PNG that spans the temperature bounds, 16-bit TIFF of centikelvin counts, or
+    float32 numpy in degrees Celsius."""
     photo_format: Literal["jpeg", "png"] = "jpeg"
-    """JPEG, as cameras write it, or PNG, which loses nothing."""
+    """Format of the photographs: JPEG, as cameras write it, or PNG, which is lossless."""
     seed: int = 0
     """Seed of the random numbers of the imperfections; the same seed writes the same files."""
     own_thermal_camera: bool = False

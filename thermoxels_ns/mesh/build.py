@@ -57,7 +57,7 @@ class BuiltMesh:
     unobserved_parts: int  # number of connected parts left out because no thermal ray saw any of their nodes
     unobserved_voxels: int  # number of voxels of these parts: in `solid.component_sizes`, not in `solid.cells`
     observed_range_c: tuple[float, float]
-    """Lowest and highest temperature of the field's measured corners, [degrees Celsius]; no node's lies outside."""
+    """Lowest and highest temperature of the field's measured corners, [degrees Celsius]; no node is outside."""
     idle_rules: tuple[str, ...] = ()
     """The user's rules that no triangle or tetrahedron of the mesh follows, such as "patch roof (entry 2)"."""
 
@@ -83,7 +83,7 @@ def build_mesh(
         metres_per_unit: Length, [m], of the unit of the input poses, in which the region's box or point is given.
 
     Raises:
-        MeshError: No voxel is solid (see `select_solid`), `world_to_metres` is no similarity, no node was measured.
+        MeshError: `select_solid` fails, `world_to_metres` is no similarity, or no node of the mesh was measured.
     """
     transform = check_similarity("world_to_metres", world_to_metres)
     scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
@@ -145,7 +145,7 @@ def build_mesh(
 
 
 def _voxels_of(cells: BoolArray, points: FloatArray, tets: IntArray, nodes: BoolArray, voxel: bool) -> BoolArray:
-    """Return the solid voxels of the bodies whose mesh has any of the `nodes` (True per node)."""
+    """Return the solid voxels from which those bodies of the mesh were made whose `nodes` are True."""
     if voxel:
         inside = points[tets[nodes[tets[:, 0]]]].mean(axis=1)
     else:  # nodes at voxel centres: every body has one, and voxels that share a face are in one body
@@ -158,7 +158,7 @@ def _voxels_of(cells: BoolArray, points: FloatArray, tets: IntArray, nodes: Bool
 
 
 def _cut_by_region(points: FloatArray, facets: IntArray, within: BoolArray) -> BoolArray:
-    """Return True for triangles with voxels outside the region in front; the solid may go on there, shape (f,)."""
+    """Return True for triangles in front of which the region ends, where the solid may go on, shape (f,)."""
     # A smoothed surface lies at most half a voxel inside the voxel face that it stands for.
     beside = np.floor(points[facets].mean(axis=1) + 0.75 * facet_normals(points, facets)).astype(np.int64)
     inside = np.all((beside >= 0) & (beside < within.shape), axis=1)

@@ -268,6 +268,6 @@ def surface_topology(points: FloatArray, facets: IntArray, sides: Groups) -> dic
 
 
 def count_open_edges(facets: IntArray, sides: Groups) -> int:
-    """Return the number of edges not passed equally often in both directions by `facets`; 0 for a closed surface."""
+    """Return the number of edges that triangles do not pass equally often in both directions; 0: a closed surface."""
     upwards = facets < np.roll(facets, -1, axis=1)
     return int(np.count_nonzero(sides.sums(np.where(upwards.ravel(), 1, -1))))

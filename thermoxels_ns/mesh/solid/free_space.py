@@ -13,10 +13,10 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.core.voxel_walk import cells_crossed
 
-MOST_CAMERAS = 128  # of more cameras than this, so many are chosen evenly in their order
+MOST_CAMERAS = 128  # largest number of cameras that are counted; of more cameras, so many are chosen evenly
 SEEN_SHARE = 0.1
-"""Of the cameras whose image holds a voxel, the share, but at least one, that must have a free line to a seen voxel: a
-reconstruction has pinholes that single cameras look through."""
+"""A voxel is seen if at least this share of the cameras whose image holds the voxel, and at least one camera, has a
+free line to the voxel: a reconstruction has pinholes that single cameras look through."""
 CLEAR_OF_CAMERA = 1.5  # solid voxels this close to a camera do not block it, [voxels]: floaters stick to cameras
 
 

@@ -160,11 +160,11 @@ def _without_strays(body: BoolArray) -> BoolArray:
 def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
     """Return for each voxel the winding number of the surface made of all voxel faces between `solid` and `air`.
 
-    The number is 1 inside a closed surface and 0 outside; where the surface has a hole, the number falls
-    gradually across it. Faces between two solid voxels, or next to a voxel neither solid nor air, are no surface. For
-    triangles see Jacobson, Kavan and Sorkine-Hornung 2013, Robust inside-outside segmentation using generalized
-    winding numbers, equation 5. The number w jumps by one across the surface and is harmonic elsewhere: Lap w = div J
-    with the jumps J, which is solved by sine transforms in blocks of 2^3 voxels.
+    The number is 1 inside a closed surface and 0 outside; through a hole in the surface it changes gradually. Faces
+    between two solid voxels, or next to a voxel that is neither solid nor air, are no surface. For triangles see
+    Jacobson, Kavan and Sorkine-Hornung 2013, Robust inside-outside segmentation using generalized winding numbers,
+    equation 5. The number w jumps by one across the surface and is harmonic elsewhere: Lap w = div J with the jumps J.
+    This equation is solved by sine transforms, with one value per block of 2^3 voxels.
     """
     shape = solid.shape
     # The lattice is padded to lengths for which the transforms are fast, and lies about in the middle.

@@ -34,7 +34,7 @@ its light, as in half-transparent space. At the second, a single voxel stops hal
 OPAQUE_OPTICAL_DEPTH = 2.0  # at this density times voxel edge or more, a dense voxel is solid even if no ray ends in it
 SHARE_THAT_ENDS = 0.5
 """A voxel stops rays if the number of rays that end in it is more than this share of the weight that rays spent in it.
-This share is 1 in a voxel where all rays that enter end, and 0 where light leaked past a surface."""
+The ratio of the two is 1 in a voxel where all rays that enter end, and 0 where light leaked past a surface."""
 LEAST_WEIGHT = 0.5  # with less weight of rays than this in a voxel, [rays], its density alone decides
 FEWEST_RAYS = 100  # least number of rays that end on something for the threshold to be chosen by rays
 LEAST_SHARE = 0.15
@@ -42,9 +42,9 @@ LEAST_SHARE = 0.15
 In nine synthetic scenes with a street or room around, this keeps all of the scene and removes half of what is around;
 in synthetic rooms seen from inside it keeps 99.7 % of what two photographs see."""
 CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # share of an image's sides that counts as its middle, and rays along each side
-NEAREST_SHARE = 0.25  # a camera's distance to what it was pointed at is this quantile of the rays' lengths
+NEAREST_SHARE = 0.25  # a camera points at the place at this quantile of the distances to solid along these rays
 FEWEST_CAMERAS = 0.1  # quantile of the visibility of what cameras are pointed at; `LEAST_SHARE` refers to it
-MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` has one answer for a block of 2^3, 4^3, ...
+MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` interpolates between blocks of voxels
 
 
 @dataclass(frozen=True)
