@@ -48,7 +48,7 @@ class Synthetic:
     height: int = 240
     """Height of the photographs, [pixels]."""
     thermal_width: int | None = None
-    """Width of the thermal images, [pixels]; by default `width`, or half of it with --own-thermal-camera True."""
+    """Width of the thermal images, [pixels]; by default --width, or half of it with --own-thermal-camera True."""
     thermal_format: Literal["png16", "tiff", "npy"] = "png16"
     """Format of the thermal images: 16-bit PNG that spans the temperature bounds, 16-bit TIFF of centikelvin counts, or
     float32 numpy in degrees Celsius."""

@@ -28,12 +28,12 @@ def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
 
 
 def face_connected(cells: BoolArray) -> npt.NDArray[np.int32]:
-    """Return each voxel's body number: bodies touch by faces, 1, 2, ... in C order of their first voxel; 0: empty."""
+    """Return each voxel's body number, 1, 2, ... in C order of first voxels, 0 if empty; bodies connect by faces."""
     return connected(cells, connectivity=1)
 
 
 def connected(cells: BoolArray, connectivity: int = 3) -> npt.NDArray[np.int32]:
-    """Return each voxel's body number, 0 if empty; voxels touch by faces (`connectivity` 1), edges (2), corners (3)."""
+    """Return each voxel's body number, 0 if empty; bodies connect by faces (`connectivity` 1), edges (2) or corners."""
     # Labels are found in the box of the solid only, because most of a lattice is empty.
     labels, box = np.zeros(cells.shape, dtype=np.int32), bounding_box(cells)
     inside = np.zeros(cells[box].shape, dtype=np.int32)
@@ -54,7 +54,7 @@ def repeated(values: npt.NDArray, times: int) -> npt.NDArray:
 
 
 def grow(cells: BoolArray, by: int) -> BoolArray:
-    """Return the solid voxels and all voxels within `by` voxels of one along every axis (a dilation by a cube).
+    """Return all voxels that are at most `by` voxels from a solid voxel along every axis (a dilation by a cube).
 
     >>> grow(np.array([[[False, False, False, True]]]), 2)[0, 0].tolist()
     [False, True, True, True]
@@ -63,7 +63,7 @@ def grow(cells: BoolArray, by: int) -> BoolArray:
 
 
 def shrink(cells: BoolArray, size: int | tuple[int, ...], origin: int | tuple[int, ...] = 0) -> BoolArray:
-    """Return the voxels for which the whole box of `size` voxels around is in the set; outside the array nothing is.
+    """Return the voxels whose surrounding box of `size` voxels is completely in the set and in the array.
 
     A box of even size is centred half a voxel below the voxel, or half a voxel above with `origin` -1.
 
@@ -114,7 +114,7 @@ def convex_hull(cells: BoolArray) -> BoolArray:
     steps = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
     ends_of_columns = [np.column_stack((columns + step, ends)) for step in steps for ends in (first, last)]
     planes = ConvexHull(np.concatenate(ends_of_columns).astype(np.float64)).equations
-    planes[:, 3] += 0.5 * np.abs(planes[:, :3]).sum(axis=1) - 1e-9  # to the hull of the cubes' centres
+    planes[:, 3] += 0.5 * np.abs(planes[:, :3]).sum(axis=1) - 1e-9  # moved to the hull of centres
     nx, ny, nz = cells.shape
     x, y = np.arange(nx)[:, None] + 0.5, np.arange(ny)[None, :] + 0.5
     low, high = np.full((nx, ny), -np.inf), np.full((nx, ny), np.inf)
