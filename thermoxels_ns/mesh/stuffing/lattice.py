@@ -44,12 +44,12 @@ class BccLattice:
 
     @property
     def strides(self) -> tuple[int, int, int]:
-        """Return what a step of one voxel along x, y, z adds to the flat index."""
+        """Return the numbers that a step of one voxel along x, y and z adds to the flat index."""
         return (self.shape[1] * self.shape[2], self.shape[2], 1)
 
     @cached_property
     def offsets(self) -> IntArray:
-        """Return what steps to the 14 neighbours add to the flat index, shape (2, 14): of a centre, of a corner."""
+        """Return what a step to each neighbour adds to the flat index of a centre and of a corner, shape (2, 14)."""
         strides = np.array(self.strides)
         along = DIRECTIONS[:6].astype(np.int64) @ strides
         # Centre i of the first block lies half a voxel below corner i of the second, along each axis.
@@ -184,7 +184,7 @@ class WarpedLattice:
 
 
 def warp(lattice: BccLattice, buried: BoolArray) -> WarpedLattice:
-    """Return the lattice after points close to the surface were moved onto it, and the cuts of the edges left.
+    """Return the lattice after points close to the surface were moved onto it, and the cuts that are left on edges.
 
     Between a point inside and one outside, the cut is where the linearly interpolated level is 0. A point with cuts
     nearer than alpha (`ALPHA_INSIDE`, `ALPHA_OUTSIDE`) times the edge moves to the nearest cut and gets sign 0, and its
@@ -300,7 +300,7 @@ class CoarseInterior:
     tets: IntArray  # flat indices, shape (t, 4), positively oriented: all tetrahedra at faces of larger cubes
 
     def buried(self, lattice: BccLattice) -> BoolArray:
-        """Return which lattice points have only voxels of larger cubes around them, shape (points,).
+        """Return True for lattice points with only voxels of larger cubes around them, shape (points,).
 
         These points and all their neighbours are inside the solid; no neighbour is moved or has a cut edge.
         """
