@@ -324,7 +324,7 @@ def _set_names(name: str, names: Sequence[str]) -> list[str]:
 
 
 def _sets(index: IntArray, names: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
-    """Yield the name and the members, rising, of every patch or region that has any."""
+    """Yield each used name and its members, rising; `index` has the number of each element's patch or region."""
     for number, name in enumerate(names):
         members = np.flatnonzero(index == number)
         if len(members):

@@ -57,7 +57,7 @@ _MOST_COMPONENTS = 20
 
 @dataclass(frozen=True)
 class Criterion:
-    """One quality criterion, and how a mesh does by it."""
+    """One quality criterion, and the result of a mesh for this criterion."""
 
     name: str  # short name, the same for every mesh
     sentence: str  # what the criterion asks for
@@ -89,7 +89,7 @@ def in_percent(share: float) -> str:
 
 @dataclass(frozen=True)
 class QualityReport:
-    """Figures of the quality of a mesh, and how the mesh does by each quality criterion."""
+    """Figures of the quality of a mesh, and its result for each quality criterion."""
 
     boundary_mode: BoundaryMode  # how the boundary was made
     length_unit: str  # unit of length of the nodes' positions; where it is not "m", read [m] below as this unit

@@ -89,7 +89,7 @@ def _signed(level: Float32Array, least: Float32Array | np.float32, cells: BoolAr
 
 
 def _thin(cells: BoolArray) -> BoolArray:
-    """Return the voxels of walls one voxel thick: alone along an axis, with at least two such voxels beside them."""
+    """Return voxels of walls one voxel thick: single along an axis, with at least two such voxels beside them."""
     thin = np.zeros_like(cells)
     for axis in range(3):
         alone = cells & ~_beside(cells, axis, 1) & ~_beside(cells, axis, -1)

@@ -202,7 +202,7 @@ def select_solid(
 def _wall_voxels(
     snapshot: GridSnapshot, selection: SolidSelection, metres_per_world_unit: float | None
 ) -> float | None:
-    """Return the wall thickness asked for, [voxels], None if none is; raise `MeshError` if it cannot be made."""
+    """Return the wall thickness, [voxels], or None if none is asked for; raise `MeshError` if it cannot be made."""
     thickness = selection.wall_thickness
     if thickness is None:
         return None
