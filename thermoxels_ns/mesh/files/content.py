@@ -72,7 +72,7 @@ class Surface:
 
 
 def surface_of(points_m: FloatArray, facets: IntArray) -> Surface:
-    """Return the surface of the triangles `facets` (f, 3): just the nodes that they use, and renumbered triangles.
+    """Return a surface of the triangles `facets` (f, 3), renumbered to the nodes that any triangle uses.
 
     >>> surface_of(np.arange(12.0).reshape(4, 3), np.array([[3, 0, 2]])).triangles.tolist()
     [[2, 0, 1]]

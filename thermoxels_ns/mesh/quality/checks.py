@@ -100,7 +100,7 @@ def triangles_across_edges(sides: Groups) -> IntArray:
 
 
 def component_of(num: int, first: IntArray, second: IntArray) -> IntArray:
-    """Return for each of `num` things its connected component's number; things first[i] and second[i] are connected."""
+    """Return the connected component's number of each of `num` things; a link joins things first[i] and second[i]."""
     links = sparse.coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
     return connected_components(links, directed=False)[1].astype(np.int64) if num else np.zeros(0, dtype=np.int64)
 

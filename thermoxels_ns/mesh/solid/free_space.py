@@ -22,7 +22,7 @@ CLEAR_OF_CAMERA = 1.5  # solid voxels this close to a camera do not block it, [v
 
 @dataclass(frozen=True)
 class CameraCounts:
-    """Numbers of cameras that could see, and that do see, each voxel."""
+    """For each voxel, the number of cameras whose image holds it and how many of these have a free line to it."""
 
     in_image: npt.NDArray[np.uint8]
     """Number of cameras whose image holds the voxel's centre, shape `lattice.cell_shape`."""

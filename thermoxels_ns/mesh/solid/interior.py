@@ -65,7 +65,7 @@ def interior(
 def _enclosed(
     cells: BoolArray, sealed: BoolArray, lattice: Lattice, views: Views | None, seal: int
 ) -> tuple[BoolArray, BoolArray]:
-    """Return the cavities of the shell and the sealed shell: the voxels of those without a camera and with a camera."""
+    """Return two masks, cavities without and with a camera, both of the shell and of the sealed shell."""
     everywhere = np.ones((3, 3, 3), dtype=bool)
     cameras = _camera_voxels(cells, lattice, views)
     # Sealing closes alcoves and corridors of a cavity, where cameras may stand: cameras are grown by the same width.
@@ -92,7 +92,7 @@ def _camera_voxels(cells: BoolArray, lattice: Lattice, views: Views | None) -> B
 
 
 def _cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Return the voxels of cavities (no way out through voxel faces) without a camera, and of those with a camera."""
+    """Return two masks, cavities without and with a camera: empty voxels without a way out through voxel faces."""
     labels = face_connected(np.pad(~shell, 1, constant_values=True))
     kept = np.ones(int(labels.max()) + 1, dtype=bool)
     kept[[0, labels[0, 0, 0]]] = False
@@ -104,7 +104,7 @@ def _cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArra
 
 
 def _hidden(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, seal: int) -> BoolArray:
-    """Return the voxels that no camera sees, behind the surface and within the convex hull of a body."""
+    """Return the voxels within a body's convex hull that no camera sees and that seen surfaces surround."""
     block = 1
     while sealed.size > LARGEST_PASS * block**3:
         block *= 2

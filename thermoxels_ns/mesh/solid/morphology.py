@@ -33,7 +33,7 @@ def face_connected(cells: BoolArray) -> npt.NDArray[np.int32]:
 
 
 def connected(cells: BoolArray, connectivity: int = 3) -> npt.NDArray[np.int32]:
-    """Return each voxel's body number, 0 if empty; bodies connect by faces (`connectivity` 1), edges (2) or corners."""
+    """Return body numbers as `face_connected`; voxels connect by faces (`connectivity` 1), edges (2) or corners (3)."""
     # Labels are found in the box of the solid only, because most of a lattice is empty.
     labels, box = np.zeros(cells.shape, dtype=np.int32), bounding_box(cells)
     inside = np.zeros(cells[box].shape, dtype=np.int32)
@@ -63,7 +63,7 @@ def grow(cells: BoolArray, by: int) -> BoolArray:
 
 
 def shrink(cells: BoolArray, size: int | tuple[int, ...], origin: int | tuple[int, ...] = 0) -> BoolArray:
-    """Return the voxels whose surrounding box of `size` voxels is completely in the set and in the array.
+    """Return the voxels whose surrounding box of `size` voxels is completely solid and inside the array.
 
     A box of even size is centred half a voxel below the voxel, or half a voxel above with `origin` -1.
 

@@ -131,7 +131,7 @@ def _clear(surface: Surface, moves: _Moves) -> BoolArray:
 
 
 def _carry_out(points: FloatArray, tets: IntArray, moves: _Moves) -> FloatArray:
-    """Return the positions (n, 3) after all moves that keep the tetrahedra around the node sound, made in order."""
+    """Return positions (n, 3) after the moves, made in order, except moves after which a tetrahedron is not sound."""
     touched = np.zeros(len(points), dtype=bool)
     touched[moves.node] = True
     near = tets[touched[tets].any(axis=1)]
@@ -322,7 +322,7 @@ def _products(vectors: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def _sum_at_nodes(facets: IntArray, values: FloatArray, count: int) -> FloatArray:
-    """Return for each of `count` nodes the sum of a value per triangle over the triangles around it, shape (count,)."""
+    """Return for each node the sum of `values`, one per triangle, over the triangles around the node, (count,)."""
     total = np.zeros(count)
     for column in facets.T:
         total += np.bincount(column, values, count)
