@@ -145,7 +145,7 @@ def build_mesh(
 
 
 def _voxels_of(cells: BoolArray, points: FloatArray, tets: IntArray, nodes: BoolArray, voxel: bool) -> BoolArray:
-    """Return the solid voxels from which those bodies of the mesh were made whose `nodes` are True."""
+    """Return the solid voxels of all bodies of the mesh that have a marked node; `nodes` is the mask, shape (n,)."""
     if voxel:
         inside = points[tets[nodes[tets[:, 0]]]].mean(axis=1)
     else:  # nodes at voxel centres: every body has one, and voxels that share a face are in one body

@@ -255,7 +255,7 @@ def _view_of_nodes(name: str, values: FloatArray) -> bytes:
 
 @dataclass(frozen=True)
 class HeatStep:
-    """A simulation of heat conduction in equal time steps, for a body of one material that is insulated all round."""
+    """Heat conduction for an .inp file to compute: a body of one material, insulated all round, in equal time steps."""
 
     conductivity_w_mk: float  # Thermal conductivity, [W / (m K)], above 0
     density_kg_m3: float  # Mass density, [kg / m3], above 0

@@ -98,7 +98,7 @@ class SolidSelection:
 
 @dataclass(frozen=True)
 class SolidStep:
-    """One step on the way from density to solid voxels, and what it changed."""
+    """The changes made by one of the steps that lead from density to solid voxels."""
 
     name: str  # threshold, close gaps, region, wall or interior
     added: int  # number of voxels that the step made solid
@@ -128,7 +128,7 @@ def select_solid(
     *,
     makes_up_volume: bool = True,
 ) -> SolidCells:
-    """Return the solid voxels of a trained field, chosen by the density at voxel centres and the later steps.
+    """Return the solid voxels of a trained field, chosen by their density and then changed by up to three more steps.
 
     `metres_per_world_unit` is needed for a wall thickness only. `world_to_input`, shape (3, 4), maps world coordinates
     to those of the region's box or point; None is the identity. `makes_up_volume` is passed to `level_of`.
@@ -380,7 +380,7 @@ def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> Bool
 def _asked_region(
     cells: BoolArray, lattice: Lattice, box: Box | None, near: Ball | None, world_to_input: FloatArray
 ) -> BoolArray:
-    """Return the voxels with centres in a box or ball; raise `MeshError` if none of the solid voxels `cells` is."""
+    """Return the voxels with centres in a box or ball; raise `MeshError` if no solid voxel (`cells`) is among these."""
     # Each input coordinate is a sum of three terms, one per voxel index: one array per axis is enough.
     middles = [
         lattice.lo[axis] + (np.arange(count) + 0.5) * lattice.voxel_size for axis, count in enumerate(cells.shape)
