@@ -1,8 +1,8 @@
-"""The command ``thermoxels``: what nerfstudio's own commands do not offer."""
+"""The command ``thermoxels``, with the subcommands that nerfstudio's own commands do not offer."""
 
 from __future__ import annotations
 
-# Only light imports at the top, so that ``--help`` answers at once.
+# All imports at the top are light, so that ``--help`` answers at once.
 import os
 import shlex
 import sys
@@ -23,7 +23,7 @@ from thermoxels_ns.synthetic.catalogue import SceneWord
 from thermoxels_ns.synthetic.imperfections import Imperfections
 
 _NEWS_FOR_PROGRAMMERS = r"`torch\.jit\.script` is deprecated"
-"""How the warning begins that newer versions of torch give when nerfstudio 1.1.5 is imported."""
+"""Regular expression for the warning of newer versions of torch when nerfstudio 1.1.5 is imported."""
 
 
 @dataclass
@@ -31,38 +31,38 @@ class Synthetic:
     """Write a synthetic scene, whose shape and temperature are known exactly, as photographs and thermal images."""
 
     scene: tyro.conf.Positional[SceneWord]
-    """Which scene. random-N and wild-N are made from the seed N; wild ones have smooth, plain or textured surroundings,
-    and some have plain walls, mirroring panes or a thin railing. After the name, in any order: +sky=R,G,B for a sky or
-    backdrop of one colour (0 to 1), +street for houses and trees around, +room for a room around, +white for white
-    plaster under a white sky (house-corner alone); for example house-corner+sky=0.55,0.57,0.60 or random-3+street."""
+    """Name of the scene. random-N and wild-N are made from the seed N; wild scenes have smooth, plain or textured
+    surroundings, and some have plain walls, mirroring panes or a thin railing. After the name, in any order: +sky=R,G,B
+    for a sky or backdrop of one colour (0 to 1), +street for houses and trees around, +room for a room around, +white
+    for white plaster under a white sky (house-corner only); for example house-corner+sky=0.55,0.57,0.60 or
+    random-3+street."""
     output_dir: Path
     """Folder for the scene, in the ThermoScenes layout; made if it does not exist. An earlier synthetic scene in it is
     replaced."""
     num_train: int = 42
-    """Training views."""
+    """Number of training views."""
     num_eval: int = 6
-    """Held-out views, half-way between training views."""
+    """Number of held-out views, which are half-way between training views."""
     width: int = 320
     """Width of the photographs, [pixels]."""
     height: int = 240
     """Height of the photographs, [pixels]."""
     thermal_width: int | None = None
-    """Width of the thermal images, [pixels]; that of the photographs by default, half of it with
-    --own-thermal-camera True."""
+    """Width of the thermal images, [pixels]; by default --width, or half of it with --own-thermal-camera True."""
     thermal_format: Literal["png16", "tiff", "npy"] = "png16"
-    """16-bit PNG that spans the temperature bounds, 16-bit TIFF of centikelvin counts, or float32 numpy in degrees
-    Celsius."""
+    """Format of the thermal images: 16-bit PNG that spans the temperature bounds, 16-bit TIFF of centikelvin counts, or
+    float32 numpy in degrees Celsius."""
     photo_format: Literal["jpeg", "png"] = "jpeg"
-    """JPEG, as cameras write it, or PNG, which loses nothing."""
+    """Format of the photographs: JPEG, as cameras write it, or PNG, which is lossless."""
     seed: int = 0
-    """Seed of what the imperfections draw; the same seed writes the same files."""
+    """Seed of the random numbers of the imperfections; the same seed writes the same files."""
     own_thermal_camera: bool = False
     """Take the thermal images with a second camera beside the first, with a lens and poses of its own."""
     imperfections: tyro.conf.OmitArgPrefixes[Imperfections] = field(default_factory=Imperfections)
-    """What cameras and poses are off by; nothing unless given. Its truth is written to truth.json."""
+    """Errors of cameras and poses, none unless given. The true errors are written to truth.json."""
 
     def main(self) -> None:
-        """Write the scene.
+        """Write the scene to `output_dir` and print the command that trains it.
 
         Raises:
             ThermoxelsError: An option is out of range or the folder cannot be used.
@@ -96,13 +96,13 @@ Commands = tyro.conf.FlagConversionOff[
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a subcommand.
+    """Run a subcommand and return its exit status.
 
     Args:
-        arguments: The words after ``thermoxels``; those of this process if left out.
+        arguments: The words after ``thermoxels``; the arguments of this process if left out.
 
     Returns:
-        The exit status: 0, 1 for an error of the input (which is printed), 130 if the user interrupted it.
+        The exit status: 0 on success, 1 after a `ThermoxelsError`, which is printed, 130 after the user's interrupt.
     """
     command = tyro.cli(
         Commands, prog="thermoxels", args=arguments, description="RGB and thermal photographs to a solid with heat."
@@ -119,15 +119,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def entrypoint() -> None:
-    """Run the console script and end the process with its status."""
-    if not sys.warnoptions:  # whoever sets filters wants to see what they let through
+    """Run `main` as the console script and end the process with its exit status."""
+    if not sys.warnoptions:  # a user who set warning filters keeps them
         warnings.filterwarnings("ignore", _NEWS_FOR_PROGRAMMERS, FutureWarning)
     try:
         try:
             status = main()
         finally:
             sys.stdout.flush()
-    except BrokenPipeError:  # who read the output has seen enough, as head has
+    except BrokenPipeError:  # the reader of a pipe, such as head, closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = 1
     sys.exit(status)

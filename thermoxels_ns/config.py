@@ -1,4 +1,4 @@
-"""The methods that nerfstudio finds through our entry points."""
+"""The training methods of this package, which nerfstudio finds through entry points."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _group(lr: float, lr_final: float, optimizer: type[OptimizerConfig]) -> dict
 def _trainer(
     optimizer: type[OptimizerConfig] = RowAdamConfig, dense: type[OptimizerConfig] = FusedAdamConfig
 ) -> ThermoxelsTrainerConfig:
-    """Give the default training: `optimizer` moves the rows of the voxel grid, `dense` what a batch touches whole."""
+    """Return the default training; `optimizer` is for rows of the voxel grid, `dense` for arrays updated as a whole."""
     return ThermoxelsTrainerConfig(
         method_name="thermoxels",
         max_num_iterations=ITERATIONS,

@@ -1,6 +1,6 @@
-"""The dataparser that nerfstudio finds through our entry point."""
+"""The dataparser of this package, which nerfstudio finds through an entry point."""
 
-# Apart from `config.py`: nerfstudio discovers dataparsers while its own datamanagers are half imported.
+# This cannot be in `config.py`: nerfstudio discovers dataparsers while its own datamanagers are half imported.
 from __future__ import annotations
 
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification

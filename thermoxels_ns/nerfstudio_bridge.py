@@ -1,4 +1,4 @@
-"""What nerfstudio 1.1.x lacks for plugins; imported by every ``ns-*`` command."""
+"""Additions to nerfstudio 1.1.x that plugins cannot make otherwise; every ``ns-*`` command imports this module."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ if TYPE_CHECKING:
 _EXPORTER, _TRAIN = "nerfstudio.scripts.exporter", "nerfstudio.scripts.train"
 _EVALUATIONS = ("nerfstudio.scripts.eval", "nerfstudio.scripts.render")
 _SUBCOMMAND, _DATAPARSER = "thermoxels-mesh", "thermal-data"
-METHODS = ("thermoxels", "thermoxels-paper", "thermoxels-arco", "plenoxels-t")  # Names of our methods
+METHODS = ("thermoxels", "thermoxels-paper", "thermoxels-arco", "plenoxels-t")  # Names of the methods in `config`
 
 
 def install() -> None:
-    """Add what nerfstudio lacks; calling it again changes nothing."""
+    """Install all additions to nerfstudio in this process; a second call changes nothing."""
     allow_checkpoint_globals()
-    yaml.Loader = ConfigLoader  # nerfstudio says yaml.load(..., Loader=yaml.Loader), which would run code from a file
+    yaml.Loader = ConfigLoader  # nerfstudio loads with Loader=yaml.Loader, which would run code from a file
     extend_commands()
     print_our_errors_plainly()
-    # nerfstudio 1.1.5 indexes rays with lists; recent torch says so several times per camera.
+    # nerfstudio 1.1.5 indexes rays with lists, of which recent torch warns several times per camera.
     warnings.filterwarnings("ignore", message="Using a non-tuple sequence for multidimensional indexing")
 
 
 def print_our_errors_plainly() -> None:
-    """Let an uncaught `ThermoxelsError` end an ``ns-*`` command with its sentence instead of a traceback.
+    """Make an uncaught `ThermoxelsError` end an ``ns-*`` command with its message instead of a traceback.
 
-    The exit status stays 1, and every other exception goes where it went before.
+    The exit status stays 1. Every other exception goes to the hook that was installed before.
     """
     previous = sys.excepthook
     if getattr(previous, "prints_thermoxels_errors", False):
@@ -61,23 +61,23 @@ def print_our_errors_plainly() -> None:
 
 
 def allow_checkpoint_globals() -> None:
-    """Let ``torch.load(weights_only=True)`` read the numpy scalars that nerfstudio's checkpoints hold.
+    """Allow ``torch.load(weights_only=True)`` to read the numpy scalars in nerfstudio's checkpoints.
 
-    Learning-rate schedulers save numpy numbers beside the tensors, and torch refuses any type that is not registered as
-    harmless. Harmless are a scalar, its dtype and the classes of the plain number types.
+    Learning-rate schedulers save numpy scalars beside the tensors, and torch refuses all types not registered as safe.
+    Registered are the function that rebuilds a scalar, `np.dtype` and the dtype classes of plain numbers.
     """
-    # The function that pickle names: numpy.core.multiarray.scalar in numpy 1, numpy._core.multiarray.scalar in 2.
+    # This is numpy.core.multiarray.scalar in numpy 1 and numpy._core.multiarray.scalar in numpy 2.
     rebuild_scalar: Any = np.float64(0).__reduce__()[0]
     kinds = {type(np.dtype(code)) for code in "?efd" + np.typecodes["AllInteger"]}
     torch.serialization.add_safe_globals([rebuild_scalar, np.dtype, *kinds])
 
 
 def extend_commands() -> None:
-    """Make ``thermoxels-mesh`` a subcommand of ``ns-export``, and let commands find out first where they cannot write.
+    """Add ``thermoxels-mesh`` to ``ns-export``, and make ``ns-*`` commands check their output paths at the start.
 
-    nerfstudio's scripts hand what they can be told to ``tyro.cli`` when they start. Their modules get a `tyro` of their
-    own with another `cli`. Only a process that has such a script loaded, or is loading it while it imports this plugin,
-    is touched: the other commands never load it.
+    nerfstudio's scripts call ``tyro.cli`` when they start. In the modules of export, train, eval and render, `tyro` is
+    replaced by a copy whose `cli` is `_cli`. Modules that are not loaded, in this process or as its main script, are
+    left alone.
     """
     main = sys.modules.get("__main__")
     for name in (_EXPORTER, _TRAIN, *_EVALUATIONS):
@@ -90,9 +90,9 @@ def extend_commands() -> None:
 
 
 def _cli(script: ModuleType, name: str, f: Any, *, args: Sequence[str] | None = None, **kwargs: Any) -> Any:
-    """Call `tyro.cli` with what our commands need, and see that results can be written before there are any.
+    """Return the command that `tyro.cli` parses; raise `OutputError` if its results could not be written.
 
-    The exporter's own union has our subcommand too; options of our dataparser may stand anywhere behind ns-train.
+    ns-export gets our subcommand too; with ns-train, options of our dataparser may stand anywhere after the method.
     """
     words = sys.argv[1:] if args is None else list(args)
     stock = name == _EXPORTER and f is vars(script).get("Commands")
@@ -110,7 +110,7 @@ def _cli(script: ModuleType, name: str, f: Any, *, args: Sequence[str] | None = 
 
 
 def _with_dataparser_last(words: list[str]) -> list[str]:
-    """Move options of our dataparser behind the word thermal-data, where tyro wants them.
+    """Return the words of ns-train with options of our dataparser moved behind thermal-data, as tyro requires.
 
     >>> " ".join(_with_dataparser_last("thermoxels --missing-thermal skip --data SCENE".split()))
     'thermoxels --data SCENE thermal-data --missing-thermal skip'
@@ -131,7 +131,7 @@ def _with_dataparser_last(words: list[str]) -> list[str]:
 
 
 def _dataparser_options() -> dict[str, str]:
-    """Name the fields of our dataparser's config by the options of ns-train."""
+    """Return the field names of our dataparser's config by their ns-train options, such as "--missing-thermal"."""
     from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 
     names = (field.name for field in dataclasses.fields(ThermalDataParserConfig))
@@ -139,7 +139,7 @@ def _dataparser_options() -> dict[str, str]:
 
 
 def _where_to_say_it(problem: str) -> str:
-    """Say where options of ns-train that a remedy names stand for a command that has a config.yml in their place."""
+    """Return a hint to config.yml if a message names ns-train options that the running command lacks, else ""."""
     command, words = Path(sys.argv[0]).name, re.findall(r"--[a-z-]*[a-z]", problem)
     named = [field for option, field in _dataparser_options().items() if option in words]
     if not named or command not in ("ns-eval", "ns-export", "ns-render", "ns-viewer"):
@@ -148,7 +148,7 @@ def _where_to_say_it(problem: str) -> str:
 
 
 def _with_mesh_export(commands: Any) -> Any:
-    """Add our subcommand to ``Annotated[Union[...], markers]`` or ``Union[...]``, keeping members and markers."""
+    """Return ``Annotated[Union[...], markers]`` or ``Union[...]`` with our subcommand as one more member."""
     from thermoxels_ns.commands.export import ExportThermoxelsMesh
 
     ours = Annotated[ExportThermoxelsMesh, tyro.conf.subcommand(name=_SUBCOMMAND)]
@@ -159,9 +159,9 @@ def _with_mesh_export(commands: Any) -> Any:
 
 
 def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
-    """Compare a trained surface, see `geometry_metrics`, and the ends of held-out rays with the exact scene.
+    """Return `geometry_metrics` of the trained surface and `depth_metrics` of held-out rays, against the exact scene.
 
-    Empty if the scene is not known exactly. The function stands here because `training` imports no evaluation.
+    The result is empty if the exact scene is not known. This function is here because `training` imports no evaluation.
     """
     from nerfstudio.utils.rich_utils import CONSOLE
     from rich.markup import escape
@@ -179,7 +179,7 @@ def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
         known = load_known_truth(datamanager.get_datapath())
         if known is None:
             return {}
-        # With the rays' evidence and the cameras, as an export has them: they decide what is solid.
+        # The snapshot has the rays' evidence and the cameras, which decide what is solid, as in an export.
         figures = geometry_metrics(pipeline.grid_snapshot(), world_to_input, known, say)
     except SceneError as problem:
         say(f"Geometry is not compared with the truth: {problem}")
@@ -188,7 +188,7 @@ def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
 
 
 def _held_out_rays(pipeline: ThermoxelsPipeline) -> Iterator[RenderedRays]:
-    """Render the rays of each held-out photograph."""
+    """Yield the rendered rays of one held-out photograph after another."""
     from thermoxels_ns.evaluation.truth_comparison import RenderedRays
 
     datamanager: Any = pipeline.datamanager

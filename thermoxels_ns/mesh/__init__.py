@@ -1,1 +1,1 @@
-"""From a density lattice to a tetrahedral mesh: numpy in, numpy out."""
+"""Construction of a tetrahedral mesh from a trained field; inputs and outputs are numpy arrays."""

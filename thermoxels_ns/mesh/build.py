@@ -1,4 +1,4 @@
-"""From a trained field to a tagged tetrahedral mesh with temperatures, in metres."""
+"""Construction of a tagged tetrahedral mesh with temperatures, in metres, from a trained field."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edge
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How solid voxels become a mesh."""
+    """Options of `build_mesh`: how solid voxels become a mesh."""
 
     boundary: BoundaryMode = "conforming"  # along the level set of the density, or along voxel faces
     coarsest_cell: int = 4
-    """Edge of the largest cells deep inside a conforming mesh, a power of two, [voxels]; 1: as fine as the surface."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Direction that points up, in the coordinates of the mesh
-    rules: PatchRules = field(default_factory=PatchRules)  # Patches and regions of the user
+    """Edge of the largest cells deep inside a conforming mesh, [voxels], a power of two; 1: all cells are one voxel."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Up direction in the coordinates of the mesh
+    rules: PatchRules = field(default_factory=PatchRules)  # The user's rules for patches and regions
 
     def __post_init__(self) -> None:
         coarsest = self.coarsest_cell
@@ -50,16 +50,16 @@ class MeshOptions:
 
 @dataclass(frozen=True)
 class BuiltMesh:
-    """A mesh and what it was made from."""
+    """A mesh, the solid voxels that it was made from, and what was left out of it."""
 
     mesh: TetMesh
     solid: SolidCells
-    unobserved_parts: int  # connected components left out because no thermal ray saw any of their nodes
-    unobserved_voxels: int  # their voxels, which count in `solid.component_sizes`, but are not in `solid.cells`
+    unobserved_parts: int  # number of connected parts left out because no thermal ray saw any of their nodes
+    unobserved_voxels: int  # number of voxels of these parts: in `solid.component_sizes`, not in `solid.cells`
     observed_range_c: tuple[float, float]
-    """Lowest and highest temperature of the measured corners, [degrees Celsius]; no node lies outside."""
+    """Lowest and highest temperature of the field's measured corners, [degrees Celsius]; no node is outside."""
     idle_rules: tuple[str, ...] = ()
-    """The user's rules for patches and regions that nothing in the mesh follows, such as "patch roof (entry 2)"."""
+    """The user's rules that no triangle or tetrahedron of the mesh follows, such as "patch roof (entry 2)"."""
 
 
 def build_mesh(
@@ -69,21 +69,21 @@ def build_mesh(
     options: MeshOptions = MeshOptions(),
     metres_per_unit: float = 1.0,
 ) -> BuiltMesh:
-    """Cut the solid part of a trained field into tetrahedra with nodal temperatures and boundary tags.
+    """Return a mesh of the solid part of a trained field, with nodal temperatures, regions and boundary tags.
 
-    Parts that no thermal ray saw have no temperature at all and are left out.
+    Connected parts that no thermal ray saw have no known temperature and are left out.
 
     Args:
         snapshot: The trained field on its corner lattice.
-        selection: Which voxels are solid.
+        selection: The rules that choose the solid voxels.
         world_to_metres: Similarity (rotation or reflection, one scale, shift), shape (4, 4), that maps homogeneous
-            column vectors of the trained scene to metres. A reflection turns the tetrahedra over, so that their
-            volumes stay positive.
-        options: Kind of boundary, and tags.
-        metres_per_unit: Length of a unit of the input poses, [m], in which a region is given.
+            column vectors of the trained scene to metres. After a reflection, nodes are reordered so that volumes stay
+            positive.
+        options: Kind of boundary, size of cells, up direction and rules for tags.
+        metres_per_unit: Length, [m], of the unit of the input poses, in which the region's box or point is given.
 
     Raises:
-        MeshError: Nothing is solid, the 4x4 is no similarity, or no node of the mesh was measured.
+        MeshError: `select_solid` fails, `world_to_metres` is no similarity, or no node of the mesh was measured.
     """
     transform = check_similarity("world_to_metres", world_to_metres)
     scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
@@ -94,7 +94,7 @@ def build_mesh(
     else:
         stuffed = sharpen(stuff(solid.level, options.coarsest_cell), solid.level.shape)
         points, tets, facets = stuffed.points, stuffed.tets, stuffed.facets
-    # From measured corners alone.
+    # Temperatures are interpolated from measured corners alone.
     measured = np.where(snapshot.observed_weight >= MIN_OBSERVED_WEIGHT, snapshot.observed_weight, 0.0)
     temperature_c, weight = interpolate_corners(points, snapshot.temperature_c, measured)
     observed = weight >= MIN_OBSERVED_WEIGHT
@@ -120,7 +120,7 @@ def build_mesh(
         tets, facets = tets[:, [0, 2, 1, 3]], facets[:, ::-1]
     points_m = apply_transform(transform, snapshot.lattice.index_to_world(points))
     colour = None
-    if snapshot.colour is not None:  # from corners with density, grey where there is none around
+    if snapshot.colour is not None:  # interpolated from corners with density; grey where no corner around has any
         found, known = interpolate_corners(points, snapshot.colour, snapshot.density > 0.0)
         colour = np.where(known[:, None] > 0.0, found, 0.5).astype(np.float32)
     of_tets = points_m[tets].mean(axis=1), None if colour is None else colour[tets].mean(axis=1)
@@ -145,10 +145,10 @@ def build_mesh(
 
 
 def _voxels_of(cells: BoolArray, points: FloatArray, tets: IntArray, nodes: BoolArray, voxel: bool) -> BoolArray:
-    """Return the solid voxels that the bodies of a mesh with some of its nodes were made from."""
+    """Return the solid voxels of all bodies of the mesh that have a marked node; `nodes` is the mask, shape (n,)."""
     if voxel:
         inside = points[tets[nodes[tets[:, 0]]]].mean(axis=1)
-    else:  # centres of solid voxels near the surface are nodes, and voxels that share a face are in one body
+    else:  # nodes at voxel centres: every body has one, and voxels that share a face are in one body
         inside = points[nodes][np.all(points[nodes] % 1.0 == 0.5, axis=1)]
     body = face_connected(cells)
     goes = np.zeros(int(body.max()) + 1, dtype=bool)
@@ -158,8 +158,8 @@ def _voxels_of(cells: BoolArray, points: FloatArray, tets: IntArray, nodes: Bool
 
 
 def _cut_by_region(points: FloatArray, facets: IntArray, within: BoolArray) -> BoolArray:
-    """Return the boundary triangles that look out of the region: the solid may go on behind them."""
-    # A smoothed surface between two voxels lies at most half a voxel before their common face.
+    """Return True for triangles in front of which the region ends, where the solid may go on, shape (f,)."""
+    # A smoothed surface lies at most half a voxel inside the voxel face that it stands for.
     beside = np.floor(points[facets].mean(axis=1) + 0.75 * facet_normals(points, facets)).astype(np.int64)
     inside = np.all((beside >= 0) & (beside < within.shape), axis=1)
     cut = np.zeros(len(beside), dtype=bool)
@@ -175,7 +175,7 @@ def _tagged(
     rotation: FloatArray,
     options: MeshOptions,
 ) -> tuple[Boundary, tuple[str, ...]]:
-    """Return the tags of every boundary triangle, and the rules that none follows; without cameras all are seen."""
+    """Return the tags of all boundary triangles and the idle rules; without cameras all triangles count as seen."""
     normal = facet_normals(mesh.points_m, mesh.facets)
     seen = np.ones(len(mesh.facets), dtype=bool)
     if snapshot.views is not None:
@@ -194,7 +194,7 @@ def _tagged(
 
 
 def check_similarity(name: str, matrix: npt.ArrayLike) -> FloatArray:
-    """Return `matrix` as float64 if it is a similarity, shape (4, 4), mirrors allowed, else raise `MeshError`."""
+    """Return `matrix` (4, 4) as float64; raise `MeshError` if it is no similarity. Reflections are allowed."""
     remedy = "Pass a 4x4 matrix made of a rotation, one scale above 0 and a shift, with last row 0 0 0 1."
     transform = check_shape(name, np.asarray(matrix, dtype=np.float64), (4, 4), remedy, MeshError)
     check_finite(name, transform, remedy, MeshError)
@@ -208,5 +208,5 @@ def check_similarity(name: str, matrix: npt.ArrayLike) -> FloatArray:
 
 
 def apply_transform(matrix: FloatArray, points: FloatArray) -> FloatArray:
-    """Map points (n, 3) by a 4x4 that acts on homogeneous column vectors."""
+    """Return points (n, 3) mapped by a matrix (4, 4) that acts on homogeneous column vectors."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]

@@ -1,4 +1,4 @@
-"""Temperatures at mesh nodes: interpolated where measured, harmonic elsewhere."""
+"""Temperatures at mesh nodes: interpolated where they were measured, extended harmonically elsewhere."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from thermoxels_ns.mesh.quality.checks import TET_EDGES
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 
 MIN_OBSERVED_WEIGHT = 0.5
-"""A node counts as measured if thermal rays, all together, gave it at least half of one fully absorbed ray; less is
-leakage through a surface or the tail of an interpolation."""
+"""Least weight of thermal rays at a measured node or corner, [fully absorbed rays]. Less weight is leakage through a
+surface or the tail of an interpolation."""
 _RELATIVE_RESIDUAL = 1e-9
 _MOST_ROUNDS = 100_000
 _LEAST_CONDUCTANCE = 1e-6
-"""Least conductance of an edge, as a share of the mean: keeps the matrix an M-matrix, and components connected."""
+"""Least conductance of an edge relative to the mean, so that no value overshoots and components stay connected."""
 
 
 def interpolate_corners(
     points_index: FloatArray, values: npt.NDArray, weights: npt.NDArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Interpolate between corners that know a value, leaving out those that do not (normalised convolution).
+    """Return corner values interpolated at points, with corners weighted by how well their values are known.
 
-    value(x) = sum_c t_c w_c v_c / sum_c t_c w_c with the trilinear weights t_c of the eight corners around x and the
-    weight w_c of what is known there (Knutsson and Westin, CVPR 1993).
+    value(x) = sum_c t_c w_c v_c / sum_c t_c w_c with the trilinear weights t_c of the eight corners around x, their
+    values v_c and `weights` w_c (normalised convolution; Knutsson and Westin, CVPR 1993).
 
     Args:
         points_index: Positions as fractional corner indices, shape (n, 3), within the lattice.
         values: Values on the corners, shape (nx, ny, nz) or (nx, ny, nz, k).
-        weights: How well each is known, at least 0, shape (nx, ny, nz).
+        weights: Weight of each corner's value, at least 0, 0 for an unknown value, shape (nx, ny, nz).
 
     Returns:
-        values: At the points, shape (n,) or (n, k); 0 where nothing around is known.
+        values: Values at the points, shape (n,) or (n, k); 0 where all eight corners have weight 0.
         weight: sum_c t_c w_c, shape (n,).
     """
     shape = weights.shape
@@ -62,21 +62,21 @@ def extend_harmonically(
     observed: BoolArray,
     edge_weights: npt.NDArray | None = None,
 ) -> FloatArray:
-    """Fill in the temperature of unobserved nodes by the graph Laplace equation, shape (n,), [degrees Celsius].
+    """Return the temperatures of all nodes, shape (n,), [degrees Celsius], with unobserved nodes filled in.
 
-    Observed nodes keep their value. Every other node i solves sum_j w_ij (T_i - T_j) = 0 over its edges: steady heat
-    conduction in an insulated body, by conjugate gradients. No value leaves the observed range of its connected
-    component, because an edge whose weights add up to 0 or less gets next to none.
+    Observed nodes keep their value. Every other node i meets sum_j w_ij (T_i - T_j) = 0 over its edges, as in steady
+    heat conduction in an insulated body, solved by conjugate gradients. No value leaves the range observed in its
+    connected component, because weights below a very small positive weight are raised to it.
 
     Args:
-        edges: Node pairs, shape (e, 2); the weights of a pair that comes more than once add up.
+        edges: Node pairs, shape (e, 2); if a pair is listed several times, its weights add up.
         temperature_c: Nodal temperatures, shape (n,), [degrees Celsius]; read at observed nodes only.
         observed: True where a node's temperature is a measurement, shape (n,).
-        edge_weights: Conductance of each edge, shape (e,), as from `voxel_tets.lattice_edges` or `tet_conductances`;
-            equal if left out.
+        edge_weights: Conductance w of each edge, shape (e,), as from `voxel_tets.lattice_edges` or `tet_conductances`;
+            all are 1 if left out.
 
     Raises:
-        MeshError: A connected component has no observed node, or the solver did not converge.
+        MeshError: A connected component has no observed node, a value is not finite, or the solver did not converge.
 
     >>> chain = np.array([[0, 1], [1, 2]])
     >>> extend_harmonically(chain, np.array([10.0, -99.0, 30.0]), np.array([True, False, True])).tolist()
@@ -110,7 +110,7 @@ def extend_harmonically(
     rows = links[free]
     degree = np.asarray(rows.sum(axis=1)).ravel()
     matrix, load = sparse.diags_array(degree) - rows[:, free], rows[:, fixed] @ (temperature[fixed] - middle)
-    with threadpool_limits(1, "blas"):  # same bits for any number of threads
+    with threadpool_limits(1, "blas"):  # the result is then the same, bit for bit, for any number of threads
         jacobi = sparse.diags_array(1.0 / degree)
         found, missed = cg(matrix.tocsr(), load, rtol=_RELATIVE_RESIDUAL, maxiter=_MOST_ROUNDS, M=jacobi)
     if missed:
@@ -128,10 +128,10 @@ def extend_harmonically(
 
 
 def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return the edges of tetrahedra, shape (6 t, 2), and their conductances: minus the linear stiffness entries.
+    """Return the edges of tetrahedra, shape (6 t, 2), and conductances (6 t,): minus their linear stiffness entries.
 
-    An edge comes once for each tetrahedron around it. A temperature that is linear in space is then extended exactly,
-    but for edges between angles so obtuse that their entries add up to less than 0.
+    An edge is listed once for each tetrahedron around it. `extend_harmonically` is exact for temperatures linear in
+    space, except at edges whose entries sum to less than 0, which happens between obtuse angles.
     """
     conductances = np.empty((len(tets), 6))
     for which, shapes in shapes_in_chunks(points, tets):

@@ -1,4 +1,4 @@
-"""The tetrahedral mesh that the heat solver and the file writers get."""
+"""The tetrahedral mesh and its boundary tags, as the heat solver and the file writers use them."""
 
 from __future__ import annotations
 
@@ -12,53 +12,53 @@ from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 
 FACET_SURFACE = 0  # boundary between solid and empty space
-FACET_BOX = 1  # boundary where the scene box or the region of an export cuts the solid
+FACET_BOX = 1  # boundary where the scene box, or the region of an export, cuts the solid
 SUPPORT = {
     "supported": "three photographs or more",
     "weak": "one or two photographs",
     "smooth": "seen, but placed by smoothness alone",
     "filled": "seen by no photograph",
 }
-"""Classes of boundary triangles by the photographs that support them, see `Boundary.photographs`."""
+"""Classes of boundary triangles by their photographs, see `Boundary.photographs`, with a description of each."""
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """What physics needs to know of every boundary triangle, in the order of `TetMesh.facets`."""
+    """Tags of the boundary triangles, in the order of `TetMesh.facets`."""
 
     seen: BoolArray  # True where some training camera has a free line of sight to the triangle, shape (f,)
-    patch: IntArray  # index into `patch_names`, shape (f,)
+    patch: IntArray  # patch of each triangle, an index into `patch_names`, shape (f,)
     patch_names: tuple[str, ...]  # names of the patches, all different; some may have no triangle
     photographs: IntArray | None = None
-    """Training photographs that see each triangle, and those of them that support it: by texture and parallax, or by
-    tracks, they say that the surface lies there. Shape (f, 2); None: not known."""
+    """Number of training photographs that see each triangle, and number of these that support it: texture and parallax,
+    or tracks, show that the surface lies there. Shape (f, 2); None if photographs were not compared."""
 
 
 @dataclass(frozen=True)
 class TetMesh:
-    """A conforming tetrahedral mesh with nodal temperatures, in metres."""
+    """A conforming tetrahedral mesh with nodal temperatures, regions and a tagged boundary; lengths in metres."""
 
     points_m: FloatArray  # nodes, shape (n, 3), [m]
     tets: IntArray  # node indices, shape (t, 4), positively oriented: det(p1 - p0, p2 - p0, p3 - p0) > 0
     temperature_c: FloatArray  # nodal temperature, shape (n,), [degrees Celsius]
     observed: BoolArray
-    """True where a thermal ray saw the node; elsewhere the temperature is a harmonic extension. Shape (n,)."""
+    """True where thermal rays measured the node's temperature; elsewhere it is a harmonic extension. Shape (n,)."""
     facets: IntArray  # boundary triangles, shape (f, 3), oriented so that the right-hand normal points out of the body
-    facet_tags: IntArray  # one of the `FACET_*` constants per boundary triangle, shape (f,)
-    region: IntArray  # region number per tetrahedron, shape (t,); an index into `region_names`
+    facet_tags: IntArray  # `FACET_SURFACE` or `FACET_BOX` for each boundary triangle, shape (f,)
+    region: IntArray  # region of each tetrahedron, an index into `region_names`, shape (t,)
     region_names: tuple[str, ...] = ("solid",)  # names of the regions, all different
-    boundary: Boundary | None = None  # tags of the boundary triangles; None for a mesh that was not tagged
+    boundary: Boundary | None = None  # tags of the boundary triangles; None if the mesh has no tags
     colour: Float32Array | None = None
-    """Colour of each node, red, green, blue in [0, 1], shape (n, 3); None if it is not known."""
+    """Colour of each node, red, green, blue in [0, 1], shape (n, 3); None if colours are not known."""
 
     def check(self, name: str = "mesh", remedy: str = "Build the mesh with thermoxels_ns.mesh.build.") -> None:
-        """Check that the arrays fit each other; whether the tetrahedra do, `quality.report.check_mesh` says.
+        """Check that the arrays fit each other; `quality.report.check_mesh` checks the geometry.
 
         Messages begin with `name` and end with `remedy`.
 
         Raises:
-            MeshError: An array has another shape than the others ask for, is not finite or points at what is not there,
-                there is no tetrahedron, or two patches or regions have one name.
+            MeshError: An array has a shape that does not fit the others, is not finite or has an index out of range;
+                there is no tetrahedron; or names of patches or regions are missing, alike or not printable.
         """
         nodes, tets, facets, tags = len(self.points_m), len(self.tets), len(self.facets), self.boundary
         arrays: list[tuple[str, npt.NDArray, tuple[int | None, ...], int | None]] = [
@@ -98,7 +98,7 @@ class TetMesh:
 
 
 def support_of_facets(mesh: TetMesh) -> IntArray | None:
-    """Return the place in `SUPPORT` of each boundary triangle, -1 where the scene box cuts the solid, shape (f,).
+    """Return for each boundary triangle the index of its class in `SUPPORT`, -1 for `FACET_BOX` triangles, shape (f,).
 
     The result is None if photographs were not compared.
     """
@@ -110,18 +110,18 @@ def support_of_facets(mesh: TetMesh) -> IntArray | None:
 
 
 def facet_area_vectors(points: FloatArray, facets: IntArray) -> FloatArray:
-    """Return the area times the unit normal of triangles (right-hand rule), shape (f, 3), [m^2]."""
+    """Return for each triangle its unit normal (right-hand rule) times its area, shape (f, 3), [m^2]."""
     origin = points[facets[:, 0]]
     return 0.5 * np.cross(points[facets[:, 1]] - origin, points[facets[:, 2]] - origin)
 
 
 def facet_areas(points: FloatArray, facets: IntArray) -> FloatArray:
-    """Return the areas of triangles, shape (f,), [m^2]."""
+    """Return the area of each triangle, shape (f,), [m^2]."""
     return np.linalg.norm(facet_area_vectors(points, facets), axis=1)
 
 
 def facet_normals(points: FloatArray, facets: IntArray) -> FloatArray:
-    """Return the unit normals of triangles (right-hand rule), 0 for one without area, shape (f, 3)."""
+    """Return the unit normal of each triangle (right-hand rule), shape (f, 3); 0 for a triangle without area."""
     vectors = facet_area_vectors(points, facets)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)

@@ -1,4 +1,4 @@
-"""Six conforming tetrahedra per voxel, their boundary and their edges."""
+"""Meshes along voxel faces: six conforming tetrahedra per voxel, their boundary and their edges."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 KUHN_PATTERN: IntArray = np.array(
     [[0, 4, 6, 7], [0, 5, 4, 7], [0, 6, 2, 7], [0, 2, 3, 7], [0, 1, 5, 7], [0, 3, 1, 7]], dtype=np.int64
 )
-"""Voxel corners of the six tetrahedra around the main diagonal, shape (6, 4), positively oriented.
+"""Voxel corners (`CORNER_OFFSETS`) of the six tetrahedra around the main diagonal, shape (6, 4), positively oriented.
 
-Each permutation of the axes a, b, c is a path 000 -> e_a -> e_a + e_b -> 111 along voxel edges (Kuhn 1960, Freudenthal
-1942); where its determinant, the permutation's sign, is negative, the two in the middle are exchanged."""
+Each permutation of the axes a, b, c gives a path 000 -> e_a -> e_a + e_b -> 111 along voxel edges (Kuhn 1960,
+Freudenthal 1942); if the sign of the permutation is negative, the two corners in the middle are exchanged."""
 
 
 def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
-    """Cut every solid voxel into six tetrahedra that share its main diagonal.
+    """Return six tetrahedra for every solid voxel, which share the voxel's main diagonal.
 
     The diagonal has the same direction in every voxel, so the mesh conforms. All dihedral angles are 45, 60 or 90
-    degrees, which keeps the heat equation's maximum principle.
+    degrees, so solutions of the heat equation keep the maximum principle.
 
     Returns:
-        corner_indices: Lattice indices (i, j, k) of the used corners in C order, shape (n, 3).
-        tets: Rows of `corner_indices`, shape (6 * solid voxels, 4), positively oriented.
+        corner_indices: Lattice indices (i, j, k) of the corners of solid voxels, the nodes, in C order, shape (n, 3).
+        tets: Row numbers in `corner_indices`, shape (6 * solid voxels, 4), positively oriented.
 
     >>> corners, tets = kuhn_tets(np.ones((1, 1, 1), dtype=bool))
     >>> corners.shape, tets.shape
@@ -41,22 +41,22 @@ def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def used_corners(cells: BoolArray) -> IntArray:
-    """Return the lattice indices (n, 3) of the corners of solid voxels, in C order: the nodes of `voxel_facets`."""
+    """Return the lattice indices (n, 3) of the corners of solid voxels in C order: the nodes of `kuhn_tets`."""
     number, first = _node_numbers(cells)[1:]
     return np.argwhere(number >= 0) + first
 
 
 def lattice_edges(cells: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return the edges of solid voxels (e, 2) between nodes of `kuhn_tets`, and how many solid voxels are around each.
+    """Return the edges of solid voxels (e, 2), by node numbers of `kuhn_tets`, and each edge's number of solid voxels.
 
-    Two corners across an empty gap are no edge, even if they are lattice neighbours.
+    Two neighbouring corners with only empty voxels around their connection are not joined by an edge.
     """
     cells, number, _ = _node_numbers(cells)
     flat_number = number.ravel()
     strides = (number.shape[1] * number.shape[2], number.shape[2], 1)
     edges, counts = [], []
     for axis in range(3):
-        # Of the edge that starts in each corner.
+        # This is the number of solid voxels around the edge that starts in each corner.
         around = np.zeros(number.shape, dtype=np.uint8)
         for offset in CORNER_OFFSETS[CORNER_OFFSETS[:, axis] == 0]:
             around[tuple(slice(o, o + n) for o, n in zip(offset, cells.shape))] += cells
@@ -67,9 +67,9 @@ def lattice_edges(cells: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def voxel_facets(cells: BoolArray) -> IntArray:
-    """Return the boundary triangles of `kuhn_tets` (f, 3), normals outwards: halves of faces between solid and empty.
+    """Return the boundary triangles of `kuhn_tets`, (f, 3), normals outwards: two per face between solid and empty.
 
-    Kuhn's tetrahedra cut every voxel face along the diagonal from its lowest to its highest corner.
+    Each face is cut along the diagonal from its lowest to its highest corner, as `kuhn_tets` does.
 
     >>> voxel_facets(np.ones((1, 1, 1), dtype=bool)).shape
     (12, 3)
@@ -81,7 +81,7 @@ def voxel_facets(cells: BoolArray) -> IntArray:
         width = [(0, 0)] * 3
         width[axis] = (1, 1)
         steps = np.diff(np.pad(cells, width).astype(np.int8), axis=axis)
-        for turned in (True, False):  # solid above the face: its outward normal points down the axis
+        for turned in (True, False):  # turned: the solid is above the face and the normal points down the axis
             low = np.argwhere(steps == (1 if turned else -1))
             a, b, c, d = (number[tuple((low + offset).T)] for offset in (0, u, u + v, v))
             pair = [(a, c, b), (a, d, c)] if turned else [(a, b, c), (a, c, d)]
@@ -90,8 +90,8 @@ def voxel_facets(cells: BoolArray) -> IntArray:
 
 
 def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tuple[int, ...]) -> IntArray:
-    """Return `FACET_BOX` where a triangle lies on a side of a lattice with so many corners, else `FACET_SURFACE`."""
-    # One bit per side of the lattice; a triangle lies on the sides that its nodes have in common.
+    """Return per triangle `FACET_BOX` if it lies on a side of the lattice of corners, else `FACET_SURFACE`, (f,)."""
+    # Each side of the lattice has one bit; a triangle lies on the sides that its three nodes have in common.
     sides = np.zeros(len(points_index), dtype=np.uint8)
     for axis, count in enumerate(lattice_shape):
         sides |= (points_index[:, axis] == 0).astype(np.uint8) << (2 * axis)
@@ -101,9 +101,9 @@ def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tu
 
 
 def _node_numbers(cells: BoolArray) -> tuple[BoolArray, IntArray, IntArray]:
-    """Return the box of voxels that holds all solid ones, the numbers of its corners, and the index of its first voxel.
+    """Return the cells of the solid's bounding box, the node numbers of their corners, and the box's first index.
 
-    Nodes are numbered in C order; corners that no solid voxel touches have -1. The second shape is one larger.
+    Nodes are numbered in C order; corners of no solid voxel have -1. Corners are one more than cells along each axis.
     """
     box = bounding_box(cells)
     cells, first = np.ascontiguousarray(cells[box]), np.array([part.start for part in box], dtype=np.int64)

@@ -1,1 +1,1 @@
-"""The boundary of a mesh: tags, patches, normals, areas and visibility."""
+"""The boundary of a mesh: patches of triangles, and the cameras that see them."""

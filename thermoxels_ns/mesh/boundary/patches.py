@@ -1,4 +1,4 @@
-"""Patches of boundary triangles and regions of tetrahedra, default ones and a user's.
+"""Patches of boundary triangles and regions of tetrahedra: the default ones, and those of a user's rules.
 
 ``configs/patches-example.yaml`` explains every key of a user's file.
 """
@@ -20,21 +20,21 @@ from thermoxels_ns.core.checks import check_direction, check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, wrong
 
-FACINGS = ("up", "side", "down")  # Where a surface may face
+FACINGS = ("up", "side", "down")  # The directions that `facing` tells apart
 DEFAULT_PATCHES = (*(f"{where}-{facing}" for where in ("exterior", "interior") for facing in FACINGS), "cut")
-"""Names of the patches that every mesh has, in this order."""
+"""Names of the patches that every mesh has, in the order of their numbers."""
 DEFAULT_REGION = "solid"  # Name of region 0
 
 Vector = tuple[float, float, float]
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")
 _COS_45 = math.sqrt(0.5) + 1e-9
-"""A little above the cosine of 45 degrees, so that a roof of exactly 45 degrees is a side whatever its rounding."""
+"""A little above the cosine of 45 degrees, so that a roof of exactly 45 degrees counts as a side despite rounding."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """An axis-aligned box that holds the centroid, its border included, [m]."""
+    """Condition of a rule: the element's centroid lies in an axis-aligned box or on its border; corners in [m]."""
 
     lower: Vector
     upper: Vector
@@ -47,7 +47,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane, [m]; the centroid lies on it or on the side that its normal points to."""
+    """Condition of a rule: the element's centroid lies on a plane, [m], or on the side to which `normal` points."""
 
     point: Vector
     normal: Vector
@@ -60,10 +60,10 @@ class Plane:
 
 @dataclass(frozen=True)
 class Colour:
-    """A colour in whole numbers to 255 or in decimals to 1.0, and the longest distance to it on the same scale."""
+    """Condition of a rule: the element's colour is near `rgb`, in whole numbers up to 255 or decimals up to 1.0."""
 
     rgb: tuple[int | float, int | float, int | float]
-    max_distance: float = math.inf
+    max_distance: float = math.inf  # Largest Euclidean distance to `rgb`, on the same scale
 
     def __post_init__(self) -> None:
         if not all(0.0 <= float(part) <= 255.0 for part in self.rgb):
@@ -80,7 +80,7 @@ class Colour:
             raise wrong("max_distance", "a number above 0, on the scale of rgb", self.max_distance)
 
     def distance(self, colours: npt.NDArray) -> FloatArray:
-        """Return the Euclidean distance of colours (n, 3) in [0, 1], infinite beyond the longest, shape (n,)."""
+        """Return the distance of colours (n, 3) in [0, 1] to `rgb`, infinite beyond `max_distance`, shape (n,)."""
         whole = all(isinstance(part, int) for part in self.rgb) or max(map(float, self.rgb)) > 1.0
         scale = 255.0 if whole else 1.0
         distance = np.linalg.norm(colours - np.array(self.rgb, dtype=np.float64) / scale, axis=1)
@@ -89,13 +89,13 @@ class Colour:
 
 @dataclass(frozen=True)
 class RegionRule:
-    """What belongs to a region: everything that meets all conditions that are given."""
+    """A user's rule for a region: elements that meet all conditions that are not None belong to it."""
 
-    name: str  # Name of the patch or region; rules of the same name add up
+    name: str  # Name of the patch or region; several rules may have one name
     box: Box | None = None
     plane: Plane | None = None
     nearest_colour: Colour | None = None
-    """Of all rules that have one and whose other conditions hold, the closest wins."""
+    """Of all rules with a colour whose other conditions hold, an element follows the rule with the nearest colour."""
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -108,15 +108,15 @@ class RegionRule:
 
 @dataclass(frozen=True)
 class PatchRule(RegionRule):
-    """What belongs to a patch."""
+    """A user's rule for a patch, with two more conditions than a rule for a region."""
 
-    only: Literal["exterior", "interior", "cut", "all"] | None = None  # Part of the boundary
-    facing: Literal["up", "side", "down", "any"] | None = None  # Where the normal points
+    only: Literal["exterior", "interior", "cut", "all"] | None = None  # Part of the boundary that the rule applies to
+    facing: Literal["up", "side", "down", "any"] | None = None  # Direction of the normal, see `facing`
 
 
 @dataclass(frozen=True)
 class PatchRules:
-    """A user's patches and regions, in the order of the file: later rules win."""
+    """A user's rules for patches and regions, in the order of the file; where several hold, the last one counts."""
 
     patches: tuple[PatchRule, ...] = ()  # Rules for boundary triangles
     regions: tuple[RegionRule, ...] = ()  # Rules for tetrahedra
@@ -124,10 +124,10 @@ class PatchRules:
 
 @raising(MeshError)
 def load_patch_rules(path: Path | str) -> PatchRules:
-    """Read a user's patches and regions from a yaml file.
+    """Read a user's rules for patches and regions from a yaml file.
 
     Raises:
-        MeshError: No such file, no yaml, or an entry that cannot be understood; the message says which.
+        MeshError: The file does not exist or is no yaml, or an entry, named in the message, is not valid.
     """
     path = Path(path)
     rules = as_record(path.name, read_yaml(path), PatchRules)
@@ -147,22 +147,22 @@ def load_patch_rules(path: Path | str) -> PatchRules:
 
 
 class Applied(NamedTuple):
-    """What rules make of some elements."""
+    """The patches of triangles, or the regions of tetrahedra, after all rules were applied."""
 
     number: IntArray  # Index of each element's patch or region, shape (n,)
     names: tuple[str, ...]  # Names of all patches or regions
     idle: tuple[str, ...]
-    """Rules that no element follows, such as "patch roof (entry 2)": none meets their conditions, or later rules take
-    all that do."""
+    """Rules that no element follows, such as "patch roof (entry 2)": no element meets the conditions, or all that do
+    follow later rules."""
 
 
 def facing(normals: FloatArray, up: npt.ArrayLike) -> IntArray:
-    """Return where unit normals (f, 3) point: index into `FACINGS`, shape (f,).
+    """Return the direction in which unit normals (f, 3) point, as indices into `FACINGS`, shape (f,).
 
-    Up is less than 45 degrees off the up direction, down more than 135 degrees, all else is side.
+    A normal less than 45 degrees from the direction `up` is "up", more than 135 degrees from it "down", else "side".
 
     Raises:
-        MeshError: `up` is no direction.
+        MeshError: `up` is not three finite numbers, or is zero.
 
     >>> facing(np.array([[0, 0, 1.0], [1, 0, 0], [0, 0.6, -0.8]]), up=(0, 0, 2)).tolist()
     [0, 1, 2]
@@ -175,9 +175,9 @@ def facing(normals: FloatArray, up: npt.ArrayLike) -> IntArray:
 def default_patches(
     normals: FloatArray, up: npt.ArrayLike, seen: BoolArray, on_box: BoolArray
 ) -> tuple[IntArray, tuple[str, ...]]:
-    """Return each triangle's patch without rules, and all names: cut, else exterior (seen) or interior, and its facing.
+    """Return each triangle's default patch, shape (f,), and the names of all default patches.
 
-    Arguments are those of `apply_patches`.
+    The patch is "cut" where `on_box`, else exterior (`seen`) or interior with the `facing`. Arguments: `apply_patches`.
     """
     patch = np.where(seen, 0, len(FACINGS)) + facing(normals, up)
     return np.where(on_box, DEFAULT_PATCHES.index("cut"), patch).astype(np.int64), DEFAULT_PATCHES
@@ -193,19 +193,19 @@ def apply_patches(
     on_box: BoolArray,
     colours: npt.NDArray | None = None,
 ) -> Applied:
-    """Return each triangle's patch: the default ones with a user's rules over them; the default names come first.
+    """Return each triangle's patch: that of the last rule that holds, else the default. Default names come first.
 
     Args:
         rules: The user's rules; without any, the default patches come back.
-        centroids_m: Middle of each boundary triangle, shape (f, 3), [m].
-        normals: Outward unit normals in the same axes, shape (f, 3).
-        up: Up direction in the same axes.
+        centroids_m: Centroid of each boundary triangle, shape (f, 3), [m].
+        normals: Outward unit normals in the axes of the centroids, shape (f, 3).
+        up: Up direction in the axes of the centroids.
         seen: True where some camera sees the triangle, shape (f,).
-        on_box: True where the scene box cuts the solid, shape (f,).
+        on_box: True where the scene box or the region of an export cuts the solid, shape (f,).
         colours: Red, green, blue in [0, 1] of each triangle, shape (f, 3); None if not known.
 
     Raises:
-        MeshError: A rule asks for colours and there are none, or `up` is no direction.
+        MeshError: A rule has a colour but `colours` is None, or `up` is no direction.
     """
     patch, names = default_patches(normals, up, seen, on_box)
     direction = facing(normals, up)
@@ -220,10 +220,10 @@ def apply_patches(
 
 
 def apply_regions(rules: PatchRules, tet_centroids: FloatArray, tet_colours: npt.NDArray | None = None) -> Applied:
-    """Return the regions of tetrahedra by a user's rules; what no rule claims is region 0, "solid".
+    """Return the regions of tetrahedra by a user's rules; tetrahedra that follow no rule are in region 0, "solid".
 
-    Centroids (t, 3) are in metres, colours (t, 3) red, green, blue in [0, 1]. Without colours (None) a rule that asks
-    for them raises `MeshError`.
+    Centroids (t, 3) are in [m], colours (t, 3) are red, green, blue in [0, 1]. Raises `MeshError` if a rule has a
+    colour but `tet_colours` is None.
     """
     count = len(tet_centroids)
     allowed = [np.ones(count, dtype=bool)] * len(rules.regions)
@@ -240,7 +240,7 @@ def _applied(
     centroids: FloatArray,
     colours: npt.NDArray | None,
 ) -> Applied:
-    """Overwrite `start` where a rule holds, and append the rules' names; `allowed` says where other conditions do."""
+    """Return `start` overwritten where rules hold; `allowed` has one mask per rule for conditions not checked here."""
     count, remedy = len(start), f"Pass one centroid per element that gets a {kind}."
     check_shape("centroids", centroids, (count, 3), remedy, MeshError)
     check_finite("centroids", centroids, remedy, MeshError)

@@ -1,4 +1,4 @@
-"""Which training cameras have a free line of sight to boundary triangles."""
+"""Lines of sight from training cameras to boundary triangles."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid.free_space import first_solid
 
 START_ABOVE_SURFACE = (1.0, 0.5)
-"""A line of sight starts this far out along the normal, [voxels]: past the steps of a staircase, or, if something solid
-is there, half as far, as in a gap of one voxel."""
+"""Distances along the normal from a triangle to the start of its line of sight, [voxels]. The first leads past the
+steps of voxel faces; the second is used if the first leads into a solid voxel, as in a gap of one voxel."""
 
 
 @dataclass(frozen=True)
 class FacetViews:
-    """Which cameras see boundary triangles, for groups of triangles that share one answer."""
+    """Which cameras see which groups of boundary triangles; all triangles of a group share one answer."""
 
-    group: IntArray  # Group of each triangle, shape (f,)
+    group: IntArray  # Number of each triangle's group, shape (f,)
     middle: FloatArray  # Mean centroid of each group, shape (g, 3), [world units]
     normal: FloatArray  # Unit mean normal of each group, shape (g, 3)
-    seen: BoolArray  # Whether each camera sees it, shape (g, cameras)
+    seen: BoolArray  # True where a camera sees a group, shape (g, cameras)
 
 
 def facet_views(
@@ -35,17 +35,17 @@ def facet_views(
     centroids_world: FloatArray,
     normals_world: FloatArray,
 ) -> FacetViews:
-    """Tell which cameras see boundary triangles.
+    """Return which cameras see which boundary triangles.
 
-    A camera sees a triangle that faces it, lies in its image and has no solid voxel on the straight line between
-    them. Triangles that lie in the same voxel and face the same of the six sides share one answer, taken at their mean.
+    A camera sees a triangle if the triangle faces the camera, lies in its image, and no solid voxel is on the straight
+    line between the two. Triangles in one voxel whose normals have the same main direction (one of six) share one
+    answer, found at their mean centroid.
 
-    `cells` (`lattice.cell_shape`) are the solid voxels; `matrices` (cameras, 3, 4) lead from the world to homogeneous
-    pixels, depth positive in front; `centres` (cameras, 3) and `centroids_world` (f, 3) are in [world units], `sizes`
-    (cameras, 2) in [pixels], `normals_world` (f, 3) unit vectors.
+    `cells` (`lattice.cell_shape`) is True for solid voxels. `matrices` (cameras, 3, 4) map world coordinates to
+    homogeneous pixels with positive depth in front. `centres` (cameras, 3) and `centroids_world` (f, 3) are in [world
+    units], `sizes` (cameras, 2) in [pixels]; `normals_world` (f, 3) are unit normals.
     """
-    # Triangles of one voxel and main direction. The shift decides for one of two voxels where a triangle lies on their
-    # common face.
+    # The shift by 1e-3 chooses one of two voxels for a triangle on their common face.
     centroids, shape = lattice.world_to_index(centroids_world), np.array(lattice.cell_shape)
     voxel = np.clip(np.floor(centroids - 1e-3).astype(np.int64) + 1, 0, shape)
     axis = np.argmax(np.abs(normals_world), axis=1)
@@ -55,7 +55,7 @@ def facet_views(
     )
     mean = [np.bincount(group, column, len(count)) / count for column in (*centroids.T, *normals_world.T)]
     middle, normal = np.stack(mean[:3], axis=1), np.stack(mean[3:], axis=1)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)  # not zero: the main components of a group have one sign
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)  # not zero: the main components in a group have one sign
     start = middle + START_ABOVE_SURFACE[0] * normal
     inside = _solid_at(cells, start)
     start[inside] = (middle + START_ABOVE_SURFACE[1] * normal)[inside]
@@ -76,14 +76,14 @@ def facet_views(
 def seen_facets(
     cells: BoolArray, views: Views, lattice: Lattice, centroids_world: FloatArray, normals_world: FloatArray
 ) -> BoolArray:
-    """Tell which boundary triangles at least one training camera sees, shape (f,); arguments as in `facet_views`."""
+    """Return which boundary triangles at least one training camera sees, shape (f,); arguments as in `facet_views`."""
     cameras = views.matrices(), views.camera_to_world[:, :, 3], views.size
     found = facet_views(cells, lattice, *cameras, centroids_world, normals_world)
     return found.seen.any(axis=1)[found.group]
 
 
 def _solid_at(cells: BoolArray, points: FloatArray) -> BoolArray:
-    """Whether points, in corner indices, are in solid voxels, shape (points,); beyond the lattice none is."""
+    """Return which points (n, 3), in corner indices, are in solid voxels, shape (n,); False outside the lattice."""
     index = np.floor(points).astype(np.int64)
     inside = np.all((index >= 0) & (index < cells.shape), axis=1)
     index[~inside] = 0

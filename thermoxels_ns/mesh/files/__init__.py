@@ -1,1 +1,1 @@
-"""Mesh files of other programs."""
+"""Mesh files for other programs: writers for seven formats, and a reader for .vtu."""

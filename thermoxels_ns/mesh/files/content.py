@@ -1,4 +1,4 @@
-"""What every mesh writer needs: a checked mesh with tags, the nodes of a surface, values per node, whole files."""
+"""Helpers of all mesh writers: checked meshes with tags, arrays per node, surfaces without unused nodes, files."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 
 
 def checked_mesh(mesh: TetMesh, temperature_c: FloatArray | None = None) -> tuple[TetMesh, Boundary]:
-    """Return a mesh that passed `TetMesh.check` and its tags; without tags all triangles are one patch, "boundary".
+    """Return a mesh after `TetMesh.check`, and its tags; if it has none, all triangles are seen, in patch "boundary".
 
-    `temperature_c` takes the place of the mesh's own, shape (n,), [degrees Celsius].
+    The argument `temperature_c`, shape (n,), [degrees Celsius], replaces the mesh's own if given.
 
     Raises:
-        MeshError: What `TetMesh.check` raises.
+        MeshError: `TetMesh.check` fails.
     """
     if temperature_c is not None:
         mesh = replace(mesh, temperature_c=np.asarray(temperature_c, dtype=np.float64))
@@ -35,7 +35,7 @@ def checked_mesh(mesh: TetMesh, temperature_c: FloatArray | None = None) -> tupl
 
 
 def node_arrays(mesh: TetMesh) -> dict[str, npt.NDArray]:
-    """Return the values per node that files of the body hold; colours only if the mesh has them."""
+    """Return the arrays per node that body files hold, by name; `colour`, in bytes, only if the mesh has colours."""
     arrays: dict[str, npt.NDArray] = {
         "temperature_c": mesh.temperature_c,
         "temperature_k": celsius_to_kelvin(mesh.temperature_c),
@@ -47,14 +47,14 @@ def node_arrays(mesh: TetMesh) -> dict[str, npt.NDArray]:
 
 
 def write_bytes(path: Path, chunks: Iterable[bytes]) -> None:
-    """Write a file, whole or not at all; its folder is made if need be."""
+    """Write a file, completely or not at all, in a folder that is made if missing."""
     writable_folder(path.parent)
     with replace_when_done(path) as temporary, open(temporary, "wb") as file:
         file.writelines(chunks)
 
 
 def colour_bytes(colour: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
-    """Turn colours in [0, 1] into bytes; what is outside is clipped.
+    """Return colours in [0, 1] as bytes; values outside are clipped.
 
     >>> colour_bytes(np.array([[0.0, 0.5, 1.2]])).tolist()
     [[0, 128, 255]]
@@ -64,15 +64,15 @@ def colour_bytes(colour: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles that use every one of their nodes."""
+    """Boundary triangles, with just the nodes that they use."""
 
     points_m: FloatArray  # nodes on the boundary, shape (m, 3), [m]
     triangles: IntArray  # indices into `points_m`, shape (f, 3), right-hand normals outwards
-    nodes: IntArray  # number of each node in the mesh, rising, shape (m,)
+    nodes: IntArray  # index of each node in the mesh, rising, shape (m,)
 
 
 def surface_of(points_m: FloatArray, facets: IntArray) -> Surface:
-    """Return triangles without the nodes that none of them uses.
+    """Return a surface of the triangles `facets` (f, 3), renumbered to the nodes that any triangle uses.
 
     >>> surface_of(np.arange(12.0).reshape(4, 3), np.array([[3, 0, 2]])).triangles.tolist()
     [[2, 0, 1]]

@@ -12,11 +12,11 @@ from thermoxels_ns.mesh.files.vtu import boundary_path, write_boundary_vtp, writ
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 MESH_FORMATS = (".vtu", ".xdmf", ".msh", ".inp", ".stl", ".ply", ".glb")
-"""Endings of all formats: body and boundary for ParaView, FEniCSx, Gmsh, CalculiX; then the surface alone."""
+"""Endings of all formats: four with body and boundary (ParaView, FEniCSx, Gmsh, CalculiX), three with the surface."""
 
 
 def mesh_file_paths(path: Path | str) -> list[Path]:
-    """Return all files that `write_mesh` writes for a path, that path first.
+    """Return the paths of all files that `write_mesh` writes for a path, `path` itself first.
 
     Raises:
         OutputError: No format has this ending.
@@ -39,20 +39,20 @@ def write_mesh(
     heat_step: HeatStep | None = None,
     up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> list[Path]:
-    """Write a mesh in the format that the file's ending stands for, see `MESH_FORMATS`.
+    """Write a mesh in the format given by the ending of the file's name, see `MESH_FORMATS`.
 
     Args:
-        path: File to write; its folder is made if need be.
+        path: File to write; its folder is made if missing.
         mesh: The mesh.
-        heat_step: Material and times, which .inp needs.
-        up: Direction that points up, in mesh coordinates, for .glb.
+        heat_step: Material and time steps, needed for .inp.
+        up: Up direction in mesh coordinates, used for .glb.
 
     Returns:
-        All files written, `path` first.
+        The paths of all files written, `path` first.
 
     Raises:
-        MeshError: An array does not fit the mesh or is not finite, or the format needs what is not there: material and
-            times, an up direction, coordinates near the origin, or short and different names.
+        MeshError: An array does not fit the mesh or is not finite; or `heat_step` is missing for .inp, `up` is no
+            direction, the mesh is too far from the origin for .stl, or names are too long or alike for the format.
         OutputError: No format has this ending, or a file cannot be written.
     """
     path, written = Path(path), mesh_file_paths(path)

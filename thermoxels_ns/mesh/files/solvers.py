@@ -1,4 +1,4 @@
-"""Meshes for solvers: .xdmf (FEniCSx, ParaView), .msh (Gmsh), and .inp with a heat transfer step that runs."""
+"""Mesh files for solvers: .xdmf (FEniCSx, ParaView), .msh (Gmsh), and .inp (CalculiX, Abaqus) that runs as it is."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_areas
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
 """Stefan-Boltzmann constant (CODATA 2018, exact to the digits given), [W / (m2 K4)]."""
 BODY_GRID, FACET_GRID = "mesh", "facets"
-"""Names of the grids of tetrahedra and of boundary triangles in .xdmf files; FEniCSx asks for "mesh" by default."""
+"""Names of the two grids in .xdmf files, of tetrahedra and of boundary triangles; "mesh" is the default in FEniCSx."""
 TEMPERATURE_VIEW = "temperature_c"  # name of the view of nodal temperatures in .msh files, [degrees Celsius]
 
 _NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UChar"}
@@ -32,13 +32,13 @@ _LONGEST_GMSH_NAME, _LONGEST_INP_NAME = 127, 60  # [bytes], [characters]
 _TRIANGLE, _TETRAHEDRON = 2, 4
 _SIZE, _INT, _DOUBLE = np.dtype("<u8"), np.dtype("<i4"), np.dtype("<f8")
 _FACE_OPPOSITE: IntArray = np.array([3, 4, 2, 1], dtype=np.int64)
-"""Number of the face opposite each node in .inp files: S1 has the nodes 1 2 3, S2 1 4 2, S3 2 4 3 and S4 3 4 1."""
+"""Number in .inp files of the face opposite each node: S1 has the nodes 1 2 3, S2 1 4 2, S3 2 4 3 and S4 3 4 1."""
 _ROWS_AT_ONCE = 1 << 15
 _REAL = "%.12E"  # Abaqus reads fields of at most 20 characters
 
 
 def heavy_data_path(path: Path | str) -> Path:
-    """Name the HDF5 file that belongs to an .xdmf file.
+    """Return the path of the HDF5 file that belongs to an .xdmf file.
 
     >>> heavy_data_path("house/mesh.xdmf").as_posix()
     'house/mesh.h5'
@@ -49,10 +49,10 @@ def heavy_data_path(path: Path | str) -> Path:
 def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as ``NAME.xdmf`` and ``NAME.h5``.
 
-    The grid "mesh" holds the tetrahedra with `region` per cell and `temperature_c`, `temperature_k`, `observed` and,
-    if the mesh has them, `colour` per node; the grid "facets" holds the boundary triangles with `patch` per triangle.
-    Region and patch are numbers from 1, as in .msh files, where 0 stands for none; ``Information`` elements of their
-    grids say their names. In FEniCSx::
+    The grid "mesh" holds the tetrahedra with `region` per cell; the grid "facets" holds the boundary triangles with
+    `patch` per triangle. Both hold `temperature_c`, `temperature_k`, `observed` and, if the mesh has colours, `colour`
+    per node. Regions and patches are numbered from 1, as in .msh files; an ``Information`` element of each grid lists
+    the names. In FEniCSx::
 
         with dolfinx.io.XDMFFile(comm, "mesh.xdmf", "r") as file:
             mesh = file.read_mesh(name="mesh")
@@ -60,7 +60,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
             mesh.topology.create_connectivity(2, 3)
             patches = file.read_meshtags(mesh, name="facets")
 
-    The .h5 comes first and the .xdmf, which points at it, last; in between there is no .xdmf.
+    The .h5 is written first; there is no .xdmf until it is complete. Raises `OutputError` if `path` ends in .h5.
     """
     import h5py
 
@@ -86,14 +86,14 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
             for name, values in arrays.items():
                 # Times of day would make two files of one mesh differ.
                 file.create_dataset(name, data=values, track_times=False)
-        # An index of the old data does not fit the new.
+        # An old .xdmf does not fit the new data.
         remove_file(path)
     with replace_when_done(path) as temporary:
         temporary.write_bytes(text)
 
 
 def _index(regions: Sequence[str], patches: Sequence[str], arrays: dict[str, npt.NDArray], data_file: str) -> bytes:
-    """Return the text of the .xdmf file."""
+    """Return the text of the .xdmf file, which describes the arrays in `data_file`."""
     add = ElementTree.SubElement
     root = ElementTree.Element("Xdmf", Version="3.0")
     domain = add(root, "Domain")
@@ -119,7 +119,7 @@ def _index(regions: Sequence[str], patches: Sequence[str], arrays: dict[str, npt
 
     body = add_grid(BODY_GRID, "tets", "Tetrahedron", "region_names", regions)
     boundary = add_grid(FACET_GRID, "facets", "Triangle", "patch_names", patches)
-    # FEniCSx takes the first attribute of a grid for its tags.
+    # FEniCSx reads the first attribute of a grid as its tags.
     add_values(body, "region", "Cell")
     add_values(boundary, "patch", "Cell")
     for grid in (body, boundary):
@@ -134,13 +134,13 @@ def _index(regions: Sequence[str], patches: Sequence[str], arrays: dict[str, npt
 def write_msh(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as a Gmsh file, MSH 4.1, binary, with one physical group per region and per patch.
 
-    Regions are physical volumes and patches physical surfaces, numbered from 1; empty ones are left out. Nodal
-    temperatures are a view, "temperature_c".
-    Tetrahedron k of the mesh has the tag k + 1, and the boundary triangles follow; nodes are numbered anew, by the
-    patch or region they lie on, as Gmsh wants them.
+    Regions become physical volumes and patches physical surfaces, numbered from 1; empty regions and patches are left
+    out. Nodal temperatures become a view, `TEMPERATURE_VIEW`. Tetrahedron k of the mesh gets the tag k + 1, and the
+    boundary triangles follow. Nodes get new numbers, sorted by the patch or region that they lie on, as Gmsh asks for.
+    Layout: "MSH file format", Gmsh reference manual, version 4.1; meshio cannot write a patch named like a region.
 
-    Layout: "MSH file format", Gmsh reference manual, version 4.1. meshio's writer has one group to a name, and a patch
-    may have a region's.
+    Raises:
+        MeshError: A name is too long for Gmsh, or what `checked_mesh` and `facet_owners` raise.
     """
     path = Path(path)
     mesh, tags = checked_mesh(mesh)
@@ -149,7 +149,7 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
             expected = f"at most {_LONGEST_GMSH_NAME} bytes, which is what Gmsh reads"
             got = f"{len(name.encode())} bytes: {name!r}"
             raise MeshError("name of a region or patch", expected=expected, got=got, remedy="Rename it.")
-    # All that can fail on a bad mesh comes before the file is opened.
+    # What can fail on a bad mesh is done before the file is opened.
     owner, _ = facet_owners(mesh.tets, mesh.facets)
     blocks = _node_blocks(mesh, tags)
     order = np.concatenate([nodes for *_, nodes in blocks])
@@ -181,7 +181,7 @@ def _sizes(*values: int) -> bytes:
 
 
 def _used(index: IntArray) -> list[int]:
-    """Return the numbers of the patches or regions that are not empty."""
+    """Return the numbers of the patches or regions that have members, rising; `index` has the number of each member."""
     return np.flatnonzero(np.bincount(index)).tolist() if len(index) else []
 
 
@@ -191,7 +191,7 @@ def _bounds(mesh: TetMesh, nodes: IntArray) -> bytes:
 
 
 def _entities(mesh: TetMesh, tags: Boundary, owner: IntArray) -> Iterator[bytes]:
-    # One surface per patch and one volume per region, each in the physical group of its own number.
+    # Each patch is one surface and each region one volume, in the physical group with the same number.
     patches, regions = _used(tags.patch), _used(mesh.region)
     yield _sizes(0, 0, len(patches), len(regions))
     for group in patches:
@@ -204,7 +204,7 @@ def _entities(mesh: TetMesh, tags: Boundary, owner: IntArray) -> Iterator[bytes]
 
 
 def _node_blocks(mesh: TetMesh, tags: Boundary) -> list[tuple[int, int, IntArray]]:
-    """Return dimension, number and nodes of every entity: a node belongs to its first patch, else to its region."""
+    """Return dimension, number and nodes of every entity; nodes belong to their first patch, else to a region."""
     blocks, free = [], np.ones(len(mesh.points_m), dtype=bool)
     for dimension, cells, index in ((2, mesh.facets, tags.patch), (3, mesh.tets, mesh.region)):
         for group in _used(index):
@@ -245,17 +245,17 @@ def _elements(mesh: TetMesh, tags: Boundary, tag: IntArray) -> Iterator[bytes]:
 
 
 def _view_of_nodes(name: str, values: FloatArray) -> bytes:
-    """Return a view of one value per node, shape (n,), in the order of the nodes' tags."""
+    """Return the bytes of a view of one value per node; `values`, shape (n,), are in the order of the nodes' tags."""
     table = np.empty(len(values), dtype=[("tag", _INT), ("value", _DOUBLE)])
     table["tag"], table["value"] = np.arange(1, len(values) + 1), values
-    # Name, time 0, step 0, number of components, number of nodes.
+    # The entries are name, time 0, step 0, number of components and number of nodes.
     head = f'$NodeData\n1\n"{name}"\n1\n0.0\n3\n0\n1\n{len(values)}\n'
     return head.encode() + table.tobytes() + b"\n$EndNodeData\n"
 
 
 @dataclass(frozen=True)
 class HeatStep:
-    """Conduction in a body of one material, insulated all round, in equal steps of time."""
+    """Heat conduction for an .inp file to compute: a body of one material, insulated all round, in equal time steps."""
 
     conductivity_w_mk: float  # Thermal conductivity, [W / (m K)], above 0
     density_kg_m3: float  # Mass density, [kg / m3], above 0
@@ -276,17 +276,17 @@ class HeatStep:
 def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> None:
     """Write a mesh as an input file of CalculiX and Abaqus that runs as it is: ``ccx NAME`` for ``NAME.inp``.
 
-    Units are metres, kilograms, seconds, degrees Celsius; node and tetrahedron k have the number k + 1. It holds:
+    Units are metres, kilograms, seconds and degrees Celsius; node k and tetrahedron k get the number k + 1. Contents:
 
-    - ``NALL`` and ``EALL``: all nodes and all elements, of type DC3D4, which CalculiX takes for C3D4.
+    - ``NALL`` and ``EALL``: all nodes and all elements, of type DC3D4, which CalculiX reads as C3D4.
     - ``REGION-<name>``: elements of a region; ``MATERIAL-<name>``: its material, the same for all regions.
-    - ``PATCH-<name>``: nodes of a boundary patch, and under the same name its element faces as a surface. Before it, a
-      comment says by what ratio to multiply film coefficients, emissivities and fluxes in voxel meshes.
+    - ``PATCH-<name>``: nodes of a boundary patch, and a surface of the same name that holds its element faces. A
+      comment before the node set says the area of the patch, [m2].
     - ``OBSERVED``: the nodes whose temperature was measured, if there are any.
     - Initial temperatures, and a heat transfer step without boundary conditions that prints temperatures (``NT``).
 
-    Names are in capitals; what is neither letter, digit nor underscore becomes an underscore. Empty regions and
-    patches are left out, because an empty set stops a solver.
+    Names are in capitals, and other characters than letters, digits and underscores become underscores. Empty regions
+    and patches are left out, because an empty set stops a solver. Raises `MeshError` if `heat_step` is None.
     """
     path = Path(path)
     if heat_step is None:
@@ -296,7 +296,7 @@ def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> No
     mesh, tags = checked_mesh(mesh)
     regions = _set_names("region_names", mesh.region_names)
     patches = _set_names("boundary.patch_names", tags.patch_names)
-    # All that can fail on a bad mesh comes before the file is opened.
+    # What can fail on a bad mesh is done before the file is opened.
     owner, opposite = facet_owners(mesh.tets, mesh.facets)
     writable_folder(path.parent)
     with replace_when_done(path) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
@@ -307,14 +307,14 @@ def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> No
         file.write("*INITIAL CONDITIONS, TYPE=TEMPERATURE\n")
         numbers_from_1 = np.arange(1, len(mesh.points_m) + 1)
         file.writelines(_rows(f"%d, {_REAL}\n", numbers_from_1, mesh.temperature_c))
-        # Equal steps: the shortest and the longest that the solver may take are the one asked for.
+        # For equal steps, the shortest and the longest step that the solver may take are the length asked for.
         length, total = _REAL % heat_step.step_seconds, _REAL % (heat_step.steps * heat_step.step_seconds)
         file.write(f"*STEP, INC={heat_step.steps}\n*HEAT TRANSFER\n{length}, {total}, {length}, {length}\n")
         file.write("*NODE PRINT, NSET=NALL\nNT\n*NODE FILE\nNT\n*END STEP\n")
 
 
 def _set_names(name: str, names: Sequence[str]) -> list[str]:
-    """Return names that every reader of .inp files takes, or raise `MeshError`."""
+    """Return the names as .inp files can hold them; raise `MeshError` if two become equal or one is too long."""
     written = [re.sub(r"[^A-Za-z0-9_]+", "_", entry).upper() for entry in names]
     if len(set(written)) != len(written) or max(map(len, written)) > _LONGEST_INP_NAME:
         expected = "names that differ in their letters and digits (capitals or not), "
@@ -324,7 +324,7 @@ def _set_names(name: str, names: Sequence[str]) -> list[str]:
 
 
 def _sets(index: IntArray, names: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
-    """Yield name and members, rising, of every patch or region that is not empty."""
+    """Yield each used name and its members, rising; `index` has the number of each element's patch or region."""
     for number, name in enumerate(names):
         members = np.flatnonzero(index == number)
         if len(members):
@@ -332,7 +332,7 @@ def _sets(index: IntArray, names: Sequence[str]) -> Iterator[tuple[str, IntArray
 
 
 def _rows(row: str, *columns: npt.NDArray) -> Iterator[str]:
-    """Yield the text of a table in chunks: Python formats many rows at once much faster than one by one."""
+    """Yield the text of a table in chunks of many rows, which Python formats much faster than single rows."""
     for start in range(0, len(columns[0]), _ROWS_AT_ONCE):
         chunk = [column[start : start + _ROWS_AT_ONCE].tolist() for column in columns]
         yield row * len(chunk[0]) % tuple(chain.from_iterable(zip(*chunk)))

@@ -1,4 +1,4 @@
-"""The surface of a mesh: .stl (shape only), .ply (shape, colours, temperatures) and .glb (for browsers and phones)."""
+"""Files of a mesh's surface: .stl (shape only), .ply (with colours and temperatures), .glb (for browsers, phones)."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import checked_mesh, colour_bytes, surface_of, write_bytes
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas
 
-_ROUNDING_NOTICED = 0.01  # share of a triangle's side by which rounding may move its corners
+_ROUNDING_NOTICED = 0.01  # largest move of a node by rounding, as a share of a triangle's side
 _COLOUR_MAP = "inferno"  # perceptually uniform, readable in grey
-_DARKEST = 0.1  # share of the colour map left out at its dark end, where shading could not be told from cold
-_FAR_SIZES = 16.0  # nodes farther from the origin than this many sizes of the body count from its middle in .glb files
+_DARKEST = 0.1  # share of the colour map's dark end that is not used, because it looks like shading
+_FAR_SIZES = 16.0  # .glb positions of a body farther from the origin than so many of its sizes count from its middle
 _UNLIT = "KHR_materials_unlit"
 
 
 def write_stl(path: Path | str, mesh: TetMesh) -> None:
-    """Write the boundary triangles as binary STL, which knows nothing but shapes; lengths are metres."""
+    """Write the boundary triangles as binary STL, shape only, lengths in [m]; raise `MeshError` as `check_stl` does."""
     from trimesh import Trimesh
     from trimesh.exchange.stl import export_stl
 
@@ -34,10 +34,10 @@ def write_stl(path: Path | str, mesh: TetMesh) -> None:
 
 
 def check_stl(mesh: TetMesh) -> None:
-    """Refuse a mesh so far from the origin that STL, which has single precision, cannot hold its shape.
+    """Check that a mesh is near enough to the origin for STL, which has single precision, to hold its shape.
 
     Raises:
-        MeshError: Rounding would move nodes by more than a hundredth of a triangle's side.
+        MeshError: Rounding would move nodes by more than a hundredth of the side of a mean triangle.
     """
     if not len(mesh.facets):
         return
@@ -54,9 +54,9 @@ def check_stl(mesh: TetMesh) -> None:
 def write_ply(path: Path | str, mesh: TetMesh) -> None:
     """Write the boundary as binary PLY with colours and temperatures (read by MeshLab, CloudCompare, Blender).
 
-    Vertex properties: x, y, z [m], red, green, blue, `temperature_c` [degrees Celsius] and `observed`. Colours are
-    those of the photographs, of temperatures where the mesh has none; a comment says which. trimesh and VTK write
-    positions in single precision, meshio the time of day.
+    Vertex properties: x, y, z [m], red, green, blue, `temperature_c` [degrees Celsius] and `observed`. The colours are
+    those of the photographs, or stand for temperatures if the mesh has no colours; a comment in the file says which.
+    Positions have double precision, which trimesh and VTK do not write.
     """
     path = Path(path)
     mesh, _ = checked_mesh(mesh)
@@ -96,12 +96,12 @@ def write_ply(path: Path | str, mesh: TetMesh) -> None:
 
 
 def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:
-    """Write the boundary as binary glTF 2.0 with a colour per node; lengths are metres.
+    """Write the boundary as binary glTF 2.0, lengths in [m], with a colour per node that stands for its temperature.
 
-    glTF's up is +y: the file holds mesh coordinates and a matrix that turns `up` to it. Colours are stored as light
-    intensities and shown without lamps (``KHR_materials_unlit``), so that a colour stands for one temperature.
-    Positions are in single precision; far from the origin they count from the middle, and the matrix brings them back.
-    The vertex attribute ``_TEMPERATURE_C`` holds the temperatures, the mesh's ``extras`` the ends of the colour map.
+    Up is +y in glTF, so the file holds a matrix that turns `up` to +y. Colours are stored as light intensities and
+    shown without lamps (``KHR_materials_unlit``), so that shading does not change them. Positions have single
+    precision; far from the origin they count from the body's middle, and the matrix moves them back. The vertex
+    attribute ``_TEMPERATURE_C`` holds the temperatures, the mesh's ``extras`` hold the ends of the colour map.
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb
@@ -114,10 +114,10 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
         remedy = "Build the mesh with its boundary."
         raise MeshError("facets", expected="at least one triangle", got="none", remedy=remedy)
     x, y, z = check_direction("up", up, "Pass for instance (0, 0, 1).", MeshError).tolist()
-    # The smallest turn to +y: about up x y, or any level axis where up is +y or -y itself.
+    # The smallest turn to +y is about the axis up x y, or about any level axis if up is +y or -y itself.
     level = math.hypot(x, z)
     turn = trimesh.transformations.rotation_matrix(math.atan2(level, y), (-z, 0.0, x) if level else (1.0, 0.0, 0.0))
-    # Five million metres from the origin single precision has steps of half a metre.
+    # At five million metres from the origin, single precision has steps of half a metre.
     lower, upper = surface.points_m.min(axis=0), surface.points_m.max(axis=0)
     far = np.abs(surface.points_m).max() > _FAR_SIZES * (upper - lower).max()
     origin = np.round(0.5 * (lower + upper)) if far else np.zeros(3)
@@ -139,12 +139,12 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
 
 
 def _range_c(temperature_c: FloatArray) -> tuple[float, float]:
-    """Return the ends of the colour map of a surface's nodes, [degrees Celsius]."""
+    """Return the lowest and highest temperature, the ends of the colour map, [degrees Celsius]; 0, 0 without nodes."""
     return (float(temperature_c.min()), float(temperature_c.max())) if len(temperature_c) else (0.0, 0.0)
 
 
 def _temperature_colours(temperature_c: FloatArray) -> FloatArray:
-    """Return colours (sRGB) in [0, 1] from a map that spans the temperatures, shape (m, 3)."""
+    """Return a colour (sRGB in [0, 1]) for each temperature, from a map that spans all of them, shape (m, 3)."""
     import matplotlib
 
     low, high = _range_c(temperature_c)
@@ -153,13 +153,13 @@ def _temperature_colours(temperature_c: FloatArray) -> FloatArray:
 
 
 def _light(colours: FloatArray) -> np.ndarray:
-    """Light intensities of screen colours (IEC 61966-2-1, sRGB) from 0 to 65535, and full opacity, shape (m, 4)."""
+    """Return light intensities, 0 to 65535, of sRGB colours (IEC 61966-2-1), and full opacity, shape (m, 4)."""
     light = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     return np.pad(np.floor(light * 65535.0 + 0.5), ((0, 0), (0, 1)), constant_values=65535.0).astype("<u2")
 
 
 def _finish(tree: dict[str, Any]) -> None:
-    """Show the colours of 16 bits, for which trimesh has no name, without lamps."""
+    """Make `_COLOR_0` the 16-bit colours of a glTF tree, which trimesh cannot write, shown without lamps."""
     (primitive,) = tree["meshes"][0]["primitives"]
     primitive["attributes"]["COLOR_0"] = number = primitive["attributes"].pop("_COLOR_0")
     tree["accessors"][number]["normalized"] = True

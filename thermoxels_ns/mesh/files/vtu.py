@@ -1,4 +1,4 @@
-"""Meshes as VTK files, written and read back: the body (.vtu) and its tagged boundary (.vtp)."""
+"""VTK files of meshes, written and read: the body (.vtu) and its tagged boundary (.vtp)."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays, surface_
 from thermoxels_ns.mesh.quality.checks import count_wrong_facets, group_faces
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh, facet_areas, facet_normals
 
-_DISK_IS_FULL = 20007  # VTK's own number
+_DISK_IS_FULL = 20007  # VTK's error code
 _REMEDY = "Export the mesh again with ns-export thermoxels-mesh."
 _REGION = "region:"
-_TETRAHEDRON = 10  # VTK's number for the kind of cell
-_MOST_COMPRESSION = 1040  # Bytes that zlib can make of one: 1032, and a little
+_TETRAHEDRON = 10  # VTK's number for tetrahedra
+_MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and a margin
 
 
 def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None) -> None:
@@ -35,7 +35,7 @@ def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
 
     Point arrays are `temperature_c` [degrees Celsius], `temperature_k` [K], `observed` (1: measured, 0: extended) and,
     if the mesh has colours, `colour` (red, green, blue as bytes). The cell array is `region`; field arrays
-    `region:NAME` hold the number of each region. `temperature_c` takes the place of the mesh's own.
+    `region:NAME` hold the number of each region. The argument `temperature_c`, if given, replaces the mesh's own.
 
     Raises:
         MeshError: An array does not fit the mesh or is not finite.
@@ -50,7 +50,7 @@ def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
     for name, values in node_arrays(mesh).items():
         grid.point_data[name] = values
     grid.cell_data["region"] = mesh.region
-    # As numbers: meshio refuses a file that holds text.
+    # Regions are field arrays of numbers, because meshio refuses a file that holds text.
     for number, name in enumerate(mesh.region_names):
         grid.field_data[f"region:{name}"] = [number]
     grid.set_active_scalars("temperature_c")
@@ -58,7 +58,7 @@ def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
 
 
 def write_vtk(writer: Any, path: Path, data: Any) -> None:
-    """Write a VTK data set with the XML writer for its kind; the folder is made if need be."""
+    """Write a VTK data set with the XML `writer` for its kind; make the folder; raise `OutputError` on failure."""
     writable_folder(path.parent)
     with replace_when_done(path) as temporary:
         writer.SetFileName(str(temporary))
@@ -68,14 +68,14 @@ def write_vtk(writer: Any, path: Path, data: Any) -> None:
             written = writer.Write() and not writer.GetErrorCode() and temporary.is_file()
         if not written:
             remedy = "Check the free space and the permissions of the folder."
-            code = writer.GetErrorCode()  # below 20,000 it is the system's
+            code = writer.GetErrorCode()  # codes below 20,000 are those of the system
             got = "no space left for it" if code == _DISK_IS_FULL else os.strerror(code)
             raise OutputError("mesh file", expected=f"to write {path}", got=got, remedy=remedy)
 
 
 @contextmanager
 def silent_vtk() -> Iterator[Any]:
-    """Keep VTK from writing to the terminal; yields what collects its complaints as `events`."""
+    """Keep VTK from writing to the terminal; yield an object whose `events` are the errors that VTK reports."""
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkLogger
 
@@ -89,7 +89,7 @@ def silent_vtk() -> Iterator[Any]:
 
 
 def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
-    """Write figures, nested as you like, as indented json in the order given; the folder is made if need be.
+    """Write a nested mapping of figures as indented json, in its order, in a folder that is made if missing.
 
     Raises:
         MeshError: A number is NaN or infinite (json has neither), or a value has no place in json.
@@ -98,12 +98,12 @@ def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
 
 
 def summary_text(summary: Mapping[str, Any]) -> str:
-    """Return the text of the file that `write_summary` writes; raises the same `MeshError`."""
+    """Return the json text that `write_summary` writes; raise `MeshError` in the same cases."""
     return json.dumps(plain_values(summary, "summary", MeshError), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def boundary_path(path: Path | str) -> Path:
-    """Return the path of the boundary that belongs to a mesh file.
+    """Return the path of the boundary file that belongs to a mesh file.
 
     >>> boundary_path("house/mesh.vtu").as_posix()
     'house/mesh-boundary.vtp'
@@ -115,12 +115,11 @@ def boundary_path(path: Path | str) -> Path:
 def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
     """Write the boundary triangles and their tags as VTK polygons (.vtp, read by ParaView and pyvista).
 
-    Cell arrays: `normal` (outward), `area_m2`, `seen` (1: a camera saw it), `patch` (an index into the field array
-    `patch_names`), `on_box` (1: where the scene box cuts the solid) and, where photographs were compared,
-    `photographs_seen` and `photographs_supporting`, see `Boundary.photographs`. Point arrays: `temperature_c`,
-    `observed`, `node` (number in the mesh, from 0) and, if the mesh has colours, `colour` as bytes.
-
-    A mesh without boundary tags is written with one patch "boundary", and without `seen`, which nobody knows.
+    Cell arrays: `normal` (outward), `area_m2`, `seen` (1: a camera sees the triangle), `patch` (an index into the field
+    array `patch_names`), `on_box` (1: the scene box or the region cuts the solid there) and, if photographs were
+    compared, `photographs_seen` and `photographs_supporting`, see `Boundary.photographs`. Point arrays:
+    `temperature_c`, `observed`, `node` (number in the mesh, from 0) and, if the mesh has colours, `colour` as bytes.
+    A mesh without boundary tags is written with one patch, "boundary", and without `seen`, which is unknown.
     """
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkStringArray
@@ -147,7 +146,7 @@ def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
             data.point_data[name] = values[surface.nodes]
     for name, values in arrays.items():
         data.cell_data[name] = values
-    names = vtkStringArray()  # pyvista itself takes ASCII only
+    names = vtkStringArray()  # pyvista's own way takes ASCII names only
     names.SetName("patch_names")
     for name in tags.patch_names:
         names.InsertNextValue(name)
@@ -157,12 +156,13 @@ def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
 
 
 def read_mesh(path: Path | str) -> TetMesh:
-    """Read ``NAME.vtu`` and the ``NAME-boundary.vtp`` beside it.
+    """Return the mesh in ``NAME.vtu`` and the ``NAME-boundary.vtp`` beside it.
 
-    All comes back as it was written, bit for bit, but colours, which files hold as bytes.
+    The mesh is equal, bit for bit, to the mesh that was written, except for colours, which files hold as bytes.
 
     Raises:
-        MeshError: A file is missing, cannot be read, lacks an array, or the two do not belong together.
+        MeshError: A file is missing, damaged or lacks an array, the cells are not sound tetrahedra, or the boundary
+            file is not that of the body.
     """
     path = Path(path)
     if path.suffix != ".vtu":
@@ -204,7 +204,7 @@ def read_mesh(path: Path | str) -> TetMesh:
 
 
 def _read(path: Path) -> Any:
-    """Read a VTK file; a damaged one is an error, not an empty mesh."""
+    """Return the data set in a VTK file; raise `MeshError` if the file is missing, damaged or empty."""
     import pyvista as pv
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
 
@@ -225,9 +225,9 @@ def _read(path: Path) -> Any:
 
 
 def _sizes_fit(content: bytes) -> bool:
-    """Tell whether the arrays of a VTK file, as `write_vtk` writes them, claim no more than its bytes can hold.
+    """Return whether the array sizes in a VTK file made by `write_vtk` are no larger than its bytes can hold.
 
-    VTK ends the process where a damaged size is too large for the memory. Files written otherwise are not checked.
+    VTK ends the process if a damaged size exceeds the memory. For files in another layout the result is True.
     """
     header = re.search(rb'header_type="UInt(32|64)"[^>]*compressor="vtkZLibDataCompressor"', content)
     begin = re.search(rb'<AppendedData encoding="base64">\s*_', content)
@@ -236,7 +236,7 @@ def _sizes_fit(content: bytes) -> bool:
     width = int(header[1]) // 8
     for offset in re.findall(rb'offset="(\d+)', content[: begin.start()]):
         start = begin.end() + int(offset)
-        # An array begins with the number of its blocks, the size of a block, that of the last one, those compressed.
+        # An array begins with the number of blocks, the size of a block and of the last, and each compressed size.
         blocks, size, last = _numbers(content[start : start + 4 * width], width, 3)
         if blocks * width > len(content) or max(blocks * size, last) > _MOST_COMPRESSION * len(content):
             return False
@@ -247,7 +247,7 @@ def _sizes_fit(content: bytes) -> bool:
 
 
 def _numbers(letters: bytes, width: int, count: int) -> list[int]:
-    """Decode little-endian numbers of `width` bytes in base64; what is no base64 or missing is as large as can be."""
+    """Decode `count` little-endian numbers of `width` bytes from base64; bytes missing or not base64 become 255."""
     try:
         found = base64.b64decode(letters + b"=" * (-len(letters) % 4), validate=True)
     except binascii.Error:
@@ -257,7 +257,7 @@ def _numbers(letters: bytes, width: int, count: int) -> list[int]:
 
 
 def _region_names(body: Any, name: str) -> tuple[str, ...]:
-    """Return the regions' names by their numbers, each of which is a field array."""
+    """Return the names of the regions in the order of their numbers, read from field arrays `region:NAME`."""
     arrays = body.GetFieldData()
     numbers = {}
     for place in range(arrays.GetNumberOfArrays()):
@@ -270,7 +270,7 @@ def _region_names(body: Any, name: str) -> tuple[str, ...]:
 
 
 def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Boundary | None]:
-    """Return the boundary triangles and their tags, None for a mesh that was not tagged."""
+    """Return the boundary triangles (f, 3) and their tags; the tags are None for a mesh written without tags."""
 
     def array(of: str) -> npt.NDArray:
         return _array(surface.cell_data, of, name)

@@ -1,1 +1,1 @@
-"""Whether a mesh is fit for a finite-element solver."""
+"""Quality of meshes: shapes of tetrahedra, topology, and checks that a finite-element solver can use them."""

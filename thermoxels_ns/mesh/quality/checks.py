@@ -1,4 +1,4 @@
-"""Faces, edges and components of a mesh: which are shared, missing or doubled."""
+"""Faces, edges and components of a mesh: grouping of shared ones, and counts of missing, wrong and doubled ones."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_normals
 
 OUTWARD_FACES: IntArray = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
-"""Faces of a positively oriented tetrahedron; face f lies opposite node f, its right-hand normal points outwards."""
+"""Node positions of a tetrahedron's faces; face f lies opposite node f, and its right-hand normal points outwards."""
 TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int64)
-"""Positions of a tetrahedron's nodes at the ends of its six edges, shape (6, 2)."""
+"""Node positions of the two ends of a tetrahedron's six edges, shape (6, 2)."""
 
 
 @dataclass(frozen=True)
 class Groups:
-    """Equal rows of a table put together: group g is `order[start[g]:start[g + 1]]`, the last one ends with `order`."""
+    """Rows of a table, grouped by equality: group g is `order[start[g]:start[g + 1]]`, the last ends with `order`."""
 
     order: IntArray  # row numbers, group after group, shape (rows,)
-    start: IntArray  # where each group starts in `order`, shape (groups,); groups are sorted by what they share
+    start: IntArray  # where each group starts in `order`, shape (groups,); groups are sorted by content
 
     @property
     def sizes(self) -> IntArray:
@@ -38,11 +38,11 @@ class Groups:
         return np.minimum.reduceat(self.order, self.start) if len(self.start) else self.start
 
     def sums(self, values: npt.NDArray) -> npt.NDArray:
-        """Return the sum of a value per row over each group, shape (groups,)."""
+        """Return for each group the sum of `values` (rows,) over its rows, shape (groups,)."""
         return np.add.reduceat(values[self.order], self.start) if len(self.start) else values[:0]
 
     def pairs(self) -> tuple[IntArray, IntArray]:
-        """Return the rows that follow each other inside a group, before and after."""
+        """Return the pairs of rows that follow each other within a group, as two arrays: rows before, rows after."""
         follows = np.ones(len(self.order), dtype=bool)
         follows[self.start] = False
         at = np.flatnonzero(follows)
@@ -50,10 +50,10 @@ class Groups:
 
 
 def group_pairs(first: IntArray, second: IntArray) -> Groups:
-    """Return the groups of rows in which a pair of whole numbers of at least 0 is the same.
+    """Return the rows grouped by equal pairs (first[row], second[row]) of whole numbers of at least 0.
 
-    A counting sort by the first number (a sparse row turned into columns) and a sort of the few rows that share it are
-    several times faster on a million tetrahedra than one sort of all rows.
+    Rows are sorted by the first number with a counting sort (scipy's csr to csc) and then, where it is the same, by the
+    second number: for a million tetrahedra this is several times faster than one sort of all rows.
 
     >>> groups = group_pairs(np.array([5, 2, 5, 2]), np.array([1, 9, 1, 0]))
     >>> groups.sizes, groups.first
@@ -73,9 +73,9 @@ def group_pairs(first: IntArray, second: IntArray) -> Groups:
 
 
 def group_faces(tets: IntArray) -> Groups:
-    """Return the faces that tetrahedra share; row 4 t + f is the face of tetrahedron t opposite its node f."""
+    """Group the faces of tetrahedra by their nodes; row 4 t + f is the face of tetrahedron t opposite its node f."""
     node = [np.ascontiguousarray(tets[:, n]) for n in range(4)]
-    # Sorted element by element with five comparisons.
+    # A sorting network of five comparisons sorts the four nodes of all tetrahedra at once.
     a, b = np.minimum(node[0], node[1]), np.maximum(node[0], node[1])
     c, d = np.minimum(node[2], node[3]), np.maximum(node[2], node[3])
     s0, low, high, s3 = np.minimum(a, c), np.maximum(a, c), np.minimum(b, d), np.maximum(b, d)
@@ -89,26 +89,26 @@ def group_faces(tets: IntArray) -> Groups:
 
 
 def group_sides(facets: IntArray) -> Groups:
-    """Return the edges that triangles share; row 3 f + s is the side of triangle f from its node s to the next."""
+    """Group the sides of triangles by their ends; row 3 f + s is the side of triangle f from its node s to the next."""
     ends = np.roll(facets, -1, axis=1)
     return group_pairs(np.minimum(facets, ends).ravel(), np.maximum(facets, ends).ravel())
 
 
 def triangles_across_edges(sides: Groups) -> IntArray:
-    """Return pairs of triangles that share an edge, shape (p, 2), from `group_sides`."""
+    """Return pairs of triangles that share an edge, shape (p, 2); `sides` is the result of `group_sides`."""
     return np.stack(sides.pairs(), axis=1) // 3
 
 
 def component_of(num: int, first: IntArray, second: IntArray) -> IntArray:
-    """Return the number of the connected component that each of `num` things is in, shape (num,)."""
+    """Return the connected component's number of each of `num` things; a link joins things first[i] and second[i]."""
     links = sparse.coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
     return connected_components(links, directed=False)[1].astype(np.int64) if num else np.zeros(0, dtype=np.int64)
 
 
 def boundary_facets(tets: IntArray, faces: Groups | None = None) -> IntArray:
-    """Return the triangles of exactly one tetrahedron, outwards, shape (f, 3), ordered by their sorted node numbers.
+    """Return the faces of exactly one tetrahedron, normals outwards, shape (f, 3), ordered by sorted node numbers.
 
-    `faces` is `group_faces(tets)` where that is already known.
+    `faces` is `group_faces(tets)`, computed if left out.
 
     >>> boundary_facets(np.array([[0, 1, 2, 3], [1, 3, 2, 4]])).shape
     (6, 3)
@@ -119,12 +119,12 @@ def boundary_facets(tets: IntArray, faces: Groups | None = None) -> IntArray:
 
 
 def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the tetrahedron of every boundary triangle and which of its nodes lies opposite to it, each shape (f,).
+    """Return each boundary triangle's tetrahedron and the position (0 to 3) of the node opposite, two arrays (f,).
 
-    Only faces whose nodes all lie on the boundary are looked at, so the sort follows the surface, not the volume.
+    Only faces whose nodes all lie on the boundary are sorted, so the time grows with the surface, not with the volume.
 
     Raises:
-        MeshError: A triangle is listed twice, is no face of a tetrahedron, or lies between two.
+        MeshError: A triangle is listed twice, is no face of a tetrahedron, or lies between two tetrahedra.
 
     >>> facet_owners(np.array([[0, 1, 2, 3]]), np.array([[0, 2, 1], [1, 2, 3]]))
     (array([0, 0]), array([3, 0]))
@@ -135,7 +135,7 @@ def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
     on_boundary = np.zeros(size, dtype=bool)
     on_boundary[facets.ravel()] = True
     flags = on_boundary[tets]
-    # A face is on the boundary's nodes if the only node that is not is the one opposite, or none is not.
+    # Face f is of interest if the three nodes other than node f all lie on the boundary.
     tet, face = np.nonzero((flags.sum(axis=1)[:, None] - flags) == 3)
     faces = np.concatenate([facets, tets[tet[:, None], OUTWARD_FACES[face]]]).astype(np.int64)
     low, middle, high = np.sort(faces, axis=1).T
@@ -152,15 +152,16 @@ def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def count_twin_nodes(points: FloatArray) -> int:
-    """Return the number of nodes at the place of an earlier one."""
+    """Return the number of nodes that are at exactly the same place as an earlier node."""
     ordered = points[np.lexsort(points.T)]
     return int(np.count_nonzero(np.all(ordered[1:] == ordered[:-1], axis=1)))
 
 
 def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
-    """Return how many triangles are wrong or missing in `mesh.facets`, which should be all faces of one tetrahedron.
+    """Return how many triangles are wrong in `mesh.facets` or missing there.
 
-    A triangle that is turned over counts twice. `faces` is `group_faces(mesh.tets)`.
+    Right are all faces of exactly one tetrahedron, normals outwards. A triangle that is turned over counts twice, as
+    wrong and as missing. `faces` is `group_faces(mesh.tets)`.
     """
     wanted = boundary_facets(mesh.tets, faces)
     both = np.concatenate([wanted, mesh.facets]).astype(np.int64)
@@ -171,17 +172,16 @@ def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
 
 
 def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
-    """Return the number of pairs of triangles that share an edge and lie on the same side of it in the same plane.
+    """Return the number of pairs of triangles that share an edge and lie in one plane on the same side of the edge.
 
-    This is how a crack looks: faces of neighbours that do not match are boundary triangles, one upon the other. `sides`
-    is `group_sides(facets)`.
+    Such pairs show cracks, where faces of neighbours do not match and lie one upon the other. `sides`: `group_sides`.
     """
     normals = facet_normals(points, facets)
     facet, side = np.divmod(sides.order, 3)
     direction = np.where(facets[facet, side] < facets[facet, (side + 1) % 3], 1.0, -1.0)
     edge = np.repeat(np.arange(len(sides.start)), sides.sizes)
-    # The direction from an edge into a triangle is the triangle's normal turned by 90 degrees about the edge, one way
-    # or the other as the triangle passes along the edge.
+    # The direction from an edge into a triangle is the triangle's normal turned by 90 degrees about the edge. The sense
+    # of this turn depends on the direction in which the triangle passes along the edge.
     overlaps = 0
     for gap in range(1, int(sides.sizes.max(initial=1))):
         pairs = np.flatnonzero(edge[gap:] == edge[:-gap])
@@ -192,7 +192,7 @@ def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
 
 
 def count_tets_in_other_bodies(mesh: TetMesh) -> int:
-    """Return the number of tetrahedra whose centre lies in a body that they share no node with."""
+    """Return the number of tetrahedra whose centre lies inside another body; bodies are parts that share no node."""
     import pyvista as pv
 
     points, tets = mesh.points_m, mesh.tets
@@ -210,27 +210,27 @@ def count_tets_in_other_bodies(mesh: TetMesh) -> int:
 
 @dataclass(frozen=True)
 class SurfaceComponent:
-    """Triangles of the boundary that hang together by edges."""
+    """One component of the boundary: triangles that are connected by shared edges."""
 
     num_triangles: int
     euler_characteristic: int  # vertices - edges + triangles
     genus: int | None
     """Number of handles, (2 - Euler characteristic) / 2; None where the component is not a closed manifold."""
     is_cavity: bool
-    """True where it bounds a hole inside a body: it is closed and the volume that it encloses is negative."""
+    """True if the component bounds a hole inside a body: the component is closed and its signed volume is negative."""
 
 
 def surface_topology(points: FloatArray, facets: IntArray, sides: Groups) -> dict[str, Any]:
-    """Count the components of a triangulated surface, their handles, and where it is no manifold.
+    """Return the components, handles and non-manifold edges and vertices of a triangulated surface.
 
-    The figures have the names that they have in `report.QualityReport`; `sides` is `group_sides(facets)`.
+    The keys are names of fields of `report.QualityReport`. `sides` is `group_sides(facets)`.
     """
     uses, (left, right) = sides.sizes, sides.pairs()
     node, row = facets.ravel(), np.arange(facets.size)
     following = row - row % 3 + (row + 1) % 3
     component = component_of(len(facets), left // 3, right // 3)
-    # Row 3 f + s is also the corner of triangle f at its node s. Two corners at one node belong to one fan if an edge
-    # with just two triangles lies between them.
+    # Row 3 f + s also stands for the corner of triangle f at its node s. Two corners at one node belong to one fan if
+    # an edge of exactly two triangles lies between the corners.
     of_two = np.zeros(len(row), dtype=bool)
     of_two[sides.order] = np.repeat(uses == 2, uses)
     left, right = left[of_two[left]], right[of_two[left]]
@@ -248,7 +248,7 @@ def surface_topology(points: FloatArray, facets: IntArray, sides: Groups) -> dic
     triangles, vertices = per_component(row[::3]), per_component(group_pairs(component[row // 3], node).first)
     euler = vertices - per_component(sides.first) + triangles
     closed = (per_component(sides.first, uses != 2) == 0) & (per_component(corner_of_fan) == vertices)
-    # Signed volumes between triangles and the middle of the nodes.
+    # Signed volumes of the cones from the mean of the nodes to the triangles.
     corner = (points - points.mean(axis=0))[facets]
     cones = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6.0
     cavity = (per_component(sides.first, uses % 2) == 0) & (per_component(row[::3], cones) < 0.0)
@@ -268,6 +268,6 @@ def surface_topology(points: FloatArray, facets: IntArray, sides: Groups) -> dic
 
 
 def count_open_edges(facets: IntArray, sides: Groups) -> int:
-    """Return the number of edges that triangles do not pass equally often in both directions; 0: it is closed."""
+    """Return the number of edges that triangles do not pass equally often in both directions; 0: a closed surface."""
     upwards = facets < np.roll(facets, -1, axis=1)
     return int(np.count_nonzero(sides.sums(np.where(upwards.ravel(), 1, -1))))

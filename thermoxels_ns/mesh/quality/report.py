@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BoundaryMode = Literal["conforming", "voxel"]
-"""How the boundary of a mesh runs: along the level set of the density, or along voxel faces."""
+"""How the boundary of a mesh runs: "conforming" along the level set of the density, "voxel" along voxel faces."""
 DIHEDRAL_BOUNDS_DEG: dict[BoundaryMode, tuple[float, float]] = {"voxel": (45.0, 90.0), "conforming": (10.7, 164.8)}
-"""Bounds of the angles between two faces of a tetrahedron, [degrees]: six equal tetrahedra per voxel have angles of 45,
-60 and 90 degrees; for isosurface stuffing see Labelle and Shewchuk (2007)."""
-ANGLE_TOLERANCE_DEG = 1e-4  # what rounding of the nodes may add to an angle, [degrees]
-TEMPERATURE_TOLERANCE_K = 1e-6  # what rounding may add to a temperature, [K]
-RATIO_EDGES = np.linspace(0.0, 1.0, 21)  # edges of the bins of the radius ratio
+"""Bounds of the angles between two faces of a tetrahedron, [degrees]. The six tetrahedra of a voxel have angles of 45,
+60 and 90 degrees; for the angles of isosurface stuffing see Labelle and Shewchuk (2007)."""
+ANGLE_TOLERANCE_DEG = 1e-4  # error of an angle that rounding of the nodes may cause, [degrees]
+TEMPERATURE_TOLERANCE_K = 1e-6  # error of a temperature that rounding may cause, [K]
+RATIO_EDGES = np.linspace(0.0, 1.0, 21)  # edges of the bins of `radius_ratio_counts`
 
 _CRITERIA = {
     "volumes_positive": "Every tetrahedron has a volume above 0.",
@@ -49,25 +49,25 @@ _CRITERIA = {
     "temperatures_in_range": "No node is colder than the coldest or hotter than the hottest observation.",
     "non_obtuse": "No obtuse angle between faces: heat with lumped mass keeps the maximum principle.",
 }
-"""What a mesh should be, by name. The last is for voxel meshes, as no cut along a level set meets it; none
-asks that a boundary nowhere touches itself, because bodies may."""
+"""Quality criteria, sentence by name. The last one is for voxel meshes only, because no conforming mesh meets it. A
+boundary may touch itself, because bodies may."""
 _BINS_WITHIN_BOUNDS: dict[BoundaryMode, int] = {"voxel": 10, "conforming": 30}
 _MOST_COMPONENTS = 20
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """One quality criterion, and whether a mesh meets it."""
+    """One quality criterion, and the result of a mesh for this criterion."""
 
     name: str  # short name, the same for every mesh
-    sentence: str  # what it asks for
-    kept: bool  # whether the mesh meets it
-    figure: float  # the number that decides
-    found: str  # the number in words
+    sentence: str  # what the criterion asks for
+    kept: bool  # True if the mesh meets the criterion
+    figure: float  # the figure that decides, with a unit that depends on the criterion
+    found: str  # that figure in words
 
 
 def angle_edges(boundary_mode: BoundaryMode) -> FloatArray:
-    """Return the edges of bins about 5 degrees wide that cover 0 to 180 degrees, none of them across a bound.
+    """Return the edges of the angle histogram's bins, [degrees]: 0 to 180 is covered, and no bin contains a bound.
 
     >>> angle_edges("voxel")[[0, 1, -1]].round(2)
     array([ -0. ,   4.5, 180. ])
@@ -81,7 +81,7 @@ def angle_edges(boundary_mode: BoundaryMode) -> FloatArray:
 
 
 def in_percent(share: float) -> str:
-    """Write a share in percent such that it looks like none, or all, only if it is."""
+    """Return a share as text in percent; only exactly 0 and exactly 1 are written as "0 %" and "100 %"."""
     if share in (0.0, 1.0):
         return f"{100 * share:.0f} %"
     return "< 0.01 %" if share < 1e-4 else f"{min(100.0 * share, 99.99):.2f} %"
@@ -89,36 +89,36 @@ def in_percent(share: float) -> str:
 
 @dataclass(frozen=True)
 class QualityReport:
-    """Figures of a mesh and the criteria it meets."""
+    """Figures of the quality of a mesh, and its result for each quality criterion."""
 
     boundary_mode: BoundaryMode  # how the boundary was made
-    length_unit: str  # unit of the nodes' positions; if it is not "m", [m] below stands for it
+    length_unit: str  # unit of length of the nodes' positions; where it is not "m", read [m] below as this unit
     num_nodes: int
     num_tets: int
     num_edges: int
     num_facets: int
-    num_box_facets: int  # boundary triangles where the scene box cuts the solid
+    num_box_facets: int  # number of boundary triangles with the tag `FACET_BOX`
     volume_m3: float  # sum of the signed volumes, [m^3]
     area_m2: float  # sum of the boundary triangles' areas, [m^2]
     edge_length_m: tuple[float, float, float]  # shortest, mean and longest edge, [m]
     dihedral_range_deg: tuple[float, float]  # smallest and largest angle between two faces of a tetrahedron, [degrees]
-    dihedral_counts: tuple[int, ...]  # number of these angles, six per tetrahedron, in the bins of `angle_edges`
-    radius_ratio_range: tuple[float, float]  # smallest and largest of `TetShapes.radius_ratios`, 1 at best
+    dihedral_counts: tuple[int, ...]  # numbers of angles, six per tetrahedron, in the bins of `angle_edges`
+    radius_ratio_range: tuple[float, float]  # smallest and largest of `TetShapes.radius_ratios`; 1 is best
     radius_ratio_mean: float
-    radius_ratio_counts: tuple[int, ...]  # number of tetrahedra by radius ratio in the bins of `RATIO_EDGES`
+    radius_ratio_counts: tuple[int, ...]  # numbers of tetrahedra in the radius-ratio bins `RATIO_EDGES`
     share_obtuse: float  # share of tetrahedra with an obtuse angle between two faces, 0 to 1
-    bodies_by_node: int  # parts of the mesh that share no node
-    bodies_by_face: int  # parts of the mesh that share no face, so that no heat is conducted between them
+    bodies_by_node: int  # number of parts of the mesh that share no node
+    bodies_by_face: int  # number of parts that share no face, so that no heat is conducted between them
     euler_characteristic: int  # vertices - edges + triangles of the boundary
-    genus: int | None  # handles of all boundary components together; None if one of them is not a closed manifold
-    components: tuple[SurfaceComponent, ...]  # of the boundary (triangles that share edges), largest first
-    num_non_manifold_edges: int  # boundary edges with more than two boundary triangles
-    num_non_manifold_vertices: int  # boundary vertices whose triangles are not one fan
-    criteria: tuple[Criterion, ...]  # quality criteria of such a boundary, and whether this mesh meets them
+    genus: int | None  # handles of all boundary components; None if one component is not a closed manifold
+    components: tuple[SurfaceComponent, ...]  # boundary components, joined by edges, largest first
+    num_non_manifold_edges: int  # number of boundary edges with more than two boundary triangles
+    num_non_manifold_vertices: int  # number of boundary vertices whose triangles form more than one fan
+    criteria: tuple[Criterion, ...]  # the criteria for this `boundary_mode`, each with the mesh's result
 
     @property
     def num_cavities(self) -> int:
-        """Return the number of boundary components around a hole inside a body."""
+        """Return the number of boundary components that bound a hole inside a body."""
         return sum(component.is_cavity for component in self.components)
 
     @property
@@ -127,7 +127,7 @@ class QualityReport:
         return tuple(criterion.name for criterion in self.criteria if not criterion.kept)
 
     def as_mapping(self) -> dict[str, Any]:
-        """Return the report as json can hold it, with the 20 largest of the boundary's components."""
+        """Return the report as a dictionary for json; of the boundary components only the 20 largest are listed."""
         mapping = asdict(self)
         listed, criteria = mapping.pop("components"), mapping.pop("criteria")
         bins = {"dihedral_counts": angle_edges(self.boundary_mode), "radius_ratio_counts": RATIO_EDGES}
@@ -150,11 +150,11 @@ def check_mesh(
     observed_range_c: tuple[float, float] | None = None,
     length_unit: str = "m",
 ) -> QualityReport:
-    """Measure a mesh as `quality_report` does, and refuse what no finite-element solver can take.
+    """Return `quality_report` of a mesh; raise if no finite-element solver can use the mesh.
 
     Raises:
-        MeshError: A volume is not above 0, neighbours do not share whole faces, a node belongs to no tetrahedron or
-            lies where another is, or the boundary is not closed; or what `quality_report` raises.
+        MeshError: A volume is not above 0, neighbours do not share whole faces, a node belongs to no tetrahedron, two
+            nodes are at one place, or the boundary is not closed; or what `quality_report` raises.
     """
     report = quality_report(mesh, boundary_mode, observed_range_c, length_unit)
     for criterion in report.criteria[:3]:
@@ -171,17 +171,17 @@ def quality_report(
     observed_range_c: tuple[float, float] | None = None,
     length_unit: str = "m",
 ) -> QualityReport:
-    """Measure a mesh and hold it against its quality criteria; one that is not met does not raise.
+    """Return the figures of a mesh and its results by the quality criteria; no error is raised for an unmet criterion.
 
     Args:
         mesh: The mesh, damaged or not.
-        boundary_mode: How its boundary was made.
-        observed_range_c: Lowest and highest observed temperature, [degrees Celsius]; the observed nodes' if left out,
-            all nodes' if none was observed.
-        length_unit: Name of the unit of the nodes' positions.
+        boundary_mode: How the boundary of the mesh was made.
+        observed_range_c: Lowest and highest observed temperature, [degrees Celsius]; if left out, the range of the
+            observed nodes, or of all nodes if none was observed.
+        length_unit: Unit of length of the nodes' positions.
 
     Raises:
-        MeshError: The arrays do not fit each other or are not finite.
+        MeshError: The arrays do not fit each other or are not finite, see `TetMesh.check`.
     """
     mesh.check()
     points, tets, temperature = mesh.points_m, mesh.tets, mesh.temperature_c
@@ -219,7 +219,7 @@ def quality_report(
         area_m2=float(areas.sum()),
         edge_length_m=(float(lengths.min()), float(lengths.mean()), float(lengths.max())),
         **figures,
-        # Nodes without a tetrahedron are no bodies.
+        # Nodes without a tetrahedron do not count as bodies.
         bodies_by_node=int(connected_components(links, directed=False)[0]) - unused,
         bodies_by_face=int(component_of(len(tets), *(rows // 4 for rows in faces.pairs())).max()) + 1,
         **surface_topology(points, mesh.facets, sides),
@@ -239,7 +239,7 @@ def _criteria(
     wrong_facets: int,
     excess_k: float,
 ) -> tuple[Criterion, ...]:
-    """Return all criteria of a boundary; `turned` is the number of tetrahedra whose volume is not above 0."""
+    """Return all criteria of a boundary mode; `turned` counts tetrahedra whose volume is not above 0."""
     (smallest, largest), (low, high) = figures["dihedral_range_deg"], DIHEDRAL_BOUNDS_DEG[mode]
     inside, bad = min(smallest - low, high - largest), open_edges + wrong_facets
     obtuse, warm = figures["share_obtuse"], excess_k > TEMPERATURE_TOLERANCE_K
@@ -257,7 +257,7 @@ def _criteria(
 
 
 def _measure_shapes(mesh: TetMesh, edges_deg: FloatArray) -> tuple[dict[str, Any], FloatArray]:
-    """Return figures by their names in `QualityReport`, and volumes, shape (t,)."""
+    """Return the shape figures by their names in `QualityReport`, and the volumes, shape (t,)."""
     num = len(mesh.tets)
     volumes, ratios = np.empty(num), np.empty(num)
     angle_counts = np.zeros(len(edges_deg) - 1, dtype=np.int64)
@@ -282,7 +282,7 @@ def _measure_shapes(mesh: TetMesh, edges_deg: FloatArray) -> tuple[dict[str, Any
 
 
 def picture_of_quality(path: Path | str, report: QualityReport) -> None:
-    """Draw a report as a PNG: two histograms above, figures and criteria below."""
+    """Draw a report as a PNG file: two histograms above, figures and criteria below."""
     from matplotlib.figure import Figure
 
     path = Path(path)
@@ -339,14 +339,14 @@ def _draw_bars(axis: Axes, counts: tuple[int, ...], edges: FloatArray) -> None:
 
 
 def _write(axis: Axes, x: float, y: float, words: str, colour: str, size: float = 10.0, weight: str = "normal") -> None:
-    """Write a line; it takes no room away from the histograms, however long it is."""
+    """Write a line of text that takes no room from the histograms, however long the line is."""
     axis.set_axis_off()
     line = axis.text(x, y, words, fontsize=size, weight=weight, color=colour, va="top", transform=axis.transAxes)
     line.set_in_layout(False)
 
 
 def _figures(report: QualityReport) -> dict[str, str]:
-    """Return the figures that a person asks for first, by name."""
+    """Return the figures shown in the picture as text, by their captions."""
     unit = report.length_unit
     shortest, mean, longest = report.edge_length_m
     return {

@@ -9,33 +9,33 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 
-_CHUNK = 1 << 14  # tetrahedra at a time: what is worked on stays in the processor's cache
+_CHUNK = 1 << 14  # tetrahedra worked on at a time, so that their data stay in the processor's cache
 _FACE_PAIRS = ((2, 3), (1, 3), (1, 2), (0, 3), (0, 2), (0, 1))
-"""Faces (by the node opposite) that meet in edge e of `checks.TET_EDGES`."""
+"""For each edge of `checks.TET_EDGES` the two faces that meet in the edge; face f is opposite node f."""
 _RIGHT_ANGLE = 1e-6
-"""Cosines below this are those of a right angle: five million metres from the origin, as in national coordinates, nodes
-have steps of a nanometre, which turn the angles of voxels of 1 cm by less."""
+"""Angles whose cosine is smaller than this in magnitude count as right angles. In national coordinates, five million
+metres from the origin, nodes have steps of a nanometre, which change cosines in voxels of 1 cm by less than this."""
 
 
 @dataclass(frozen=True)
 class TetShapes:
-    """Sides and face normals of tetrahedra, from which all figures of their shape follow; one column each."""
+    """Sides, face normals and volumes of tetrahedra; every tetrahedron is one column of the arrays."""
 
     sides: tuple[FloatArray, FloatArray, FloatArray]
     """Vectors from node 0 to nodes 1, 2 and 3, each of shape (3, t), [m]."""
     normals: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-    """Inward normal of the face opposite each node, twice the face's area long, each of shape (3, t), [m^2]."""
+    """Inward normals of the faces opposite nodes 0 to 3, with twice the face's area as length, each (3, t), [m^2]."""
     six_volumes: FloatArray  # six times the signed volume, shape (t,), [m^3]
 
     @property
     def volumes(self) -> FloatArray:
-        """Signed volumes, negative if a tetrahedron is turned over, shape (t,), [m^3]."""
+        """Return the signed volumes, negative for tetrahedra that are turned over, shape (t,), [m^3]."""
         return self.six_volumes / 6.0
 
     def dihedral_cosines(self) -> FloatArray:
-        """Return the cosines of the inner angles between two faces, shape (6, t), at the edges of `checks.TET_EDGES`.
+        """Return the cosines of the dihedral angles at the edges `checks.TET_EDGES`, shape (6, t).
 
-        The angle at a face without area counts as 0 degrees; cosines of right angles are exactly 0.
+        Angles at a face without area count as 0 degrees. Cosines smaller than `_RIGHT_ANGLE` in magnitude become 0.
         """
         lengths = [np.sqrt(_dot(normal, normal)) for normal in self.normals]
         cosines = np.empty((6, len(self.six_volumes)))
@@ -49,8 +49,8 @@ class TetShapes:
     def radius_ratios(self) -> FloatArray:
         """Return three times the radius of the inscribed over that of the circumscribed sphere, shape (t,).
 
-        It is 1 for the regular tetrahedron, and 0 where the volume is not above 0. The radii are r = 3 V / A and
-        R = | |a|^2 b x c + |b|^2 c x a + |c|^2 a x b | / (12 V), with sides a, b, c and area A.
+        The ratio is 1 for a regular tetrahedron, and 0 where the volume V is not above 0. The radii are r = 3 V / A and
+        R = | |a|^2 b x c + |b|^2 c x a + |c|^2 a x b | / (12 V), with `sides` a, b, c and the area A of all faces.
         """
         double_areas = np.sum([np.sqrt(_dot(normal, normal)) for normal in self.normals], axis=0)
         centre = np.sum([_dot(side, side) * normal for side, normal in zip(self.sides, self.normals[1:])], axis=0)
@@ -60,16 +60,16 @@ class TetShapes:
         return np.minimum(ratios, 1.0, out=ratios)
 
     def stiffness(self, cosines: FloatArray) -> FloatArray:
-        """Return what each tetrahedron adds to the stiffness of its edges at conductivity 1, shape (6, t), [m].
+        """Return the stiffness entries of each tetrahedron's edges at conductivity 1, shape (6, t), [m].
 
-        The entry of the linear element is V grad(lambda_i) . grad(lambda_j) = n_i . n_j / (36 V): the cotangent of the
-        angle at the opposite edge times minus a sixth of that edge's length. It is positive where that angle is obtuse,
-        and 0 where the volume is. `cosines` are those of `dihedral_cosines`.
+        For linear shape functions f the entry of edge ij is V grad(f_i) . grad(f_j) = n_i . n_j / (36 V) (`normals` n).
+        This equals -l cot(a) / 6 with the length l of the opposite edge and the dihedral angle a there: the entry is
+        positive if a is obtuse. If V is 0 the entry is 0. `cosines` are those of `dihedral_cosines`.
         """
         entries = np.empty_like(cosines)
         weight = np.zeros_like(self.six_volumes)
         np.divide(1.0, 6.0 * self.six_volumes, out=weight, where=self.six_volumes != 0.0)
-        # Nodes i and j lie opposite the two faces that meet in the opposite edge, 5 - e.
+        # Nodes i and j of edge e lie opposite the two faces that meet in the opposite edge, which is edge 5 - e.
         for edge, (i, j) in enumerate(reversed(_FACE_PAIRS)):
             np.multiply(_dot(self.normals[i], self.normals[j]), weight, out=entries[edge])
         entries[cosines[::-1] == 0.0] = 0.0
@@ -77,7 +77,7 @@ class TetShapes:
 
 
 def shapes_in_chunks(points: FloatArray, tets: IntArray) -> Iterator[tuple[slice, TetShapes]]:
-    """Yield chunks of the tetrahedra (t, 4) and their shapes, so that memory does not grow with their number."""
+    """Yield, for one chunk of tetrahedra (t, 4) after another, its slice of `tets` and its shapes, to save memory."""
     columns = np.ascontiguousarray(np.asarray(points, dtype=np.float64).T)
     for start in range(0, len(tets), _CHUNK):
         which = slice(start, min(start + _CHUNK, len(tets)))
@@ -89,7 +89,7 @@ def shapes_in_chunks(points: FloatArray, tets: IntArray) -> Iterator[tuple[slice
 
 
 def signed_volumes(points: FloatArray, tets: IntArray) -> FloatArray:
-    """Return det(p1 - p0, p2 - p0, p3 - p0) / 6, shape (t,), [m^3]: the volume, negative for one turned over."""
+    """Return volumes det(p1 - p0, p2 - p0, p3 - p0) / 6, shape (t,), [m^3]; negative for tetrahedra turned over."""
     volumes = np.empty(len(tets))
     for which, shapes in shapes_in_chunks(points, tets):
         volumes[which] = shapes.volumes
@@ -97,7 +97,7 @@ def signed_volumes(points: FloatArray, tets: IntArray) -> FloatArray:
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products of columns, shape (3, t)."""
+    """Return the cross products of the columns of a and b, shape (3, t)."""
     out = np.empty_like(a)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.multiply(a[j], b[k], out=out[i])
@@ -106,7 +106,7 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Dot products of columns, shape (t,)."""
+    """Return the dot products of the columns of a and b, shape (t,)."""
     out = a[0] * b[0]
     out += a[1] * b[1]
     out += a[2] * b[2]

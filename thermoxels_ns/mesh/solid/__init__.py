@@ -1,1 +1,1 @@
-"""Which part of space is solid."""
+"""Choice of the solid voxels of a trained field, and the level whose zero is their surface."""

@@ -1,4 +1,4 @@
-"""Lines of sight through solid voxels: how far a ray gets, and how many training cameras see each voxel."""
+"""Lines of sight among solid voxels: where rays meet the first one, and how many training cameras see each voxel."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.core.voxel_walk import cells_crossed
 
-MOST_CAMERAS = 128  # more cameras than this are thinned out evenly, in their order
+MOST_CAMERAS = 128  # largest number of cameras that are counted; of more cameras, so many are chosen evenly
 SEEN_SHARE = 0.1
-"""A voxel is seen if at least this share of the cameras whose image holds it, and at least one, has a free line to it:
-a reconstruction has pinholes that single cameras look through."""
+"""A voxel is seen if at least this share of the cameras whose image holds the voxel, and at least one camera, has a
+free line to the voxel: a reconstruction has pinholes that single cameras look through."""
 CLEAR_OF_CAMERA = 1.5  # solid voxels this close to a camera do not block it, [voxels]: floaters stick to cameras
 
 
 @dataclass(frozen=True)
 class CameraCounts:
-    """How many cameras see each voxel."""
+    """For each voxel, the number of cameras whose image holds it and how many of these have a free line to it."""
 
     in_image: npt.NDArray[np.uint8]
     """Number of cameras whose image holds the voxel's centre, shape `lattice.cell_shape`."""
-    free: npt.NDArray[np.uint8]  # number of them with a free line to it; the voxel itself may be solid
+    free: npt.NDArray[np.uint8]  # number of these cameras with a free line to the voxel, which may be solid itself
 
     @property
     def seen(self) -> BoolArray:
-        """Voxels that enough cameras see, see `SEEN_SHARE`."""
+        """Return True for voxels that enough cameras see, by the rule of `SEEN_SHARE`."""
         return (self.free > 0) & (self.free >= np.float32(SEEN_SHARE) * self.in_image)
 
     @property
     def hidden(self) -> BoolArray:
-        """Voxels that some image would hold, but that are not seen because something stands in front of them."""
+        """Return True for voxels that lie in some camera's image but are not seen, as solid voxels block the view."""
         return (self.in_image > 0) & ~self.seen
 
 
 def count_cameras(cells: BoolArray, lattice: Lattice, views: Views) -> CameraCounts:
-    """Count the cameras, at most `MOST_CAMERAS`, that see each voxel past those of `cells` that block the view.
+    """Count for each voxel the cameras that see it, of `MOST_CAMERAS` at most; solid voxels `cells` block the view.
 
-    Around each camera stand six pyramids, one per side of the lattice. In each of them, rays that lie one voxel apart
-    at its far end go from layer to layer; a layer of voxels meets a regular grid of rays, so the ray of a voxel is a
-    product of two look-ups along the axes. The cost is that of two or three passes over the lattice per camera.
+    The space around each camera is six pyramids, one per side of the lattice. In each, rays that are one voxel apart at
+    the far end are followed from layer to layer. They meet a layer in a regular grid, so that the ray of a voxel takes
+    one look-up per axis. The cost is two or three passes over the lattice per camera.
     """
     chosen = np.arange(len(views.focal))
     if len(chosen) > MOST_CAMERAS:
@@ -52,7 +52,7 @@ def count_cameras(cells: BoolArray, lattice: Lattice, views: Views) -> CameraCou
     eyes = lattice.world_to_index(views.camera_to_world[:, :, 3])
     both = np.zeros(cells.shape, dtype=np.uint16)
     for order in ((0, 1, 2), (1, 0, 2), (2, 0, 1)):
-        # Layers across the first of these axes are contiguous.
+        # The layers across the first axis of `order` are contiguous in memory.
         passes = np.where(np.ascontiguousarray(cells.transpose(order)), _HELD, _HELD + _FREE)
         blocks = cells.any(axis=order[1:])
         counts = np.zeros(passes.shape, dtype=np.uint16)
@@ -64,11 +64,11 @@ def count_cameras(cells: BoolArray, lattice: Lattice, views: Views) -> CameraCou
 
 
 _HELD, _FREE = np.uint16(1), np.uint16(256)
-"""Both counts of a voxel stand in one number, so that one look-up serves them: the image holds it, its line is free."""
+"""Units of the two counts, which share one number: `_HELD` for an image that holds a voxel, `_FREE` for a free line."""
 
 
 def _holds(views: Views, camera: int, direction: FloatArray) -> BoolArray:
-    """Whether a camera's image holds directions (..., 3)."""
+    """Return whether directions (..., 3) from a camera's centre lie in its image, shape (...)."""
     local = direction @ views.camera_to_world[camera, :, :3]
     depth = -local[..., 2]
     ahead = depth > 1e-9
@@ -90,7 +90,7 @@ def _count_along(
     order: tuple[int, int, int],
     sign: int,
 ) -> None:
-    """Add what one camera sees in the pyramid around one half of an axis, layer after layer away from it."""
+    """Add to `counts` what one camera sees in the pyramid around one half (`sign`) of the axis `order[0]`."""
     distance = sign * (np.arange(len(passes)) + 0.5 - eye[0])
     ahead = np.flatnonzero(distance > 0.0)[::sign]
     if len(ahead) == 0:
@@ -126,21 +126,21 @@ def _count_along(
 
 @dataclass(frozen=True)
 class _Rays:
-    """Evenly spaced slopes of rays along one axis of the layers."""
+    """Rays of a pyramid, evenly spaced by their slopes along one axis of the layers."""
 
-    low: float
-    step: float
-    count: int
-    eye: float
-    voxels: int
-    owns_diagonal: bool  # whether slopes of exactly 1 belong to this pyramid; else they belong to its neighbour
+    low: float  # lowest slope
+    step: float  # difference of the slopes of neighbours
+    count: int  # number of rays
+    eye: float  # position of the camera along the axis, [voxels]
+    voxels: int  # number of voxels along the axis
+    owns_diagonal: bool  # True: rays of slope exactly 1 or -1 belong to this pyramid; False: to its neighbour
 
     @property
     def slopes(self) -> FloatArray:
         return self.low + (np.arange(self.count) + 0.5) * self.step
 
     def of_voxels(self, away: FloatArray) -> list[tuple[slice, IntArray]]:
-        """For layers so far away: the voxels that lie within the pyramid, and the ray nearest to each of them."""
+        """Return, per layer at distance `away`, the run of voxels in the pyramid and the number of each one's ray."""
         slope = (np.arange(self.voxels) + 0.5 - self.eye) / away[:, None]
         number = np.clip(np.floor((slope - self.low) / self.step), -1, self.count).astype(np.int64)
         if self.owns_diagonal:
@@ -150,12 +150,12 @@ class _Rays:
         return _runs(number, self.count)
 
     def at_voxels(self, away: FloatArray) -> list[tuple[slice, IntArray]]:
-        """For layers so far away: the rays that lie within the layer, and the voxel that each of them meets."""
+        """Return, per layer at distance `away`, the run of rays in the layer and the number of each one's voxel."""
         return _runs(np.floor(self.eye + self.slopes * away[:, None]).astype(np.int64), self.voxels)
 
 
 def _runs(number: IntArray, count: int) -> list[tuple[slice, IntArray]]:
-    """In each row of ascending numbers, the run of those that lie in 0..count - 1."""
+    """Return for each row of ascending numbers the slice of entries from 0 to `count` - 1, and these entries."""
     starts, stops = ((number < end).sum(axis=1).tolist() for end in (0, count))
     return [(slice(a, b), row[a:b]) for row, a, b in zip(number, starts, stops)]
 
@@ -163,9 +163,9 @@ def _runs(number: IntArray, count: int) -> list[tuple[slice, IntArray]]:
 def first_solid(
     cells: BoolArray, eye: FloatArray, directions: FloatArray, reach: FloatArray | float = np.inf
 ) -> FloatArray:
-    """How far from a point, in corner indices, rays along unit vectors (n, 3) enter the first solid voxel, [voxels].
+    """Return the distances (n,), [voxels], from `eye` (corner indices) along unit vectors (n, 3) to the first solid.
 
-    Infinite where they meet none up to `reach`. What begins nearer than `CLEAR_OF_CAMERA` blocks no ray.
+    Rays that meet none within `reach` get infinity. Solid nearer to `eye` than `CLEAR_OF_CAMERA` blocks no ray.
     """
     found = np.empty(len(directions))
     reach = np.broadcast_to(np.asarray(reach, dtype=np.float64), len(directions))
@@ -176,7 +176,7 @@ def first_solid(
 
 @kernel
 def _enter_solid(cells, shape, eye, directions, reach, clear, found):
-    """Find how far rays get, see `first_solid`; `cells` is flat."""
+    """Write the result of `first_solid` into `found`; `cells` is flat."""
     crossed, faces = np.empty(shape.sum(), np.int64), np.empty(shape.sum() + 1)
     for n in range(len(directions)):
         found[n] = np.inf

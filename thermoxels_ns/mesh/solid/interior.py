@@ -1,4 +1,4 @@
-"""The inside of bodies: cavities, space that no camera sees, walls behind seen surfaces."""
+"""The inside of bodies of which only the shell was reconstructed: cavities, hidden space, walls of given thickness."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow, repeated
 
-LARGEST_PASS = 4_000_000  # lattices with more voxels than this are looked at in blocks of 2^3, 4^3, ... voxels.
+LARGEST_PASS = 4_000_000  # with more voxels than this, `_hidden` has one answer per block of 2^3, 4^3, ... voxels
 SHADOW_SURROUNDED = 0.1
-"""Space that the shell itself hides is inside only if seen surfaces surround it at least this far, as a winding number:
-behind a surface seen from one side only it is up to one half; in the shadow before a wall it is 0 or less."""
-CREVICE_SURROUNDED = 0.3  # the same for space that only the filled inside hides
+"""Least winding number, in the seen surfaces, of inside space that the shell hides from cameras. The number is up to
+one half behind a surface seen from one side only, and at most 0 in the shadow before a wall."""
+CREVICE_SURROUNDED = 0.3  # least winding number of inside space that only the filled inside hides
 STRAY_SHARE = 0.005
-"""Share of a body's solid voxels, strays, that may lie beyond each side of the box that bounds its hull."""
+"""Share of a body's voxels that may be strays: the outermost layers on each side, up to this share."""
 _fast_length = cast(Callable[[int], int], fft.next_fast_len)
-MARGIN = 0.25  # the potential is zero this share of the lattice's size beyond it, on each side
+MARGIN = 0.25  # the winding number is set to 0 at this share of the lattice's size outside the lattice, on each side
 THINNEST_GROWN = 1.5
-"""A wall thinner than this has the middle of no voxel behind the seen one, so none is added, [voxels]."""
+"""Least thickness of a wall that gets voxels behind the seen one, [voxels]: the next voxel's middle is this deep."""
 
 
 @dataclass(frozen=True)
 class Interior:
-    """Empty voxels that lie inside a solid."""
+    """The empty voxels that lie inside a solid."""
 
-    enclosed: BoolArray  # voxels of cavities: no way out through voxel faces, and no camera in them
+    enclosed: BoolArray  # voxels of cavities that have no way out through voxel faces and no camera in them
     hidden: BoolArray
-    """Other voxels that cameras cannot look into, behind the surface and within the convex hull of a body."""
+    """Other voxels that no camera sees, behind the surface and within the convex hull of a body."""
     rooms: int  # cavities left empty because a camera stands in them
 
 
 def interior(
     cells: BoolArray, lattice: Lattice, views: Views | None, seal: int, within: BoolArray | None = None
 ) -> Interior:
-    """Find the inside, apart from `cells`, of bodies of which only a shell was reconstructed.
+    """Return the empty voxels inside bodies of which only a shell was reconstructed; `cells` are the shell's voxels.
 
-    Only what lies `within` a region is filled; what stands beside it still hides. A body is what touches once openings
-    of up to twice `seal` voxels are closed. Its inside are cavities of the sealed shell and, if the cameras are known,
-    the space within its convex hull that they should see but do not, because the shell stands in front of it
-    (`free_space`), and that the backs of seen surfaces surround (`winding_number`). Lines of sight through holes of the
-    shell then end at what was filled, and crevices that are hidden now are filled where surfaces surround them well.
+    Only voxels `within` a region are returned; solid outside the region still blocks the view. Voxels are one body if
+    they touch after openings of up to twice `seal` voxels are closed. Inside are the cavities of this sealed shell and,
+    if the cameras are known, voxels in the body's convex hull that lie in a camera's image, are hidden by the shell
+    (`count_cameras`) and surrounded by the backs of seen surfaces (`winding_number`). A second pass takes the voxels
+    found as solid and adds crevices that these hide, where surfaces surround them well (`CREVICE_SURROUNDED`).
     """
     sealed, within = close_gaps(cells, seal), np.ones_like(cells) if within is None else within
     enclosed, room = _enclosed(cells, sealed, lattice, views, seal)
@@ -57,7 +57,7 @@ def interior(
     if views is None or len(views.focal) == 0:
         return Interior(enclosed & within, np.zeros_like(cells), rooms)
     hidden = _hidden(sealed, within, lattice, views, seal) & ~cells & ~enclosed
-    # What the filled space now encloses is as much inside as the rest.
+    # Cavities that the filled space encloses are inside as well.
     cavity, _ = _cavities(cells | enclosed | hidden, room | _camera_voxels(cells, lattice, views))
     return Interior(enclosed & within, (hidden | cavity) & within, rooms)
 
@@ -65,10 +65,10 @@ def interior(
 def _enclosed(
     cells: BoolArray, sealed: BoolArray, lattice: Lattice, views: Views | None, seal: int
 ) -> tuple[BoolArray, BoolArray]:
-    """Return the cavities without a camera, of the shell and of the sealed shell, and those with one."""
+    """Return two masks, cavities without and with a camera, both of the shell and of the sealed shell."""
     everywhere = np.ones((3, 3, 3), dtype=bool)
     cameras = _camera_voxels(cells, lattice, views)
-    # Sealing takes the alcoves and corridors of a cavity, where cameras may stand as well.
+    # Sealing closes alcoves and corridors of a cavity, where cameras may stand: cameras are grown by the same width.
     if seal and cameras.any():
         cameras = np.asarray(ndimage.binary_dilation(cameras, everywhere, iterations=2 * seal, mask=~cells), dtype=bool)
     cavity, room = _cavities(cells, cameras)
@@ -76,7 +76,7 @@ def _enclosed(
         wide, wide_room = _cavities(sealed, cameras)
         room |= wide_room
         if wide.any():
-            # It also rounds corners off and plugs openings; both belong to the cavity.
+            # Sealing also fills corners and openings of a cavity; the filled voxels belong to the cavity.
             taken = wide | (sealed & ~cells)
             wide = np.asarray(ndimage.binary_dilation(wide, everywhere, iterations=2 * seal, mask=taken), dtype=bool)
         cavity = (cavity | wide) & ~room
@@ -92,7 +92,7 @@ def _camera_voxels(cells: BoolArray, lattice: Lattice, views: Views | None) -> B
 
 
 def _cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Return the empty voxels without a way out through voxel faces, in cavities without a camera and with one."""
+    """Return two masks, cavities without and with a camera: empty voxels without a way out through voxel faces."""
     labels = face_connected(np.pad(~shell, 1, constant_values=True))
     kept = np.ones(int(labels.max()) + 1, dtype=bool)
     kept[[0, labels[0, 0, 0]]] = False
@@ -104,13 +104,13 @@ def _cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArra
 
 
 def _hidden(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, seal: int) -> BoolArray:
-    """Return the voxels that are not seen, behind the surface and within the convex hull of a body."""
+    """Return the voxels within a body's convex hull that no camera sees and that seen surfaces surround."""
     block = 1
     while sealed.size > LARGEST_PASS * block**3:
         block *= 2
     if block > 1:
         return _hidden_in_blocks(sealed, within, lattice, views, seal, block)
-    # The convex hull of every body, strays of which do not count.
+    # The convex hull of every body is taken without its strays.
     labels, hull = connected(sealed & within), np.zeros_like(sealed)
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
         hull[box] |= convex_hull(_without_strays(labels[box] == number))
@@ -122,7 +122,7 @@ def _hidden(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views
 
 
 def _behind(cells: BoolArray, lattice: Lattice, views: Views, surrounded: float) -> BoolArray:
-    """Return the voxels that are not seen and whose winding number in seen surfaces is at least `surrounded`."""
+    """Return the voxels that are hidden from cameras and have a winding number of at least `surrounded`."""
     counts = count_cameras(cells, lattice, views)
     return counts.hidden & (winding_number(cells, counts.seen & ~cells) >= surrounded)
 
@@ -130,7 +130,7 @@ def _behind(cells: BoolArray, lattice: Lattice, views: Views, surrounded: float)
 def _hidden_in_blocks(
     sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, seal: int, block: int
 ) -> BoolArray:
-    """Return what `_hidden` does, with one answer for a block of voxels."""
+    """Return the result of `_hidden`, with one answer for a block of `block`^3 voxels."""
     shape = sealed.shape
     padded = np.pad((sealed, within), [(0, 0), *((0, -n % block) for n in shape)])
     cx, cy, cz = (n // block for n in padded.shape[1:])
@@ -138,17 +138,17 @@ def _hidden_in_blocks(
     coarse_lattice = Lattice(lattice.lo, lattice.voxel_size * block, (cx + 1, cy + 1, cz + 1))
     hidden = _hidden(coarse, coarse_within, coarse_lattice, views, seal // block)
 
-    # A block that holds a piece of the shell has an inner and an outer side; its empty voxels go with what they touch.
+    # The empty voxels of a block with a piece of the shell are inside if they are connected to a hidden block.
     inside = tuple(slice(n) for n in shape)
     seeds, partly = repeated(hidden & ~coarse, block)[inside], repeated(coarse, block)[inside] & ~sealed
     touching = ndimage.generate_binary_structure(3, 1)
-    # In a corner of the shell the way is longest: across the block along all three axes.
+    # The longest connection is in a corner of the shell: across the block along all three axes.
     inner = ndimage.binary_dilation(seeds, touching, iterations=3 * (block - 1), mask=partly)
     return np.logical_or(seeds, inner)
 
 
 def _without_strays(body: BoolArray) -> BoolArray:
-    """Return a body without the outermost layers that hold at most `STRAY_SHARE` of its voxels, on each side."""
+    """Return a body without its strays: the outermost layers on each side with at most `STRAY_SHARE` of its voxels."""
     most, kept = STRAY_SHARE * np.count_nonzero(body), body
     for axis in range(3):
         layers = np.count_nonzero(body, axis=tuple(other for other in range(3) if other != axis))
@@ -158,16 +158,16 @@ def _without_strays(body: BoolArray) -> BoolArray:
 
 
 def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
-    """Return the winding number of each voxel in the voxel faces between solid and air, taken from their back.
+    """Return for each voxel the winding number of the surface made of all voxel faces between `solid` and `air`.
 
-    It is 1 within a closed surface and 0 outside of it; where the surface has a hole, one half is a film across it.
-    Faces with solid on both sides, or next to voxels that are neither, are no surface. For triangles see Jacobson,
-    Kavan and Sorkine-Hornung 2013, Robust inside-outside segmentation using generalized winding numbers, equation 5.
-    Here it is the function that jumps by one across the surface and is harmonic elsewhere: Lap w = div J with the jumps
-    J, solved by sine transforms in blocks of 2^3 voxels.
+    The number is 1 inside a closed surface and 0 outside; through a hole in the surface it changes gradually. Faces
+    between two solid voxels, or next to a voxel that is neither solid nor air, are no surface. For triangles see
+    Jacobson, Kavan and Sorkine-Hornung 2013, Robust inside-outside segmentation using generalized winding numbers,
+    equation 5. The number w jumps by one across the surface and is harmonic elsewhere: Lap w = div J with the jumps J.
+    This equation is solved by sine transforms, with one value per block of 2^3 voxels.
     """
     shape = solid.shape
-    # Lengths for which the transforms are fast, with the lattice about in the middle.
+    # The lattice is padded to lengths for which the transforms are fast, and lies about in the middle.
     blocks = [_fast_length(int(np.ceil((0.5 + MARGIN) * n)) + 3) - 1 for n in shape]
     before = [(count - (n + 1) // 2) // 2 for count, n in zip(blocks, shape)]
     pads = [(2 * b, 2 * count - n - 2 * b) for b, count, n in zip(before, blocks, shape)]
@@ -186,7 +186,7 @@ def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
 
 
 def _jumps(side: npt.NDArray[np.int8], axis: int) -> Float32Array:
-    """Return the jump from each block to the next along an axis: 1 where solid is before air, -1 air before solid."""
+    """Return the jump from each block to the next along an axis: 1 for solid before air, -1 for air before solid."""
     # A face in the middle of a block counts half at each of the block's ends.
     row, jump = np.moveaxis(side, axis, 0), np.zeros_like(side)
     np.moveaxis(jump, axis, 0)[:-1] = np.where(row[:-1] * row[1:] == -1, row[:-1], 0)
@@ -200,14 +200,14 @@ def _jumps(side: npt.NDArray[np.int8], axis: int) -> Float32Array:
 
 
 def wall_behind(cells: BoolArray, lattice: Lattice, views: Views, thickness: float) -> BoolArray:
-    """Find the empty voxels that make the seen surface as thick as a wall, the seen voxel included, [voxels].
+    """Return the empty voxels to add behind seen surfaces so that these become walls of a `thickness`, [voxels].
 
-    An empty voxel joins if it lies within the thickness of solid voxels that enough cameras see, counted from their
-    outer faces, on the straight way through space that is solid or not seen. A plate that is seen from both sides does
-    not grow.
+    An empty voxel is added if its middle is within the thickness of the outer face of the nearest solid voxel that
+    enough cameras see, and if the straight line between the two voxels leads through voxels that are solid or not seen.
+    The thickness includes the seen voxel. A plate that is seen from both sides does not grow.
     """
     added = np.zeros_like(cells)
-    # The middle of a surface voxel lies half a voxel below its face, that of the last one half a voxel before the end.
+    # The middle of a surface voxel lies half a voxel below its face, so this is how far from it other middles may be.
     reach = thickness - 0.5
     seen = count_cameras(cells, lattice, views).seen
     surface = np.argwhere(cells & seen & grow(seen & ~cells, 1))

@@ -1,4 +1,4 @@
-"""The level function on voxel centres whose zero is the surface; thin and small bodies keep their volume."""
+"""The level on voxel centres whose zero is the surface, made so that thin and small bodies keep their volume."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from scipy import ndimage
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, IntArray
 from thermoxels_ns.mesh.solid.morphology import bounding_box
 
-DEEP_QUANTILE = 0.95  # before smoothing, a voxel as dense as this quantile of the dense ones has level 1 ..
-DEEP_RATIOS = (2.0, 100.0)  # ... but that density is kept within these multiples of the threshold.
+DEEP_QUANTILE = 0.95  # quantile of the density of the dense voxels at which the level is 1 before smoothing
+DEEP_RATIOS = (2.0, 100.0)  # lowest and highest ratio of that density to the threshold
 LEAST_LEVEL = 0.02
-"""No voxel is nearer to 0 than this before smoothing: a surface never passes through a voxel's centre."""
-LEAST_SHARE = 0.25  # smoothing leaves at least this share of a voxel's level, with its sign
-LEAST_SHARE_THIN = 0.5  # the same in walls and gaps one voxel thick; they keep their thickness
-MARGIN = 4  # voxels farther from the solid than this, along an axis, have level -1 without a look at their density
+"""Least distance of levels from 0 before smoothing, so that the surface never passes through a voxel's centre."""
+LEAST_SHARE = 0.25  # smoothing leaves at least this share of a voxel's level, and its sign
+LEAST_SHARE_THIN = 0.5  # the same for walls and gaps one voxel thick, which then keep their thickness
+MARGIN = 4  # voxels farther than this outside the bounding box of the solid have level -1, whatever their density
 UNNOTICED = 0.12
-"""Up to this share of the solid (for gaps: of the empty space) within a voxel may be lost to smoothing, as edges of
-large bodies and single bumps of noise."""
+"""Share of the solid (for gaps: of the empty space) around a voxel that smoothing may remove, as at edges of large
+bodies and single bumps of noise; only what is missing beyond it is made up."""
 
-_ROUNDS = 5  # how often what is missing is looked for and made up
-_RATE = 1.5  # share of what is missing that each round makes up, if all of the surface moves alike
+_ROUNDS = 5  # number of rounds in which missing volume is found and made up
+_RATE = 1.5  # share of the missing volume that a round makes up where all of the surface moves alike
 _LEAST_SLOPE = 0.6
-"""Levels change by at least this much per voxel of shift, [1 / voxel]; else a speck that smoothing left nearly nothing
-of would never grow."""
-_CHUNK = 1 << 14  # voxels at a time: what is worked on stays in the processor's cache
+"""Least change of the level per voxel of shift, [1 / voxel]; with less, a speck that smoothing nearly removed would
+never grow back."""
+_CHUNK = 1 << 14  # number of voxels worked on at a time, so that their data stay in the processor's cache
 _AROUND = np.indices((3, 3, 3)).reshape(3, 27).T - 1
 _WINDOW = np.array([0.25, 0.5, 0.25], dtype=np.float32)[_AROUND + 1].prod(axis=1)
 
@@ -40,27 +40,27 @@ def level_of(
     *,
     makes_up_volume: bool = True,
 ) -> Float32Array:
-    """Give every voxel a level in [-1, 1]: above 0 in solid voxels, below 0 in empty ones, 0 on the surface between.
+    """Return a level in [-1, 1] for every voxel: above 0 in solid voxels, below 0 in empty voxels, 0 on the surface.
 
-    Trained density jumps by orders of magnitude between neighbours, mostly from exactly 0. So the level is
-    s = log(density / threshold) / log(deep / threshold), at most 1, where that is above 0, and exp(s) - 1 below; deep
-    is the density of the densest part of the body. It is 0 at the threshold and -1 where there is no density: the
-    logarithm keeps what density says about the place of the surface. The weights 1 2 1 along each axis, over three
-    voxels, take the noise out, and the level shifts where thin or small bodies would lose volume by that.
+    Let s = log(density / threshold) / log(deep / threshold), where deep is the density of the densest part of the body.
+    The level is s, at most 1, where s is above 0, and exp(s) - 1 below: 0 at the threshold and -1 without density.
+    Trained density jumps by orders of magnitude between neighbours; the logarithm keeps what it says about the place of
+    the surface. The levels are then smoothed with weights 1 2 1 along each axis against noise, and shifted where thin
+    or small bodies would lose volume by the smoothing.
 
     Args:
-        density: At voxel centres, at least 0, [1 / world unit].
-        threshold: From which on a voxel counts as dense, at least 0, same unit.
-        dense: Voxels that the threshold chose.
-        cells: Solid voxels. Those that are not dense were made solid on purpose and lie deep inside; dense ones that
-            are not solid were removed on purpose and lie far outside.
-        makes_up_volume: Whether the level shifts in thin and small bodies so that its trilinear zero holds their
-            volume. Not for voxels, which hold it as they are.
+        density: Density at voxel centres, at least 0, [1 / world unit].
+        threshold: Least density of a dense voxel, at least 0, [1 / world unit].
+        dense: True for voxels that the threshold chose.
+        cells: True for solid voxels. Solid voxels that are not dense were added by a later step and get level 1 before
+            smoothing; dense voxels that are not solid were removed by a later step and get level -1.
+        makes_up_volume: True if the level is shifted so that thin and small bodies keep their volume; False for meshes
+            along voxel faces, which keep it anyway.
     """
     result = np.full(cells.shape, -1.0, dtype=np.float32)
     near, threshold = bounding_box(cells, MARGIN), max(threshold, float(np.finfo(np.float64).tiny))
     low, high = map(math.log, DEEP_RATIOS)
-    logarithm = high  # of how many times denser than the threshold the densest part of the body is
+    logarithm = high  # logarithm of the ratio of the deep density to the threshold
     if dense.any():
         deep = float(np.quantile(density[dense], DEEP_QUANTILE, method="higher"))
         logarithm = min(max(math.log(deep) - math.log(threshold), low), high)
@@ -84,12 +84,12 @@ def level_of(
 
 
 def _signed(level: Float32Array, least: Float32Array | np.float32, cells: BoolArray) -> Float32Array:
-    """Return the level, raised to `least` in solid voxels and lowered to minus that in empty ones."""
+    """Return the level, raised to at least `least` in solid voxels and lowered to at most -`least` in empty ones."""
     return np.where(cells, np.maximum(level, least), np.minimum(level, -least))
 
 
 def _thin(cells: BoolArray) -> BoolArray:
-    """Return the voxels of walls one voxel thick: alone along an axis, and beside at least two others like them."""
+    """Return voxels of walls one voxel thick: single along an axis, with at least two such voxels beside them."""
     thin = np.zeros_like(cells)
     for axis in range(3):
         alone = cells & ~_beside(cells, axis, 1) & ~_beside(cells, axis, -1)
@@ -99,19 +99,19 @@ def _thin(cells: BoolArray) -> BoolArray:
 
 
 def _beside(cells: BoolArray, axis: int, step: int) -> BoolArray:
-    """Return the neighbour of every voxel along an axis; on the border of the lattice, where there is none, itself."""
+    """Return the value of each voxel's neighbour along an axis, or the voxel's own value if it has no neighbour."""
     row = np.moveaxis(cells, axis, 0)
     return np.moveaxis(np.concatenate((row[1:], row[-1:]) if step > 0 else (row[:1], row[:-1])), 0, axis)
 
 
 def _keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, cells: BoolArray) -> Float32Array:
-    """Shift a smoothed level until around every voxel about as much is solid as the level before smoothing has it.
+    """Return a smoothed level, shifted so that the solid volume around every voxel is about that of the `sharp` level.
 
-    Of a bar one voxel thick, smoothing would leave a third. Of each voxel near the surface, the solid share is taken
-    from the trilinear level, and from where the sharp level changes its sign along the axes. Their differences,
-    averaged with weights 1 4 6 4 1 along each axis and divided by the surface around, say how far the surface should
-    move. Differences below `UNNOTICED` of what is there are left alone, so that faces and long edges of a body of many
-    voxels stay. Signs stay, and no level comes nearer to 0 than `least`.
+    Smoothing alone would leave a third of a bar one voxel thick. For each voxel near the surface, the solid share is
+    taken from the trilinear level, and the wanted share from where the sharp level changes its sign along the axes.
+    Their difference, averaged with weights 1 4 6 4 1 along each axis and divided by the area of the surface around, is
+    the distance by which the surface should move. Averages below `UNNOTICED` times the volume around are left alone, so
+    that faces and long edges of large bodies stay. Signs stay, and no level comes nearer to 0 than `least`.
     """
     some, every = (look(cells, 3, mode="nearest") for look in (ndimage.maximum_filter, ndimage.minimum_filter))
     near = np.pad(np.not_equal(some, every), 1)
@@ -150,8 +150,8 @@ def _keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, 
 
 
 def _wanted(sharp: Float32Array, index: IntArray, strides: IntArray) -> tuple[Float32Array, Float32Array]:
-    """Share of some voxels that is solid, and how many of their six neighbours are on the other side of the surface."""
-    # A voxel is as wide along an axis as the surface leaves of it, from its centre at most half a voxel to either side.
+    """Return the wanted solid share of the voxels `index`, and the number of their neighbours across the surface."""
+    # Along each axis, a voxel reaches from its centre to the surface on each side, but at most half a voxel.
     own = sharp[index]
     share, sides = np.ones(len(index), dtype=np.float32), np.zeros(len(index), dtype=np.float32)
     for stride in strides:
@@ -159,7 +159,7 @@ def _wanted(sharp: Float32Array, index: IntArray, strides: IntArray) -> tuple[Fl
         for step in (stride, -stride):
             other = sharp[index + step]
             across = (other > 0.0) != (own > 0.0)
-            # Both are never 0.
+            # The two levels are never 0.
             width += np.where(across, np.minimum(np.abs(own) / (np.abs(own) + np.abs(other)), 0.5), 0.5)
             sides += across
         share *= width
@@ -167,7 +167,7 @@ def _wanted(sharp: Float32Array, index: IntArray, strides: IntArray) -> tuple[Fl
 
 
 def _octant_weights() -> tuple[Float32Array, Float32Array]:
-    """Return the weights of the 27 levels around a voxel in value (8, 27) and gradient (3, 8, 27) of its octants."""
+    """Return weights of the 27 levels around a voxel in the value (8, 27) and gradient (3, 8, 27) at octant centres."""
     side = np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1
     towards = _AROUND[None] == side[:, None]
     share = np.where(_AROUND[None] == 0, 0.75, np.where(towards, 0.25, 0.0))
@@ -180,9 +180,9 @@ _VALUES, _SLOPES = _octant_weights()
 
 
 def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> tuple[Float32Array, Float32Array]:
-    """Return solid share and mean slope [1 / voxel] of some voxels; the level is taken for linear in each octant.
+    """Return solid share and mean slope, [1 / voxel], of the voxels `index`, with a level linear in each octant.
 
-    Of a cube of half a voxel, cut by a plane at distance d from its middle, 1/2 + 2 d is inside (on average).
+    If a plane at distance d [voxels] from its middle cuts an octant, a share of 1/2 + 2 d is inside (on average).
     """
     share, slope = np.empty(len(index), dtype=np.float32), np.empty(len(index), dtype=np.float32)
     for start in range(0, len(index), _CHUNK):
@@ -196,7 +196,7 @@ def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> tuple[Floa
 
 
 def _windowed(values: Float32Array, at_index: Float32Array, index: IntArray, steps: IntArray) -> Float32Array:
-    """Return means around voxels at flat indices, weights 1 4 6 4 1 along each axis; `at_index` overwrites `values`."""
+    """Return means around voxels, weights 1 4 6 4 1 along each axis, of `values` with `at_index` written at `index`."""
     for _ in range(2):
         values[index] = at_index
         at_index = np.empty(len(index), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Operations on sets of voxels: bodies, gaps, what is enclosed, convex hulls."""
+"""Operations on sets of voxels (True in boolean arrays): bodies, growing and shrinking, gaps, cavities, hulls."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _PLANES_AT_A_TIME = 64
 
 
 def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
-    """Return the box of voxels that holds all solid ones and `margin` more to each side; empty if none is solid.
+    """Return slices of the box of all solid voxels and `margin` more on each side; the box is empty if none is solid.
 
     >>> bounding_box(np.array([[[False, False, True, True, False]]]), 1)
     (slice(0, 2, None), slice(0, 2, None), slice(1, 5, None))
@@ -28,13 +28,13 @@ def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
 
 
 def face_connected(cells: BoolArray) -> npt.NDArray[np.int32]:
-    """Number the bodies whose voxels touch by faces: 1, 2, ... in C order of their first voxel, 0 elsewhere."""
+    """Return each voxel's body number, 1, 2, ... in C order of first voxels, 0 if empty; bodies connect by faces."""
     return connected(cells, connectivity=1)
 
 
 def connected(cells: BoolArray, connectivity: int = 3) -> npt.NDArray[np.int32]:
-    """Number bodies as `face_connected` does; voxels touch by faces (`connectivity` 1), edges (2), or corners (3)."""
-    # Only where something is solid: a lattice is mostly empty.
+    """Return body numbers as `face_connected`; voxels connect by faces (`connectivity` 1), edges (2) or corners (3)."""
+    # Labels are found in the box of the solid only, because most of a lattice is empty.
     labels, box = np.zeros(cells.shape, dtype=np.int32), bounding_box(cells)
     inside = np.zeros(cells[box].shape, dtype=np.int32)
     ndimage.label(cells[box], ndimage.generate_binary_structure(3, connectivity), output=inside)
@@ -43,7 +43,7 @@ def connected(cells: BoolArray, connectivity: int = 3) -> npt.NDArray[np.int32]:
 
 
 def repeated(values: npt.NDArray, times: int) -> npt.NDArray:
-    """Repeat every entry of an array so many times along each axis.
+    """Return an array with every entry repeated `times` times along each of the three axes.
 
     >>> repeated(np.array([[[1, 2]]]), 2)[1].tolist()
     [[1, 1, 2, 2], [1, 1, 2, 2]]
@@ -54,7 +54,7 @@ def repeated(values: npt.NDArray, times: int) -> npt.NDArray:
 
 
 def grow(cells: BoolArray, by: int) -> BoolArray:
-    """Add all voxels that a cube of 2 `by` + 1 voxels around a solid one reaches.
+    """Return all voxels that are at most `by` voxels from a solid voxel along every axis (a dilation by a cube).
 
     >>> grow(np.array([[[False, False, False, True]]]), 2)[0, 0].tolist()
     [False, True, True, True]
@@ -63,9 +63,9 @@ def grow(cells: BoolArray, by: int) -> BoolArray:
 
 
 def shrink(cells: BoolArray, size: int | tuple[int, ...], origin: int | tuple[int, ...] = 0) -> BoolArray:
-    """Keep the voxels around which a box of `size` voxels lies in the set; nothing beyond the array does.
+    """Return the voxels whose surrounding box of `size` voxels is completely solid and inside the array.
 
-    A box of an even size lies half a voxel lower, with an origin of -1 half a voxel higher.
+    A box of even size is centred half a voxel below the voxel, or half a voxel above with `origin` -1.
 
     >>> shrink(np.array([[[True, True, True, True]]]), (1, 1, 3))[0, 0].tolist()
     [False, True, True, False]
@@ -74,21 +74,21 @@ def shrink(cells: BoolArray, size: int | tuple[int, ...], origin: int | tuple[in
 
 
 def close_gaps(cells: BoolArray, by: int) -> BoolArray:
-    """Add what no cube of 2 `by` + 1 empty voxels reaches.
+    """Return the solid voxels and the gaps into which no cube of 2 `by` + 1 empty voxels along an edge fits.
 
     >>> close_gaps(np.array([[[True, False, True]]]), 1)[0, 0].tolist()
     [True, True, True]
     """
     if by == 0:
         return cells
-    # Where the box cuts the scene, what is solid goes on behind it; far enough out all is as if it were solid.
+    # Solid at the border of the lattice is continued outwards by `by` voxels.
     grown = grow(np.pad(cells, by, mode="edge"), by)
     closed = ~grow(~grown, by)
     return np.logical_or(closed[by:-by, by:-by, by:-by], cells)
 
 
 def fill_enclosed(cells: BoolArray) -> BoolArray:
-    """Add all empty voxels that have no way out of the lattice through voxel faces.
+    """Return the solid voxels and all empty voxels that have no way out of the lattice through voxel faces.
 
     >>> cells = np.ones((3, 3, 3), dtype=bool)
     >>> cells[1, 1, 1] = False
@@ -103,7 +103,7 @@ def fill_enclosed(cells: BoolArray) -> BoolArray:
 def convex_hull(cells: BoolArray) -> BoolArray:
     """Return the voxels whose centres lie in the convex hull of the centres of the solid voxels.
 
-    The hull meets every column of voxels in one interval, so it costs one comparison per column and plane.
+    The hull meets each column of voxels in one interval, whose ends take one comparison per column and hull plane.
     """
     columns = np.argwhere(cells.any(axis=2))
     if len(columns) == 0:
@@ -114,13 +114,13 @@ def convex_hull(cells: BoolArray) -> BoolArray:
     steps = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
     ends_of_columns = [np.column_stack((columns + step, ends)) for step in steps for ends in (first, last)]
     planes = ConvexHull(np.concatenate(ends_of_columns).astype(np.float64)).equations
-    planes[:, 3] += 0.5 * np.abs(planes[:, :3]).sum(axis=1) - 1e-9  # from the cubes' hull half a cube inwards
+    planes[:, 3] += 0.5 * np.abs(planes[:, :3]).sum(axis=1) - 1e-9  # moved to the hull of centres
     nx, ny, nz = cells.shape
     x, y = np.arange(nx)[:, None] + 0.5, np.arange(ny)[None, :] + 0.5
     low, high = np.full((nx, ny), -np.inf), np.full((nx, ny), np.inf)
     for start in range(0, len(planes), _PLANES_AT_A_TIME):
         a, b, c, d = (v[:, None, None] for v in planes[start : start + _PLANES_AT_A_TIME].T)
-        # a x + b y + c z + d <= 0 inside; planes along the columns bound no z, but may leave a column out.
+        # Inside is a x + b y + c z + d <= 0. Planes parallel to the columns bound no z, but may exclude a column.
         rest = a * x + b * y + d
         upright = np.abs(c) < 1e-9
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Which voxels are solid: dense enough, gaps closed, in the region, no floaters, walls thick, interiors filled."""
+"""Choice of the solid voxels: threshold, closing of gaps, region, removal of floaters, wall thickness, interior."""
 
 from __future__ import annotations
 
@@ -25,43 +25,43 @@ Box = tuple[float, float, float, float, float, float]
 Ball = tuple[float, float, float, float]
 
 SMALLEST_BODY = 0.01
-"""Bodies (voxels that touch, if only by corners) of less than this share of the largest are mostly floaters."""
-FALLBACK_OPTICAL_DEPTH = 0.5  # density times voxel edge from which on a voxel is solid where rays say nothing
-SHARE_OF_RAYS = 0.95  # share of the rays that end on something that are to meet a solid voxel where they end
+"""Bodies (voxels that touch, if only by corners) with less than this share of the largest body's voxels are removed."""
+FALLBACK_OPTICAL_DEPTH = 0.5  # least density times voxel edge of a solid voxel if there are too few rays to choose by
+SHARE_OF_RAYS = 0.95  # of the rays that end on something, the share that shall meet a solid voxel at their end
 OPTICAL_DEPTH_BOUNDS = (0.02, math.log(2.0))
-"""The automatic threshold times the voxel edge stays within these. Below the first a ray needs 35 voxels to lose half
-of its light: half-transparent space. From the second on a single voxel stops half of it: a surface."""
-OPAQUE_OPTICAL_DEPTH = 2.0  # density times voxel edge from which on a voxel is solid even though no ray ends in it
+"""Bounds of the automatic threshold, as density times voxel edge. At the first, a ray needs 35 voxels to lose half of
+its light, as in half-transparent space. At the second, a single voxel stops half of the light, as a surface does."""
+OPAQUE_OPTICAL_DEPTH = 2.0  # at this density times voxel edge or more, a dense voxel is solid even if no ray ends in it
 SHARE_THAT_ENDS = 0.5
-"""Rays that end in a voxel, per weight that rays spent in it, above which it is part of what they end on: 1 in a voxel
-that ends all rays that come, 0 where light leaked past a surface."""
-LEAST_WEIGHT = 0.5  # weight that rays spent in a voxel, [rays], below which density alone decides about it
-FEWEST_RAYS = 100  # with fewer rays than this that end on something, there is no evidence to choose by
+"""A voxel stops rays if the number of rays that end in it is more than this share of the weight that rays spent in it.
+The ratio of the two is 1 in a voxel where all rays that enter end, and 0 where light leaked past a surface."""
+LEAST_WEIGHT = 0.5  # with less weight of rays than this in a voxel, [rays], its density alone decides
+FEWEST_RAYS = 100  # least number of rays that end on something for the threshold to be chosen by rays
 LEAST_SHARE = 0.15
-"""Space belongs to the region if photographs show it at least this well, as a share of how well they show what they
-were taken of. Chosen on nine drawn scenes with a street or a room around: all of the scene stays and half of what is
-around goes; of drawn rooms seen from inside 99.7 % of what two photographs see stays."""
-CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # the middle of an image, as a share of its sides, and rays along each of them
-NEAREST_SHARE = 0.25  # a camera was pointed at what this share of these rays end on first
-FEWEST_CAMERAS = 0.1  # share of the cameras that may look at places which are seen less well
-MOST_BLOCKS = 500_000  # how well places are seen changes slowly: in larger lattices it is found in blocks of voxels
+"""A voxel is in the region if photographs show it at least this well, relative to what the cameras were pointed at.
+In nine synthetic scenes with a street or room around, this keeps all of the scene and removes half of what is around;
+in synthetic rooms seen from inside it keeps 99.7 % of what two photographs see."""
+CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # share of an image's sides that counts as its middle, and rays along each side
+NEAREST_SHARE = 0.25  # a camera points at the place at this quantile of the distances to solid along these rays
+FEWEST_CAMERAS = 0.1  # quantile of the visibility of what cameras are pointed at; `LEAST_SHARE` refers to it
+MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` interpolates between blocks of voxels
 
 
 @dataclass(frozen=True)
 class SolidSelection:
-    """How solid voxels are told from empty ones, as the options of an export of the same names say."""
+    """The rules that tell solid voxels from empty ones; the fields are the export's options of the same names."""
 
-    voxel_optical_depth: float | None = None  # density times edge length; without any threshold it is automatic
+    voxel_optical_depth: float | None = None  # least density times voxel edge; without any threshold, rays choose
     density_percentile: float | None = None
-    """Over all voxels of the box, 0 to 100, as in the Thermoxels paper. Overrides the optical depth."""
-    density_threshold: float | None = None  # [1 / world unit of the trained scene]; overrides both
+    """Percentile, 0 to 100, of the density of all voxels, as in the Thermoxels paper; overrides the optical depth."""
+    density_threshold: float | None = None  # least density, [1 / world unit]; overrides both rules above
     close_gaps: int = 1  # gaps up to twice this many voxels wide are filled (a morphological closing)
     region: RegionKind = "auto"
-    region_box: Box | None = None  # in place of auto; in the coordinates of the input poses
-    region_near: Ball | None = None  # the same
+    region_box: Box | None = None  # xmin ymin zmin xmax ymax zmax, in coordinates of the input poses; replaces `region`
+    region_near: Ball | None = None  # x y z radius in the same coordinates; replaces `region`
     interior: InteriorKind = "solid"
-    seal_openings: int = 2  # openings up to twice this many voxels wide count as closed while looking for the inside
-    wall_thickness: float | None = None  # [m]; takes the place of filling the interior
+    seal_openings: int = 2  # to find the interior, openings up to twice this many voxels wide count as closed
+    wall_thickness: float | None = None  # thickness that walls get instead of a filled interior, [m]
 
     def __post_init__(self) -> None:
         def good(value: object, most: float = math.inf) -> bool:
@@ -98,26 +98,26 @@ class SolidSelection:
 
 @dataclass(frozen=True)
 class SolidStep:
-    """What one step on the way from density to solid did."""
+    """The changes made by one of the steps that lead from density to solid voxels."""
 
     name: str  # threshold, close gaps, region, wall or interior
-    added: int  # voxels that it made solid
-    removed: int  # voxels that it made empty
-    remark: str  # how and why, in a sentence or two
+    added: int  # number of voxels that the step made solid
+    removed: int  # number of voxels that the step made empty
+    remark: str  # one or two sentences on how and why
 
 
 @dataclass(frozen=True)
 class SolidCells:
-    """The solid voxels and how they were found."""
+    """The solid voxels of a field, their surface level, and the steps that found them."""
 
     cells: BoolArray  # True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is
-    level: Float32Array  # what `level_of` returns, whose trilinear zero between voxel centres is the surface
-    threshold: float  # density at voxel centres from which on a voxel counted as solid, [1 / world unit]
+    level: Float32Array  # what `level_of` returns: trilinear between voxel centres, its zero is the surface
+    threshold: float  # least density at the centre of a voxel that counts as dense, [1 / world unit]
     explanation: str  # which rule chose the threshold, and why
-    steps: tuple[SolidStep, ...]  # what each step did, in order; the first is the threshold
-    component_sizes: IntArray  # Voxels in each body of the region once gaps are closed, largest first
-    within: BoolArray  # The region, solid or not; where it ends the solid is cut
-    left_out: BoolArray  # Voxels that are solid, but not in the region or too small a body
+    steps: tuple[SolidStep, ...]  # all steps in order; the first is the threshold
+    component_sizes: IntArray  # number of voxels of each body in the region after gaps were closed, largest first
+    within: BoolArray  # True for voxels, solid or not, in the region; the solid is cut at its border
+    left_out: BoolArray  # True for dense voxels and closed gaps outside the region or in bodies that were too small
 
 
 def select_solid(
@@ -128,15 +128,15 @@ def select_solid(
     *,
     makes_up_volume: bool = True,
 ) -> SolidCells:
-    """Choose the solid voxels of a trained field, by the density at their centres.
+    """Return the solid voxels of a trained field, chosen by their density and then changed by up to three more steps.
 
-    A voxel without density is solid only if a step after the threshold makes it so. Only a wall thickness needs
-    `metres_per_world_unit`; `world_to_input`, shape (3, 4), which leads to the coordinates of the region's box or
-    point, is the identity if left out; `makes_up_volume` is that of `level_of`.
+    `metres_per_world_unit` is needed for a wall thickness only. `world_to_input`, shape (3, 4), maps world coordinates
+    to those of the region's box or point; None is the identity. `makes_up_volume` is passed to `level_of`.
 
     Raises:
-        MeshError: No voxel is solid, or none in the region; density does not tell solid from empty; or a wall thickness
-            is asked for but the scale or the cameras are not known.
+        MeshError: No voxel is dense enough; none lies in the box or ball asked for; a percentile is asked for and all
+            voxels have one density; or the wall thickness cannot be made: the scale or the cameras are not known, or
+            the wall is thicker than the scene box.
     """
     thickness = _wall_voxels(snapshot, selection, metres_per_world_unit)
     density = snapshot.centre_density()
@@ -166,7 +166,7 @@ def select_solid(
     )
     cells = step("region", np.append(False, ~small)[labels], remark)
     left_out = everything & ~cells
-    # What is outside of the region still stands between cameras and what is inside; floaters never stood anywhere.
+    # Solid outside the region still blocks the view of cameras into the region; floaters block nothing.
     opaque = cells | (everything & ~within)
     if thickness is not None:
         assert snapshot.views is not None
@@ -202,7 +202,7 @@ def select_solid(
 def _wall_voxels(
     snapshot: GridSnapshot, selection: SolidSelection, metres_per_world_unit: float | None
 ) -> float | None:
-    """Return the wall thickness that is asked for, [voxels], or raise `MeshError` if it cannot be made."""
+    """Return the wall thickness, [voxels], or None if none is asked for; raise `MeshError` if it cannot be made."""
     thickness = selection.wall_thickness
     if thickness is None:
         return None
@@ -225,21 +225,21 @@ def _wall_voxels(
 
 @dataclass(frozen=True)
 class Threshold:
-    """The voxels that are dense enough."""
+    """The density threshold that was chosen, and the voxels that reach it."""
 
-    cells: BoolArray  # True where a voxel is dense enough and not ruled out by rays, shape `lattice.cell_shape`
-    density: float  # density at the voxel centre from which on it is dense enough, [1 / world unit]
-    explanation: str  # which rule chose it, and why, in one or two sentences
+    cells: BoolArray  # True where a voxel is dense enough and rays do not rule it out, shape `lattice.cell_shape`
+    density: float  # least density at the centre of a voxel that is dense enough, [1 / world unit]
+    explanation: str  # one or two sentences on which rule chose the threshold, and why
 
 
 def dense_voxels(snapshot: GridSnapshot, density: FloatArray, selection: SolidSelection) -> Threshold:
-    """Return the voxels that are dense enough by the rule asked for; `density` is that at their centres.
+    """Return the voxels that are dense enough by the rule of `selection`; `density` is given at voxel centres.
 
-    Without a rule, training rays choose: see `_where_rays_end`. Without enough of them a voxel is solid whose density
-    times edge length is at least `FALLBACK_OPTICAL_DEPTH`.
+    If no rule is asked for, training rays choose, see `_where_rays_end`. With fewer than `FEWEST_RAYS` of them, voxels
+    are dense enough whose density times edge length is at least `FALLBACK_OPTICAL_DEPTH`.
 
     Raises:
-        MeshError: A percentile is asked for, and all voxels have the same density.
+        MeshError: A percentile above 0 is asked for, and all voxels have the same density.
     """
     evidence, depth = snapshot.evidence, selection.voxel_optical_depth
     if selection.density_threshold is not None:
@@ -261,20 +261,20 @@ def dense_voxels(snapshot: GridSnapshot, density: FloatArray, selection: SolidSe
 
 
 def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) -> Threshold:
-    """Return the voxels that training rays end on.
+    """Return the voxels that training rays end on; `voxel` is the edge of a voxel, [world units].
 
-    A ray ends where half of its weight is spent. What it meets there is the densest voxel within half a voxel of that
-    point (`RayEvidence.half_depth_density`). The threshold is the highest density that `SHARE_OF_RAYS` of the rays
-    meet, within `OPTICAL_DEPTH_BOUNDS`: what nearly all rays end on is solid, what they merely pass through goes.
+    A ray ends at the point where half of its weight is spent. The ray meets the densest voxel within half a voxel of
+    that point (`RayEvidence.half_depth_density`). The threshold is the highest density that a share `SHARE_OF_RAYS` of
+    the rays meet or exceed, kept within `OPTICAL_DEPTH_BOUNDS`: nearly all rays end on solid voxels.
 
-    Where rays spend weight but hardly any ends, density is what light left that leaked past a surface. Such a voxel
-    must be opaque by itself (`OPAQUE_OPTICAL_DEPTH`): a few behind a surface would widen the body by a layer. Without
-    `RayEvidence.voxel_ends` all voxels that reach the threshold are solid.
+    Voxels where rays spend weight but hardly any ray ends hold density from light that leaked past a surface. A few of
+    these behind a surface would thicken the body by a layer, so they must also reach `OPAQUE_OPTICAL_DEPTH`. Without
+    `RayEvidence.voxel_ends` all voxels that reach the threshold are chosen.
     """
     met, weight = evidence.half_depth_density, evidence.voxel_weight
     low, high = (depth / voxel for depth in OPTICAL_DEPTH_BOUNDS)
     threshold = min(max(float(np.quantile(met, 1.0 - SHARE_OF_RAYS, method="lower")), low), high)
-    # The densities of rays are float32; the threshold is one of them, and its own voxel must reach it.
+    # Densities are float32, and the voxel whose density became the threshold must reach it.
     cells = dense = density >= np.float32(threshold)
     if evidence.voxel_ends is not None:
         passed = (evidence.voxel_ends <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
@@ -295,10 +295,10 @@ def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) ->
 
 
 def _densest_share(density: FloatArray, percentile: float) -> Threshold:
-    """Return the densest (100 - percentile) % of all voxels of the box, as in the Thermoxels paper.
+    """Return the densest (100 - percentile) % of all voxels, as in the Thermoxels paper.
 
-    Where more voxels tie at the threshold than were asked for (space that training never touched keeps its starting
-    value), only the denser ones are taken, if there are any.
+    If so many voxels tie at the threshold that more would be taken than asked for (training leaves the initial density
+    in space that no ray touches), only denser voxels are taken, if any. Raises `MeshError` if all are equally dense.
     """
     threshold = float(np.percentile(density, percentile))
     if percentile > 0.0 and 0.0 < density.min() == density.max():
@@ -316,7 +316,7 @@ def _densest_share(density: FloatArray, percentile: float) -> Threshold:
 def _region(
     cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection, world_to_input: FloatArray | None
 ) -> tuple[BoolArray, str]:
-    """Return the voxels, solid or not, that belong to what is asked for, and which these are."""
+    """Return the voxels, solid or not, of the region asked for, and a sentence that describes the region."""
     box, near, views = selection.region_box, selection.region_near, snapshot.views
     if box is not None or near is not None:
         to_input = np.eye(4)[:3] if world_to_input is None else world_to_input
@@ -331,12 +331,12 @@ def _region(
 
 
 def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> BoolArray:
-    """Return the voxels, solid or not, that photographs show about as well as what they were taken of.
+    """Return the voxels, solid or not, that photographs show about as well as what the cameras were pointed at.
 
-    A camera was pointed at what the rays through the middle of its image end on, d away. It counts as one for all that
-    its image holds up to there, and as (d / distance)^2 behind: so many pixels does an equal area get. The region is
-    where the sum over the cameras, whatever stands in front, is `LEAST_SHARE` or more of what it is where nearly all
-    cameras look. A ground that runs on then ends about where the cameras stood.
+    Rays through the middle of a camera's image end on what the camera was pointed at, at a distance d. Each camera adds
+    1 to the visibility of all places in its image up to the distance d, and (d / distance)^2 beyond, in proportion to
+    the pixels per area; occlusion is ignored. The region is where the sum over all cameras is at least `LEAST_SHARE`
+    of the sum at the places that nearly all cameras look at. Open ground then ends about where the cameras stood.
     """
     eyes, far = lattice.world_to_index(views.camera_to_world[:, :, 3]), {}
     count = len(views.focal)
@@ -355,7 +355,7 @@ def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> Bool
     matrices[:, :, :3] *= lattice.voxel_size
 
     def seen(at: FloatArray) -> FloatArray:
-        """Return how well places (n, 3), in corner indices, are seen."""
+        """Return the visibility of places (n, 3), in corner indices, summed over all cameras, shape (n,)."""
         total = np.zeros(len(at))
         for camera, distance in far.items():
             column, row, depth = matrices[camera, :, :3] @ at.T + matrices[camera, :, 3:]
@@ -380,8 +380,8 @@ def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> Bool
 def _asked_region(
     cells: BoolArray, lattice: Lattice, box: Box | None, near: Ball | None, world_to_input: FloatArray
 ) -> BoolArray:
-    """Return the voxels whose centres lie in a box or near a point; raise `MeshError` if none of `cells` does."""
-    # Each coordinate of the input is a sum of what the three indices of a voxel give.
+    """Return the voxels with centres in a box or ball; raise `MeshError` if no solid voxel (`cells`) is among these."""
+    # Each input coordinate is a sum of three terms, one per voxel index: one array per axis is enough.
     middles = [
         lattice.lo[axis] + (np.arange(count) + 0.5) * lattice.voxel_size for axis, count in enumerate(cells.shape)
     ]
@@ -406,5 +406,5 @@ def _asked_region(
 
 
 def _typed(values: tuple[float, ...] | FloatArray, digits: int | None = None) -> str:
-    """Write numbers as a command line takes them."""
+    """Return numbers separated by blanks, as typed on a command line, with `digits` decimals if given."""
     return " ".join(f"{value:g}" if digits is None else f"{value:.{digits}f}" for value in values)

@@ -1,1 +1,1 @@
-"""Isosurface stuffing: tetrahedra that follow the surface."""
+"""Isosurface stuffing: tetrahedra whose boundary follows a level set, and sharpening of edges."""

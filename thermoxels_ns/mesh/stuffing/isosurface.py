@@ -1,4 +1,4 @@
-"""Isosurface stuffing: tetrahedra that follow the zero level of a lattice of voxel centres."""
+"""Isosurface stuffing: tetrahedra that fill a solid up to the surface where a level on voxel centres is 0."""
 
 from __future__ import annotations
 
@@ -32,53 +32,53 @@ BUNDLE_EDGES: tuple[tuple[int, int], ...] = (
     *((1, corner) for corner in (2, 3, 4, 5)),
     *((2, 3), (3, 4), (4, 5), (5, 2)),
 )
-"""Ends of the 13 edges of a bundle; edge e has its cut at number 6 + e."""
+"""Numbers of the end points of a bundle's 13 edges, see `stencil_table`; the cut of edge e has number 6 + e."""
 BUNDLE_POINTS: FloatArray = np.array(
     [[0, 0, 0], [1, 0, 0], [0.5, -0.5, -0.5], [0.5, 0.5, -0.5], [0.5, 0.5, 0.5], [0.5, -0.5, 0.5]]
 )
-"""Positions of the six points, the first coordinate along the face's axis, the others in cyclic order, [voxels]."""
+"""Positions of a bundle's six points, [voxels]; the first coordinate is along the face's axis, then cyclically."""
 NUM_BUNDLE_NODES = 19
 CODE_WEIGHTS: npt.NDArray[np.int16] = (3 ** np.arange(6)).astype(np.int16)
-"""A bundle's code is the sum of (sign + 1) times these."""
+"""The code of a bundle is the sum of (sign + 1) times these weights over its six points."""
 
-_CUT = {(a, b): 6 + e for e, (c, d) in enumerate(BUNDLE_EDGES) for a, b in ((c, d), (d, c))}  # edge to its cut
+_CUT = {(a, b): 6 + e for e, (c, d) in enumerate(BUNDLE_EDGES) for a, b in ((c, d), (d, c))}  # ends to cut
 _Tet = tuple[int, int, int, int]
 _CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
 class StuffedSolid:
-    """Tetrahedra that fill a solid up to its surface, in fractional corner indices of the voxel lattice."""
+    """Tetrahedra that fill a solid up to its surface; positions are fractional corner indices of the voxel lattice."""
 
     points: FloatArray
-    """Nodes, shape (n, 3), all different and all used; each coordinate is from 0 to the number of voxels."""
+    """Positions of nodes, shape (n, 3), all different and used; coordinates are from 0 to the number of voxels."""
     tets: IntArray  # node numbers, shape (t, 4), positively oriented
-    facets: IntArray  # boundary triangles, shape (f, 3), right-hand normal out of the solid
+    facets: IntArray  # boundary triangles, shape (f, 3); right-hand normals point out of the solid
     on_surface: BoolArray  # True for nodes of boundary triangles, shape (n,)
     on_box: BoolArray
-    """True for boundary triangles on the border of the voxel lattice, exactly on its plane, shape (f,)."""
+    """True for boundary triangles that lie exactly on a border plane of the voxel lattice, shape (f,)."""
 
 
 def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
-    """Fill the part of a voxel lattice where the level is above 0 with tetrahedra up to the zero level.
+    """Return tetrahedra that fill the part of a voxel lattice where the interpolated level is above 0.
 
     This is isosurface stuffing (Labelle and Shewchuk 2007, ACM Transactions on Graphics 26(3), article 57) on a
-    body-centred cubic lattice: of one voxel near the surface, of cubes that double in size from there on inwards. All
-    dihedral angles are between 10.9 and 163.8 degrees, whatever the levels are, and between 45 and 120 away from the
-    surface, which does not depend on the size of the cells inside.
+    body-centred cubic lattice. Its cubes have an edge of one voxel near the surface and double in size from there
+    inwards. All dihedral angles are between 10.9 and 163.8 degrees for any levels, and between 45 and 120 degrees away
+    from the surface. The surface is the same for any size of the cells inside.
 
-    The surface is exact in the second order of the voxel size where the level is linear over the voxels next to it.
-    Levels that stop at -1 and 1 should not do so closer than 1.5 voxels to the surface: at 0.5 voxels the area of a
-    sphere is 1.5 % too large, and 13 % with -1 and 1 alone. Sharp edges become chamfers about half a voxel wide. Solid
-    voxels that share a face stay in one piece, and walls and gaps of one voxel get no holes.
+    Errors of the surface are of second order in the voxel size where the level is linear over the voxels next to it.
+    If levels are clipped to -1 and 1, the clipping should begin at least 1.5 voxels from the surface: at 0.5 voxels the
+    area of a sphere is 1.5 % too large, and with levels of -1 and 1 alone 13 %. Sharp edges become chamfers half a
+    voxel wide. Solid voxels that share a face stay in one piece; walls and gaps of one voxel get no holes.
 
     Args:
         level: Levels at the voxel centres, above 0 in solid voxels, shape (cx, cy, cz). Only their ratios matter.
         coarsest: Edge of the largest cells inside the solid, [voxels], a power of two; 1 makes all cells alike. Larger
-            cells than 4 hardly save anything, because most tetrahedra are at the surface.
+            cells than 4 save little, because most tetrahedra are at the surface.
 
     Returns:
-        The mesh. Where solid voxels touch the border of the lattice, it ends on the border.
+        The mesh. Where solid voxels touch the border of the lattice, the mesh ends on the border.
 
     Raises:
         MeshError: A level is NaN or infinite, or none is above 0.
@@ -100,7 +100,7 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
     bundles = _solid_bundles(lattice, warped.sign, interior)
     filled = (_fill_bundles(some, warped.sign, nodes) for some in bundles)
     tets = np.concatenate([*filled, nodes.of_point[interior.tets]], dtype=np.int64)
-    # Nodes with a number from here on lie on the surface; only tetrahedra with three of them have a face there.
+    # Nodes from number `num_inside` on lie on the surface; only tetrahedra with three such nodes have a face there.
     facets = boundary_facets(tets[(tets >= nodes.num_inside).sum(axis=1) >= 3])
     facets = facets[facets.min(axis=1) >= nodes.num_inside]
     on_surface = np.zeros(len(nodes.points), dtype=bool)
@@ -111,17 +111,17 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
 
 @dataclass(frozen=True)
 class _Nodes:
-    """The mesh's nodes in order: points inside that have cuts, other points inside, those on the surface, cuts."""
+    """The mesh's nodes in order: points inside with cut edges, other points inside, points on the surface, cuts."""
 
     points: FloatArray  # positions, shape (n, 3)
-    of_point: npt.NDArray[np.integer]  # node number of every lattice point, -1 where it is no node
-    of_cut: npt.NDArray[np.integer]  # node numbers of the cuts on the 14 edges of the first nodes, -1 where no cut is
-    num_inside: int  # number of nodes inside, which come first
+    of_point: npt.NDArray[np.integer]  # node number of every lattice point, -1 for points that are no node
+    of_cut: npt.NDArray[np.integer]  # node number of the cut on each edge of each `cut_points`, -1 if uncut
+    num_inside: int  # number of nodes strictly inside, which come first
 
 
 def _number_nodes(lattice: BccLattice, warped: WarpedLattice, interior: CoarseInterior) -> _Nodes:
     inner, sign = warped.inner, warped.sign
-    # A point on the surface is a node if one of its neighbours is inside: they share a tetrahedron.
+    # A point on the surface is a node if a neighbour is inside, because the two points share a tetrahedron.
     touched = np.zeros(len(sign), dtype=bool)
     for neighbour in lattice.each_neighbour(inner):
         touched[neighbour[sign[neighbour] == 0]] = True
@@ -149,18 +149,18 @@ def _number_nodes(lattice: BccLattice, warped: WarpedLattice, interior: CoarseIn
 
 @dataclass(frozen=True)
 class _Bundles:
-    """Some of the voxel faces of one axis, each with the four lattice tetrahedra around it."""
+    """Bundles of one axis: each is a voxel face across the axis with its four tetrahedra, see `stencil_table`."""
 
     points: IntArray  # flat lattice indices of the six points of each bundle, shape (6, b)
-    directions: IntArray  # lattice direction of each edge of a bundle, there and back, shape (13, 2)
+    directions: IntArray  # row in `DIRECTIONS` of each edge, from its first and its second end, (13, 2)
 
 
 def _solid_bundles(lattice: BccLattice, sign: npt.NDArray[np.int8], interior: CoarseInterior) -> Iterator[_Bundles]:
-    """Yield all bundles with a point inside the solid but none in larger cubes, a chunk at a time."""
+    """Yield, in chunks, all bundles with a point inside the solid, except bundles in or between larger cubes."""
     inner = sign > 0
     first, second = np.array(BUNDLE_EDGES).T
     for axis in range(3):
-        # Bundles are written for the x axis; x, y, z turn into the axes from here on in their order.
+        # `BUNDLE_POINTS` are given for the x axis; for another axis the coordinates are rotated cyclically.
         strides = np.roll(lattice.strides, -axis)
         corners = np.where(BUNDLE_POINTS[2:] > 0.0, 0, -1) @ strides + lattice.num_centres
         offsets = np.concatenate([[0, strides[0]], corners])
@@ -168,7 +168,7 @@ def _solid_bundles(lattice: BccLattice, sign: npt.NDArray[np.int8], interior: Co
         ways = np.stack([steps, -steps], axis=1)
         directions = np.argmin(np.abs(ways[:, :, None, :] - DIRECTIONS).max(axis=-1), axis=-1)
 
-        # Where a step leaves a row, a layer or a block it ends in the padding, where nothing is inside.
+        # A step that leaves a row, a layer or a block ends in the padding, where nothing is inside.
         active = np.zeros(lattice.num_centres, dtype=bool)
         for offset in offsets:
             active |= inner[offset : offset + len(active)]
@@ -180,7 +180,7 @@ def _solid_bundles(lattice: BccLattice, sign: npt.NDArray[np.int8], interior: Co
 
 
 def _fill_bundles(bundles: _Bundles, sign: npt.NDArray[np.int8], nodes: _Nodes) -> npt.NDArray[np.integer]:
-    """Return the tetrahedra in the bundles."""
+    """Return the tetrahedra that fill the solid part of the bundles, as node numbers, shape (t, 4)."""
     stencils, start = stencil_table()
     count = bundles.points.shape[1]
     signs = sign[bundles.points]
@@ -194,7 +194,7 @@ def _fill_bundles(bundles: _Bundles, sign: npt.NDArray[np.int8], nodes: _Nodes) 
         row = np.where(from_a, number[a, cut], number[b, cut])
         number[6 + edge, cut] = nodes.of_cut[row, np.where(from_a, *bundles.directions[edge])]
 
-    # Bundle and row of the table of everything that the codes of the bundles call for.
+    # For every new tetrahedron: the bundle that it is in, and its row in the table of stencils.
     counts = start[code + 1] - start[code]
     bundle = np.repeat(np.arange(count), counts)
     row = np.arange(len(bundle)) + (start[code] + counts - np.cumsum(counts))[bundle]
@@ -203,10 +203,10 @@ def _fill_bundles(bundles: _Bundles, sign: npt.NDArray[np.int8], nodes: _Nodes) 
 
 @cache
 def stencil_table() -> tuple[IntArray, IntArray]:
-    """Return the tetrahedra of every bundle code, shape (t, 4), positively oriented, and where each code's rows start.
+    """Return the tetrahedra of all bundle codes, shape (t, 4), positively oriented, and the first row of each code.
 
-    The tetrahedra of the lattice come in bundles of four: around the long edge from the voxel centre below a face to
-    the one above it, each with one side of the face. Points and edges of a bundle are numbered
+    A bundle is the four lattice tetrahedra around the long edge from the voxel centre below a voxel face to the centre
+    above it; each of them holds one side of the face. Points and cuts of a bundle are numbered
 
         0, 1           centre below and above the face
         2 .. 5         the face's corners, counter-clockwise seen from above
@@ -215,7 +215,7 @@ def stencil_table() -> tuple[IntArray, IntArray]:
         11 .. 14       the cuts of edges 1-2, 1-3, 1-4, 1-5
         15 .. 18       the cuts of the face's sides 2-3, 3-4, 4-5, 5-2
 
-    The same numbers serve the faces of all three axes: nothing changes when x, y, z are turned into y, z, x.
+    The numbers serve faces across all three axes, because turning x, y, z into y, z, x leaves the lattice as it is.
     """
     tets, start = [], [0]
     # The first sign varies fastest, as in `CODE_WEIGHTS`.
@@ -230,7 +230,7 @@ def stencil_table() -> tuple[IntArray, IntArray]:
 
 @cache
 def _fill_tet(points: _Tet, signs: tuple[int, ...]) -> list[_Tet]:
-    """Fill the solid part of one lattice tetrahedron (the stencils of Labelle and Shewchuk 2007)."""
+    """Return the tetrahedra in the solid part of a lattice tetrahedron (stencils of Labelle and Shewchuk 2007)."""
     plus = [v for v, sign in zip(points, signs) if sign > 0]
     zero = [v for v, sign in zip(points, signs) if sign == 0]
     minus = [v for v, sign in zip(points, signs) if sign < 0]
@@ -241,7 +241,7 @@ def _fill_tet(points: _Tet, signs: tuple[int, ...]) -> list[_Tet]:
     if len(plus) == 1:
         return [_oriented((plus[0], *zero, *(_CUT[plus[0], v] for v in minus)))]
     if len(plus) == 2 and zero:
-        # A pyramid over the quadrilateral that is left of the face without the point on the surface.
+        # The solid part is a pyramid: its tip is the point on the surface, its base the rest of the opposite face.
         first, second = _diagonal_first(plus[0], plus[1], minus[0])
         near, far = _CUT[first, minus[0]], _CUT[second, minus[0]]
         return [_oriented((first, second, far, zero[0])), _oriented((first, far, near, zero[0]))]
@@ -257,7 +257,7 @@ def _fill_tet(points: _Tet, signs: tuple[int, ...]) -> list[_Tet]:
 
 
 def _fill_prism(top: tuple[int, ...], bottom: tuple[int, ...], before: set[tuple[int, int]]) -> list[_Tet]:
-    """Cut a prism into three; (m, n) in `before` is the diagonal from corner m of the top to corner n of the bottom."""
+    """Cut a prism into three tetrahedra; (m, n) in `before`: a diagonal goes from top corner m to bottom corner n."""
     for order in permutations(range(3)):
         if all(order.index(m) < order.index(n) for m, n in before):
             i, j, k = order
@@ -270,12 +270,12 @@ def _fill_prism(top: tuple[int, ...], bottom: tuple[int, ...], before: set[tuple
 
 
 def _diagonal_first(a: int, b: int, outside: int) -> tuple[int, int]:
-    """Order the two inner points of a face so that its diagonal runs from the first one to the cut of the other.
+    """Order the two inner points of a face so that its diagonal goes from the first point to the cut of the second.
 
-    The rule depends on the face alone, so both tetrahedra that share it agree (Labelle and Shewchuk 2007, section 3):
-    between the ends of a short edge, the diagonal ends at the cut of the long edge; between the ends of a long one, it
-    starts at the lower end if an odd number of coordinates of the outer point is above those of the lower end. The
-    diagonals of a prism then never run in a circle.
+    The rule depends on the face alone, so both tetrahedra that share the face agree (Labelle and Shewchuk 2007, section
+    3). If the inner points are joined by a short edge, the diagonal ends at the cut of the long edge. If they are
+    joined by a long edge, the diagonal starts at its lower end if an odd number of coordinates of `outside` is above
+    those of the lower end, else at its upper end. The diagonals of a prism then never form a cycle.
     """
     along = BUNDLE_POINTS[b] - BUNDLE_POINTS[a]
     if np.abs(along).max() < 1.0:
@@ -287,7 +287,7 @@ def _diagonal_first(a: int, b: int, outside: int) -> tuple[int, int]:
 
 
 def _oriented(tet: tuple[int, ...]) -> _Tet:
-    """Turn a tetrahedron so that its volume is above 0, with all cuts in the middle of their edges."""
+    """Return a tetrahedron with positive orientation, computed with all cuts in the middle of their edges."""
     middles = [0.5 * (BUNDLE_POINTS[a] + BUNDLE_POINTS[b]) for a, b in BUNDLE_EDGES]
     corners = np.concatenate([BUNDLE_POINTS, middles])[list(tet)]
     a, b, c, d = tet

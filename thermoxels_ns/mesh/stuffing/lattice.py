@@ -1,4 +1,4 @@
-"""The body-centred cubic lattice of isosurface stuffing, which of its points move, and the cubes of its inside."""
+"""The body-centred cubic lattice of isosurface stuffing: its levels, its moved points and its cubes deep inside."""
 
 from __future__ import annotations
 
@@ -20,39 +20,39 @@ DIRECTIONS: FloatArray = np.concatenate([_AXES, _DIAGONALS])
 """Steps to the 14 neighbours, shape (14, 3), [voxels]: +x, -x, +y, -y, +z, -z, then the diagonals (---) to (+++)."""
 LENGTHS: FloatArray = np.linalg.norm(DIRECTIONS, axis=1)  # lengths of the 14 edges, [voxels]
 OPPOSITE: IntArray = np.array([1, 0, 3, 2, 5, 4, 13, 12, 11, 10, 9, 8, 7, 6])
-"""Number of the direction that points the other way, shape (14,)."""
+"""For each row of `DIRECTIONS` the number of the row that points the opposite way, shape (14,)."""
 
 
 @dataclass(frozen=True)
 class BccLattice:
-    """Levels on the points of the lattice around the solid part of a voxel lattice.
+    """A body-centred cubic lattice over the solid part of a voxel lattice, with a level on every point.
 
-    The voxel centres and the voxel corners are a cubic lattice each. A point has 14 neighbours: six of its own lattice
-    along the axes (long edges, 1 voxel) and eight of the other one along the space diagonals (short edges, sqrt(3)/2
-    voxels). All points lie in one flat array, first the centres, then the corners, both padded to the same shape, so
-    that a step along an edge is a constant offset of the flat index.
+    The points are the voxel centres and the voxel corners. Each point has 14 neighbours. Six are of its own kind, along
+    the axes (long edges, 1 voxel). Eight are of the other kind, along the space diagonals (short edges, sqrt(3)/2
+    voxels). The points are numbered by a flat index: first a block of centres, then a block of corners, both padded to
+    the same shape, so that a step along an edge adds the same number to the flat index of all centres or all corners.
     """
 
-    level: npt.NDArray[np.floating]  # level of every point; above 0 is solid, strictly inside of the array and the box
-    shape: tuple[int, int, int]  # shape of each of the two padded blocks
+    level: npt.NDArray[np.floating]  # level of every point, flat; above 0 is solid; no point of the padding is solid
+    shape: tuple[int, int, int]  # shape of each of the two padded blocks, centres and corners
     first_cell: IntArray  # index of the voxel whose centre has index (1, 1, 1) in its block
 
     @property
     def num_centres(self) -> int:
-        """Return the number of points in the block of centres; flat indices from here on are corners."""
+        """Return the number of points in the block of centres, which is the flat index of the first corner."""
         return self.shape[0] * self.shape[1] * self.shape[2]
 
     @property
     def strides(self) -> tuple[int, int, int]:
-        """Return the flat steps along x, y, z within a block."""
+        """Return the numbers that a step of one voxel along x, y and z adds to the flat index."""
         return (self.shape[1] * self.shape[2], self.shape[2], 1)
 
     @cached_property
     def offsets(self) -> IntArray:
-        """Return the flat steps to the 14 neighbours, of a centre and of a corner, shape (2, 14)."""
+        """Return what a step to each neighbour adds to the flat index of a centre and of a corner, shape (2, 14)."""
         strides = np.array(self.strides)
         along = DIRECTIONS[:6].astype(np.int64) @ strides
-        # Centre i lies half a voxel below corner i of its block.
+        # Centre i of the first block lies half a voxel below corner i of the second, along each axis.
         to_corner = np.where(_DIAGONALS > 0.0, 0, -1) @ strides + self.num_centres
         to_centre = np.where(_DIAGONALS > 0.0, 1, 0) @ strides - self.num_centres
         return np.stack([np.concatenate([along, to_corner]), np.concatenate([along, to_centre])])
@@ -62,33 +62,33 @@ class BccLattice:
         return (points >= self.num_centres).astype(np.int64)
 
     def neighbours(self, points: IntArray) -> IntArray:
-        """Return the flat indices of the 14 neighbours, shape (n, 14)."""
+        """Return the flat indices of the 14 neighbours of each point, shape (n, 14)."""
         return points[:, None] + self.offsets[self.is_corner(points)]
 
     def each_neighbour(self, points: IntArray) -> Iterator[IntArray]:
-        """Yield the flat indices of one neighbour of every point, shape (n,), for each of the 14 directions."""
+        """Yield, for each of the 14 directions, the flat index of the neighbour of every point, shape (n,)."""
         corner = self.is_corner(points)
         for step in self.offsets.T:
             yield points + step[corner]
 
     def block_index(self, points: IntArray) -> IntArray:
-        """Return the index along x, y, z within the point's block, shape (n, 3)."""
+        """Return the index of each point along x, y, z within its block of centres or corners, shape (n, 3)."""
         within = points - self.is_corner(points) * self.num_centres
         return np.stack(np.unravel_index(within, self.shape), axis=-1)
 
     def positions(self, points: IntArray) -> FloatArray:
-        """Return the fractional corner indices of points in the whole voxel lattice, shape (n, 3)."""
+        """Return the positions of points as fractional corner indices of the whole voxel lattice, shape (n, 3)."""
         shift = self.first_cell + 0.5 * self.is_corner(points)[:, None] - 0.5
         return self.block_index(points) + shift
 
 
 def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
-    """Put levels of voxel centres, above 0 somewhere, on the lattice and close it where the solid touches the border.
+    """Return the body-centred lattice of levels at voxel centres, shape (cx, cy, cz), at least one of them above 0.
 
-    A corner gets the mean of the eight centres around it, which is the trilinear value, or 0 where that would break a
-    layer of one voxel. Beyond the border every centre has the level -|level| of the centre inside, and corners on the
-    border are at most 0: linear interpolation is then 0 exactly on the border where solid touches it, and nothing above
-    0 lies on the border or beyond. What is farther than two voxels from all solid voxels is left out.
+    A corner gets the mean level of the eight centres around it, which is the trilinear value, or 0 where the mean would
+    make a hole in a layer of one voxel. Where solid touches the border of the voxel lattice, the surface is on the
+    border: each centre in the padding has the level -|level| of the centre inside, and corners on the border are at
+    most 0. The lattice covers the bounding box of the solid voxels and two voxels more to each side.
     """
     box = bounding_box(level > 0.0, margin=2)
     first, inner = np.array([part.start for part in box]), level[box]
@@ -102,7 +102,7 @@ def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
         padded[0, 1:-1, 1:-1] = -np.abs(within[0])
         padded[-1, 1:-1, 1:-1] = -np.abs(within[-1])
 
-    # Halved before each sum: the sum of two levels may be too large for the number type, their mean is not.
+    # Levels are halved before each sum: the sum of two levels may overflow the number type, their mean cannot.
     mean = 0.5 * np.pad(inner, 1, mode="edge")
     for axis in range(3):
         mean = np.moveaxis(mean, axis, 0)
@@ -118,10 +118,10 @@ def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
 
 
 def _keep_sheets(centres: npt.NDArray[np.floating], corners: npt.NDArray[np.floating]) -> None:
-    """Raise corners to 0 where a solid layer of one voxel would have holes, and lower them where a gap of one would.
+    """Raise corners to 0 where a solid layer of one voxel would get holes; lower them to 0 where a gap of one would.
 
-    The middle of a square of four solid centres is solid too, but no point of the lattice: it is on the long edge
-    between the corners above and below. If neither of them is above 0, the square is a hole, unless both are 0.
+    The middle of a square of four solid centres lies on the long edge between the corners above and below. If neither
+    corner is above 0, the square is a hole, unless both are exactly 0. Likewise for gaps and squares of empty centres.
     """
     solid = centres > 0.0
     for layer, side in ((~solid, -1.0), (solid, 1.0)):
@@ -139,9 +139,9 @@ def _keep_sheets(centres: npt.NDArray[np.floating], corners: npt.NDArray[np.floa
 
 
 ALPHA_INSIDE = np.where(LENGTHS == 1.0, 0.272, 0.397)
-"""Share of each of the 14 edges within which a cut pulls a point inside the solid onto the surface."""
+"""Distance within which a cut pulls a point inside the solid onto the surface, as a share of the edge, shape (14,)."""
 ALPHA_OUTSIDE = np.where(LENGTHS == 1.0, 0.282, 0.369)
-"""The same for a point outside.
+"""Distance within which a cut pulls a point outside the solid onto the surface, as a share of the edge, shape (14,).
 
 With these four numbers all dihedral angles are between 10.94 and 163.74 degrees: the extremes over all stencils, with
 every cut and every moved point at every end of its range. Labelle and Shewchuk (2007) give one pair for both sides.
@@ -149,9 +149,9 @@ every cut and every moved point at every end of its range. Labelle and Shewchuk 
 
 
 def _contractible_links() -> BoolArray:
-    """Tell for every set of neighbours, as 14 bits, whether the lattice between them is one piece without holes."""
-    # The neighbours of a point span a sphere of 24 triangles. A part of a sphere can be shrunk to a point if neither it
-    # nor the rest of the sphere is empty or in several pieces.
+    """Return for every set of neighbours, numbered by 14 bits, whether it can be shrunk to a point, shape (2^14,)."""
+    # The neighbours of a point span a sphere of 24 triangles. A part of a sphere can be shrunk to a point if both the
+    # part and the rest of the sphere are one piece, and neither is empty.
     steps = DIRECTIONS[:, None, :] - DIRECTIONS[None, :, :]
     joined = (np.abs(steps[:, :, None, :] - DIRECTIONS).max(axis=-1) < 0.25).any(axis=-1)
     around = joined @ (1 << np.arange(14))
@@ -172,27 +172,27 @@ _CONTRACTIBLE = _contractible_links()
 
 @dataclass(frozen=True)
 class WarpedLattice:
-    """The lattice with its near points moved onto the surface, and the cuts that are left."""
+    """A lattice after the points close to the surface were moved onto it, and the cuts that are left on its edges."""
 
     sign: npt.NDArray[np.int8]  # +1 inside the solid, 0 on its surface, -1 outside, one per point of the lattice
     moved: IntArray  # points that moved, shape (m,)
-    moved_to: FloatArray  # where they are now, fractional corner indices, shape (m, 3)
+    moved_to: FloatArray  # new positions of the `moved` points, fractional corner indices, shape (m, 3)
     inner: IntArray  # points with sign +1 that are not buried, ascending; shape (p,)
-    cut_points: IntArray  # those of them that have a cut edge, ascending; shape (s,)
+    cut_points: IntArray  # points of `inner` with at least one cut edge, ascending; shape (s,)
     cuts: FloatArray
-    """How far along each of their edges the surface is, as a share of the edge, NaN where no cut is; shape (s, 14)."""
+    """Distance from each cut point to the cut, as a share of the edge length; NaN on edges without; shape (s, 14)."""
 
 
 def warp(lattice: BccLattice, buried: BoolArray) -> WarpedLattice:
-    """Find where the surface cuts edges, and move points that are too close to a cut onto the surface.
+    """Return the lattice after points close to the surface were moved onto it, and the cuts that are left on edges.
 
-    A cut is where linear interpolation along an edge between two opposite signs is 0. A point with cuts within alpha
-    times the edge length moves to the nearest of them and has sign 0 from then on; its edges are cut no more (Labelle
-    and Shewchuk 2007, section 3). `buried` points and all their neighbours are inside.
+    Between a point inside and one outside, the cut is where the linearly interpolated level is 0. A point with cuts
+    nearer than alpha (`ALPHA_INSIDE`, `ALPHA_OUTSIDE`) times the edge moves to the nearest cut and gets sign 0, and its
+    edges are cut no more (Labelle and Shewchuk 2007, section 3). `buried` points and their neighbours are all inside.
 
-    Beyond the paper, nothing thin is lost: a point stays if the solid is not on its other side, seen from the cut, or
-    if the solid (for a point outside: the empty space) would fall apart, close up or vanish with it. Its cuts are then
-    held at alpha times the edge length, which the bounds on the angles allow.
+    Beyond the paper, thin parts are kept: an inside point stays if its neighbour opposite the nearest cut is not
+    inside, or if the solid would split, close up or vanish without it; likewise outside points in the empty space. The
+    cuts of a point that stays are kept alpha times the edge length away, which the bounds on the angles allow.
     """
     level = lattice.level
     sign = (level > 0.0).astype(np.int8)
@@ -203,7 +203,7 @@ def warp(lattice: BccLattice, buried: BoolArray) -> WarpedLattice:
         crosses = sign[neighbour] < 0
         touches |= crosses
         touched[neighbour[crosses]] = True
-    # Points inside with a neighbour outside, and points outside with one inside.
+    # These are the points inside with a neighbour outside, and the points outside with a neighbour inside.
     inside, outside = inner[touches], np.flatnonzero(touched)
 
     moved, moved_to = [], []
@@ -216,9 +216,9 @@ def warp(lattice: BccLattice, buried: BoolArray) -> WarpedLattice:
         behind = points + lattice.offsets[lattice.is_corner(points), OPPOSITE[nearest]]
         thick = sign[behind] == own
         points, nearest, share = points[thick], nearest[thick], share[thick]
-        # Taking a point away leaves the topology as it is if its neighbours of the same sign can be shrunk to a point.
-        # No two points of one of the four classes (centre or corner, even or odd sum of indices) are neighbours, so
-        # each class may be decided at once.
+        # Moving a point keeps the topology if its neighbours of the same sign can be shrunk to a point. Points form
+        # four classes: centre or corner, with an even or odd sum of indices. No two points of one class are neighbours,
+        # so all points of a class may be decided at once.
         free = np.zeros(len(points), dtype=bool)
         group = 2 * lattice.is_corner(points) + lattice.block_index(points).sum(axis=1) % 2
         for number in range(4):
@@ -246,28 +246,28 @@ def warp(lattice: BccLattice, buried: BoolArray) -> WarpedLattice:
 
 
 def _cut_shares(lattice: BccLattice, sign: npt.NDArray[np.int8], points: IntArray) -> FloatArray:
-    """Return the share of each edge from the point to its cut, infinite where none is; shape (n, 14)."""
+    """Return the distance from points to the cuts of their edges, as a share of the edge, inf where uncut, (n, 14)."""
     neighbours = lattice.neighbours(points)
     own = lattice.level[points].astype(np.float64)
     other = lattice.level[neighbours].astype(np.float64)
-    # Where levels differ by more than the number type holds, the ratio is infinite and the cut at the point: right.
+    # A ratio that overflows is infinite and puts the cut at the point itself, which is right.
     with np.errstate(over="ignore", divide="ignore"):
         share = 1.0 / (1.0 - other / own[:, None])
     share[sign[neighbours] != -sign[points][:, None]] = np.inf
     return share
 
 
-# The sides of a face lie between its corners 0-1, 1-2, 2-3 and 3-0, counter-clockwise seen from where its axis points.
+# Corners of a face across x, counter-clockwise seen from +x, and outward directions of its sides 0-1, 1-2, 2-3, 3-0.
 _CORNERS = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])
 _OUTWARD = np.array([[0, 0, -1], [0, 1, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
-    """Join voxels into cubes of 2, 4, 8, ... `largest` voxels along an edge that only hold voxels of the set.
+    """Return the cubes with edges of 2, 4, 8, ... `largest` voxels into which the voxels of a set can be joined.
 
-    Cube (i, j, k) of edge s begins at voxel (i s, j s, k s). Cubes that touch, if only at a corner, differ at most by
-    a factor 2 in size; voxels outside the set count as cubes of one voxel. Under these rules every cube is as large as
-    it can be. Entry n of the result is for cubes of 2^(n + 1) voxels along an edge: True where nothing is smaller.
+    Entry n of the result is an array over all cubes with an edge of 2^(n + 1) voxels, True where nothing in the cube is
+    smaller. Cube (i, j, k) of edge s begins at voxel (i s, j s, k s). Cubes that touch, if only at a corner, differ at
+    most by a factor 2 in size; voxels outside the set count as cubes of one voxel. Cubes are as large as this allows.
 
     >>> [np.count_nonzero(level) for level in balanced_octree(np.ones((12, 12, 12), dtype=bool), 8)]
     [216, 1]
@@ -275,7 +275,7 @@ def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
     levels: list[BoolArray] = []
     size, whole = 1, cells
     while size < largest:
-        # A cube of one voxel touches any cube of two; larger ones need neighbours of at least half their size.
+        # A cube of two voxels may touch single voxels; larger cubes need neighbours of at least half their size.
         halves = whole if size == 1 else shrink(whole, 3)
         halves = np.pad(halves, [(0, n % 2) for n in halves.shape])
         nx, ny, nz = (n // 2 for n in halves.shape)
@@ -288,35 +288,35 @@ def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
 
 
 def split_in_eight(level: BoolArray, shape: tuple[int, ...]) -> BoolArray:
-    """Give each of the eight halves of a cube its value, and cut the array to the shape of the level below."""
+    """Return values for cubes of half the edge, each copied from the larger cube around it, cut to `shape`."""
     return repeated(level, 2)[tuple(slice(n) for n in shape)]
 
 
 @dataclass(frozen=True)
 class CoarseInterior:
-    """Tetrahedra that take the place of those of the uniform lattice inside a solid."""
+    """Tetrahedra of cubes of two voxels and more, in place of the uniform lattice's tetrahedra deep inside a solid."""
 
-    covered: BoolArray  # True for the centres of voxels inside a larger cube, in the order of the lattice's centres
-    tets: IntArray  # flat lattice indices, shape (t, 4), positively oriented: all that larger cubes share a face with
+    covered: BoolArray  # True for voxels inside a larger cube, one entry per point of the block of centres, flat
+    tets: IntArray  # flat indices, shape (t, 4), positively oriented: all tetrahedra at faces of larger cubes
 
     def buried(self, lattice: BccLattice) -> BoolArray:
-        """Return True for points of the lattice around which there are only voxels in larger cubes.
+        """Return True for lattice points with only voxels of larger cubes around them, shape (points,).
 
-        They and all their neighbours are inside the solid, and none of these neighbours is moved or has a cut.
+        These points and all their neighbours are inside the solid; no neighbour is moved or has a cut edge.
         """
         corners = shrink(self.covered.reshape(lattice.shape), 2, -1)
         return np.concatenate([self.covered, corners.reshape(-1)])
 
 
 def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior:
-    """Build the inside of a solid from cubes of two to `largest` voxels, where there is room for them.
+    """Fill the deep inside of a solid with tetrahedra from cubes with edges of two to `largest` voxels.
 
-    Every cube has nodes at its centre and its corners, points of the body-centred cubic lattice. Between two neighbours
-    of the same size lie four tetrahedra, one for each side of their common face, around the edge that joins the
-    centres; where smaller cubes touch a side it has a node in the middle, and its tetrahedron is cut in two there.
-    Between two of different sizes lies the face of the smaller: the diagonal through the middle of the larger face cuts
-    it into two triangles, and each makes a tetrahedron with either centre (Labelle and Shewchuk 2007). The octree
-    begins at the lowest voxel that may be joined, so the solid's place in the lattice does not matter.
+    Every cube has nodes at its centre and its corners, which are points of the body-centred cubic lattice. Two
+    neighbours of the same size share a face: each of the face's four sides makes a tetrahedron with the edge between
+    the two centres. A side that smaller cubes touch has a node in its middle, which cuts its tetrahedron in two. Two
+    neighbours of different sizes share the smaller cube's face: its diagonal through the middle of the larger face cuts
+    it into two triangles, and each triangle makes a tetrahedron with either centre (Labelle and Shewchuk 2007). The
+    octree begins at the lowest voxel that may be joined, so results do not depend on where in the lattice the solid is.
     """
     deep = _far_from_surface(lattice)
     box = bounding_box(deep)
@@ -335,10 +335,10 @@ def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior:
 
 
 def _far_from_surface(lattice: BccLattice) -> BoolArray:
-    """Return the voxels on whose faces no bundle has a point that moves or an edge with a cut; as block of centres."""
-    # A point of a cut edge has a neighbour outside. So the voxel's centre and corners and the centres next to it must
-    # be inside, and no neighbour of these points outside: no centre next to a centre next to it, no corner of a voxel
-    # next to it, and no centre at one of its own corners.
+    """Return voxels with no moved point and no cut edge in the tetrahedra at their faces, shape `lattice.shape`."""
+    # A point of a cut edge has a neighbour outside. So the voxel's centre and corners and the six centres next to it
+    # must be inside, and all neighbours of these points must not be outside: the centres two steps along faces away,
+    # the corners of the six voxels beside it, and the centres of all voxels that touch it.
     centres, corners = lattice.level.reshape(2, *lattice.shape)
     inside = centres > 0.0
     deep = shrink(inside, 3) & shrink(corners > 0.0, 2)
@@ -348,16 +348,16 @@ def _far_from_surface(lattice: BccLattice) -> BoolArray:
 
 @dataclass(frozen=True)
 class _Cubes:
-    """The cubes of one size, in arrays with one more cube on each side."""
+    """The cubes of one size, as arrays over all places for such cubes, padded by one cube on each side."""
 
     size: int  # edge of a cube, [voxels]
     whole: BoolArray  # True where nothing inside the cube is smaller
-    joined: BoolArray  # True where the cube is part of a larger one, twice as large wherever a single one touches it
+    joined: BoolArray  # True where the cube is part of a larger cube of the octree
     single: BoolArray  # True where the cube is one of the octree: whole, but not joined
 
 
 def _each_size(octree: tuple[BoolArray, ...], shape: tuple[int, ...]) -> Iterator[_Cubes]:
-    """Yield the cubes of every size, voxels first; those beyond the octree are single voxels."""
+    """Yield the cubes of every size, single voxels first; all places outside the octree count as single voxels."""
     whole = np.ones([n + 2 for n in shape], dtype=bool)
     for number in range(len(octree) + 1):
         joined = np.zeros_like(whole)
@@ -371,17 +371,17 @@ def _each_size(octree: tuple[BoolArray, ...], shape: tuple[int, ...]) -> Iterato
 
 @dataclass(frozen=True)
 class _Points:
-    """Where in the lattice the points of cubes of one size are, and those of their faces across one axis."""
+    """Flat lattice indices of the points of cubes of one size, and of the corners of their faces across one axis."""
 
     origin: int  # flat index of the lowest corner of cube (0, 0, 0)
     per_cube: IntArray  # flat steps from a cube to the next along x, y, z
     centre: int  # flat step from a cube's lowest corner to its centre
-    ahead: int  # flat step from a cube to the one ahead: one edge along the axis
-    corners: IntArray  # flat steps from a cube's lowest corner to the corners of the face behind, shape (4,)
+    ahead: int  # flat step from a cube to the next along the axis
+    corners: IntArray  # flat steps from a cube's lowest corner to the corners of its low face across the axis, (4,)
 
     @classmethod
     def around(cls, lattice: BccLattice, first: IntArray, axis: int, size: int) -> _Points:
-        """Make it for cubes of `size` voxels; the first of them begins at the centre `first` of the lattice."""
+        """Return the points of cubes of `size` voxels; cube (0, 0, 0) begins at the voxel with block index `first`."""
         strides = np.array(lattice.strides)
         per_cube = size * strides
         centre = size // 2 * strides.sum() if size > 1 else strides.sum() - lattice.num_centres
@@ -391,13 +391,13 @@ class _Points:
         return cls(int(origin), per_cube, int(centre), int(per_cube[axis]), corners)
 
     def of(self, cubes: IntArray) -> IntArray:
-        """Return the flat indices of the lowest corners of cubes, given by their indices, shape (n, 3)."""
+        """Return the flat indices (n,) of the lowest corners of cubes with the indices `cubes`, shape (n, 3)."""
         return self.origin + cubes @ self.per_cube
 
 
 def _between_equals(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntArray]:
-    """Yield the tetrahedra between each cube and the one ahead, if both are single."""
-    two, ahead = [1, 1, 1], [0, 0, 0]  # a cube and the one ahead
+    """Yield the tetrahedra (t, 4) between each cube and the next along the axis, if both are single."""
+    two, ahead = [1, 1, 1], [0, 0, 0]  # a box of a cube and the next along the axis
     two[axis], ahead[axis] = 2, -1
     pairs, whole = (shrink(mask, tuple(two), tuple(ahead)) for mask in (cubes.single, cubes.whole))
     pair = np.flatnonzero(pairs)
@@ -407,7 +407,7 @@ def _between_equals(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntAr
     centres = [points.centre, points.centre + points.ahead]
     corners = points.corners + points.ahead
     for side, (a, b) in enumerate(zip(corners, np.roll(corners, -1))):
-        # Pairs that are not whole on the other side of the face's side have cubes of half the size along it.
+        # A pair of cubes beside this side of the face that is not whole has cubes of half the size along the side.
         is_plain = whole.reshape(-1)[pair + aside[side]]
         middle = (a + b) // 2
         for which, tet in (
@@ -419,7 +419,7 @@ def _between_equals(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntAr
 
 
 def _between_sizes(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntArray]:
-    """Yield the tetrahedra between each single cube and a larger one, ahead of it or behind it."""
+    """Yield the tetrahedra (t, 4) between each single cube and a larger cube before or after it along the axis."""
     single, joined = (np.moveaxis(mask, axis, 0) for mask in (cubes.single, cubes.joined))
     for larger_ahead in (True, False):
         found = np.zeros_like(cubes.single)
@@ -433,7 +433,7 @@ def _between_sizes(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntArr
         face = points.corners + (points.ahead if larger_ahead else 0)
         beyond = points.ahead if larger_ahead else -points.ahead
         for number in range(4):
-            # The low one of two cubes has the middle of the larger face at its high side.
+            # Of two small cubes beside one larger face, the lower one has the middle of this face at its high side.
             here = lowest[np.all(is_high == 1 - _CORNERS[number, 1:], axis=1), None]
             middle, first, opposite, last = np.roll(face, -number)
             below, above = (points.centre, middle + beyond) if larger_ahead else (middle + beyond, points.centre)

@@ -1,4 +1,4 @@
-"""Moves the nodes of chamfers back to the sharp edges that isosurface stuffing cuts off."""
+"""Sharpening: moves nodes of the chamfers that isosurface stuffing makes back to the sharp edges of the solid."""
 
 from __future__ import annotations
 
@@ -15,51 +15,50 @@ from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 from thermoxels_ns.mesh.tetrahedra import facet_area_vectors
 
 ANGLES_DEG = (13.0, 160.0)
-"""No move leaves a dihedral angle outside this range, narrower than that of stuffing itself."""
-LONGEST_MOVE = 1.0  # nodes farther than this from the edge stay, [voxels]
+"""Range of the dihedral angles after a move, [degrees]; it is narrower than the range of stuffing itself."""
+LONGEST_MOVE = 1.0  # nodes farther than this from the edge or corner do not move, [voxels]
 
 _LEAST_DETERMINANT = 0.15
-"""Smallest determinant of the inner products of the normals of planes; below, where they meet is uncertain."""
-_WRONG_SIDE = 0.15  # how far a node may seem to lie beyond a plane of its edge, [voxels]
+"""Least determinant of the matrix n_i . n_j of the planes' normals; below, the place where they meet is uncertain."""
+_WRONG_SIDE = 0.15  # how far a node may lie on the wrong side of a plane of its edge, [voxels]
 _CLEARANCE = 2.5
-"""Nodes do not move towards a facing surface nearer than this, [voxels], so the two do not cross."""
-_ONE_CORNER = 0.5  # corners that two nodes could move to are the same if they are this near, [voxels]
+"""A node does not move towards another surface that faces it and is nearer than this, [voxels]."""
+_ONE_CORNER = 0.5  # corners of the body found by different nodes are the same if they are this near, [voxels]
 LEAST_TURN_DEG = 50.0
-"""Two planes make an edge if their normals differ by more than this, and by more than `TURN_OVER_SPREAD` times the
-spread of the normals in either: 3.5 times is a pipe, 15 the rim of a cylinder."""
+"""Two planes make an edge if the angle between their normals is more than this, [degrees], and more than
+`TURN_OVER_SPREAD` times the spread of the normals within either. The ratio is 3.5 on a pipe, 15 at a cylinder's rim."""
 TURN_OVER_SPREAD = 8.0
 
-_FLAT_DEG = 8.0  # a node is flat if the normals around it spread by less than this (root mean square)
+_FLAT_DEG = 8.0  # a node is flat if the normals of its triangles spread by less than this, [degrees] (root mean square)
 _LEAST_FLAT_SHARE = 0.08
-"""Nodes are looked at where flat triangles are at least this share of the surface around: above 0.1 at clean edges."""
-_SHARE_RINGS = 8  # rings of triangles over which that share is averaged
-_REACH = 3.0  # planes are made of flat triangles this near, [voxels] ..
-_NEAREST = 48  # ... and of no more than this many of them ...
-_FARTHEST = 1.2  # ... whose own plane passes the node within this distance, [voxels].
-_LEAST_FACETS = 3  # no plane is made of fewer triangles
-_SPREAD_DEG = 9.0  # most that the normals in one plane may spread (root mean square)
-_OFFSET_SPREAD = 0.2  # most that triangles in one plane may be off it, [voxels] (root mean square)
-_CHUNK = 1 << 10  # nodes at a time: what is worked on stays in the processor's cache
+"""Chamfers are sought where flat triangles are more than this share of the area around; clean edges have over 0.1."""
+_SHARE_RINGS = 8  # number of rings of triangles over which that share is averaged
+_REACH = 3.0  # planes are fitted to flat triangles within this distance of a node, [voxels]
+_NEAREST = 48  # of these, at most so many, the nearest, are used
+_FARTHEST = 1.2  # of these, triangles whose plane is farther than this from the node are not used, [voxels]
+_LEAST_FACETS = 3  # least number of triangles in a plane
+_SPREAD_DEG = 9.0  # largest spread of the normals in one plane, [degrees] (root mean square)
+_OFFSET_SPREAD = 0.2  # largest distance of the triangles in one plane from the plane, [voxels] (root mean square)
+_CHUNK = 1 << 10  # number of nodes worked on at a time, so that their data stay in the processor's cache
 
 
 def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
-    """Move nodes of chamfers to the edge or corner where the planes of the surface beside them meet.
+    """Return the mesh with nodes of chamfers moved to the edge or corner where the planes beside the chamfer meet.
 
-    Where two planes of the surface meet, stuffing leaves a chamfer about half a voxel wide. Planes come from the flat
-    parts of the surface within three voxels: the triangles there are sorted by their normals into at most three. Where
-    it is not clear that there are two or three, as on smooth or noisy surfaces and walls of less than 3 voxels, nothing
-    moves. Nodes move one after another, those with the shortest way first, each only if all tetrahedra around it stay
-    sound. Nodes on the border of the lattice, and those with another surface in front of them, stay. `shape` is the
-    number of voxels along each axis.
-
-    At 48 voxels across, the area of boxes at any angle is within 0.5 % instead of 3.2 %.
+    Where two planes of the surface meet, stuffing leaves a chamfer about half a voxel wide. The planes are fitted to
+    flat parts of the surface within three voxels of a node, whose triangles are sorted by their normals into up to
+    three planes. Where two or three planes are not found clearly, as on smooth or noisy surfaces and on walls of less
+    than 3 voxels, nothing moves. Nodes move one after another, to corners first, then by the length of the move; a node
+    moves only if all its tetrahedra stay sound (`ANGLES_DEG`, volume above 0). Nodes on the border of the lattice, and
+    nodes that face another surface close by, stay. For boxes 48 voxels across, at any angle, the area is then within
+    0.5 % instead of 3.2 %. `shape` is the number of voxels along each axis.
     """
     assert solid.points.min() >= 0.0 and np.all(solid.points.max(axis=0) <= shape)
     surface = Surface.of(solid)
     planes = edge_planes(surface)
     parts = [_ways(surface, planes, which) for which in ([0, 1], [0, 2], [1, 2], [0, 1, 2])]
     node, to, is_corner, length = (np.concatenate(column) for column in zip(*parts))
-    # Corners first: the nodes nearest to one would otherwise end on the edges beside it.
+    # Moves to corners come first: nodes near a corner would otherwise end on the edges beside the corner.
     order = np.lexsort((node, length, ~is_corner))
     moves = _Moves(node[order], to[order], _same_corners(to[order], is_corner[order]))
     moves = moves.keep(np.all((moves.to > 0.0) & (moves.to < shape), axis=1))
@@ -71,32 +70,32 @@ def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
 
 @dataclass(frozen=True)
 class _Moves:
-    """Where nodes could move to, those to be tried first in front; a node may have several places to go to."""
+    """Possible moves of nodes, in the order in which they are tried; several moves may be of one node."""
 
     node: IntArray  # node numbers, shape (m,)
     to: FloatArray  # positions, shape (m, 3)
-    corner: IntArray  # number of the body's corner that a move leads to, -1 for none, shape (m,)
+    corner: IntArray  # number of the body's corner that a move leads to, -1 for a move to an edge, (m,)
 
     def keep(self, which: npt.NDArray) -> _Moves:
-        """Return some of the moves, by mask or number."""
+        """Return the moves chosen by a mask or by their numbers."""
         return _Moves(self.node[which], self.to[which], self.corner[which])
 
 
 def _ways(surface: Surface, planes: Planes, which: list[int]) -> tuple[IntArray, FloatArray, BoolArray, FloatArray]:
-    """Return nodes, where they could go, whether that is a corner, and how far it is, for some of the planes."""
+    """Return nodes, their goals (m, 3), which goals are corners, and distances, [voxels], for the planes `which`."""
     row = np.flatnonzero(planes.there[:, which].all(axis=1))
     normals, below = planes.normals[row][:, which], planes.distances[row][:, which]
     products = normals @ normals.transpose(0, 2, 1)
     clear = np.linalg.det(products) > _LEAST_DETERMINANT
     if len(which) == 2:
-        # At a convex edge either plane's triangles are below the other plane, and so is the chamfer; at a concave one
-        # all are above.
+        # At a convex edge, the triangles of each plane and the chamfer lie below the other plane. At a concave edge
+        # they lie above.
         centres = planes.centres[row][:, which]
         above = np.einsum("mpj,mpj->mp", normals, centres[:, ::-1]) - below
         convex, concave = np.all(above < 0.0, axis=1), np.all(above > 0.0, axis=1)
         clear &= (convex & np.all(below > -_WRONG_SIDE, axis=1)) | (concave & np.all(below < _WRONG_SIDE, axis=1))
     row, normals, below, products = row[clear], normals[clear], below[clear], products[clear]
-    # The shortest step to all of the planes.
+    # This is the shortest step to a point that lies in all of the planes.
     step = np.einsum("mp,mpj->mj", np.linalg.solve(products, below[:, :, None])[:, :, 0], normals)
     length = np.linalg.norm(step, axis=1)
     short = length < LONGEST_MOVE
@@ -105,7 +104,7 @@ def _ways(surface: Surface, planes: Planes, which: list[int]) -> tuple[IntArray,
 
 
 def _same_corners(to: FloatArray, is_corner: BoolArray) -> IntArray:
-    """Number the different corners among places, -1 for those that are none, shape (m,)."""
+    """Return for each goal `to` the number of its corner of the body, -1 where `is_corner` is False, shape (m,)."""
     number = np.full(len(to), -1, dtype=np.int64)
     corners = np.flatnonzero(is_corner)
     if len(corners):
@@ -115,7 +114,7 @@ def _same_corners(to: FloatArray, is_corner: BoolArray) -> IntArray:
 
 
 def _clear(surface: Surface, moves: _Moves) -> BoolArray:
-    """Return False for moves towards a surface that faces them, shape (m,)."""
+    """Return False for outward moves towards a surface that faces the node within `_CLEARANCE`, shape (m,)."""
     clear = np.ones(len(moves.node), dtype=bool)
     if len(clear) == 0:
         return clear
@@ -132,7 +131,7 @@ def _clear(surface: Surface, moves: _Moves) -> BoolArray:
 
 
 def _carry_out(points: FloatArray, tets: IntArray, moves: _Moves) -> FloatArray:
-    """Return the nodes after one move after another, each made if the tetrahedra around the node stay sound."""
+    """Return positions (n, 3) after the moves, made in order, except moves after which a tetrahedron is not sound."""
     touched = np.zeros(len(points), dtype=bool)
     touched[moves.node] = True
     near = tets[touched[tets].any(axis=1)]
@@ -145,7 +144,7 @@ def _carry_out(points: FloatArray, tets: IntArray, moves: _Moves) -> FloatArray:
 
 @kernel
 def _move_nodes(points, tets, around, first, node, to, corner, bounds):
-    """Make the moves in place; the tetrahedra of node n are `around[first[n]:first[n + 1]]`."""
+    """Move `points` in place where all stays sound; the tetrahedra of node n are `around[first[n]:first[n + 1]]`."""
     moved = np.zeros(len(points), np.bool_)
     taken = np.zeros(corner.max() + 1 if len(corner) else 0, np.bool_)
     for move in range(len(node)):
@@ -166,7 +165,7 @@ def _move_nodes(points, tets, around, first, node, to, corner, bounds):
 
 @kernel
 def _is_sound(corners, bounds):
-    """Whether a tetrahedron (4, 3) has a volume above 0 and cosines of its dihedral angles within the bounds."""
+    """Return whether a tetrahedron (4, 3) has a volume above 0 and dihedral cosines within `bounds` (high, low)."""
     normals, volume = np.zeros((4, 3)), 0.0
     for axis in range(3):
         one, two = (axis + 1) % 3, (axis + 2) % 3
@@ -193,20 +192,20 @@ def _is_sound(corners, bounds):
 
 @dataclass(frozen=True)
 class Surface:
-    """The boundary without what lies on the border of the lattice."""
+    """The boundary triangles of a mesh that do not lie on the border of the lattice."""
 
-    points: FloatArray  # all nodes, shape (n, 3)
+    points: FloatArray  # all nodes of the mesh, shape (n, 3)
     facets: IntArray  # triangles, shape (f, 3)
-    areas: FloatArray
-    normals: FloatArray  # areas (f,) and unit normals (f, 3) of the triangles
+    areas: FloatArray  # areas of the triangles, shape (f,)
+    normals: FloatArray  # unit normals of the triangles, shape (f, 3)
     node_normals: FloatArray
-    """Mean normals of the triangles around each node, weighted by area, not of unit length: shorter where they differ,
-    0 where there are none. Shape (n, 3)."""
+    """Mean unit normal of the triangles around each node, weighted by area, shape (n, 3). The mean is shorter than 1
+    where normals differ, and 0 at nodes without a triangle."""
     on_border: BoolArray  # True for nodes on the border of the lattice, shape (n,)
 
     @classmethod
     def of(cls, solid: StuffedSolid) -> Surface:
-        """Make it from the boundary of a mesh."""
+        """Return the surface of a stuffed solid."""
         on_border = np.zeros(len(solid.points), dtype=bool)
         on_border[solid.facets[solid.on_box]] = True
         facets = solid.facets[~solid.on_box]
@@ -220,28 +219,28 @@ class Surface:
 
 @dataclass(frozen=True)
 class Planes:
-    """None, two or three planes beside each node."""
+    """The planes of the surface beside nodes that may lie on a chamfer: none, two or three for each node."""
 
     nodes: IntArray  # node numbers, shape (m,)
-    there: BoolArray  # which of them there are, shape (m, 3)
+    there: BoolArray  # True for the planes that a node has, shape (m, 3)
     normals: FloatArray  # unit normals, shape (m, 3, 3)
     distances: FloatArray  # how far the node lies below each plane, [voxels], shape (m, 3)
-    centres: FloatArray  # middle of the triangles that lie in it, from the node, shape (m, 3, 3)
+    centres: FloatArray  # vectors from the node to the mean centroid of each plane's triangles, shape (m, 3, 3)
 
 
 def edge_planes(surface: Surface) -> Planes:
-    """Find the nodes of chamfers, ascending, and the planes beside them.
+    """Return the nodes that may lie on a chamfer, ascending, and the planes beside them.
 
-    A node that is not flat, with flat surface nearby that lies in two or three planes, is taken for one of a chamfer.
+    A node lies on a chamfer if it is not flat and the flat surface nearby lies in two or three planes.
     """
     squared = np.einsum("ij,ij->i", surface.node_normals, surface.node_normals)
-    flat_nodes = squared > (1.0 - 0.5 * np.radians(_FLAT_DEG) ** 2) ** 2  # triangles around lie in one plane
+    flat_nodes = squared > (1.0 - 0.5 * np.radians(_FLAT_DEG) ** 2) ** 2  # triangles around the node lie in one plane
     flat = flat_nodes[surface.facets].all(axis=1)
     chamfer = np.zeros(len(surface.points), dtype=bool)
     if flat.any() and not flat.all():
         count, around = len(surface.points), _sum_at_nodes(surface.facets, surface.areas, len(surface.points))
         area, share = np.maximum(around, np.finfo(np.float64).tiny), flat.astype(np.float64)
-        for _ in range(_SHARE_RINGS):  # of the area around each triangle, how much is of flat ones
+        for _ in range(_SHARE_RINGS):  # share of flat triangles in the area around each triangle
             share = (_sum_at_nodes(surface.facets, surface.areas * share, count) / area)[surface.facets].mean(axis=1)
         chamfer[surface.facets[share > _LEAST_FLAT_SHARE]] = True
     nodes = np.flatnonzero(chamfer & ~flat_nodes & ~surface.on_border)
@@ -259,10 +258,11 @@ def edge_planes(surface: Surface) -> Planes:
 
 
 def _planes_beside(surface: Surface, nodes: IntArray, tree: KDTree, centroids: FloatArray, facets: IntArray) -> Planes:
-    """Sort the flat triangles near each of some nodes by their normals into planes; nodes with one plane are left out.
+    """Return the planes of the flat triangles near some nodes, without nodes that have less than two planes.
 
-    Three seeds are chosen: the nearest normal, the one that differs most from it, and the one that differs most from
-    both. If what is taken for a plane is not plane, the node has none. The tree holds the flat triangles' centroids.
+    Triangles are sorted by their normals around three seeds: the nearest normal, the one that differs most from it, and
+    the one that differs most from both. If the triangles of a seed do not lie in a plane, the node gets no plane.
+    `tree` holds the `centroids` of the flat triangles, whose numbers are `facets`.
     """
     distance, found = map(np.asarray, tree.query(surface.points[nodes], k=_NEAREST, distance_upper_bound=_REACH))
     several = np.flatnonzero(np.count_nonzero(np.isfinite(distance), axis=1) >= 2 * _LEAST_FACETS)
@@ -299,8 +299,8 @@ def _planes_beside(surface: Surface, nodes: IntArray, tree: KDTree, centroids: F
         plane = np.where(length[:, :, None] > 0.0, total / np.where(length > 0.0, length, 1.0)[:, :, None], plane)
     sums = share.sum(axis=1)
     scale = np.where(sums > 0.0, sums, 1.0)
-    # Half with each triangle's own normal, half with their mean: where the surface is curved, that has no error of
-    # second order.
+    # The offset is the mean of that along each triangle's own normal and that along their mean normal: this mean has no
+    # second-order error on curved surfaces.
     offset = 0.5 * (ways @ plane.transpose(0, 2, 1) + below[:, :, None])
     mean = (share * offset).sum(axis=1) / scale
     scatter = (share * (offset - mean[:, None]) ** 2).sum(axis=1) / scale
@@ -322,7 +322,7 @@ def _products(vectors: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def _sum_at_nodes(facets: IntArray, values: FloatArray, count: int) -> FloatArray:
-    """Return the sum of a value over the triangles around each node, shape (count,)."""
+    """Return for each node the sum of `values`, one per triangle, over the triangles around the node, (count,)."""
     total = np.zeros(count)
     for column in facets.T:
         total += np.bincount(column, values, count)
