@@ -14,7 +14,7 @@ from thermoxels_ns.field.kept_voxels import KeptVoxels
 
 @dataclass(frozen=True)
 class TrilinearPoints:
-    """Where points lie in a lattice: the voxel of each point, and its place in that voxel."""
+    """The places of points in a lattice: the voxel of each point, and the place of the point in its voxel."""
 
     voxels: KeptVoxels
     number: Int64[Tensor, " n"]
@@ -59,7 +59,7 @@ def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Fl
 
 
 def splat(values: Float[Tensor, "n channels"], at: TrilinearPoints) -> Float[Tensor, "rows channels"]:
-    """Return sums per corner row of values at points, shared out by trilinear weights: `interpolate` transposed."""
+    """Return for each row the sum of values at points times the trilinear weight of its corner, (rows, channels)."""
     total = values.new_zeros((at.voxels.num_rows, values.shape[1]))
     if values.shape[0] == 0:
         return total

@@ -1,4 +1,4 @@
-"""Which voxels of a lattice are kept, in which row each of their corners is stored, and the memory that takes."""
+"""The kept voxels of a lattice, the row in which each of their corners is stored, and the memory needed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What lies outside the box: six lattices from its faces to infinity, and colour and temperature at infinity."""
+"""The space outside the box: a frustum from each face to infinity, and colour and temperature at infinity."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Segments:
 
     ray: Int64[Tensor, " n"]  # Ray to which each piece belongs
     rank: Int64[Tensor, " n"]  # 0 for the first piece of a ray, 1 for the next
-    origins: Float[Tensor, "n 3"]  # Where each piece begins
+    origins: Float[Tensor, "n 3"]  # Begin of each piece
     directions: Float[Tensor, "n 3"]  # Unit vectors
     lengths: Float[Tensor, " n"]  # Lattice units
 

@@ -98,7 +98,7 @@ class VoxelGrid(nn.Module):
 
     @property
     def kept(self) -> Bool[Tensor, "x y z"]:
-        """Which voxels of the lattice are kept, as a mask on the CPU."""
+        """Mask of the lattice's voxels on the CPU, True for kept voxels."""
         return torch.from_numpy(self.voxels.mask())
 
     def row_parameters(self) -> dict[str, nn.Parameter]:

@@ -103,7 +103,7 @@ def _recorded_samples(
 
 
 def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple[Records, Sums, list[tuple[int, int]]]:
-    """Fill `sums` and return the records of the samples; as long as the records do not suffice, double and repeat."""
+    """Fill `sums` and return the records of the samples; repeat with twice as many while the records do not suffice."""
     count, rows, dtype = len(rays.origins), len(volume.density), volume.density.dtype
     while True:
         room = _room.get(rows, FEWEST_SAMPLES)

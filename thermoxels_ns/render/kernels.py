@@ -77,11 +77,11 @@ class Rays(NamedTuple):
     directions: Floats  # Unit vectors, (rays, 3)
     near: Floats  # Distance at which sampling begins, (rays,)
     far: Floats  # Distance at which sampling ends, (rays,)
-    wants: Ints  # What each ray wants, (rays,) uint8: bit 1 colour, bit 2 temperature
+    wants: Ints  # Values that each ray wants, (rays,) uint8: 1 for colour, 2 for temperature, 3 for both
 
 
 class Settings(NamedTuple):
-    """What the kernels compute and how exactly: `RenderOptions` as plain numbers."""
+    """Options of the kernels: `RenderOptions` as plain numbers."""
 
     step: float  # Length of a step along a ray, world units
     smallest_weight: float
@@ -291,7 +291,7 @@ def march_rays(
     """Weigh the samples of rays `first` to before `last` (paper, eq. 1); fill records from `begin` to before `end`.
 
     Fills all of `sums` but colour and temperature, in double precision. Threads share a batch: each has a range of
-    rays and a range of records. `AHEAD` samples are read together, so that the memory serves several at once.
+    rays and a range of records. `AHEAD` samples are read together, so that their loads from memory overlap.
 
     Returns:
         Number of rays with a NaN density (-1 if the records do not suffice), and the place behind the last record.

@@ -136,7 +136,7 @@ class Order(NamedTuple):
     """The samples with a gradient, by groups of successive voxels; within a group in the order of rays."""
 
     shift: int  # A group has 2^shift voxels
-    group: Ints  # Where each group begins in the two lists below, and their end, (groups + 1,) int64
+    group: Ints  # Index at which each group begins in the two lists below, and their length, (groups + 1,) int64
     record: Ints  # Record of each sample, int32
     ray: Ints  # Ray of each sample, int32
 

@@ -31,7 +31,7 @@ class RayRequest:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What a renderer computes, and how exactly."""
+    """Options of a renderer: the values that it computes, and how exactly."""
 
     steps_per_voxel: float = 2.0  # Samples per voxel edge along a ray
     smallest_weight: float = 0.0
@@ -53,7 +53,7 @@ class RenderOptions:
 
 @dataclass(frozen=True)
 class RayRender:
-    """What a bundle of rays sees."""
+    """The result of rendering rays through one grid, without the background."""
 
     rgb: Float[Tensor, "rays 3"] | None  # Sum of weight times colour; None where there is no colour
     thermal: Float[Tensor, "rays 1"]  # Sum of weight times normalised temperature

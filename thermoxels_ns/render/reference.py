@@ -77,7 +77,7 @@ SMALLEST_VARIATION = 1e-10  # Number added under the root of the total variation
 
 @dataclass(frozen=True)
 class RayWeights:
-    """Where the light of rays ends: in which step, or behind the last."""
+    """The shares of each ray's light that end in each of its steps and behind the last step."""
 
     weights: Float[Tensor, "rays steps"]  # Share of its ray's light that ends in each step
     transmittance: Float[Tensor, " rays"]  # Share of the light that is left behind the last step

@@ -1,4 +1,4 @@
-"""What rays see of a scene: the box by one of two renderers, what surrounds it, and what lies at infinity."""
+"""Rendering of a scene: the box and its surroundings by one of two backends, and the background at infinity."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class AroundRender:
-    """What rays see of the surroundings; a ray that lost nearly all light in the box gets 0, and transmittance 1."""
+    """Rendered rays through the surroundings; a ray that lost nearly all light in the box has 0 and transmittance 1."""
 
     rgb: Float[Tensor, "rays 3"] | None  # Sum of weight times colour; None where there is no colour
     thermal: Float[Tensor, "rays 1"]  # Sum of weight times normalised temperature
@@ -75,11 +75,11 @@ class AroundRender:
 
 @dataclass(frozen=True)
 class SceneRender:
-    """What rays see of a scene (paper, eq. 1 and 2): C = C_box + T_box (C_around + T_around C_infinity)."""
+    """Rendered rays through a scene (paper, eq. 1 and 2): C = C_box + T_box (C_around + T_around C_infinity)."""
 
     rgb: Float[Tensor, "rays 3"] | None  # Colour; None for a grid without colour
     thermal: Float[Tensor, "rays 1"]  # Normalised temperature
-    box: RayRender  # What rays see of the box alone
+    box: RayRender  # Result of the box alone
     around: AroundRender | None  # None without surroundings
 
 

@@ -19,7 +19,7 @@ _RAYS_AT_ONCE = 16_384  # rays whose arrays about fit into a processor's cache
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """What one camera sees: mean colour and temperature of each pixel, and depth at the pixel's centre."""
+    """The view of one camera: mean colour and temperature of each pixel, and depth at the pixel's centre."""
 
     rgb: Float32Array  # 0 to 1, shape (height, width, 3)
     temperature_c: FloatArray  # [degrees Celsius], shape (height, width)

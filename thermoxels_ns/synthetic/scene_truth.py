@@ -42,7 +42,7 @@ class SyntheticScene(Body):
     rings: tuple[CameraRing | CameraWalk, ...]  # where cameras stand
     focal_share: float  # focal length over the image width, for a 4:3 image
     around: Body | None = None
-    """Things between the scene and infinity that photographs show, such as houses opposite; a mesh needs none of them."""
+    """Things between the scene and infinity that photographs show, such as houses opposite; meshes leave them out."""
     mirror: RgbFunction | None = None
     """Function of points (n, 3) and normals (n, 3) to the share of light (n,) that the surface mirrors; None: none."""
 

@@ -97,7 +97,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         largest = voxel_weights(SurroundingsSampler(model), rays).largest.cpu().numpy()
         keep = grid.voxels.dilated(largest > (model.config.prune_threshold if step else 0.0), 1)
         if not keep.any():
-            model.backdrop_on[2], keep[0] = False, True  # a parameter without rows is none
+            model.backdrop_on[2], keep[0] = False, True  # one voxel stays: parameters need a row
         old = grid.row_parameters()
         follow(old, prune(grid, keep), grid, prefix)
         if model.seen_surroundings is None:

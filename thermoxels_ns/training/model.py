@@ -209,7 +209,7 @@ class ThermoxelsModel(Model):
     def correct_photographs(self, index: IntArray, log_gain: npt.NDArray | None, offset: npt.NDArray | None) -> None:
         """Set the logarithmic gains (n, 3) and normalised offsets (n,) of the training images `index` (n,).
 
-        The others stay at 0. For gains, or offsets, that are None nothing changes.
+        Other images keep 0. If `log_gain` or `offset` is None, these corrections stay as they are.
         """
         for number, (parameter, values) in enumerate(((self.log_gain, log_gain), (self.thermal_offset, offset))):
             if parameter is not None and values is not None:

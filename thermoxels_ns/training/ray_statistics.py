@@ -18,7 +18,7 @@ from thermoxels_ns.render.renderers import GridSamples
 
 
 class RaySampler(Protocol):
-    """A voxel grid and a way to sample it along rays."""
+    """A model with a voxel grid that can be sampled along rays."""
 
     @property
     def grid(self) -> VoxelGrid:
@@ -32,7 +32,7 @@ class RaySampler(Protocol):
 
 @dataclass(frozen=True)
 class VoxelWeights:
-    """What the weights of rays say about each kept voxel."""
+    """Statistics of the weights of rays for each kept voxel."""
 
     largest: Float[Tensor, " voxels"]  # Largest weight of a sample in the voxel on any ray
     ends: Bool[Tensor, " voxels"]
@@ -101,7 +101,7 @@ class CornerTemperature:
 
 @dataclass(frozen=True)
 class FieldEvidence:
-    """What training rays say about the trained field."""
+    """Statistics of training rays about the trained field, for the mesher."""
 
     rays: int  # Number of rays
     temperature: CornerTemperature  # Temperatures that the thermal rays see

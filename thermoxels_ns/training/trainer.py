@@ -236,8 +236,8 @@ class ThermoxelsTrainer(Trainer):
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint to a temporary file, rename the file, and only then delete older checkpoints.
 
-        The temporary file lies beside the checkpoint folder, because nerfstudio takes each file in it for a checkpoint.
-        Raises `OutputError` if the disk has no room.
+        The temporary file lies outside the checkpoint folder, where nerfstudio takes each file for a checkpoint.
+        Raises `OutputError` if the file cannot be written.
         """
         if self.local_rank != 0:
             return
