@@ -36,7 +36,7 @@ class TrilinearPoints:
         return self.number >= 0
 
     def weights(self) -> Float[Tensor, "n 8"]:
-        """Return the trilinear weights of the voxel's corners in the order of `CORNER_OFFSETS`; each row sums to 1."""
+        """Return the trilinear weights of the corners (see `CORNER_OFFSETS`) of each point's voxel, which sum to 1."""
         (x, y, z), (u, v, w) = self.fraction.unbind(-1), (1 - self.fraction).unbind(-1)
         face = torch.stack((v * w, v * z, y * w, y * z), -1)
         return torch.cat((face * u[:, None], face * x[:, None]), -1)

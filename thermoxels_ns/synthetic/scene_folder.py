@@ -150,7 +150,7 @@ def _thermal_camera(
     """Return the camera of the thermal images and its pose (4, 4) in the frame of the photographs' camera.
 
     With `own`, the thermal camera has a slightly different field of view and an off-centre principal point. Otherwise
-    both cameras are one, and `thermal_width` must keep the aspect in whole pixels, else `SceneError` is raised.
+    it differs in pixels only; `SceneError` is raised if `thermal_width` does not keep the aspect in whole pixels.
     """
     chosen = thermal_width if thermal_width is not None else max(width // 2, 1) if own else width
     sizes = {"width": width, "height": height, "thermal_width": chosen}
