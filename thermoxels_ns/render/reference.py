@@ -87,9 +87,9 @@ class RayWeights:
 def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> RayWeights:
     """Return the weights w_i = exp(-sum_{j<i} s_j d_j) (1 - exp(-s_i d_i)) for densities s and lengths d.
 
-    This is eq. 1 of the paper, s in 1 / world unit. Weights and transmittance of a ray sum to 1. An infinite density is opaque, but a
-    step of length 0 has no weight. Optical depths are summed and 1 - exp(-x) is -expm1(-x), so that neither opaque
-    rays nor small densities lose digits.
+    This is eq. 1 of the paper, with s in 1 / world unit. Weights and transmittance of a ray sum to 1. An infinite
+    density is opaque, but a step of length 0 has no weight. Optical depths are summed and 1 - exp(-x) is -expm1(-x), so
+    that neither opaque rays nor small densities lose digits.
 
     Raises:
         ThermoxelsError: A density is NaN.
