@@ -18,7 +18,7 @@ _Y22 = 0.5462742152960396  # sqrt(15 / (16 pi))
 
 
 def num_coefficients(degree: int) -> int:
-    """Number of harmonics up to `degree`: (degree + 1)^2.
+    """Return the number of harmonics of degree 0 to `degree`: (degree + 1)^2.
 
     >>> num_coefficients(2)
     9
@@ -28,7 +28,7 @@ def num_coefficients(degree: int) -> int:
 
 
 def degree_of(coefficients: int) -> int:
-    """The degree up to which there are so many harmonics; the inverse of `num_coefficients`.
+    """Return the degree that has `coefficients` harmonics up to it; the inverse of `num_coefficients`.
 
     >>> degree_of(9)
     2
@@ -37,7 +37,7 @@ def degree_of(coefficients: int) -> int:
 
 
 def harmonics(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
-    """Evaluate the orthonormal real spherical harmonics at unit directions.
+    """Return the orthonormal real spherical harmonics of degree 0 to `degree` at unit directions, (n, k).
 
     Order and signs are those of Plenoxels (Fridovich-Keil et al. 2022): l = 0; l = 1 as -y, z, -x;
     l = 2 as xy, -yz, 3z^2 - 1, -xz, x^2 - y^2, each with its normalising constant.
@@ -53,5 +53,5 @@ def harmonics(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n
 
 
 def harmonics_with_unit_mean(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
-    """The same basis scaled so that the first function is exactly 1: the first coefficient is the mean value."""
+    """Return `harmonics` scaled so that the first is 1: the first coefficient is then the mean over directions."""
     return harmonics(directions, degree) / _Y00

@@ -14,16 +14,16 @@ from thermoxels_ns.field.kept_voxels import KeptVoxels
 
 @dataclass(frozen=True)
 class TrilinearPoints:
-    """Where points lie in a lattice, made once per set of points and used for density, colour and temperature alike."""
+    """The places of points in a lattice: the voxel of each point, and the place of the point in its voxel."""
 
     voxels: KeptVoxels
     number: Int64[Tensor, " n"]
-    """Number of the kept voxel that each point lies in; -1 where that voxel is not kept, and no value can be read."""
-    fraction: Float[Tensor, "n 3"]  # Place in the voxel, 0 to 1
+    """Number of the kept voxel in which each point lies; -1 where the voxel is not kept: such a point has no values."""
+    fraction: Float[Tensor, "n 3"]  # Place in the voxel, each coordinate from 0 to 1
 
     @classmethod
     def of(cls, voxels: KeptVoxels, points: Float[Tensor, "n 3"]) -> TrilinearPoints:
-        """Find the voxels of world positions; points outside the lattice take the value of the nearest face."""
+        """Find the voxels of world positions; a point outside the lattice is moved to the nearest point of its box."""
         lattice = voxels.lattice
         lo = torch.tensor(lattice.lo, dtype=points.dtype, device=points.device)
         cells = torch.tensor(lattice.cell_shape, dtype=points.dtype, device=points.device)
@@ -32,35 +32,34 @@ class TrilinearPoints:
         return cls(voxels, voxels.number_at(corner.long()), position - corner)
 
     def kept(self) -> Bool[Tensor, " n"]:
-        """Whether each point lies in a kept voxel."""
+        """Return for each point whether it lies in a kept voxel."""
         return self.number >= 0
 
     def weights(self) -> Float[Tensor, "n 8"]:
-        """Trilinear weights in the corner order of `CORNER_OFFSETS`; they sum to 1."""
+        """Return the trilinear weights of the corners (see `CORNER_OFFSETS`) of each point's voxel, which sum to 1."""
         (x, y, z), (u, v, w) = self.fraction.unbind(-1), (1 - self.fraction).unbind(-1)
         face = torch.stack((v * w, v * z, y * w, y * z), -1)
         return torch.cat((face * u[:, None], face * x[:, None]), -1)
 
     def rows(self) -> Int64[Tensor, "n 8"]:
-        """Rows of the corners of each point's voxel in the order of `CORNER_OFFSETS`."""
+        """Return the row numbers of the voxel's corners in the order of `CORNER_OFFSETS`; for points in kept voxels."""
         return self.voxels.tables(self.number.device)[0][self.number]
 
     def select(self, chosen: Tensor | slice) -> TrilinearPoints:
-        """The same for a subset of the points (boolean mask, indices or slice)."""
+        """Return a subset of the points, chosen by a boolean mask, indices or a slice."""
         return TrilinearPoints(self.voxels, self.number[chosen], self.fraction[chosen])
 
 
 def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Float[Tensor, "n channels"]:
-    """Interpolate `rows` at points in kept voxels: f(p) = sum over the voxel's corners of w_c(p) rows[c].
+    """Return values at points in kept voxels: f(p) = sum over the voxel's corners c of w_c(p) rows[c].
 
-    The gradient with respect to `rows` sums each voxel's points in their order and adds rows without duplicates, so
-    that it does not depend on thread count or on a race.
+    The gradient for `rows` is summed in the order of the points, so its bits do not depend on the number of threads.
     """
     return _Interpolate.apply(rows, at)  # type: ignore[return-value]
 
 
 def splat(values: Float[Tensor, "n channels"], at: TrilinearPoints) -> Float[Tensor, "rows channels"]:
-    """Add values at points to their voxels' corners with trilinear weights: the transpose of `interpolate`."""
+    """Return for each row the sum of values at points times the trilinear weight of its corner, (rows, channels)."""
     total = values.new_zeros((at.voxels.num_rows, values.shape[1]))
     if values.shape[0] == 0:
         return total

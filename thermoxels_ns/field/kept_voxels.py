@@ -1,4 +1,4 @@
-"""Which voxels are kept, in which row their corners are stored, and the memory they need."""
+"""The kept voxels of a lattice, the row in which each of their corners is stored, and the memory needed."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ BLOCK = 8  # Voxels along the side of a block
 class KeptVoxels:
     """The kept voxels of a lattice and the rows of their corners.
 
-    Rows exist for corners of kept voxels only (Plenoxels, Fridovich-Keil et al. 2022), in the order of their flat
-    corner index. Corners k and k + 1 of a kept voxel stand in neighbouring rows, so four row numbers per voxel find all
-    eight. The voxel under a point is found through blocks of 8^3 voxels; an empty block costs four bytes.
+    Only corners of kept voxels have a row, in ascending order of the flat corner index (Plenoxels, Fridovich-Keil et
+    al. 2022). Two corners of a kept voxel that differ by one step along z have neighbouring rows, so that four row
+    numbers give all eight. Voxels are looked up by blocks of 8^3 voxels; a block without kept voxels costs four bytes.
 
     Args:
         lattice: The lattice.
         cells: Flat indices of the kept voxels, ascending, each once; None: all.
 
     Attributes:
-        cells: Flat voxel indices, ascending, shape (voxels,), int64. The place in this list is the voxel's number.
+        cells: Flat indices of the kept voxels, ascending, shape (voxels,), int64. A voxel's number is its place here.
         corners: Flat index of the corner that each row holds, ascending, shape (rows,), int64.
         voxel_rows: Rows of the corners (0,0,0), (0,1,0), (1,0,0), (1,1,0) of each voxel, shape (voxels, 4), int32; the
-            corner one step along z stands in the next row.
-        block_slot: Place of each block's table, -1 for a block without kept voxels, shape (blocks,), int32.
-        voxel_number: Tables of the blocks, one after the other: number of each voxel, -1 where it is not kept,
-            shape (slots * 512,), int32.
+            corner one step along z has the next row.
+        block_slot: Slot of each block in `voxel_number`, -1 for a block without kept voxels, shape (blocks,), int32.
+        voxel_number: Number of each voxel of the blocks that have a slot, slot after slot; -1 where a voxel is not
+            kept, shape (slots * 512,), int32.
     """
 
     def __init__(self, lattice: Lattice, cells: npt.ArrayLike | None = None):
@@ -69,33 +69,33 @@ class KeptVoxels:
 
     @property
     def num_rows(self) -> int:
-        """Number of stored corners."""
+        """Number of rows, that is of corners of kept voxels."""
         return len(self.corners)
 
     def __len__(self) -> int:
         return len(self.cells)
 
     def mask(self) -> BoolArray:
-        """Kept voxels as a dense array, shape of the lattice's voxels."""
+        """Return which voxels of the lattice are kept, boolean, shape `lattice.cell_shape`."""
         kept = np.zeros(self.lattice.cell_shape, dtype=bool)
         kept.reshape(-1)[self.cells] = True
         return kept
 
     def corner_index(self) -> IntArray:
-        """Lattice index (i, j, k) of every stored corner, shape (rows, 3)."""
+        """Return the lattice index (i, j, k) of the corner of each row, shape (rows, 3)."""
         return np.stack(np.unravel_index(self.corners, self.lattice.shape), axis=1)
 
     def dilated(self, chosen: BoolArray, by: int) -> BoolArray:
-        """Grow a subset of the kept voxels by `by` voxels in all 26 directions, one boolean per kept voxel.
+        """Return which kept voxels lie within `by` voxels, along each axis, of the chosen ones; one boolean per voxel.
 
-        Growth may pass through voxels that are not kept.
+        `chosen` has one boolean per kept voxel too. Distances count across voxels that are not kept.
         """
         grown = np.zeros(self.lattice.cell_shape, dtype=bool)
         grown.reshape(-1)[self.cells[chosen]] = True
         return np.asarray(maximum_filter(grown, 2 * by + 1, mode="constant"), dtype=bool).reshape(-1)[self.cells]
 
     def tables(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-        """`voxel_rows` of all eight corners (voxels, 8), `block_slot` and `voxel_number` as int64 tensors."""
+        """Return int64 tensors: rows of all eight corners (voxels, 8), `block_slot` and `voxel_number`."""
         if device not in self._tables:
             four = torch.from_numpy(self.voxel_rows).to(device, torch.int64)
             eight = torch.stack((four, four + 1), dim=-1).flatten(1)  # order of CORNER_OFFSETS
@@ -105,7 +105,7 @@ class KeptVoxels:
         return self._tables[device]
 
     def number_at(self, voxel: Tensor) -> Tensor:
-        """Number of voxels given by their lattice index (n, 3), inside the lattice; -1 where it is not kept."""
+        """Return the numbers of voxels given by index (n, 3) inside the lattice; -1 for a voxel that is not kept."""
         _, slot, number = self.tables(voxel.device)
         if len(number) == 0:
             return torch.full_like(voxel[:, 0], -1)
@@ -122,10 +122,10 @@ _BYTES_PER_VOXEL = 4 * 4 + 8 + 2 * 4  # Row numbers, index, and the voxel's part
 
 @dataclass(frozen=True)
 class MemoryNeed:
-    """Predicted peak memory of training on a lattice, beside photographs and programs."""
+    """Predicted peak memory of training on a lattice, without photographs and programs."""
 
-    voxels: int  # Kept voxels
-    rows: int  # Stored corners
+    voxels: int  # Number of kept voxels
+    rows: int  # Number of their corners; predicted unless all voxels are kept
     gigabytes: float  # Parameters, optimiser state, gradients and tables together, [1e9 bytes]
 
     def __str__(self) -> str:
@@ -133,9 +133,9 @@ class MemoryNeed:
 
 
 def memory_need(lattice: Lattice, voxels: int, channels: int) -> MemoryNeed:
-    """Predict what training on `voxels` kept voxels of a lattice needs.
+    """Predict the memory of training on a number of kept voxels of a lattice, with `channels` columns per row.
 
-    Each stored corner has a value, two moments and at most one gradient per channel in single precision.
+    Each channel of a row takes a value, two moments of the optimiser and a gradient, each of four bytes.
     """
     total = int(np.prod([float(n) for n in lattice.cell_shape]))
     rows = lattice.num_corners if voxels >= total else min(lattice.num_corners, int(_ROWS_PER_VOXEL * voxels))
@@ -146,7 +146,7 @@ def memory_need(lattice: Lattice, voxels: int, channels: int) -> MemoryNeed:
 
 
 def check_memory(lattice: Lattice, voxels: int, channels: int, budget_gb: float) -> MemoryNeed:
-    """Predict the memory of a lattice; raises `MemoryBudgetError` if it exceeds the budget."""
+    """Return `memory_need`; raise `MemoryBudgetError` if it is above `budget_gb`, [1e9 bytes]."""
     need = memory_need(lattice, voxels, channels)
     if need.gigabytes > budget_gb:
         raise MemoryBudgetError(

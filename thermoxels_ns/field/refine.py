@@ -15,14 +15,14 @@ from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 
 RowChange = Callable[[Tensor], Tensor]
-"""Maps values of the old rows, shape (old rows, channels), to values of the new ones."""
+"""A function from values per row before a change, (old rows, channels), to values after it, (new rows, channels)."""
 ColumnChange = Callable[[Tensor], Tensor]
-"""Maps values with the old columns, shape (rows, old columns), to values with the new ones."""
-ROWS_AT_ONCE = 1 << 17  # Rows interpolated at once: corner numbers and weights take more memory than the values
+"""A function from values before a change, (rows, old columns), to values after it, (rows, new columns)."""
+ROWS_AT_ONCE = 1 << 17  # Rows interpolated at once, which limits the memory for corner numbers and weights
 
 
 def split_voxels(voxels: KeptVoxels, factor: int) -> KeptVoxels:
-    """Split every kept voxel into `factor`^3 kept ones."""
+    """Return the voxels of the refined lattice into which the kept voxels split: `factor`^3 for each."""
     fine = voxels.lattice.refined(factor)
     index = np.unravel_index(voxels.cells, voxels.lattice.cell_shape)
     first = np.ravel_multi_index(tuple(along * factor for along in index), fine.cell_shape)
@@ -33,13 +33,13 @@ def split_voxels(voxels: KeptVoxels, factor: int) -> KeptVoxels:
 
 
 def parents_of_corners(old: KeptVoxels, new: KeptVoxels, factor: int) -> TrilinearPoints:
-    """Where the corners of split voxels lie in the voxels they came from; old corners lie exactly on old ones."""
+    """Return where the corners of the split voxels `new` lie in the voxels `old`, in the order of the new rows."""
     index = new.corner_index()
     number = torch.full((len(index),), -1, dtype=torch.int64)
     fraction = torch.zeros(len(index), 3, dtype=torch.float64)
     limit = np.asarray(old.lattice.cell_shape)
     for back in np.ndindex(2, 2, 2):
-        # A corner on the face between two old voxels belongs to both; either may be the one that is kept.
+        # A corner on the face between two old voxels belongs to both; perhaps only one of the two is kept.
         missing = (number < 0).nonzero()[:, 0].numpy()
         voxel = index[missing] // factor - np.asarray(back)
         possible = ((index[missing] % factor == 0) | (np.asarray(back) == 0)).all(1)
@@ -55,9 +55,9 @@ def parents_of_corners(old: KeptVoxels, new: KeptVoxels, factor: int) -> Triline
 
 @torch.no_grad()
 def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
-    """Split every kept voxel into factor^3 without changing the field; return how rows change: by interpolation.
+    """Split every kept voxel of `grid` into factor^3, in place; return the interpolation from old rows to new rows.
 
-    Density is per world unit, so nothing is rescaled. Old corners keep their rows exactly.
+    The field stays as it is: new corners get interpolated raw values, and corners of before keep their exact values.
     """
     new = split_voxels(grid.voxels, factor)
     at = parents_of_corners(grid.voxels, new, factor)
@@ -76,7 +76,7 @@ def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
 
 @torch.no_grad()
 def prune(grid: VoxelGrid, keep: BoolArray) -> RowChange:
-    """Keep only some of the kept voxels, one boolean for each, and return how rows change: by a copy."""
+    """Drop voxels of `grid` where `keep` (voxels,) is False, in place; return the selection of the rows that stay."""
     voxels = grid.voxels
     new = KeptVoxels(voxels.lattice, voxels.cells[keep])
     stay: IntArray = np.searchsorted(voxels.corners, new.corners)
@@ -90,9 +90,9 @@ def prune(grid: VoxelGrid, keep: BoolArray) -> RowChange:
 
 @torch.no_grad()
 def widen_colour(grid: VoxelGrid, degree: int) -> ColumnChange:
-    """Store colour up to a higher degree without changing the field: columns that were not stored are 0.
+    """Let `grid` store colour up to a higher degree, in place; return the function that adds columns of zeros.
 
-    While colour is the same from all sides, its further harmonics are 0 and no gradient moves them.
+    The field stays as it is, because harmonics with coefficient 0 add nothing.
     """
     assert grid.sh is not None and grid.sh_degree is not None and grid.sh_degree < degree
     few, many = num_coefficients(grid.sh_degree), num_coefficients(degree)

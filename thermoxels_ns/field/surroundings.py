@@ -1,4 +1,4 @@
-"""What lies outside the box: six lattices from its faces to infinity, and colour and temperature at infinity."""
+"""The space outside the box: a frustum from each face to infinity, and colour and temperature at infinity."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from thermoxels_ns.field.voxel_grid import DensityActivation, VoxelGrid
 
 @dataclass(frozen=True)
 class Segments:
-    """Straight pieces of rays in the coordinates of the lattice, in the order in which each ray meets them."""
+    """Straight pieces of rays in lattice coordinates of `Surroundings`, ray after ray and from near to far."""
 
-    ray: Int64[Tensor, " n"]  # The ray that each belongs to
+    ray: Int64[Tensor, " n"]  # Ray to which each piece belongs
     rank: Int64[Tensor, " n"]  # 0 for the first piece of a ray, 1 for the next
-    origins: Float[Tensor, "n 3"]
+    origins: Float[Tensor, "n 3"]  # Begin of each piece
     directions: Float[Tensor, "n 3"]  # Unit vectors
-    lengths: Float[Tensor, " n"]
+    lengths: Float[Tensor, " n"]  # Lattice units
 
 
 class Surroundings(nn.Module):
     """Density, colour and temperature from the faces of the box to infinity.
 
-    Each face opens into a frustum. With q the coordinate across the face (1 on it; the box is -1 to 1) and p, r those
-    along it, 1/q, p/q and r/q are coordinates in which the frustum is a box that ends at infinity, where 1/q = 0, and
-    straight lines are straight. The six boxes stand one behind the other in one lattice, with an empty layer of voxels
-    between, so that the renderer of the box serves here too.
+    A frustum reaches from each face to infinity. Scale the box to -1 to 1 and let q be the coordinate across the face
+    (1 on the face), p and r those along it. In the coordinates 1/q, p/q and r/q the frustum is a box, infinity is its
+    far side 1/q = 0, and straight lines stay straight. The six boxes stand in one lattice, one behind the other with
+    an empty layer of voxels between, so that the renderers of a grid can render them.
 
-    The box, (2, 3), is in world units; a face is `across` voxels wide, infinity `deep` voxels away; density is
-    [1 / voxel].
+    `box` (2, 3) is in world units. At the start a face is `across` voxels wide and infinity lies `deep` voxels away;
+    densities are per edge of such a voxel.
     """
 
     centre: Tensor
@@ -63,11 +63,11 @@ class Surroundings(nn.Module):
 
     @property
     def step(self) -> float:
-        """Share of the way from a face to infinity, in 1 / distance, that a voxel spans."""
+        """Change of 1/q across a voxel, where 1/q falls from 1 on a face of the box to 0 at infinity."""
         return self.grid.lattice.voxel_size / self.deep
 
     def keep(self, chosen: np.ndarray) -> None:
-        """Keep the voxels chosen by one boolean for each of the lattice's; only before a training."""
+        """Drop the voxels that are False in `chosen`, one boolean per voxel of the lattice; only before a training."""
         voxels = KeptVoxels(self.grid.lattice, np.flatnonzero(chosen))
         rows = {name: values.data[: voxels.num_rows] for name, values in self.grid.row_parameters().items()}
         self.grid.replace_voxels(voxels, rows, keep_identity=True)
@@ -75,10 +75,10 @@ class Surroundings(nn.Module):
     def segments(
         self, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"] | None = None
     ) -> Segments:
-        """Cut rays where they pass from one frustum into another, from where they leave the box for good to `far`.
+        """Return rays, from where they leave the box to distance `far`, cut where they pass between two frusta.
 
-        A ray that misses the box begins where it is nearest to the box's middle, so that what a camera outside has
-        before it stays empty.
+        Rays and `far` are in world units. A ray that misses the box begins where it is nearest to the box's middle, so
+        that the space before a camera outside the box stays empty.
         """
         from thermoxels_ns.field.surroundings_kernels import MOST_SEGMENTS, cut_rays
 
@@ -97,14 +97,14 @@ class Surroundings(nn.Module):
 
 
 RAYS_AT_ONCE = 8192
-"""Rays for which a background is evaluated together: torch splits tensors of 32,768 entries or more among its threads,
-and then the last bits of gradients and of some functions depend on how many there are."""
+"""Most rays for which a background is evaluated together. Torch splits tensors of 32,768 entries or more among its
+threads; the last bits of gradients and of some functions would then depend on the number of threads."""
 
 
 def seen_behind(
     background: nn.Module, directions: Float[Tensor, "n 3"], wanted: Bool[Tensor, " n"] | None
 ) -> Float[Tensor, "n c"]:
-    """Colour or temperature of a background along unit directions; 0 for rays that do not want it."""
+    """Return colour or temperature of `background` along unit directions; 0 for rays that are False in `wanted`."""
     if wanted is None or bool(wanted.all()):
         if len(directions) <= RAYS_AT_ONCE:
             return background(directions)
@@ -115,10 +115,10 @@ def seen_behind(
 
 
 class SphereImage(nn.Module):
-    """Colour at infinity as an equirectangular image around the z axis, bilinear, in logits.
+    """Colour at infinity: an equirectangular image around the z axis, of colours before the sigmoid, bilinear.
 
     Args:
-        height: Rows from the +z pole to the -z pole; there are twice as many columns.
+        height: Number of rows from the +z pole to the -z pole; the image has twice as many columns.
     """
 
     def __init__(self, height: int = 32):
@@ -126,7 +126,7 @@ class SphereImage(nn.Module):
         self.image = nn.Parameter(torch.zeros(height, 2 * height, 3))
 
     def forward(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Colour in [0, 1] seen along unit directions."""
+        """Return the colour seen along unit directions, each channel in [0, 1]."""
         height, width, _ = self.image.shape
         x, y, z = directions.unbind(-1)
         column = (torch.atan2(y, x) / (2 * math.pi) + 0.5) * width - 0.5
@@ -141,14 +141,14 @@ class SphereImage(nn.Module):
 
 
 class SkyTemperature(nn.Module):
-    """Normalised temperature at infinity as spherical harmonics, 0 in every direction at first."""
+    """Normalised temperature at infinity as a sum of spherical harmonics; 0 in every direction at the start."""
 
     def __init__(self) -> None:
         super().__init__()
         self.coefficients = nn.Parameter(torch.zeros(num_coefficients(MAX_DEGREE)))
 
     def forward(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
-        """Normalised temperature seen along unit directions."""
+        """Return the normalised temperature seen along unit directions."""
         # BLAS splits a product over rays among its threads; the gradient of `embedding` adds rays in their order.
         one = torch.zeros(len(directions), dtype=torch.long, device=directions.device)
         coefficients = F.embedding(one, self.coefficients[None])

@@ -1,4 +1,4 @@
-"""Compiled: cut rays into straight pieces of the surroundings."""
+"""Compiled kernel that cuts rays into straight pieces of the surroundings."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import numpy as np
 
 from thermoxels_ns.core.kernel_cache import kernel
 
-MOST_SEGMENTS = 6  # Frusta that a ray can pass through
+MOST_SEGMENTS = 6  # Most frusta through which a ray can pass
 
 
 @kernel
 def cut_rays(at, along, reaches, across: int, deep: int, ends, ray, rank):
-    """Cut rays into segments, see `Surroundings.segments`; the box is -1 to 1.
+    """Cut rays into pieces for `Surroundings.segments`, scaled so that the box is -1 to 1, and return their number.
 
-    Returns:
-        Number of segments, for which `ends` (n, 2, 3), `ray` and `rank` (n,) are filled.
+    Writes the two ends of each piece in lattice coordinates into `ends` (n, 2, 3), its ray and its rank into `ray` and
+    `rank` (n,). Origins `at`, directions `along` (rays, 3) and distances `reaches` (rays,) are the input.
     """
     count = 0
     for r in range(len(at)):
@@ -22,7 +22,7 @@ def cut_rays(at, along, reaches, across: int, deep: int, ends, ray, rank):
         if now >= reaches[r]:
             continue
         axis, sign, reach = 0, 1.0, -1.0
-        for i in range(3):  # the coordinate that is largest, or grows fastest among equal ones
+        for i in range(3):  # the face of the largest coordinate; of equal coordinates, of the one that grows fastest
             value = at[r, i] + now * along[r, i]
             side = 1.0 if value + 1e-12 * along[r, i] >= 0.0 else -1.0
             if side * value > reach + 1e-9 or (
@@ -61,7 +61,7 @@ def cut_rays(at, along, reaches, across: int, deep: int, ends, ray, rank):
 
 @kernel
 def _begin(at, along):
-    """Distance at which a ray leaves the box -1 to 1, or comes nearest to its middle if it misses it; at least 0."""
+    """Return the distance, at least 0, where a ray leaves the box -1 to 1, or, for a miss, is nearest to its middle."""
     enter, leave, across, square = -np.inf, np.inf, 0.0, 0.0
     for i in range(3):
         step = along[i] if abs(along[i]) > 1e-12 else 1e-12

@@ -18,14 +18,14 @@ DensityActivation = Literal["relu", "softplus", "exp"]
 COLOUR_CHANNELS = tuple(3 * num_coefficients(degree) for degree in range(MAX_DEGREE + 1))
 """Columns of colour by the degree of its harmonics."""
 
-_PALEST = 0.02  # Colours nearer to 0 or 1 are stored as this far from them: a sigmoid reaches neither
+_PALEST = 0.02  # `VoxelGrid.paint` clips colours to 0.02 .. 0.98, because a sigmoid reaches neither 0 nor 1
 
 
 def activate_density(raw: Tensor, kind: DensityActivation) -> Tensor:
-    """Map interpolated raw density to density >= 0, [1 / world unit], after interpolation.
+    """Return the density, >= 0, [1 / world unit], of interpolated raw density.
 
-    `relu` is the paper's (Plenoxels'): density itself is trilinear. `softplus` (DVGO, Sun et al. 2022) and `exp`
-    (Instant-NGP) let one voxel hold a sharp surface; `exp` is limited to e^15, opaque at any resolution.
+    `relu` is the choice of Plenoxels and of the paper. `softplus` (DVGO, Sun et al. 2022) and `exp` (Instant-NGP) let
+    one voxel hold a sharp surface; `exp` is limited to e^15, which is opaque at any resolution.
     """
     if kind == "relu":
         return F.relu(raw)
@@ -35,7 +35,7 @@ def activate_density(raw: Tensor, kind: DensityActivation) -> Tensor:
 
 
 def raw_density(density: float, kind: DensityActivation) -> float:
-    """The raw value that `activate_density` maps to `density`, [1 / world unit], above 0.
+    """Return the raw density that `activate_density` maps to `density`, which must be above 0, [1 / world unit].
 
     >>> round(raw_density(0.1, "softplus"), 4)
     -2.2522
@@ -45,17 +45,17 @@ def raw_density(density: float, kind: DensityActivation) -> float:
 
 
 class VoxelGrid(nn.Module):
-    """The parameters of the field, one row per corner of a kept voxel.
+    """The parameters of the field: density, colour and temperature, one row per corner of a kept voxel.
 
-    Refinement and pruning make new parameters (autograd remembers the shape of a leaf), to which optimisers must be
-    pointed. Loading a checkpoint exchanges only the data, so that optimisers that were built before stay valid.
+    Refinement and pruning make new parameters, because autograd remembers the shape of a leaf; the caller must point
+    the optimisers to these. Loading a checkpoint exchanges only the data, so that existing optimisers stay valid.
 
     Args:
-        lattice: Start lattice; all its voxels are kept at first.
-        sh_degree: Degree of the colour harmonics that are stored; None: no colour. `refine.widen_colour` raises it.
-        temperature_degree: Degree of the temperature harmonics; 0: the same from all directions (the paper).
-        start_density: Start density everywhere, [1 / world unit]; near-transparent.
-        activation: Density activation.
+        lattice: Lattice at the start; all its voxels are kept.
+        sh_degree: Degree of the colour harmonics at the start; None: no colour. `refine.widen_colour` raises it.
+        temperature_degree: Degree of the temperature harmonics; 0 (the paper): the same from all directions.
+        start_density: Density everywhere at the start, [1 / world unit].
+        activation: Function from interpolated raw density to density, see `activate_density`.
     """
 
     lo: Tensor
@@ -88,27 +88,27 @@ class VoxelGrid(nn.Module):
 
     @property
     def sh_degree(self) -> int | None:
-        """Degree of the colour harmonics that are stored; None: no colour."""
+        """Degree of the colour harmonics that are stored; None without colour."""
         return None if self.sh is None else degree_of(self.sh.shape[1] // 3)
 
     @property
     def lattice(self) -> Lattice:
-        """The corner lattice."""
+        """The lattice of the corners, kept or not."""
         return self.voxels.lattice
 
     @property
     def kept(self) -> Bool[Tensor, "x y z"]:
-        """Kept voxels as a dense mask, on the CPU."""
+        """Mask of the lattice's voxels on the CPU, True for kept voxels."""
         return torch.from_numpy(self.voxels.mask())
 
     def row_parameters(self) -> dict[str, nn.Parameter]:
-        """The parameters that have one row per stored corner, by name."""
+        """Return the parameters by name: density, sh (with colour only) and temperature, each (rows, columns)."""
         rows = {"density": self.density, "sh": self.sh, "temperature": self.temperature}
         return {name: p for name, p in rows.items() if p is not None}
 
     @torch.no_grad()
     def paint(self, colours: Float[Tensor, "rows 3"]) -> None:
-        """Give the stored corners a colour, the same from all directions."""
+        """Set the colour of each row, in [0, 1], the same from all directions."""
         assert self.sh is not None
         constant = harmonics(self.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # the same in all directions
         by_channel = self.sh.view(len(self.sh), 3, -1)
@@ -116,9 +116,9 @@ class VoxelGrid(nn.Module):
         by_channel[..., 0] = torch.logit(colours.to(self.sh), _PALEST) / constant
 
     def replace_voxels(self, voxels: KeptVoxels, rows: dict[str, Tensor], keep_identity: bool = False) -> None:
-        """Exchange the kept voxels, of this lattice or another, and the rows of every parameter by its name.
+        """Set the kept voxels, of this lattice or another, and the new rows of each parameter by name.
 
-        `keep_identity`: exchange the data of the parameters that exist; only while no graph uses them.
+        `keep_identity`: keep the parameter objects and exchange their data, allowed only while no graph uses them.
         """
         for name, parameter in self.row_parameters().items():
             data = rows[name].to(parameter.device, parameter.dtype).contiguous()
@@ -131,7 +131,7 @@ class VoxelGrid(nn.Module):
             setattr(self, name, values.to(self.lo.device))
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs):
-        """Take over the checkpoint's kept voxels and its degree of colour before its rows are copied."""
+        """Set kept voxels and degree of colour to the checkpoint's, then load its parameters."""
         names = ("lo", "voxel_size", "corner_shape", "cells")
         if all(prefix + name in state_dict for name in (*names, *self.row_parameters())):
             lo, size, shape, cells = (state_dict[prefix + name] for name in names)
@@ -148,22 +148,22 @@ class VoxelGrid(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def locate(self, points: Float[Tensor, "n 3"]) -> TrilinearPoints:
-        """Find the voxels and trilinear weights of world positions."""
+        """Return the voxel of each world position, and the place in the voxel."""
         return TrilinearPoints.of(self.voxels, points)
 
     def density_at(self, at: TrilinearPoints) -> Float[Tensor, " n"]:
-        """Density, [1 / world unit], >= 0."""
+        """Return the density at points in kept voxels, >= 0, [1 / world unit]."""
         return activate_density(interpolate(self.density, at)[:, 0], self.activation)
 
     def rgb_at(self, at: TrilinearPoints, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Colour in [0, 1] seen along unit directions: the sigmoid of the interpolated harmonics."""
+        """Return the colour, in [0, 1], of points in kept voxels seen along unit directions; the grid needs colour."""
         assert self.sh is not None and self.sh_degree is not None, "this grid has no colour"
         basis = harmonics(directions, self.sh_degree)[:, None]
         coefficients = interpolate(self.sh, at).view(len(directions), 3, basis.shape[-1])
         return torch.sigmoid((coefficients * basis).sum(-1))
 
     def thermal_at(self, at: TrilinearPoints, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
-        """Normalised temperature; the first coefficient is its mean over directions."""
+        """Return the normalised temperature of points in kept voxels seen along unit directions."""
         coefficients = interpolate(self.temperature, at)
         if self.temperature_degree == 0:
             return coefficients
@@ -172,19 +172,19 @@ class VoxelGrid(nn.Module):
 
     @torch.no_grad()
     def corner_values(self, rows: Float[Tensor, " rows"], fill: float = 0.0) -> Float[Tensor, "x y z"]:
-        """Spread one value per stored corner over the whole lattice; `fill` at the corners of no kept voxel."""
+        """Return values on all corners of the lattice from one value per row; other corners get `fill`."""
         values = torch.full((self.lattice.num_corners,), fill, dtype=rows.dtype, device=rows.device)
         values[torch.from_numpy(self.voxels.corners).to(rows.device)] = rows
         return values.view(self.lattice.shape)
 
     @torch.no_grad()
     def corner_density(self) -> Float[Tensor, "x y z"]:
-        """Density at every corner, 0 at corners of no kept voxel."""
+        """Return the density at each corner of the lattice, [1 / world unit]; 0 at corners without a row."""
         return self.corner_values(activate_density(self.density[:, 0], self.activation))
 
     @torch.no_grad()
     def voxel_density(self) -> Float[Tensor, "x y z"]:
-        """Density at every voxel centre, 0 in voxels that are not kept."""
+        """Return the density at the centre of each voxel, [1 / world unit]; 0 in voxels that are not kept."""
         corners, _, _ = self.voxels.tables(self.density.device)
         centre = activate_density(self.density[:, 0][corners].mean(-1), self.activation)
         values = torch.zeros(self.lattice.cell_shape, dtype=centre.dtype, device=centre.device)
@@ -193,7 +193,7 @@ class VoxelGrid(nn.Module):
 
 
 def _described(voxels: KeptVoxels) -> dict[str, Tensor]:
-    """What a checkpoint keeps of a lattice and its kept voxels."""
+    """Return the buffers by which a checkpoint describes the lattice and its kept voxels."""
     lattice = voxels.lattice
     return {
         "lo": torch.tensor(lattice.lo, dtype=torch.float64),

@@ -1,4 +1,4 @@
-"""Rendering by compiled kernels on the CPU, with row-sparse gradients."""
+"""Backend fused: rendering by compiled kernels on the CPU, with row-sparse gradients."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ from thermoxels_ns.render.ray_render import GridSamples, RayRender, RayRequest, 
 from thermoxels_ns.render.reference import SMALLEST_VARIATION
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
-VOXELS_AT_ONCE = 1 << 14  # Voxels whose total variation is one task
-FEWEST_SAMPLES = 24  # Samples per ray, averaged over a range of rays, that the first batch on a lattice has memory for
-MOST_GROUPS = 1 << 12  # Groups of voxels that samples are put in order by
-RANGES_PER_THREAD = 4  # Ranges of rows for the sums of gradients
-VARIATION_SHARE = 0.02  # Work of one channel's variation in a voxel, in samples
+VOXELS_AT_ONCE = 1 << 14  # Voxels whose total variation one task sums
+FEWEST_SAMPLES = 24  # Samples per ray, on average over a range of rays, for which the first batch takes memory
+MOST_GROUPS = 1 << 12  # Most groups of voxels by which samples are put in order (one group more may occur)
+RANGES_PER_THREAD = 4  # Ranges of rows per thread over which gradients are summed
+VARIATION_SHARE = 0.02  # Work for the variation of one channel in one voxel, relative to the work for one sample
 _room: dict[int, int] = {}
-"""Samples per ray that batches on the last lattice had memory for; the key is the number of rows."""
+"""Samples per ray for which the last batch took memory, by the number of rows of its grid."""
 NAMES = ("density", "sh", "temperature")
 
 
 @dataclass(frozen=True)
 class RecordedSamples:
-    """What was recorded of the samples of a batch of rays."""
+    """The forward pass of a batch of rays: its inputs, the records of its samples, and the sums per ray."""
 
     rays: Rays
     volume: Volume
     settings: Settings
     records: Records
     sums: Sums
-    spans: list[tuple[int, int]]  # The first and one behind the last record of each range of rays
+    spans: list[tuple[int, int]]  # First and one behind the last used record of each range of rays
 
 
 def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> GridSamples:
-    """March rays and list their samples; neither colour nor temperature is read.
+    """Return the samples of rays in kept voxels with their weights; neither colour nor temperature is read.
 
     Raises:
-        ThermoxelsError: A density on the way is NaN.
+        ThermoxelsError: The density of a sample is NaN.
     """
     nothing = torch.zeros(len(request.origins), dtype=torch.bool)
     recorded = _recorded_samples(grid, None, replace(request, rgb_rays=nothing, thermal_rays=nothing), options)
@@ -66,7 +66,7 @@ def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> Gri
 def _recorded_samples(
     grid: VoxelGrid, sh: Tensor | None, request: RayRequest, options: RenderOptions
 ) -> RecordedSamples:
-    """March rays and record their samples."""
+    """Run the forward pass for rays through a grid; `sh` is its colour, or None to leave colour out."""
     density = grid.density.detach().numpy()
     voxels, dtype, lattice = grid.voxels, density.dtype, grid.lattice
     volume = Volume(
@@ -103,7 +103,7 @@ def _recorded_samples(
 
 
 def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple[Records, Sums, list[tuple[int, int]]]:
-    """Fill `sums` and record the samples; where these are more than there is memory for, with twice as much again."""
+    """Fill `sums` and return the records of the samples; repeat with twice as many while the records do not suffice."""
     count, rows, dtype = len(rays.origins), len(volume.density), volume.density.dtype
     while True:
         room = _room.get(rows, FEWEST_SAMPLES)
@@ -127,7 +127,7 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
             break
         _room.clear()
         _room[rows] = 2 * room
-        del records, work  # what was too small is given back before more is taken
+        del records, work  # free the memory that was too small before more is taken
     if sum(wrong):
         remedy = "Lower the density learning rate and resume from the last checkpoint."
         raise ThermoxelsError("density", expected="numbers >= 0", got=f"NaN in {sum(wrong)} places", remedy=remedy)
@@ -135,10 +135,10 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
 
 
 def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
-    """Render rays through a grid on the CPU; differentiable once with respect to its parameters.
+    """Return what rays see of a grid on the CPU; the result can be differentiated once, by the grid's parameters.
 
     Raises:
-        ThermoxelsError: A density on the way is NaN.
+        ThermoxelsError: The density of a sample is NaN.
     """
     out = _Render.apply(grid.density, grid.sh, grid.temperature, grid, request, options)
     assert isinstance(out, tuple)
@@ -158,7 +158,7 @@ def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayR
 class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx, density, sh, temperature, grid: VoxelGrid, request: RayRequest, options: RenderOptions):
-        # `density`, `sh` and `temperature` are the grid's: autograd differentiates only by what it is handed.
+        # `density`, `sh` and `temperature` are the grid's parameters: autograd differentiates by arguments only.
         recorded = _recorded_samples(grid, grid.sh, request, options)
         variation = [
             _total_variation(_parameters(recorded.volume)[name], recorded.volume.voxel_rows, *block) / divisor + missing
@@ -209,7 +209,7 @@ def _parameters(volume: Volume) -> dict[str, np.ndarray]:
 
 
 def _blocks(options: RenderOptions, volume: Volume) -> Iterator[tuple[str, tuple[int, int], int, float]]:
-    """Yield parameter, block, what makes a mean of its total variation, and the share of channels without a column."""
+    """Yield parameter, (first, last), divisor for the mean total variation, and its part of channels not stored."""
     for name, (first, last) in options.variation.items():
         columns = _parameters(volume)[name].shape[1]
         channels = columns if name != "sh" or options.colour_channels is None else options.colour_channels
@@ -218,7 +218,7 @@ def _blocks(options: RenderOptions, volume: Volume) -> Iterator[tuple[str, tuple
 
 
 def _total_variation(values: np.ndarray, voxel_rows: np.ndarray, first: int, last: int) -> float:
-    """Sum of the total variation over a block, by parts that do not depend on the number of threads."""
+    """Return the total variation summed over voxels `first` to before `last`; no bit depends on the thread count."""
     bounds = [*range(first, last, VOXELS_AT_ONCE), last]
     parts: Any = run_tasks(
         [
@@ -238,7 +238,7 @@ def _gradient(gradient: Tensor | None, like: np.ndarray) -> np.ndarray:
 
 
 def row_gradients(rays: Rays, volume: Volume, of_samples: SampleGradients, blocks: Blocks) -> list[Tensor | None]:
-    """Gradients of density, colour and temperature as row-sparse tensors; None for one that no row has."""
+    """Return the gradients of density, colour and temperature as row-sparse tensors; None for one without rows."""
     parameters, num_rows = list(_parameters(volume).values()), len(volume.density)
     order = _ordered(of_samples, len(volume.voxel_rows))
     bounds = _row_ranges(volume.voxel_rows, num_rows, order, blocks, [p.shape[1] for p in parameters])
@@ -277,7 +277,7 @@ def row_gradients(rays: Rays, volume: Volume, of_samples: SampleGradients, block
 
 
 def _ordered(samples: SampleGradients, voxels: int) -> Order:
-    """The samples that have a gradient in the order of their voxels."""
+    """Return the samples with a gradient in the order of their groups of voxels."""
     total = int(samples.used.sum())
     shift = max(0, (voxels - 1).bit_length() - MOST_GROUPS.bit_length() + 1)
     groups = (voxels >> shift) + 1
@@ -287,7 +287,7 @@ def _ordered(samples: SampleGradients, voxels: int) -> Order:
 
 
 def _row_ranges(voxel_rows: np.ndarray, num_rows: int, order: Order, blocks: Blocks, channels: list[int]) -> list[int]:
-    """Bounds of row ranges with about equally much work."""
+    """Return the bounds of ranges of rows with about equal work, ascending, from 0 to `num_rows`."""
     ranges = num_threads() * RANGES_PER_THREAD
     if num_threads() == 1 or len(voxel_rows) == 0:
         return [0, num_rows]

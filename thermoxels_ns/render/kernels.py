@@ -1,4 +1,4 @@
-"""Compiled forward pass: follow rays through kept voxels, weigh samples by density, sum colour and temperature."""
+"""Compiled forward pass: follow rays through kept voxels, weigh the samples by density, sum colour and temperature."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from thermoxels_ns.core.kernel_cache import kernel
 
 
 def _prefetch(typing_context: Any, array: Any, row: Any, column: Any):
-    """Start to load ``array[row, column]``, or ``array[row]`` of a list, into the cache; for compiled code.
+    """Return how numba compiles `prefetch`, which loads ``array[row, column]`` (1-D: ``array[row]``) into the cache.
 
-    It is a hint: no result depends on it, and an index outside the array does no harm.
+    The call is a hint: no result depends on it, and an index outside the array does no harm.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -42,101 +42,101 @@ prefetch: Any = intrinsic(_prefetch)  # called as prefetch(array, row, column)
 Floats = npt.NDArray[np.floating]
 Ints = Any  # arrays of integers; numba knows which
 
-Y00 = 0.28209479177387814  # The first harmonic
-BLOCK = 8  # Voxels along the side of a block; the rule is that of `KeptVoxels`
-OPAQUE = 100.0  # Optical depth of a step from which it counts as opaque
-EXP_LIMIT = 15.0  # Raw density from which `exp` stays constant
-AHEAD = 8  # Samples of a ray that are read before they are weighed
+Y00 = 0.28209479177387814  # Value of the spherical harmonic of degree 0
+BLOCK = 8  # Voxels along the side of a block of `KeptVoxels`
+OPAQUE = 100.0  # Largest optical depth of a step; light behind such a step is 0
+EXP_LIMIT = 15.0  # Raw density above which the activation `exp` stays constant
+AHEAD = 8  # Samples of a ray that `march_rays` finds and reads before it weighs them
 NEAR, FAR = 8, 24
-"""Samples ahead of the one that is shaded whose values, and whose row numbers, are asked for."""
+"""While `shade` reads a sample, it prefetches corner values NEAR samples ahead, and row numbers FAR samples ahead."""
 RELU, SOFTPLUS, EXP = 0, 1, 2
 DENSITY, COLOUR, TEMPERATURE = 1, 2, 4
-"""Bits: which parameters a sample has a gradient for."""
+"""Bits of `SampleGradients.uses`: the parameters for which a sample has a gradient."""
 
 
 class Volume(NamedTuple):
-    """The kept voxels and their parameters as plain arrays."""
+    """The kept voxels and their parameters as plain arrays; lengths are in world units."""
 
-    lo: Floats  # Lower corner, (3,) float64
-    hi: Floats  # Upper corner, (3,) float64
+    lo: Floats  # Lower corner of the lattice, (3,) float64
+    hi: Floats  # Upper corner of the lattice, (3,) float64
     size: float  # Edge of a voxel
     cells: Ints  # Voxels along x, y, z, (3,) int64
-    block_slot: Ints
+    block_slot: Ints  # This and the next two: the attributes of `KeptVoxels` of that name
     voxel_number: Ints
     voxel_rows: Ints
-    density: Floats  # (rows, 1), raw
-    sh: Floats  # (rows, 3 k), or (0, 0)
-    temperature: Floats  # (rows, k)
-    activation: int
+    density: Floats  # Raw density, before the activation, (rows, 1)
+    sh: Floats  # k harmonics of red, of green and of blue, (rows, 3 k); (0, 0) without colour
+    temperature: Floats  # k harmonics of normalised temperature, (rows, k)
+    activation: int  # RELU, SOFTPLUS or EXP
 
 
 class Rays(NamedTuple):
-    """A batch of rays."""
+    """A batch of rays; lengths are in world units."""
 
-    origins: Floats
-    directions: Floats
-    near: Floats
-    far: Floats
-    wants: Ints  # Bits per ray, (rays,) uint8: 1 colour, 2 temperature
+    origins: Floats  # (rays, 3)
+    directions: Floats  # Unit vectors, (rays, 3)
+    near: Floats  # Distance at which sampling begins, (rays,)
+    far: Floats  # Distance at which sampling ends, (rays,)
+    wants: Ints  # Values that each ray wants, (rays,) uint8: 1 for colour, 2 for temperature, 3 for both
 
 
 class Settings(NamedTuple):
-    """What to compute and how exactly."""
+    """Options of the kernels: `RenderOptions` as plain numbers."""
 
-    step: float
+    step: float  # Length of a step along a ray, world units
     smallest_weight: float
     early_stop: float
-    distortion_scale: float  # Length that counts as 1 in the distortion; 0: not computed
-    sparsity: int  # 1: sum the sparsity term
-    thermal_moves_density: int
+    distortion_scale: float  # Length that counts as 1 in the distortion, world units; 0: no distortion is computed
+    sparsity: int  # 1: the sparsity is computed; 0: it is not
+    thermal_moves_density: int  # 1: density gets a gradient from temperature; 0: it does not
 
 
 class Records(NamedTuple):
-    """What the forward pass found of each sample in a kept voxel, ray after ray, until each ray is opaque.
+    """One record per sample in a kept voxel, ray after ray; a ray has no records behind `Settings.early_stop`.
 
-    Each range of rays writes from a place of its own on, so that unused records may lie between ranges.
+    Each range of rays has a part of the arrays for itself, so unused records may lie between ranges.
     """
 
     offset: Ints  # First record of each ray, (rays,) int64
-    used: Ints  # Records of each ray, (rays,) int64
-    number: Ints  # Number of the voxel, int32
-    step: Ints  # Number of the step, int32
-    fraction: Floats  # Place in the voxel, (records, 3)
-    density: Floats
-    transmittance: Floats  # Share of the ray's light that is left behind the step
-    weight: Floats
-    rgb: Floats  # Colour, (records, 3)
-    thermal: Floats  # Temperature
+    used: Ints  # Number of records of each ray, (rays,) int64
+    number: Ints  # Number of the kept voxel, (records,) int32
+    step: Ints  # Number of the step along the ray, from 0, (records,) int32
+    fraction: Floats  # Place in the voxel, each coordinate from 0 to 1, (records, 3)
+    density: Floats  # Density, [1 / world unit], (records,)
+    transmittance: Floats  # Share of the ray's light that is left behind the step, (records,)
+    weight: Floats  # Share of the ray's light that ends in the step, (records,)
+    rgb: Floats  # Colour from 0 to 1, (records, 3); (0, 3) without colour
+    thermal: Floats  # Normalised temperature, (records,)
 
 
 class SampleGradients(NamedTuple):
-    """Gradients of recorded samples. Three take the memory of the `Records` that the backward pass has read by then."""
+    """Gradients of the loss for each recorded sample; three arrays reuse the memory of arrays of `Records`."""
 
-    offset: Ints  # That of the records, as the next three
+    offset: Ints  # This and the next three are the arrays of `Records` of that name
     used: Ints
     number: Ints
     fraction: Floats
-    raw_density: Floats  # Written over `Records.density`
-    temperature: Floats  # Written over `Records.transmittance`
-    logits: Floats  # Those of the colour, (records, 3), written over `Records.rgb`
-    uses: Ints  # Which of the three a sample has (bits), uint8
+    raw_density: Floats  # For the raw density, (records,); overwrites `Records.density`
+    temperature: Floats  # For the temperature, (records,); overwrites `Records.transmittance`
+    logits: Floats  # For the colour before the sigmoid, (records, 3); overwrites `Records.rgb`
+    uses: Ints  # Gradients that a sample has, (records,) uint8: bits DENSITY, COLOUR, TEMPERATURE
 
 
 class Sums(NamedTuple):
-    """What comes out per ray."""
+    """The results of the forward pass for each ray; `RayRender` says what each is."""
 
-    rgb: Floats
-    thermal: Floats
-    transmittance: Floats
-    accumulation: Floats
-    depth: Floats
-    distortion: Floats
-    sparsity: Floats
+    rgb: Floats  # (rays, 3); (0, 3) without colour
+    thermal: Floats  # (rays, 1)
+    transmittance: Floats  # (rays,)
+    accumulation: Floats  # (rays,)
+    depth: Floats  # (rays,), world units
+    distortion: Floats  # (rays,); (0,) where `Settings.distortion_scale` is 0
+    sparsity: Floats  # (rays,); (0,) where `Settings.sparsity` is 0
 
 
 @kernel
 def chord(rays: Rays, r: int, volume: Volume):
-    """Entry and exit distance of a ray, both 0 for a miss; each axis guarded as in `reference.intersect_box`."""
+    """Return where ray `r` enters and leaves the box, as distances; 0, 0 for a miss (as `reference.intersect_box`)."""
     enter, leave = float(rays.near[r]), float(rays.far[r])
     for axis in range(3):
         origin, direction = float(rays.origins[r, axis]), float(rays.directions[r, axis])
@@ -158,7 +158,7 @@ def chord(rays: Rays, r: int, volume: Volume):
 
 @kernel
 def path_of(rays: Rays, r: int, volume: Volume):
-    """Where a ray begins, its direction, and its distance per world unit along each axis; finite where it is level."""
+    """Return origin, direction, and 1 / direction of ray `r`, three numbers each; 1e200 stands for 1 / 0."""
     never = 1e200
     dx, dy, dz = float(rays.directions[r, 0]), float(rays.directions[r, 1]), float(rays.directions[r, 2])
     ix, iy = 1.0 / dx if abs(dx) > 1e-100 else never, 1.0 / dy if abs(dy) > 1e-100 else never
@@ -168,10 +168,10 @@ def path_of(rays: Rays, r: int, volume: Volume):
 
 @kernel
 def next_sample(i: int, enter: float, length: float, step: float, path, volume: Volume):
-    """The first sample from step `i` on that lies in a kept voxel.
+    """Find the first sample of a ray, from step `i` on, that lies in a kept voxel.
 
-    The ray, see `path_of`, enters the box at the distance `enter` and is `length` long in it. Gives the sample's step,
-    the voxel's number, distance, step length and place in the voxel; step -1 if there is none.
+    `path` is the ray as `path_of` returns it; the ray enters the box at distance `enter` and crosses `length` of it.
+    Returns step, number of the voxel, distance, length of the step, and place (x, y, z) in the voxel; step -1: none.
     """
     (ox, oy, oz), (dx, dy, dz), (ix, iy, iz) = path
     lx, ly, lz = volume.lo[0], volume.lo[1], volume.lo[2]
@@ -184,7 +184,7 @@ def next_sample(i: int, enter: float, length: float, step: float, path, volume: 
         if delta <= 0.0:
             return -1, -1, 0.0, 0.0, 0.0, 0.0, 0.0
         t = enter + i * step + 0.5 * delta
-        # In this order, as the reference does: on a face between two voxels rounding decides.
+        # The same order of operations as in `TrilinearPoints.of`: rounding decides on a face between two voxels.
         ux = min(max((ox + dx * t - lx) / h, 0.0), float(nx))
         uy = min(max((oy + dy * t - ly) / h, 0.0), float(ny))
         uz = min(max((oz + dz * t - lz) / h, 0.0), float(nz))
@@ -196,7 +196,7 @@ def next_sample(i: int, enter: float, length: float, step: float, path, volume: 
                 return i, number, t, delta, ux - x, uy - y, uz - z
             i += 1
             continue
-        # Empty block: on to the first sample behind its far side (a little early rather than late).
+        # The block is empty: go on with the first sample behind its far side, rather a little early than late.
         face_x = lx + ((x >> 3) + (1 if ix > 0.0 else 0)) * BLOCK * h
         face_y = ly + ((y >> 3) + (1 if iy > 0.0 else 0)) * BLOCK * h
         face_z = lz + ((z >> 3) + (1 if iz > 0.0 else 0)) * BLOCK * h
@@ -207,7 +207,7 @@ def next_sample(i: int, enter: float, length: float, step: float, path, volume: 
 
 @kernel
 def basis_of(directions: Floats, r: int, count: int, scale: float, basis: Floats):
-    """Spherical harmonics of a ray's direction, the first `count` of `harmonics.harmonics`, times `scale`."""
+    """Write the first `count` of `harmonics.harmonics` in the direction of ray `r`, times `scale`, into `basis`."""
     basis[0] = Y00 * scale
     if count > 1:
         x, y, z = float(directions[r, 0]), float(directions[r, 1]), float(directions[r, 2])
@@ -222,7 +222,7 @@ def basis_of(directions: Floats, r: int, count: int, scale: float, basis: Floats
 
 @kernel(fastmath={"contract"})
 def gather(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, into: Floats):
-    """Interpolate one row of `values` at a place in a voxel."""
+    """Write all channels of `values` (rows, channels), interpolated at (fx, fy, fz) in a voxel, into `into`."""
     gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
     a, b, c, d = rows[number, 0], rows[number, 1], rows[number, 2], rows[number, 3]
     one = values.dtype.type
@@ -238,7 +238,7 @@ def gather(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: fl
 
 @kernel(fastmath={"contract"})
 def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, k: int):
-    """Interpolate channel `k` at a place in a voxel."""
+    """Return channel `k` of `values` (rows, channels), interpolated at (fx, fy, fz) in voxel `number`."""
     gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
     a, b = np.uint64(rows[number, 0]), np.uint64(rows[number, 1])
     c, d = np.uint64(rows[number, 2]), np.uint64(rows[number, 3])
@@ -254,7 +254,7 @@ def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz
 
 @kernel
 def prefetch_corners(values: Floats, rows: Ints, number: int):
-    """Ask for the first channel of a voxel's corners."""
+    """Prefetch the first channel of a voxel's corners."""
     for corner in range(4):
         row = np.int64(rows[number, corner])
         prefetch(values, row, 0)
@@ -262,13 +262,13 @@ def prefetch_corners(values: Floats, rows: Ints, number: int):
 
 @kernel
 def place_of(records: Records, n: int):
-    """Place of a sample in its voxel."""
+    """Return the place of record `n` in its voxel: x, y and z, each from 0 to 1."""
     return float(records.fraction[n, 0]), float(records.fraction[n, 1]), float(records.fraction[n, 2])
 
 
 @kernel
 def activate(raw: float, kind: int):
-    """Density of an interpolated raw value; a NaN stays one."""
+    """Return the density of an interpolated raw density, for the activation `kind`; NaN for NaN."""
     if kind == RELU:
         return raw if not raw <= 0.0 else 0.0
     if kind == SOFTPLUS:
@@ -288,13 +288,13 @@ def march_rays(
     begin: int,
     end: int,
 ):
-    """Weigh the samples of rays `first` to `last` (paper, eq. 1) and record them from `begin` to before `end`.
+    """Weigh the samples of rays `first` to before `last` (paper, eq. 1); fill records from `begin` to before `end`.
 
-    Ranges of rays write to places of their own, so that threads can share a batch. Sums are in double precision.
-    Samples are found, read and weighed a few at a time, so that several of them are asked of the memory at once.
+    Fills all of `sums` but colour and temperature, in double precision. Threads share a batch: each has a range of
+    rays and a range of records. `AHEAD` samples are read together, so that their loads from memory overlap.
 
     Returns:
-        Number of samples with NaN density, or -1 if there are more samples than places; place behind the last record.
+        Number of rays with a NaN density (-1 if the records do not suffice), and the place behind the last record.
     """
     distance, length_of, raw = np.empty(AHEAD), np.empty(AHEAD), np.empty(AHEAD)
     wrong = 0
@@ -364,7 +364,7 @@ def march_rays(
 
 @kernel
 def prefetch_colours(values: Floats, rows: Ints, number: int):
-    """Ask for the colours of a voxel's corners; with harmonics, rows of two corners take several cache lines."""
+    """Prefetch the colours of a voxel's corners; with harmonics, the rows of two corners take several cache lines."""
     channels = values.shape[1]
     if channels == 3:
         prefetch_corners(values, rows, number)
@@ -379,9 +379,9 @@ def prefetch_colours(values: Floats, rows: Ints, number: int):
 
 @kernel
 def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, sums: Sums):
-    """Read and sum colour and temperature of rays `first` to `last` (paper, eq. 1 and 2), as far as rays want them.
+    """Sum colour and temperature of rays `first` to before `last` into `sums` (paper, eq. 1 and 2).
 
-    Samples of at most the smallest weight are left out. Values are asked for some samples ahead.
+    A ray that does not want a value gets 0. Samples of at most `Settings.smallest_weight` are left out.
     """
     channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
     count = channels // 3
@@ -402,12 +402,12 @@ def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings,
             if n + FAR < end:
                 prefetch(volume.voxel_rows, records.number[n + FAR], 0)
             if n + NEAR < end and records.weight[n + NEAR] > settings.smallest_weight:
-                # What this ray wants is a good guess of what the next one wants.
+                # The sample ahead may belong to the next ray, which mostly wants what this ray wants.
                 if wants_rgb:
                     prefetch_colours(volume.sh, volume.voxel_rows, records.number[n + NEAR])
                 if wants_thermal:
                     prefetch_corners(volume.temperature, volume.voxel_rows, records.number[n + NEAR])
-            if not records.weight[n] > settings.smallest_weight:  # as rounded: the backward pass asks the same
+            if not records.weight[n] > settings.smallest_weight:  # as recorded: the backward pass compares this too
                 continue
             number, (fx, fy, fz), weight = records.number[n], place_of(records, n), float(records.weight[n])
             if wants_rgb:

@@ -1,4 +1,4 @@
-"""Compiled backward pass: gradients of rays become those of their samples, and these are summed for each row."""
+"""Compiled backward pass: from the gradients of rays to those of their samples, which are summed for each row."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from thermoxels_ns.render.kernels import (
 )
 
 _FLAT_EXP = math.exp(EXP_LIMIT) * (1.0 - 1e-6)
-"""Density from which `exp` is constant; a little less, so that rounding to single precision does not hide it."""
+"""Density at which `exp` has become constant, less 1e-6 of it: densities are rounded to single precision."""
 NEAR, FAR = 8, 16
-"""Samples ahead whose sums, and whose places of sums, are asked for; records are asked for at twice the latter."""
+"""Sums are prefetched NEAR samples ahead, the places of sums FAR samples ahead, and records 2 FAR samples ahead."""
 
 
 class RayGradients(NamedTuple):
-    """Gradients of what came out per ray."""
+    """Gradients of the loss for the results of each ray; the shapes are those of `kernels.Sums`."""
 
     rgb: Floats
     thermal: Floats
-    transmittance: Floats  # That of the accumulation is subtracted already, the sum of both being 1
+    transmittance: Floats  # For the transmittance, less that for the accumulation, which is 1 - transmittance
     distortion: Floats
     sparsity: Floats
 
@@ -56,10 +56,10 @@ def find_sample_gradients(
     grads: RayGradients,
     samples: SampleGradients,
 ):
-    """Find the gradients of the samples of rays `first` to `last`; each replaces what is recorded of its sample.
+    """Write the gradients of the samples of rays `first` to before `last` into `samples`, over part of `records`.
 
     With w_i = T_i (1 - exp(-x_i)), T_{i+1} = T_i exp(-x_i) and x_i the optical depth of step i,
-    dL/dx_i = g_i T_{i+1} - sum_{j>i} g_j w_j - g_T T_end, where g_i = dL/dw_i and g_T is the gradient of what is left.
+    dL/dx_i = g_i T_{i+1} - sum_{j>i} g_j w_j - g_T T_end, where g_i = dL/dw_i and g_T = dL/dT_end.
     """
     channels = volume.sh.shape[1]
     for r in range(first, last):
@@ -133,36 +133,36 @@ def find_sample_gradients(
 
 
 class Order(NamedTuple):
-    """Samples with a gradient in the order of their voxels; of those in one group of voxels, in the order of rays."""
+    """The samples with a gradient, by groups of successive voxels; within a group in the order of rays."""
 
-    shift: int  # A group is 2^shift voxels
-    group: Ints  # First of each group in the lists below and one behind the last, (groups + 1,) int64
-    record: Ints  # Record, int32
-    ray: Ints  # Its ray, int32
+    shift: int  # A group has 2^shift voxels
+    group: Ints  # Index at which each group begins in the two lists below, and their length, (groups + 1,) int64
+    record: Ints  # Record of each sample, int32
+    ray: Ints  # Ray of each sample, int32
 
 
 class Blocks(NamedTuple):
-    """Total variation to add: one entry per parameter, in the order density, colour, temperature."""
+    """The block of voxels whose total variation has a gradient: entries for density, colour, temperature."""
 
-    first: Ints  # First voxel, (3,) int64
-    last: Ints  # One behind the last voxel; the first where there is no block
-    push: Floats  # Gradient of the sum of the block's total variation, (3,) float64
-    smallest: float  # Added under the root
+    first: Ints  # First voxel of the block, (3,) int64
+    last: Ints  # One behind the last voxel, (3,) int64; equal to `first` for a parameter without a block
+    push: Floats  # Gradient of the loss for the block's `total_variation`, (3,) float64
+    smallest: float  # Number added under the root of the total variation
 
 
 class RowGradients(NamedTuple):
-    """Gradients of the rows that have one."""
+    """Sums of gradients, one for each row that a gradient reaches."""
 
-    uses: Ints  # Which parameters each row has a gradient for (bits), (rows,) uint8
-    place: Ints  # Where, in the sums below, (rows, 3) int32; for density, colour, temperature
-    density: Floats
-    sh: Floats
-    temperature: Floats
+    uses: Ints  # Parameters for which each row has a gradient, (rows,) uint8: bits DENSITY, COLOUR, TEMPERATURE
+    place: Ints  # Index of each row in the three arrays below, (rows, 3) int32
+    density: Floats  # (rows with a gradient of density, 1)
+    sh: Floats  # (rows with a gradient of colour, columns)
+    temperature: Floats  # (rows with a gradient of temperature, columns)
 
 
 @kernel
 def order_samples(samples: SampleGradients, order: Order):
-    """Fill `order` by counting; `order.group` holds zeros before."""
+    """Fill `order` by a counting sort of the samples with a gradient; `order.group` must hold zeros."""
     group = order.group
     for r in range(len(samples.used)):
         for n in range(samples.offset[r], samples.offset[r] + samples.used[r]):
@@ -183,7 +183,7 @@ def order_samples(samples: SampleGradients, order: Order):
 
 @kernel
 def first_voxel(voxel_rows: Ints, corner: int, row: int):
-    """The first voxel whose row of a corner is at least `row`; such rows ascend."""
+    """Return the first voxel whose row in column `corner` of `voxel_rows`, which ascends, is at least `row`."""
     low, high = 0, len(voxel_rows)
     while low < high:
         middle = (low + high) >> 1
@@ -198,7 +198,7 @@ def first_voxel(voxel_rows: Ints, corner: int, row: int):
 def use_rows(
     first_row: int, last_row: int, volume: Volume, samples: SampleGradients, order: Order, blocks: Blocks, uses: Ints
 ):
-    """Mark in `uses` which parameters rows `first_row` to `last_row` have a gradient for."""
+    """Write the bits of `RowGradients.uses` for rows `first_row` to before `last_row` into `uses`."""
     rows = volume.voxel_rows
     uses[first_row:last_row] = 0
     begin, end = first_voxel(rows, 3, first_row - 1), first_voxel(rows, 0, last_row)
@@ -220,13 +220,13 @@ def use_rows(
 
 @kernel
 def _groups_before(number: int, order: Order):
-    """Number of groups that reach the voxels before `number`."""
+    """Return the number of groups that hold the voxels 0 to `number` - 1."""
     return (number + (1 << order.shift) - 1) >> order.shift
 
 
 @kernel
 def list_rows(first_row: int, last_row: int, kind: int, at: int, rows: RowGradients, listed: Ints, sums: Floats):
-    """List the rows of a range that have a gradient of a parameter, from place `at` on, and set their sums to 0."""
+    """List the rows of a range with a gradient of parameter `kind` (0 to 2) from place `at` on; set their sums to 0."""
     for row in range(first_row, last_row):
         if rows.uses[row] & (1 << kind):
             rows.place[row, kind], listed[at] = at, row
@@ -236,7 +236,7 @@ def list_rows(first_row: int, last_row: int, kind: int, at: int, rows: RowGradie
 
 @kernel
 def prefetch_sample(samples: SampleGradients, n: int):
-    """Ask for what is needed of a sample."""
+    """Prefetch the gradients and the place of record `n`."""
     prefetch(samples.number, n, 0)
     prefetch(samples.fraction, n, 0)
     prefetch(samples.raw_density, n, 0)
@@ -246,7 +246,7 @@ def prefetch_sample(samples: SampleGradients, n: int):
 
 @kernel
 def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
-    """Ask for the sums of a voxel's corners, as far as they are in the range whose places are known."""
+    """Prefetch the sums of a voxel's corners; for a corner outside the thread's rows another sum may be fetched."""
     for corner in range(4):
         row = voxel_rows[number, corner]
         prefetch(rows.density, rows.place[row, 0], 0)
@@ -256,7 +256,7 @@ def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
 
 @kernel
 def corner_shares(samples: SampleGradients, n: int, shares: Floats):
-    """Trilinear weights of a sample's corners, in the order of `lattice.CORNER_OFFSETS`."""
+    """Write the trilinear weights of a sample's corners into `shares` (8,), in the order of `CORNER_OFFSETS`."""
     one = shares.dtype.type(1.0)
     fx, fy, fz = samples.fraction[n, 0], samples.fraction[n, 1], samples.fraction[n, 2]
     gx, gy, gz = one - fx, one - fy, one - fz
@@ -275,9 +275,9 @@ def add_samples(
     order: Order,
     rows: RowGradients,
 ):
-    """Add the gradients of samples to rows `first_row` to `last_row`, in the order of their voxels.
+    """Add the gradients of samples, in the order of `order`, to the sums of rows `first_row` to before `last_row`.
 
-    Each thread owns a range of rows: the sums are the same bits for any number of threads.
+    No other thread adds to these rows, so the sums have the same bits for any number of threads.
     """
     count, thermal_channels = volume.sh.shape[1] // 3, volume.temperature.shape[1]
     dtype = volume.density.dtype
@@ -337,7 +337,7 @@ def add_samples(
 
 @kernel(fastmath={"contract"})
 def total_variation(values: Floats, voxel_rows: Ints, first: int, last: int, smallest: float):
-    """Sum over voxels `first` to `last` and channels of sqrt(dx^2 + dy^2 + dz^2) (Plenoxels, eq. 4)."""
+    """Return sqrt(dx^2 + dy^2 + dz^2) summed over voxels `first` to before `last` and channels (Plenoxels, eq. 4)."""
     channels = values.shape[1]
     tiny = values.dtype.type(smallest)
     totals = np.zeros(channels)
@@ -365,7 +365,7 @@ def add_variation(
     place: Ints,
     gradient: Floats,
 ):
-    """Add the gradient of the total variation of a parameter's block to rows `first_row` to `last_row`."""
+    """Add the gradient of the total variation of parameter `kind` to rows `first_row` to before `last_row`."""
     channels = values.shape[1]
     first, last = blocks.first[kind], blocks.last[kind]
     one = values.dtype.type

@@ -1,4 +1,4 @@
-"""The plain twin of the compiled renderer: the volume rendering sum of the paper (eq. 1 and 2) in torch."""
+"""Backend reference: the volume rendering sum of the paper (eq. 1 and 2) in plain torch."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from thermoxels_ns.render.ray_render import GridSamples, RayRender, RayRequest, 
 
 @dataclass(frozen=True)
 class RaySteps:
-    """Samples along rays, padded to the longest ray."""
+    """Steps along rays, with one sample in the middle of each step, padded to the ray with most steps."""
 
     t: Float[Tensor, "rays steps"]  # Distance of each sample (the middle of its step) from the ray origin, world units
     deltas: Float[Tensor, "rays steps"]
-    """Length of each step; 0 for padding. Sums to the length of the ray inside the box."""
+    """Length of each step, world units; 0 for padding. The lengths of a ray sum to its length inside the box."""
 
 
 def intersect_box(
@@ -33,11 +33,10 @@ def intersect_box(
     near: float | Float[Tensor, " rays"] = 0.0,
     far: Float[Tensor, " rays"] | None = None,
 ) -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"], Bool[Tensor, " rays"]]:
-    """Intersect rays with an axis-aligned box by slabs (Kay and Kajiya 1986): entry, exit, and whether a ray hits.
+    """Return where rays enter and leave an axis-aligned box, world units, and whether they hit it; (rays,) each.
 
-    An axis along which the direction is 0 (below 1e-20, whose inverse would overflow) constrains nothing if the
-    origin lies in the closed slab and misses otherwise. A camera inside the box starts at `near`; a miss has both
-    distances 0.
+    By slabs (Kay and Kajiya 1986): a ray parallel to a slab (direction below 1e-20) misses the box if its origin lies
+    outside that slab. Only the part of a ray from `near` to `far` counts; both distances of a miss are 0.
     """
     parallel = directions.abs() < 1e-20
     inverse = 1.0 / torch.where(parallel, torch.ones_like(directions), directions)
@@ -62,7 +61,7 @@ def sample_box(
     near: float | Float[Tensor, " rays"] = 0.0,
     far: Float[Tensor, " rays"] | None = None,
 ) -> RaySteps:
-    """Cut each ray's chord through the box into steps of length `step`; the last step takes what is left."""
+    """Cut the part of each ray inside the box into steps of length `step`; the last step may be shorter."""
     t_enter, t_leave, _ = intersect_box(origins, directions, lo, hi, near, far)
     length = t_leave - t_enter
     num_steps = max(1, int(torch.ceil(length.amax() / step)) if len(length) else 1)
@@ -72,25 +71,25 @@ def sample_box(
 
 
 OPAQUE_OPTICAL_DEPTH = 100.0
-"""Optical depth of one step from which it counts as opaque: exp(-100) is 0 in float32, 4e-44 in float64."""
-SMALLEST_VARIATION = 1e-10  # Added under the root of the total variation, whose gradient is finite then
+"""Largest optical depth of one step; light behind it is exp(-100): 4e-44, below the normal numbers of float32."""
+SMALLEST_VARIATION = 1e-10  # Number added under the root of the total variation to keep its gradient finite
 
 
 @dataclass(frozen=True)
 class RayWeights:
-    """What density makes of a ray's steps."""
+    """The shares of each ray's light that end in each of its steps and behind the last step."""
 
-    weights: Float[Tensor, "rays steps"]  # Share of the pixel that each step fills
-    transmittance: Float[Tensor, " rays"]  # Share of the background that is left behind the last step
-    accumulation: Float[Tensor, " rays"]  # 1 - transmittance, with all digits when it is small
+    weights: Float[Tensor, "rays steps"]  # Share of its ray's light that ends in each step
+    transmittance: Float[Tensor, " rays"]  # Share of the light that is left behind the last step
+    accumulation: Float[Tensor, " rays"]  # Opacity, 1 - transmittance, with all digits when it is small
 
 
 def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> RayWeights:
-    """Turn densities [1 / world unit] into weights: w_i = exp(-sum_{j<i} s_j d_j) (1 - exp(-s_i d_i)) (paper, eq. 1).
+    """Return the weights w_i = exp(-sum_{j<i} s_j d_j) (1 - exp(-s_i d_i)) for densities s and lengths d.
 
-    Optical depths are summed, so that deep rays keep their digits; 1 - exp(-x) is computed as -expm1(-x), so that
-    vanishing density keeps its value and its gradient. Infinite density is opaque, but a step of length 0 has no
-    weight. Weights and transmittance sum to 1.
+    This is eq. 1 of the paper, with s in 1 / world unit. Weights and transmittance of a ray sum to 1. An infinite
+    density is opaque, but a step of length 0 has no weight. Optical depths are summed and 1 - exp(-x) is -expm1(-x), so
+    that neither opaque rays nor small densities lose digits.
 
     Raises:
         ThermoxelsError: A density is NaN.
@@ -112,7 +111,7 @@ def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "ray
 
 
 def ray_sparsity(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> Float[Tensor, " rays"]:
-    """Cauchy sparsity of each ray: sum_i log(1 + 2 s_i^2) over real steps (Plenoxels, eq. 5; SNeRG)."""
+    """Return the Cauchy sparsity of each ray, sum_i log(1 + 2 s_i^2) over its steps (Plenoxels, eq. 5; SNeRG)."""
     terms = torch.log1p(2.0 * density.clamp(max=1e9) ** 2)
     return torch.sum(torch.where(deltas > 0, terms, torch.zeros_like(terms)), -1)
 
@@ -123,10 +122,10 @@ def ray_distortion(
     deltas: Float[Tensor, "rays steps"],
     scale: float,
 ) -> Float[Tensor, " rays"]:
-    """How far each ray's weight is spread (mip-NeRF 360, eq. 15, in the O(n) form of DVGOv2, eq. 6-7).
+    """Return the distortion of each ray: sum_ij w_i w_j |t_i - t_j| + 1/3 sum_i w_i^2 d_i (mip-NeRF 360, eq. 15).
 
-    sum_ij w_i w_j |t_i - t_j| + 1/3 sum_i w_i^2 d_i, lengths divided by `scale` [world units]; its mean gathers the
-    weight of rays in one short interval. Step middles `t` ascend along each ray.
+    Distortion is small where the weight of a ray lies in one short interval. `t` must ascend along each ray; `t` and
+    `deltas` are divided by `scale`, world units. The sum is computed in the O(n) form of DVGOv2, eq. 6-7.
     """
     t, deltas = t / scale, deltas / scale
     moment = weights * t
@@ -138,18 +137,18 @@ def ray_distortion(
 
 @dataclass(frozen=True)
 class Marched:
-    """Samples of rays through the box, and what density makes of them."""
+    """Samples of rays through the box, with their densities and weights."""
 
     steps: RaySteps
-    density: Float[Tensor, "rays steps"]  # Density at the samples, 0 where nothing was asked, [1 / world unit]
+    density: Float[Tensor, "rays steps"]  # Density at the samples, 0 outside kept voxels, [1 / world unit]
     along: RayWeights
     active: Int64[Tensor, " n"]  # Flat indices (into rays x steps) of the samples in kept voxels, ascending
-    ray: Int64[Tensor, " n"]  # The ray of each of them
-    at: TrilinearPoints  # Where they lie
+    ray: Int64[Tensor, " n"]  # Ray of each sample in `active`
+    at: TrilinearPoints  # Voxel of each sample in `active`, and the place in the voxel
 
 
 def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> Marched:
-    """Sample rays through the kept voxels and weigh the samples."""
+    """Return the samples of rays through a grid with their densities and weights."""
     origins, directions, lattice = request.origins, request.directions, grid.lattice
     lo = torch.tensor(lattice.lo, dtype=origins.dtype, device=origins.device)
     hi = torch.tensor(lattice.hi, dtype=origins.dtype, device=origins.device)
@@ -159,20 +158,20 @@ def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> March
     ray = active // steps.t.shape[1]
     positions = origins[ray] + directions[ray] * steps.t.flatten()[active][:, None]
     at = grid.locate(positions)
-    kept = at.kept()  # of a point that rounding puts outside the box, the nearest voxel counts, as in the kernels
+    kept = at.kept()  # a point that rounding puts outside the box counts to the nearest voxel, as in the kernels
     active, ray, at = active[kept], ray[kept], at.select(kept)
     density = torch.zeros_like(steps.t).flatten().index_put((active,), grid.density_at(at)).view_as(steps.t)
     return Marched(steps, density, ray_weights(density, steps.deltas), active, ray, at)
 
 
 def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
-    """Render rays in plain torch: what every faster renderer is tested against."""
+    """Return what rays see of a grid, in plain torch; faster renderers are tested against this function."""
     marched = march(grid, request, options)
     steps, along, ray = marched.steps, marched.along, marched.ray
     weight = along.weights.flatten()[marched.active]
 
     def summed(values_at: Callable[..., Tensor], wants: Tensor | None, weight: Tensor, channels: int) -> Tensor:
-        """Sum values over the samples with a weight that counts, on rays that want them: C = sum_i w_i c_i."""
+        """Return sum_i w_i c_i of each ray that wants the value, over samples above the smallest weight; else 0."""
         chosen = weight.detach() > options.smallest_weight
         chosen = (chosen if wants is None else chosen & wants[ray]).nonzero()[:, 0]
         values = values_at(marched.at.select(chosen), request.directions[ray[chosen]]) * weight[chosen][:, None]
@@ -204,7 +203,7 @@ def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayR
 
 
 def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> GridSamples:
-    """March rays and list their samples; neither colour nor temperature is read."""
+    """Return the samples of rays in kept voxels with their weights; neither colour nor temperature is read."""
     marched = march(grid, request, options)
     weights = marched.along.weights
     before = torch.cumsum(weights, -1) - weights
@@ -217,10 +216,11 @@ def total_variation(
     corners: Int64[Tensor, "voxels 8"],
     channels: int | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean over voxels and channels of sqrt(dx^2 + dy^2 + dz^2), differences from corner 0 (Plenoxels, eq. 4).
+    """Return the mean over voxels and channels of sqrt(dx^2 + dy^2 + dz^2) (Plenoxels, eq. 4).
 
-    `corners` are rows of voxels in the order of `lattice.CORNER_OFFSETS`; `channels` are those of which the mean is
-    taken, 0 where they have no column, by default the columns.
+    dx, dy, dz are differences from corner 0 of a voxel. `corners` holds the rows of each voxel's corners, in the order
+    of `lattice.CORNER_OFFSETS`. The mean is over `channels` (default: the columns of `rows`); channels without a
+    column count as 0.
     """
     columns = rows.shape[1]
     channels = columns if channels is None else channels

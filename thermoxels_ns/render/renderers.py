@@ -1,4 +1,4 @@
-"""What rays see of a scene: the box by one of two renderers, what surrounds it, and what lies at infinity."""
+"""Rendering of a scene: the box and its surroundings by one of two backends, and the background at infinity."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from thermoxels_ns.render.ray_render import GridSamples, RayRender, RayRequest, 
 
 Backend = Literal["auto", "reference", "fused"]
 STEPS_PER_VOXEL = 1.0
-"""Samples per voxel edge of the surroundings: what stands behind is soft anyway (a figure in a street: 17.1 dB, and
-16.9 dB with two)."""
-LEAST_LIGHT = 0.003  # Share of a ray's light that leaves the box from which its surroundings are asked for
+"""Most samples per voxel edge of the surroundings, which are soft anyway (a figure in a street: 17.1 dB with one,
+16.9 dB with two samples)."""
+LEAST_LIGHT = 0.003  # The surroundings of a ray are rendered if more than this share of its light leaves the box
 
 
 def choose_backend(backend: Backend, device: torch.device) -> Literal["reference", "fused"]:
-    """Turn auto into the fastest backend of a device; raises `ThermoxelsError` for the compiled one beside a CPU."""
+    """Return the backend to use; auto is fused on a CPU. Raise `ThermoxelsError` for fused on another device."""
     if backend == "fused" and device.type != "cpu":
         remedy = "Pass --pipeline.model.backend auto, or --machine.device-type cpu."
         got = "fused, whose kernels run on the CPU"
@@ -34,7 +34,7 @@ def choose_backend(backend: Backend, device: torch.device) -> Literal["reference
 
 
 def _of(grid: VoxelGrid, backend: Backend) -> Any:
-    """The module that renders a grid with the backend of choice."""
+    """Return the module, `reference` or `fused`, that renders a grid."""
     if choose_backend(backend, grid.density.device) == "reference":
         return reference
     from thermoxels_ns.render import fused  # numba, which importing the configuration must not load
@@ -43,43 +43,43 @@ def _of(grid: VoxelGrid, backend: Backend) -> Any:
 
 
 def render_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, backend: Backend) -> RayRender:
-    """Render rays through a grid, without what stands behind it."""
+    """Return what rays see of a grid alone; no background is added."""
     return _of(grid, backend).render(grid, request, options)
 
 
 @torch.no_grad()
 def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, backend: Backend) -> GridSamples:
-    """March rays and list their samples; neither colour nor temperature is read."""
+    """Return the samples of rays in kept voxels with their weights; neither colour nor temperature is read."""
     return _of(grid, backend).samples(grid, request, options)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """All that rays can see; what is None is not there, infinity without a colour or temperature is black or 0."""
+    """All that rays can see: the grid in the box, the surroundings outside the box, and the values at infinity."""
 
     grid: VoxelGrid
-    surroundings: Surroundings | None = None
-    rgb: nn.Module | None = None  # Colour at infinity along unit directions
-    thermal: nn.Module | None = None  # Normalised temperature there
+    surroundings: Surroundings | None = None  # None: between the box and infinity is nothing
+    rgb: nn.Module | None = None  # Maps unit directions to colour at infinity, (n, 3); None: black
+    thermal: nn.Module | None = None  # Maps unit directions to normalised temperature at infinity, (n, 1); None: 0
 
 
 @dataclass(frozen=True)
 class AroundRender:
-    """What rays see of the surroundings; those that lost nearly all of their light in the box see nothing."""
+    """Rendered rays through the surroundings; a ray that lost nearly all light in the box has 0 and transmittance 1."""
 
     rgb: Float[Tensor, "rays 3"] | None  # Sum of weight times colour; None where there is no colour
     thermal: Float[Tensor, "rays 1"]  # Sum of weight times normalised temperature
-    transmittance: Float[Tensor, " rays"]  # Share of the light that reaches them from infinity
-    variation: dict[str, Float[Tensor, ""]]  # Total variation of the blocks asked for
+    transmittance: Float[Tensor, " rays"]  # Share of the light from infinity that passes the surroundings
+    variation: dict[str, Float[Tensor, ""]]  # Total variation by parameter name, of the blocks that were requested
 
 
 @dataclass(frozen=True)
 class SceneRender:
-    """What rays see of a scene (paper, eq. 1 and 2): C = C_box + T_box (C_around + T_around C_infinity)."""
+    """Rendered rays through a scene (paper, eq. 1 and 2): C = C_box + T_box (C_around + T_around C_infinity)."""
 
-    rgb: Float[Tensor, "rays 3"] | None
-    thermal: Float[Tensor, "rays 1"]
-    box: RayRender
+    rgb: Float[Tensor, "rays 3"] | None  # Colour; None for a grid without colour
+    thermal: Float[Tensor, "rays 1"]  # Normalised temperature
+    box: RayRender  # Result of the box alone
     around: AroundRender | None  # None without surroundings
 
 
@@ -90,9 +90,9 @@ def render_scene(
     backend: Backend,
     variation: dict[str, tuple[int, int]] | None = None,
 ) -> SceneRender:
-    """Render rays through box and surroundings to infinity; rays that do not want a value get 0.
+    """Return what rays see of box, surroundings and infinity; a ray that does not want a value gets 0.
 
-    `options` are those of the box, `variation` is the total variation to compute of the surroundings.
+    `variation` is `RenderOptions.variation` for the grid of the surroundings; `options` is for the box.
     """
     box = render_rays(scene.grid, request, options, backend)
     around = None
@@ -120,7 +120,7 @@ def _render_around(
     backend: Backend,
     variation: dict[str, tuple[int, int]],
 ) -> AroundRender:
-    """Render the surroundings for rays of which enough light leaves the box: their pieces as rays, put together."""
+    """Return what rays see of the surroundings; `light` (rays,) is the share of their light that leaves the box."""
     (chosen,) = (light.detach() > LEAST_LIGHT).nonzero(as_tuple=True)
     far = None if request.far is None else request.far[chosen]
     cut = surroundings.segments(request.origins[chosen], request.directions[chosen], far)

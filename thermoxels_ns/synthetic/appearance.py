@@ -1,4 +1,4 @@
-"""Colour of synthetic scenes: paints, solid texture, light and surroundings."""
+"""Colour of synthetic scenes (paints, solid texture, light), and colour and temperature of backgrounds."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _AMPLITUDES = (0.45, 0.55, 0.5)
 _REFERENCE_RESOLUTION = 64
 _HORIZON_BLEND = 0.08
 _GROUND_RISE_K = 2.0
-# Brightness first, then two colour differences; columns are the noise channels.
+# Columns are the noise channels: brightness, then two colour differences. Rows are red, green and blue.
 _CHANNELS_TO_RGB = np.array([[0.8, 0.3, 0.0], [0.8, -0.1, 0.25], [0.8, -0.15, -0.3]], dtype=np.float32)
 
 
 class SolidTexture:
-    """Value noise in three channels, defined at every point of space, that does not repeat within the box.
+    """A texture in space: a random colour deviation at every point, which does not repeat within the box.
 
-    Random values on cubic lattices, interpolated with a smoothstep, are added at three scales. The finest lattice
-    is two voxels wide where 64 voxels span the box's longest side.
+    The texture is the sum of random values on three cubic lattices, interpolated with a smoothstep. The spacing of the
+    finest lattice is two voxels where 64 voxels span the box's longest side.
     """
 
     def __init__(self, box: Box, seed: int) -> None:
-        """Draw the lattices of a scene between two corners [m]."""
+        """Draw the values of the three lattices; `box` is lower and upper corner [m]."""
         draw = np.random.default_rng(seed)
         self._lo = np.asarray(box[0], dtype=np.float64)
         voxel = float(np.subtract(box[1], box[0]).max()) / _REFERENCE_RESOLUTION
@@ -39,7 +39,7 @@ class SolidTexture:
             self._octaves.append((spacing * voxel, amplitude, size, values))
 
     def __call__(self, points: npt.ArrayLike) -> Float32Array:
-        """Colour deviation at points (n, 3) [m]: red, green and blue around 0, mostly within -1 to 1."""
+        """Return the deviation of red, green and blue at points (n, 3) [m], (n, 3): about 0, mostly within -1 to 1."""
         relative = np.asarray(points, dtype=np.float64) - self._lo
         noise = np.zeros((len(relative), 3), dtype=np.float32)
         for spacing, amplitude, size, values in self._octaves:
@@ -60,11 +60,11 @@ class SolidTexture:
 
 @dataclass(frozen=True)
 class Paint:
-    """A base colour and how strongly the texture shows on it."""
+    """A base colour, the strength of the texture on it, and a share of mirroring."""
 
     base: tuple[float, float, float]  # red, green, blue, 0 to 1
     contrast: float = 0.22  # weight of the texture, 0 to about 0.4
-    mirror: float = 0.0  # share of the light that comes off it as off a mirror, 0 to 1; the rest shows the paint
+    mirror: float = 0.0  # share of the light that the surface reflects as a mirror, 0 to 1; the rest shows the paint
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ class SunLight:
     """Lambert shading by one distant light and an ambient part; there are no shadows."""
 
     towards: tuple[float, float, float] = (0.45, -0.6, 0.66)  # direction to the light, any length
-    ambient: float = 0.62  # brightness of a surface that faces away from the light; one that faces it has 1
+    ambient: float = 0.62  # brightness of a surface that faces away from the light; facing the light it is 1
 
     def brightness(self, normals: npt.ArrayLike) -> Float32Array:
-        """Brightness of surfaces with unit normals (n, 3), shape (n, 1)."""
+        """Return the brightness, `ambient` to 1, of surfaces with unit normals (n, 3), shape (n, 1)."""
         sun = np.asarray(self.towards) / np.linalg.norm(self.towards)
         facing = np.maximum(np.asarray(normals) @ sun, 0.0)
         return (self.ambient + (1.0 - self.ambient) * facing).astype(np.float32)[:, None]
@@ -89,10 +89,10 @@ def painted(
     texture: SolidTexture,
     light: SunLight,
 ) -> Float32Array:
-    """Colour of surface points: base colour plus texture, times the brightness of the light.
+    """Return the colour of surface points, (n, 3) in [0, 1]: base colour plus texture, times the brightness.
 
-    Points [m] and normals have shape (n, 3), `part` indexes `paints` for each, shape (n,); red, green, blue in [0, 1],
-    shape (n, 3).
+    Points [m] and unit normals have shape (n, 3); `part` (n,) has the index into `paints` of each point. Mirrors are
+    left to `raycast`.
     """
     base, contrast = (np.array(one, dtype=np.float32)[part] for one in zip(*((p.base, p.contrast) for p in paints)))
     colour = (base + contrast[:, None] * texture(points)) * light.brightness(normals)
@@ -100,27 +100,27 @@ def painted(
 
 
 def sky_temperature_c(directions: npt.ArrayLike, horizon_c: float, drop_k: float) -> FloatArray:
-    """Apparent temperature [C] of sky and far ground along unit directions (n, 3), linear in the sine of the elevation.
+    """Return the apparent temperature [C] of sky and far ground along unit directions (n, 3), shape (n,).
 
-    The zenith is `drop_k` colder than the horizon, and the ground straight below is 2 K warmer.
+    Temperature is linear in z from the horizon to the zenith, `drop_k` colder, and to straight below, 2 K warmer.
     """
     z = np.asarray(directions, dtype=np.float64)[:, 2]
     return horizon_c - drop_k * _rise(z) + _GROUND_RISE_K * _rise(-z)
 
 
 def plain(rgb: Sequence[float]) -> Callable[[npt.ArrayLike], Float32Array]:
-    """A sky or backdrop of one colour, red, green and blue 0 to 1, in every direction."""
+    """Return a background of one colour (red, green, blue, 0 to 1): a function of directions (n, 3) to (n, 3)."""
     colour = np.asarray(rgb, dtype=np.float32)
     return lambda directions: np.tile(colour, (len(np.asarray(directions)), 1))
 
 
 def everywhere(degrees_c: float) -> Callable[[npt.ArrayLike], FloatArray]:
-    """A background of one temperature [C] in every direction."""
+    """Return a background of one temperature [C]: a function of directions (n, 3) to temperatures (n,)."""
     return lambda directions: np.full(len(np.asarray(directions)), degrees_c)
 
 
 def sky_rgb(directions: npt.ArrayLike) -> Float32Array:
-    """Pale haze at the horizon, blue above, grey green below: unit directions (n, 3) to colours (n, 3)."""
+    """Return colours (n, 3) for unit directions (n, 3): pale haze at the horizon, blue above, grey green below."""
     z = np.asarray(directions, dtype=np.float64)[:, 2:]
     haze, blue, ground = (0.82, 0.86, 0.90), (0.26, 0.45, 0.80), (0.46, 0.48, 0.40)
     up, down = _rise(z), np.minimum(3.0 * _rise(-z), 1.0)
@@ -129,12 +129,12 @@ def sky_rgb(directions: npt.ArrayLike) -> Float32Array:
 
 
 def room_rgb(directions: npt.ArrayLike) -> Float32Array:
-    """Light grey walls, a little warmer to one side and darker below: unit directions (n, 3) to colours (n, 3)."""
+    """Return colours (n, 3) for unit directions (n, 3): light grey, darker below, redder towards +x, bluer to +y."""
     x, y, z = np.asarray(directions, dtype=np.float32).T
     return np.stack([0.74 + 0.04 * x + 0.06 * z, 0.73 + 0.07 * z, 0.72 + 0.03 * y + 0.08 * z], axis=1)
 
 
 def _rise(z: FloatArray) -> FloatArray:
-    """Height above the horizon, max(z, 0) with a smooth bend: (z + b)^2 / 4b within b of it, and 1 at the zenith."""
+    """Return max(z, 0) with a smooth bend, (z + b)^2 / 4b for -b < z < b = 0.08; z is the sine of the elevation."""
     b = _HORIZON_BLEND
     return np.where(z > b, z, np.square(np.maximum(z + b, 0.0)) / (4.0 * b))

@@ -1,4 +1,4 @@
-"""Camera poses on rings that look at a point, and on lines that walk past something."""
+"""Camera poses on rings around a point, and on straight lines past a scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from thermoxels_ns.synthetic.solids import Vector
 
 
 def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:
-    """Pose (4, 4) of a camera that looks from `position` to `target`, not vertically, with world z up in its image."""
+    """Return the pose (4, 4) of a camera at `position` that looks at `target`, not vertically, with world z up."""
     position = np.asarray(position, dtype=np.float64)
     back = position - np.asarray(target, dtype=np.float64)
     right = np.cross((0.0, 0.0, 1.0), back)
@@ -29,9 +29,9 @@ def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True)
 class CameraRing:
-    """A horizontal circle, or a part of one, of cameras that look at one point."""
+    """A horizontal circle, or an arc of a circle, of cameras that look at one point."""
 
-    target: Vector  # point that all cameras look at and the axis goes through [m]
+    target: Vector  # point at which all cameras look, on the axis of the circle [m]
     radius_m: float  # horizontal distance from the axis [m]
     height_m: float  # z of the cameras [m]
     start_deg: float = 0.0  # azimuth where the arc begins, counted from x towards y [degrees]
@@ -39,11 +39,11 @@ class CameraRing:
 
     @property
     def closed(self) -> bool:
-        """Whether the last camera is a neighbour of the first."""
+        """True for a full circle, where the last camera is a neighbour of the first."""
         return self.span_deg >= 360.0
 
     def pose(self, share: float) -> FloatArray:
-        """Pose (4, 4) at a share of the arc, 0 to 1."""
+        """Return the pose (4, 4) at a share of the arc, 0 to 1, camera to world."""
         azimuth = math.radians(self.start_deg + self.span_deg * share)
         x = self.target[0] + self.radius_m * math.cos(azimuth)
         y = self.target[1] + self.radius_m * math.sin(azimuth)
@@ -51,20 +51,20 @@ class CameraRing:
 
 
 def rings_around(middle: tuple[float, float], *rings: Vector, **arc: float) -> tuple[CameraRing, ...]:
-    """Rings about one vertical axis, each from the height of its aim, its radius and its height [m]."""
+    """Return rings about a vertical axis at `middle` (x, y), each from z of its target, radius and z of cameras [m]."""
     return tuple(CameraRing((*middle, aim), radius, height, **arc) for aim, radius, height in rings)
 
 
 @dataclass(frozen=True)
 class CameraWalk:
-    """A straight line of cameras, each of which looks at a point of another line."""
+    """A straight line of cameras that look at points of a second line, in step."""
 
-    ends: tuple[Vector, Vector]  # where the line of cameras begins and ends [m]
-    aims: tuple[Vector, Vector]  # what the first and the last camera look at [m]
-    closed: bool = False
+    ends: tuple[Vector, Vector]  # begin and end of the line of cameras [m]
+    aims: tuple[Vector, Vector]  # points at which cameras at begin and end look [m]
+    closed: bool = False  # as of `CameraRing`: the last camera is no neighbour of the first
 
     def pose(self, share: float) -> FloatArray:
-        """Pose (4, 4) at a share of the line, 0 to 1."""
+        """Return the pose (4, 4) at a share of the line, 0 to 1, camera to world."""
         position, aim = (np.add(a, share * np.subtract(b, a)) for a, b in (self.ends, self.aims))
         return look_at(position, aim)
 
@@ -72,10 +72,10 @@ class CameraWalk:
 def ring_poses(
     rings: Sequence[CameraRing | CameraWalk], num_train: int, num_eval: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Spread training cameras evenly over rings and put evaluation cameras half-way between neighbours.
+    """Return training poses (num_train, 4, 4), evenly spread over rings, and evaluation poses (num_eval, 4, 4) between.
 
-    Cameras go to the rings in turn; each ring starts a fraction of a step later than the one before. More evaluation
-    cameras than there are gaps share a gap evenly. Poses have shapes (num_train, 4, 4) and (num_eval, 4, 4).
+    Cameras go to the rings in turn; each ring starts a fraction of a step later than the ring before. The evaluation
+    cameras in a gap between neighbours divide it evenly. Raises `SceneError` for too small a number of cameras.
     """
     if num_train < 1 or num_eval < 0:
         expected, got = "at least 1 for training and at least 0 for evaluation", f"{num_train} and {num_eval}"

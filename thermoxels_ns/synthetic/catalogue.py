@@ -1,4 +1,4 @@
-"""The synthetic scenes by name."""
+"""The names of synthetic scenes, and the scene of each name."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ _BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
     "facade": drawn_scenes.facade,
     "street": drawn_scenes.street,
 }
-DEVELOPMENT_NAMES = ("wall-object", "facade", "street")  # names of scenes that are hard to reconstruct, for development
+DEVELOPMENT_NAMES = ("wall-object", "facade", "street")  # names of hand-drawn scenes that are hard, for development
 SCENE_NAMES = tuple(name for name in _BUILDERS if name not in DEVELOPMENT_NAMES)
-"""Names of the scenes that were built by hand; `make_scene` also knows `DEVELOPMENT_NAMES`, `random-N` and `wild-N`."""
+"""Names of the other hand-drawn scenes; `make_scene` also knows `DEVELOPMENT_NAMES`, `random-N` and `wild-N`."""
 
 VARIANTS = "+sky=R,G,B, +white, +street, +room"
-"""What a name may end in, in any order: a sky of one colour (0 to 1); white plaster under a white sky (house-corner);
-houses and trees around; a room around."""
+"""Endings of a name, in any order: a sky of one colour (0 to 1); white plaster under a white sky (house-corner only);
+houses and trees around the scene; a room around the scene. Street and room exclude each other."""
 _SKY = re.compile(r"sky=((?:0?\.\d+|[01](?:\.0*)?)(?:,(?:0?\.\d+|[01](?:\.0*)?)){2})")
 
 
 def check_scene_name(name: str) -> str:
-    """Return a name if `make_scene` knows it, else raise a `SceneError` that lists the names there are.
+    """Return `name` if `make_scene` knows it; raise a `SceneError` that lists the known names otherwise.
 
     >>> check_scene_name("random-17")
     'random-17'
@@ -66,18 +66,18 @@ SceneWord = Annotated[
         str_from_instance=lambda value: [value],
     ),
 ]
-"""A scene's name as an option of a command, checked while the command line is read."""
+"""Type of a command's option that is a scene's name, which is checked while the command line is read."""
 
 
 @cache
 def make_scene(name: str) -> SyntheticScene:
-    """Make a synthetic scene by its name.
+    """Return the synthetic scene of a name.
 
-    One of `SCENE_NAMES` or `DEVELOPMENT_NAMES`, or ``random-`` or ``wild-`` and a seed without leading zeros; then, if
-    you like, some of `VARIANTS`, such as ``sphere+sky=1,1,1`` or ``random-3+street``.
+    A name is one of `SCENE_NAMES` or `DEVELOPMENT_NAMES`, or ``random-`` or ``wild-`` and a seed without leading zeros.
+    Some of `VARIANTS` may follow, such as ``sphere+sky=1,1,1`` or ``random-3+street``.
 
     Raises:
-        SceneError: No scene has that name; the message lists those there are.
+        SceneError: No scene has this name; the message lists the known names.
 
     >>> make_scene("sphere").temperature_bounds_c
     (10.0, 40.0)

@@ -1,4 +1,4 @@
-"""Synthetic scenes that were drawn by hand: to demonstrate on, and to develop on what photographs leave open."""
+"""Synthetic scenes that were drawn by hand: some for demonstrations, some that are hard, for development."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, Vector
 
 HOUSE = "house-corner"
 _HOUSE_AIR_C, _HOUSE_ROOM_C, _HOUSE_COEFFICIENT = 0.0, 20.0, 8.0
-"""The coefficient is that between surface and air, [W/(m2 K)]: 5.8 + 3.8054 v (Dall'O, Sarto and Panza 2013) in a wind
-of 0.578 m/s. A surface is warmer than the air by U (Ti - Te) / h."""
+"""Air outside and room inside, [C], and the coefficient h between surface and air, [W/(m2 K)]: h = 5.8 + 3.8054 v
+(Dall'O, Sarto and Panza 2013) in a wind v of 0.578 m/s. A surface is warmer than the air by U (Ti - Te) / h."""
 _KELVIN_PER_U = (_HOUSE_ROOM_C - _HOUSE_AIR_C) / _HOUSE_COEFFICIENT
-_HOUSE_WALL_U, _BRIDGE_U, _BRIDGE_WIDTH_M = 2.0, 1.2, 0.35  # of the wall, and what the slab's band adds, [W/(m2 K)]
+_HOUSE_WALL_U, _BRIDGE_U, _BRIDGE_WIDTH_M = 2.0, 1.2, 0.35  # U of the wall, and what the slab's band adds to it
 BRIDGE_PSI_W_MK = _BRIDGE_U * _BRIDGE_WIDTH_M * float(np.sqrt(np.pi))
-"""Extra loss of the band, 1.2 exp(-(z / 0.35 m)^2) W/(m2 K) over the height, per metre and kelvin, [W/(m K)]."""
+"""Extra loss of the slab's band per metre of its length, [W/(m K)]: 1.2 exp(-(z / 0.35 m)^2) W/(m2 K) over height z."""
 
 _GLASS, _DOOR = Paint((0.22, 0.30, 0.40), 0.16), Paint((0.42, 0.22, 0.14), 0.18)
 _PANE_M = 0.1
 _Openings = tuple[tuple[Wall, Range, Range, float, Paint], ...]
-"""The wall; from and to along it and in z [m]; the pane's temperature [C]; its paint."""
+"""For each opening: the wall, extents along the wall and in z [m], temperature [C] and paint of the pane."""
 
 
 def hot_object() -> SyntheticScene:
@@ -88,10 +88,10 @@ def sphere() -> SyntheticScene:
 
 
 def pipes() -> SyntheticScene:
-    """Build the pipes: two stand before the wall, a third crosses in front of both; the wall shows little texture.
+    """Build three pipes: two stand before a wall of little texture, a third crosses in front of both.
 
-    The room is 16 C everywhere. The thick pipe falls from 65 to 59 C along its height, the crossing one from 50 to
-    38 C along its length, the thin one rises from 26 to 34 C, and the wall glows behind the two that stand near it.
+    The room is 16 C everywhere. The thick pipe is 59 C at its foot and 65 C at its top, the thin pipe 26 and 34 C. The
+    crossing pipe falls from 50 to 38 C along x. The wall is warmer behind the two pipes that stand near it.
     """
     room_c, wall = 16.0, ((-1.3, 0.0, -0.9), (1.3, 0.16, 0.9))
     thick = Cylinder((-0.55, -0.28, 0.0), radius=0.13, length=1.6, axis=2)
@@ -128,14 +128,14 @@ def pipes() -> SyntheticScene:
 
 
 def house_corner(white: bool = False) -> SyntheticScene:
-    """Build the house: recessed warm windows, a door, a balcony slab, a roof, ground around, sky above.
+    """Build a house: recessed warm windows, a door, a balcony slab, a roof, ground around, sky above.
 
     `white`: walls of white plaster without texture, in the even light of a white sky.
 
-    20 C inside and 0 C outside: walls of U = 2.0, single panes of 4.8 to 5.8 and a door of 3.6 W/(m2 K) are as warm as
-    8 W/(m2 K) between surface and air make them, 5 C and 9 to 14.5 C, with a smooth fall over the reveals. The storey
-    slab shows as a band 3 K warmer, the balcony cools like a fin towards the air, and the sky falls from 0 C at the
-    horizon to -20 C at the zenith.
+    The room is 20 C, the air 0 C, and the coefficient between surface and air 8 W/(m2 K). So walls (U = 2.0 W/(m2 K))
+    are 5 C, the door (3.6) 9 C and single panes (4.8 to 5.8) 12 to 14.5 C warm; the warmth of panes fades over the
+    reveals. The storey slab shows as a band 3 K warmer, the balcony cools like a fin towards the air, and the sky falls
+    from 0 C at the horizon to -20 C at the zenith.
     """
     building: Box = ((-3.0, -2.5, 0.0), (3.0, 2.5, 5.0))
     ground: Box = ((-3.3, -4.2, -0.45), (4.3, 2.9, 0.0))
@@ -194,17 +194,17 @@ def house_corner(white: bool = False) -> SyntheticScene:
 
 
 def true_u_w_m2k(points: npt.ArrayLike) -> FloatArray:
-    """U-value that the temperature of the house's walls and panes at points (n, 3) follows from, (n,), [W/(m2 K)]."""
+    """Return the U-value behind the temperature of the house's walls and panes at points (n, 3), (n,), [W/(m2 K)]."""
     return (house_corner().surface_temperature_c(points) - _HOUSE_AIR_C) / _KELVIN_PER_U
 
 
 def courtyard() -> SyntheticScene:
-    """Build the courtyard: a U of three wings, a pergola, a thin garden wall, roofs that stand out, ground and sky.
+    """Build a courtyard: a U of three wings, a pergola, a thin garden wall, roofs that stand out, ground and sky.
 
-    The west wing is nearly without texture, the north and the east wing beside it are not. Walls run from 5.5 to 11 C
-    along the building, panes lie at 16 to 22 C, the roofs at -2.5 to 1 C, the garden wall is 15 C on its sunny and 5 C
-    on its other side, the chimney rises to 30 C and a flue in the east wall, 0.35 m wide, is 39.5 C hot. The sky falls
-    from 2 C at the horizon to -10 C at the zenith.
+    The west wing has nearly no texture; the north and the east wing have some. Walls are 5 to 11 C warm, panes and the
+    door 16 to 22 C, roofs -2.5 to 1 C, the garden wall about 15 C on its sunny side and 5 C on the other. The chimney
+    rises from 12 to 30 C, and a flue beside the east wall, 0.35 m wide, is 39.5 C hot. The sky falls from 2 C at the
+    horizon to -10 C at the zenith.
     """
     ground: Box = ((-5.2, -5.2, -0.4), (5.2, 5.2, 0.0))
     # A U of three wings that opens towards -y; the east wing is lower and shorter.
@@ -221,7 +221,7 @@ def courtyard() -> SyntheticScene:
     x, y, thick, top = (-0.75, 0.25, 1.25, 2.25), -2.3, 0.28, 2.4
     pergola: list[Box] = [((at, y, 0.0), (at + thick, y + thick, top)) for at in x]
     pergola.append(((west[1][0], y, top), (x[-1] + thick, y + thick, top + thick)))
-    # A free-standing wall, 1.8 voxels thick where 128 of them span the scene.
+    # A free-standing wall, 1.8 voxels thick where 128 voxels span the scene.
     garden_wall: Box = ((1.2, -4.4, 0.0), (4.8, -4.24, 1.6))
     flue: Box = ((3.9, 0.3, 1.2), (4.25, 0.65, 1.55))
     plan = _plan(
@@ -284,7 +284,7 @@ def courtyard() -> SyntheticScene:
 
 
 def _plan(*painted: tuple[Any, ...], openings: _Openings = (), recess_m: float = 0.0) -> Plan:
-    """A plan in metres: each paint and the shapes that have it, then openings with panes as far back as `recess_m`."""
+    """Return a plan in metres from (paint, shapes ...) for each paint, and openings with panes `recess_m` deep."""
     plan = Plan(np.random.default_rng(0), unit=_PANE_M)
     for paint, *shapes in painted:
         number = plan.add_paint(paint)
@@ -296,7 +296,7 @@ def _plan(*painted: tuple[Any, ...], openings: _Openings = (), recess_m: float =
 
 
 def _in_a_room(plan: Plan, *, light: SunLight = SunLight(), **fields: Any) -> SyntheticScene:  # noqa: B008 - frozen
-    """Make a scene, by default in a room as cold as its coldest surface."""
+    """Return a scene of a plan, by default in a room at the lower of its `temperature_bounds_c`."""
     room = {
         "background_rgb": room_rgb,
         "background_temperature_c": everywhere(fields["temperature_bounds_c"][0]),
@@ -305,7 +305,7 @@ def _in_a_room(plan: Plan, *, light: SunLight = SunLight(), **fields: Any) -> Sy
 
 
 def _of_nearest(points: npt.ArrayLike, *bodies: tuple[Any, ...]) -> FloatArray:
-    """Temperatures (n,) at points (n, 3) of the nearest body; a body is its temperatures (n,) and its shapes."""
+    """Return the temperatures (n,) of the body nearest to each point (n, 3); a body is temperatures (n,) and shapes."""
     far = [np.min([distance_to(shape, points) for shape in shapes], axis=0) for _, *shapes in bodies]
     return np.choose(np.argmin(far, axis=0), [degrees for degrees, *_ in bodies])
 
@@ -347,7 +347,7 @@ def wall_object() -> SyntheticScene:
         ),
         focal_share=0.98,
     )
-    # A large upright wall behind, of the air's temperature; what is seen past its edges has its colour too.
+    # A large upright wall stands behind, at the temperature of the air; the background past its edges has its colour.
     behind_m, half_m = 0.7, 25.0
     wall = Plan(np.random.default_rng(0), paints=[paint])
     wall.put(((-half_m, behind_m, -half_m), (half_m, behind_m + 0.1, half_m)), 0)
@@ -358,9 +358,9 @@ def wall_object() -> SyntheticScene:
 
 
 def facade() -> SyntheticScene:
-    """Build one front of a house, textured, with windows, ledges, a door and a strip of ground, under a plain sky.
+    """Build the textured front of a house with windows, ledges, a door and a strip of ground, under a plain sky.
 
-    Cameras walk along in front of it; none stands behind.
+    Cameras walk along in front of the house; no camera stands behind it.
     """
     return _front("facade", Paint((0.70, 0.60, 0.46), 0.25), mirror=0.0, sky=(0.62, 0.72, 0.84), railing=False)
 
@@ -368,14 +368,14 @@ def facade() -> SyntheticScene:
 def street() -> SyntheticScene:
     """Build a front of plain plaster with mirroring panes and a balcony with a railing of 2 cm bars, in a street.
 
-    Textured houses stand opposite, behind the cameras, and farther away beside the front; panes show them mirrored.
+    Textured houses stand all round: also behind the cameras, where the panes mirror them.
     """
     scene = _front("street", Paint((0.80, 0.76, 0.68), 0.0), mirror=0.6, sky=None, railing=True)
     return with_street(scene, seed=1)
 
 
 def _front(name: str, wall: Paint, mirror: float, sky: Vector | None, railing: bool) -> SyntheticScene:
-    """Build a front of 10.4 x 7.6 m, in decimetres, and walk past it in three lines of cameras."""
+    """Return a scene of a front, 10.4 m wide and 7.6 m high, past which three lines of cameras lead."""
     plan = Plan(np.random.default_rng(8))
     glass_paint = Paint((0.22, 0.30, 0.40), 0.0 if railing else 0.16, mirror)
     ground_paint, stone_paint = Paint((0.46, 0.45, 0.42), 0.26), Paint((0.58, 0.55, 0.50), 0.22)
@@ -421,7 +421,7 @@ def _front(name: str, wall: Paint, mirror: float, sky: Vector | None, railing: b
 
 
 def _balcony(plan: Plan, stone: int, metal: int) -> None:
-    """A slab over the door with bars 2 cm thick, 12 cm apart, and a rail on top of them [decimetres]."""
+    """Put a slab over the door with bars 2 cm thick, 12 cm apart, and a rail on top into a plan in decimetres."""
     x, out, low, top, thick = 18.0, 13.0, 39.0, 50.0, 0.2
     plan.put(((-x, -out, low - 3.0), (x, 0.0, low)), stone, 0.3)
     across, along = np.arange(-x + 0.2, x - 0.2, 1.2).tolist(), np.arange(-out + 1.4, -1.0, 1.2).tolist()

@@ -1,4 +1,4 @@
-"""What real cameras do to photographs, as switches of the synthetic scenes."""
+"""Flaws of real cameras and poses, which synthetic scenes can imitate."""
 
 from __future__ import annotations
 
@@ -11,59 +11,59 @@ from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import check_ranges
 
-_NOISE_SIGMAS = 6.0  # Noise that thermal files leave room for
-_PASSER_BY = ((0.09, 0.03, 0.03), 31.0)  # Colour and temperature, [degrees Celsius], of somebody in dark clothes
+_NOISE_SIGMAS = 6.0  # Standard deviations of the noise for which the range of thermal files leaves room
+_PASSER_BY = ((0.09, 0.03, 0.03), 31.0)  # Colour and temperature, [degrees Celsius], of a person in dark clothes
 _PASSER_BY_SIZE = (0.06, 0.35)  # Half width and half height, relative to the photograph's height
 
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Flaws of cameras and of their poses. All are off unless given; random ones are drawn from the scene's seed."""
+    """Sizes of the flaws of cameras and poses; a size of 0 switches a flaw off. `DrawnFlaws` draws them from a seed."""
 
     exposure_stops: float = 0.0
-    """Standard deviation of the exposure of each photograph, [stops]: pixel values are multiplied by 2^x."""
+    """Standard deviation of the exposure x of each photograph, [stops]: pixel values are multiplied by 2^x."""
     white_balance: float = 0.0
-    """Standard deviation of each channel's gain of each photograph, relative."""
+    """Standard deviation of the gain of each channel of each photograph, relative to 1."""
     vignetting: float = 0.0
-    """Share of the light that the corners of the photographs lose; it grows with the square of the distance."""
+    """Share of the light that the corners of photographs lose, growing with the squared distance from the middle."""
     noise_counts: float = 0.0
     """Standard deviation of the noise in every pixel of the photographs, [counts of 255]."""
     jpeg_quality: int = 92
     """Quality of JPEG files, 1 to 95."""
     motion_blur_px: float = 0.0
-    """Length of the line, in a direction of its own in each photograph, along which pixels are blurred, [pixels]."""
+    """Length of the line along which pixels are blurred, [pixels]; each photograph has its own direction."""
     rolling_shutter_px: float = 0.0
-    """How far the photograph moves between its first and its last row, [pixels]; the pose is that of the middle row."""
+    """Shift of the photograph between its first and last row, [pixels]; the true pose belongs to the middle row."""
     pose_error_deg: float = 0.0
-    """Standard deviation of the angle, about each axis, by which the poses given are turned, [degrees]; they are also
-    moved, by as much as that turn moves what the scene's middle shows."""
+    """Standard deviation of the angle, about each axis, by which given poses are turned, [degrees]. Given positions are
+    also moved, along each axis by such an angle in radians times the distance to the scene's middle."""
     pose_correlation: float = 0.0
-    """Share of a pose's error that the next photograph has too, below 1: 0.95 for a walk."""
+    """Correlation of the pose errors of successive photographs, below 1: 0.95 for a walk."""
     focal_error: float = 0.0
-    """How much longer the focal length given is than the true one, relative."""
+    """Error of the given focal length, relative to the true one; above 0 the given focal length is too long."""
     noise_k: float = 0.0
     """Standard deviation of the noise in every thermal pixel, [K]."""
     drift_k: float = 0.0
-    """Standard deviation of one temperature offset per thermal image, [K], as uncooled cameras have it."""
+    """Standard deviation of the temperature offset of each thermal image, [K], as uncooled cameras have it."""
     thermal_blur_px: float = 0.0
     """Standard deviation of the thermal camera's Gaussian point spread, [thermal pixels]."""
     thermal_vignetting_k: float = 0.0
-    """How much too cold the corners of the thermal images read, [K]; it grows with the square of the distance."""
+    """Error by which the corners of thermal images read too cold, [K], growing with the squared distance."""
     fixed_pattern_k: float = 0.0
-    """Standard deviation of an offset of each thermal pixel that is the same in all images, [K]."""
+    """Standard deviation of the offset of each thermal pixel, which is the same in all images, [K]."""
     dead_pixels: float = 0.0
     """Share of the thermal pixels that always read the same value."""
     rig_error_deg: float = 0.0
-    """Standard deviation of the angle, about each axis, by which all given poses of a thermal camera of its own are
-    turned against the photographs', [degrees]."""
+    """Standard deviation of the angle, about each axis, by which the given poses of a separate thermal camera are
+    turned against those of the photographs, [degrees]; all poses are turned alike."""
     passers_by: float = 0.0
-    """Share of the pairs in which somebody walks before the scene, 31 C warm."""
+    """Share of the pairs of images in which a person, 31 C warm, walks before the scene."""
 
     def check(self) -> None:
-        """Refuse what cannot be drawn.
+        """Check the range of every option.
 
         Raises:
-            ThermoxelsError: Names the option, what it takes and what it got.
+            ThermoxelsError: An option is out of range; the message has its name, range and value.
         """
         limits = {field.name: (0.0, 1e6, "a finite number of at least 0") for field in fields(self)}
         limits |= dict.fromkeys(("vignetting", "dead_pixels", "passers_by"), (0.0, 1.0, "from 0 to 1"))
@@ -76,14 +76,14 @@ PERFECT = Imperfections()
 
 
 class DrawnFlaws:
-    """What was drawn for the photographs of one scene: the truth that corrections are to find.
+    """The flaws drawn for the photographs of one scene, which corrections are to find, and their effect on images.
 
     Args:
-        flaws: How large the flaws are.
-        seed: Seed of all that is drawn.
+        flaws: Sizes of the flaws.
+        seed: Seed of all random numbers.
         poses: True poses of the photographs (n, 4, 4), camera to world.
-        middle: Middle of the scene (3,) [m], by whose distance poses are moved.
-        range_c: Between which dead thermal pixels read [degrees Celsius].
+        middle: Middle of the scene (3,) [m]; errors of position are proportional to the distance to it.
+        range_c: Lowest and highest reading of dead thermal pixels [degrees Celsius].
     """
 
     def __init__(
@@ -109,38 +109,38 @@ class DrawnFlaws:
         self._passing: BoolArray = np.random.default_rng([seed, 6]).random(count) < flaws.passers_by
 
     def _normal(self, *shape: int, stream: int, number: int | None = None) -> FloatArray:
-        """Normal deviates of a stream, of one photograph of it or of all."""
+        """Return standard normal numbers of a stream, for one photograph or without `number` for all."""
         return np.random.default_rng(
             [self._seed, stream] if number is None else [self._seed, stream, number]
         ).standard_normal(shape)
 
     def given_poses(self) -> FloatArray:
-        """The poses (n, 4, 4) that a scene folder gives in place of the true ones."""
+        """Return the wrong poses (n, 4, 4) that a scene folder contains in place of the true poses."""
         given = self._poses.copy()
         given[:, :3, :3] = given[:, :3, :3] @ _turned(self.turns_rad)
         given[:, :3, 3] += self._moves
         return given
 
     def given_rig_turn(self) -> FloatArray:
-        """Transform (4, 4) by which all poses of a thermal camera of its own are turned."""
+        """Return the transform (4, 4) by which the given poses of a separate thermal camera are wrong."""
         turn = np.eye(4)
         turn[:3, :3] = _turned(self._rig_turn_rad)
         return turn
 
     def bounds_c(self, lowest_c: float, highest_c: float) -> tuple[float, float]:
-        """Lowest and highest reading [degrees Celsius] of thermal images of a scene with these temperatures."""
+        """Return the range of readings of thermal images [degrees Celsius] for the range of a scene's temperatures."""
         flaws = self.flaws
         margin = _NOISE_SIGMAS * float(np.hypot(flaws.noise_k, flaws.fixed_pattern_k))
         low = min(float(self.drifts_k.min()), 0.0) - margin - flaws.thermal_vignetting_k
         return lowest_c + low, highest_c + (max(float(self.drifts_k.max()), 0.0) + margin)
 
     def given_camera(self, camera: Camera) -> Camera:
-        """The intrinsics that a scene folder gives."""
+        """Return the wrong intrinsics that a scene folder contains in place of those of `camera`."""
         stretch = 1.0 + self.flaws.focal_error
         return replace(camera, fl_x=stretch * camera.fl_x, fl_y=stretch * camera.fl_y)
 
     def photograph(self, number: int, rgb: Float32Array) -> npt.NDArray[np.uint8]:
-        """What the camera stores of a view (h, w, 3) in [0, 1]: counts (h, w, 3)."""
+        """Return what the camera stores in photograph `number`, counts (h, w, 3), for true colours in [0, 1]."""
         flaws, draw = self.flaws, np.random.default_rng([self._seed, 7, number])
         angle, side, place = draw.uniform(0.0, 2.0 * np.pi), draw.random(), draw.random()
         seen = rgb.astype(np.float64)
@@ -155,7 +155,7 @@ class DrawnFlaws:
         return np.clip(np.round(counts), 0, 255).astype(np.uint8)
 
     def thermogram(self, number: int, temperature_c: FloatArray) -> FloatArray:
-        """What the thermal camera reads of true apparent temperatures (h, w), [degrees Celsius]."""
+        """Return what thermal image `number` reads, (h, w), for true apparent temperatures, [degrees Celsius]."""
         from scipy import ndimage
 
         flaws, shape, seen = self.flaws, temperature_c.shape, temperature_c.copy()
@@ -170,7 +170,7 @@ class DrawnFlaws:
         return np.where(draw.random(shape) < flaws.dead_pixels, draw.uniform(*self._range_c, shape), seen)
 
     def truth(self) -> dict[str, object]:
-        """What ``truth.json`` says of the flaws."""
+        """Return the entries of ``truth.json`` about the flaws."""
         return {
             "imperfections": vars(self.flaws),
             "gains": self.gains.tolist(),
@@ -182,20 +182,20 @@ class DrawnFlaws:
 
 
 def _turned(rotation_vectors: FloatArray) -> FloatArray:
-    """Matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
-    from scipy.spatial.transform import Rotation  # not loaded by --help
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    from scipy.spatial.transform import Rotation  # imported here so that --help stays fast
 
     return Rotation.from_rotvec(rotation_vectors).as_matrix()
 
 
 def _corner_distance(shape: tuple[int, ...]) -> FloatArray:
-    """Distance of pixels from the middle of an image (h, w), 1 at its corners."""
+    """Return the distance of each pixel from the middle, (h, w), in half sides over sqrt(2): about 1 at the corners."""
     y, x = (np.linspace(-1.0, 1.0, side + 2)[1:-1] for side in shape)
     return np.sqrt(0.5 * (y[:, None] ** 2 + x**2))
 
 
 def _passer_by(shape: tuple[int, ...], place: float) -> BoolArray:
-    """Pixels (h, w) of somebody who walks by at a share of the width: an upright ellipse."""
+    """Return the pixels (h, w) that a passer-by covers: an upright ellipse at a share `place` of the width."""
     height, width = shape
     rows, columns = np.mgrid[:height, :width] + 0.5
     x, y = (columns - place * width) / height, (rows - 0.6 * height) / height
@@ -203,7 +203,7 @@ def _passer_by(shape: tuple[int, ...], place: float) -> BoolArray:
 
 
 def _sheared(image: FloatArray, pixels: float) -> FloatArray:
-    """An image (h, w, 3) whose last row stands so many pixels to the side of its first."""
+    """Return an image (h, w, 3) sheared so that its last row is shifted by `pixels` against its first row."""
     from scipy import ndimage
 
     height = len(image)
@@ -212,7 +212,7 @@ def _sheared(image: FloatArray, pixels: float) -> FloatArray:
 
 
 def _moved_along(image: FloatArray, length: float, angle: float) -> FloatArray:
-    """Mean of an image (h, w, 3) over shifts along a line of some pixels at an angle [rad]."""
+    """Return an image (h, w, 3) blurred along a line of `length` pixels at an angle [rad]."""
     from scipy import ndimage
 
     steps = 2 * int(np.ceil(length)) + 1

@@ -7,16 +7,16 @@ from collections.abc import Callable
 from thermoxels_ns.synthetic.random_plan import HAIR, SMALLEST, WIDEST, Plan, Range, Wall
 from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, box_beside
 
-_CORNER = 8.5  # least wall between the corner of a house and an opening [voxels of the plan], as all lengths here
-_PIER = 3.6  # least wall beside an opening
+_CORNER = 8.5  # least wall between the corner of a house and an opening; all lengths here are in voxels of the plan
+_PIER = 3.6  # least length of wall beside an opening
 _OPENING = 6.0  # least side of an opening
-_LEDGE = 3.2  # least roof beside a chimney
+_LEDGE = 3.2  # least width of roof beside a chimney
 _RIDGE = 13.0  # least width of a roof's last step
-_AISLE = 4.0  # half the least gap between machines
+_AISLE = 4.0  # half of the least gap between machines
 
 
 def detached_house(plan: Plan) -> None:
-    """A house on a plinth with a stepped roof, an annex on one side and windows on the other three."""
+    """Put a house on a plinth with a stepped roof and windows into a plan, with an annex on one of its sides."""
     u = plan.u
     ground, wall, roof, stone, glass = (plan.paint(m) for m in ("ground", "wall", "roof", "stone", "glass"))
     size_x, size_y = u(104, WIDEST), u(94, 112)
@@ -58,7 +58,7 @@ def detached_house(plan: Plan) -> None:
 
 
 def wings(plan: Plan) -> None:
-    """An L or a U of flat-roofed wings with parapets or eaves, a balcony, a jutting storey and a thin garden wall."""
+    """Put an L or a U of flat-roofed wings with a balcony, a jutting storey and a thin garden wall into a plan."""
     u = plan.u
     ground, wall, roof, stone, glass = (plan.paint(m) for m in ("ground", "wall", "roof", "stone", "glass"))
     size_x, size_y = u(106, WIDEST), u(102, WIDEST)
@@ -127,7 +127,7 @@ def wings(plan: Plan) -> None:
 
 
 def facade(plan: Plan) -> None:
-    """A strip of facade with window recesses, sills, a cornice, entrance steps and a post that stands before it."""
+    """Put a facade with window recesses, sills and a cornice into a plan, a post before it and perhaps steps."""
     u = plan.u
     ground, wall, stone, glass = (plan.paint(m) for m in ("ground", "wall", "stone", "glass"))
     half_x, ground_half = 0.5 * u(84, 104), 0.5 * u(108, WIDEST)
@@ -159,7 +159,7 @@ def facade(plan: Plan) -> None:
 
 
 def railing(plan: Plan) -> None:
-    """Thin bars under a rail along the front edge of the ground, which is the plan's first piece."""
+    """Put thin bars under a rail along the front edge of the ground, which must be the plan's first piece."""
     u = plan.u
     ground = plan.pieces[0].shape
     assert isinstance(ground, tuple)
@@ -174,7 +174,7 @@ def railing(plan: Plan) -> None:
 
 
 def _stepped_roof(plan: Plan, body: Box, paint: int) -> Box:
-    """Eaves and steps that shrink to a ridge along x; returns the last step."""
+    """Put eaves and a roof of steps that shrink to a ridge along x onto `body`, and return the last step."""
     u = plan.u
     (x0, y0, _), (x1, y1, z) = body
     over, steps, warm = u(3.3, 5.5), int(plan.draw.integers(2, 5)), u(0.0, 0.25)
@@ -199,7 +199,7 @@ def _windows(
     rows: int | None = None,
     pier: float = _PIER,
 ) -> list[tuple[Range, Range]]:
-    """Cut a grid of openings into a wall, each with its own size; some are left out. Returns those that were cut."""
+    """Cut a grid of openings of equal size into a wall, leave some out, and return the extents of each opening."""
     a0, a1 = along[0] + _CORNER, along[1] - _CORNER
     z0, z1 = height
     room = 2.0 * pier + _OPENING
@@ -225,32 +225,32 @@ def _windows(
 
 
 def _spots(plan: Plan, boxes: tuple[Box, ...], high: float) -> None:
-    """Warm places, as vents and leaks make them, and a colder one."""
+    """Add one to three warm spots, such as vents and leaks, on random boxes, and a cold spot on the first box."""
     for _ in range(int(plan.draw.integers(1, 4))):
         plan.spot(boxes[int(plan.draw.integers(len(boxes)))], plan.u(0.7, 1.1), plan.u(0.15, 0.4) * high)
     plan.spot(boxes[0], plan.u(0.1, 0.2), plan.u(0.2, 0.5) * high)
 
 
 def _put_ground(plan: Plan, size_x: float, size_y: float, thickest: float, paint: int | None, warmest: float) -> None:
-    """Put a slab below z = 0 that is between 4 and `thickest` voxels thick."""
+    """Put a slab below z = 0 that is between 4 and `thickest` voxels thick; `paint` None: draw a paint."""
     half_x, half_y, thick = 0.5 * size_x, 0.5 * size_y, plan.u(4, thickest)
     paint = plan.paint("ground") if paint is None else paint
     plan.put(((-half_x, -half_y, -thick), (half_x, half_y, 0.0)), paint, plan.u(0.0, warmest))
 
 
 def _grown(lo: tuple[float, float, float], hi: tuple[float, float, float], by: float) -> Box:
-    """A box widened in x and y."""
+    """Return a box widened by `by` on all four sides in x and y."""
     return (lo[0] - by, lo[1] - by, lo[2]), (hi[0] + by, hi[1] + by, hi[2])
 
 
 def _against(wall: Wall, out: float, along: Range, height: Range) -> Box:
-    """A box that stands out from a wall."""
+    """Return a box that stands out from a wall by `out`, with extents along the wall and in z."""
     axis, sign, plane = wall
     return box_beside(axis, (plane, plane + sign * out), along, height)
 
 
 def machinery(plan: Plan) -> None:
-    """Tanks, drums, balls, blocks and frames on a floor slab, at least one of each."""
+    """Put tanks, drums, balls, blocks and frames on a floor slab, at least one of each, into a plan."""
     u = plan.u
     size_x, size_y = u(102, WIDEST), u(84, 108)
     _put_ground(plan, size_x, size_y, 6, None, 0.2)
@@ -266,7 +266,7 @@ def machinery(plan: Plan) -> None:
 
 
 def pipes_and_radiators(plan: Plan) -> None:
-    """A wall on a floor, radiators and standing pipes close to both of its sides, lying pipes on posts before them."""
+    """Put a wall on a floor into a plan, with radiators on one or both sides, standing pipes, and pipes on posts."""
     u = plan.u
     size_x, size_y = u(102, WIDEST), u(86, 100)
     _put_ground(plan, size_x, size_y, 6, None, 0.15)
@@ -296,7 +296,7 @@ def pipes_and_radiators(plan: Plan) -> None:
 
 
 def _radiator(plan: Plan, sign: int, plane: float, along: Range) -> float:
-    """A panel, or columns between two rails, on brackets; returns how far it reaches from the wall's plane."""
+    """Put a radiator (a panel, or columns between rails) before a wall, and return how far it reaches from the wall."""
     u = plan.u
     gap, thick, low, tall = u(4, 6), u(4, 6), u(6, 12), u(20, 28)
     paint, warm = plan.paint("metal"), u(0.75, 1.0)
@@ -321,7 +321,7 @@ def _radiator(plan: Plan, sign: int, plane: float, along: Range) -> float:
 
 
 def _lying_pipe(plan: Plan, sign: int, near: float, half: float, high: float) -> None:
-    """A level pipe along the wall, on two posts."""
+    """Put a level pipe on two posts along the wall, with its near side at distance `near` from the wall's middle."""
     u = plan.u
     radius, length, z = u(2.2, 5), u(1.1, 1.8) * half, u(0.25, 0.8) * high
     x, y = u(-1, 1) * (half - 0.5 * length), sign * (near + radius)
@@ -332,7 +332,7 @@ def _lying_pipe(plan: Plan, sign: int, near: float, half: float, high: float) ->
 
 
 def _tank(plan: Plan, middle: Range, half: Range) -> None:
-    """An upright cylinder on a foot."""
+    """Put an upright cylinder on a foot, within `half` of `middle` in x and y."""
     u = plan.u
     radius, length, foot = u(7, 0.95 * min(half)), u(22, 48), u(3.4, 6)
     plan.put(_upright(middle, (0.55 * radius, 0.55 * radius), 0.0, foot), plan.paint("stone"), u(0.2, 0.4))
@@ -341,7 +341,7 @@ def _tank(plan: Plan, middle: Range, half: Range) -> None:
 
 
 def _drum(plan: Plan, middle: Range, half: Range) -> None:
-    """A lying cylinder on two saddles."""
+    """Put a lying cylinder on two saddles, within `half` of `middle` in x and y."""
     u = plan.u
     axis = int(plan.draw.integers(2))
     radius, length, saddle = u(6, 9), u(1.6, 2.0) * half[axis], u(4, 8)
@@ -354,7 +354,7 @@ def _drum(plan: Plan, middle: Range, half: Range) -> None:
 
 
 def _ball(plan: Plan, middle: Range, half: Range) -> None:
-    """A sphere on a foot, or on the floor."""
+    """Put a sphere on a foot or on the floor, within `half` of `middle` in x and y."""
     u = plan.u
     radius, foot = u(8, 0.95 * min(half)), 0.0
     if plan.chance(0.6):
@@ -364,7 +364,7 @@ def _ball(plan: Plan, middle: Range, half: Range) -> None:
 
 
 def _block(plan: Plan, middle: Range, half: Range) -> None:
-    """A housing with a smaller one on top and a hatch in one of its sides."""
+    """Put a housing with a smaller housing on top and a hatch in one side, within `half` of `middle` in x and y."""
     u = plan.u
     (x, y), sides, high = middle, (u(0.7, 1) * half[0], u(0.7, 1) * half[1]), u(14, 28)
     body = _upright(middle, sides, 0.0, high)
@@ -380,7 +380,7 @@ def _block(plan: Plan, middle: Range, half: Range) -> None:
 
 
 def _frame(plan: Plan, middle: Range, half: Range) -> None:
-    """Two posts and a beam."""
+    """Put two posts and a beam on top of them, within `half` of `middle` in x and y."""
     u = plan.u
     axis = int(plan.draw.integers(2))
     thick, high, beam, reach = u(4.5, 7), u(24, 44), u(4, 6), u(0.75, 1.0) * half[axis]
@@ -394,7 +394,7 @@ def _frame(plan: Plan, middle: Range, half: Range) -> None:
 
 
 def _upright(middle: Range, sides: Range, low: float, high: float) -> Box:
-    """A box around a vertical axis, with half of its sides along x and y."""
+    """Return a box around a vertical axis at `middle`, with half sides `sides` along x and y, from `low` to `high`."""
     (x, y), (half_x, half_y) = middle, sides
     return (x - half_x, y - half_y, low), (x + half_x, y + half_y, high)
 

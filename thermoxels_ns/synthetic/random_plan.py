@@ -1,4 +1,4 @@
-"""The plan of a scene: pieces, openings and warm spots, of random scenes in voxels."""
+"""The plan of a scene: pieces, openings and warm spots. Plans of random scenes have voxels as unit of length."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from thermoxels_ns.synthetic.solids import (
 Shape = Box | Sphere | Cylinder
 Range = tuple[float, float]
 Wall = tuple[int, int, float]
-"""The axis that a wall's plane is at right angles to (0 or 1), its outward sign, and the plane's coordinate."""
+"""A wall: the axis of its normal (0 or 1), the sign of its outward normal, and the coordinate of its plane."""
 
-SMALLEST = 3.1  # lower bound of every thickness, gap and step of a random plan [voxels of the plan]
-WIDEST = 116.0  # upper bound of a plan's extent [voxels of the plan]: with the margins of the scene box it is below 127
+SMALLEST = 3.1  # lower bound of thicknesses, gaps and steps of a random plan, but for railings [voxels of the plan]
+WIDEST = 116.0  # upper bound of a plan's extent [voxels of the plan]; with the margins of the scene box below 127
 HAIR = 0.002
-"""How far a cylinder stays off what carries it [voxels of the plan], since exact solids side by side share no face."""
+"""Gap between a cylinder and what carries it [voxels of the plan], since parts of `SolidUnion` must share no face."""
 
 _BLEND = 2.0
 _LIGHTEST, _STRONGEST = 0.08, 0.35
@@ -49,47 +49,47 @@ _BASES: dict[str, tuple[Vector, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """One solid thing with its paint and warmth."""
+    """One shape of a plan with its paint and warmth."""
 
     shape: Shape
-    paint: int
-    warmth: float  # warmth at its middle, about 0 (coldest of the scene) to 1 (hottest)
-    slope: FloatArray  # change of the warmth along x, y and z [per unit of length]
+    paint: int  # index into `Plan.paints`
+    warmth: float  # warmth at the middle of the shape, from about 0 (coldest of the scene) to 1 (hottest)
+    slope: FloatArray  # change of the warmth along x, y and z, (3,) [per unit of length]
 
 
 @dataclass(frozen=True, eq=False)
 class Glow:
-    """A box, or a point, of one warmth that fades into what is around it."""
+    """A box, or a point, of one warmth that fades into the warmth around it."""
 
-    core: Box  # where the warmth is reached; a point if both corners agree
+    core: Box  # box that has the full warmth; a point if both corners agree
     warmth: float
-    reach: float  # how far from the core the surroundings are themselves again [units of length]
+    reach: float  # distance from the core beyond which the glow changes nothing [units of length]
 
 
 @dataclass(eq=False)
 class Plan:
-    """What a scene consists of; a point has the paint of the last piece that holds it."""
+    """The pieces, openings and glows of a scene; a point has the paint of the last piece that contains it."""
 
     draw: np.random.Generator
     pieces: list[Piece] = field(default_factory=list)
-    """Boxes (which may overlap and touch) and round things (which share no volume and no face)."""
-    removed: list[Box] = field(default_factory=list)  # boxes cut out of all others
-    glows: list[Glow] = field(default_factory=list)  # what is warmer, or colder, than the piece it lies on
+    """Pieces in the order in which they were put; boxes may overlap and touch, round pieces must not."""
+    removed: list[Box] = field(default_factory=list)  # boxes that are cut out of all other boxes
+    glows: list[Glow] = field(default_factory=list)  # places that are warmer, or colder, than the piece around them
     paints: list[Paint] = field(default_factory=list)
-    unit: float = 1.0  # length of a voxel of the plan, as thick as a pane, in the unit that the plan is in
-    plain_walls: bool = False  # whether walls that are painted from now on are plain plaster, without texture
+    unit: float = 1.0  # length of a voxel of the plan, which is also the thickness of panes [unit of the plan]
+    plain_walls: bool = False  # True: walls that are painted from now on are plain plaster, without texture
     mirror: float = 0.0  # share of light that panes painted from now on reflect as mirrors do
 
     def u(self, low: float, high: float) -> float:
-        """Draw a number between two, `low` if they are in the wrong order."""
+        """Draw a uniform number between `low` and `high`; return `low` if `high` is below `low`."""
         return float(self.draw.uniform(low, max(low, high)))
 
     def chance(self, share: float) -> bool:
-        """Draw whether something happens."""
+        """Return True with probability `share`."""
         return bool(self.draw.random() < share)
 
     def paint(self, material: str) -> int:
-        """Mix a paint: one of a material's colours, a shade beside it, clearly textured to nearly plain."""
+        """Draw a paint of a material (random base colour, shade and contrast), add it, and return its number."""
         base = np.asarray(_BASES[material][int(self.draw.integers(len(_BASES[material])))])
         mixed = np.clip(base + self.u(-_SHADE, _SHADE) + self.draw.uniform(-0.03, 0.03, 3), 0.12, 0.85)
         red, green, blue = mixed.tolist()
@@ -99,20 +99,20 @@ class Plan:
         return self.add_paint(Paint((red, green, blue), contrast, self.mirror if material == "glass" else 0.0))
 
     def add_paint(self, paint: Paint) -> int:
-        """Number of a paint that is new to the plan."""
+        """Add a paint to the plan and return its number."""
         self.paints.append(paint)
         return len(self.paints) - 1
 
     def put(self, shape: Shape, paint: int, warmth: float = 0.0) -> None:
-        """Add a piece, with a gentle slope of its warmth."""
+        """Add a piece whose warmth has a gentle random slope."""
         lo, hi = bounds_of(shape)
         slope = self.draw.uniform(-0.12, 0.12, 3) / max(float(np.subtract(hi, lo).max()), 1.0)
         self.pieces.append(Piece(shape, paint, warmth, slope))
 
     def recess(self, wall: Wall, along: Range, height: Range, depth: float, paint: int, warmth: float) -> None:
-        """Cut an opening, a stretch along a wall and in z, and put a pane as far behind the wall's plane as it is deep.
+        """Cut an opening, with extents along a wall and in z, and put a pane `depth` behind the wall's plane into it.
 
-        The pane's warmth fades into the wall over that depth.
+        The pane's warmth fades into the wall within the distance `depth`.
         """
         axis, sign, plane = wall
         back = plane - sign * depth
@@ -122,7 +122,7 @@ class Plan:
         self.glows.append(Glow(pane, warmth, depth))
 
     def spot(self, box: Box, warmth: float, reach: float) -> None:
-        """Warm a place on one of the upright sides or on the top of a box."""
+        """Add a glow at a random point on the top or on an upright side of a box."""
         lo, hi = np.asarray(box[0]), np.asarray(box[1])
         point = self.draw.uniform(lo, hi)
         side = int(self.draw.integers(5))
@@ -131,7 +131,7 @@ class Plan:
         self.glows.append(Glow(box_between(point, point), warmth, reach))
 
     def scaled(self, factor: float) -> Plan:
-        """The same plan in another unit of length; it shares the source of choices and the paints."""
+        """Return a plan with all lengths times `factor`, which shares `draw` and `paints` with this plan."""
 
         def scale(shape: Any) -> Any:
             if isinstance(shape, tuple):
@@ -148,14 +148,14 @@ class Plan:
         )
 
     def solid(self) -> Solid:
-        """The exact solid: all boxes joined (panes lie within), less what is cut out, beside the round things."""
+        """Return the exact solid: all boxes joined, the openings cut out of these, and the round pieces beside."""
         boxes = [piece.shape for piece in self.pieces if isinstance(piece.shape, tuple)]
         parts: list[Solid] = [BoxSolid(boxes, self.removed)] if boxes else []
         parts += [piece.shape for piece in self.pieces if not isinstance(piece.shape, tuple)]
         return parts[0] if len(parts) == 1 else SolidUnion(tuple(parts))
 
     def part(self, points: npt.ArrayLike, normals: npt.ArrayLike) -> IntArray:
-        """Paint of the last piece that holds a point just below the surface: points and normals (n, 3) to (n,)."""
+        """Return the paint number of the last piece at each surface point, (n,); points and outward normals: (n, 3)."""
         inner = np.asarray(points, dtype=np.float64) - 0.01 * self.unit * np.asarray(normals, dtype=np.float64)
         number = np.zeros(len(inner), dtype=np.int64)
         x, y, z = np.ascontiguousarray(inner.T)
@@ -169,10 +169,10 @@ class Plan:
         return number
 
     def warmth(self, points: npt.ArrayLike) -> FloatArray:
-        """Warmth at points (n, 3), continuous in space, shape (n,).
+        """Return the warmth at points (n, 3), continuous in space, shape (n,).
 
-        Every piece has a share that falls with the distance from it, exp(-distance / 2 voxels), so that two that
-        touch pass into each other as heat makes them; glows lie over this.
+        Warmth is the mean of that of all pieces, weighted by exp(-distance / 2 voxels), so that touching pieces blend
+        as by heat conduction; then glows are blended in.
         """
         points = np.asarray(points, dtype=np.float64)
         far = np.array([distance_to(piece.shape, points) for piece in self.pieces])
@@ -183,18 +183,18 @@ class Plan:
         return warmth
 
     def add_glows(self, values: FloatArray, points: FloatArray) -> None:
-        """Blend the glows into warmth, or into temperatures, (n,) at points (n, 3)."""
+        """Blend the glows into values of warmth, or of temperature, (n,) at points (n, 3), in place."""
         for glow in self.glows:
             fade_towards(values, points, glow.core, glow.warmth, glow.reach)
 
 
 def bounds_of(shape: Shape) -> Box:
-    """The smallest box around a shape."""
+    """Return the smallest box around a shape."""
     return shape if isinstance(shape, tuple) else shape.bounds
 
 
 def distance_to(shape: Shape, points: npt.ArrayLike) -> FloatArray:
-    """Distance of points (n, 3) to a shape, 0 inside it."""
+    """Return the distance of points (n, 3) to a shape, 0 inside the shape, shape (n,)."""
     if isinstance(shape, tuple):
         return distance_to_box(points, *shape)
     return np.maximum(shape.signed_distance(points), 0.0)

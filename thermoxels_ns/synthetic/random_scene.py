@@ -1,4 +1,4 @@
-"""Synthetic scenes from a seed, `random-17` and `wild-17`, and streets and rooms around any scene."""
+"""Synthetic scenes from a seed, such as `random-17` and `wild-17`, and streets and rooms around any scene."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from thermoxels_ns.synthetic.scene_truth import Body, DegreesFunction, RgbFuncti
 from thermoxels_ns.synthetic.solids import Box, Solid, Sphere, box_beside, box_between, distance_to_box
 
 RANDOM_NAMES = ("random-N", "wild-N")
-"""How the names of these scenes are written where all names are listed; N is the seed."""
+"""Patterns of the names of these scenes, for lists of names; N is the seed."""
 
 _NAME = re.compile(r"(?:random|wild)-(0|[1-9][0-9]{0,17})")
 _STREAM, _WILD_STREAM = 7411, 7413
@@ -50,14 +50,14 @@ _RANGE_K = (15.0, 60.0)
 
 
 class Family(NamedTuple):
-    """A kind of arrangement."""
+    """A kind of random scene."""
 
     name: str
-    lay_out: Callable[[Plan], None]  # puts its pieces into a plan
-    size_m: tuple[float, float]  # longest side of the smallest and of the largest one [m]
-    outdoors: float  # share of them that stand under the sky; the others stand in a room
+    lay_out: Callable[[Plan], None]  # puts the pieces of a scene into a plan
+    size_m: tuple[float, float]  # longest side of the smallest and of the largest scene [m]
+    outdoors: float  # share of the scenes that stand under the sky; the others stand in a room
     arc_deg: tuple[float, float] | None = None
-    """Shortest and longest arc of cameras, in front of it (towards -y) [degrees]; None: all round."""
+    """Shortest and longest arc of cameras in front of a scene (towards -y) [degrees]; None: cameras all round."""
 
 
 FAMILIES = (
@@ -67,11 +67,11 @@ FAMILIES = (
     Family("wings", wings, (14.0, 26.0), outdoors=1.0),
     Family("facade", facade, (8.0, 14.0), outdoors=1.0, arc_deg=(90.0, 130.0)),
 )
-"""The kinds; seed N has number N modulo their count."""
+"""The kinds of random scenes; the scene of seed N is of kind N modulo their number."""
 
 
 def random_seed(name: str) -> int | None:
-    """Seed of a scene's name; None if it is not the name of a random or a wild scene.
+    """Return the seed in the name of a random or wild scene; None for any other name.
 
     >>> random_seed("random-17"), random_seed("wild-3"), random_seed("random-017")
     (17, 3, None)
@@ -81,10 +81,10 @@ def random_seed(name: str) -> int | None:
 
 
 def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
-    """Make the scene of a seed, named ``random-`` or ``wild-`` and the seed; the same seed makes the same scene.
+    """Return the scene of a seed, named ``random-`` or ``wild-`` and the seed; the same seed gives the same scene.
 
-    Random scenes have textured walls before smooth gradients. Some wild ones have plain walls, mirroring panes or a
-    thin railing; behind a third of them each lie smooth gradients, one plain colour, and a street or a room.
+    Random scenes have textured walls and a background of smooth gradients. Some wild scenes have plain walls, mirroring
+    panes or a thin railing; a third each has smooth gradients, one plain colour, or a street or room behind it.
 
     >>> random_scene(3).name
     'random-3'
@@ -113,7 +113,7 @@ def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
     rings = random_rings(draw, [bounds_of(piece.shape) for piece in plan.pieces], focal_share, (start, span))
     name = f"{'wild' if wild else 'random'}-{seed}"
     scene = warm_scene(plan, texture_seed, light, surface_c, name=name, rings=rings, focal_share=focal_share, **weather)
-    kind = seed % 3  # beside seed % 5 of the families: 15 seeds in a row show every pair
+    kind = seed % 3  # the family is seed % 5, so 15 seeds in a row have every pair of kind and family
     if not wild or kind == 0:
         return scene
     if kind == 1:
@@ -127,12 +127,12 @@ def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
 def warm_scene(
     plan: Plan, texture_seed: int, light: SunLight, surface_c: tuple[float, float], **rest: Any
 ) -> SyntheticScene:
-    """Make a scene of a plan in metres, whose warmth becomes temperatures from its coldest to its hottest surface [C].
+    """Return a scene of a plan in metres; the plan's warmth, from least to most, becomes temperatures `surface_c` [C].
 
-    The scene's other fields are passed by name.
+    `rest` are the other fields of the scene by name.
     """
     solid = plan.solid()
-    lo, hi = np.asarray(solid.bounds)  # to reconstruct: with a margin of 4 % of the longest side all round
+    lo, hi = np.asarray(solid.bounds)  # the scene box has a margin of 4 % of its longest side all round
     margin = float((hi - lo).max()) * _MARGIN_SHARE / (1.0 - 2.0 * _MARGIN_SHARE)
     box = box_between(np.round(lo - margin, 3), np.round(hi + margin, 3))
     sampled = plan.warmth(solid.surface_points(_SURFACE_SAMPLES, seed=1)[0])
@@ -150,7 +150,7 @@ def warm_scene(
 def painted_scene(
     plan: Plan, texture_seed: int, light: SunLight, *, scene_box: Box, solid: Solid | None = None, **rest: Any
 ) -> SyntheticScene:
-    """Make a scene of a plan in metres, whose paints are textured; the scene's other fields are passed by name."""
+    """Return a scene of a plan in metres, with textured paints; `rest` are the other fields of the scene by name."""
     texture = SolidTexture(scene_box, texture_seed)
     mirrors = np.array([paint.mirror for paint in plan.paints], dtype=np.float32)
     return SyntheticScene(
@@ -165,7 +165,7 @@ def painted_scene(
 
 
 def _weather(draw: np.random.Generator, outdoors: bool) -> tuple[tuple[float, float], dict[str, Any]]:
-    """The surface's coldest and hottest temperature [C], and the fields of the scene that say what lies behind."""
+    """Draw the coldest and hottest temperature of the surface [C], and the fields of the scene for its background."""
     brightness, spread = np.float32(draw.uniform(0.75, 1.0)), _degrees(draw.uniform(*_RANGE_K))
     behind: RgbFunction = sky_rgb if outdoors else room_rgb
     if outdoors:
@@ -184,12 +184,12 @@ def _weather(draw: np.random.Generator, outdoors: bool) -> tuple[tuple[float, fl
 
 
 def _degrees(value: float) -> float:
-    """A multiple of a quarter, so that sums and differences of temperatures are exact."""
+    """Return the nearest multiple of 0.25, so that sums and differences of temperatures are exact."""
     return 0.25 * round(4.0 * float(value))
 
 
 _PICTURE_ASPECT = 0.75
-_RIM = 0.95  # share of the picture within which everything shows
+_RIM = 0.95  # everything must show within this share of the picture's width and height
 _AZIMUTHS = 73
 _AIMS = 9
 _ELEVATIONS_DEG = {2: ((10.0, 20.0), (38.0, 50.0)), 3: ((7.0, 15.0), (24.0, 36.0), (46.0, 60.0))}
@@ -199,10 +199,10 @@ _FARTHEST_SHARE = 1.10
 def random_rings(
     draw: np.random.Generator, boxes: Sequence[Box], focal_share: float, arc_deg: tuple[float, float]
 ) -> tuple[CameraRing, ...]:
-    """Draw two or three rings, or arcs (begin and length, [degrees]), around boxes [m] that every picture shows.
+    """Draw two or three rings of cameras around boxes [m], all of which every picture shows, from low to high.
 
-    The focal length is a share of the width of a 4:3 image. Rings come from the lowest to the highest, at most a tenth
-    farther than the nearest at which all boxes show.
+    `arc_deg` is begin and length of each ring's arc. `focal_share` is the focal length over the width of a 4:3 image.
+    Cameras stand at most a tenth farther away than the least distance from which all boxes show.
     """
     corners = np.array([corner for box in boxes for corner in itertools.product(*zip(*box))], dtype=np.float64)
     lo, hi = corners.min(axis=0), corners.max(axis=0)
@@ -220,10 +220,10 @@ def random_rings(
 
 
 def _nearest(relative: FloatArray, elevation: float, focal_share: float, arc_deg: tuple[float, float]) -> float:
-    """Least distance from the origin at which an arc of cameras that look at it has all points (n, 3) in the picture.
+    """Return the least distance from the origin at which all cameras of an arc, looking at it, see all points (n, 3).
 
-    A point is in the picture if its distances from the view axis, sideways and upwards, are within the half width and
-    half height at the point's depth: beside <= half (distance - nearer), and likewise above.
+    A camera sees a point whose distances from the view axis, sideways and upwards, are within the half width and half
+    height of the view at the point's depth: beside <= half (distance - nearer), and likewise above.
     """
     azimuth = np.radians(arc_deg[0] + arc_deg[1] * np.linspace(0.0, 1.0, _AZIMUTHS))
     back = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(_AZIMUTHS, math.tan(elevation))], axis=1)
@@ -241,9 +241,9 @@ _GLASS_SHARE, _GLASS_DIM = (0.32, 0.68), 0.35
 
 
 def with_street(scene: SyntheticScene, seed: int) -> SyntheticScene:
-    """Put ground, houses with windows and trees around a scene and its cameras, near the temperature of the air.
+    """Return a scene with ground, houses with windows, and trees around its cameras, about as warm as the air.
 
-    They stand all round, between the cameras and 20 times the scene's size away.
+    Houses stand all round, up to 14 times the scene's size away; the ground reaches 26 times the scene's size.
     """
     plan, middle, size, reach, floor = _place(scene, seed)
     x, y = middle
@@ -280,7 +280,7 @@ def with_street(scene: SyntheticScene, seed: int) -> SyntheticScene:
 
 
 def with_room(scene: SyntheticScene, seed: int) -> SyntheticScene:
-    """Put a scene and its cameras into a room of its temperature: walls, floor, ceiling, cupboards along the walls."""
+    """Return a scene in a room around its cameras, about as warm as the air: walls, floor, ceiling and cupboards."""
     plan, (x, y), size, reach, floor = _place(scene, seed)
     half = (max(reach, 2.0 * size) * plan.u(1.2, 2.2), max(reach, 2.0 * size) * plan.u(1.2, 2.2))
     top = max(scene.poses(48, 0)[0][:, 2, 3].max(), floor + 1.2 * size) + plan.u(0.3, 1.0) * size
@@ -302,7 +302,7 @@ def with_room(scene: SyntheticScene, seed: int) -> SyntheticScene:
 
 
 def _place(scene: SyntheticScene, seed: int) -> tuple[Plan, tuple[float, float], float, float, float]:
-    """An empty plan, the middle (x, y) and size of the scene, how far from it its cameras stand, and a floor below."""
+    """Return an empty plan, the scene's middle (x, y) and size, a radius beyond its cameras, and the floor's z [m]."""
     lo, hi = np.array(scene.scene_box)
     size, middle = scene.size, 0.5 * (lo + hi)
     cameras = scene.poses(48, 6)[0][:, :3, 3]
@@ -315,9 +315,9 @@ def _place(scene: SyntheticScene, seed: int) -> tuple[Plan, tuple[float, float],
 def surrounded(
     scene: SyntheticScene, plan: Plan, seed: int, range_k: float, windows: tuple[range, float, float] | None = None
 ) -> SyntheticScene:
-    """Put a plan around a scene, whose warmth 0 to 1 is up to `range_k` above the temperature at the horizon.
+    """Return a scene with a plan around it; warmth 0 to 1 is 0 to `range_k` above the temperature at the horizon.
 
-    `windows`: the paints of walls that have windows, the height at which storeys begin [m], and that of a storey [m].
+    `windows`: numbers of the paints of walls with windows, z at which storeys begin [m], height of a storey [m].
     """
     lo = np.asarray(scene.scene_box[0])
     texture, light = SolidTexture(box_between(lo, lo + 3.0 * scene.size), seed), SunLight()

@@ -1,4 +1,4 @@
-"""Exact ray casting of photographs, thermal images and visible surface points."""
+"""Exact ray casting of synthetic scenes: photographs, thermal images, and which surface points cameras see."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 _VISIBLE_TOLERANCE = 1e-7
 _GRAZING_COSINE = 1e-6
-_RAYS_AT_ONCE = 16_384  # about what stays in a processor's cache
+_RAYS_AT_ONCE = 16_384  # rays whose arrays about fit into a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """What one camera sees: colour and temperature are means over each pixel, depth is that of its centre."""
+    """The view of one camera: mean colour and temperature of each pixel, and depth at the pixel's centre."""
 
     rgb: Float32Array  # 0 to 1, shape (height, width, 3)
     temperature_c: FloatArray  # [degrees Celsius], shape (height, width)
     depth_m: FloatArray
-    """Distance along the ray [m], infinite where the ray does not meet the solid first, shape (height, width)."""
+    """Distance along the ray to the scene's solid [m], infinite if the ray first meets something else or nothing."""
 
     @property
     def hit(self) -> BoolArray:
-        """Whether the ray through the pixel's centre meets the solid first, shape (height, width)."""
+        """True for pixels whose central ray first meets the scene's solid, shape (height, width)."""
         return np.isfinite(self.depth_m)
 
 
 def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samples_per_axis: int = 2) -> RenderedView:
-    """Render both bands of one view from a camera-to-world pose, shape (3, 4) or (4, 4) [m].
+    """Return what a camera sees from a camera-to-world pose, shape (3, 4) or (4, 4) [m].
 
-    Colour and temperature are means over a grid of `samples_per_axis` rays along each axis of a pixel.
+    Colour and temperature are means over `samples_per_axis` x `samples_per_axis` rays in each pixel.
 
     Raises:
-        SceneError: The camera stands inside the solid.
+        SceneError: The camera stands inside the scene's solid.
     """
     pose = np.asarray(pose, dtype=np.float64)
     origin = _position_outside(scene, pose)
@@ -50,10 +50,10 @@ def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samp
 
 
 def first_surface(scene: SyntheticScene, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Find what rays meet first, in the scene or around it, from origins (n, 3) or (3,) [m] along unit vectors (n, 3).
+    """Find the first surface, of the scene or around it, that rays meet: origins (n, 3) or (3,) [m], directions (n, 3).
 
     Returns:
-        Distances (n,) [m], infinite where nothing is met, and whether it is the scene's own solid (n,).
+        Distances (n,) in lengths of the directions, infinite for no surface, and whether it is the scene's solid (n,).
     """
     distance, _, body = _first_hits(scene, origins, directions)
     return distance, body == 0
@@ -67,12 +67,12 @@ def visible_surface_points(
     normals: npt.ArrayLike,
     min_views: int = 3,
 ) -> BoolArray:
-    """Find the surface points (n, 3) [m] that at least `min_views` of the cameras (c, 4, 4) see, shape (n,).
+    """Return for each surface point (n, 3) [m] whether at least `min_views` of the cameras (c, 4, 4) see it, (n,).
 
-    A camera sees a point if the point lies in its image, faces it and is the first hit of the ray towards it.
+    A camera sees a point that lies in its image, faces the camera, and is what the ray from the camera meets first.
 
     Raises:
-        SceneError: A camera stands inside the solid.
+        SceneError: A camera stands inside the scene's solid.
     """
     points, normals = np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
     views = np.zeros(len(points), dtype=np.int64)
@@ -82,7 +82,7 @@ def visible_surface_points(
         candidate = camera.contains(camera.project_world(pose, points))
         candidate &= np.einsum("ij,ij->i", ray, normals) < -_GRAZING_COSINE * np.linalg.norm(ray, axis=1)
         index = np.flatnonzero(candidate)
-        # Unnormalised directions: a free line of sight hits at 1.
+        # The directions are not normalised: a ray with a free line of sight meets its point at distance 1.
         views[index[first_surface(scene, origin, ray[index])[0] >= 1.0 - _VISIBLE_TOLERANCE]] += 1
     return views >= min_views
 
@@ -90,7 +90,7 @@ def visible_surface_points(
 def _first_hits(
     scene: SyntheticScene, origins: FloatArray, directions: FloatArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Distances (n,) and normals (n, 3) of what rays meet first, and its number among the bodies (n,); -1: nothing."""
+    """Return distance (n,), normal (n, 3) and number in `scene.bodies` (n,) of what rays first meet; -1: nothing."""
     distance, normal = map(np.array, zip(*(body.solid.intersect(origins, directions) for body in scene.bodies)))
     first, every = distance.argmin(axis=0), np.arange(distance.shape[1])
     nearest = distance[first, every]
@@ -100,9 +100,9 @@ def _first_hits(
 def _look(
     scene: SyntheticScene, origins: FloatArray, directions: FloatArray, mirrors: bool = True
 ) -> tuple[Float32Array, FloatArray]:
-    """Colour (n, 3) and temperature (n,) along rays from one origin (3,) or from one each (n, 3).
+    """Return colour (n, 3) and temperature (n,) along rays from one origin (3,) or from one origin each (n, 3).
 
-    A mirroring surface adds the colour along the reflected ray, on which mirrors show their paint only.
+    With `mirrors`, mirroring surfaces blend in the colour along the reflected ray; along it no surface mirrors again.
     """
     rgb, temperature_c = np.empty(directions.shape, dtype=np.float32), np.empty(len(directions))
     for start in range(0, len(directions), _RAYS_AT_ONCE):

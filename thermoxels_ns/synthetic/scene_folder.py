@@ -1,4 +1,4 @@
-"""Write a synthetic scene as a scene folder, and get its truth back."""
+"""Write a synthetic scene as a scene folder, and load the exact scene that belongs to a folder."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 ThermalFormat = Literal["png16", "tiff", "npy"]
 """16-bit PNG that spans the temperature bounds; uint16 TIFF of centikelvin counts; float32 numpy in Celsius."""
-PhotoFormat = Literal["jpeg", "png"]  # JPEG, as cameras write it, of quality 92 by default; PNG, which loses nothing
+PhotoFormat = Literal["jpeg", "png"]  # JPEG as cameras write, of quality 92 by default; PNG, which loses nothing
 
 _SUFFIXES = {"png16": ".png", "tiff": ".tiff", "npy": ".npy"}
 _PHOTO_SUFFIXES: dict[str, str] = {"jpeg": ".jpg", "png": ".png"}
 TRUTH = "truth.json"
 _LARGEST_COUNT = 65535
-_MOST_SIDE = 4096  # pixels of an image along a side; all rays of an image are in memory at once
+_MOST_SIDE = 4096  # most pixels along a side of an image: all rays of an image are in memory at once
 _CENTIKELVIN = {"celsius_per_count": 0.01, "celsius_offset": -273.15}
-# The second camera: what its lens and mounting differ by from the first. About 1 degree and a few centimetres.
+# Lens, turn (1 degree) and shift (2 % of the scene) of a separate thermal camera, relative to the photographs' camera.
 _THERMAL_ASPECT, _THERMAL_ZOOM, _THERMAL_CENTRE_SHIFT = 0.8, 0.95, (-0.012, 0.008)
 _RIG_ROTATION_RAD = (0.005, -0.018, 0.003)
 _RIG_SHIFT_SHARE = (0.02, 0.004, 0.006)
@@ -53,20 +53,20 @@ def write_scene(
     imperfections: Imperfections = PERFECT,
     progress: bool = True,
 ) -> Path:
-    """Photograph a scene in both bands and write the folder; ``transforms.json`` comes last.
+    """Write photographs and thermal images of a scene, and their poses, into a folder, and return the folder.
 
-    The layout is that of ThermoScenes: ``images/``, ``thermal/``, ``transforms.json`` and ``temperature_bounds.json``,
-    with ``frame_train_`` and ``frame_eval_`` names. Scale (metres) and up (z) are added to the json, as a capture finds
-    them. The scene's name, its exact box and the errors of each image go to ``truth.json``, which training never reads.
+    The layout is that of ThermoScenes: ``images/``, ``thermal/``, ``transforms.json`` (written last) and
+    ``temperature_bounds.json``, with ``frame_train_`` and ``frame_eval_`` names. ``transforms.json`` also has the scale
+    (metres) and up (z), as after a capture, and the unit of TIFF counts as ``thermal_unit``. The scene's name and exact
+    box and the drawn `imperfections` go to ``truth.json``, which training never reads.
 
-    The folder is made if absent; an earlier synthetic scene in it is removed, any other refused. Held-out views lie
-    half-way between training views. `thermal_width` [pixels] is by default that of the photographs, half of it for a
-    camera of their own, whose lens and poses are written under ``thermal_camera`` and ``thermal_transform_matrix``.
-    What `imperfections` do to photographs, thermal images and the poses given is written to ``truth.json``; the same
-    `seed` writes the same bytes. The unit of TIFF counts is written under ``thermal_unit``.
+    The folder is made if absent; an earlier synthetic scene in it is removed, any other scene is refused. Held-out
+    views lie half-way between training views. `thermal_width` [pixels] is by default the width of photographs, or half
+    of it with `own_thermal_camera`, whose lens and poses are written as ``thermal_camera`` and
+    ``thermal_transform_matrix``. The same `seed` writes the same bytes.
 
     Raises:
-        SceneError: An option is out of range, or the folder holds somebody else's scene.
+        SceneError: An option is out of range, or the folder contains a scene that is not synthetic.
         OutputError: The folder cannot be written to.
     """
     thermal_camera, offset = _thermal_camera(scene, width, height, thermal_width, own_thermal_camera)
@@ -85,7 +85,7 @@ def write_scene(
     flaws = DrawnFlaws(imperfections, seed, poses, np.mean(scene.scene_box, axis=0), scene.temperature_bounds_c)
     given_poses, given_offset = flaws.given_poses(), offset @ flaws.given_rig_turn()
     bounds = flaws.bounds_c(*scene.temperature_bounds_c)
-    # Counts become degrees by: Celsius = count * celsius_per_count + celsius_offset.
+    # Temperature [C] = count * celsius_per_count + celsius_offset.
     unit = {"celsius_per_count": (bounds[1] - bounds[0]) / _LARGEST_COUNT, "celsius_offset": bounds[0]}
     if thermal_format == "tiff":
         unit = _CENTIKELVIN
@@ -119,7 +119,7 @@ def write_scene(
     transforms: dict[str, Any] = _intrinsics(flaws.given_camera(camera))
     if own_thermal_camera:
         transforms["thermal_camera"] = _intrinsics(thermal_camera)
-    if thermal_format == "tiff":  # a 16-bit PNG has its unit in the bounds, and count 0 is a temperature there
+    if thermal_format == "tiff":  # counts of a 16-bit PNG span the temperature bounds, which are written above
         transforms["thermal_unit"] = unit
     transforms |= {"metres_per_unit": 1.0, "up": [0, 0, 1], "frames": frames}
     truth = {"synthetic_scene": scene.name, "scene_box": scene.scene_box, "seed": seed}
@@ -129,9 +129,9 @@ def write_scene(
 
 
 def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
-    """Get the exact scene that a folder was written from; None for real photographs (no ``truth.json``).
+    """Return the exact scene from which a folder was written; None for real photographs (no ``truth.json``).
 
-    A `SceneError` is raised where the json is unreadable, or names a scene that does not exist.
+    Raises `SceneError` if ``truth.json`` is unreadable, or names a scene that does not exist.
     """
     path = Path(scene_folder) / TRUTH
     if not path.is_file():
@@ -147,10 +147,10 @@ def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
 def _thermal_camera(
     scene: SyntheticScene, width: int, height: int, thermal_width: int | None, own: bool
 ) -> tuple[Camera, FloatArray]:
-    """Camera of the thermal images and its pose (4, 4) in the frame of the photographs' camera.
+    """Return the camera of the thermal images and its pose (4, 4) in the frame of the photographs' camera.
 
-    A camera of its own has a slightly different field of view and an off-centre principal point; one camera for both
-    bands needs the same aspect exactly.
+    With `own`, the thermal camera has a slightly different field of view and an off-centre principal point. Otherwise
+    it differs in pixels only; `SceneError` is raised if `thermal_width` does not keep the aspect in whole pixels.
     """
     chosen = thermal_width if thermal_width is not None else max(width // 2, 1) if own else width
     sizes = {"width": width, "height": height, "thermal_width": chosen}
@@ -171,11 +171,11 @@ def _thermal_camera(
 
 
 def _prepared_folder(folder: Path | str) -> Path:
-    """Make the folders and take away an earlier synthetic scene, so that nothing stale or half-written stays."""
+    """Make the folders and remove an earlier synthetic scene; raise `SceneError` for any other scene in the folder."""
     target = writable_folder(folder)
     if (target / TRUTH).is_file():
         for path in (target / "transforms.json", *target.glob("images/frame_*"), *target.glob("thermal/frame_*")):
-            remove_file(path)  # truth.json goes when it is replaced: until then the next call knows what to take away
+            remove_file(path)  # truth.json stays until it is replaced: it marks the folder as synthetic
     elif (target / "transforms.json").exists():
         expected = "an empty folder or one with an earlier synthetic scene"
         got = f"{target}, whose transforms.json describes other photographs"

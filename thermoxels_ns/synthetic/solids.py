@@ -1,4 +1,4 @@
-"""Exact solids (balls, cylinders, boxes joined and cut, and unions of them) and where rays meet them."""
+"""Exact solids: balls, cylinders, joined and cut boxes, and unions of these, with distances and ray intersections."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PARALLEL_SINE_SQUARED = 1e-30
 
 
 class Solid(Protocol):
-    """A closed set, lengths in metres; all that it tells is exact."""
+    """A solid body, its surface included; lengths in metres. All values are exact up to rounding."""
 
     bounds: Box
     """Lower and upper corner of the smallest box around the solid [m]."""
@@ -32,18 +32,18 @@ class Solid(Protocol):
     """Area of the surface [m2]."""
 
     def contains(self, points: npt.ArrayLike, /) -> BoolArray:
-        """Which of the points (n, 3) lie in the solid or on its surface."""
+        """Return for each of the points (n, 3) whether it lies in the solid or on its surface, shape (n,)."""
         return self.signed_distance(points) <= 0.0
 
     def signed_distance(self, points: npt.ArrayLike, /) -> FloatArray:
-        """Distance of the points (n, 3) to the surface [m], negative inside."""
+        """Return the distance of each of the points (n, 3) to the surface [m], negative inside, shape (n,)."""
         ...
 
     def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """First entry of rays: origins (n, 3) or one shared (3,), directions (n, 3).
+        """Find where rays first enter the solid: origins (n, 3) or one shared (3,), directions (n, 3).
 
-        Only passing from outside to inside counts: a ray that starts within does not see walls from behind. Touching
-        an edge counts as a hit.
+        Only passing from outside to inside counts: a ray that starts inside does not see the surface from behind.
+        Touching an edge counts as a hit.
 
         Returns:
             Distances (n,) in multiples of the direction's length, infinite for a miss, and outward unit normals (n, 3),
@@ -52,7 +52,7 @@ class Solid(Protocol):
         ...
 
     def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
-        """Draw points uniformly by area: positions (count, 3) and outward normals (count, 3)."""
+        """Return random points on the surface, uniform by area: positions and outward unit normals, (count, 3) each."""
         ...
 
 
@@ -96,9 +96,9 @@ class Cylinder(Solid):
     ((-0.5, -0.5, 0.0), (0.5, 0.5, 2.0))
     """
 
-    centre: Vector
-    radius: float
-    length: float  # middle of the axis, radius and length along the axis [m], above 0
+    centre: Vector  # middle of the axis [m]
+    radius: float  # radius [m], above 0
+    length: float  # length along the axis [m], above 0
     axis: int  # direction of the axis: 0 for x, 1 for y, 2 for z
 
     def __post_init__(self) -> None:
@@ -122,7 +122,7 @@ class Cylinder(Solid):
         start = np.broadcast_to(np.subtract(origins, self.centre), directions.shape)
         side_in, side_out = _through_circle(start[:, self._across], directions[:, self._across], self.radius)
         height, rise = start[:, self.axis], directions[:, self.axis]
-        # A level ray meets the planes of the ends at infinity, to the same side of both if it runs above or below.
+        # A ray parallel to the ends meets both planes at infinity, with the same sign if it passes above or below them.
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
             ends = (np.array([[-0.5], [0.5]]) * self.length - height) / rise
         end_in, end_out = np.fmin(*ends), np.fmax(*ends)
@@ -156,8 +156,8 @@ class Cylinder(Solid):
 class BoxSolid(Solid):
     """The union of axis-aligned boxes, minus other axis-aligned boxes.
 
-    All `boxes` are joined first, then all `removed` ones are cut out. The coordinates of all faces span a small
-    non-uniform grid whose cells are filled or empty; rectangles between the two kinds are the surface.
+    First all `boxes` are joined, then all `removed` are cut out. The coordinates of all faces span a small non-uniform
+    grid whose cells are filled or empty; the rectangles between filled and empty cells are the surface.
 
     >>> notched = BoxSolid([((0, 0, 0), (2, 1, 1))], removed=[((1, 0, 0.5), (2, 1, 1))])
     >>> notched.volume, notched.area
@@ -184,10 +184,10 @@ class BoxSolid(Solid):
         self.bounds = box_between(self._lo.min(axis=0), self._hi.max(axis=0))
 
     def _find_rectangles(self) -> None:
-        """Cover the surface once by rectangles, as large as neighbouring faces of cells allow.
+        """Cover the surface once by large rectangles: set `_lo`, `_hi`, `_normals` and `_planes`.
 
-        Lower corners, upper corners [m] and outward unit normals have shape (m, 3); a plane is its axis, the side that
-        it faces, its coordinate [m] and the numbers of its rectangles.
+        Lower corners, upper corners [m] and outward unit normals have shape (m, 3). Each plane is its axis, the sign of
+        its normal, its coordinate [m] and the numbers of its rectangles.
         """
         filled, found = np.pad(self._cells, 1).astype(np.int8), []
         self._planes: list[tuple[int, int, float, range]] = []
@@ -224,13 +224,13 @@ class BoxSolid(Solid):
         return np.where(self.contains(points), -nearest, nearest)
 
     def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """See `Solid`. Rectangles are a billionth of the solid's size wider, so that no ray slips between two."""
+        """See `Solid`. Rectangles are widened by a billionth of the solid's size, so that no ray slips between two."""
         direction = np.ascontiguousarray(np.asarray(directions, dtype=np.float64).T)
         origin = np.ascontiguousarray(np.broadcast_to(origins, direction.T.shape).T, dtype=np.float64)
         slack = _EDGE_TOLERANCE * float(np.subtract(self.bounds[1], self.bounds[0]).max())
         lo, hi = self._lo - slack, self._hi + slack
         best, index = np.full(direction.shape[1], np.inf), np.full(direction.shape[1], -1)
-        # A nearly parallel ray may reach its plane at infinity; the comparisons below then are false, as they must.
+        # A ray nearly parallel to a plane may meet it at infinity; the comparisons below are then false: no hit.
         with np.errstate(over="ignore", invalid="ignore"):
             for axis, sign, coordinate, numbers in self._planes:
                 front = ((origin[axis] - coordinate) * sign >= 0.0) & (direction[axis] * sign < 0.0)
@@ -254,10 +254,10 @@ class BoxSolid(Solid):
 
 @dataclass(eq=False)
 class SolidUnion(Solid):
-    """Solids side by side that share no volume and no face; round ones may touch others in a point or a line."""
+    """Solids side by side that share no volume and no face; a round solid may touch others in a point or a line."""
 
     parts: tuple[Solid, ...]
-    """The solids. Boxes that touch belong into one `BoxSolid`, which knows that the shared face is not exposed."""
+    """The solids. Touching boxes must be in one `BoxSolid`, which leaves their shared face out of the surface."""
 
     def __post_init__(self) -> None:
         corners = np.array([part.bounds for part in self.parts])
@@ -286,20 +286,20 @@ class SolidUnion(Solid):
 
 
 def box_between(lo: npt.ArrayLike, hi: npt.ArrayLike) -> Box:
-    """Box with these corners, as plain numbers."""
+    """Return the box with these lower and upper corners, as plain numbers."""
     (x0, y0, z0), (x1, y1, z1) = np.asarray(lo).tolist(), np.asarray(hi).tolist()
     return (x0, y0, z0), (x1, y1, z1)
 
 
 def box_beside(axis: int, across: tuple[float, float], along: tuple[float, float], height: tuple[float, float]) -> Box:
-    """Box from its extents across a wall (at right angles to axis 0 or 1, in any order), along it and in z."""
+    """Return the box with these extents: along `axis` (0 or 1, in any order), along the other of the two, and in z."""
     through = (min(across), max(across))
     (x0, x1), (y0, y1) = (through, along) if axis == 0 else (along, through)
     return (x0, y0, height[0]), (x1, y1, height[1])
 
 
 def distance_to_box(points: npt.ArrayLike, lo: npt.ArrayLike, hi: npt.ArrayLike) -> FloatArray:
-    """Distance from each point (n, 3) to a solid box, 0 inside it [m].
+    """Return the distance of each point (n, 3) to a box [m], 0 inside the box, shape (n,).
 
     >>> float(distance_to_box([[4.0, 5.0, 0.5]], (0, 0, 0), (1, 1, 1))[0])
     5.0
@@ -310,18 +310,18 @@ def distance_to_box(points: npt.ArrayLike, lo: npt.ArrayLike, hi: npt.ArrayLike)
 
 
 def fade_towards(values: FloatArray, points: FloatArray, core: Box, value: float, reach: float) -> None:
-    """Change values (n,) at points (n, 3) to `value` within a box, smoothly back to their own over `reach` around."""
+    """Set values (n,) at points (n, 3) to `value` inside the box `core`, in place, and blend within `reach` around."""
     near = np.maximum(1.0 - distance_to_box(points, *core) / reach, 0.0)
     values += (value - values) * near * near * (3.0 - 2.0 * near)
 
 
 def _through_circle(start: FloatArray, way: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
-    """Where rays (n, 2 or 3) enter and leave a circle or ball around the origin; infinity, minus infinity for a miss.
+    """Return where rays (n, 2 or 3) enter and leave a circle or ball around the origin; for a miss inf and -inf.
 
-    The half chord comes from the foot of the perpendicular, which does not cancel for far origins.
+    The half chord is found from the foot of the perpendicular, which keeps its digits for far origins.
     """
     squared = np.einsum("ij,ij->i", way, way)
-    # Along a cylinder's axis, or tilted from it by less than rounding, a ray is inside for ever or never.
+    # A ray along a cylinder's axis, or tilted from the axis by less than rounding, is inside for ever or never.
     along = squared <= _PARALLEL_SINE_SQUARED
     squared = np.where(along, 1.0, squared)
     foot = np.where(along, 0.0, -np.einsum("ij,ij->i", start, way) / squared)
@@ -332,7 +332,7 @@ def _through_circle(start: FloatArray, way: FloatArray, radius: float) -> tuple[
 
 
 def _merged_blocks(mask: BoolArray) -> Iterator[tuple[int, int, int, int]]:
-    """Cover the true entries of a mask by disjoint blocks [u0, u1) x [v0, v1), greedily along v, then u."""
+    """Yield disjoint blocks [u0, u1) x [v0, v1) that cover the true entries of a mask, grown along v, then u."""
     left = mask.copy()
     for u0, v0 in np.argwhere(mask):
         if not left[u0, v0]:

@@ -1,4 +1,4 @@
-"""The course of a training as callbacks: carve, refine, prune, widen colour, decide on backgrounds."""
+"""Callbacks that change the grid during training: carve, refine, prune, widen colour, decide on backgrounds."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from thermoxels_ns.training.ray_statistics import (
     voxel_weights,
 )
 
-FEWEST_OPEN_RAYS = 0.002  # Share of rays that must leave the box unsaturated for a background to be worth its cost
+FEWEST_OPEN_RAYS = 0.002  # Least share of rays that leave the box with half of their light for a background to stay
 FEWEST_SKY_DIFFERENCE = 0.01
 """Share of the temperature range by which the learned sky must differ from the scene's minimum to be kept."""
-MOST_OPENED_RAYS = 0.01  # Share of the rays that end on something which pruning may open
-OPAQUE_DEPTH = 0.7  # Optical depth across a voxel from which it is opaque: half of the light is lost
-PRUNING_ATTEMPTS = 4  # Thresholds tried before pruning fails
-RAYS_PER_IMAGE = 4096  # Training rays per image that statistics look at
+MOST_OPENED_RAYS = 0.01  # Largest share of the rays of opacity above one half that pruning may open
+OPAQUE_DEPTH = 0.7  # Optical depth across a voxel from which the voxel counts as opaque: half of the light is lost
+PRUNING_ATTEMPTS = 4  # Number of thresholds tried before pruning fails
+RAYS_PER_IMAGE = 4096  # Training rays per image from which statistics are made
 SHORTEST_RUN_WITH_DEPTHS = 400
-"""Steps that a run must have for photo_depth auto: a shorter one would spend most of its time on depths."""
+"""Fewest steps for which photo_depth auto finds depths: a shorter run would spend most of its time on them."""
 
 
 def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
-    """The callbacks of one training run, in the order in which they act at a step."""
+    """Return the callbacks of one training run, in the order in which they act at a step."""
     before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
     evidence = follow_depths(model, attributes)
     factors = model.config.refinements()
@@ -53,11 +53,11 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         late = sorted(step for step in steps if step >= end)
         if late:
             CONSOLE.log(f"the run ends before step {end}: no refinement or pruning at {', '.join(map(str, late))}")
-    # Where the lattice never changes within the run, a third of it is time enough to know what stands behind.
+    # A run that never changes the lattice decides on backgrounds after a third of its steps.
     decisions = {step for step in steps if end is None or step < end} or {(end or 0) // 3}
 
     def carve(step: int) -> None:
-        """Drop what is air; at the first step of a training, not of a resumed one, and after every refinement."""
+        """Drop the voxels of the box that are air, see `ThermoxelsModelConfig.carve`."""
         found = [rays for rays in (model.feature_rays, evidence and evidence.feature_rays) if rays is not None]
         if model.config.carve == "off" or not found:
             return
@@ -76,7 +76,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     def follow(
         old: dict[str, Parameter], change: RowChange | None, grid: VoxelGrid = model.grid, prefix: str = ""
     ) -> None:
-        """Point the optimisers to the rows that took the place of `old`; their state changes as the rows did."""
+        """Give the optimisers the new parameters of `grid` in place of `old`, and change their state by `change`."""
         assert attributes.optimizers is not None
         if change is None:
             return
@@ -87,7 +87,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
                 attributes.optimizers.parameters[prefix + name] = [new]
 
     def change_surroundings(step: int) -> None:
-        """Drop voxels of the surroundings that training rays give no weight, and split the others with the box's."""
+        """Drop voxels of the surroundings by `prune_threshold` (at step 0: by 0); split the others at a refinement."""
         if model.seen_surroundings is None:
             return
         assert attributes.pipeline is not None
@@ -97,7 +97,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         largest = voxel_weights(SurroundingsSampler(model), rays).largest.cpu().numpy()
         keep = grid.voxels.dilated(largest > (model.config.prune_threshold if step else 0.0), 1)
         if not keep.any():
-            model.backdrop_on[2], keep[0] = False, True  # a parameter without rows is none
+            model.backdrop_on[2], keep[0] = False, True  # one voxel stays: parameters need a row
         old = grid.row_parameters()
         follow(old, prune(grid, keep), grid, prefix)
         if model.seen_surroundings is None:
@@ -127,7 +127,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             try:
                 follow(old, model.split(factors[step]))
             except MemoryBudgetError as problem:
-                if not model.config.voxel_pixels:  # somebody asked for just this resolution
+                if not model.config.voxel_pixels:  # the user gave this resolution
                     raise
                 CONSOLE.log(
                     f"step {step}: the lattice stays as it is, where photographs ask for a finer one: {problem}"
@@ -137,13 +137,13 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
                 model.config = replace(model.config, resolutions=known[0], refine_at=known[1])
                 trainer: Any = attributes.trainer
                 if trainer is not None:
-                    trainer.save_found_settings()  # for who goes on from here
+                    trainer.save_found_settings()  # so that a run that resumes from here agrees
                 return
             CONSOLE.log(f"step {step}: lattice refined to {' x '.join(map(str, model.grid.lattice.cell_shape))} voxels")
             carve(step)
 
     def widen(step: int) -> None:
-        """Store colour for all directions from the step on at which it depends on them, also in a resumed training."""
+        """Widen colour if its step is reached, also in a resumed training, and tell the optimiser."""
         assert attributes.optimizers is not None
         old, change = model.grid.sh, model.widen_colour()
         if old is not None and change is not None:
@@ -163,10 +163,10 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
 
 def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> PhotographEvidence | None:
-    """Give the model feature rays to depths of photographs, beside those of tracks, where it is to have them.
+    """Find the evidence of photographs, give it to the model, and return it; None if no depths are wanted or possible.
 
-    See `ThermoxelsModelConfig.photo_depth`; without photographs in training there are none, and what is returned is
-    None.
+    The model gets feature rays to depths, rays through a plain backdrop, and, unless the training is resumed, gains,
+    offsets and first colours. See `ThermoxelsModelConfig.photo_depth`; depths need photographs in training.
     """
     config, pipeline, trainer = model.config, attributes.pipeline, attributes.trainer
     if config.photo_depth == "off" or not model.loss_weights.tracks or pipeline is None:
@@ -179,7 +179,7 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
     if model.grid.sh is None or datamanager.config.streams == "thermal":
         return None
     box = model.scene_box.aabb.double().numpy()
-    lattice = Lattice.covering(box[0], box[1], config.resolutions[0])  # the same in a resumed training
+    lattice = Lattice.covering(box[0], box[1], config.resolutions[0])  # not the grid's, which may be finer if resumed
     near = config.near_plane * model.unit
     with threadpool_limits(1, "blas"):  # same bits for any number of threads
         wanted = config.exposure == "auto", config.per_image_offset == "auto" and datamanager.config.streams != "rgb"
@@ -204,12 +204,12 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
 
 @dataclass(frozen=True)
 class PruningReport:
-    """What pruning did."""
+    """Result of one pruning."""
 
-    kept_voxels: int
-    total_voxels: int
-    threshold: float  # Smallest largest weight of a voxel that was kept for its own sake
-    opened: float  # Share of the rays with an end of whose weight more than half lay in the voxels removed
+    kept_voxels: int  # Kept voxels after pruning
+    total_voxels: int  # Voxels of the whole lattice
+    threshold: float  # Voxels that gave some ray more than this share of a pixel were kept
+    opened: float  # `share_of_rays_opened` of this pruning
 
     def __str__(self) -> str:
         return (
@@ -221,15 +221,15 @@ class PruningReport:
 def prune_by_rays(
     model: ThermoxelsModel, datamanager, threshold: float, dilation: int
 ) -> tuple[PruningReport, RowChange]:
-    """Keep voxels to which some training ray of either stream gives more than `threshold` of its weight.
+    """Prune to voxels to which some training ray of either stream gives more than `threshold` of its light.
 
-    So stay voxels in which rays that end on something have spent half of their weight, so that no surface opens where
-    it is still soft, neighbours up to `dilation` voxels away, and neighbours that are opaque themselves: a few thousand
-    rays of an image miss some voxels of a fine surface, and each would be a hole. Where that would open more than 1 %
-    of the rays that end on something, the threshold is lowered, fourfold at a time.
+    Also kept are voxels in which a ray that ends on something completes half of its weight (else soft surfaces would
+    open), kept voxels up to `dilation` voxels away, and opaque neighbours (the rays of statistics miss some voxels of a
+    fine surface, and each would be a hole). If this opens more than `MOST_OPENED_RAYS`, the threshold is divided by 4
+    and the pruning tried again. Returns a report and the change of rows.
 
     Raises:
-        PruningError: Even the lowest threshold would open more; the grid is left as it was.
+        PruningError: Even the lowest threshold would open more rays; the grid stays as it was.
     """
 
     def rays():
@@ -255,9 +255,9 @@ def prune_by_rays(
 
 @torch.no_grad()
 def decide_backdrop(model: ThermoxelsModel, datamanager) -> None:
-    """Drop a background that the scene does not call for, and say which was chosen and why.
+    """Switch off a background that the scene does not need, and log which background was chosen and why.
 
-    Asked again at every change of the lattice: what was kept before surfaces had formed can still go.
+    The decision is repeated at every change of the lattice, because surfaces may form late.
     """
     config = model.config
     rgb_on, thermal_on, _ = model.backdrop_on.tolist()

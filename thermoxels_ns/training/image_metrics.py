@@ -1,4 +1,4 @@
-"""How well a rendered photograph matches a held-out one."""
+"""Metrics of rendered photographs and thermal images against held-out ones."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 _SMALLEST_MSE = 1e-10
 _HSSIM_WINDOW = 4
 _HSSIM_C2 = 9e-4  # (0.03 x data range 1)^2
-SATURATED = 0.99  # Channel from which on a pixel may have been brighter than it says
+SATURATED = 0.99  # Value of a channel from which the pixel counts as saturated: the scene may have been brighter
 
 
 def psnr(predicted: Tensor, target: Tensor, valid: Tensor | None = None) -> float:
-    """Return the peak signal-to-noise ratio of values in [0, 1], [dB]; at most 100 (identical images)."""
+    """Return the peak signal-to-noise ratio of values in [0, 1], over `valid` entries, [dB]; at most 100."""
     squared = (predicted - target) ** 2
     mse = squared.mean() if valid is None else squared[valid].mean()
     return float(-10.0 * torch.log10(mse.clamp(min=_SMALLEST_MSE)))
@@ -31,9 +31,9 @@ def psnr_of_blocks(
     valid: Bool[Tensor, "h w 1"] | None = None,
     side: int = 8,
 ) -> float:
-    """Return `psnr` of both images averaged over blocks of `side` x `side` pixels, [dB]: blur within a block is free.
+    """Return the `psnr` of both images after averaging over blocks of `side` x `side` pixels, [dB].
 
-    A block is the mean of its valid pixels; a block without any is left out. NaN where no pixel is valid.
+    A block is the mean of its valid pixels, or left out without any. The result is NaN if no pixel is valid.
 
     >>> fine = torch.tensor([[[0.0], [1.0]], [[1.0], [0.0]]])
     >>> round(psnr_of_blocks(torch.full((2, 2, 1), 0.6), fine, side=2), 3)  # pixels are 0.4 and 0.6 off, their mean 0.1
@@ -50,9 +50,9 @@ def psnr_of_blocks(
 
 
 def fitted_gain(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, " 3"]:
-    """Return the gain of each channel that fits a rendered photograph to a measured one, robustly (Huber).
+    """Return the gain of each channel, (3,), that best maps rendered to measured pixels, by a robust fit (Huber).
 
-    Saturated pixels do not count.
+    Values that are `SATURATED` in the measured photograph do not count.
     """
     gain, weight = torch.ones(3, device=predicted.device), (target < SATURATED).to(predicted.dtype)
     for _ in range(8):
@@ -65,9 +65,9 @@ def fitted_gain(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -
 def ssim(
     predicted: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"], valid: Bool[Tensor, "h w 1"] | None = None
 ) -> float:
-    """Return the structural similarity (Wang et al. 2004), Gaussian window of 11 pixels, a box on smaller images.
+    """Return the structural similarity (Wang et al. 2004), with a Gaussian window of 11 pixels.
 
-    With `valid`, it is the mean over the windows that hold valid pixels only; NaN if there is none.
+    Smaller images have a box window. With `valid`, the mean is over windows with valid pixels only; NaN without any.
     """
     side = min(11, *predicted.shape[:2])
     side -= 1 - side % 2
@@ -85,8 +85,8 @@ def hssim(
 ) -> float:
     """Return the heat-based structural similarity (arXiv 2403.10340), as the Thermoxels paper reports it.
 
-    It is the mean of (2 cov + C2) / (var_p + var_t + C2), C2 = 9e-4, over disjoint 4 x 4 windows (those with valid
-    pixels only): 1 where both are flat, NaN where no window is valid.
+    HSSIM is the mean of (2 cov + C2) / (var_p + var_t + C2), C2 = 9e-4, over disjoint 4 x 4 windows with valid pixels
+    only. A window that is flat in both images counts 1. The result is NaN if there is no such window.
     """
 
     def window_mean(image: Tensor) -> Tensor:
@@ -101,7 +101,7 @@ def hssim(
 
 
 def hot_region(temperature_c: Float[Tensor, "h w 1"], valid: Bool[Tensor, "h w 1"]) -> Bool[Tensor, "h w 1"]:
-    """Return the pixels above Otsu's threshold (Otsu 1979); all valid pixels if the image is flat."""
+    """Return the valid pixels hotter than Otsu's threshold (Otsu 1979), or all valid pixels of a flat image."""
     values = temperature_c[valid]
     if values.numel() == 0:
         return valid
@@ -135,8 +135,8 @@ def thermal_metrics(
     Returns:
         `thermal_psnr`, `thermal_ssim`, `thermal_hssim` of normalised images, and mean absolute errors in kelvin (the
         size of a degree Celsius): `thermal_mae_c` over all valid pixels; `thermal_mae_hit_c` where opacity exceeds one
-        half; `thermal_mae_box_c` in the box; `thermal_mae_roi_c` in the hot region; `thermal_mae_debiased_c` with the
-        image's mean difference removed first. NaN where no pixel qualifies.
+        half; `thermal_mae_box_c` in the box; `thermal_mae_roi_c` in `hot_region`; `thermal_mae_debiased_c` after the
+        image's mean error is subtracted. A metric over no pixel is NaN.
     """
     filled_p, filled_t = (torch.where(valid, image, torch.zeros_like(image)) for image in (predicted, target))
     error_k = (predicted - target) * span_k
@@ -159,7 +159,7 @@ def lpips_available() -> bool:
 
 
 def lpips(predicted: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float:
-    """Return the learned perceptual distance (Zhang et al. 2018, AlexNet); its package fetches weights on first use."""
+    """Return the learned perceptual distance (Zhang et al. 2018, AlexNet); the first call may download weights."""
     import lpips as package  # type: ignore[import-not-found]
 
     def prepare(image: Tensor) -> Tensor:

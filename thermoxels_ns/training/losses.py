@@ -1,4 +1,4 @@
-"""Loss terms of colour, temperature, opacity and feature rays, each a mean, in plain torch."""
+"""Loss terms of colour, temperature, opacity and feature rays, in plain torch; each term is a mean."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from torch import Tensor
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.render.ray_render import RayRequest
 
-MARGIN_VOXELS = 1.5  # Voxels before and behind a point between which the surface may lie
-LARGEST_ERROR = 0.25  # Share of a ray's length that the margin may be for it to end in the surroundings
-MARGIN_ERRORS = 2.0  # Standard errors of a ray's length by which that is widened
+MARGIN_VOXELS = 1.5  # The surface may lie so many voxels before or behind a point, plus `MARGIN_ERRORS`
+LARGEST_ERROR = 0.25  # Rays end in the surroundings if `MARGIN_ERRORS` errors are a smaller share of the length
+MARGIN_ERRORS = 2.0  # Standard errors of a ray's length that are added to the margin before and behind its point
 
 COARSE_LIGHT = 0.5
-"""Share of the light that may pass a depth of photographs while the lattice is coarse: a coarse voxel that is opaque
-reaches beyond the surface in it, and hides what lies beside that. Through tracks of structure from motion none may
-pass: they are fewer, and rooms would keep more floaters."""
+"""Share of the light that may pass a depth found in photographs while the lattice is coarse: an opaque coarse voxel
+reaches beyond the surface in it and hides things beside that surface. Through points of structure from motion no light
+may pass: these points are fewer, and rooms would keep more floaters."""
 
 
 def rgb_loss(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
@@ -31,15 +31,15 @@ def rgb_loss(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> F
 def thermal_loss(
     predicted: Float[Tensor, "n 1"], target: Float[Tensor, "n 1"], l2_share: float = 0.5
 ) -> Float[Tensor, ""]:
-    """Return lambda L2 + (1 - lambda) L1 of normalised temperature (paper, eq. 4, lambda = 1/2)."""
+    """Return l2_share L2 + (1 - l2_share) L1 of normalised temperature (paper, eq. 4, where lambda = 1/2)."""
     error = predicted - target
     return l2_share * torch.mean(error**2) + (1.0 - l2_share) * torch.mean(error.abs())
 
 
 def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple[int, int]:
-    """Return first and end of a part of a list of kept voxels, about `share` of it, at a random place.
+    """Return the first and one behind the last number of a random block of kept voxels, about `share` of all.
 
-    Kept voxels are listed slab by slab along x, so the part is contiguous in space too.
+    Kept voxels are numbered slab by slab along x, so that a block is contiguous in space too.
     """
     length = min(voxels, max(1, math.ceil(share * voxels)))
     first = int(torch.randint(voxels - length + 1, (), generator=generator))
@@ -47,21 +47,21 @@ def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple
 
 
 def beta_loss(accumulation: Float[Tensor, " rays"], guard: float = 1e-3) -> Float[Tensor, ""]:
-    """Return the mean of log(A + guard) + log(1 - A + guard) (Neural Volumes; Plenoxels), 0 for decided rays.
+    """Return the mean of log(A + guard) + log(1 - A + guard), shifted to be 0 for opacities A of 0 or 1.
 
-    It pushes rays to be opaque or empty.
+    This term pushes rays to be opaque or empty (Neural Volumes; Plenoxels).
     """
     decided = math.log(guard) + math.log(1.0 + guard)
     return torch.mean(torch.log(accumulation + guard) + torch.log(1.0 - accumulation + guard)) - decided
 
 
 class FeatureRaySampler:
-    """Rays to points that photographs see, for the loss that asks whether the surface lies there.
+    """Draws rays to points that photographs see, for the loss that is 0 where the surface lies at these points.
 
     Args:
         rays: Feature rays, world units; at least one.
-        box: Lower and upper corner, (2, 3). A ray to a point that lies outside ends on nothing in it.
-        surroundings: There are surroundings, in which such a ray ends if its length is known well enough.
+        box: Lower and upper corner, (2, 3). No surface is expected at points outside the box.
+        surroundings: True if a surface is expected at points outside whose distance is known well enough.
         coarse_light: Share of the light that may pass a point while the lattice is coarse.
     """
 
@@ -73,7 +73,7 @@ class FeatureRaySampler:
         self._ends = torch.from_numpy(((rays.points > lo) & (rays.points < hi)).all(1)[rays.point])
         along = torch.from_numpy(rays.points[rays.point] - rays.origins)
         self._length = torch.linalg.norm(along, dim=-1)
-        # How much farther one voxel of the surroundings reaches there, per share of the way to infinity that it spans.
+        # Depth of a voxel of the surroundings at each point, world units, per `Surroundings.step`; 0 inside the box.
         times = (np.abs(rays.points - 0.5 * (lo + hi)) / (0.5 * (hi - lo))).max(1)[rays.point]
         self._growth = torch.from_numpy(np.where(times > 1.0, times * times, 0.0) * 0.5 * (hi - lo).max())
         if surroundings:
@@ -92,11 +92,11 @@ class FeatureRaySampler:
         device: torch.device,
         surroundings_step: float = 0.0,
     ) -> RayRequest:
-        """Choose `count` feature rays at random; return for all one that ends before the point, then one behind it.
+        """Return 2 `count` rays: random feature rays that end a margin before their points, then behind the points.
 
-        A ray behind its point is empty where nothing is known to be there. The rays want neither colour nor
-        temperature. Lengths are in world units; the generator is on the CPU. `surroundings_step` is the share of the
-        way from the box to infinity that a voxel of the surroundings spans.
+        In the second half, a ray to a point without an expected surface has length 0. The rays want neither colour nor
+        temperature. Lengths are in world units; the generator is on the CPU. `surroundings_step` is
+        `Surroundings.step`, or 0 without surroundings.
         """
         chosen = torch.randint(len(self._length), (count,), generator=generator)
         margin = (
@@ -104,7 +104,7 @@ class FeatureRaySampler:
             + MARGIN_ERRORS * self._uncertainty[chosen]
         )
         length = self._length[chosen]
-        # Errors are of the inverse length: one as large as the length leaves half of it.
+        # The error is one of 1 / length: a margin as large as the length leaves half of the length.
         before = length * length / (length + margin).clamp(min=1e-12)
         far = torch.cat((before, (length + margin) * self._ends[chosen])).float()
         nothing = torch.zeros(2 * count, dtype=torch.bool, device=device)
@@ -113,10 +113,10 @@ class FeatureRaySampler:
 
 
 def feature_ray_loss(accumulation: Tensor, transmittance: Tensor, tolerated: float = 0.0) -> Tensor:
-    """Return the mean share of light that feature rays lose before their points, plus the share that passes them.
+    """Return the mean share of light that feature rays lose before their points, plus the share that passes the points.
 
-    Both are 0 where the surface lies at the point. The rays are those of `FeatureRaySampler.request`, shape (2 n,); the
-    share `tolerated` of the light may pass without counting.
+    Both shares are 0 where the surface lies at the points. Inputs have shape (2 n,), one entry per ray of
+    `FeatureRaySampler.request`; of the light that passes a point the share `tolerated` does not count.
 
     >>> float(feature_ray_loss(torch.tensor([0.25, 0.9]), torch.tensor([0.75, 0.1])))
     0.3499999940395355

@@ -1,4 +1,4 @@
-"""The nerfstudio model: a voxel field with its losses and metrics."""
+"""The nerfstudio model: a voxel grid with its background, losses and metrics."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.ray_statistics import field_evidence
 
 SURROUNDINGS = (48, 12)
-"""Voxels of the surroundings across a face of the box and from there to infinity, at the start; they are split
-whenever those of the box are."""
-SURROUNDINGS_DENSITY = 0.005  # Their density at the start, [1 / voxel]: a tenth of the light is lost
+"""Voxels of the surroundings at the start: across a face of the box, and from a face to infinity. They are split when
+the voxels of the box are."""
+SURROUNDINGS_DENSITY = 0.005  # Density of the surroundings at the start, [1 / voxel]; a ray straight out loses 6 %
 SURROUNDINGS_VARIATION = 100.0
-"""Their total variation counts this many times that of the box; chosen on one real scene (1: 16.6, 100: 17.7 dB)."""
+"""Weight of the surroundings' total variation, relative to the box's; from one real scene (1: 16.6, 100: 17.7 dB)."""
 
 
 class ThermoxelsModel(Model):
-    """A voxel grid with density, colour and temperature on its corners, learned from RGB and thermal rays."""
+    """A voxel grid with its surroundings and background, trained on RGB and thermal rays."""
 
     config: ThermoxelsModelConfig
     temperature_bounds_c: Tensor
@@ -63,7 +63,7 @@ class ThermoxelsModel(Model):
     trained_steps: Tensor
 
     def populate_modules(self) -> None:
-        """Build the field, the background and what belongs to single images."""
+        """Build grid, surroundings, background and corrections; raise `SceneError` without a temperature range."""
         super().populate_modules()
         self.config.check()
         box, metadata = self.scene_box.aabb.double().numpy(), self.kwargs.get("metadata") or {}
@@ -84,7 +84,7 @@ class ThermoxelsModel(Model):
                 f"voxels: {config.resolutions[-1]} along the longest side of the box, each {pixels:.1f} pixels wide "
                 "where most of what photographs show stands"
             )
-        # Densities, distances and learning rates are made for a box 2 long; other sizes are converted.
+        # Settings are for a box whose longest side is 2; `unit` converts them to world units.
         self.unit = longest / 2.0
         lattice = Lattice.covering(box[0], box[1], config.resolutions[0])
         channels, budget = config.row_channels(config.resolutions[0]), config.memory_budget_gb
@@ -102,38 +102,38 @@ class ThermoxelsModel(Model):
         self.background_thermal = SkyTemperature() if config.thermal_background != "minimum" else None
         start = (*SURROUNDINGS, SURROUNDINGS_DENSITY, config.density_activation, wants_rgb)
         self.surroundings = Surroundings(torch.from_numpy(box), *start) if config.surroundings == "on" else None
-        # Which of colour at infinity, temperature at infinity and surroundings take part; kept in the checkpoint.
+        # Whether colour at infinity, temperature at infinity and surroundings are rendered; kept in the checkpoint.
         on = [wants_rgb, self.background_thermal is not None, self.surroundings is not None]
         self.register_buffer("backdrop_on", torch.tensor(on))
         images, colour = self.num_train_data, config.sh_degree is not None and config.exposure != "off"
         self.log_gain = nn.Parameter(torch.zeros(images, 3)) if colour else None
         self.thermal_offset = nn.Parameter(torch.zeros(images)) if config.per_image_offset != "off" else None
-        # Whether gains and offsets take part; kept in the checkpoint.
+        # Whether gains and offsets are applied; kept in the checkpoint.
         self.register_buffer("corrected", torch.tensor([config.exposure == "on", config.per_image_offset == "on"]))
-        # How far training got; part of the checkpoint, because view-dependence begins at some step.
+        # Last step of training; kept in the checkpoint, because colour depends on the direction from some step on.
         self.register_buffer("trained_steps", torch.tensor(0))
         self.step = 0
-        # What training photographs see of the tracks of structure from motion.
+        # Rays from training photographs to the points of structure from motion.
         rays: FeatureRays | None = metadata.get("feature_rays")
         self.feature_rays, self.feature_ray_sampler = rays, None
         if rays is not None and len(rays.point) and config.sh_degree is not None:
             self.feature_ray_sampler = losses.FeatureRaySampler(rays, box, self.surroundings is not None)
-        # Through pixels of photographs that show a plain backdrop; found when a training begins.
+        # Rays through pixels that show a plain backdrop; `callbacks.follow_depths` finds them.
         self.backdrop_ray_sampler: losses.FeatureRaySampler | None = None
 
     @property
     def seen_surroundings(self) -> Surroundings | None:
-        """The lattices outside the box; None where all that lies there is at infinity."""
+        """The surroundings that are rendered; None where everything outside the box lies at infinity."""
         return self.surroundings if bool(self.backdrop_on[2]) else None
 
     @property
     def temperature_range(self) -> TemperatureRange:
-        """The temperatures that 0 and 1 stand for; part of the checkpoint."""
+        """The temperatures for which normalised temperatures 0 and 1 stand, from the checkpoint if one was loaded."""
         low, high = self.temperature_bounds_c.tolist()
         return TemperatureRange(low, high)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Return the parameters by optimiser: density, sh, temperature, background, corrections (those that exist)."""
+        """Return the parameters by the name of their optimiser, such as density or surroundings_density."""
         groups = {name: [parameter] for name, parameter in self.grid.row_parameters().items()}
         backdrop = [p for m in (self.background_rgb, self.background_thermal) if m is not None for p in m.parameters()]
         if backdrop:
@@ -147,10 +147,10 @@ class ThermoxelsModel(Model):
         return groups
 
     def split(self, factor: int) -> RowChange:
-        """Split every kept voxel into factor^3, say what that needs, and return how values of rows change.
+        """Split every kept voxel into factor^3, log the memory that takes, and return the change of rows.
 
         Raises:
-            MemoryBudgetError: The next lattice needs more than `memory_budget_gb`.
+            MemoryBudgetError: The finer lattice needs more than `memory_budget_gb`; the grid stays as it is.
         """
         lattice = self.grid.lattice.refined(factor)
         voxels, channels = len(self.grid.voxels) * factor**3, self.config.row_channels(max(lattice.cell_shape))
@@ -158,10 +158,10 @@ class ThermoxelsModel(Model):
         return refine(self.grid, factor)
 
     def widen_colour(self) -> ColumnChange | None:
-        """Store all harmonics of colour once it depends on the direction.
+        """Let the grid store all harmonics of colour if step `view_dependence_from` is reached.
 
         Returns:
-            How values of its columns change; None where they stay.
+            Change of the columns of colour; None if the columns stay as they are.
         """
         degree, stored = self.config.sh_degree, self.grid.sh_degree
         if degree is None or stored is None or int(self.trained_steps) < self.config.view_dependence_from:
@@ -169,14 +169,14 @@ class ThermoxelsModel(Model):
         return widen_colour(self.grid, degree) if stored < degree else None
 
     def update_to_step(self, step: int) -> None:
-        """Tell the model which step it is at (schedules, random blocks)."""
+        """Set the step of training, on which weights, random blocks and random rays depend."""
         self.step = step
         self.trained_steps.fill_(step)
 
     def _request(
         self, origins: Tensor, directions: Tensor, nears: Tensor | None = None, fars: Tensor | None = None
     ) -> RayRequest:
-        """Return rays between `nears` and `fars` (rays, 1) if given, behind the near plane."""
+        """Return a request for rays from `nears`, but at least the near plane, to `fars`, both (rays, 1)."""
         near: float | Tensor = self.config.near_plane * self.unit
         if nears is not None:
             near = nears[:, 0].clamp(min=near)
@@ -187,7 +187,7 @@ class ThermoxelsModel(Model):
         return RenderOptions(c.steps_per_voxel, c.smallest_weight, c.early_stop, c.thermal_density_gradient)
 
     def _training_options(self) -> RenderOptions:
-        """Return the options with what this step's loss needs beside pixels."""
+        """Return the options with which a training step renders: those of images and what the loss terms need."""
         return replace(
             self._options(),
             distortion_scale=2.0 * self.unit if self._distortion_weight() > 0 else None,
@@ -197,7 +197,7 @@ class ThermoxelsModel(Model):
         )
 
     def _blocks(self, grid: VoxelGrid, stream: int) -> dict[str, tuple[int, int]]:
-        """Return the parts of a grid whose total variation this step looks at."""
+        """Return the blocks of a grid whose total variation this step computes, by the name of the parameter."""
         generator = torch.Generator().manual_seed(self.config.seed * stream + self.step)
         return {
             name: losses.random_block(len(grid.voxels), self.config.tv_share, generator)
@@ -207,9 +207,9 @@ class ThermoxelsModel(Model):
 
     @torch.no_grad()
     def correct_photographs(self, index: IntArray, log_gain: npt.NDArray | None, offset: npt.NDArray | None) -> None:
-        """Begin with gains (n, 3) and offsets (n,) found for some training images; the others begin with none.
+        """Set the logarithmic gains (n, 3) and normalised offsets (n,) of the training images `index` (n,).
 
-        None: none was found, and none takes part.
+        Other images keep 0. If `log_gain` or `offset` is None, these corrections stay as they are.
         """
         for number, (parameter, values) in enumerate(((self.log_gain, log_gain), (self.thermal_offset, offset))):
             if parameter is not None and values is not None:
@@ -217,11 +217,11 @@ class ThermoxelsModel(Model):
                 self.corrected[number] = True
 
     def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
-        """Return the samples of rays in kept voxels and their weights, for statistics."""
+        """Return the samples of rays in kept voxels of the box with their weights, for statistics."""
         return sample_rays(self.grid, self._request(origins, directions), self._options(), self.config.backend)
 
     def render_rays(self, request: RayRequest, options: RenderOptions) -> SceneRender:
-        """Render what rays see, from the box to infinity."""
+        """Return what rays see of the box, the surroundings and infinity."""
         rgb_on, thermal_on, _ = self.backdrop_on.tolist()
         around = self.seen_surroundings
         rgb, thermal = self.background_rgb if rgb_on else None, self.background_thermal if thermal_on else None
@@ -229,10 +229,10 @@ class ThermoxelsModel(Model):
         return render_scene(Scene(self.grid, around, rgb, thermal), request, options, self.config.backend, blocks)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation, in_box (1 if it meets the box).
+        """Return what rays see: rgb, thermal (normalised), temperature_c, depth, accumulation, in_box (1: meets box).
 
-        Rays of a batch carry their stream (see `core.feature_rays`). In training only what it needs is rendered, and
-        the outputs are those that losses are made of. A crop that the viewer sets (nears, fars) is kept.
+        Rays of a batch carry their stream, see `core.feature_rays`; in training their outputs are the inputs of
+        `get_loss_dict` instead. Rays are rendered from `nears` to `fars`, with which the viewer crops a scene.
         """
         request = self._request(ray_bundle.origins, ray_bundle.directions, ray_bundle.nears, ray_bundle.fars)
         stream = ray_bundle.metadata.get("stream")
@@ -241,14 +241,14 @@ class ThermoxelsModel(Model):
         rgb_rays, thermal_rays = (stream[:, 0] & RGB_STREAM) > 0, (stream[:, 0] & THERMAL_STREAM) > 0
         batch: dict[str, Any] = {"rgb_rays": rgb_rays, "thermal_rays": thermal_rays}
         if not self.training:
-            # Stock exporters ask for batches as for images; colour is left out only where no ray is a photograph's.
+            # Exporters of nerfstudio render batches too; colour is left out only if no ray belongs to a photograph.
             if not bool(rgb_rays.any()):
                 request = replace(request, rgb_rays=rgb_rays)
             return batch | self._image_outputs(request)
         request = replace(request, rgb_rays=rgb_rays, thermal_rays=thermal_rays)
         seen = self.render_rays(request, self._training_options())
         rgb, thermal = seen.rgb, seen.thermal
-        # The gradient of `index_select` adds rays in their order; that of an index leaves the order to a race.
+        # The gradient of `index_select` adds rays in their order; with an index instead, threads would race.
         gains_on, offsets_on = self.corrected.tolist()
         photograph = torch.zeros(0) if ray_bundle.camera_indices is None else ray_bundle.camera_indices[:, 0]
         if self.log_gain is not None and gains_on and rgb is not None:
@@ -260,7 +260,7 @@ class ThermoxelsModel(Model):
         return batch | {"rgb": rgb, "thermal": thermal, "accumulation": seen.box.accumulation[:, None], "render": seen}
 
     def _correction(self, correction: Tensor, wanted: str) -> Tensor:
-        """Return a correction; one found in photographs learns only once surfaces stand, which would distort it."""
+        """Return a correction, without gradient if `wanted` is auto and the distortion ramp has not ended yet."""
         return correction.detach() if wanted == "auto" and self.step < self.config.distortion_ramp[1] else correction
 
     def _image_outputs(self, request: RayRequest) -> dict[str, Tensor]:
@@ -281,17 +281,17 @@ class ThermoxelsModel(Model):
         }
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Return colour and opacity, for nerfstudio's stock exporters."""
+        """Return colour and opacity (..., 4), for the exporters of nerfstudio."""
         return torch.cat((outputs[output_name], outputs["accumulation"]), dim=-1)
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        """Return the weighted loss terms; those of weight 0 are not computed."""
+        """Return the weighted loss terms by name; terms of weight 0 are not computed."""
         weights, terms = self.loss_weights, {}
         if weights.rgb and (pair := _seen_and_measured(outputs, batch, "rgb", "image")) is not None:
             seen, measured = pair
-            if self.training and bool(self.corrected[0]):  # what saturates a photograph may be any brighter
+            if self.training and bool(self.corrected[0]):  # a saturated pixel may have been brighter than it says
                 seen = torch.where(measured >= SATURATED, torch.minimum(seen, measured), seen)
             terms["rgb_loss"] = weights.rgb * losses.rgb_loss(seen, measured)
         if weights.thermal and (pair := _seen_and_measured(outputs, batch, "thermal", "thermal")) is not None:
@@ -321,7 +321,7 @@ class ThermoxelsModel(Model):
         return terms
 
     def _feature_ray_loss(self, rays: losses.FeatureRaySampler) -> Tensor:
-        """Return how far this step's feature rays are from ending at their points; coarse lattices let light pass."""
+        """Return `losses.feature_ray_loss` of random rays of a sampler; a coarse lattice may let light pass points."""
         config, near, lattice = self.config, self.config.near_plane * self.unit, self.grid.lattice
         generator = torch.Generator().manual_seed((config.seed + 1) * 2_000_003 + self.step)
         step = 0.0 if self.seen_surroundings is None else self.seen_surroundings.step
@@ -335,13 +335,13 @@ class ThermoxelsModel(Model):
         return losses.feature_ray_loss(lost, left, 0.0 if last else rays.coarse_light)
 
     def _distortion_weight(self) -> float:
-        """Return the weight of the distortion term at this step: it grows over its ramp."""
+        """Return the weight of the distortion term at this step; over `distortion_ramp` the weight grows from 0."""
         first, last = self.config.distortion_ramp
         return self.loss_weights.distortion * min(1.0, max(0.0, (self.step - first) / max(1, last - first)))
 
     @torch.no_grad()
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
-        """Return PSNR and temperature error of the batch."""
+        """Return psnr, [dB], and thermal_mae_c, the mean temperature error, [K], of a batch."""
         metrics = {}
         if (pair := _seen_and_measured(outputs, batch, "rgb", "image")) is not None:
             metrics["psnr"] = torch.tensor(psnr(*pair))
@@ -355,9 +355,9 @@ class ThermoxelsModel(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Return metrics of one held-out frame, and pictures with the measured image left of the rendered one.
 
-        A thermal camera of its own has the thermal image rendered from its pose. ``psnr_box`` and
-        ``thermal_mae_box_c`` count every pixel whose ray meets the lattice's box ahead of the camera; some of these
-        pixels show what stands in front of the box or behind it.
+        The thermal image is rendered from the pose of its own camera if there is one. ``psnr_box`` and
+        ``thermal_mae_box_c`` count the pixels whose rays meet the box ahead of the camera; some of these pixels show
+        things in front of the box or behind it.
         """
         metrics: dict[str, float] = {}
         images: dict[str, Tensor] = {}
@@ -391,11 +391,11 @@ class ThermoxelsModel(Model):
     def _fitted_metrics(
         self, outputs: dict[str, Tensor], seen: dict[str, Tensor], batch: dict[str, Any], valid: Tensor
     ) -> dict[str, float]:
-        """Return ``psnr_fitted``, for which a held-out frame is corrected as training frames are.
+        """Return ``psnr_fitted``: the PSNR of a held-out frame with fitted gains and, if there is one, fitted pose.
 
-        Gains are fitted to all of its pixels. If training poses were adjusted, its pose is the one fitted to its own
-        features, for ``thermal_mae_debiased_c`` too. `outputs` and `seen` are photograph and thermal image as rendered
-        from the poses given.
+        Gains are fitted to all valid pixels. Where the batch has a camera fitted to the frame's own features, the frame
+        is rendered from there, and ``thermal_mae_debiased_c`` is returned too. `outputs` and `seen` are the photograph
+        and the thermal image as rendered from the given poses.
         """
         metrics: dict[str, float] = {}
         if batch.get("fitted_camera") is not None:
@@ -416,25 +416,25 @@ class ThermoxelsModel(Model):
         return metrics
 
     def _rendered(self, camera: Cameras, stream: int) -> dict[str, Tensor]:
-        """Render what a camera, of shape (1,), sees."""
+        """Return the outputs of `get_outputs` for the image of a camera, shape (1,), in a stream."""
         rays = camera.to(self.device).generate_rays(camera_indices=0, keep_shape=True)
         rays.metadata["stream"] = torch.full((*rays.shape, 1), stream, dtype=torch.uint8, device=self.device)
         return self.get_outputs_for_camera_ray_bundle(rays)
 
     @torch.no_grad()
     def grid_snapshot(self, rays: Iterable[RayBundle], views: Views | None = None) -> GridSnapshot:
-        """Return the trained field for the mesher.
+        """Return the trained field for the mesher, with the evidence of training rays of both streams.
 
-        Training rays of both streams tell where solid is, which corners were measured and what temperature was seen
-        there; without any there is no evidence. Colour is that of the harmonic of degree 0, grey at corners of no kept
-        voxel: its sigmoid stands for the mean over directions, exact where colour is the same from all sides.
+        Without rays there is no evidence, and temperatures are the stored ones. Colour is the sigmoid of the harmonic
+        of degree 0, which is the mean over directions where colour is the same from all sides, and about that mean
+        elsewhere; corners without a row are grey.
         """
         grid, colour, evidence = self.grid, None, None
         seen = field_evidence(self, rays)
-        # Corners of no kept voxel are given the middle of the range; nothing reads them.
+        # Corners without a row get the middle of the range; nothing reads these values.
         thermal = grid.corner_values(seen.temperature.thermal.float(), fill=0.5)
         if grid.sh is not None and grid.sh_degree is not None:
-            constant = harmonics(grid.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # the same in all directions
+            constant = harmonics(grid.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # degree 0 is the same in all directions
             mean = grid.sh.view(len(grid.sh), 3, num_coefficients(grid.sh_degree))[..., 0] * constant
             channels = torch.sigmoid(mean).float().unbind(-1)
             colour = torch.stack([grid.corner_values(rows, 0.5) for rows in channels], -1).cpu().numpy()
@@ -457,7 +457,7 @@ class ThermoxelsModel(Model):
 def _seen_and_measured(
     outputs: dict[str, Any], batch: dict[str, Any], name: str, target: str
 ) -> tuple[Tensor, Tensor] | None:
-    """Return what the rays of a stream (rgb or thermal) saw and what was measured; None without such rays."""
+    """Return the rendered and the measured values of the rays of a stream, rgb or thermal; None without such rays."""
     (chosen,) = outputs[f"{name}_rays"].nonzero(as_tuple=True)
     if outputs[name] is None or not len(chosen):
         return None
@@ -465,14 +465,14 @@ def _seen_and_measured(
 
 
 class SurroundingsSampler:
-    """Samples of rays in the surroundings, each piece a ray of its own, for statistics; the box is not in their way."""
+    """A `RaySampler` of the surroundings: each straight piece of a ray counts as a ray, and the box hides nothing."""
 
     def __init__(self, model: ThermoxelsModel) -> None:
         assert model.surroundings is not None
         self.grid, self._surroundings, self._config = model.surroundings.grid, model.surroundings, model.config
 
     def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
-        """Return the samples of rays."""
+        """Return the samples of the pieces of rays in kept voxels of the surroundings."""
         cut = self._surroundings.segments(origins, directions)
         request = RayRequest(cut.origins, cut.directions, 0.0, cut.lengths)
         return sample_rays(self.grid, request, RenderOptions(), self._config.backend)

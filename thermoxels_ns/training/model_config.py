@@ -18,15 +18,15 @@ from thermoxels_ns.training.schedule import COARSEST, QUALITIES, schedule_for
 
 _STANDARD = schedule_for(*QUALITIES["standard"])
 MOST_VOXELS = 2.0
-"""Voxels along the longest side that a scene may ask for, relative to the last of the resolutions. wild-11, whose
-ground runs on, asks for 256 and has F 0.95 of what is seen, 0.59 with 192. A statue photographed at 12 megapixels asks
-for 512: with 384 after 1500 steps more of its depths are off by 2 % (17 %, with 192 15 %)."""
-MOST_STRETCH = 1.5  # The same, up to which no split more is made
-STEP_OF_COARSEST = 8  # Of so many voxels the coarsest resolution is a multiple
+"""Most voxels along the longest side that a scene may ask for, divided by the last of the resolutions. wild-11, with
+far ground, asks for 256 voxels; F of the seen surface is 0.95 with 256 and 0.59 with 192. A statue photographed at 12
+megapixels asks for 512; after 1500 steps 17 % of its depths are off by 2 % with 384 voxels, 15 % with 192."""
+MOST_STRETCH = 1.5  # Voxels asked for, divided by the last of the resolutions, up to which no split is added
+STEP_OF_COARSEST = 8  # The coarsest resolution is a multiple of this number of voxels
 
 
 def _in_steps(voxels: float) -> int:
-    """Round to a coarsest resolution: up by less than three quarters of a step."""
+    """Return a multiple of `STEP_OF_COARSEST`: rounded up by less than 3/4 of a step, otherwise down; at least one."""
     return STEP_OF_COARSEST * max(1, math.ceil(voxels / STEP_OF_COARSEST - 0.25))
 
 
@@ -43,13 +43,13 @@ class LossWeights:
     beta: float = 0.0  # Push rays to be opaque or empty
     distortion: float = 0.1  # Gather each ray's weight in one short interval
     tracks: float = 0.05
-    """Feature rays end at their points: tracks of structure from motion, depths on which photographs agree."""
-    backdrop: float = 0.02  # Rays through a plain backdrop (sky, a wall far behind) meet nothing in the box
-    surroundings: float = 1e-3  # What infinity explains is not in the surroundings before it
+    """Make feature rays end at their points: tracks of structure from motion, depths on which photographs agree."""
+    backdrop: float = 0.02  # Let rays through a plain backdrop (sky, a wall far behind) meet nothing in the box
+    surroundings: float = 1e-3  # Keep the surroundings transparent where colour at infinity explains the photographs
 
 
 LOSS_RECIPES: Mapping[str, LossWeights] = {
-    # Tuned on the synthetic scenes for what meshes need: opaque solids, empty air.
+    # Tuned on the synthetic scenes for meshes, which need opaque solids and empty air.
     "default": LossWeights(),
     # The published training configuration of the original code (TV, sparsity and beta as there).
     "paper": LossWeights(
@@ -67,10 +67,10 @@ LOSS_RECIPES: Mapping[str, LossWeights] = {
 
 @dataclass
 class ThermoxelsModelConfig(ModelConfig):
-    """Settings of the voxel model."""
+    """Settings of `ThermoxelsModel`."""
 
     model_class: ClassVar[type] = ModelConfig
-    """The model that these settings make; `training.model` puts itself here."""
+    """Class of the model that these settings make; the module `training.model` sets it to `ThermoxelsModel`."""
     _target: type = field(default_factory=lambda: ThermoxelsModelConfig.model_class)
     enable_collider: bool = False
     """Rays are cut by the lattice itself; nerfstudio's collider is not used."""
@@ -78,33 +78,33 @@ class ThermoxelsModelConfig(ModelConfig):
     """Rays rendered at once for a whole image."""
 
     resolutions: tuple[int, ...] = _STANDARD.resolutions
-    """Voxels along the longest side of the scene box, coarse to fine; each a multiple of the one before. Unless they
-    are typed, voxel-pixels replaces them by up to twice as many."""
+    """Voxels along the longest side of the scene box, coarse to fine; each number is a multiple of the one before.
+    Unless resolutions is typed, voxel-pixels replaces these numbers, by at most twice as many voxels."""
     voxel_pixels: float = 0.0
-    """Width of the finest voxels in pixels of the photographs, where most of what they show stands. Finer ones follow
-    noise, coarser ones cannot hold the shape. 0: as resolutions says."""
+    """Width of the finest voxels in pixels of the photographs, at the distance of most of what photographs show. Finer
+    voxels follow noise, coarser voxels cannot hold the shape. 0: as resolutions says."""
     refine_at: tuple[int, ...] = _STANDARD.refine_at
     """Steps at which the next resolution begins; one fewer than resolutions."""
     steps: int = _STANDARD.steps
     """Steps of a whole training, over which refine-at and prune-at are spread where voxel-pixels asks for another
-    number of resolutions. A quality sets it; --max-num-iterations alone does not."""
+    number of resolutions. A quality sets this number; --max-num-iterations alone does not."""
     prune_at: tuple[int, ...] = _STANDARD.prune_at
-    """Further steps at which voxels that no ray gives weight to are dropped (done at every refinement too)."""
+    """Steps, beside those of refine-at, at which voxels that hold little of each ray go, see prune-threshold."""
     prune_threshold: float = 0.03
     """A voxel stays if some training ray gave it more than this share of a pixel. 0 switches pruning off."""
     prune_dilation: int = 1
-    """Voxels kept around those, so that surfaces can still move."""
+    """Width, in voxels, of the margin kept around voxels that stay by prune-threshold, so that surfaces can move."""
     thin_at: tuple[int, ...] = _STANDARD.thin_at
-    """Steps at which surfaces are thinned: half-transparent voxels before and behind them go."""
+    """Steps at which surfaces are thinned: half-transparent voxels before and behind a surface are dropped."""
     thin_threshold: float = 0.05
-    """At those steps a voxel stays only if some training ray gave it more than this share of a pixel, or spent half of
-    its light there. 0 switches thinning off."""
+    """At a step of thin-at a voxel stays if some training ray gave it more than this share of a pixel or spent half of
+    its light there; opaque neighbours of such voxels stay too. 0 switches thinning off."""
 
     sh_degree: int | None = 2
     """Degree of the view-dependent colour, 0 to 2. None: no colour (thermal images alone)."""
     view_dependence_from: int = _STANDARD.view_dependence_from
-    """Step from which colour depends on the direction; before, it cannot explain away a surface in the wrong place, and
-    is stored as one colour per voxel corner."""
+    """Step from which colour depends on the direction. Before it there is one colour per voxel corner, which cannot
+    explain away a surface in the wrong place."""
     temperature_degree: int = 0
     """Degree of view-dependent temperature; 0 (the paper): surfaces look equally warm from all sides."""
     density_activation: DensityActivation = "exp"
@@ -114,29 +114,29 @@ class ThermoxelsModelConfig(ModelConfig):
     carve: Literal["auto", "off"] = "auto"
     """auto: at the start and after every refinement, drop voxels that rays cross on the way to what photographs see:
     points of structure from motion (tracks of thermoxels capture or of a COLMAP model, see the dataparser's tracks),
-    and depths on which photographs agree. So go voxels around cameras: nearer than half of what one shows, where no two
-    photographs look."""
+    and depths on which photographs agree. Voxels around cameras are dropped too: nearer than half of what a photograph
+    shows, where no two photographs look."""
     photo_depth: Literal["auto", "off", "on"] = "auto"
     """Depth supervision: find depths by comparing each photograph with its neighbours (multi-view stereo, plane sweep),
-    and ask rays to end there, as at points of structure from motion. It keeps opaque floaters from forming before walls
-    of little texture. auto: where the run has at least 400 steps; on: always. It needs a
-    loss weight tracks above 0."""
+    and make rays end at these depths, as at points of structure from motion. This keeps opaque floaters from forming
+    before walls of little texture. auto: where the run has at least 400 steps; on: always. Both need a loss weight
+    tracks above 0."""
     track_rays: int = 512
-    """Feature rays (to depths or to points of structure from motion) that each step follows."""
+    """Number of feature rays (to depths or to points of structure from motion) that each step draws."""
     thermal_density_gradient: bool = False
-    """Let thermal images move the geometry (off: temperature is painted on what the RGB images show)."""
+    """Let thermal images move the geometry (off: temperature is painted on the surfaces that RGB images show)."""
     steps_per_voxel: float = 2.0
     """Samples per voxel edge along a ray (the paper: 2)."""
     near_plane: float = 0.0
-    """Distance before each camera that stays empty, in scene units (the scene box is 2 long)."""
+    """Distance before each camera that is not rendered, in units of half the longest side of the scene box."""
     early_stop: float = 1e-5
     """A ray ends where less than this share of its light is left; its pixel is off by at most this much. 0: never."""
     backend: Backend = "auto"
-    """fused: compiled kernels, on a CPU; reference: plain PyTorch; auto: fused on a CPU, reference on a GPU."""
+    """fused: compiled kernels, on a CPU only; reference: plain PyTorch; auto: fused on a CPU, reference on a GPU."""
     memory_budget_gb: float = 4.0
-    """Memory that the voxel grid with its optimiser may need, [GB]; what needs more is refused before it is taken."""
+    """Memory that the voxel grid with its optimiser may need, [GB]; a lattice that needs more is not built."""
     smallest_weight: float = 1e-5
-    """Samples that fill less than this share of a pixel add no colour or temperature. 0 is exact and slower."""
+    """Samples that fill at most this share of a pixel add no colour or temperature. 0 is exact and slower."""
 
     background: Literal["auto", "on", "off"] = "auto"
     """Colour behind the box as a sphere image. auto: dropped at the first refinement if no ray leaves unsaturated."""
@@ -146,31 +146,31 @@ class ThermoxelsModelConfig(ModelConfig):
     """Temperature behind the box: the scene's minimum (the paper), or a learned low-order sky."""
 
     surroundings: Literal["on", "off"] = "on"
-    """What lies outside the box, with parallax: coarse lattices from the box to infinity. They are not exported. off:
-    all that is outside lies at infinity."""
+    """on: what lies outside the box is rendered with parallax, by coarse lattices from the box to infinity, which are
+    not exported. off: everything outside the box lies at infinity."""
 
     recipe: Literal["default", "paper"] = "default"
-    """Set of loss weights; paper: the published one."""
+    """Set of loss weights; paper: the published weights."""
     loss_overrides: dict[str, float] = field(default_factory=dict)
-    """Loss weights that replace the recipe's, by name: rgb, thermal, tv_density, tv_sh, tv_temperature, sparsity,
-    beta, distortion, tracks, backdrop, surroundings."""
+    """Loss weights by name that replace weights of the recipe: rgb, thermal, tv_density, tv_sh, tv_temperature,
+    sparsity, beta, distortion, tracks, backdrop, surroundings."""
     thermal_l2_share: float = 0.5
     """lambda of the paper's eq. 4."""
     distortion_ramp: tuple[int, int] = _STANDARD.distortion_ramp
     """Steps over which the distortion term grows from nothing to its weight."""
     tv_share: float = 0.1
-    """Share of the lattice that each step's total variation looks at."""
+    """Share of the kept voxels over which each step computes total variation."""
     per_image_offset: Literal["auto", "on", "off"] = "auto"
-    """One temperature offset per thermal image (mean zero), for cameras whose reading drifts. auto: where thermal
-    images of the same points differ by it (it needs photo_depth); on: learned from nothing."""
+    """One temperature offset per thermal image (mean zero), for cameras whose reading drifts. auto: only where thermal
+    images of the same points differ, beginning with these differences (needs photo_depth); on: beginning with 0."""
     exposure: Literal["auto", "on", "off"] = "auto"
     """One gain per photograph and channel (mean one), for cameras that choose exposure and white balance anew. auto:
-    where photographs of the same points differ by it (it needs photo_depth); on: learned from nothing."""
+    only where photographs of the same points differ, beginning with their ratios (needs photo_depth); on: with 1."""
     seed: int = 0
     """Seed of everything random in the model."""
 
     def loss_weights(self) -> LossWeights:
-        """Return the recipe's weights with the overrides in place."""
+        """Return the recipe's weights with the overrides; raise `ThermoxelsError` for an unknown name."""
         known = vars(LOSS_RECIPES[self.recipe])
         for name in self.loss_overrides.keys() - known.keys():
             expected = "one of " + ", ".join(known)
@@ -178,7 +178,7 @@ class ThermoxelsModelConfig(ModelConfig):
         return LossWeights(**{**known, **self.loss_overrides})
 
     def check(self) -> None:
-        """Raise `ThermoxelsError` for a value that cannot work."""
+        """Raise `ThermoxelsError` if a setting is out of range or settings contradict each other."""
         self.refinements()
         ranges: dict[str, tuple[float, float, str]] = {
             **dict.fromkeys(("prune_threshold", "thin_threshold", "thermal_l2_share"), (0.0, 1.0, "from 0 to 1")),
@@ -208,10 +208,10 @@ class ThermoxelsModelConfig(ModelConfig):
                 raise ThermoxelsError(name, expected="steps of at least 1", got=at, remedy="Correct the steps.")
 
     def refinements(self) -> dict[int, int]:
-        """Return by step the factor by which voxels are split there.
+        """Return for each step of `refine_at` the factor by which the edges of voxels are divided.
 
         Raises:
-            ThermoxelsError: Resolutions are no multiples of each other, or the number of steps is wrong.
+            ThermoxelsError: A resolution is no multiple of the one before, or `refine_at` does not fit.
         """
         pairs = list(zip(self.resolutions, self.resolutions[1:]))
         increasing = all(b % a == 0 and b > a for a, b in pairs) and sorted(set(self.refine_at)) == list(self.refine_at)
@@ -224,12 +224,12 @@ class ThermoxelsModelConfig(ModelConfig):
         return {step: b // a for step, (a, b) in zip(self.refine_at, pairs)}
 
     def suited_to(self, voxels: float) -> ThermoxelsModelConfig:
-        """Return the settings for a scene whose longest side is as long as this number of voxels of `voxel_pixels`.
+        """Return the settings for a scene along whose longest side `voxels` voxels of width `voxel_pixels` fit.
 
-        Up to `MOST_STRETCH` times the resolution, all resolutions grow or shrink alike. Beyond, up to `MOST_VOXELS`
-        times, the lattice is split as often as that many voxels need; resolutions and steps of one's own are not.
-        Voxels are rounded up by less than three quarters of a step: too few voxels lose more than they save (courtyard:
-        F 0.81, 0.86 and 0.89 of what is seen with 96, 112 and 128 voxels).
+        Up to `MOST_STRETCH` times the last resolution all resolutions are scaled alike; so are resolutions and steps
+        that are not those of `schedule_for`. Beyond, up to `MOST_VOXELS` times, `schedule_for` gives resolutions and
+        steps for the voxels wanted. Numbers are rounded by `_in_steps`, rather up: too few voxels lose shape
+        (courtyard: F of the seen surface is 0.81, 0.86 and 0.89 with 96, 112 and 128 voxels).
         """
         if not self.voxel_pixels or not math.isfinite(voxels):
             return self
@@ -246,17 +246,17 @@ class ThermoxelsModelConfig(ModelConfig):
         return replace(self, resolutions=found.resolutions, refine_at=found.refine_at, prune_at=found.prune_at)
 
     def first_sh_degree(self) -> int | None:
-        """Return the degree of colour that is stored at the start: 0 until colour depends on the direction."""
+        """Return the degree of colour at the start: 0, unless colour depends on the direction from step 0 on."""
         return 0 if self.sh_degree is not None and self.view_dependence_from > 0 else self.sh_degree
 
     def row_channels(self, resolution: int) -> int:
-        """Return the most channels that a row gets while the lattice has a resolution."""
+        """Return the most columns of a row, all parameters together, while the lattice has a resolution."""
         gives_way = dict(zip(self.resolutions, self.refine_at)).get(resolution, math.inf)
         degree = self.sh_degree if gives_way > self.view_dependence_from else self.first_sh_degree()
         return 1 + num_coefficients(self.temperature_degree) + (0 if degree is None else 3 * num_coefficients(degree))
 
     def checkpoint_columns(self) -> dict[str, tuple[int, ...]]:
-        """Return the numbers of columns that each parameter of the grid may have in a checkpoint."""
+        """Return for each parameter of the grid the numbers of columns that are possible in a checkpoint."""
         columns: dict[str, tuple[int, ...]] = {"density": (1,)}
         columns["temperature"] = (num_coefficients(self.temperature_degree),)
         if self.sh_degree is not None:  # one per channel until colour depends on the direction

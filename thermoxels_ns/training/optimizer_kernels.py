@@ -1,4 +1,4 @@
-"""Compiled row updates of the optimisers; the plain twins stand in `optimizers`."""
+"""Compiled row updates of the optimisers on a CPU; `optimizers` has the same updates in plain PyTorch."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def adam_rows(
     correction1,
     correction2,
 ):
-    """One step of Adam on entries `begin` to `end` of the list of rows."""
+    """Take one step of Adam on ``rows[begin:end]``, in place; `correction1` and `2` are tables of 1 - beta^t."""
     last1, last2 = len(correction1) - 1, len(correction2) - 1
     one = values.dtype.type  # constants in the parameter's precision, so that the inner loop has one width
     b1, c1, b2, c2, tiny = one(beta1), one(1.0 - beta1), one(beta2), one(1.0 - beta2), one(eps)
     for n in range(begin, end):
         row = rows[n]
         updates[row] += one(1.0)
-        count = int(updates[row] + 0.5)  # interpolation leaves numbers that are not whole
+        count = int(updates[row] + 0.5)  # after a split, interpolated numbers of updates are not whole
         rate, share = one(lr / correction1[min(count, last1)]), one(1.0 / correction2[min(count, last2)])
         at, m, v, g = values[row], first[row], second[row], gradient[n]
         for k in range(at.shape[0]):
@@ -42,7 +42,7 @@ def adam_rows(
 
 @kernel
 def rmsprop_rows(begin: int, end: int, rows, gradient, values, square, lr, alpha, eps):
-    """One step of RMSprop on entries `begin` to `end` of the list of rows."""
+    """Take one step of RMSprop on ``rows[begin:end]``, in place."""
     one = values.dtype.type
     keep, take, rate, tiny = one(alpha), one(1.0 - alpha), one(lr), one(eps)
     for n in range(begin, end):

@@ -1,4 +1,4 @@
-"""Optimisers that touch only rows with a gradient, as nerfstudio optimizer configs."""
+"""Optimisers that update only rows with a gradient, and their settings for nerfstudio."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from thermoxels_ns.field.refine import ColumnChange, RowChange
 
 
 class RowOptimizer(torch.optim.Optimizer):
-    """An optimiser whose step goes over the rows (entries along the first axis) that have a gradient.
+    """An optimiser that updates only the rows (entries along the first axis) that have a gradient.
 
-    Other rows keep their value and their state, and each row's bias correction counts its own updates, so that a corner
-    first seen late in a training starts like all others. Gradients are row-sparse tensors (`torch.sparse_coo`, one
-    sparse dimension) or dense ones, whose rows of zeros count as rows without a gradient.
+    Other rows keep their value and their state. State counts the updates of each row, so that a corner first seen late
+    in a training starts like all others. A gradient is a row-sparse tensor (`torch.sparse_coo`, one sparse dimension)
+    or a dense tensor, whose rows of zeros count as rows without a gradient.
     """
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
-        """Update all parameters once."""
+        """Update all parameters once and return the loss of `closure`, or None without a closure."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -44,21 +44,21 @@ class RowOptimizer(torch.optim.Optimizer):
         return loss
 
     def new_state(self, parameter: Tensor) -> dict[str, Tensor]:
-        """Return the state of a parameter that was never updated; each entry has the parameter's rows."""
+        """Return the state of a parameter before its first update: tensors by name with one entry per row."""
         raise TypeError(f"{type(self).__name__} has no state")
 
     def update_rows(
         self, parameter: Tensor, rows: Tensor, gradient: Tensor, state: dict[str, Tensor], group: dict[str, Any]
     ) -> None:
-        """Update ``parameter[rows]``, seen as (rows, channels), with `gradient` (len(rows), channels)."""
+        """Update ``parameter[rows]`` and `state`; `parameter` has shape (n, channels), `gradient` (rows, channels)."""
         raise TypeError(f"{type(self).__name__} does not say how rows are updated")
 
     def change_rows(self, old: Tensor, new: torch.nn.Parameter, change: RowChange) -> None:
-        """Go on with a parameter whose rows were split or dropped: the state follows as the values did."""
+        """Replace parameter `old` by `new`, whose rows were split or dropped, and change the state by `change`."""
         self._change(old, new, lambda values: change(values.view(len(values), -1)).reshape(-1, *values.shape[1:]))
 
     def change_columns(self, old: Tensor, new: torch.nn.Parameter, change: ColumnChange) -> None:
-        """Go on with a parameter whose rows have other columns; state that is one number per row stays."""
+        """Replace parameter `old` by `new`, whose columns differ; state with the shape of `old` changes by `change`."""
         self._change(old, new, lambda values: change(values) if values.shape == old.shape else values)
 
     def _change(self, old: Tensor, new: torch.nn.Parameter, change: Callable[[Tensor], Tensor]) -> None:
@@ -66,15 +66,15 @@ class RowOptimizer(torch.optim.Optimizer):
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
         state = self.state.pop(old, None)  # type: ignore[arg-type]
         if state:
-            # One after the other, so that only one is there twice.
+            # One entry after the other, so that only one exists twice at a time.
             self.state[new] = {name: change(state.pop(name)) for name in list(state)}
 
 
 def touched_rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows with a gradient, ascending, and their gradients, (rows, channels)."""
+    """Return the numbers of the rows with a gradient, ascending (rows,), and their gradients (rows, channels)."""
     if gradient.is_sparse:
         rows = gradient._indices()[0]
-        # Accumulation into `grad` forgets that a tensor is coalesced; finding out is quicker than doing it again.
+        # Accumulation into `grad` forgets that a tensor is coalesced; checking is quicker than coalescing again.
         if not gradient.is_coalesced() and not bool((rows[1:] > rows[:-1]).all()):
             gradient = gradient.coalesce()
         values = gradient._values()
@@ -85,13 +85,13 @@ def touched_rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class RowAdam(RowOptimizer):
-    """Adam (Kingma and Ba 2015) on touched rows, each with its own bias correction."""
+    """Adam (Kingma and Ba 2015) on rows with a gradient; each row has its own bias correction."""
 
     def __init__(self, params, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
         super().__init__(params, {"lr": lr, "betas": tuple(betas), "eps": eps})
 
     def new_state(self, parameter: Tensor) -> dict[str, Tensor]:
-        """Two moments and the number of updates of each row."""
+        """Return two moments and the number of updates of each row, all 0."""
         return {
             "exp_avg": torch.zeros_like(parameter),
             "exp_avg_sq": torch.zeros_like(parameter),
@@ -99,7 +99,7 @@ class RowAdam(RowOptimizer):
         }
 
     def update_rows(self, parameter, rows, gradient, state, group):
-        """One step of Adam on some rows."""
+        """Take one step of Adam on the given rows; see `RowOptimizer.update_rows`."""
         (beta1, beta2), lr, eps = group["betas"], group["lr"], group["eps"]
         first, second = (state[name].view(len(parameter), -1) for name in ("exp_avg", "exp_avg_sq"))
         if parameter.device.type == "cpu":
@@ -114,23 +114,23 @@ class RowAdam(RowOptimizer):
         m = beta1 * first[rows] + (1 - beta1) * gradient
         v = beta2 * second[rows] + (1 - beta2) * gradient * gradient
         first[rows], second[rows], state["updates"][rows] = m, v, updates
-        count = (updates + 0.5).floor()  # interpolation leaves numbers that are not whole
+        count = (updates + 0.5).floor()  # after a split, interpolated numbers of updates are not whole
         root = (v / (1 - beta2**count)[:, None]).sqrt() + eps
         parameter[rows] -= lr * (m / (1 - beta1**count)[:, None]) / root
 
 
 class RowRMSprop(RowOptimizer):
-    """RMSprop (Tieleman and Hinton 2012) on touched rows, as Plenoxels uses it."""
+    """RMSprop (Tieleman and Hinton 2012), which Plenoxels uses, on rows with a gradient."""
 
     def __init__(self, params, lr: float = 1e-2, alpha: float = 0.95, eps: float = 1e-8):
         super().__init__(params, {"lr": lr, "alpha": alpha, "eps": eps})
 
     def new_state(self, parameter: Tensor) -> dict[str, Tensor]:
-        """The running mean of squared gradients."""
+        """Return the running mean of squared gradients, all 0."""
         return {"square_avg": torch.zeros_like(parameter)}
 
     def update_rows(self, parameter, rows, gradient, state, group):
-        """One step of RMSprop on some rows."""
+        """Take one step of RMSprop on the given rows; see `RowOptimizer.update_rows`."""
         lr, alpha, eps = group["lr"], group["alpha"], group["eps"]
         square = state["square_avg"].view(len(parameter), -1)
         if parameter.device.type == "cpu":
@@ -147,7 +147,7 @@ class RowRMSprop(RowOptimizer):
 
 @cache
 def _corrections(beta: float) -> np.ndarray:
-    """Return 1 - beta^t for t = 0, 1, ... until it is 1; the last entry serves all later t."""
+    """Return a table of 1 - beta^t for t = 0, 1, ... up to where the value is 1, also the value for all later t."""
     count = 2 if beta == 0 else min(1_000_000, int(np.ceil(np.log(1e-17) / np.log(beta))) + 2)
     table = 1.0 - np.power(beta, np.arange(count, dtype=np.float64))
     table[-1] = 1.0
@@ -156,18 +156,18 @@ def _corrections(beta: float) -> np.ndarray:
 
 @dataclass
 class RowAdamConfig(OptimizerConfig):
-    """Adam that touches only rows with a gradient."""
+    """Settings of `RowAdam`: Adam that updates only rows with a gradient."""
 
     _target: type = RowAdam
     eps: float = 1e-15
-    """Added to the root of the second moment; tiny, so that corners few rays see move as fast as the others."""
+    """Number added to the root of the second moment; tiny, so that corners seen by few rays move as fast as others."""
     betas: tuple[float, float] = (0.9, 0.999)
     """Decay of the running means of the gradient and of its square."""
 
 
 @dataclass
 class RowRMSpropConfig(OptimizerConfig):
-    """RMSprop that touches only rows with a gradient, as Plenoxels uses it."""
+    """Settings of `RowRMSprop`: RMSprop, which Plenoxels uses, that updates only rows with a gradient."""
 
     _target: type = RowRMSprop
     alpha: float = 0.95
@@ -176,9 +176,9 @@ class RowRMSpropConfig(OptimizerConfig):
 
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):
-    """Dense Adam whose step is one compiled pass over each parameter, for what has no rows (the background)."""
+    """Settings of dense Adam, for parameters without rows (the background), in one compiled pass per parameter."""
 
     eps: float = 1e-15
-    """Added to the root of the second moment."""
+    """Number added to the root of the second moment."""
     fused: bool = True
-    """Use the fused implementation."""
+    """Use PyTorch's fused implementation."""

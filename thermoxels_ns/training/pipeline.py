@@ -1,4 +1,4 @@
-"""The nerfstudio pipeline: loads checkpoints with clear errors, averages metrics with gaps, takes the snapshot."""
+"""The nerfstudio pipeline: checkpoints with clear errors, averages of metrics with gaps, the snapshot for meshes."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class ThermoxelsPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: ThermoxelsPipeline)
     cpu_threads: int | None = None
-    """Threads of the compiled kernels. Default: one per processor. (PyTorch's own are half of the processors, or
-    OMP_NUM_THREADS: they wait for each other, and one whose processor another program holds slows every step.)"""
+    """Threads of the compiled kernels. Default: one per processor. (PyTorch itself gets half of the processors, or
+    OMP_NUM_THREADS: its threads wait for each other, so one that shares a processor would slow every step.)"""
 
 
 class ThermoxelsPipeline(VanillaPipeline):
-    """nerfstudio's pipeline with what it lacks for us."""
+    """Pipeline of the voxel model: data manager, model, checkpoints and evaluation."""
 
     @property
     def model(self) -> ThermoxelsModel:
@@ -51,7 +51,7 @@ class ThermoxelsPipeline(VanillaPipeline):
         return super().model  # type: ignore[return-value]
 
     compare_with_truth: ClassVar[Callable[[Any], dict[str, float]] | None] = None
-    """What measures the surface in `geometry_metrics`; `config.py` sets it, as training knows no evaluation."""
+    """Function from pipeline to metrics of the surface, which `config.py` sets; None: there are no such metrics."""
     world_from_input: torch.Tensor
 
     def __init__(self, config: ThermoxelsPipelineConfig, *args: Any, **kwargs: Any) -> None:
@@ -59,7 +59,7 @@ class ThermoxelsPipeline(VanillaPipeline):
             raise SceneError("cpu_threads", expected="1 or more", got=config.cpu_threads, remedy="Leave it out.")
         set_num_threads(config.cpu_threads)
         for module in map(sys.modules.get, ("nerfstudio.engine.trainer", "nerfstudio.utils.eval_utils")):
-            if module is not None:  # they say torch.load(path, map_location="cpu")
+            if module is not None:  # these modules call torch.load(path, map_location="cpu")
                 vars(module)["torch"] = ModuleWith(torch, load=load_checkpoint)
         if "OMP_NUM_THREADS" not in os.environ:
             torch.set_num_threads(max(1, (os.cpu_count() or 2) // 2))
@@ -87,18 +87,18 @@ class ThermoxelsPipeline(VanillaPipeline):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Nerfstudio's own, and the course of the training."""
-        # The course loads compiled kernels, which importing the configuration must not.
+        """Return the callbacks of nerfstudio and those of `coarse_to_fine_callbacks`."""
+        # The module `callbacks` loads compiled kernels, which importing the configuration must not.
         from thermoxels_ns.training.callbacks import coarse_to_fine_callbacks
 
         stock = super().get_training_callbacks(training_callback_attributes)
         return stock + coarse_to_fine_callbacks(self.model, training_callback_attributes)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load a checkpoint.
+        """Load the state of a checkpoint into the model.
 
         Raises:
-            CheckpointError: It belongs to another method, to other settings or to another scene.
+            CheckpointError: The checkpoint belongs to another method, to other settings or to another scene.
         """
         state = {name.removeprefix("module."): value for name, value in loaded_state.items()}
         columns = self.model.config.checkpoint_columns()
@@ -146,21 +146,21 @@ class ThermoxelsPipeline(VanillaPipeline):
         super().load_pipeline(state, step)
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Average metrics over the held-out images; in ns-eval also those of the surface, if the truth is known."""
+        """Return metrics averaged over held-out images; in ns-eval with `geometry_metrics`."""
         averages = super().get_average_eval_image_metrics(*args, **kwargs)
         if self.test_mode == "test":  # ns-eval; training has "val"
             averages |= self.geometry_metrics()
         return averages
 
     def geometry_metrics(self) -> dict[str, float]:
-        """Return how well the surface agrees with the exact scene; empty if that is not known."""
+        """Return metrics of the surface against the exact scene; empty without `compare_with_truth`."""
         compare = type(self).compare_with_truth
         return {} if compare is None else compare(self)
 
     def get_average_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Average metrics over images; an image without a pixel that counts for a metric does not count for it.
+        """Return metrics averaged over images; images where a metric is NaN are left out of its average.
 
-        ``half_transparent``, the share of rays of opacity between 0.1 and 0.9, joins the metrics of the model.
+        ``half_transparent``, the share of rays of opacity between 0.1 and 0.9, is added to the metrics of the model.
         """
         rows: list[dict[str, float]] = []
         one_image = self.model.get_image_metrics_and_images
@@ -187,10 +187,10 @@ class ThermoxelsPipeline(VanillaPipeline):
         return averages
 
     def corrections(self) -> dict[str, Any]:
-        """Return what the training corrected in its photographs, by their names; a part without corrections is absent.
+        """Return the corrections of training photographs: dictionaries by file name, for each kind that there is.
 
-        ``poses``: camera to world in input coordinates; ``gains``: of red, green and blue; ``thermal_offsets_c``: how
-        much too warm the thermal image reads, [K]. The geometric mean of gains is 1, the mean of offsets 0.
+        ``poses``: camera to world in input coordinates; ``gains``: of red, green and blue, with geometric mean 1;
+        ``thermal_offsets_c``: by how much the thermal image reads too warm, [K], with mean 0.
         """
         datamanager: Any = self.datamanager
         metadata, model, found = datamanager.train_dataparser_outputs.metadata, self.model, {}
@@ -207,17 +207,17 @@ class ThermoxelsPipeline(VanillaPipeline):
         return found
 
     def grid_snapshot(self, rays_per_image: int = 20_000) -> GridSnapshot:
-        """Return the trained field for the mesher, with the evidence of the training rays, and the cameras."""
+        """Return the trained field for the mesher, with the training cameras and the evidence of their rays."""
         datamanager: Any = self.datamanager
         rays = datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, rays_per_image)
         return self.model.grid_snapshot(rays, datamanager.training_views())
 
 
 def load_checkpoint(path: Any, **options: Any) -> dict[str, Any]:
-    """Call `torch.load` with ``weights_only=True``, whatever the default of this version of torch is.
+    """Return the content of a checkpoint, read by `torch.load` with ``weights_only=True``, so that no code can run.
 
     Raises:
-        CheckpointError: The file is damaged, cannot be read, or holds something else than tensors and plain values.
+        CheckpointError: The file is damaged, cannot be read, or contains anything but tensors and plain values.
     """
     try:
         return torch.load(path, **{**options, "weights_only": True})
@@ -232,11 +232,11 @@ def load_checkpoint(path: Any, **options: Any) -> dict[str, Any]:
 
 
 def compile_kernels(say: Callable[[str], None]) -> None:
-    """Run every kernel once on a few rays, so that numba keeps the compiled result; `say` that it compiles."""
+    """Run every kernel of training once, so that numba compiles and caches it; call `say` if numba has to compile."""
     from numba.core import event
 
     class Once(event.Listener):
-        """Told when numba compiles, not when it loads what it kept."""
+        """Calls `say` at the first compilation; loading a cached kernel is none."""
 
         told = False
 

@@ -1,4 +1,4 @@
-"""What training rays say about voxels and corners: how much of their weight falls where."""
+"""Statistics of training rays: how much of their weight falls into each voxel, and what they measure at corners."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from thermoxels_ns.render.renderers import GridSamples
 
 
 class RaySampler(Protocol):
-    """What is needed of a model here."""
+    """A model with a voxel grid that can be sampled along rays."""
 
     @property
     def grid(self) -> VoxelGrid:
-        """The voxel grid."""
+        """The voxel grid that rays sample."""
         ...
 
     def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
-        """Sample and weigh rays."""
+        """Return the samples of rays (n, 3) in kept voxels with their weights."""
         ...
 
 
 @dataclass(frozen=True)
 class VoxelWeights:
-    """Weights of rays per kept voxel."""
+    """Statistics of the weights of rays for each kept voxel."""
 
-    largest: Float[Tensor, " voxels"]  # Largest weight a sample in the voxel had on any ray
+    largest: Float[Tensor, " voxels"]  # Largest weight of a sample in the voxel on any ray
     ends: Bool[Tensor, " voxels"]
-    """Voxels in which some ray that ends on something (opacity above one half) has spent half of its weight."""
+    """True where some ray that ends on something (opacity above one half) completes half of its weight in the voxel."""
 
 
 @torch.no_grad()
 def voxel_weights(model: RaySampler, rays: Iterable[RayBundle]) -> VoxelWeights:
-    """Find how much of a ray each voxel ever held, and where rays end."""
+    """Return for each kept voxel the largest weight on any of the rays, and whether some ray ends in it."""
     density = model.grid.density
     largest = torch.zeros(len(model.grid.voxels), device=density.device)
     ends = torch.zeros(len(model.grid.voxels), dtype=torch.bool, device=density.device)
@@ -53,7 +53,7 @@ def voxel_weights(model: RaySampler, rays: Iterable[RayBundle]) -> VoxelWeights:
 
 
 def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
-    """Return, for each ray of opacity above one half, the sample by which half of its weight is spent."""
+    """Return, for each ray of opacity above one half, the index of the sample that completes half of its weight."""
     opacity = (1.0 - samples.transmittance)[samples.ray]
     spent = (opacity > 0.5) & (samples.before + samples.weight >= 0.5 * opacity)
     (places,) = spent.nonzero(as_tuple=True)
@@ -65,9 +65,9 @@ def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
 
 @torch.no_grad()
 def share_of_rays_opened(model: RaySampler, rays: Iterable[RayBundle], keep: Bool[Tensor, " voxels"]) -> float:
-    """Return the share of the rays of opacity above one half that lose more than half of their weight.
+    """Return the share of rays, of those with opacity above one half, that pruning to `keep` would open.
 
-    Only voxels of `keep` stay. Removing thin, half-transparent voxels lets no ray through; removing a body does.
+    A ray is opened if more than half of its weight lies in voxels that go: in a body, not in half-transparent voxels.
     """
     device = model.grid.density.device
     hit, opened = 0, 0
@@ -83,45 +83,45 @@ def share_of_rays_opened(model: RaySampler, rays: Iterable[RayBundle], keep: Boo
 
 
 END_WIDTH = 0.5
-"""A ray meets the voxels that it crosses this much before and after the point where half of its weight is spent,
-[voxels]. A sharp surface may lie anywhere in a voxel: if it lies behind the centre, that voxel is empty at its centre
-although rays end in it, and the solid begins with the next one, whose centre is at most half a voxel farther in."""
+"""Distance, [voxels], before and behind the sample that completes half of a ray's weight, within which the voxels that
+the ray crosses count as met. If a sharp surface lies behind the centre of a voxel, that voxel is empty at its centre
+although rays end in it; the solid begins with the next voxel, whose centre is at most half a voxel farther in."""
 _END_STEPS = 5
 
 
 @dataclass(frozen=True)
 class CornerTemperature:
-    """What thermal rays say about the stored corners."""
+    """The temperature that thermal rays see around each stored corner."""
 
     thermal: Float[Tensor, " rows"]
-    """Normalised temperature, in [0, 1], the range of what was measured; where no ray came, the stored value."""
+    """Normalised temperature, clipped to [0, 1]; the stored value at corners that no thermal ray reaches."""
     weight: Float[Tensor, " rows"]
-    """Sum of the weights of the first-hit samples around the corner, shared out by the trilinear weights."""
+    """Sum of the weights of the first-hit samples around the corner, shared out by trilinear weights, [rays]."""
 
 
 @dataclass(frozen=True)
 class FieldEvidence:
-    """What training rays say about the trained field."""
+    """Statistics of training rays about the trained field, for the mesher."""
 
-    rays: int  # Rays looked at
-    temperature: CornerTemperature  # What the thermal ones among them measured
-    voxel_weight: Float[Tensor, " voxels"]  # Sum of the weights that rays spent in each kept voxel, [rays]
+    rays: int  # Number of rays
+    temperature: CornerTemperature  # Temperatures that the thermal rays see
+    voxel_weight: Float[Tensor, " voxels"]  # Sum of the weights of all rays in each kept voxel, [rays]
     voxel_ends: Float[Tensor, " voxels"]
-    """Number of rays that end on something (opacity above one half) and have spent half of their weight in each kept
+    """Number of rays that end on something (opacity above one half) and complete half of their weight in each kept
     voxel, [rays]."""
     half_depth_density: Float[Tensor, " ends"]
     """One density per ray of opacity above one half, in the order of the rays, [1 / world unit]: the highest at the
-    centres of the voxels that it crosses within `END_WIDTH` of the point at which half of its weight is spent."""
+    centres of the voxels that the ray crosses within `END_WIDTH` of the sample that completes half of its weight."""
 
 
 @torch.no_grad()
 def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidence:
-    """Find in one pass where rays spend their weight, and what temperature thermal rays see around each corner.
+    """Return the evidence of training rays about the trained field, found in one pass.
 
-    The temperature is the mean over thermal rays, each sample weighted by its share of the pixel: images can be right
-    while values stored at single corners overshoot, but this mean cannot. Only first hits count for it: samples of rays
-    of opacity above one half, before half of the ray's light is spent, so that light which leaks through a surface
-    measures nothing behind it. A ray without a stream (see `core.feature_rays`) counts as thermal too.
+    The temperature of a corner is a mean over samples of thermal rays, weighted by their share of the pixel; stored
+    values of single corners can overshoot where images are right, but this mean cannot. Only first hits count: samples
+    of rays of opacity above one half, before half of the light is spent, so that light which leaks through a surface
+    measures nothing behind it. A ray without a stream (see `core.feature_rays`) counts as thermal.
     """
     grid = model.grid
     device = grid.density.device
@@ -158,7 +158,7 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
 def _density_met(
     grid: VoxelGrid, centre_density: Float[Tensor, "x y z"], at: TrilinearPoints, directions: Float[Tensor, "n 3"]
 ) -> Float[Tensor, " n"]:
-    """Return the highest density at the centre of a voxel within `END_WIDTH` of points along unit directions."""
+    """Return for each point the highest density at the centres of voxels that its direction meets in `END_WIDTH`."""
     shape = torch.tensor(grid.lattice.cell_shape, device=centre_density.device)
     voxel = torch.stack(torch.unravel_index(grid.cells[at.number], grid.lattice.cell_shape), -1)
     met = torch.zeros(len(voxel), dtype=centre_density.dtype, device=centre_density.device)
@@ -172,7 +172,7 @@ def _density_met(
 
 @torch.no_grad()
 def backdrop_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> tuple[float, Float[Tensor, "n 3"]]:
-    """Return share and directions of the rays that leave the box with more than half of their light."""
+    """Return the share and the directions (n, 3) of the rays that leave the box with more than half of their light."""
     device = model.grid.density.device
     seen, open_directions = 0, [torch.zeros(0, 3, device=device)]
     for bundle in rays:

@@ -1,4 +1,4 @@
-"""When a training refines, prunes and thins, for every resolution and length."""
+"""The steps at which a training refines, prunes and thins, for every resolution and number of steps."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Literal
 
 from thermoxels_ns.core.errors import ThermoxelsError
 
-COARSEST = 32  # Voxels along the longest side that a training starts with, or a few more
-# The shares of the run below were set by hand while the losses were tuned; only the whole was measured.
+COARSEST = 32  # Fewest voxels along the longest side with which `schedule_for` lets a training start that refines
+# The shares of the run below were set by hand while the losses were tuned; only all of them together were measured.
 _REFINE: Mapping[int, tuple[float, ...]] = {
     0: (),
     1: (0.25,),
@@ -17,7 +17,7 @@ _REFINE: Mapping[int, tuple[float, ...]] = {
     3: (0.15, 0.35, 0.6),
     4: (0.12, 0.27, 0.44, 0.62),
 }
-_PRUNE_AFTER = 0.13  # Share of the run after each refinement at which what turned out empty is dropped
+_PRUNE_AFTER = 0.13  # Share of the run between a refinement and the pruning that drops what it left empty
 _THIN = 0.8
 _VIEW_DEPENDENCE = 0.8
 _RAMP = (0.1, 0.4)
@@ -28,35 +28,35 @@ QUALITIES: Mapping[Quality, tuple[int, int, float]] = {
     "standard": (128, 1500, 1.6),
     "fine": (256, 4000, 1.6),
 }
-"""Resolution, steps, and width of a voxel in pixels of the named qualities; `thermoxels cost` measures what they give.
-Voxels of one pixel follow noise (wild-5: F 0.89 to 0.87), of two lose shape (courtyard: 0.81, 0.86, 0.89 of what is
-seen with voxels of 2.1, 1.9, 1.6 pixels). On house-corner and its like the resolution stays as it is."""
+"""Last resolution, steps, and width of a voxel in pixels of each named quality; `thermoxels cost` measures them.
+Voxels of one pixel follow noise (wild-5: F falls from 0.89 to 0.87), voxels of two pixels lose shape (courtyard: F of
+the seen surface is 0.81, 0.86, 0.89 with 2.1, 1.9, 1.6 pixels). House-corner keeps the resolution given here."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """The course of a training."""
+    """The resolutions of a training, and the steps at which it changes."""
 
     resolutions: tuple[int, ...]  # Voxels along the longest side, coarse to fine
     refine_at: tuple[int, ...]  # Steps at which the next resolution begins
-    prune_at: tuple[int, ...]  # Steps at which voxels without weight are dropped, beside those of refinement
+    prune_at: tuple[int, ...]  # Steps, beside `refine_at`, at which voxels that hold little of each ray are dropped
     thin_at: tuple[int, ...]  # Steps at which surfaces are thinned
     distortion_ramp: tuple[int, int]  # Steps over which the distortion term grows
     view_dependence_from: int  # Step from which colour depends on the direction
-    steps: int  # Number of steps
-    voxel_pixels: float  # Width of the last voxels, [pixels of the photographs]; 0: as the resolutions say
+    steps: int  # Number of steps of the training
+    voxel_pixels: float  # Width of the last voxels, [pixels of the photographs]; 0: `resolutions` counts
 
 
 def schedule_for(resolution: int, steps: int, voxel_pixels: float = 0.0) -> Schedule:
-    """The course of a training that ends at a resolution after some steps.
+    """Return the schedule of a training that ends with a resolution after a number of steps.
 
     Args:
         resolution: Voxels along the longest side of the scene box at the end, at least 1.
         steps: Training steps, at least 10.
-        voxel_pixels: Width of the last voxels in pixels, from which a scene makes the resolution its own; 0: never.
+        voxel_pixels: Width of the last voxels, [pixels], by which a scene adapts the resolutions; 0: it does not.
 
     Raises:
-        ThermoxelsError: A number is too small.
+        ThermoxelsError: `resolution` is below 1, or `steps` below 10.
 
     >>> schedule_for(128, 1000).refine_at
     (200, 500)

@@ -1,4 +1,4 @@
-"""Nerfstudio's trainer with checkpoints that are complete or absent."""
+"""Nerfstudio's trainer, with named qualities, checked options, and checkpoints that are complete or absent."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from thermoxels_ns.training.schedule import QUALITIES, Quality, Schedule, schedu
 
 LOCAL_HOST = "127.0.0.1"
 _HELD: list[FileLock] = []
-"""Locks of the folders of this process's trainings."""
+"""Locks of the folders into which trainings of this process write; kept while the process lives."""
 _SCHEDULE = tuple(field.name for field in fields(Schedule))
-"""Options of the model that depend on the resolution and the number of steps."""
+"""Names of the fields of `Schedule`, each of which is also an option of the model."""
 
 
 @dataclass
@@ -38,20 +38,20 @@ class ThermoxelsTrainerConfig(TrainerConfig):
     quality: Quality | None = None
     """Named setting of resolution and length: draft (voxels of 3.2 pixels, up to 128 along the longest side, 800
     steps: a first look, half a minute on two cores), standard (1.6 pixels, up to 256, 1500 steps, the default: one to
-    some minutes) or fine (1.6 pixels, up to 512, 4000 steps: many minutes); `thermoxels cost` measures what they give.
-    It replaces max-num-iterations, the lengths of the learning rate schedules, and the model's resolutions, refine-at,
-    voxel-pixels, steps, prune-at, thin-at, distortion-ramp and view-dependence-from."""
+    some minutes) or fine (1.6 pixels, up to 512, 4000 steps: many minutes); `thermoxels cost` measures all three.
+    A quality replaces max-num-iterations, the lengths of the learning rate schedules, and the model's resolutions,
+    refine-at, voxel-pixels, steps, prune-at, thin-at, distortion-ramp and view-dependence-from."""
     replaced: tyro.conf.Suppress[str] = ""
-    """What the quality replaced, for the log."""
+    """Voxels and steps that the quality replaced, as text for the log."""
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Keep the viewer on this machine, whatever the default of ns-viewer, unless another host was typed."""
+        """Set a field; the viewer gets `LOCAL_HOST` as its host unless another host was typed on the command line."""
         if name == "viewer":
             value = replace(value, websocket_host=typed_value("--viewer.websocket-host") or LOCAL_HOST)
         super().__setattr__(name, value)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take what a config.yml says, but for the viewer's host: only a typed option opens it to the network."""
+        """Take the known fields of a config.yml; its viewer's host gives way to the host typed, or to `LOCAL_HOST`."""
         known = {each.name for each in fields(self)}
         self.__dict__.update({name: value for name, value in state.items() if name in known})
         if "viewer" in state:
@@ -65,17 +65,17 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         self.follow_schedule(schedule_for(*QUALITIES[self.quality]))
 
     def set_experiment_name(self) -> None:
-        """Name the run by the folder of its scene if no name is given, for ``--data ..`` too."""
+        """Name the run by the folder of its scene, found for ``--data ..`` too, if no name is given."""
         data = self.pipeline.datamanager.data
         if self.experiment_name is None and data is not None:
             self.experiment_name = Path(os.path.abspath(data.parent if data.is_file() else data)).stem
         super().set_experiment_name()
 
     def get_base_dir(self) -> Path:
-        """Return the folder of the run, which is inside `output_dir` whatever the names say.
+        """Return the folder of the run, which always lies inside `output_dir`.
 
         Raises:
-            OutputError: A name that the folder is made of has a separator, or is ``.`` or ``..``.
+            OutputError: The name of a folder in the path contains a separator, or is ``.`` or ``..``.
         """
         self.set_experiment_name()
         names = {name: str(getattr(self, name)) for name in ("experiment_name", "method_name", "timestamp")}
@@ -92,7 +92,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         """Check all options, lock the run's folder while this process lives, and write config.yml.
 
         Raises:
-            ThermoxelsError: An option is out of range, the folder cannot be written to, or another training is in it.
+            ThermoxelsError: An option is out of range, the folder cannot be written to, or another training uses it.
         """
         self.follow_checkpoint()
         model: Any = self.pipeline.model
@@ -101,13 +101,13 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         self.check()
         first = (model.resolutions[0] + 1) ** 3 * 4 * model.row_channels(model.resolutions[0])
         with plain_os_errors(self.output_dir):
-            # Values and two moments of the first lattice, in the last checkpoint and in the one that replaces it.
+            # Room for two checkpoints, each with values and two moments of the first lattice.
             folder = writable_folder(self.get_base_dir(), min(6 * first, 1e9 * model.memory_budget_gb))
             _HELD.append(hold_folder(folder / ".lock", "Wait until it ends, or pass another --timestamp.", CONSOLE.log))
             super().save_config()
 
     def check(self) -> None:
-        """Raise `ThermoxelsError` for numbers that cannot work, and for a device that is not there."""
+        """Raise `ThermoxelsError` for a number out of range, and for a device that PyTorch does not find."""
         manager: Any = self.pipeline.datamanager
         model: Any = self.pipeline.model
         rays = [f"{stream}_num_rays_per_batch" for stream in ("train", "thermal", "eval")]
@@ -134,7 +134,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
             raise ThermoxelsError("device_type", expected=expected, got=self.machine.device_type, remedy=remedy)
 
     def follow_checkpoint(self) -> None:
-        """Take resolutions and schedule from the config.yml of the run that is resumed, but for what was typed."""
+        """Take resolutions and schedules that were not typed from the run to resume, unless a quality is given."""
         folder = self.load_dir or (self.load_checkpoint.parent if self.load_checkpoint else None)
         if self.quality is not None or folder is None or not (folder.parent / "config.yml").is_file():
             return
@@ -150,7 +150,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
                 group["scheduler"] = before
 
     def follow_schedule(self, schedule: Schedule) -> None:
-        """Set everything that depends on the resolution and the number of steps."""
+        """Set the number of steps, the lengths of learning rate schedules, and the model's options to a schedule."""
         self.max_num_iterations = schedule.steps
         for group in self.optimizers.values():
             if group.get("scheduler") is not None:
@@ -161,15 +161,15 @@ class ThermoxelsTrainerConfig(TrainerConfig):
 
 
 class ThermoxelsTrainer(Trainer):
-    """Trainer whose checkpoints are complete or absent."""
+    """Trainer of the voxel model whose checkpoints are complete or absent."""
 
     config: ThermoxelsTrainerConfig
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Build the pipeline, load the checkpoint, and say which options a quality replaced.
+        """Build the pipeline, load the checkpoint if one is named, and log which options a quality replaced.
 
         Raises:
-            CheckpointError: The checkpoint that is named is not there, or the training cannot go on from it.
+            CheckpointError: The named checkpoint does not exist, or the training cannot go on from it.
         """
         quality, replaced = self.config.quality, self.config.replaced
         if quality is not None:
@@ -181,11 +181,11 @@ class ThermoxelsTrainer(Trainer):
             super().setup(test_mode)
         if self.local_rank == 0:
             self.save_found_settings()
-        # nerfstudio takes the shares and times that it shows from the number of steps without those before.
+        # nerfstudio shows progress and remaining time by the number of steps, without the steps of earlier runs.
         writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
 
     def save_found_settings(self) -> None:
-        """Write the box and the resolutions that photographs asked for into config.yml, for those who load it."""
+        """Write the scene box and the resolutions that were found from the photographs into config.yml."""
         kept: Any = deepcopy(self.config)
         pipeline: Any = getattr(self.pipeline, "module", self.pipeline)
         model, parser = kept.pipeline.model, kept.pipeline.datamanager.dataparser
@@ -196,12 +196,12 @@ class ThermoxelsTrainer(Trainer):
             path.write_text(yaml.dump(kept), encoding="utf-8")
 
     def train(self) -> None:
-        """Train; an `OutputError` where results cannot be written."""
+        """Run the training; raise `OutputError` if results cannot be written."""
         with plain_os_errors(self.base_dir):
             super().train()
 
     def _load_checkpoint(self) -> None:
-        """Load a checkpoint if one is named, and say to which step the training goes on."""
+        """Load the named checkpoint, if any, and log to which step training goes on; may raise `CheckpointError`."""
         folder, step, file = self.config.load_dir, self.config.load_step, self.config.load_checkpoint
         missing = None if folder is not None or file is None or file.is_file() else f"no file {file}"
         if folder is not None:
@@ -222,7 +222,7 @@ class ThermoxelsTrainer(Trainer):
             raise CheckpointError("checkpoint", expected=expected, got=f"step {first}", remedy=remedy)
         model: Any = getattr(self.pipeline, "module", self.pipeline).model
         wanted = model.config.resolutions[sum(step < first for step in model.config.refine_at)]
-        if (found := max(model.grid.lattice.cell_shape)) < wanted:  # it would never be refined
+        if (found := max(model.grid.lattice.cell_shape)) < wanted:  # the lattice would never be refined to it
             expected = f"at least {wanted} voxels at step {first}, which these options refine to before it"
             remedy = "Pass the quality, or the resolutions and refine-at, that the training began with."
             raise CheckpointError("checkpoint", expected=expected, got=f"{found} voxels", remedy=remedy)
@@ -234,10 +234,10 @@ class ThermoxelsTrainer(Trainer):
             CONSOLE.log(f"goes on from step {first} for {steps} more{end}")
 
     def save_checkpoint(self, step: int) -> None:
-        """Save model and optimisers under a temporary name, rename, and only then delete older checkpoints.
+        """Write a checkpoint to a temporary file, rename the file, and only then delete older checkpoints.
 
-        The temporary file lies beside the checkpoint folder, not in it: nerfstudio takes every name in there for a
-        checkpoint's.
+        The temporary file lies outside the checkpoint folder, where nerfstudio takes each file for a checkpoint.
+        Raises `OutputError` if the file cannot be written.
         """
         if self.local_rank != 0:
             return
