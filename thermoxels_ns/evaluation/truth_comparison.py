@@ -355,8 +355,8 @@ def geometry_metrics(
 
     Returns:
         ``fscore``, ``precision`` and ``recall`` of `compare_with_truth`, with a tolerance of `TOLERANCE_VOXELS` of the
-        lattice; ``fscore_128`` with voxels of `COMMON_RESOLUTION`, which compares resolutions and boxes; both as
-        ``..._seen``; and the mean distance. If no voxel is solid, only the first four, all 0.
+        lattice; ``fscore_128`` with voxels of `COMMON_RESOLUTION`, which compares resolutions and boxes;
+        ``fscore_seen`` and ``fscore_128_seen``; and the mean distance. If no voxel is solid: the first four, all 0.
 
     Raises:
         SceneError: No true point is seen by enough training cameras.
