@@ -44,7 +44,7 @@ class PhotographEvidence:
 def depths_of_dataset(dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike) -> Depths | None:
     """Return the depths of a `ThermalDataset`'s photographs in the box from `lo` to `hi` and behind it.
 
-    Depths nearer than `near` are not considered. All lengths are in world units. Return None if no camera is perspective.
+    Depths nearer than `near` are not considered. Lengths are in world units. Return None if no camera is perspective.
     """
     photographs = read_photographs(dataset, near)
     if photographs is None:

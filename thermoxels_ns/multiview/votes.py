@@ -44,8 +44,8 @@ def air_voxels(lattice: Lattice, rays: FeatureRays) -> BoolArray:
 def around_cameras(points: FloatArray, rays: FeatureRays, views: Views) -> BoolArray:
     """Return which points (n, 3) are in the empty space around a camera and in view of fewer than two photographs.
 
-    The space ends at `CLEARANCE` of the distance to the nearest thing that the camera shows. No training ray contradicts
-    a lump there that no second photograph shows. (A real room: 21.5 dB without this rule, 23.6 dB with it.)
+    The space ends at `CLEARANCE` of the distance to the nearest thing that the camera shows. No training ray refutes a
+    lump there that no second photograph shows. (A real room: 21.5 dB without this rule, 23.6 dB with it.)
     """
     origins, camera_of = np.unique(rays.origins, axis=0, return_inverse=True)
     lengths = np.linalg.norm(rays.points[rays.point] - rays.origins, axis=1)
