@@ -33,7 +33,7 @@ class ConfigLoader(yaml.Loader):
     """
 
     def get_single_data(self) -> Any:
-        """Return the content of the file, or raise `CheckpointError` with the first forbidden name and its line."""
+        """Return the content of the file, or raise `CheckpointError` with a forbidden name and its line."""
         expected = "a config.yml that names only configuration classes of nerfstudio and its installed plugins"
         remedy = "Do not use this file: it could run code. If you trust it, install the package that it names."
         try:
