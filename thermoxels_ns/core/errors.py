@@ -29,7 +29,7 @@ class CheckpointError(ThermoxelsError, ValueError):
 
 
 class PruningError(ThermoxelsError, RuntimeError):
-    """Pruning would remove a part of the scene that rays see."""
+    """Pruning would open too many rays that end on something: it would remove a part of the scene."""
 
 
 class MemoryBudgetError(ThermoxelsError, MemoryError):

@@ -18,7 +18,7 @@ from typing_extensions import dataclass_transform
 
 from thermoxels_ns.core.errors import RecordError, ThermoxelsError, explain, printable
 
-if TYPE_CHECKING:  # pydantic is slow to import, and presets do without
+if TYPE_CHECKING:  # pydantic is slow to import, and presets do not need it
     from pydantic import ConfigDict, ValidationError
 
 Record = TypeVar("Record")
@@ -203,7 +203,7 @@ def _keys_at(hint: Any, path: list[str | int]) -> tuple[str, ...]:
 
 
 def _as_number(content: object) -> str:
-    """Return a remedy for a text that looks like a number, as yaml reads 1e0 and 1.0e0 as text."""
+    """Return the remedy for a text where a number is expected; yaml reads 1e0 and 1.0e0 as texts."""
     number = math.nan
     with suppress(ValueError):
         number = float(content) if isinstance(content, str) else math.nan
@@ -224,7 +224,7 @@ def _meant(key: str, known: tuple[str, ...]) -> str:
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """Loader that raises `ConstructorError` for a key twice in one mapping, which yaml accepts, or a key not text."""
+    """Loader that raises `ConstructorError` for a key that a mapping has twice, which yaml accepts, or that is no text."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set[str]()

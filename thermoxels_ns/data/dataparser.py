@@ -49,7 +49,7 @@ _KEYS = {"train": "train_filenames", "val": "val_filenames", "test": "test_filen
 
 @dataclass
 class ThermalDataParserConfig(DataParserConfig):
-    """Scenes of paired colour and thermal photographs: ThermoScenes layout, or a thermal camera of its own."""
+    """Scenes of paired colour and thermal photographs, as in ThermoScenes or with thermal cameras of their own."""
 
     _target: type = field(default_factory=lambda: ThermalDataParser)
     """Class to instantiate."""
@@ -74,8 +74,8 @@ class ThermalDataParserConfig(DataParserConfig):
     """Temperatures outside this range are masked, in degrees Celsius."""
     tracks: TrackSource = "auto"
     """Source of tracks: which photographs saw which points in structure from motion. Tracks tell training what is air.
-    auto: the file that the json names (tracks_file_path), else a COLMAP model in the scene's folder (colmap/sparse/0,
-    colmap or sparse/0) whose poses are those of the json. given: only the file. off: no tracks."""
+    auto: the file that the json names (tracks_file_path), else a COLMAP model in the scene's folder (in colmap or
+    sparse) whose poses are those of the json. given: only the file. off: no tracks."""
     refine_poses: PoseSource = "auto"
     """Poses to train with. auto: poses adjusted to features that photographs share (bundle adjustment), if the scene
     has no tracks and the adjusted poses fit better than the json's; else the json's. given: the json's."""
@@ -83,7 +83,7 @@ class ThermalDataParserConfig(DataParserConfig):
 
 @dataclass(frozen=True)
 class _Scene:
-    """What training and evaluation share: one scene, read once from all of its frames.
+    """The content of one scene that training and evaluation share, read once from all frames.
 
     A point p in input coordinates lies at scale * (p + translation) in nerfstudio's world, without a rotation.
     """
@@ -379,7 +379,7 @@ def _cameras(intrinsics: list[Camera], poses: torch.Tensor) -> Cameras:
 
 
 def _same_cameras(first: Cameras, second: Cameras) -> bool:
-    """Return whether two sets of cameras have the same pixels and the same ray through each, up to rounding."""
+    """Return whether two sets of cameras have the same pixels with the same rays through them, up to rounding."""
     return all(
         torch.equal(getattr(first, name), getattr(second, name)) for name in ("width", "height", "camera_type")
     ) and all(

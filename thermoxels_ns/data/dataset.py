@@ -42,7 +42,7 @@ class ThermalDataset(InputDataset):
         self.temperature_range: TemperatureRange = self.metadata["temperature_range"]
         self.thermal_cameras: Cameras | None = self.metadata["thermal_cameras"]
         if self.thermal_cameras is None and scale_factor != 1.0:
-            # The photographs change their resolution here, the thermal images do not.
+            # `scale_factor` changes the resolution of the photographs, not of the thermal images.
             self.thermal_cameras = deepcopy(dataparser_outputs.cameras)
         self._thermal: dict[int, tuple[Tensor, Tensor, PixelReport]] = {}
 
@@ -142,7 +142,7 @@ class ThermalDataset(InputDataset):
             if dead is not None:
                 report = report + PixelReport(dead=int((valid & dead).sum()))
                 valid &= ~dead
-            # float64: a narrow range far from 0 C would lose 16-bit steps in float32.
+            # float32 would lose 16-bit steps of a narrow range far from 0 C.
             normalised = self.temperature_range.normalise(image.temperature_c.astype(np.float64))
             thermal = np.where(valid, normalised, 0.0).astype(np.float32)
             tensors = torch.from_numpy(thermal)[..., None], torch.from_numpy(valid)[..., None]

@@ -114,7 +114,7 @@ def find_scene_box(scene: SceneFile, option: Sequence[Sequence[float]] | None, t
 
 
 def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
-    """Return points (n, 3), in input coordinates, on which photographs agree, and the number of those photographs."""
+    """Return points (n, 3) on which photographs agree, in input coordinates, and how many photographs are compared."""
     from thermoxels_ns.multiview import photographs, stereo  # its kernels are slow to load and only needed here
 
     frames = [frame for frame in frames if frame.intrinsics.lens == "perspective"]

@@ -30,7 +30,7 @@ _LENS_OF_MODEL: dict[str, Lens] = {
     "OPENCV_FISHEYE": "fisheye",
     "EQUIRECTANGULAR": "equirectangular",
 }
-"""nerfstudio's camera models whose rays start in one point."""
+"""Lens by nerfstudio's camera model, for models whose rays all start in one point."""
 
 
 def read_pose(values: Any, where: str, turned: bool = True) -> FloatArray:
@@ -41,7 +41,7 @@ def read_pose(values: Any, where: str, turned: bool = True) -> FloatArray:
     """
     try:
         entries = np.array(values, dtype=object)
-    except ValueError:  # rows of several lengths
+    except ValueError:  # rows differ in length
         entries = np.zeros(0, dtype=object)
     odd = [repr(entry)[:80] for entry in entries.ravel() if not is_number(entry)]
     if odd or entries.shape not in ((3, 4), (4, 4)):
@@ -81,7 +81,7 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         named = f"{where}: {image.name}"
         with errors_name(named, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(image) as opened:
             size = opened.size
-            if (values.get("h"), values.get("w")) == size:  # of a PNG, EXIF is read with all of its pixels
+            if (values.get("h"), values.get("w")) == size:  # only then: reading EXIF of a PNG reads all pixels
                 orientation = int(opened.getexif().get(_ORIENTATION, 1))
     try:
         if any(isinstance(value, bool) for key, value in values.items() if key in _NUMBERS):
@@ -157,7 +157,7 @@ def path_inside(folder: Path, name: str, where: str) -> Path:
         try:
             path = (root / Path(*windows.parts)).resolve()
             path.exists()
-        except (OSError, RuntimeError) as problem:  # a link to itself, or a name longer than names can be
+        except (OSError, RuntimeError) as problem:  # a link to itself, or a name that is too long
             got = f"{name[:200]!r} ({problem.strerror if isinstance(problem, OSError) else 'a link to itself'})"
         else:
             if path.is_relative_to(root):

@@ -25,8 +25,8 @@ def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolA
     No photograph tells how far away a plain area is. A plain pixel without a known `depth` (pixels,) shows the backdrop
     if plain pixels lead up from it to the edge of the photograph (a wall ends at a roof, windows or the ground), and if
     its colour and temperature are those that most such pixels have as a function of direction (harmonics of degree 2).
-    So do plain pixels of the same look that touch the backdrop, such as those below an object. The depth of a pixel
-    beside the backdrop that looks like it is wrong, taken from an outline (drawn courtyard: 2.6 % of all depths lie on
+    Plain pixels of the same look that touch the backdrop, such as pixels below an object, show it too. Pixels beside
+    the backdrop that look like it have wrong depths, taken from an outline (drawn courtyard: 2.6 % of all depths lie on
     the sky, 0.5 % without these pixels).
     """
     open_above, plain = (np.zeros(len(photographs.colours), dtype=bool) for _ in range(2))

@@ -1,4 +1,4 @@
-"""Poses that photographs themselves agree on: features, tracks and bundle adjustment around given poses."""
+"""Adjustment of given poses to photographs: features, tracks and bundle adjustment."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def adjust_poses(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: in
     """
     middle = poses[:, :3, 3].mean(0)
     poses = poses.copy()
-    poses[:, :3, 3] -= middle  # coordinates of a country would cost digits
+    poses[:, :3, 3] -= middle  # large national coordinates would cost precision
     tracks = _plausible(tracks, poses, focal)
     if tracks.points < FEWEST_TRACKS:
         return None

@@ -95,7 +95,7 @@ def photograph_differences(depths: Depths, thermal: Float32Array) -> Differences
             told = np.isfinite(off).sum(0)
             off[:, told < FEWEST_PAIRS] = 0.0
             middle = np.nanmedian(off, axis=0)
-            spread = 1.48 * np.nanmedian(np.abs(off - middle), axis=0)  # of a normal distribution
+            spread = 1.48 * np.nanmedian(np.abs(off - middle), axis=0)  # standard deviation of a normal distribution
             # A median's variance is pi / 2 times that of a mean.
             variance = 0.5 * np.pi * spread**2 / np.maximum(told, 1) + systematic**2
             rows.append((a, b))

@@ -1,4 +1,4 @@
-"""Multi-view stereo: depths of photographs by plane sweep, and feature rays to them."""
+"""Multi-view stereo: depths of photographs by plane sweep, and feature rays to these depths."""
 
 from __future__ import annotations
 
@@ -239,7 +239,7 @@ class _View:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Number of rows and of columns."""
         return self.channels.shape[1], self.channels.shape[2]
 
     @property
@@ -337,7 +337,7 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
     elsewhere = np.where(away, total, np.inf).min(-1)
     sure = elsewhere - np.take_along_axis(total, best[..., None], -1)[..., 0] >= MARGIN
     sure &= (best < total.shape[-1] - 1) & (view.channels[0] >= 0.0)
-    # Nothing is farther than the last plane: only what agrees well there is that far.
+    # Everything behind the farthest plane is matched there, so a depth on it is sure only where patches agree well.
     sure &= (best > 0) | ((beyond > 0) & (agreement[..., 0] <= 0.5 * (1.0 - LEAST_CORRELATION)))
     apart = np.diff(inverse_depths, append=2.0 * inverse_depths[-1] - inverse_depths[-2])[best]
     found = 1.0 / np.maximum(inverse_depths[best] + _between(total, best) * apart, inverse_depths[0])
@@ -387,7 +387,7 @@ def _warped(other: _View, view: _View, depth: float, warped: Float32Array) -> No
     """Fill `warped` (c, h, w) with what `view` would see if `other` were painted on the plane at `depth` of `view`."""
     turn = depth * (other.matrix[:, :3] @ view.inverse)
     turn[:, 2] += other.matrix[:, :3] @ view.centre + other.matrix[:, 3]
-    half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # pixel centres lie at halves, OpenCV's not
+    half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV's pixel centres are whole numbers
     height, width = view.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     to_other = np.linalg.inv(half) @ turn @ half

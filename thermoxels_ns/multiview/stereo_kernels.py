@@ -1,4 +1,4 @@
-"""Compiled loops over photographs that are compared: patches, costs along paths, and depths refined."""
+"""Compiled loops of stereo: weights and correlation of patches, costs along paths, and refinement of depths."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _weigh(features, row, column, radius, likeness, spread, least_weight, around
         for j in range(column - 1, column + 2):
             around[k] = _difference(features, row, column, i, j)
             k += 1
-    scale = max(likeness, spread * np.sort(around)[5])  # the first is the pixel itself
+    scale = max(likeness, spread * np.sort(around)[5])  # number 0 is the pixel itself
     k = 0
     for i in range(row - radius, row + radius + 1):
         for j in range(column - radius, column + radius + 1):
@@ -116,7 +116,7 @@ def correlate(channels, others, radius, weights, means, variances, noise, count,
                 for i in range(row - radius, row + radius + 1):
                     for j in range(2 * radius + 1):
                         weight, line, here = weights[k, row, radius:], other[i, j:], channels[channel, i, j:]
-                        for x in range(inner):  # one instruction for several pixels
+                        for x in range(inner):
                             value = line[x] - mean[x]
                             share = weight[x] * value
                             first[x] += share
