@@ -76,7 +76,7 @@ class Camera:
         return replace(self, width=width, height=height, **lengths)
 
     def scaled(self, factor: float) -> Camera:
-        """Return the same camera for an image `factor` times as many pixels wide; a last fraction is cut off."""
+        """Return the same camera with `factor` times as many pixels along each side; a last fraction is cut off."""
         width, height = (max(int(length * factor + 1e-6), 1) for length in (self.width, self.height))
         lengths = {name: getattr(self, name) * factor for name in ("fl_x", "fl_y", "cx", "cy")}
         return replace(self, width=width, height=height, **lengths)
@@ -95,7 +95,7 @@ class Camera:
         return self.project(local * (1.0, -1.0, -1.0))
 
     def rays(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Return the points (n, 3) at depth 1 in OpenCV camera axes that appear at pixels (n, 2), with distortion."""
+        """Return the points (n, 3) at depth 1 in OpenCV camera axes that the distorting lens images at pixels (n, 2)."""
         pixels = np.asarray(pixels, dtype=np.float64)
         distorted = (pixels - (self.cx, self.cy)) / (self.fl_x, self.fl_y)
         plane = distorted

@@ -40,7 +40,7 @@ def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsE
 
 
 def check_ranges(prefix: str, values: Mapping[str, tuple[Any, float, float, str]]) -> None:
-    """Raise `ThermoxelsError` for an option out of range; `values` has its value, least, largest and range in words."""
+    """Raise `ThermoxelsError` for an option out of range; `values` holds (value, least, largest, range in words)."""
     for name, (value, low, high, expected) in values.items():
         if not low <= value <= high:  # NaN fails too
             remedy = f"Correct {prefix}{name.replace('_', '-')}."

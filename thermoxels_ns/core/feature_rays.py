@@ -22,7 +22,7 @@ _RAYS_AT_ONCE = 1 << 18  # Rays whose neighbours are sought at once, to limit me
 
 @dataclass(frozen=True, eq=False)
 class FeatureRays:
-    """Rays from camera centres to points on which photographs agree; between both is air. [world units]"""
+    """Rays from camera centres to points on which photographs agree; the space between is air. [world units]"""
 
     origins: FloatArray  # Camera centre of each ray, shape (s, 3)
     point: IntArray  # Index into `points` of each ray, ascending, shape (s,)
@@ -51,7 +51,7 @@ def agrees_with_neighbours(rays: FeatureRays) -> BoolArray:
     Neighbours of a point in a photograph (all rays of one origin) are the `NEIGHBOURS` points seen nearest to it. The
     photograph vouches for the point if at least half of these agree in distance, within the largest of `STEEPEST` times
     their distance across the ray, the share `LEAST_TOLERANCE` of the distance, and `TOLERANCE_ERRORS` standard errors,
-    or if these are fewer than `FEWEST_NEIGHBOURS`. A point passes if at least half of its photographs vouch for it, or
+    or if there are fewer than `FEWEST_NEIGHBOURS`. A point passes if at least half of its photographs vouch for it, or
     if it has no rays. A point on a thin thing in front of other things may fail.
     """
     from scipy.spatial import KDTree  # slow to import and only needed here

@@ -224,7 +224,7 @@ def _meant(key: str, known: tuple[str, ...]) -> str:
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """Loader that raises `ConstructorError` for a key that a mapping has twice, which yaml accepts, or that is no text."""
+    """Loader that raises `ConstructorError` for a key that is no text, or twice in a mapping (yaml keeps the last)."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set[str]()

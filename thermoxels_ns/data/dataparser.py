@@ -35,7 +35,7 @@ by more than a millionth of the box. National coordinates are so far away."""
 _LEAST_THAT_MEETS = 0.01  # share of the rays that must meet the scene box
 _COLDEST_SKY_K = 150.0  # a file's median may be this far below the declared lowest temperature: it shows a clear sky
 _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
-"""A file holds kelvins if its median is at least the first, and less 273.15 is within the second of the other files."""
+"""A file with a median of at least the first holds kelvins if, less 273.15, it is near the others: within the second."""
 _MOST_FRAMES = 64  # training files in which stuck pixels are sought
 
 LONGEST_SIDE = 640  # pixels along the longer side of the pictures in which features are sought
@@ -64,7 +64,7 @@ class ThermalDataParserConfig(DataParserConfig):
     eval_mode: SplitMode = "auto"
     """How frames are split into training and evaluation. filename: by frame_train_ / frame_eval_ in the names. lists:
     by train_filenames / val_filenames / test_filenames in the json. interval: every eval_interval-th frame evaluates.
-    auto: the first of these three that the scene allows."""
+    auto: the first of these three that suits the scene."""
     eval_interval: int = 8
     """With n here and eval_mode interval, every n-th frame by sorted name evaluates. Counting starts in the middle of
     the first n frames, so that the ends of the sequence stay in training."""
@@ -405,7 +405,7 @@ def split_frames(
 
     "filename" splits by frame_train_ and frame_eval_ in the names, "lists" by train_filenames, val_filenames and
     test_filenames of `meta`, the json. "interval" evaluates every `interval`-th frame from index interval // 2 on, so
-    that the ends of the sequence train. "auto" takes the first of the three that the scene allows. Lists may name
+    that the ends of the sequence train. "auto" takes the first of the three that suits the scene. Lists may name
     frames in `left_out`, which are skipped.
 
     Raises:

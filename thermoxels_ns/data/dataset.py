@@ -63,7 +63,7 @@ class ThermalDataset(InputDataset):
         return Camera(width, height, fx, fy, cx, cy, **named)
 
     def pose(self, image_idx: int, thermal: bool = False) -> FloatArray:
-        """Return the pose of the camera of `camera`, camera to world, OpenGL axes, shape (3, 4)."""
+        """Return the pose of the camera that `camera` returns: camera to world, OpenGL axes, shape (3, 4)."""
         cameras: Any = self.thermal_cameras if thermal else self.cameras
         return cameras.camera_to_worlds[image_idx].double().numpy()
 

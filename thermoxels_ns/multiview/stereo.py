@@ -372,7 +372,7 @@ def _neighbours_agree(depth: Float32Array, error: Float32Array) -> BoolArray:
 
 
 def _num_planes(view: _View, others: list[_View], near: float, far: float) -> int:
-    """Return a number of planes by which the picture's middle moves one pixel per plane where it moves most."""
+    """Return how many planes it takes for the picture's middle to move by a pixel per plane where it moves most."""
     height, width = view.shape
     middle = view.centre + np.outer((near, far), view.inverse @ (0.5 * width, 0.5 * height, 1.0))
     most = 0.0
