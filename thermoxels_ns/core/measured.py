@@ -62,8 +62,8 @@ class Unit:
     above: bool = False  # True: the value must be above `low`, not equal to it
 
     def read(self, content: object) -> Measured:
-        """Return `content`, written by a person or a `Measured`, as a value in this unit. Raises a ValueError that holds
-        a `ThermoxelsError` without a name if `read_measured` does or the value is not within the limits."""
+        """Return `content`, written by a person or a `Measured`, as a value in this unit. Raises a ValueError, which
+        holds a `ThermoxelsError` without a name, if `read_measured` fails or the value is not within the limits."""
         try:
             found = content if isinstance(content, Measured) else read_measured("", content, self.name)
             low, high = (found.low, found.high) if self.surely else (found.value, found.value)

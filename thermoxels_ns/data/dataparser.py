@@ -35,7 +35,7 @@ by more than a millionth of the box. National coordinates are so far away."""
 _LEAST_THAT_MEETS = 0.01  # share of the rays that must meet the scene box
 _COLDEST_SKY_K = 150.0  # a file's median may be this far below the declared lowest temperature: it shows a clear sky
 _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
-"""A file with a median of at least the first holds kelvins if, less 273.15, it is near the others: within the second."""
+"""A file whose median is at least the first holds kelvins if the median less 273.15 is within the second of others."""
 _MOST_FRAMES = 64  # training files in which stuck pixels are sought
 
 LONGEST_SIDE = 640  # pixels along the longer side of the pictures in which features are sought

@@ -172,9 +172,9 @@ def surface_distances(
 ) -> SurfaceDistances | None:
     """Return the distances between a mesh's surface and the true one; None if nothing of the surface can be measured.
 
-    Facets cut by the scene box are left out. Distances from mesh to truth start at 20,000 points of the other facets,
+    Facets on the scene box, which cuts the scene, are left out. Distances from mesh to truth start at 20,000 points,
     without points within `tolerance` [truth units] of `surroundings` and not of the truth. Distances from truth to mesh
-    go from `true_points` (m, 3), [truth units], to the nearest point of any of these facets.
+    go from `true_points` (m, 3), [truth units], to the nearest point of any remaining facet.
     """
     import pyvista as pv
     from trimesh.triangles import points_to_barycentric

@@ -10,7 +10,7 @@ from thermoxels_ns.core.arrays import Float32Array, FloatArray, IntArray
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import TOLERANCE, Depths
 
-MOST_PIXELS = 1500  # Of each photograph, fewer than twice as many pixels are looked up in the others
+MOST_PIXELS = 1500  # Pixels of each photograph, or up to twice as many, that are looked up in the others
 DARKEST, BRIGHTEST = 0.06, 0.94  # Pixels used for gains have channels between: noise below, saturation above
 FEWEST_PAIRS = 30  # Pixels that two photographs must share to be compared
 SYSTEMATIC = 0.02
