@@ -95,7 +95,7 @@ class Camera:
         return self.project(local * (1.0, -1.0, -1.0))
 
     def rays(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Return the points (n, 3) at depth 1 in OpenCV camera axes that the camera, with distortion, shows at pixels."""
+        """Return the points (n, 3) at depth 1 in OpenCV camera axes that project to pixels (n, 2): undo `project`."""
         pixels = np.asarray(pixels, dtype=np.float64)
         distorted = (pixels - (self.cx, self.cy)) / (self.fl_x, self.fl_y)
         plane = distorted

@@ -21,7 +21,7 @@ Numbers = TypeVar("Numbers", float, np.ndarray, "torch.Tensor")
 
 
 def celsius_to_kelvin(temperature_c: Numbers) -> Numbers:
-    """Return a temperature in kelvin that is given in degrees Celsius.
+    """Convert temperatures from degrees Celsius to kelvin.
 
     >>> celsius_to_kelvin(20.0)
     293.15
@@ -30,7 +30,7 @@ def celsius_to_kelvin(temperature_c: Numbers) -> Numbers:
 
 
 def kelvin_to_celsius(temperature_k: Numbers) -> Numbers:
-    """Return a temperature in degrees Celsius that is given in kelvin."""
+    """Convert temperatures from kelvin to degrees Celsius."""
     return temperature_k - ZERO_CELSIUS_K  # type: ignore[return-value]
 
 
@@ -50,7 +50,7 @@ class TemperatureRange:
 
     @classmethod
     def spanning(cls, min_c: float, max_c: float) -> TemperatureRange:
-        """Return the range between the data's extremes; if these are equal, a range of 1 K around their middle.
+        """Return the range between the data's extremes; if these nearly coincide, a range of 1 K around them.
 
         >>> TemperatureRange.spanning(20.0, 20.0)
         TemperatureRange(min_c=19.5, max_c=20.5)
@@ -66,11 +66,11 @@ class TemperatureRange:
         return self.max_c - self.min_c
 
     def normalise(self, temperature_c: Numbers) -> Numbers:
-        """Return the normalised temperature of degrees Celsius; it is outside [0, 1] for values outside the range."""
+        """Convert degrees Celsius to normalised temperature; values outside the range become values outside [0, 1]."""
         return (temperature_c - self.min_c) / self.span_k  # type: ignore[return-value]
 
     def to_celsius(self, thermal: Numbers) -> Numbers:
-        """Return the degrees Celsius of a normalised temperature.
+        """Convert normalised temperature to degrees Celsius.
 
         >>> TemperatureRange(10.0, 30.0).to_celsius(0.25)
         15.0

@@ -59,7 +59,7 @@ def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the mapping that a yaml file holds; raises `ThermoxelsError` if it is none, empty or has a key twice."""
+    """Return the mapping in a yaml file; raises `ThermoxelsError` if there is none, or it is empty or repeats a key."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
     except OSError as problem:
