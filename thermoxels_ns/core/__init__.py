@@ -1,1 +1,1 @@
-"""The ground floor: errors, checks, units, the lattice and the types that cross walls."""
+"""Modules that all rooms may use: errors, checks, units, the lattice, and types that several rooms share."""

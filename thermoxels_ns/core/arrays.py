@@ -1,4 +1,4 @@
-"""Short names of the array types that most signatures have."""
+"""Short names of array types that occur in most signatures."""
 
 from __future__ import annotations
 

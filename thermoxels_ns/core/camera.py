@@ -1,4 +1,4 @@
-"""One camera for all rooms: image size, lens and distortion; poses stand beside it."""
+"""The camera that all rooms use: image size, lens and distortion, without a pose."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from thermoxels_ns.core.errors import SceneError
 
 Lens = Literal["perspective", "fisheye", "equirectangular"]
 
-_UNDISTORT_STEPS = 20
-_MOST_PIXELS = 1_000_000  # Along a side
+_UNDISTORT_STEPS = 20  # Fixed-point steps that remove distortion
+_MOST_PIXELS = 1_000_000  # Most pixels along a side
 
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera's projection, lengths in pixels; its fields are named as in transforms.json.
+    """The projection of one camera; fields are named as in transforms.json, lengths are in pixels.
 
-    Poses beside it are camera to world with x right, y up, z back (OpenGL), as in transforms.json. Points in camera
-    axes have x right, y down, z ahead (OpenCV). The centre of the top left pixel is at (0.5, 0.5). Only for perspective
-    lenses are there `project`, `rays` and `directions`.
+    Poses passed to methods are camera to world with x right, y up, z back (OpenGL), as in transforms.json. Points in
+    camera axes have x right, y down, z ahead (OpenCV). The centre of the top left pixel is at (0.5, 0.5). `project`,
+    `rays` and `directions` are right for perspective lenses only.
     """
 
     width: int
@@ -33,12 +33,12 @@ class Camera:
     fl_y: float
     cx: float
     cy: float
-    k1: float = 0.0  # Radial distortion, second order, as in OpenCV; k2, k3, k4 are the fourth, sixth and eighth order
-    k2: float = 0.0
-    p1: float = 0.0  # Tangential distortion, as in OpenCV; p2 too
-    p2: float = 0.0
-    k3: float = 0.0
-    k4: float = 0.0
+    k1: float = 0.0  # Radial distortion of second order (coefficient of r^2), as in OpenCV
+    k2: float = 0.0  # Fourth order
+    p1: float = 0.0  # Tangential distortion, as in OpenCV
+    p2: float = 0.0  # Tangential distortion, as in OpenCV
+    k3: float = 0.0  # Sixth order
+    k4: float = 0.0  # Eighth order
     lens: Lens = "perspective"
 
     def __post_init__(self) -> None:
@@ -52,7 +52,7 @@ class Camera:
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal_deg: float) -> Camera:
-        """Return a camera with square pixels, its principal point at the centre, by its horizontal angle of view.
+        """Return a camera with square pixels, its principal point at the centre, and this horizontal angle of view.
 
         >>> round(Camera.from_field_of_view(640, 480, 90.0).fl_x, 6)
         320.0
@@ -66,36 +66,36 @@ class Camera:
 
     @property
     def distortion(self) -> tuple[float, float, float, float, float, float]:
-        """k1, k2, k3, k4, p1, p2, in nerfstudio's order."""
+        """Distortion k1, k2, k3, k4, p1, p2, in nerfstudio's order."""
         return self.k1, self.k2, self.k3, self.k4, self.p1, self.p2
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return the same camera, its image sampled with another number of pixels; distortion does not change."""
+        """Return the same camera for its image resampled to `width` x `height` pixels; distortion does not change."""
         x, y = width / self.width, height / self.height
         lengths = {"fl_x": self.fl_x * x, "fl_y": self.fl_y * y, "cx": self.cx * x, "cy": self.cy * y}
         return replace(self, width=width, height=height, **lengths)
 
     def scaled(self, factor: float) -> Camera:
-        """Return the same camera with pixels `1 / factor` times as large; a last part of a pixel is cut off."""
+        """Return the same camera with `factor` times as many pixels along each side; a last fraction is cut off."""
         width, height = (max(int(length * factor + 1e-6), 1) for length in (self.width, self.height))
         lengths = {name: getattr(self, name) * factor for name in ("fl_x", "fl_y", "cx", "cy")}
         return replace(self, width=width, height=height, **lengths)
 
     def project(self, points: npt.ArrayLike) -> FloatArray:
-        """Project points (n, 3) in OpenCV camera axes to pixels (n, 2); NaN for points not ahead of the camera."""
+        """Return the pixels (n, 2) of points (n, 3) in OpenCV camera axes; NaN for points not ahead of the camera."""
         local = np.asarray(points, dtype=np.float64)
         ahead = local[:, 2] > 0.0
         scale = np.divide(1.0, local[:, 2], out=np.full(len(local), np.nan), where=ahead)
         return self._distort(local[:, :2] * scale[:, None]) * (self.fl_x, self.fl_y) + (self.cx, self.cy)
 
     def project_world(self, pose: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
-        """Project world points (n, 3) with a pose (3, 4) or (4, 4) to pixels (n, 2); NaN behind the camera."""
+        """Return the pixels (n, 2) of world points (n, 3) by a pose (3, 4) or (4, 4); NaN for points not ahead."""
         pose = np.asarray(pose, dtype=np.float64)
         local = (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
         return self.project(local * (1.0, -1.0, -1.0))
 
     def rays(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Return the points (n, 3) at depth 1 in OpenCV camera axes that pixels (n, 2) see (distortion removed)."""
+        """Return the points (n, 3) at depth 1 in OpenCV camera axes that project to pixels (n, 2): undo `project`."""
         pixels = np.asarray(pixels, dtype=np.float64)
         distorted = (pixels - (self.cx, self.cy)) / (self.fl_x, self.fl_y)
         plane = distorted
@@ -105,7 +105,7 @@ class Camera:
         return np.column_stack([plane, np.ones(len(plane))])
 
     def directions(self, pose: npt.ArrayLike, samples_per_axis: int = 1) -> FloatArray:
-        """Return unit ray directions in the world through a grid of points in every pixel, without distortion.
+        """Return unit ray directions in the world through a grid of points in every pixel; distortion is ignored.
 
         `pose` is camera to world, shape (3, 4) or (4, 4). The result has shape (height, width, samples_per_axis^2, 3).
         """
@@ -122,12 +122,12 @@ class Camera:
         return np.ascontiguousarray(blocks).reshape(self.height, self.width, s * s, 3)
 
     def contains(self, pixels: npt.ArrayLike, border: float = 0.0) -> BoolArray:
-        """Return which pixels (n, 2) lie in the image, at least `border` pixels from its edge; NaN does not."""
+        """Return which pixels (n, 2) lie in the image, at least `border` pixels from its edge; False for NaN."""
         x, y = np.asarray(pixels, dtype=np.float64).T
         return (x >= border) & (x <= self.width - border) & (y >= border) & (y <= self.height - border)
 
     def _distort(self, plane: FloatArray) -> FloatArray:
-        """Apply Brown's model to points (n, 2) at depth 1."""
+        """Return points (n, 2) at depth 1 distorted by Brown's model."""
         if not any(self.distortion):
             return plane
         x, y = plane[:, 0], plane[:, 1]

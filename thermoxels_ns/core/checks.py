@@ -1,4 +1,4 @@
-"""Checks at public boundaries, and files that are complete or absent."""
+"""Checks of arguments at public boundaries, and files and folders of results that are written whole or not at all."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Whether a value is a number that a float can hold: NaN is one, True is none.
+    """Return whether a value is a number that a float can hold. NaN counts as a number, True does not.
 
     >>> [is_number(value) for value in (1, 2.5, True, "3", 10**400)]
     [True, True, False, False, False]
@@ -33,14 +33,14 @@ def is_number(value: object) -> TypeGuard[float]:
 
 
 def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> float:
-    """Return `value` if it is a finite number above zero (True is no number), else raise `error`."""
+    """Return `value` as a float if it is a finite number above zero (True is no number), else raise `error`."""
     if not (is_number(value) and math.isfinite(value) and value > 0):
         raise error(name, expected="a finite number above 0", got=repr(value), remedy=remedy)
     return float(value)
 
 
 def check_ranges(prefix: str, values: Mapping[str, tuple[Any, float, float, str]]) -> None:
-    """Check options, named without their `prefix`: each has a value, its least and largest, and these in words."""
+    """Raise `ThermoxelsError` for an option out of range; `values` holds (value, least, largest, range in words)."""
     for name, (value, low, high, expected) in values.items():
         if not low <= value <= high:  # NaN fails too
             remedy = f"Correct {prefix}{name.replace('_', '-')}."
@@ -74,7 +74,7 @@ def check_shape(
 def check_direction(
     name: str, vector: npt.ArrayLike, remedy: str, error: type[ThermoxelsError] = ThermoxelsError
 ) -> FloatArray:
-    """Return `vector` as three numbers if it is a direction of any length above 0, else raise `error`."""
+    """Return `vector`, shape (3,), if its numbers are finite and its length is above 0, else raise `error`."""
     array = np.asarray(vector, dtype=np.float64)
     length = float(np.linalg.norm(array)) if array.shape == (3,) else 0.0
     if not (math.isfinite(length) and length > 0.0):
@@ -83,9 +83,9 @@ def check_direction(
 
 
 def writable_folder(path: Path | str, room_bytes: float = 0.0) -> Path:
-    """Make `path` a folder that can be written to, on a disk with some room, or raise `OutputError`.
+    """Make the folder `path` if needed and return it, or raise `OutputError`.
 
-    The proof is a temporary file written and removed again, because permission bits lie (root, network drives).
+    The folder must take a temporary file, as permission bits lie (root, network drives), and have `room_bytes` free.
     """
     folder = Path(path)
     try:
@@ -114,7 +114,7 @@ def plain_os_errors(
     remedy: str = "Check free space, permissions and the length of names.",
     error: type[ThermoxelsError] = OutputError,
 ) -> Iterator[None]:
-    """Turn an error of the operating system in the block into one of ours that names the file, else `what`."""
+    """Raise an OSError of the block as `error`, which names the file, or `what` if the system names none."""
     try:
         yield
     except ThermoxelsError:
@@ -125,20 +125,20 @@ def plain_os_errors(
 
 
 def remedy_of(problem: Exception, remedy: str) -> str:
-    """Return what helps against an error of reading a file: `remedy`, unless the system refused to read it at all."""
+    """Return the remedy for an error of reading a file: `remedy`, or another if the file exists but cannot be read."""
     refused = isinstance(problem, OSError) and problem.errno not in (None, errno.ENOENT)
     return "Check its permissions and the disk, or copy it again." if refused else remedy
 
 
 def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock:
-    """Lock a file in an output folder for this process, or raise `OutputError` if another process holds it.
+    """Lock `file` in an output folder for this process, or raise `OutputError` if another process has locked it.
 
-    The system ends the lock with the process, however that ends. A drive without locks is named by `say`.
+    The system releases the lock when the process ends in any way. On a drive without locks, `say` receives a warning.
     """
     lock = FileLock(file)
     try:
         lock.acquire(blocking=False)
-        with suppress(OSError):  # the number is for the message below alone
+        with suppress(OSError):  # the number serves only the message below, in another process
             file.write_text(str(os.getpid()))
     except Timeout as problem:
         number = ""
@@ -154,7 +154,7 @@ def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock
 
 @contextmanager
 def replace_when_done(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; rename it to `path` only if the block ends without an error.
+    """Yield a temporary path beside `path`; rename the file there to `path` only if the block ends without an error.
 
     The temporary name keeps the suffix, by which writers choose their format.
 
@@ -171,13 +171,13 @@ def replace_when_done(path: Path | str) -> Iterator[Path]:
     except OSError as problem:
         raise _output_error(final, "a file that can be written", problem) from problem
     finally:
-        # The error that kept it from being renamed says more than that it cannot be removed either.
+        # An error of the block says more than an error of removing the temporary file.
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
 
 
 def remove_file(path: Path | str) -> None:
-    """Remove a file if it is there, or raise `OutputError`."""
+    """Remove a file if it exists, or raise `OutputError` if that fails."""
     try:
         Path(path).unlink(missing_ok=True)
     except OSError as problem:
@@ -185,9 +185,9 @@ def remove_file(path: Path | str) -> None:
 
 
 def remove_stale_temporaries(folder: Path | str, names: Iterable[str]) -> None:
-    """Remove what a killed process left of files of these names (stars as in ``step-*.vtu``) in a folder, if any.
+    """Remove temporary files that a killed process left in a folder while it wrote files of these names.
 
-    Temporary files of `replace_when_done` alone are removed.
+    Names may have stars, as in ``step-*.vtu``. Only temporary files of `replace_when_done` are removed.
     """
     for name in map(Path, names):
         for path in sorted(Path(folder).glob(f".{name.stem}.*.part{name.suffix}")):
@@ -196,7 +196,7 @@ def remove_stale_temporaries(folder: Path | str, names: Iterable[str]) -> None:
 
 
 def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Iterable[str] = ()) -> None:
-    """Raise `OutputError` where a folder has the name of a file to write, or a file that of a folder."""
+    """Raise `OutputError` if a folder has the name of one of `files`, or a file the name of one of `folders`."""
     blocked = [name for name in files if (folder / name).is_dir()]
     blocked += [name for name in folders if (folder / name).exists() and not (folder / name).is_dir()]
     if blocked:
@@ -208,17 +208,17 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
 def result_folder(
     path: Path | str, files: Sequence[str], own: Sequence[str], others: Sequence[str], series: str | None = None
 ) -> Path:
-    """Make the folder of a command's results, and remove what killed runs of the command left half-written.
+    """Make and return the folder of a command's results, and remove temporary files that killed runs left there.
 
-    Raises `OutputError`, before anything is computed, for what is in the way of results, and for files that the command
-    would replace or remove although it did not write them.
+    Raises `OutputError` if something is in the way of the results, if the folder holds results of another command, or
+    if the command would replace or remove files that it did not write.
 
     Args:
         path: The folder.
         files: Names of all files that the command may write.
-        own: Names that it writes first and last, without any of which the others are not the command's.
-        others: Names that tell the results of another command.
-        series: Files of a folder in it, with a star that stands for anything, as in ``heat/step-*.vtu``.
+        own: Names of files that a run writes first and last. If none exists, the command wrote none of `files`.
+        others: Names of files by which results of another command are recognised.
+        series: Pattern of files in a subfolder, as ``heat/step-*.vtu``; None: the command writes no such files.
     """
     folder, steps = writable_folder(path), [] if series is None else [series]
     refuse_what_is_in_the_way(folder, files, [Path(name).parent.name for name in steps])

@@ -1,4 +1,4 @@
-"""nerfstudio from outside: its config.yml read without running code from it, its command line, its modules."""
+"""nerfstudio's config.yml read without running code from the file, its command line, and changed modules."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _HARMLESS_TAGS = {
 
 
 class ConfigLoader(yaml.Loader):
-    """Reads what ``ns-train`` writes to config.yml, and nothing that could run code.
+    """Loader of the config.yml that ``ns-train`` writes, which refuses entries that could run code.
 
-    Python objects are limited to configuration dataclasses, enumerations and paths, python names to classes, of
-    nerfstudio and of packages that are installed as its plugins. The whole file is looked at before anything is made.
+    The file may make configuration dataclasses, enumerations and paths, and may name classes, of nerfstudio and of
+    packages installed as its plugins. The whole file is checked before any object is made.
     """
 
     def get_single_data(self) -> Any:
-        """Read the file; a `CheckpointError` says what it names that it must not, and where."""
+        """Return the content of the file, or raise `CheckpointError` with a forbidden name and its line."""
         expected = "a config.yml that names only configuration classes of nerfstudio and its installed plugins"
         remedy = "Do not use this file: it could run code. If you trust it, install the package that it names."
         try:
@@ -50,7 +50,7 @@ class ConfigLoader(yaml.Loader):
 
 
 def _nodes(root: yaml.Node | None) -> Iterator[yaml.Node]:
-    """A node and all below, each once."""
+    """Yield a yaml node and all nodes below, each once."""
     seen, waiting = set[int](), [root] if root is not None else []
     while waiting:
         node = waiting.pop()
@@ -65,7 +65,7 @@ def _nodes(root: yaml.Node | None) -> Iterator[yaml.Node]:
 
 
 def _harmless(tag: str) -> bool:
-    """Return whether a tag ``kind:name`` makes plain data, or names a class that a configuration may be made of."""
+    """Return whether a tag ``kind:name`` makes plain data, or names a class that a configuration may contain."""
     kind, _, name = tag.partition(":")
     if not name or tag in _HARMLESS_TAGS:
         return True
@@ -83,7 +83,7 @@ def _harmless(tag: str) -> bool:
 
 
 def _plugin_packages() -> set[str]:
-    """Return the names of nerfstudio, of ours, and of packages whose metadata say that they extend nerfstudio."""
+    """Return names of packages: nerfstudio, ours, and plugins by metadata or nerfstudio's environment variables."""
     groups = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
     values = [entry.value for group in groups for entry in entry_points(group=group)]
     for name in ("NERFSTUDIO_METHOD_CONFIGS", "NERFSTUDIO_DATAPARSER_CONFIGS"):
@@ -92,13 +92,13 @@ def _plugin_packages() -> set[str]:
 
 
 def typed(option: str) -> bool:
-    """Return whether this process was started with an option whose name is, or begins with, the given one."""
+    """Return whether an argument of this process's command line begins with `option`; "-" and "_" are equal."""
     start = option.replace("_", "-")
     return any(word.replace("_", "-").startswith(start) for word in sys.argv[1:])
 
 
 def typed_value(option: str) -> str | None:
-    """Return the last value that was typed for an option when this process was started; None: it was not typed."""
+    """Return the last value of an option (as "--max-rays") on this process's command line; None if there is none."""
     found = None
     for word, following in zip(sys.argv[1:], [*sys.argv[2:], None]):
         name, equals, value = word.partition("=")
@@ -108,7 +108,7 @@ def typed_value(option: str) -> str | None:
 
 
 class ModuleWith(ModuleType):
-    """A module with some of its names replaced."""
+    """A module that has the names of another module, some of them `replaced`."""
 
     def __init__(self, module: ModuleType, **replaced: Any) -> None:
         super().__init__(module.__name__, doc=module.__doc__)

@@ -1,19 +1,19 @@
-"""Errors a user can act on: name, expected, got and remedy."""
+"""Errors that a user can act on, with four parts: name, expected, got and remedy."""
 
 import unicodedata
 
-_UNPRINTED = ("Cc", "Cs")  # kinds of characters that break a line or a terminal, or are bytes that no encoding explains
+_UNPRINTED = ("Cc", "Cs")  # categories of control characters, which break lines or terminals, and undecodable bytes
 
 
 class ThermoxelsError(Exception):
-    """Base of all errors that are the input's, not the program's: what is wrong, or the whole sentence alone."""
+    """Base of all errors caused by the input, not by the program. Without `expected`, `what` is the whole message."""
 
     def __init__(self, what: str, *, expected: str | None = None, got: object = None, remedy: str = "") -> None:
         super().__init__(what if expected is None else explain(what, expected=expected, got=got, remedy=remedy))
 
 
 class RecordError(ThermoxelsError, ValueError):
-    """An entry of a file or a record is wrong."""
+    """An entry of a file, or a field of a record, has a wrong value."""
 
 
 class SceneError(ThermoxelsError, ValueError):
@@ -25,11 +25,11 @@ class ThermalFileError(SceneError):
 
 
 class CheckpointError(ThermoxelsError, ValueError):
-    """A checkpoint does not fit the model that is asked to load it."""
+    """A checkpoint or its config.yml is damaged or unsafe, or does not fit the model that loads it."""
 
 
 class PruningError(ThermoxelsError, RuntimeError):
-    """Pruning would remove a part of the scene that rays see."""
+    """Pruning would open too many rays that end on something: it would remove a part of the scene."""
 
 
 class MemoryBudgetError(ThermoxelsError, MemoryError):
@@ -41,19 +41,19 @@ class MeshError(ThermoxelsError, ValueError):
 
 
 class HeatError(ThermoxelsError, ValueError):
-    """A heat problem is not well posed or its solver did not converge."""
+    """A heat problem is not well posed, or the solver did not converge."""
 
 
 class AuditError(ThermoxelsError, ValueError):
-    """The conditions of a survey, or its mesh, do not give the answers that are asked for."""
+    """The audit cannot give the answers asked for with these survey conditions or this mesh."""
 
 
 class OutputError(ThermoxelsError, OSError):
-    """A result cannot be written where it was asked for."""
+    """A result cannot be written to the place that was asked for."""
 
 
 def explain(name: str, *, expected: str, got: object, remedy: str) -> str:
-    """Put the four parts of an error message into one sentence order.
+    """Return the message of an error made of its four parts.
 
     >>> explain("metres_per_unit", expected="a number above 0", got=-1, remedy="Pass --metres-per-unit 1.")
     'metres_per_unit: expected a number above 0, got -1. Pass --metres-per-unit 1.'
@@ -62,7 +62,7 @@ def explain(name: str, *, expected: str, got: object, remedy: str) -> str:
 
 
 def printable(text: str) -> str:
-    """Escape what is no letter in any alphabet: line breaks, control characters, bytes of no encoding.
+    """Return a text with line breaks, control characters and undecodable bytes written as escapes.
 
     >>> printable("two\\nlines.jpg")
     'two\\\\nlines.jpg'

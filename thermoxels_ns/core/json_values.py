@@ -1,4 +1,4 @@
-"""Results as json: one converter, one writer, one reader."""
+"""Conversion of results to values that json knows, and writing and reading of json files."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from thermoxels_ns.core.errors import ThermoxelsError
 
 
 def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] = ThermoxelsError) -> Any:
-    """Return dataclasses, mappings, arrays, tuples and paths, nested in any way, as values that json knows.
+    """Return `value` with all dataclasses, mappings, arrays, tuples and paths in it converted to types that json knows.
 
-    Raises `error`, which says where in `name` the value stands, for a value that json has not, such as NaN.
+    Raises `error` for NaN, infinity or any other type; the message says where in `name` the bad value stands.
 
     >>> plain_values({"sizes": (1, 2.5), "file": Path("a.npy")})
     {'sizes': [1, 2.5], 'file': 'a.npy'}
@@ -43,7 +43,7 @@ def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] =
 
 
 def write_json(path: Path, content: Any, error: type[ThermoxelsError] = ThermoxelsError) -> None:
-    """Write json, whole or not at all (`OutputError`), of values as `plain_values` converts or refuses them."""
+    """Write `plain_values(content)` as json, whole or not at all; raises `error`, or `OutputError` by the system."""
     text = json.dumps(plain_values(content, path.stem, error), indent=1, allow_nan=False)
     with replace_when_done(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -55,7 +55,7 @@ def read_json(
     remedy: str = "Write it again, or pass another file.",
     error: type[ThermoxelsError] = ThermoxelsError,
 ) -> Any:
-    """Return what a json file holds, or raise `error` if it is missing or damaged, or has a key twice in one object."""
+    """Return the content of a json file; raises `error` if it is missing or damaged, or an object has a key twice."""
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_unique)
     except (OSError, ValueError, RecursionError) as problem:
@@ -65,7 +65,7 @@ def read_json(
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object of json; refuse a key that stands twice, of which json would forget the first."""
+    """Return an object of json, or raise ValueError for a key that occurs twice; json alone would drop the first."""
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
@@ -74,7 +74,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_json_object(path: Path, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> dict[str, Any]:
-    """Return what a json file holds if that is an object, else raise `error`."""
+    """Return the object that a json file holds; raises `error` if `read_json` does or the content is no object."""
     content = read_json(path, "a readable json file", remedy, error)
     if not isinstance(content, dict):
         raise error(str(path), expected="a json object", got=type(content).__name__, remedy=remedy)

@@ -1,4 +1,4 @@
-"""The decorator of compiled kernels, and the cache of what was compiled."""
+"""The decorator that compiles kernels with numba, and the upkeep of numba's cache of compiled kernels."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _DIGEST = "thermoxels-kernels.sha256"
 
 
 def kernel(function: Callable | None = None, **options: Any) -> Any:
-    """Compile a function with numba when it is first called, without the interpreter's lock, and keep the result.
+    """Return the function compiled with numba at its first call, without the interpreter's lock, cached on disk.
 
-    A kernel may call kernels of its own room and of ``core``: numba watches only the file that a kernel stands in,
-    so what was compiled in a room is thrown away when any file of the room or of ``core`` changed: kernels freeze
-    constants of other files too. Plain use is ``@kernel``; options are those of `numba.njit`, such as
+    A kernel may call kernels of its own room (subpackage) and of ``core``, and holds constants of their files. As numba
+    watches only the kernel's own file, all compiled kernels of a room are removed when any file of the room or of
+    ``core`` has changed. Plain use is ``@kernel``; `options` are those of `numba.njit`, such as
     ``fastmath={"contract"}``. Division by zero gives inf or NaN, as in numpy.
     """
     import numba
@@ -30,7 +30,7 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
         dispatcher = njit(**{"nogil": True, "cache": True, "error_model": "numpy", **options})(function)
         source, cached = Path(function.__code__.co_filename), dispatcher.stats.cache_path
         if cached and _PACKAGE in source.parents:
-            # Before the first call, which loads what was compiled earlier.
+            # This comes before the first call, which loads kernels compiled earlier.
             _forget_once(source.relative_to(_PACKAGE).parts[0], Path(cached))
         return dispatcher
 
@@ -44,9 +44,9 @@ def _forget_once(room: str, cached: Path) -> None:
 
 
 def forget_stale_kernels(cached: Path, sources: Iterable[Path]) -> bool:
-    """Remove what numba keeps in a folder if any of the sources differs from when it was kept; say whether one does.
+    """Remove compiled kernels from a folder of numba's cache if any of `sources` has changed since the last call.
 
-    A folder that cannot be written is left alone.
+    Return whether any has changed. Return False for a folder that cannot be written.
     """
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sorted(sources))).hexdigest()
     mark = cached / _DIGEST

@@ -1,4 +1,4 @@
-"""The corner lattice: the one place where index <-> world is written."""
+"""The lattice of voxels and their corners: the only module that converts between indices and world positions."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from thermoxels_ns.core.errors import CheckpointError, ThermoxelsError
 CORNER_OFFSETS: IntArray = np.array(
     [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1], [1, 1, 0], [1, 1, 1]], dtype=np.int64
 )
-"""Offsets of a voxel's eight corners, shape (8, 3), in C order: corner c is (c >> 2 & 1, c >> 1 & 1, c & 1)."""
+"""Offsets of a voxel's eight corners from its lowest corner, shape (8, 3); the last axis varies fastest (C order)."""
 
 
 @dataclass(frozen=True)
 class Lattice:
     """A regular lattice of cubic voxels with values on their corners.
 
-    Corner (i, j, k) sits at ``lo + (i, j, k) * voxel_size``; N corners along an axis span N - 1 voxels. Flat corner
-    index: ``(i * ny + j) * nz + k`` (C order), and the same rule for cells.
+    Corner (i, j, k) is at ``lo + (i, j, k) * voxel_size``; N corners along an axis span N - 1 voxels. The flat index of
+    a corner is ``(i * ny + j) * nz + k`` (C order); that of a cell (a voxel) follows the same rule with `cell_shape`.
     """
 
     lo: tuple[float, float, float]  # World position of corner (0, 0, 0)
-    voxel_size: float  # Edge length of a voxel, world units
+    voxel_size: float  # Edge length of a voxel, [world units]
     shape: tuple[int, int, int]  # Number of corners along x, y, z; at least 2 each
 
     def __post_init__(self) -> None:
@@ -38,7 +38,7 @@ class Lattice:
     def covering(cls, box_lo: npt.ArrayLike, box_hi: npt.ArrayLike, resolution: int) -> Lattice:
         """Return the lattice that covers a box with `resolution` voxels along its longest side.
 
-        The other sides get as many voxels as cover them; both ends of a side exceed the box by the same length.
+        Each other side gets as many voxels as cover it, and both of its ends exceed the box by the same length.
 
         >>> Lattice.covering((0, 0, 0), (2, 1, 0.9), 4)
         Lattice(lo=(0.0, 0.0, -0.05), voxel_size=0.5, shape=(5, 3, 3))
@@ -56,13 +56,13 @@ class Lattice:
         return cls(tuple(start.tolist()), h, tuple((cells + 1).tolist()))
 
     def refined(self, factor: int) -> Lattice:
-        """Return the lattice with every voxel split into `factor`^3; every old corner is one of its corners."""
+        """Return the lattice with every voxel split into `factor`^3 voxels; old corners are corners of it too."""
         nx, ny, nz = ((n - 1) * factor + 1 for n in self.shape)
         return Lattice(self.lo, self.voxel_size / factor, (nx, ny, nz))
 
     @property
     def hi(self) -> tuple[float, float, float]:
-        """World position of the last corner."""
+        """World position of the last corner, with the highest indices."""
         x, y, z = self.index_to_world(np.array(self.shape) - 1).tolist()
         return (x, y, z)
 
@@ -78,24 +78,24 @@ class Lattice:
         return self.shape[0] * self.shape[1] * self.shape[2]
 
     def index_to_world(self, index: npt.ArrayLike) -> FloatArray:
-        """Map (fractional) corner indices (..., 3) to world positions (..., 3)."""
+        """Return the world positions (..., 3) of corner indices (..., 3), which may be fractional."""
         return np.asarray(self.lo) + np.asarray(index, dtype=np.float64) * self.voxel_size
 
     def world_to_index(self, point: npt.ArrayLike) -> FloatArray:
-        """Map world positions (..., 3) to fractional corner indices (..., 3)."""
+        """Return the fractional corner indices (..., 3) of world positions (..., 3)."""
         return (np.asarray(point, dtype=np.float64) - np.asarray(self.lo)) / self.voxel_size
 
     def corner_positions(self) -> FloatArray:
-        """World positions of all corners, shape (nx, ny, nz, 3)."""
+        """Return the world positions of all corners, shape (nx, ny, nz, 3)."""
         return self.index_to_world(np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), axis=-1))
 
     def cell_centres(self) -> FloatArray:
-        """World positions of all voxel centres, shape (nx-1, ny-1, nz-1, 3)."""
+        """Return the world positions of all voxel centres, shape (nx-1, ny-1, nz-1, 3)."""
         cells = np.stack(np.meshgrid(*map(np.arange, self.cell_shape), indexing="ij"), axis=-1)
         return self.index_to_world(cells + 0.5)
 
     def corner_to_cell_mean(self, values: npt.NDArray) -> npt.NDArray:
-        """Return trilinear values at voxel centres: the means of each voxel's eight corners, shape `cell_shape`."""
+        """Return the mean of corner values (nx, ny, nz) over each voxel's eight corners, shape `cell_shape`."""
         total = np.zeros(self.cell_shape, dtype=np.result_type(values.dtype, np.float32))
         for dx, dy, dz in CORNER_OFFSETS:
             nx, ny, nz = self.cell_shape
@@ -104,7 +104,7 @@ class Lattice:
 
 
 def input_from_world(transform: npt.ArrayLike, scale: float) -> FloatArray:
-    """Return the inverse (4, 4) of a nerfstudio dataparser's p_world = scale * (R p_input + t), [R | t] of (3, 4).
+    """Return the inverse (4, 4) of a nerfstudio dataparser's p_world = scale * (R p_input + t); `transform` is [R | t].
 
     >>> input_from_world([[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]], 2.0) @ [12, 0, 4, 1]
     array([1., 0., 2., 1.])

@@ -1,4 +1,4 @@
-"""Measured values: a number, how far it may be off, and its unit, as people write them."""
+"""Measured values as people write them: a number, its uncertainty and its unit."""
 
 from __future__ import annotations
 
@@ -28,41 +28,42 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "/kWh": {"/kWh": (1.0, 0.0), "/MWh": (1e-3, 0.0)},
     "kg/kWh": {"kg/kWh": (1.0, 0.0), "g/kWh": (1e-3, 0.0)},
 }
-"""Units by the one that values are kept in: factor and summand that lead from each to it. Spaces, brackets and powers
-are written as people like."""
+"""For each unit in which values are kept: the units that people may write, with factor and summand to convert a value.
+Spaces, brackets and ^ in a written unit are ignored."""
 _EXAMPLES = {"1": "0.93 +- 0.02", "C": "20.0 +- 0.5 C", "K": "0 +- 1 K"}
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A number and the half width of the range that holds the true value, every value in it as likely."""
+    """A measured number with the half width of the range around it in which every true value is equally likely."""
 
     value: float
-    off_by: float = 0.0  # At least 0; 0: taken as exact
+    off_by: float = 0.0  # Half width of the range, at least 0; 0: the value is taken as exact
 
     @property
     def low(self) -> float:
-        """Least true value."""
+        """Lower end of the range of true values."""
         return self.value - self.off_by
 
     @property
     def high(self) -> float:
-        """Largest true value."""
+        """Upper end of the range of true values."""
         return self.value + self.off_by
 
 
 @dataclass(frozen=True)
 class Unit:
-    """What a value is measured in, and where it may lie: ``Annotated[Measured, Unit("1", 0.0, 1.0)]`` in a record."""
+    """The unit of a field of a record and the limits of its value: ``Annotated[Measured, Unit("1", 0.0, 1.0)]``."""
 
-    name: str  # "1" for none
-    low: float = -math.inf
-    high: float = math.inf
-    surely: bool = True  # Whether no value in the range may lie beyond; False: the value itself alone may not
-    above: bool = False  # Whether `low` itself is beyond
+    name: str  # Key of the table of units, such as "m/s"; "1": no unit
+    low: float = -math.inf  # Least value allowed
+    high: float = math.inf  # Largest value allowed
+    surely: bool = True  # True: the whole range must be within the limits; False: only the value itself
+    above: bool = False  # True: the value must be above `low`, not equal to it
 
     def read(self, content: object) -> Measured:
-        """Read or check a value, or raise a ValueError that holds a `ThermoxelsError` without a name."""
+        """Return `content`, written by a person or a `Measured`, as a value in this unit. Raises a ValueError, which
+        holds a `ThermoxelsError` without a name, if `read_measured` fails or the value is not within the limits."""
         try:
             found = content if isinstance(content, Measured) else read_measured("", content, self.name)
             low, high = (found.low, found.high) if self.surely else (found.value, found.value)
@@ -83,10 +84,9 @@ class Unit:
 
 
 def read_measured(name: str, content: object, unit: str) -> Measured:
-    """Return a value that people wrote, such as ``20.0 +- 0.5 C``, ``3 ± 1 m/s``, ``0.93``, in `unit` ("1": none).
+    """Return in `unit` ("1": none) a value that a person wrote, such as ``20.0 +- 0.5 C``, ``3 ± 1 m/s``, ``0.93``.
 
-    Raises `ThermoxelsError`, which calls the value `name`, for a text that is no number, and for a wrong or missing
-    unit.
+    Raises `ThermoxelsError`, which starts with `name`, if the text is no number or its unit is wrong or missing.
 
     >>> read_measured("wind", "3.6 +- 1.8 km/h", "m/s")
     Measured(value=1.0, off_by=0.5)

@@ -1,4 +1,4 @@
-"""The trained field as plain arrays: what training hands to the mesher."""
+"""The trained field as plain arrays, which training hands to the mesher."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Views:
     size: IntArray  # Image widths and heights, shape (c, 2), [pixels]
 
     def matrices(self) -> FloatArray:
-        """World to homogeneous pixels (columns, rows, depth, positive in front), shape (c, 3, 4)."""
+        """Return matrices from the world to (column, row, 1) times depth, positive ahead of the camera, (c, 3, 4)."""
         turned = self.camera_to_world[:, :, :3].transpose(0, 2, 1) * [[1.0], [-1.0], [-1.0]]
         local = np.concatenate((turned, -turned @ self.camera_to_world[:, :, 3:]), axis=2)
         local[:, :2] = self.focal[..., None] * local[:, :2] + self.centre[..., None] * local[:, 2:]
@@ -31,36 +31,36 @@ class Views:
 
 @dataclass(frozen=True)
 class RayEvidence:
-    """What training rays, colour and thermal alike, say about where solid is."""
+    """Evidence from training rays, colour and thermal alike, of where solid is."""
 
     voxel_weight: Float32Array
     """Sum of the weights that rays spent in each voxel, shape `lattice.cell_shape`, [rays]."""
     half_depth_density: Float32Array
-    """One density per ray of opacity above one half, shape (rays,), [1 / world unit]: the highest at the centres of the
-    voxels that the ray crosses within half a voxel of the point at which half of its weight is spent."""
+    """One density per ray with an opacity above 1/2, shape (rays,), [1 / world unit]: the highest at centres of voxels
+    that the ray crosses within half a voxel of the point at which half of its weight is spent."""
     voxel_ends: Float32Array | None = None
-    """Number of rays that end on something and have spent half of their weight in each voxel, shape
-    `lattice.cell_shape`, [rays]. None: not known."""
+    """Number of rays that end on a surface and reach half of their weight in each voxel, `lattice.cell_shape`, [rays].
+    None: not known."""
 
 
 @dataclass(frozen=True)
 class GridSnapshot:
-    """The trained field, detached: arrays of the lattice's shape, all finite (checked)."""
+    """The trained field as arrays on the corners of a lattice. Shapes and finite values are checked (`MeshError`)."""
 
     lattice: Lattice
     density: Float32Array  # Density after activation at the corners, [1 / world unit], >= 0
     temperature_c: Float32Array
-    """Temperature at the corners, [degrees Celsius]: the mean over thermal training rays, each sample weighted by its
-    share of the pixel; where `observed_weight` is 0 it is not a measurement."""
+    """Temperature at the corners, [degrees Celsius]: the mean over samples of thermal training rays at their first hit,
+    weighted by their share of the pixel. Where `observed_weight` is 0, the value is not a measurement."""
     observed_weight: Float32Array
-    """Sum of the weights that thermal training rays gave each corner; 0: no thermal ray ever saw it."""
+    """Sum of the weights that thermal training rays gave each corner; 0: no thermal ray saw the corner."""
     voxel_density: Float32Array | None = None
-    """Density at the voxel centres as the field has it, shape `lattice.cell_shape`, [1 / world unit]. None: density is
-    trilinear, so it is the mean of the corners."""
+    """Density of the field at the voxel centres, shape `lattice.cell_shape`, [1 / world unit]. None: the field is
+    trilinear, so the density at a centre is the mean of the voxel's corners."""
     colour: Float32Array | None = None
     """Red, green, blue in [0, 1] at the corners, the mean over all directions, shape (*lattice.shape, 3). None: the
     model has no colour."""
-    evidence: RayEvidence | None = None  # What training rays spent where. None: not known
+    evidence: RayEvidence | None = None  # Where training rays spent their weight. None: not known
     views: Views | None = None  # The training cameras of both streams. None: not known
 
     def __post_init__(self) -> None:
@@ -91,12 +91,12 @@ class GridSnapshot:
                 raise MeshError(named, expected=expected, got=got, remedy=remedy)
 
     def centre_density(self) -> FloatArray:
-        """Density at the voxel centres, shape `lattice.cell_shape`, [1 / world unit]."""
+        """Return the density at the voxel centres, shape `lattice.cell_shape`, [1 / world unit]."""
         if self.voxel_density is not None:
             return self.voxel_density.astype(np.float64)
         return self.lattice.corner_to_cell_mean(self.density.astype(np.float64))
 
 
-_SMALLEST_FOCAL = 1e-6  # pixels; what is smaller is no lens
+_SMALLEST_FOCAL = 1e-6  # least focal length of a lens, [pixels]
 _FIELD = "The checkpoint is damaged; resume from an earlier one."
 _CAMERAS = "Correct the camera poses and intrinsics of the scene."

@@ -1,4 +1,4 @@
-"""A pool of threads for ranges of work of the compiled kernels."""
+"""The pool of threads that runs compiled kernels on ranges of their work."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ _pool: list[ThreadPoolExecutor] = []
 
 
 def num_threads() -> int:
-    """Return the number of threads that kernels use."""
+    """Return the number of threads that `run_ranges` and `run_tasks` use."""
     return _state["threads"] or os.cpu_count() or 1
 
 
 def set_num_threads(threads: int | None) -> None:
-    """Set the number of threads; None: one per processor."""
+    """Set the number of threads of `run_ranges` and `run_tasks`; None: one per processor."""
     _state["threads"] = threads or 0
 
 
 def _executor() -> ThreadPoolExecutor:
     wanted, process = num_threads(), os.getpid()
     if not _pool or _state["owner"] != process or _pool[0]._max_workers != wanted:
-        # A forked process has none of its parent's threads.
+        # A forked process does not have the threads of its parent.
         if _pool and _state["owner"] == process:
             _pool[0].shutdown(wait=True)
         _pool[:] = [ThreadPoolExecutor(wanted, thread_name_prefix="thermoxels")]
@@ -33,10 +33,10 @@ def _executor() -> ThreadPoolExecutor:
 
 
 def run_ranges(work: Callable[[int, int], object], total: int, smallest: int = 64) -> list[object]:
-    """Call ``work(first, last)`` on ranges that cover 0 to `total`, in parallel, and return the results in order.
+    """Call ``work(first, last)`` in parallel on ranges (last excluded) that cover 0 to `total`; return all results.
 
-    Kernels release Python's lock and write to disjoint places; how many threads there are never changes a result. A
-    range of fewer than `smallest` items is not worth a thread.
+    Results are in the order of the ranges. `work` must release Python's lock and write to places of its own range, so
+    that the number of threads never changes a result. Ranges have at least `smallest` items, but for the last.
     """
     threads = num_threads()
     if threads == 1 or total <= smallest:
@@ -47,7 +47,7 @@ def run_ranges(work: Callable[[int, int], object], total: int, smallest: int = 6
 
 
 def run_tasks(tasks: list[Callable[[], object]]) -> list[object]:
-    """Call independent functions in parallel and return their results in order."""
+    """Call independent functions in parallel and return their results in the order of `tasks`."""
     if num_threads() == 1 or len(tasks) < 2:
         return [task() for task in tasks]
     return list(_executor().map(lambda task: task(), tasks))

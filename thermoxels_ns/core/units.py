@@ -1,4 +1,4 @@
-"""Units: degrees Celsius for people, kelvin for the heat solver, [0, 1] for the optimiser."""
+"""Units of temperature: degrees Celsius for people, kelvin for the heat solver, [0, 1] for the optimiser."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 ZERO_CELSIUS_K = 273.15  # 0 degrees Celsius in kelvin (exact, BIPM)
 
-_SMALLEST_SPAN_K = 1e-3
-_CONSTANT_SCENE_SPAN_K = 1.0
+_SMALLEST_SPAN_K = 1e-3  # Least width of a range
+_CONSTANT_SCENE_SPAN_K = 1.0  # Width of the range of a scene whose temperatures are all the same
 
 Numbers = TypeVar("Numbers", float, np.ndarray, "torch.Tensor")
 
 
 def celsius_to_kelvin(temperature_c: Numbers) -> Numbers:
-    """Convert degrees Celsius to kelvin.
+    """Convert temperatures from degrees Celsius to kelvin.
 
     >>> celsius_to_kelvin(20.0)
     293.15
@@ -30,16 +30,16 @@ def celsius_to_kelvin(temperature_c: Numbers) -> Numbers:
 
 
 def kelvin_to_celsius(temperature_k: Numbers) -> Numbers:
-    """Convert kelvin to degrees Celsius."""
+    """Convert temperatures from kelvin to degrees Celsius."""
     return temperature_k - ZERO_CELSIUS_K  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
 class TemperatureRange:
-    """The span of a scene's temperatures, [degrees Celsius], that normalised values 0 and 1 stand for."""
+    """The range of a scene's temperatures, by which temperatures are normalised. Raises `ThermoxelsError` if empty."""
 
-    min_c: float
-    max_c: float
+    min_c: float  # Temperature with the normalised value 0, [degrees Celsius]
+    max_c: float  # Temperature with the normalised value 1, [degrees Celsius]
 
     def __post_init__(self) -> None:
         finite = np.isfinite(self.min_c) and np.isfinite(self.max_c)
@@ -50,7 +50,7 @@ class TemperatureRange:
 
     @classmethod
     def spanning(cls, min_c: float, max_c: float) -> TemperatureRange:
-        """Make a range from the data's extremes; a constant scene gets 1 K around its value (which becomes 0.5).
+        """Return the range between the data's extremes; if these nearly coincide, a range of 1 K around them.
 
         >>> TemperatureRange.spanning(20.0, 20.0)
         TemperatureRange(min_c=19.5, max_c=20.5)
@@ -66,11 +66,11 @@ class TemperatureRange:
         return self.max_c - self.min_c
 
     def normalise(self, temperature_c: Numbers) -> Numbers:
-        """Map degrees Celsius to normalised temperature; values outside the range leave [0, 1]."""
+        """Convert degrees Celsius to normalised temperature; values outside the range become values outside [0, 1]."""
         return (temperature_c - self.min_c) / self.span_k  # type: ignore[return-value]
 
     def to_celsius(self, thermal: Numbers) -> Numbers:
-        """Map normalised temperature to degrees Celsius.
+        """Convert normalised temperature to degrees Celsius.
 
         >>> TemperatureRange(10.0, 30.0).to_celsius(0.25)
         15.0

@@ -9,17 +9,17 @@ from thermoxels_ns.core.kernel_cache import kernel
 
 @kernel
 def cells_crossed(origin, direction, longest, shape, cells, faces):
-    """Write the voxels that a ray crosses, in order, and return how many they are (Amanatides and Woo 1987).
+    """Fill `cells` with the voxels that a ray crosses, in order, and return their number (Amanatides and Woo 1987).
 
     Coordinates are corner indices, lengths are in voxels.
 
     Args:
-        origin: Where the ray begins, in the lattice or not, shape (3,).
+        origin: Start of the ray, inside or outside the lattice, shape (3,).
         direction: Unit vector, shape (3,).
         longest: Length at which the ray ends.
-        shape: Voxels along each axis, shape (3,).
-        cells: Receives the numbers of the voxels in C order; shape (m,) with m at least the sum of `shape`.
-        faces: Receives the lengths at which the ray enters the first one and leaves each, shape (m + 1,).
+        shape: Number of voxels along each axis, shape (3,).
+        cells: Receives the flat indices (C order) of the voxels, shape (m,) with m at least the sum of `shape`.
+        faces: Receives the length at which the ray enters the first voxel, then at which it leaves each, (m + 1,).
     """
     voxel, step = np.empty(3, np.int64), np.empty(3, np.int64)
     next_face, across = np.empty(3), np.empty(3)

@@ -1,4 +1,4 @@
-"""Yaml files turned into checked dataclasses, and presets that change some fields of one."""
+"""Yaml files read into checked dataclasses, and presets that replace fields of a dataclass."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing_extensions import dataclass_transform
 
 from thermoxels_ns.core.errors import RecordError, ThermoxelsError, explain, printable
 
-if TYPE_CHECKING:  # pydantic is slow to import, and presets do without
+if TYPE_CHECKING:  # pydantic is slow to import, and presets do not need it
     from pydantic import ConfigDict, ValidationError
 
 Record = TypeVar("Record")
@@ -38,20 +38,20 @@ _EXPECTED = {
     "greater_than_equal": "a number of at least {ge:g}",
     "less_than_equal": "a number of at most {le:g}",
 }
-"""What is expected where pydantic raises an error of a type, with words of its context."""
-_MOST_TOLD = 20  # Mistakes of a file that are told at once
-_MOST_PARTS = 1_000_000  # Of the json that a file becomes
+"""Text for "expected" in our message by the type of pydantic's error; braces take values of the error's context."""
+_MOST_TOLD = 20  # Most mistakes that one message lists
+_MOST_PARTS = 1_000_000  # Most pieces of json text that a file may become
 
 
 def configs_folder() -> Path:
-    """Return the folder of our yaml files: inside an installed package, or beside it in a source tree."""
+    """Return the folder of our yaml files: inside the package if installed, beside the package in a source tree."""
     inside = _PACKAGE / "configs"
     return inside if inside.is_dir() else _PACKAGE.parent / "configs"
 
 
 @contextmanager
 def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
-    """Raise a `ThermoxelsError` of the block again as one of the caller's kind; a context, or a decorator."""
+    """Raise a `ThermoxelsError` of the block as `error`, with `before` in front of its text; context or decorator."""
     try:
         yield
     except ThermoxelsError as problem:
@@ -59,7 +59,7 @@ def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a yaml file whose content is a mapping without a key twice, or raise `ThermoxelsError`."""
+    """Return the mapping in a yaml file; raises `ThermoxelsError` if there is none, or it is empty or repeats a key."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
     except OSError as problem:
@@ -75,20 +75,20 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def wrong(name: str, expected: str, got: object, remedy: str = "Correct the file.") -> RecordError:
-    """Return the error for an entry of a file."""
+    """Return the error for a wrong file or an entry called `name`."""
     return RecordError(name, expected=expected, got=got, remedy=remedy)
 
 
 def shown(content: object) -> str:
-    """Return what was read as a message shows it."""
+    """Return content of a file in the form in which messages show it."""
     return "nothing" if content is None else repr(content)[:200]
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def record(error: type[ThermoxelsError]) -> Callable[[type[Record]], type[Record]]:
-    """Make a frozen dataclass whose values pydantic checks by their types; all mistakes are one `error`.
+    """Return a decorator for frozen dataclasses whose values pydantic checks by type; all mistakes raise one `error`.
 
-    ``__post_init__`` checks what concerns several fields, and raises an error of ours that is a ValueError.
+    A class may check several fields together in ``__post_init__`` by raising an error of ours that is a ValueError.
     """
     from pydantic import ValidationError
     from pydantic.dataclasses import dataclass
@@ -111,22 +111,22 @@ def record(error: type[ThermoxelsError]) -> Callable[[type[Record]], type[Record
 
 
 def as_record(name: str, content: Mapping[str, Any], target: type[Record]) -> Record:
-    """Return the content of a file as a dataclass whose fields without a default are required.
+    """Return the content of a file as an instance of the dataclass `target`.
 
-    `name` says for messages where the content stands, such as "winter.yaml". Raises `ThermoxelsError`, which names all
-    keys that are unknown or missing, and all values of a wrong kind or out of range.
+    `name` is the source of the content in messages, such as "winter.yaml". Raises `ThermoxelsError`, which lists the
+    keys that are unknown, or missing and without a default, and the values of a wrong kind or out of range.
     """
     from pydantic import TypeAdapter, ValidationError
 
     try:
         parts = list(islice(json.JSONEncoder(default=str).iterencode(content), _MOST_PARTS + 1))
-    except ValueError as problem:  # an entry that holds itself
+    except ValueError as problem:  # an entry contains itself
         raise wrong(name, "a yaml file", problem) from problem
-    if len(parts) > _MOST_PARTS:  # a few entries that refer to each other may stand for more than memory holds
+    if len(parts) > _MOST_PARTS:  # a few entries that repeat each other by reference may exceed the memory
         raise wrong(name, f"at most {_MOST_PARTS:,} entries", "more", "Do not refer to entries by & and *.")
-    alone: Any = tuple.__class_getitem__(target)  # hands the configuration on to dataclasses that have none
+    alone: Any = tuple.__class_getitem__(target)  # passes the configuration on to dataclasses without one
     try:
-        # Of json, pydantic takes lists for tuples and mappings for dataclasses, and converts nothing else.
+        # From json, strict pydantic accepts lists as tuples and mappings as dataclasses, and converts nothing else.
         return TypeAdapter(alone, config=_config(infinite=True)).validate_json(f"[{''.join(parts)}]")[0]
     except ValidationError as problem:
         raise ThermoxelsError(_report(name, problem, target, content)) from problem
@@ -137,7 +137,7 @@ def _config(infinite: bool = False) -> ConfigDict:
 
 
 def _report(name: str, problem: ValidationError, target: Any, content: Any, positional: list[str] | None = None) -> str:
-    """Return a line for each mistake, at most `_MOST_TOLD`; `positional` names fields that were given in order."""
+    """Return one line per mistake, at most `_MOST_TOLD`; `positional` names fields that may be given in order."""
     found: dict[tuple[str | int, ...], tuple[bool, str]] = {}
     for one in problem.errors(include_url=False):
         place, at, path, chosen = one["loc"], content, list[str | int](), False
@@ -147,10 +147,10 @@ def _report(name: str, problem: ValidationError, target: Any, content: Any, posi
             place = (positional[place[0]], *place[1:])
         for part in place:
             try:
-                at = at[part]  # the value, or what lacks it
+                at = at[part]  # the value, or the mapping that lacks the key
             except (TypeError, KeyError, IndexError):
                 if part is not place[-1] or one["type"] != "missing":
-                    chosen = True  # the place names one of several kinds that a value may have
+                    chosen = True  # this part is no key: it names one of several types that the value may have
                     continue
             path.append(part)
         chosen = chosen or one["type"] == "too_short"
@@ -161,7 +161,7 @@ def _report(name: str, problem: ValidationError, target: Any, content: Any, posi
 
 
 def _mistake(name: str, path: list[str | int], value: object, one: dict[str, Any], target: Any) -> str:
-    """Return one of pydantic's errors as a sentence of ours."""
+    """Return our message for one of pydantic's errors, about `value` at `path` in `name`."""
     kind, where, above = one["type"], _where(name, path), _where(name, path[:-1]) or target.__name__
     if kind == "value_error":
         return ": ".join(filter(None, (printable(where), str(one["ctx"]["error"]).removeprefix(": "))))
@@ -186,14 +186,14 @@ def _mistake(name: str, path: list[str | int], value: object, one: dict[str, Any
 
 
 def _where(name: str, path: list[str | int]) -> str:
-    """Name a place in a file, such as ``winter.yaml: surfaces entry 2: patches``."""
+    """Return the name of a place in a file, such as ``winter.yaml: surfaces entry 2: patches``."""
     for part in path:
         name = f"{name} entry {part + 1}" if isinstance(part, int) else f"{name}: {part}" if name else part
     return name
 
 
 def _keys_at(hint: Any, path: list[str | int]) -> tuple[str, ...]:
-    """Return the keys of the dataclass, or of several, that a path leads to from a type."""
+    """Return the keys of all dataclasses to which a path of keys leads from the type `hint`."""
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         if not path:
             return tuple(field.name for field in dataclasses.fields(hint) if field.init)
@@ -203,7 +203,7 @@ def _keys_at(hint: Any, path: list[str | int]) -> tuple[str, ...]:
 
 
 def _as_number(content: object) -> str:
-    """Return how to write a text that looks like a number: yaml takes 1e0 and 1.0e0 for text."""
+    """Return the remedy for a text where a number is expected; yaml reads 1e0 and 1.0e0 as texts."""
     number = math.nan
     with suppress(ValueError):
         number = float(content) if isinstance(content, str) else math.nan
@@ -216,7 +216,7 @@ def _as_number(content: object) -> str:
 
 
 def _meant(key: str, known: tuple[str, ...]) -> str:
-    """Return the known key that starts with the same word (air_k: air_c), or else is spelled much the same, or ""."""
+    """Return the known key that a wrong `key` probably means, by its first word (air_k: air_c) or spelling, or ""."""
     word = re.split(r"[_-]", key)[0]
     same = [name for name in known if name.split("_")[0] == word]
     close = difflib.get_close_matches(key, same or known, n=1, cutoff=0.0 if len(same) == 1 else 0.6)
@@ -224,7 +224,7 @@ def _meant(key: str, known: tuple[str, ...]) -> str:
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """Refuses a key that stands twice in one mapping, where yaml forgets the first."""
+    """Loader that raises `ConstructorError` for a key that is no text, or twice in a mapping (yaml keeps the last)."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set[str]()
@@ -245,14 +245,14 @@ Config = TypeVar("Config")
 
 
 def read_preset(name: str) -> dict[str, Any]:
-    """Read ``configs/<name>.yaml``, or raise `ThermoxelsError` if there is no such preset or it is not a mapping."""
+    """Read ``configs/<name>.yaml``, or raise `ThermoxelsError` if the file does not exist or is not a mapping."""
     return read_yaml(configs_folder() / f"{name}.yaml")
 
 
 def with_overrides(config: Config, overrides: Mapping[str, Any], name: str = "preset") -> Config:
-    """Return a copy of a (nested) dataclass, or of a dict of such, with some fields replaced; a list becomes a tuple.
+    """Return a copy of a (nested) dataclass, or a mapping of dataclasses, with the fields in `overrides` replaced.
 
-    Raises `ThermoxelsError` for a name that the configuration does not have.
+    A list becomes a tuple where the old value is one. Raises `ThermoxelsError` for a name that `config` does not have.
     """
     fields, changed = dict(config) if isinstance(config, Mapping) else vars(config), {}
     for key, value in overrides.items():

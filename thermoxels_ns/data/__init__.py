@@ -1,1 +1,1 @@
-"""From scene folders to rays and temperatures."""
+"""Readers of scene folders, which turn photographs and poses into rays and temperatures."""

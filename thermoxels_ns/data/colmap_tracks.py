@@ -1,4 +1,4 @@
-"""Feature rays of a scene, from its file of tracks or a COLMAP model."""
+"""Feature rays of a scene, from its file of tracks or from a COLMAP model in its folder."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from thermoxels_ns.data.tracks import (
 from thermoxels_ns.data.transforms_json import path_inside
 
 MOST_OFF_PX = 2.0
-"""Median distance in a photograph between points as the model's pose and as the given one sees them, above which the
-photograph is left out."""
+"""A photograph is left out if points seen from the model's pose and from the given pose are farther apart than this
+(median over its points)."""
 LEAST_AGREEING = 0.7
-"""Share of the photographs in common whose poses must agree; with fewer the model belongs to other poses."""
+"""Share of the photographs with points whose poses must agree; with fewer, the model belongs to other poses."""
 _PARTS = ("cameras", "images", "points3D")
-_ROUNDS = 20
-_FEWEST = 3  # cameras from which a similarity is found; fewer cannot outvote a wrong one
-_STRAY = 5.0  # medians of the misfit above which a camera takes no part in the last fit
+_ROUNDS = 20  # most rounds of `align_poses`
+_FEWEST = 3  # least number of cameras for a similarity; fewer cannot outvote a wrong pose
+_STRAY = 5.0  # a camera whose misfit is above so many medians takes no part in the last fit
 
 TrackSource = Literal["auto", "given", "off"]
 
 
 def find_feature_rays(scene: SceneFile, training: Sequence[int], source: TrackSource = "auto") -> FeatureRays | None:
-    """Return the feature rays of the photographs that train, in input coordinates; None for a scene without tracks.
+    """Return the feature rays of the photographs that train, in input coordinates; None if there are no tracks.
 
-    "auto" takes the file that the json names, else a COLMAP model in the scene's folder; "given" takes the file alone.
-    A COLMAP model that cannot be used is left out with a warning, because nobody asked for it.
+    `training` holds indices of frames. "auto" takes the file of tracks that the json names, else a COLMAP model in the
+    scene's folder, which gives a warning and None if it cannot be used. "given" takes the file alone.
 
     Raises:
         SceneError: The file that the json names lies outside the scene, cannot be used, or does not fit the poses.
@@ -65,11 +65,11 @@ def find_feature_rays(scene: SceneFile, training: Sequence[int], source: TrackSo
 
 
 def read_colmap_tracks(scene: SceneFile) -> SparseTracks | None:
-    """Return the tracks of the COLMAP model in a scene's folder, brought to the scene's poses; None without a model.
+    """Return the tracks of the COLMAP model in a scene's folder, in input coordinates; None if there is no model.
 
-    Photographs are matched by name. The similarity between the model's cameras and the json's poses moves the points.
-    How well both agree is measured in the photographs: how far apart a point is seen from the model's pose and from the
-    given one. Photographs that do not agree are left out and named.
+    Photographs are matched by name. Points are moved by the similarity from the model's cameras to the json's poses.
+    Two poses of a photograph agree if points appear less than `MOST_OFF_PX` apart from both (median). Sightings of
+    photographs whose poses do not agree are left out, and these photographs are printed.
 
     Raises:
         SceneError: The model is damaged, is not of these photographs, or too few of its poses agree.
@@ -135,10 +135,10 @@ def _is_model(folder: Path) -> bool:
 
 
 def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, int]]:
-    """Return the numbers (image, frame) of the same photographs, matched by the name of the file.
+    """Return the pairs (image, frame) of indices that belong to the same photograph, matched by file name.
 
-    Where several images have that name, the image counts whose folders end the frame's name too; where several do, the
-    image with the longest such name.
+    If several images or frames have the same file name, the frame's name must end with the image's name, folders
+    included, and the longest such image is taken. Images that then belong to several frames are left out.
     """
     of_name: dict[str, list[int]] = {}
     for number, image in enumerate(images):
@@ -165,7 +165,7 @@ def _off_px(
     frame: IntArray,
     point: IntArray,
 ) -> FloatArray:
-    """Return how far apart a frame's two poses see its points: the median angle times the focal length, (frames,)."""
+    """Return how far apart points appear from a frame's two poses, (frames,), [pixels]; NaN for a frame without any."""
     seen = []
     for poses, points in (model, given):
         line = np.einsum("sji,sj->si", poses[frame, :3, :3], points[point] - poses[frame, :3, 3])
@@ -179,12 +179,12 @@ def _off_px(
 
 
 def align_poses(source: FloatArray, target: FloatArray) -> FloatArray | None:
-    """Find the similarity (4, 4) from one world to another that brings cameras (n, 4, 4) of the first to the second.
+    """Return the similarity (4, 4) that brings camera poses `source` (n, 4, 4) of one world to `target` of another.
 
-    The rotation is the mean of the rotations between the cameras' axes, so that cameras on one line are enough; scale
-    and translation fit the centres by least squares. The half of the cameras that fits worst is left out and the fit
-    repeated until that half stays the same (least trimmed squares), so that some wrong poses do not move the others.
-    Last, all cameras but strays are fitted. None: there are fewer than three cameras, or all stand at one place.
+    The rotation is the mean of the rotations between the cameras' axes, so that cameras on one line suffice. Scale and
+    translation fit the centres by least squares. The worse half of the cameras is left out and the fit repeated until
+    that half stays the same (least trimmed squares), so that single wrong poses do not matter. The last fit uses all
+    cameras but strays (`_STRAY`). Return None for fewer than three cameras, or if all stand at one place.
     """
     if len(source) < _FEWEST:
         return None
@@ -217,7 +217,7 @@ def _fit(source: FloatArray, target: FloatArray) -> FloatArray | None:
 
 
 def _misfit(similarity: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:
-    """Return of each camera the distance of its centres, relative to the spread of all, plus the angle of its axes."""
+    """Return per camera the distance of its centres, relative to the spread of all, plus the angle [radians], (n,)."""
     moved, wanted = similarity @ source, target[:, :3, 3]
     spread = np.median(np.linalg.norm(wanted - np.median(wanted, axis=0), axis=1))
     off = np.linalg.norm(moved[:, :3, 3] - wanted, axis=1) / max(spread, 1e-300)

@@ -25,7 +25,7 @@ from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.ray_sampler import RaySampler, draw_generator
 
 _TRAIN, _EVAL, _EVAL_IMAGE = 0, 1, 2
-_WIDEST = np.deg2rad(80.0)  # angle from the optical axis up to which a pinhole stands for a fisheye lens
+_WIDEST = np.deg2rad(80.0)  # largest angle from the optical axis in the pinhole view of a fisheye lens
 _CUBE = np.array(
     [
         [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -37,36 +37,36 @@ _CUBE = np.array(
     ],
     dtype=np.float64,
 )
-"""Rotations, by columns x right, y up, z back, whose view directions are the six half axes."""
+"""Rotations of six cameras that look along the half axes, shape (6, 3, 3); columns are x right, y up, z back."""
 
 
 @dataclass
 class ThermalDataManagerConfig(VanillaDataManagerConfig):
-    """Two streams of precomputed rays from paired photographs."""
+    """Batches of rays from paired photographs, in two streams: colour and temperature."""
 
     _target: type = field(default_factory=lambda: ThermalDataManager)
     """Class to instantiate."""
     dataparser: AnnotatedDataParserUnion = field(default_factory=ThermalDataParserConfig)
-    """Reads the scene; thermal-data is the one that gives thermal images."""
+    """Dataparser that reads the scene; only thermal-data gives thermal images."""
     train_num_rays_per_batch: int = 4096
-    """Rays through photographs per training step. Where a pair shares its camera they carry the temperature too."""
+    """Rays through photographs per training step. If a pair shares its camera, these rays carry temperature too."""
     thermal_num_rays_per_batch: int = 2048
-    """Rays of the thermal cameras per training step, beside those of the photographs. Used only where a thermal
-    camera is not its photograph's (own pose, intrinsics or resolution)."""
+    """Rays through thermal images per training step, beside the rays through photographs. Used only if thermal cameras
+    differ from the photographs' in pose, intrinsics or resolution."""
     eval_num_rays_per_batch: int = 4096
-    """Rays through photographs per evaluation batch; thermal rays in the proportion of training."""
+    """Rays through photographs per evaluation batch. Thermal rays are added in the proportion of training."""
     streams: Literal["both", "rgb", "thermal"] = "both"
-    """Which photographs train: both, colour only, or thermal only (the baseline that sees no colour)."""
+    """Images that train: both, rgb (photographs only) or thermal (thermal images only, the baseline without colour)."""
     seed: int = 42
-    """Start of the random numbers. A batch depends on the seed and the step alone, so a resumed training repeats
-    the batches of an uninterrupted one."""
+    """Seed of the random numbers. A batch depends on the seed and the step alone, so that a resumed training draws the
+    same batches as an uninterrupted training."""
 
 
 class ThermalDataManager(VanillaDataManager[ThermalDataset]):
-    """Serves batches of colour and thermal rays of one scene, in this process.
+    """Source of batches of colour and thermal rays of one scene, made in this process.
 
-    In training (test_mode "val") a batch depends on seed and step alone. In the other modes nerfstudio's exporters ask
-    for step 0 again and again and want new rays each time, so there the number of the call takes the step's place.
+    In training (test_mode "val") a training batch depends on seed and step alone. In other modes the number of the call
+    replaces the step: nerfstudio's exporters ask for step 0 every time and need new rays each time.
     """
 
     config: ThermalDataManagerConfig
@@ -74,7 +74,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     eval_dataset: ThermalDataset
 
     def setup_train(self) -> None:
-        """Precompute the rays and load the photographs of the training split; report what is masked."""
+        """Make the rays and load the photographs of the training split; print how many thermal pixels are masked."""
         # Stock exporters and dynamic batches set the number of rays on this object.
         self.train_pixel_sampler = PixelSamplerConfig(num_rays_per_batch=self.config.train_num_rays_per_batch).setup()
         self.train_rays.load()
@@ -87,7 +87,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         )
 
     def setup_eval(self) -> None:
-        """Prepare whole evaluation images; rays of the evaluation split are made when first asked for."""
+        """Prepare whole evaluation images; the rays of the evaluation split are made at the first `next_eval`."""
         self.eval_pixel_sampler = PixelSamplerConfig(num_rays_per_batch=self.config.eval_num_rays_per_batch).setup()
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
         self.eval_dataloader = RandIndicesEvalDataloader(self.eval_dataset, device=self.device)
@@ -106,9 +106,9 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         return RaySampler(self.eval_dataset, self.config.streams, storage, self.device)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Return the training batch of a step: rays, and ``image`` (n, 3) and ``thermal`` (n, 1) targets.
+        """Return the training batch of a step: rays, and their targets ``image`` (n, 3) and ``thermal`` (n, 1).
 
-        ``ray_bundle.metadata["stream"]`` says which targets a ray has (see `thermoxels_ns.core.feature_rays`).
+        ``ray_bundle.metadata["stream"]`` says which targets a ray has (bits of `thermoxels_ns.core.feature_rays`).
         """
         number = step if self.test_mode == "val" else self.train_count
         self.train_count += 1
@@ -116,7 +116,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         return self.train_rays.draw(generator, self._rgb_rays(), self.config.thermal_num_rays_per_batch)
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Return a batch of evaluation rays with the keys of `next_train`."""
+        """Return a batch of rays of the evaluation split, in the form of `next_train`."""
         self.eval_count += 1
         rgb_rays = self.config.eval_num_rays_per_batch
         share = self.config.thermal_num_rays_per_batch / max(self.config.train_num_rays_per_batch, 1)
@@ -124,7 +124,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         return self.eval_rays.draw(generator, rgb_rays, max(round(rgb_rays * share), 1))
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
-        """Return one whole evaluation image; which one depends on seed and step alone."""
+        """Return the camera and the item of one evaluation image, chosen by seed and step alone."""
         generator = draw_generator(self.config.seed, self.local_rank, _EVAL_IMAGE, step)
         index = int(torch.randint(len(self.eval_dataset), (1,), generator=generator))
         return self.eval_dataloader.get_camera(index)
@@ -132,17 +132,17 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     def training_rays(
         self, stream: int, max_rays_per_image: int | None = None, *, stride: int = 1, chunk: int = 16384
     ) -> Iterator[RayBundle]:
-        """Yield training rays on a regular grid of pixels, always the same ones, without decoding photographs.
+        """Yield training rays through the pixels of a regular grid, always the same, without decoding photographs.
 
-        `stream` holds bits of `core.feature_rays`: the thermal bit gives valid pixels only, both bits give every ray
-        once; a stream that does not train (see the option streams) gives nothing. `stride` takes every n-th pixel in
-        both directions, and is widened per photograph until at most `max_rays_per_image` remain. A bundle has at most
-        `chunk` rays.
+        `stream` holds bits of `core.feature_rays`. The thermal bit alone gives rays through valid thermal pixels; both
+        bits together give every ray once. Streams that do not train (option `streams`) give no rays. The grid has every
+        `stride`-th pixel in both directions, or fewer, until at most `max_rays_per_image` remain in an image. A bundle
+        has at most `chunk` rays. Raises ValueError for an unknown stream or a number below 1.
         """
         return self.train_rays.grid(stream, stride, max_rays_per_image, chunk)
 
     def training_views(self) -> Views:
-        """Return the cameras of the streams that train: the photographs', and the thermal ones where they differ."""
+        """Return the cameras of the streams that train: the photographs', and thermal cameras where these differ."""
         dataset, streams = self.train_dataset, self.config.streams
         chosen = []
         if streams != "thermal" or dataset.thermal_cameras is None:
@@ -153,7 +153,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         return Views(*(np.concatenate(arrays) for arrays in zip(*(vars(part).values() for part in parts))))
 
     def get_train_rays_per_batch(self) -> int:
-        """Return how many rays `next_train` gives."""
+        """Return the number of rays in a batch of `next_train`."""
         thermal = 0 if self.train_dataset.shares_camera else self.config.thermal_num_rays_per_batch
         rgb = self._rgb_rays()
         return {"both": rgb + thermal, "rgb": rgb, "thermal": thermal or rgb}[self.config.streams]
@@ -164,11 +164,11 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
 
 
 def views_of_cameras(cameras: Cameras) -> Views:
-    """Return views (pinholes without distortion) that stand for cameras, in order.
+    """Return pinhole views without distortion that approximate `cameras`, in the same order.
 
-    Lens distortion is ignored, so at the border of a distorted photograph a view reaches a little too far or not far
-    enough. A fisheye lens becomes a pinhole with the same focal length whose image spans the same angles along both
-    axes, at most 80 degrees to each side; a panorama (equirectangular) becomes the six sides of a cube.
+    Lens distortion is ignored, so a view may end a little inside or outside the border of a distorted photograph. A
+    fisheye lens becomes a pinhole with the same focal length whose image spans the same angles along both axes, at most
+    80 degrees to each side. A panorama (equirectangular) becomes six views, the sides of a cube.
     """
     cameras = cameras.to("cpu")
 

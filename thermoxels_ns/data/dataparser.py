@@ -30,18 +30,17 @@ from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixel
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
 _FAR_SIDES = 16.0
-"""Distance from the origin, in longest sides of the box, from which shifts in single precision are off by more than a
-millionth of the box, as in national coordinates."""
+"""Distance of the box from the origin, in longest sides of the box, beyond which a shift in single precision is wrong
+by more than a millionth of the box. National coordinates are so far away."""
 _LEAST_THAT_MEETS = 0.01  # share of the rays that must meet the scene box
-_COLDEST_SKY_K = 150.0  # How far a clear sky may be below the lowest temperature that somebody declares, [K]
+_COLDEST_SKY_K = 150.0  # a file's median may be this far below the declared lowest temperature: it shows a clear sky
 _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
-"""Median from which on a file may hold kelvins, and how far it may then be from the other files."""
-_MOST_FRAMES = 64  # frames per resolution that the search for dead pixels keeps in memory
-
+"""A file whose median is at least the first holds kelvins if the median less 273.15 is within the second of others."""
+_MOST_FRAMES = 64  # training files in which stuck pixels are sought
 
 LONGEST_SIDE = 640  # pixels along the longer side of the pictures in which features are sought
 MOST_PHOTOGRAPHS = 500  # with more, poses stay as given: the normal equations would take minutes
-FEWEST_PHOTOGRAPHS = 3
+FEWEST_PHOTOGRAPHS = 3  # with fewer, poses stay as given
 
 PoseSource = Literal["auto", "given"]
 SplitMode = Literal["auto", "filename", "lists", "interval"]
@@ -50,42 +49,43 @@ _KEYS = {"train": "train_filenames", "val": "val_filenames", "test": "test_filen
 
 @dataclass
 class ThermalDataParserConfig(DataParserConfig):
-    """Scenes of paired colour and thermal photographs: ThermoScenes layout, or a thermal camera of its own."""
+    """Scenes of paired colour and thermal photographs, as in ThermoScenes or with thermal cameras of their own."""
 
     _target: type = field(default_factory=lambda: ThermalDataParser)
     """Class to instantiate."""
     data: Path = Path()
     """Scene folder (with transforms.json or transforms_thermal.json), or the json itself."""
     downscale_factor: Optional[int] = None  # noqa: UP045 - read by tyro
-    """Divide the resolution of the colour photographs by this; they are resized when loaded, nothing is written.
-    Thermal images keep their resolution. Default: full resolution."""
+    """Divide the resolution of the colour photographs by this number. Photographs are resized when loaded; no file is
+    written. Thermal images keep their resolution. Default: full resolution."""
     scene_box: Optional[tuple[tuple[float, float, float], tuple[float, float, float]]] = None  # noqa: UP045
     """Box to reconstruct, in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax. Default: scene_box in
-    the json, else from the sparse points, else from depths that photographs agree on, else from the cameras."""
+    the json, else found from the sparse points, else from depths that photographs agree on, else from the cameras."""
     eval_mode: SplitMode = "auto"
-    """Which frames evaluate. auto takes the first that the scene has: names with frame_train_ / frame_eval_, the lists
-    train_filenames / val_filenames / test_filenames in the json, every eval_interval-th frame."""
+    """How frames are split into training and evaluation. filename: by frame_train_ / frame_eval_ in the names. lists:
+    by train_filenames / val_filenames / test_filenames in the json. interval: every eval_interval-th frame evaluates.
+    auto: the first of these three that suits the scene."""
     eval_interval: int = 8
-    """Every n-th frame by sorted name evaluates (eval_mode interval), from half of it on, so that the ends of the
-    sequence stay in training."""
+    """With n here and eval_mode interval, every n-th frame by sorted name evaluates. Counting starts in the middle of
+    the first n frames, so that the ends of the sequence stay in training."""
     missing_thermal: Literal["error", "skip"] = "error"
-    """A frame without a thermal image: stop, or leave the frame out and name it."""
+    """What happens to a frame without a thermal image. error: stop. skip: leave the frame out and print its name."""
     valid_range_c: tuple[float, float] = (-100.0, 2000.0)
     """Temperatures outside this range are masked, in degrees Celsius."""
     tracks: TrackSource = "auto"
-    """Which photographs saw which points, from structure from motion: they tell training what is air. auto: the file
-    that the json names (tracks_file_path), else a COLMAP model in the scene's folder (colmap/sparse/0, colmap or
-    sparse/0) whose poses are those of the json; given: only the file; off: none."""
+    """Source of tracks: which photographs saw which points in structure from motion. Tracks tell training what is air.
+    auto: the file that the json names (tracks_file_path), else a COLMAP model in the scene's folder (in colmap or
+    sparse) whose poses are those of the json. given: only the file. off: no tracks."""
     refine_poses: PoseSource = "auto"
-    """Whose poses train. auto: where the scene has no tracks, and features that photographs share fit better with
-    poses adjusted to them (bundle adjustment), those; given: the json's."""
+    """Poses to train with. auto: poses adjusted to features that photographs share (bundle adjustment), if the scene
+    has no tracks and the adjusted poses fit better than the json's; else the json's. given: the json's."""
 
 
 @dataclass(frozen=True)
 class _Scene:
-    """All that training and evaluation share; made from all frames, so that both agree.
+    """The content of one scene that training and evaluation share, read once from all frames.
 
-    A point p of input coordinates lies at scale * (p + translation) in nerfstudio's world; the axes stay.
+    A point p in input coordinates lies at scale * (p + translation) in nerfstudio's world, without a rotation.
     """
 
     file: SceneFile
@@ -93,30 +93,30 @@ class _Scene:
     shapes: dict[Path, tuple[int, int]]  # height and width of every thermal file
     translation: FloatArray
     scale: float
-    metadata: dict[str, Any]  # what the outputs of all splits hold
-    box: SceneBox
-    feature_rays: FeatureRays | None  # what the training photographs see of the tracks; nerfstudio's world
-    adjusted: bool  # whether the poses of training photographs are others than the json's
+    metadata: dict[str, Any]  # entries that the outputs of all splits hold
+    box: SceneBox  # in nerfstudio's world
+    feature_rays: FeatureRays | None  # rays from training photographs to points of tracks, in nerfstudio's world
+    adjusted: bool  # True if `refine_poses` changed the poses of the training photographs
     fitted: dict[int, FloatArray]
-    """Poses (4, 4) that were fitted to held-out photographs, in input coordinates, by number of the frame."""
+    """Poses (4, 4) fitted to held-out photographs, in input coordinates, by the frame's index in `file.frames`."""
 
     def placed(self, poses: Sequence[FloatArray]) -> torch.Tensor:
-        """Return camera-to-world matrices (4, 4) in nerfstudio's world, shape (n, 3, 4) float32."""
+        """Return camera-to-world matrices (4, 4) of input coordinates in nerfstudio's world, (n, 3, 4) float32."""
         moved = np.stack(poses)[:, :3]
         moved[:, :, 3] = self.scale * (moved[:, :, 3] + self.translation)
         return torch.from_numpy(moved.astype(np.float32))
 
 
 class ThermalDataParser(DataParser):
-    """Reads a scene of paired photographs; see `ThermalDataParserConfig`.
+    """Reader of a scene of paired photographs, with the options of `ThermalDataParserConfig`.
 
-    The outputs' metadata hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``, ``thermal_cameras``
-    (`Cameras` of the split, or None where a pair shares camera and resolution), ``thermal_unit``, ``valid_range_c``,
-    ``thermal_dead_pixels`` (a mask of stuck pixels by shape of the image), ``image_scale`` (1 / downscale_factor),
-    ``pixel_size`` (width of a pixel where most of what is seen stands, in the world), ``input_box`` (the scene box in
-    input coordinates), ``scene_name`` and, for train, ``feature_rays`` (`FeatureRays`, or None without tracks).
-    Where poses were adjusted, ``adjusted_poses`` are those of training photographs (camera to world in input
-    coordinates, by the photograph's name), and ``fitted_poses`` (n, 3, 4) those of held-out ones; else both are None.
+    The metadata of its outputs hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``,
+    ``thermal_cameras`` (`Cameras`; None if all pairs share camera and resolution), ``thermal_unit``, ``valid_range_c``,
+    ``thermal_dead_pixels`` (masks of stuck pixels by shape of the image), ``image_scale`` (1 / downscale_factor),
+    ``pixel_size`` (width of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the
+    scene box in input coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None unless train has tracks).
+    If `refine_poses` adjusted poses, ``adjusted_poses`` of train maps file names to poses (camera to world, input
+    coordinates), and ``fitted_poses`` of val and test are camera to world in nerfstudio's world, (n, 3, 4); else None.
     """
 
     config: ThermalDataParserConfig
@@ -182,7 +182,7 @@ class ThermalDataParser(DataParser):
         box = evidence.box()
         translation, longest = -box.mean(axis=0), float((box[1] - box[0]).max())
         if np.abs(box).max() > _FAR_SIDES * longest:
-            # nerfstudio keeps the way back in single precision; without rounding here, both would differ by metres.
+            # nerfstudio keeps dataparser_transform in single precision; unrounded, the two would differ by metres.
             translation = translation.astype(np.float32).astype(np.float64)
         scale = SCENE_SIZE / longest
         paths, training = [f.thermal for f in file.frames], [file.frames[index] for index in split.train]
@@ -221,9 +221,9 @@ class ThermalDataParser(DataParser):
 
 
 def _share_that_meets(frames: list[Frame], poses: torch.Tensor, box: SceneBox, source: str) -> float:
-    """Return the share of the rays of photographs that meet the scene box, on a grid of 8 x 8 rays each.
+    """Return the share of rays, 8 x 8 per photograph, that meet the scene box; 1 if any lens is not perspective.
 
-    Lenses other than perspective ones count as seeing it. Raises `SceneError` where next to no ray does.
+    Raises `SceneError` if the share is below `_LEAST_THAT_MEETS`. `source` says in the message where `box` comes from.
     """
     corners, shares = box.aabb.double().numpy(), []
     x, y = (each.ravel() for each in np.meshgrid(*2 * [(np.arange(8) + 0.5) / 8]))
@@ -249,7 +249,7 @@ def _share_that_meets(frames: list[Frame], poses: torch.Tensor, box: SceneBox, s
 
 
 def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int]]) -> None:
-    """Refuse thermal images of several sizes beside photographs of one size, unless each has a camera of its own."""
+    """Raise `SceneError` if thermal images without a thermal camera differ in size and their photographs do not."""
     shared = [frame for frame in frames if frame.thermal_intrinsics is None]
     sizes: defaultdict[tuple[int, int], Counter[tuple[int, int]]] = defaultdict(Counter)
     for frame in shared:
@@ -264,10 +264,7 @@ def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int
 
 
 def _refuse_beyond_bounds(middles_c: dict[Path, float], bounds_c: tuple[float, float]) -> None:
-    """Refuse files whose median is further from the declared bounds than these are wide: they have another unit.
-
-    Below the bounds that is at least `_COLDEST_SKY_K`: a clear sky may be colder than anybody declares.
-    """
+    """Raise `ThermalFileError` for a file whose median is so far from the declared bounds that its unit must differ."""
     width = bounds_c[1] - bounds_c[0]
     least, most = bounds_c[0] - max(width, _COLDEST_SKY_K), bounds_c[1] + max(width, _SAME_PLACE_K)
     for path, middle in middles_c.items():
@@ -279,7 +276,7 @@ def _refuse_beyond_bounds(middles_c: dict[Path, float], bounds_c: tuple[float, f
 
 
 def _refuse_mixed_units(middles_c: dict[Path, float]) -> None:
-    """Refuse files that read 273 K more than the others, by their medians: they hold kelvins."""
+    """Raise `ThermalFileError` if the medians of some files are about 273 degrees above the rest: they hold kelvins."""
     usual = [middle for middle in middles_c.values() if middle < _LEAST_OF_KELVINS]
     shifted = [
         path.name
@@ -299,13 +296,14 @@ def survey_thermal_files(
     bounds_c: tuple[float, float] | None,
     training: Collection[Path],
 ) -> tuple[dict[Path, tuple[int, int]], TemperatureRange, dict[tuple[int, int], BoolArray]]:
-    """Read every thermal file; return their shapes, the temperature range, and masks of stuck pixels by shape.
+    """Read every thermal file; return its shape (h, w) by path, the temperature range, and masks of stuck pixels.
 
-    Range and stuck pixels come from the files in `training` alone. The range that the scene declares, `bounds_c`, is
-    widened to the extremes of training files; files that hold shares of that range cannot exceed it. [degrees Celsius]
+    A mask holds for all files of its shape; a shape without stuck pixels has none. Range and stuck pixels come from the
+    files in `training` alone. The range is that of the scene, `bounds_c` [degrees Celsius], where given, widened to the
+    extremes of the training files.
 
     Raises:
-        ThermalFileError: A file cannot be read, has no valid pixel, or has another unit than bounds or other files.
+        ThermalFileError: A file cannot be read or has no valid pixel, or its median tells of another unit.
     """
     shapes: dict[Path, tuple[int, int]] = {}
     extremes: dict[Path, tuple[float, float]] = {}
@@ -333,7 +331,7 @@ def survey_thermal_files(
     dead = {shape: find_dead_pixels(np.stack(frames)) for shape, frames in kept.items()}
     dead = {shape: mask for shape, mask in dead.items() if mask.any()}
     for path in extremes:
-        if shapes[path] in dead:  # the extremes of these files may be a stuck pixel's
+        if shapes[path] in dead:  # a stuck pixel may hold the file's extreme
             live = read_thermal_file(path, unit, valid_range_c).temperature_c[~dead[shapes[path]]]
             if np.isfinite(live).any():
                 extremes[path] = (float(np.nanmin(live)), float(np.nanmax(live)))
@@ -345,7 +343,7 @@ def survey_thermal_files(
 
 
 def _thermal_intrinsics(frame: Frame, shape: tuple[int, int]) -> Camera:
-    """Return a thermal image's camera: its own, or the photograph's at the thermal resolution."""
+    """Return the camera of a thermal image of `shape` (h, w), or raise `SceneError` if that shape does not fit it."""
     height, width = shape
     own = frame.thermal_intrinsics
     if own is not None:
@@ -381,7 +379,7 @@ def _cameras(intrinsics: list[Camera], poses: torch.Tensor) -> Cameras:
 
 
 def _same_cameras(first: Cameras, second: Cameras) -> bool:
-    """Return whether both give the same rays for the same pixels."""
+    """Return whether two sets of cameras have the same pixels with the same rays through them, up to rounding."""
     return all(
         torch.equal(getattr(first, name), getattr(second, name)) for name in ("width", "height", "camera_type")
     ) and all(
@@ -392,25 +390,26 @@ def _same_cameras(first: Cameras, second: Cameras) -> bool:
 
 @dataclass(frozen=True)
 class Split:
-    """Positions of frames in the sorted list of names."""
+    """Frames that train and frames that evaluate, as indices into the list of frames sorted by name."""
 
     train: list[int]
     val: list[int]
-    test: list[int]
-    how: str  # how the split was made, for the report
+    test: list[int]  # often the same as `val`
+    how: str  # how the split was made, in words for the report
 
 
 def split_frames(
     names: Sequence[str], meta: Mapping[str, Any], mode: SplitMode, interval: int, left_out: Sequence[str] = ()
 ) -> Split:
-    """Split frames, given by their sorted names, into training and evaluation.
+    """Split frames, given by their sorted `names`, into training and evaluation.
 
-    "auto" takes the first that the scene has: names with frame_train_ and frame_eval_, lists in the json
-    (train_filenames, val_filenames, test_filenames), every n-th frame from half the interval on, so that the ends of
-    the sequence, which the other frames see least, stay in training. Lists may hold names in `left_out`.
+    "filename" splits by frame_train_ and frame_eval_ in the names, "lists" by train_filenames, val_filenames and
+    test_filenames of `meta`, the json. "interval" evaluates every `interval`-th frame from index interval // 2 on, so
+    that the ends of the sequence train. "auto" takes the first of the three that suits the scene. Lists may name
+    frames in `left_out`, which are skipped.
 
     Raises:
-        SceneError: A side is empty, a frame is on both sides or a listed name is unknown.
+        SceneError: A side is empty, a frame is on both sides, a name is untagged or unknown, or `interval` is below 2.
     """
     tagged = [("frame_train_" in Path(n).name, "frame_eval_" in Path(n).name) for n in names]
     if mode == "filename" or (mode == "auto" and any(train or test for train, test in tagged)):
@@ -445,7 +444,8 @@ def split_frames(
 
 
 def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[str]) -> Split:
-    """Split by the lists in the json; a list that is absent holds the frames that no other list holds."""
+    """Split by the lists in the json. Without a list of one side, training or evaluation, the side gets all other
+    frames. If only one of val and test is listed, both hold its frames."""
     position = {Path(name).as_posix(): i for i, name in enumerate(names)}
     found: dict[str, list[int]] = {}
     for side, key in _KEYS.items():
@@ -471,14 +471,14 @@ def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[
 def refine_poses(
     scene: SceneFile, training: Sequence[int], say: Callable[[str], None]
 ) -> tuple[SceneFile, dict[int, FloatArray]]:
-    """Adjust the poses of the photographs that train to each other, if features that took no part then fit better.
+    """Adjust the poses of training photographs by bundle adjustment, if features held back from it then fit better.
 
-    Thermal cameras of their own follow their photographs. Held-out photographs keep the poses given, so that they
-    judge; the poses fitted to their own features are returned beside.
+    `training` holds indices of frames; all other frames are held out and keep their poses, so that evaluation stays
+    independent. A thermal camera with a pose of its own moves with its photograph. `say` receives the result in words.
 
     Returns:
-        The scene with poses adjusted (the same scene if those given fit), and by number of the frame the poses (4, 4)
-        that were fitted to held-out photographs.
+        The scene with adjusted poses (`scene` itself if nothing was adjusted), and the poses (4, 4) that fit the
+        features of held-out photographs, by index of the frame.
     """
     began = time.perf_counter()
     frames = scene.frames
@@ -521,7 +521,7 @@ def refine_poses(
 
 
 def _picture(frame: Frame) -> tuple[npt.NDArray[np.uint8], BoolArray | None, Camera]:
-    """Return a photograph in grey of at most `LONGEST_SIDE` pixels, its mask, and its camera at that size."""
+    """Return a photograph in grey, at most `LONGEST_SIDE` pixels long, its mask (None: none), and its camera there."""
     grey, mask = frame.read_picture("L", LONGEST_SIDE)
     factor = LONGEST_SIDE / max(grey.size)
     if factor < 1.0:

@@ -1,4 +1,4 @@
-"""nerfstudio dataset of paired photographs: colour as nerfstudio gives it, temperature beside it."""
+"""nerfstudio dataset of paired photographs: colour images as in nerfstudio, and thermal images."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from thermoxels_ns.radiometry.thermal_pixels import PixelReport, read_thermal_fi
 
 
 class ThermalDataset(InputDataset):
-    """Photographs of one split with their thermal partners.
+    """Photographs of one split with their thermal images.
 
-    An item holds ``image_idx``, ``image`` (h, w, 3), ``mask`` where the scene has masks, ``thermal`` (ht, wt, 1)
-    float32 normalised by the scene's range and 0 where invalid, and ``thermal_valid`` (ht, wt, 1) bool. Where the
-    thermal camera is not the photograph's, it holds ``thermal_camera``, nerfstudio `Cameras` of shape (1,). Where poses
-    were fitted to held-out photographs, it holds ``fitted_camera`` and ``fitted_thermal_camera``.
+    An item holds ``image_idx``, ``image`` (h, w, 3), ``mask`` if the scene has masks, ``thermal`` (ht, wt, 1) float32,
+    normalised by the scene's range and 0 where invalid, and ``thermal_valid`` (ht, wt, 1) bool; if thermal cameras
+    differ from the photographs', ``thermal_camera``, nerfstudio `Cameras` of shape (1,); if poses were fitted to
+    held-out photographs, ``fitted_camera`` and, beside a thermal camera, ``fitted_thermal_camera``.
     """
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
@@ -42,17 +42,17 @@ class ThermalDataset(InputDataset):
         self.temperature_range: TemperatureRange = self.metadata["temperature_range"]
         self.thermal_cameras: Cameras | None = self.metadata["thermal_cameras"]
         if self.thermal_cameras is None and scale_factor != 1.0:
-            # The photographs change their resolution here, the thermal images do not.
+            # `scale_factor` changes the resolution of the photographs, not of the thermal images.
             self.thermal_cameras = deepcopy(dataparser_outputs.cameras)
         self._thermal: dict[int, tuple[Tensor, Tensor, PixelReport]] = {}
 
     @property
     def shares_camera(self) -> bool:
-        """True where one ray carries a colour and a temperature."""
+        """True if photographs and thermal images share cameras, so that one ray carries a colour and a temperature."""
         return self.thermal_cameras is None
 
     def camera(self, image_idx: int, thermal: bool = False) -> Camera | None:
-        """Camera of a photograph, or of its thermal image where that has one of its own; None unless perspective."""
+        """Return the camera of a photograph, or with `thermal` that in `thermal_cameras`; None if not perspective."""
         cameras: Any = self.thermal_cameras if thermal else self.cameras
         if int(cameras.camera_type[image_idx]) != CameraType.PERSPECTIVE.value:
             return None
@@ -63,12 +63,12 @@ class ThermalDataset(InputDataset):
         return Camera(width, height, fx, fy, cx, cy, **named)
 
     def pose(self, image_idx: int, thermal: bool = False) -> FloatArray:
-        """Pose of that camera, camera to world, OpenGL axes, shape (3, 4)."""
+        """Return the pose of the camera that `camera` returns: camera to world, OpenGL axes, shape (3, 4)."""
         cameras: Any = self.thermal_cameras if thermal else self.cameras
         return cameras.camera_to_worlds[image_idx].double().numpy()
 
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
-        """Load a photograph at the resolution of its camera, shape (h, w, 3)."""
+        """Return a photograph at the resolution of its camera, shape (h, w, 3), or raise `SceneError`."""
         path = self._dataparser_outputs.image_filenames[image_idx]
         with errors_name(path, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(path) as opened:
             opened.load()
@@ -84,7 +84,7 @@ class ThermalDataset(InputDataset):
         return np.array(self._resized(picture.convert("RGB"), image_idx, Image.Resampling.BOX))
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """Return the item described at the class; ``image`` as uint8 or as float32 in [0, 1]."""
+        """Return the item that `ThermalDataset` describes, with ``image`` as uint8, or as float32 in [0, 1]."""
         data: dict[str, Any] = {
             "image_idx": image_idx,
             "image": self.get_image_uint8(image_idx) if image_type == "uint8" else self.get_image_float32(image_idx),
@@ -102,7 +102,7 @@ class ThermalDataset(InputDataset):
         return data
 
     def _fitted(self, cameras: Cameras, image_idx: int) -> Cameras:
-        """Return one of the cameras, shape (1,), moved as the photograph moves to its fitted pose."""
+        """Return one of `cameras`, shape (1,), moved with its photograph from the given pose to the fitted pose."""
         moved = deepcopy(cameras[image_idx : image_idx + 1])
         given, own = (_square(c.camera_to_worlds[image_idx]) for c in (self.cameras, cameras))
         pose = _square(self.metadata["fitted_poses"][image_idx]) @ torch.linalg.inv(given) @ own
@@ -110,7 +110,7 @@ class ThermalDataset(InputDataset):
         return moved
 
     def get_mask(self, image_idx: int) -> Bool[Tensor, "h w 1"] | None:
-        """Return where the photograph may be used, or None if the scene has no masks."""
+        """Return a mask that is True where the photograph may be used; None if the scene has no masks."""
         if self._dataparser_outputs.mask_filenames is None:
             return None
         path = self._dataparser_outputs.mask_filenames[image_idx]
@@ -126,11 +126,11 @@ class ThermalDataset(InputDataset):
         return torch.from_numpy(resized > 0)[..., None]
 
     def get_thermal(self, image_idx: int) -> tuple[Float[Tensor, "ht wt 1"], Bool[Tensor, "ht wt 1"]]:
-        """Return the normalised temperatures (0 where invalid) and where they are valid; the file is read once."""
+        """Return normalised temperatures, 0 where invalid, and a mask of valid ones; the file is read only once."""
         return self._read_thermal(image_idx)[:2]
 
     def thermal_report(self) -> PixelReport:
-        """Count what is masked over all thermal images of the split."""
+        """Return the counts of masked pixels over all thermal images of the split."""
         return sum((self._read_thermal(index)[2] for index in range(len(self))), PixelReport())
 
     def _read_thermal(self, image_idx: int) -> tuple[Tensor, Tensor, PixelReport]:
@@ -142,7 +142,7 @@ class ThermalDataset(InputDataset):
             if dead is not None:
                 report = report + PixelReport(dead=int((valid & dead).sum()))
                 valid &= ~dead
-            # float64: a narrow range far from 0 C would lose 16-bit steps in float32.
+            # float32 would lose 16-bit steps of a narrow range far from 0 C.
             normalised = self.temperature_range.normalise(image.temperature_c.astype(np.float64))
             thermal = np.where(valid, normalised, 0.0).astype(np.float32)
             tensors = torch.from_numpy(thermal)[..., None], torch.from_numpy(valid)[..., None]
@@ -150,7 +150,7 @@ class ThermalDataset(InputDataset):
         return self._thermal[image_idx]
 
     def _resized(self, picture: Image.Image, image_idx: int, filter_: Image.Resampling) -> Image.Image:
-        """Resample to the camera's resolution; the last part of a pixel is cut off, as in the intrinsics."""
+        """Return a picture at the camera's resolution; a last fraction of a pixel is cut off, as in `Camera.scaled`."""
         width, height = int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx])
         if picture.size == (width, height):
             return picture
@@ -160,5 +160,5 @@ class ThermalDataset(InputDataset):
 
 
 def _square(pose: Tensor) -> Tensor:
-    """A pose (3, 4) as (4, 4), float64."""
+    """Return a pose (3, 4) as (4, 4), float64."""
     return torch.cat((pose.double().cpu(), torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)))

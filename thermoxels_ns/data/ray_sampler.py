@@ -1,4 +1,4 @@
-"""Rays of a split with what their pixels saw, drawn at random or on a grid, and computed before training."""
+"""Rays of a split and the colours and temperatures of their pixels, drawn at random or on a grid of pixels."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from thermoxels_ns.data.dataset import ThermalDataset
 Streams = Literal["both", "rgb", "thermal"]
 _BITS = {"both": RGB_STREAM | THERMAL_STREAM, "rgb": RGB_STREAM, "thermal": THERMAL_STREAM}
 TABLE_LIMIT_BYTES = 2 * 1024**3
-"""Above this the directions are computed per batch: scenes where every photograph has intrinsics of its own."""
+"""Largest table of ray directions; else they are computed per batch, as where all photographs differ in intrinsics."""
 _CHUNK = 1 << 17
 _BYTES_PER_PIXEL = 16
 _FISHEYE = CameraType.FISHEYE.value
 
 
 class RaySampler:
-    """Pixels of a `ThermalDataset` in memory, drawn at random or on a regular grid.
+    """The pixels of a `ThermalDataset` in memory, from which rays are drawn at random or on a regular grid.
 
-    Where a pair shares its camera, a ray through a photograph's pixel carries both targets, and the thermal target
-    only where the thermal pixel is valid. Else the thermal cameras have rays of their own, drawn among valid pixels.
-    Photographs are decoded at the first draw, so that the grids (which need no colour) are cheap. Tables live in
-    `storage`, batches go to `device`.
+    If photographs and thermal images share cameras, a ray through a photograph's pixel carries both targets, and the
+    thermal target only where the thermal pixel is valid. Else the thermal cameras have rays of their own, through valid
+    pixels. Photographs are decoded at the first draw, so that grids, which need no colour, are cheap. Tables are kept
+    on the device `storage`; batches are moved to `device`.
     """
 
     def __init__(
@@ -62,12 +62,12 @@ class RaySampler:
 
     @cached_property
     def colour_rays(self) -> CameraRays:
-        """Rays of the photographs."""
+        """Rays of all pixels of the photographs."""
         return CameraRays(self.dataset.cameras, self.storage)
 
     @cached_property
     def thermal_rays(self) -> CameraRays:
-        """Rays of the thermal images; the photographs' where the camera is shared."""
+        """Rays of all pixels of the thermal images; `colour_rays` if cameras are shared."""
         cameras = self.dataset.thermal_cameras
         return self.colour_rays if cameras is None else CameraRays(cameras, self.storage)
 
@@ -81,21 +81,21 @@ class RaySampler:
         return colours.to(self.storage)
 
     def load(self) -> None:
-        """Decode all photographs that the streams need and fill the tables of rays."""
+        """Decode all photographs and make the tables of rays, as far as the streams need them."""
         if self.streams != "thermal":
             _ = self._colours
         if self.streams != "rgb":
             _ = self.thermal_rays
 
     def draw(self, generator: torch.Generator, rgb_rays: int, thermal_rays: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Draw rays with equal chance for every pixel, with replacement; random numbers are those of the CPU.
+        """Draw rays through random pixels, with replacement and an equal chance for every usable pixel.
 
-        `thermal_rays` counts only where thermal cameras are not the photographs'. With the streams "thermal" and a
-        shared camera, `rgb_rays` go through thermal pixels.
+        `rgb_rays` go through photographs, `thermal_rays` through thermal images. With shared cameras `thermal_rays` is
+        ignored, and if `streams` is "thermal" besides, `rgb_rays` go through valid thermal pixels.
 
         Returns:
-            Rays (colour first, then thermal only) and the targets ``image`` (n, 3) and ``thermal`` (n, 1), float32 and
-            0 where the ray has no such target.
+            The rays (colour first, then thermal only), and their targets ``image`` (n, 3) in [0, 1] and ``thermal``
+            (n, 1), normalised, both float32 and 0 where the ray has no such target.
         """
         columns: list[dict[str, Tensor]] = []
         bits, images, temperatures = [], [], []
@@ -124,7 +124,7 @@ class RaySampler:
         return self._bundle(rays, torch.cat(bits)), batch
 
     def grid(self, stream: int, stride: int, max_rays_per_image: int | None, chunk: int) -> Iterator[RayBundle]:
-        """Yield the usable pixels of a stream on a regular grid, see `ThermalDataManager.training_rays`."""
+        """Yield rays through the usable pixels of a regular grid, see `ThermalDataManager.training_rays`."""
         if not 0 < stream <= RGB_STREAM | THERMAL_STREAM or min(stride, chunk, max_rays_per_image or 1) < 1:
             raise ValueError(f"no such grid: {stream=}, {stride=}, {max_rays_per_image=}, {chunk=}")
         wanted = stream & _BITS[self.streams]
@@ -159,7 +159,7 @@ class RaySampler:
 
 
 def _regular(rays: CameraRays, stride: int, max_rays_per_image: int | None) -> Int[Tensor, " n"]:
-    """Return the pixels of a regular grid in every photograph, at most `max_rays_per_image` of each."""
+    """Return the numbers of the pixels on a regular grid in every image, at most `max_rays_per_image` of each."""
     strides = torch.full_like(rays.widths, stride)
     if max_rays_per_image is not None:
         # Rows and columns are rounded up, so the square root alone may give a few pixels too many.
@@ -171,15 +171,15 @@ def _regular(rays: CameraRays, stride: int, max_rays_per_image: int | None) -> I
 
 
 def draw_generator(*key: int) -> torch.Generator:
-    """Return a generator on the CPU whose numbers depend on `key` alone (non-negative integers).
+    """Return a random generator on the CPU whose numbers depend on `key` alone (non-negative integers).
 
-    torch seeds its CPU generator with 32 bits, so the key is hashed instead of added up.
+    The key is hashed, because torch seeds its CPU generator with 32 bits only.
     """
     return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1)[0]))
 
 
 def _numbers(usable: Bool[Tensor, " pixels"] | None, name: str, remedy: str) -> Int[Tensor, " usable"] | None:
-    """Return the numbers of the usable pixels; None: all are usable."""
+    """Return the numbers of the usable pixels; None if all are usable. Raises `SceneError` if none is."""
     if usable is None or bool(usable.all()):
         return None
     numbers = usable.nonzero()[:, 0]
@@ -189,14 +189,14 @@ def _numbers(usable: Bool[Tensor, " pixels"] | None, name: str, remedy: str) -> 
 
 
 class CameraRays:
-    """Rays of all pixels; pixels are numbered camera by camera, rows from the top, columns from the left.
+    """Rays of all pixels of `cameras`, numbered camera by camera, rows from the top, columns from the left.
 
-    Directions in camera axes depend on the intrinsics only, so one table serves all photographs of a camera; a ray
-    is then one look-up and one rotation. The table is filled by nerfstudio's `Cameras.generate_rays`, so lens
-    distortion is the same as in evaluation. Above `table_limit_bytes` directions are computed when asked for.
+    Directions in camera axes depend on the intrinsics alone, so cameras with equal intrinsics share one table, and a
+    ray costs one look-up and one rotation. nerfstudio's `Cameras.generate_rays` fills the table, so that lens
+    distortion is the same as in evaluation. Instead of a table above `table_limit_bytes`, `columns` computes the rays.
 
     Attributes:
-        first_pixel: Number of the first pixel of each camera and, last, the number of pixels, shape (n + 1,).
+        first_pixel: Number of the first pixel of each camera and, last, the number of all pixels, shape (n + 1,).
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class CameraRays:
         self._rotations = poses[:, :, :3].contiguous().to(self.device)
         self._origins = poses[:, :, 3].contiguous().to(self.device)
 
-        # Cameras with equal rows of numbers have equal directions in camera axes.
+        # Cameras with equal rows in `models` have equal directions in camera axes.
         names = ["fx", "fy", "cx", "cy", "width", "height", "camera_type", "distortion_params"]
         parts = [part.double() for name in names if (part := getattr(self.cameras, name)) is not None]
         models = torch.cat(parts, dim=-1).numpy()
@@ -232,10 +232,8 @@ class CameraRays:
         return int(self.first_pixel[-1])
 
     def columns(self, pixels: Int[Tensor, " n"]) -> dict[str, Tensor]:
-        """Return the rays through the centres of pixels, given by their numbers on the device of this object.
-
-        Fields of a `RayBundle`: origins (n, 3), unit directions (n, 3), pixel_area (n, 1) and camera_indices (n, 1).
-        """
+        """Return fields of a `RayBundle` for the centres of pixels, given by numbers (n,) on `self.device`: origins
+        (n, 3), unit directions (n, 3), pixel_area (n, 1) and camera_indices (n, 1)."""
         image = torch.searchsorted(self._first_pixel, pixels, right=True) - 1
         if self.has_table:
             place = pixels + self._table_shift.index_select(0, image)
@@ -249,10 +247,10 @@ class CameraRays:
         return {"origins": origins, "directions": directions, "pixel_area": area, "camera_indices": image[:, None]}
 
     def grid(self, stride: Int[Tensor, " images"]) -> Int[Tensor, " n"]:
-        """Return the numbers of every `stride`-th pixel in both directions of every photograph, in order.
+        """Return the numbers of every `stride`-th pixel in both directions, in ascending order; one stride per camera.
 
-        The grid starts in the middle of its first cell, so that it prefers no border; a photograph smaller than its
-        stride gives its middle pixel.
+        The grid starts in the middle of its first cell, so that it prefers no border. Along a side shorter than the
+        stride, the grid has the middle pixel alone.
         """
         numbers = []
         for index, step in enumerate(stride.tolist()):
@@ -263,7 +261,7 @@ class CameraRays:
         return torch.cat(numbers).to(self.device)
 
     def grid_sizes(self, stride: Int[Tensor, " images"]) -> Int[Tensor, " images"]:
-        """Return how many pixels `grid` gives of every photograph."""
+        """Return how many pixels `grid` returns of every camera."""
 
         def along(length: Tensor) -> Tensor:
             start = torch.minimum(stride, length) // 2
@@ -272,7 +270,7 @@ class CameraRays:
         return along(self.widths) * along(self.heights)
 
     def _camera_axes(self, index: int) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 1"]]:
-        """Return the directions and areas of all pixels of one camera, in camera axes."""
+        """Return the ray directions in camera axes, and the areas, of all pixels of one camera."""
         still = self.cameras[index : index + 1]
         still.camera_to_worlds = torch.eye(4)[None, :3]
         size = int(self.widths[index] * self.heights[index])
@@ -296,9 +294,10 @@ class CameraRays:
 def _mend_optical_axis(
     rays: RayBundle, cameras: Cameras, image: Int[Tensor, " n"], coords: Float[Tensor, "n 2"], lost: Bool[Tensor, " n"]
 ) -> None:
-    """Give the ray on the optical axis of a fisheye lens its limit, where nerfstudio divides 0 by 0.
+    """Set the direction and area of rays on the optical axis of a fisheye lens, where nerfstudio divides 0 by 0.
 
-    Raises `SceneError` where another ray is not finite: the distortion cannot be undone there.
+    `lost` marks directions that are not finite. Raises `SceneError` if `lost` marks any other ray, whose distortion
+    cannot be undone.
     """
     axis = torch.cat([cameras.cy, cameras.cx], dim=-1)[image]
     on_axis = ((coords - axis).abs().amax(dim=1) < 1e-3) & (cameras.camera_type.view(-1)[image] == _FISHEYE)

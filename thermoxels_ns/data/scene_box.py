@@ -1,4 +1,4 @@
-"""The box of the voxel lattice: given, or found from sparse points, depths of photographs, or cameras."""
+"""The scene box, which the voxel lattice fills: given, or found from points, depths of photographs, or cameras."""
 
 from __future__ import annotations
 
@@ -20,42 +20,42 @@ Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 
 _REMEDY = "Pass --scene-box with two corners in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax."
 _TAIL_OF_POINTS, _TAIL_OF_DEPTHS = 0.5, 0.1
-"""Points that may lie outside at either end of an axis, [%]; tracks have more strays than depths."""
-_MARGIN = 0.08
-_ROUNDED = 2.0**-8
-_MOST_POINTS = 20_000
-_MOST_PHOTOGRAPHS = 64  # Photographs in which points are looked at
-_PROBES = 8  # Points along each side of a box of which no points are known
+"""Points left outside the box at either end of an axis, [%]; sparse points have more strays than depths."""
+_MARGIN = 0.08  # Width added on every side, relative to the longest side of the box
+_ROUNDED = 2.0**-8  # Corners are rounded to this share of the longest side, or less
+_MOST_POINTS = 20_000  # About as many of the points are used
+_MOST_PHOTOGRAPHS = 64  # Photographs in which points are looked up
+_PROBES = 8  # Probe points along each side of a box for which no points are known
 _STEREO_PHOTOGRAPHS, _STEREO_SIDE = 32, 96
-"""Photographs whose depths are compared, and pixels along their longer side: some seconds."""
-_FEWEST_POINTS = 10
-_FEWEST_DEPTHS = 200
+"""Photographs whose depths are found, and pixels along their longer side; this takes some seconds."""
+_FEWEST_POINTS = 10  # Sparse points in view that a box needs
+_FEWEST_DEPTHS = 200  # Depths that a box needs; with fewer it is found from the cameras
 _LEAST_SHOWN, _MOST_WITHOUT = 0.15, 0.1
-"""What is close up fills this share of a photograph's points, except in this share of the photographs."""
-_WORTH_LEAVING_OUT = 1.5  # Points per length that a box without the distant points must gain
-_NEARLY_BEST = 0.9
-_FEW_IN_VIEW = 0.05  # Points in view relative to the most that one has, below which a photograph tells nothing
-_NEARER_HALF = 0.25  # Quantile of the depths in a box at which its surface is taken to stand, where no points are known
-_CONVERGING = 0.5  # Distance to where cameras look, relative to their spread, below which they look outwards
-# The axes that ns-process-data swapped in old versions, before it wrote applied_transform into the json.
+"""Least share of a photograph's points that must be kept, and share of the photographs that may keep less."""
+_WORTH_LEAVING_OUT = 1.5  # Points are left out if the box then holds at least so many times the points per length
+_NEARLY_BEST = 0.9  # Limits that give this share of the most points per length are as good
+_FEW_IN_VIEW = 0.05  # A photograph with fewer points in view, relative to the photograph with most, tells nothing
+_NEARER_HALF = 0.25  # Where no points are known, the surface is taken to stand at this quantile of the depths in a box
+_CONVERGING = 0.5  # Cameras look outwards if the place they look at is nearer than this, relative to their spread
+# Swap of axes by old versions of ns-process-data, before the json had applied_transform.
 _LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
 class BoxEvidence:
-    """What says where the scene's box is, in input coordinates: the box itself, else points, else the cameras."""
+    """Evidence of where the scene box is, in input coordinates: its corners, else points, else the cameras alone."""
 
-    source: str  # Where it comes from, in words
+    source: str  # Source of the evidence, in words
     frames: Sequence[Frame]
-    corners: Box | None = None
-    points: FloatArray | None = None
-    tail: float = _TAIL_OF_POINTS
+    corners: Box | None = None  # None: not given
+    points: FloatArray | None = None  # Points of the scene, shape (n, 3); None: not known
+    tail: float = _TAIL_OF_POINTS  # Points left outside at either end of an axis, [%]
 
     def box(self) -> Box:
-        """The box.
+        """Return the scene box: `corners`, else `box_of_points`, else `box_of_cameras`.
 
         Raises:
-            SceneError: It has no volume, or what there is does not tell it.
+            SceneError: The box has no volume, or points or cameras do not suffice to find it.
         """
         if self.corners is not None:
             return self.corners
@@ -64,10 +64,10 @@ class BoxEvidence:
         return box_of_cameras(self.frames)
 
     def pixel_size(self, box: Box) -> float:
-        """Width of a photograph's pixel where most of what is seen in the box stands, in input units.
+        """Return the width that a pixel covers at the typical distance of surfaces in `box`, in input units.
 
-        The median over what photographs see of the points in the box; without points, what a pixel covers in the nearer
-        half of the box. Infinite where no photograph of a perspective camera looks at it.
+        This is the median over the points in the box and the photographs that have them in view; without points, the
+        width of a pixel in the middle of the nearer half of the box. It is infinite if no perspective camera sees it.
         """
         low, high = box
         if self.points is not None:
@@ -85,11 +85,11 @@ class BoxEvidence:
 
 
 def find_scene_box(scene: SceneFile, option: Sequence[Sequence[float]] | None, training: Sequence[int]) -> BoxEvidence:
-    """Find what says where the scene's box is.
+    """Return the best evidence of where the scene box is.
 
-    In order: the option, ``scene_box`` in the json (both in input coordinates), sparse points (``ply_file_path``, or a
-    COLMAP model in one of `COLMAP_FOLDERS`), depths about which photographs that train agree, the cameras. The same
-    folder and split give the same.
+    The first available counts: `option`, ``scene_box`` in the json (both in input coordinates), sparse points
+    (``ply_file_path``, or a COLMAP model in one of `COLMAP_FOLDERS`), depths on which the photographs that train
+    (indices `training`) agree, the cameras. The same folder and split give the same result.
 
     Raises:
         SceneError: A given box has no volume or is not finite, or a file cannot be read.
@@ -114,7 +114,7 @@ def find_scene_box(scene: SceneFile, option: Sequence[Sequence[float]] | None, t
 
 
 def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
-    """What photographs agree to see, (points, 3), in input coordinates, and how many were compared."""
+    """Return points (n, 3) on which photographs agree, in input coordinates, and how many photographs are compared."""
     from thermoxels_ns.multiview import photographs, stereo  # its kernels are slow to load and only needed here
 
     frames = [frame for frame in frames if frame.intrinsics.lens == "perspective"]
@@ -127,19 +127,19 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
         mask, camera = None if shown is None else np.array(shown) > 0, frame.intrinsics.resized(*picture.size)
         pinholes.append(photographs.pinhole(np.array(picture), mask, camera, frame.pose, _STEREO_SIDE))
     seen = photographs.gathered(pinholes, [frame.pose[:3, 3] for frame in frames])
-    depths = stereo.depths_of(seen, views_to_contradict=0)  # a stray costs the box more than a depth that is lacking
+    depths = stereo.depths_of(seen, views_to_contradict=0)  # a wrong depth harms the box more than a missing one
     depths = stereo.depths_before_backdrop(depths)[0]
     return stereo.feature_rays_to_depths(depths).points, len(frames)
 
 
 def box_of_points(points: FloatArray, frames: Sequence[Frame], tail: float = _TAIL_OF_POINTS) -> Box:
-    """Enclose what photographs show close up of points (n, 3) in input coordinates.
+    """Return the box around the points (n, 3), in input coordinates, that photographs show close up.
 
-    Per axis all but `tail` [%] of them at either end, and 8 % of the longest extent more on every side (parts without
-    texture have no points, and a flat scene keeps some depth). Points that are not finite or in no photograph's view do
-    not count; nor do those that lie far behind others, or that few photographs have in view, where
-    they cost too much, see `_worth_keeping`. A ground that runs on belongs to what is seen. A photograph with hardly
-    any of what is left in view, as of a plain wall, is taken to show something as far away as in the others.
+    Along each axis the box leaves out `tail` [%] of the points at either end, and is then wider by `_MARGIN` on every
+    side, because parts without texture have no points and a flat scene needs some depth. Points that are not finite or
+    in no photograph's view do not count. Points that few photographs have in view, or that lie far behind others, are
+    left out where `_worth_keeping` says so. For a photograph with hardly any of the remaining points in view, as of a
+    plain wall, the box also holds the point on the optical axis that is as far away as points are in the others.
     """
     points = points[np.isfinite(points).all(axis=1)]
     points, frames = points[:: max(len(points) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
@@ -160,7 +160,7 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame], tail: float = _TA
         ahead = np.median([np.nanmedian(row) for row in depth[~few]])
         ends = np.stack([f.pose[:3, 3] - ahead * f.pose[:3, 2] for f, blind in zip(frames, few) if blind])
         low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
-    # Rounded outwards: another processor, on which a few depths differ, shall find the same.
+    # Rounded outwards, so that other processors, on which a few depths differ, find the same box.
     step = _ROUNDED * 2.0 ** np.floor(np.log2(max((high - low).max(), 1e-300)))
     low, high = low - margin, high + margin
     low, high = np.floor(low / step) * step, np.ceil(high / step) * step
@@ -168,7 +168,7 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame], tail: float = _TA
 
 
 def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array:
-    """Depth of each point for each photograph, (photographs, points); NaN where it is not in view."""
+    """Return the depth of each point in each photograph, (photographs, points); NaN where the point is not in view."""
     depth = np.full((len(frames), len(points)), np.nan, dtype=np.float32)
     for row, frame in zip(depth, frames):
         camera, local = frame.intrinsics, (points - frame.pose[:3, 3]) @ frame.pose[:3, :3] * (1.0, -1.0, -1.0)
@@ -180,21 +180,21 @@ def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array
 
 
 def _distance_behind(depth: Float32Array) -> Float32Array:
-    """Depth of each point, relative to the median of each photograph, in the one where that is smallest."""
+    """Return the smallest ratio over photographs of a point's depth to the photograph's median depth, (points,)."""
     depth = depth[np.isfinite(depth).any(axis=1)]
     return np.nanmin(depth / np.nanmedian(depth, axis=1, keepdims=True), axis=0)
 
 
 def _rarity(depth: Float32Array) -> Float32Array:
-    """One over the number of photographs that have each point in view."""
+    """Return 1 over the number of photographs that have each point in view, (points,)."""
     return 1.0 / np.isfinite(depth).sum(axis=0, dtype=np.float32)
 
 
 def _worth_keeping(points: FloatArray, depth: Float32Array, figure: Float32Array, tail: float) -> BoolArray:
-    """Which points have so small a figure that they belong to the body, not to what lies around it.
+    """Return which points to keep, (points,): those whose `figure` (points,) is at most a limit.
 
-    All do, unless a limit of the figure exists that gives half as many more points per length of the box; of the limits
-    nearly as good, the largest counts. Hardly any photograph may lose most of its points.
+    The limit is the largest that comes near (`_NEARLY_BEST`) to the most points per length of the box, and is used only
+    if it gains `_WORTH_LEAVING_OUT`; else all points are kept. Hardly any photograph may lose most of its points.
     """
     seen = np.isfinite(depth)
     seen = seen[seen.any(axis=1)]
@@ -210,19 +210,19 @@ def _worth_keeping(points: FloatArray, depth: Float32Array, figure: Float32Array
 
 
 def _spread(frames: Sequence[Frame], most: int) -> list[Frame]:
-    """At most so many frames, at equal distances in the list."""
+    """Return at most `most` frames, evenly spaced in the list."""
     return [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))]
 
 
 def box_of_cameras(frames: Sequence[Frame]) -> Box:
-    """Guess a cube from the cameras alone.
+    """Return a cube as scene box, guessed from the cameras alone.
 
-    Where they look at one place: its centre is the point nearest to all optical axes (least squares), half its side the
-    median over the cameras of distance times the tangent of half the field of view, what an average photograph shows at
-    that distance. Where they look outwards, as in a room: the cube around them, four times their extent.
+    If cameras look at one place, the cube's centre is the point nearest to all optical axes (least squares). Half its
+    side is the median over the cameras of the distance to the centre times the tangent of half the field of view. If
+    cameras look outwards, as in a room, the cube lies around the cameras and its side is four times their extent.
 
     Raises:
-        SceneError: All look into one direction, or outwards from one place.
+        SceneError: All cameras look in one direction, or look outwards from one place.
     """
     axes, origins = (np.stack([frame.pose[:3, column] for frame in frames]) for column in (2, 3))
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -257,7 +257,7 @@ def _checked(corners: Any, name: str) -> Box:
 
 
 def _read_ply(path: Path) -> FloatArray:
-    """Read the x, y, z of a .ply (ASCII or binary); it is in the coordinates of the json."""
+    """Read the points (n, 3) of a .ply file (ASCII or binary), which is in the coordinates of the json."""
     import trimesh  # slow to import and only needed here
 
     if not path.is_file():
@@ -272,10 +272,10 @@ def _read_ply(path: Path) -> FloatArray:
 
 
 def _read_colmap(folder: str, scene: SceneFile) -> FloatArray:
-    """Read a COLMAP model's points and bring them into the coordinates of the json.
+    """Return the points (n, 3) of a COLMAP model in the coordinates of the json.
 
-    The json may hold COLMAP's world or one with other axes (``applied_transform``). Which one is decided by the
-    camera centres that both files know, so that a stale model cannot give a wrong box.
+    The json may be in COLMAP's world or in one with other axes (``applied_transform``). The camera centres in both
+    decide which. Raises `SceneError` if they do not fit, so that a stale model cannot give a wrong box.
     """
     try:
         model = read_model(scene.folder / folder)

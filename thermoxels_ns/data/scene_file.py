@@ -1,4 +1,4 @@
-"""Read a scene folder: transforms.json, photographs and their thermal partners, checked."""
+"""Scene folders read and checked: transforms.json, photographs and their thermal partners."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES, ThermalUni
 
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")
 BOUNDS_NAME = "temperature_bounds.json"
-_HOTTEST_C = 10_000  # no thermal camera says more
+_HOTTEST_C = 10_000  # no thermal camera measures more
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One pair of photographs."""
+    """One photograph with its thermal image, pose and camera."""
 
-    name: str  # name of the photograph as the json writes it, with forward slashes; frames are sorted by it
+    name: str  # `file_path` of the photograph in the json, with forward slashes; frames are sorted by name
     image: Path
     thermal: Path
-    mask: Path | None
+    mask: Path | None  # image that is white where the photograph may be used; None: no mask
     pose: FloatArray  # camera to world, shape (4, 4), OpenGL axes, input coordinates
-    intrinsics: Camera
-    thermal_pose: FloatArray | None  # pose of the thermal camera; None: the photograph's
+    intrinsics: Camera  # camera of the photograph
+    thermal_pose: FloatArray | None  # pose of the thermal camera, as `pose`; None: the photograph's
     thermal_intrinsics: Camera | None
-    """The thermal camera's own projection; None: the photograph's at the thermal image's resolution."""
+    """Camera of the thermal image; None: the photograph's, scaled to the thermal image's resolution."""
 
     def read_picture(self, mode: Literal["RGB", "L"], longest_side: int) -> tuple[Image.Image, Image.Image | None]:
-        """Read the photograph in colour or grey, and the mask at the photograph's size, None where there is none.
+        """Read the photograph in colour or grey, and its mask at the size of the result; None: no mask.
 
-        A large JPEG is decoded at a part of its size that is no smaller than `longest_side` [pixels].
+        A large JPEG is decoded at a fraction of its size, but with no fewer than `longest_side` pixels along that side.
 
         Raises:
             SceneError: A file cannot be read.
@@ -58,27 +58,27 @@ class Frame:
 
 @dataclass(frozen=True)
 class SceneFile:
-    """A scene folder after reading and checking its json; frames are sorted by name."""
+    """The checked content of a scene folder."""
 
     folder: Path
     json_path: Path
-    frames: list[Frame]
-    unit: ThermalUnit
+    frames: list[Frame]  # sorted by name
+    unit: ThermalUnit  # unit of the numbers in thermal files
     bounds_c: tuple[float, float] | None  # lowest and highest temperature of temperature_bounds.json, [degrees Celsius]
     meta: dict[str, Any]  # the json as it is (split lists, scene_box, ply_file_path, applied_transform)
     left_out: list[str] = field(default_factory=list)  # names of frames and files that missing_thermal="skip" left out
-    bounds_swapped: bool = False  # whether temperature_bounds.json has its lowest temperature above its highest
+    bounds_swapped: bool = False  # True if temperature_bounds.json has the lowest temperature above the highest
 
 
 @plain_os_errors("scene folder", "a file or folder that can be read", "Check permissions and names.", SceneError)
 def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "error") -> SceneFile:
-    """Read a scene folder (or the json in it) and check all that can be checked without decoding images.
+    """Read a scene folder (or the json in it) and check everything that can be checked without decoding images.
 
-    The thermal partner of a photograph is the file that `thermal_file_path` names, else the file of the same stem in
-    thermal/. Frames without one raise an error, or are left out and named (`missing_thermal`).
+    The thermal image of a photograph is the file that `thermal_file_path` names, else the file with the same stem in
+    thermal/. `missing_thermal` "skip" leaves out frames without a thermal image and lists them in `SceneFile.left_out`.
 
     Raises:
-        SceneError: Something is missing, doubled, not finite or contradictory; the message names it.
+        SceneError: An entry or a file is missing, doubled, not finite or contradictory; the message names it.
     """
     json_path = _find_json(data)
     folder = json_path.parent
@@ -118,7 +118,7 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
         got = f"{len(entries)} frames, none with one ({there} files in thermal/)"
         raise SceneError(json_path.name, expected="frames with a thermal image", got=got, remedy=remedy)
     stems = {frame.image.stem for frame in frames}
-    for parent in {frame.image.parent for frame in frames}:  # frames that have no pose still have photographs
+    for parent in {frame.image.parent for frame in frames}:  # photographs without a pose may have thermal images too
         stems |= {path.stem for path in parent.iterdir()}
     orphans = [
         str(path.relative_to(folder))
@@ -150,7 +150,7 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
     scale_from_scene_file(meta)
     up_from_scene_file(meta)
     bounds, swapped = _read_bounds(folder), False
-    if bounds is not None and bounds[0] > bounds[1]:  # published scenes exist with the two names swapped
+    if bounds is not None and bounds[0] > bounds[1]:  # some published scenes have the two keys swapped
         bounds, swapped = (bounds[1], bounds[0]), True
     frames.sort(key=lambda frame: frame.name)
     unit = _unit(meta, json_path, bounds)

@@ -1,4 +1,4 @@
-"""Metres per unit of a scene, how well that is known, and which way is up."""
+"""Scale of a scene, metres per unit, with its standard error, and the direction that is up."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ _FILE = "transforms.json"
 
 @record(ThermoxelsError)
 class SceneScale:
-    """Metres per unit of the scene's coordinates, with its standard error."""
+    """Metres per unit of the scene's coordinates, with standard error and source."""
 
     metres_per_unit: Length  # Length of one input unit, [m]
-    standard_error: StandardError | None  # Standard error of `metres_per_unit`, [m]; None where nobody knows it
-    source: str  # Where the scale comes from: a sentence
+    standard_error: StandardError | None  # Standard error of `metres_per_unit`, [m]; None: not known
+    source: str  # Source of the scale, as a sentence
 
     def area_standard_error(self, area_m2: float) -> float | None:
-        """Return the standard error of an area, twice the relative one of the scale, [m^2]; None: not known."""
+        """Return an area's standard error [m^2]: twice the scale's relative error times the area; None: unknown."""
         return self._share(2, area_m2)
 
     def volume_standard_error(self, volume_m3: float) -> float | None:
-        """Return the standard error of a volume, three times the relative one of the scale, [m^3]; None: not known.
+        """Return a volume's standard error [m^3]: three times the scale's relative error times the volume.
 
         >>> SceneScale(2.0, 0.02, "").volume_standard_error(10.0)
         0.3
@@ -41,11 +41,11 @@ class SceneScale:
         return self._share(3, volume_m3)
 
     def as_mapping(self) -> dict[str, Any]:
-        """Return the fields as json can hold them."""
+        """Return the fields by name, as json can hold them."""
         return asdict(self)  # type: ignore[call-overload]
 
     def _share(self, power: int, size: float) -> float | None:
-        """Standard error of a quantity that grows with a power of the scale, to first order."""
+        """Return the standard error, to first order, of a quantity `size` that grows with a power of the scale."""
         return None if self.standard_error is None else power * (self.standard_error / self.metres_per_unit) * abs(size)
 
 
@@ -59,7 +59,7 @@ class _KnownDistance:
 
 @record(SceneError)
 class _InFile:
-    """What a scene's json says."""
+    """Scale and up in a scene's json."""
 
     metres_per_unit: Length | None = None
     metres_per_unit_standard_error: StandardError | None = None
@@ -77,7 +77,7 @@ class _InFile:
 
 
 def scale_from_option(metres_per_unit: float) -> SceneScale:
-    """Take the scale as the user gives it, or raise `ThermoxelsError`; its error is not known."""
+    """Return the scale that the user gives, without a standard error; raises `ThermoxelsError` unless above 0."""
     given = SceneScale(metres_per_unit, None, "")
     return replace(given, source=f"Given by the user: {given.metres_per_unit:g} m per unit.")
 
@@ -85,10 +85,10 @@ def scale_from_option(metres_per_unit: float) -> SceneScale:
 def scale_from_known_distance(
     point_a: Vector, point_b: Vector, distance_m: float, standard_error_m: float | None = None
 ) -> SceneScale:
-    """Return the scale that two points of the scene [input units] give, whose distance was measured [m].
+    """Return the scale from two points of the scene [input units] and their measured distance [m].
 
-    The scale is the measured distance over that of the points; its relative standard error is that of the measured
-    distance, which includes how far the points may lie from the ends of what was measured (None: not known).
+    The scale is the measured distance over the distance of the points, with the same relative standard error. Include
+    in `standard_error_m` how far the points may lie from the ends of the measured length. None: not known.
     Raises `ThermoxelsError` if a number is out of range, or the points coincide.
 
     >>> scale_from_known_distance((0, 0, 0), (0, 3, 4), 10.0, standard_error_m=0.1).standard_error
@@ -108,7 +108,7 @@ def scale_from_known_distance(
 
 
 def scale_from_scene_file(meta: Mapping[str, Any]) -> SceneScale | None:
-    """Read scale and standard error from a scene's json, None if it has none; raises `SceneError` for wrong values."""
+    """Return the scale in a scene's json, None if the json has none; raises `SceneError` for wrong values."""
     found = _in_file(meta)
     value = found.metres_per_unit
     if value is None:
@@ -117,7 +117,7 @@ def scale_from_scene_file(meta: Mapping[str, Any]) -> SceneScale | None:
 
 
 def up_from_scene_file(meta: Mapping[str, Any]) -> Vector | None:
-    """Read the unit vector that is up from a scene's json, None if it has none; raises `SceneError` for a wrong one.
+    """Return the unit vector up in a scene's json, None if the json has none; raises `SceneError` for a wrong one.
 
     >>> up_from_scene_file({"up": [0, 0, 2]})
     (0.0, 0.0, 1.0)
@@ -138,10 +138,10 @@ def _in_file(meta: Mapping[str, Any]) -> _InFile:
 def choose_scale(
     option: float | None = None, known_distance: SceneScale | None = None, scene_file: Mapping[str, Any] | None = None
 ) -> SceneScale | None:
-    """Return the scale that the user gives, else that of the scene's json; None if neither gives one.
+    """Return the scale that the user gives, else the scale in the scene's json; None if there is neither.
 
-    The source of the scale says what it was preferred to. Raises `ThermoxelsError` if the user gives both a scale and a
-    distance.
+    The user gives `option`, in metres per unit, or `known_distance`; giving both raises `ThermoxelsError`. If the json
+    has a scale too, the source of the result says that the user's goes before it.
     """
     if option is not None and known_distance is not None:
         remedy = "Leave one of them out."

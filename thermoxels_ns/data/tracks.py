@@ -1,4 +1,4 @@
-"""Tracks of structure from motion: their file, a COLMAP model beside a scene, and the feature rays they give."""
+"""Tracks of structure from motion: their file, the COLMAP model in a scene's folder, and feature rays from tracks."""
 
 from __future__ import annotations
 
@@ -18,36 +18,37 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.data.scene_file import Frame
 
-TRACKS_KEY = "tracks_file_path"  # name in transforms.json under which the file of tracks is given
-FEWEST_VIEWS = 3  # photographs that must see a point: two agree about many wrong ones
-MOST_ERROR_PX = 2.0  # mean reprojection error above which a point is left out
-LEAST_ERROR_PX = 0.3  # error that a point has at least: what three photographs agree on more closely agrees by luck
-LEAST_PARALLAX_DEG = 2.0  # largest angle between the rays of a point below which its distance is not known
-MOST_BEHIND = 0.1  # share of sightings behind their camera above which tracks belong to other poses
+TRACKS_KEY = "tracks_file_path"  # key of transforms.json that names the file of tracks
+FEWEST_VIEWS = 3  # photographs that must see a point: two photographs agree on many wrong points
+MOST_ERROR_PX = 2.0  # mean reprojection error above which a point is left out, [pixels]
+LEAST_ERROR_PX = 0.3  # a smaller reprojection error of a point is due to luck and is raised to this, [pixels]
+LEAST_PARALLAX_DEG = 2.0  # a point is left out if the largest angle between its rays is not above this
+MOST_BEHIND = 0.1  # if a larger share of sightings lies behind the camera, the tracks belong to other poses
 _REMEDY = f"Write the scene again with thermoxels capture, or remove {TRACKS_KEY} from the json to train without it."
 
 COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "sparse")
-"""Where a model may lie in a scene's folder, the first that does counts."""
+"""Places of a COLMAP model in a scene's folder; the first that holds a model counts."""
 
-_LEAST_CAMERA_BYTES = 48  # of a camera with three parameters; others have more
+_LEAST_CAMERA_BYTES = 48  # size of a camera with three parameters in cameras.bin; cameras with more are larger
 _LAYOUT = {"frames": (64, "<I", 16), "images": (64, "<Q", 24), "points3D": (43, "<Q", 8)}
-"""Bytes of an entry before the number of its parts (of an image: before its name), that number, bytes of each part."""
+"""Layout of an entry in a .bin file: bytes before the number of its parts (of an image: before its name), the format of
+that number, bytes of each part."""
 
 
 @dataclass(frozen=True, eq=False)
 class SparseTracks:
-    """Points and the photographs that see them; the content of a file of tracks, arrays by these names."""
+    """Points and the photographs that see each point: the arrays in a file of tracks, by these names."""
 
     points: FloatArray  # shape (n, 3), in the coordinates of the poses
     point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
-    frames: tuple[str, ...]  # ``file_path`` of the photographs, as transforms.json has it
-    sighting_frame: IntArray
-    sighting_point: IntArray  # indices into `frames` and `points`, each shape (s,)
+    frames: tuple[str, ...]  # names of photographs, as ``file_path`` in transforms.json
+    sighting_frame: IntArray  # index into `frames` of each sighting, shape (s,)
+    sighting_point: IntArray  # index into `points` of each sighting, shape (s,)
 
 
 def write_tracks(path: Path, tracks: SparseTracks) -> None:
-    """Write tracks as a compressed .npz."""
-    packed = io.BytesIO()  # numpy complains of a half-made file when it is closed later
+    """Write tracks to a compressed .npz file, whole or not at all; raises `OutputError` if it cannot be written."""
+    packed = io.BytesIO()  # numpy warns of a file whose writing was interrupted
     np.savez_compressed(
         packed,
         points=tracks.points,
@@ -61,7 +62,7 @@ def write_tracks(path: Path, tracks: SparseTracks) -> None:
 
 
 def read_tracks(path: Path) -> SparseTracks:
-    """Read and check a file of tracks; a `SceneError` where it is missing, no such file, or contradicts itself."""
+    """Read and check a file of tracks, or raise `SceneError` if it is missing, of another kind or inconsistent."""
     names = ("points", "point_error_px", "frames", "sighting_frame", "sighting_point")
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -86,13 +87,12 @@ def read_tracks(path: Path) -> SparseTracks:
 def feature_rays(
     tracks: SparseTracks, frames: Sequence[Frame], name: str = "tracks", remedy: str = _REMEDY
 ) -> FeatureRays:
-    """Return the rays from frames (at least one) to the points that they see and whose place is well known.
+    """Return the feature rays from `frames` (at least one) to the points of tracks whose place is well known.
 
-    A point counts if at least `FEWEST_VIEWS` of the frames see it, more than `LEAST_PARALLAX_DEG` apart, with a mean
-    reprojection error of at most `MOST_ERROR_PX`. A point that does not agree with its neighbours in the frames
-    (`agrees_with_neighbours`) is listed without rays: wrong rays would make air of walls. The standard error of a
-    ray's length is that of a triangulation: the error in the image, over the focal length and the sine of that angle,
-    times the length.
+    A point counts if at least `FEWEST_VIEWS` frames see it, from directions more than `LEAST_PARALLAX_DEG` apart, with
+    a mean reprojection error of at most `MOST_ERROR_PX`. A counting point that does not agree with its neighbours
+    (`agrees_with_neighbours`) is kept without rays, as wrong rays would turn walls into air. The standard error of a
+    ray's length is that of triangulation: reprojection error / focal length / sine of the angle, times the length.
 
     Raises:
         SceneError: None of the frames is in the tracks, or the tracks belong to other poses.
@@ -105,7 +105,7 @@ def feature_rays(
     known = np.isfinite(tracks.points).all(axis=1) & (tracks.point_error_px <= MOST_ERROR_PX)
     known &= tracks.point_error_px >= 0.0  # COLMAP writes -1 for an error that it did not compute
     used = (number[tracks.sighting_frame] >= 0) & known[tracks.sighting_point]
-    # Sorted by point, each pair once: a photograph that sees a point twice is still one that sees it.
+    # Sorted by point, each pair once: a photograph that sees a point twice counts once.
     pairs = np.unique(tracks.sighting_point[used] * len(frames) + number[tracks.sighting_frame[used]])
     point, frame = np.divmod(pairs, len(frames))
     poses = np.stack([one.pose for one in frames])
@@ -130,7 +130,7 @@ def feature_rays(
 
 
 def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray:
-    """Return twice the largest angle between each point's directions and their mean, shape (count,), [radians]."""
+    """Return twice the largest angle between a point's directions and their mean, shape (count,), [radians]."""
     mean = np.stack([np.bincount(point, directions[:, axis], count) for axis in range(3)], axis=1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
     off = np.zeros(count)
@@ -140,7 +140,7 @@ def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray
 
 
 def read_model(folder: Path) -> Any:
-    """Read the COLMAP model in a folder as a `pycolmap.Reconstruction`; a `SceneError` where a file is not whole."""
+    """Read the COLMAP model in a folder as a `pycolmap.Reconstruction`, or raise `SceneError` if it cannot be read."""
     import pycolmap  # slow to import and only needed here
 
     check_complete(folder)
@@ -151,16 +151,16 @@ def read_model(folder: Path) -> Any:
 
 
 def camera_to_world(image: Any) -> FloatArray:
-    """Return the pose (4, 4) of a pycolmap image, its camera axes as in transforms.json: x right, y up, z back."""
+    """Return the camera-to-world pose (4, 4) of a pycolmap image, with camera axes x right, y up, z back (OpenGL)."""
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().inverse().matrix()
     return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def check_complete(folder: Path) -> None:
-    """Raise `SceneError` for a file of a model that may not be read, or that ends before what it announces.
+    """Raise `SceneError` if a file of a COLMAP model cannot be opened, or ends before the last entry that it announces.
 
-    pycolmap says of the first that it is no model, and reads on behind the end of the second, perhaps for ever.
+    pycolmap says of an unreadable file that it is no model, and may read a truncated file for ever.
     """
     for name in ("cameras", "frames", "images", "points3D"):
         for path in (folder / f"{name}.txt", folder / f"{name}.bin"):
@@ -190,6 +190,6 @@ def _complete(name: str, data: bytes) -> bool:
                 end = data.index(b"\0", end) + 1
             (parts,) = struct.unpack_from(kind, data, end)
             end += struct.calcsize(kind) + parts * size
-    except (struct.error, ValueError):  # a number, or the end of a name, behind the end
+    except (struct.error, ValueError):  # a number, or the end of a name, lies behind the end of the data
         return False
     return end <= len(data)

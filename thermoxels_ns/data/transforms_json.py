@@ -1,4 +1,4 @@
-"""What transforms.json says of a camera or a file, checked: poses, intrinsics, names."""
+"""Entries of transforms.json read and checked: poses, intrinsics, file names."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from thermoxels_ns.core.checks import is_number
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.decoders import errors_name
 
-_NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")  # lenses in nerfstudio's order
+_NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")  # k1 ... in nerfstudio's order
 _ORIENTATION = 0x0112
-_LONGEST_LENS = 1e4  # Focal length, relative to the photograph's side: an angle of view of 0.006 degrees
+_LONGEST_LENS = 1e4  # largest focal length relative to the photograph's side: an angle of view of 0.006 degrees
 _MOST_DISTORTION = 10.0
-"""Most that a term of the distortion may move a corner of the image, in distances from the corner to the middle."""
-MOST_UNITS = 1e8  # farthest that a camera may be from the origin of its coordinates: the earth is 6.4e6 m in radius
+"""Largest shift of an image corner by one term of the distortion, in distances of the corner from the middle."""
+MOST_UNITS = 1e8  # largest coordinate of a camera; the earth's radius is 6.4e6 m
 DAMAGED_PHOTOGRAPH = "The file is damaged; copy it again or remove the frame."
 _LENS_OF_MODEL: dict[str, Lens] = {
     "SIMPLE_PINHOLE": "perspective",
@@ -30,18 +30,18 @@ _LENS_OF_MODEL: dict[str, Lens] = {
     "OPENCV_FISHEYE": "fisheye",
     "EQUIRECTANGULAR": "equirectangular",
 }
-"""nerfstudio's camera models whose rays start in one point."""
+"""Lens by nerfstudio's camera model, for models whose rays all start in one point."""
 
 
 def read_pose(values: Any, where: str, turned: bool = True) -> FloatArray:
-    """Return a camera-to-world matrix (4, 4) from 3 x 4 or 4 x 4 numbers of a json.
+    """Return a camera-to-world matrix (4, 4) from 3 x 4 or 4 x 4 numbers of a json; `where` names them in messages.
 
-    Raises `SceneError` unless the numbers are finite, the camera is within `MOST_UNITS` of the origin, a fourth row is
-    0, 0, 0, 1, and the upper left is a rotation (`turned` False: any linear map).
+    Raises `SceneError` unless the numbers are finite, the camera's coordinates are within `MOST_UNITS`, a fourth row is
+    0, 0, 0, 1, and the upper left 3 x 3 is a rotation. With `turned` False the upper left may be any matrix.
     """
     try:
         entries = np.array(values, dtype=object)
-    except ValueError:  # rows of several lengths
+    except ValueError:  # rows differ in length
         entries = np.zeros(0, dtype=object)
     odd = [repr(entry)[:80] for entry in entries.ravel() if not is_number(entry)]
     if odd or entries.shape not in ((3, 4), (4, 4)):
@@ -66,7 +66,8 @@ def read_pose(values: Any, where: str, turned: bool = True) -> FloatArray:
 
 
 def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | None, where: str) -> Camera:
-    """Return the camera of a frame: its own values go before the scene's; without w and h the image's size counts."""
+    """Return a frame's camera by values of its `entry`, else of the scene's `meta`; w and h else are those of `image`.
+    Raises `SceneError` for values that are missing, that no lens has, or that do not fit the size of `image`."""
     values = {**meta, **entry}
     remedy = "Correct the json."
     model = values.get("camera_model", "OPENCV")
@@ -80,7 +81,7 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         named = f"{where}: {image.name}"
         with errors_name(named, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(image) as opened:
             size = opened.size
-            if (values.get("h"), values.get("w")) == size:  # of a PNG, EXIF is read with all of its pixels
+            if (values.get("h"), values.get("w")) == size:  # only then: reading EXIF of a PNG reads all pixels
                 orientation = int(opened.getexif().get(_ORIENTATION, 1))
     try:
         if any(isinstance(value, bool) for key, value in values.items() if key in _NUMBERS):
@@ -117,7 +118,7 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
 
 
 def _refuse_odd(camera: Camera, where: str) -> None:
-    """Refuse a principal point, a focal length or a distortion that no lens has."""
+    """Raise `SceneError` for a principal point, a focal length or a distortion that no lens has."""
     if camera.lens == "equirectangular":
         return
     corner = min(0.5 * float(np.hypot(camera.width / camera.fl_x, camera.height / camera.fl_y)), 1e30)
@@ -138,12 +139,10 @@ def _refuse_odd(camera: Camera, where: str) -> None:
 
 
 def path_inside(folder: Path, name: str, where: str) -> Path:
-    """Turn a file name found in a json or in metadata into a resolved path inside a folder; it need not exist.
+    """Return the resolved path inside `folder` of a file name found in a json; the file need not exist.
 
-    `where` names its place in messages, such as ``transforms.json: frame 3``.
-
-    Raises:
-        SceneError: The name is empty or absolute, climbs out, has a drive, or a link on its way leads out.
+    `where` says in messages where the name stands, such as ``transforms.json: frame 3``. Raises `SceneError` if the
+    name is empty or absolute, has a drive or "..", or leads out of the folder by a link.
     """
     windows = PureWindowsPath(name)
     root = folder.resolve()
@@ -158,7 +157,7 @@ def path_inside(folder: Path, name: str, where: str) -> Path:
         try:
             path = (root / Path(*windows.parts)).resolve()
             path.exists()
-        except (OSError, RuntimeError) as problem:  # a link to itself, or a name longer than names can be
+        except (OSError, RuntimeError) as problem:  # a link to itself, or a name that is too long
             got = f"{name[:200]!r} ({problem.strerror if isinstance(problem, OSError) else 'a link to itself'})"
         else:
             if path.is_relative_to(root):

@@ -1,1 +1,1 @@
-"""Comparison of a reconstruction with the truth."""
+"""Comparison of a reconstruction with a synthetic scene whose shape and temperature are known."""

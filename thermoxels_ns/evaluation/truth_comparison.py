@@ -28,21 +28,21 @@ from thermoxels_ns.synthetic.raycast import first_surface, visible_surface_point
 from thermoxels_ns.synthetic.scene_folder import load_truth
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
-MIN_VIEWS = 3  # A point of a surface is seen if at least this many training cameras see it
-TOLERANCE_VOXELS = 1.5  # Surfaces closer than this agree, [voxels]
-DEPTH_TOLERANCE = 0.02  # Depths that differ by more, relative to the true one, are off
-COMMON_RESOLUTION = 128  # Voxels along the longest side of the exact box whose size `fscore_128` is measured with
+MIN_VIEWS = 3  # A point of a surface counts as seen if at least this many training cameras see it
+TOLERANCE_VOXELS = 1.5  # Two surfaces agree where their distance is at most this, [voxels]
+DEPTH_TOLERANCE = 0.02  # A depth is off if it differs from the true depth by more than this share of the true depth
+COMMON_RESOLUTION = 128  # `fscore_128` has voxels of the exact box's longest side over this number
 
 _SURFACE_POINTS = 20_000
-_PER_SIDE = 2  # Points along each side of a voxel's face that stand for it
+_PER_SIDE = 2  # Sample points along each side of a voxel's face
 _TRAINING_PREFIX = "frame_train_"
 
 
 class TrueShape(Protocol):
-    """A body whose shape is known exactly, in coordinates of its own (truth units)."""
+    """A body whose shape is known exactly, in coordinates of its own (truth coordinates, in truth units)."""
 
     def signed_distance(self, points: FloatArray, /) -> FloatArray:
-        """Distance of points (n, 3) to the surface, shape (n,), negative inside the body."""
+        """Return the distance of points (n, 3) to the surface, shape (n,), [truth units], negative inside the body."""
         ...
 
 
@@ -53,14 +53,14 @@ class SurfaceScore:
     precision: float = 0.0
     """Share of the reconstructed boundary within the tolerance of the true surface, 0 to 1; 0 if there is none."""
     recall: float = 0.0
-    """Share of the true surface that cameras see within the tolerance of the reconstructed boundary, 0 to 1."""
-    share: float = 0.0  # Of the boundary that is scored, 0 to 1
+    """Share of the true surface seen by cameras that is within the tolerance of the reconstructed boundary, 0 to 1."""
+    share: float = 0.0  # Share of the reconstructed boundary that is scored, 0 to 1
     mean_distance: float | None = None
-    """Mean distance of the reconstructed boundary to the true surface, [truth units]; None without a boundary."""
+    """Mean distance of the scored boundary to the true surface, [truth units]; None where it was not measured."""
 
     @property
     def fscore(self) -> float:
-        """Harmonic mean of precision and recall; 0 if both are."""
+        """Harmonic mean of precision and recall, 0 to 1; 0 if both are 0."""
         return 2.0 * self.precision * self.recall / (self.precision + self.recall or 1.0)
 
 
@@ -75,23 +75,23 @@ def surface_fscore(
     surroundings: TrueShape | None = None,
     within: BoolArray | None = None,
 ) -> tuple[SurfaceScore, SurfaceScore]:
-    """Score the boundary of the solid voxels against the true surface: all of it, and the part that cameras see.
+    """Return two scores of the boundary of solid voxels against the true surface: of all faces, and of the seen ones.
 
-    Enclosed cavities are filled first: no camera sees what is inside. The boundary is sampled at four points per voxel
-    face. Faces where the lattice or the region ends, which cut the scene, do not count for precision. A face is seen if
-    `MIN_VIEWS` cameras have a free line, past the solid voxels, to the empty voxel before it.
+    Enclosed cavities are filled first, as no camera sees into them. The boundary is sampled at four points per voxel
+    face. Faces at the end of the lattice or of the region `within` cut the scene; they do not count for precision. A
+    face is seen if `MIN_VIEWS` cameras have a free line, past the solid voxels, to the empty voxel in front of it.
 
     Args:
         cells: Solid voxels, shape `lattice.cell_shape`.
-        lattice: Where they are, [world units].
+        lattice: Lattice of the voxels, [world units].
         truth: The true body.
-        true_points_seen: True surface that enough training cameras see, shape (m, 3), m at least 1, [truth units].
-        tolerance: Distance that counts as agreement, above 0, [truth units].
+        true_points_seen: Points of the true surface that training cameras see, shape (m, 3), m > 0, [truth units].
+        tolerance: Distance up to which surfaces agree, above 0, [truth units].
         world_to_truth: Similarity, shape (4, 4), from the lattice's world to truth coordinates.
         views: The training cameras, in the coordinates of the lattice.
-        surroundings: What truly stands beside the body. Boundary within the tolerance of it is neither right nor wrong:
-            photographs do not say where the body ends and its surroundings begin.
-        within: The region that was taken, shape `lattice.cell_shape`; None: all.
+        surroundings: True shape of what stands beside the body. Boundary within the tolerance of this shape, and not of
+            the body, is not scored: photographs do not say where the body ends and its surroundings begin.
+        within: Voxels of the region that was reconstructed, shape `lattice.cell_shape`; None: all voxels.
     """
     cells = check_shape("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
     transform = check_similarity("world_to_truth", world_to_truth)
@@ -120,8 +120,8 @@ def surface_fscore(
 
 
 def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, IntArray, BoolArray]:
-    """Return points on the faces between solid and empty voxels, (n, 3) [corner indices], the empty voxel beside each
-    (n, 3), and whether each face lies on the border of the lattice or of the region (n,)."""
+    """Return points on the faces between solid and empty voxels, (n, 3) [corner indices], the empty voxel in front of
+    each point (n, 3), and whether that voxel is outside the lattice or the region `within` (n,)."""
     steps, within, found = (np.arange(_PER_SIDE) + 0.5) / _PER_SIDE, np.pad(within, 1), []
     for axis in range(3):
         rise = np.diff(np.pad(cells, [(int(a == axis),) * 2 for a in range(3)]).astype(np.int8), axis=axis)
@@ -139,23 +139,23 @@ def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, 
 
 @dataclass(frozen=True)
 class SurfaceDistances:
-    """Distances between two surfaces, [truth units]."""
+    """Distances between the surface of a mesh and the true surface, [truth units]."""
 
-    mesh_to_truth: float  # Mean distance of the mesh's surface, spread evenly by area, to the true surface
+    mesh_to_truth: float  # Mean distance of points spread evenly over the mesh's surface to the true surface
     truth_to_mesh: float  # Mean distance of the given true points to the mesh's surface
-    hausdorff: float
+    hausdorff: float  # Largest of all distances both ways
     closest_temperature_c: FloatArray
     """Temperature of the mesh at its surface point closest to each true point, shape (m,), [degrees Celsius]."""
-    closest_distance: FloatArray
+    closest_distance: FloatArray  # Distance of each true point to the mesh's surface, shape (m,)
 
     @property
     def chamfer(self) -> float:
-        """Mean of the mean distances both ways."""
+        """Mean of `mesh_to_truth` and `truth_to_mesh`, [truth units]."""
         return 0.5 * (self.mesh_to_truth + self.truth_to_mesh)
 
 
 def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArray:
-    """Return points spread by area over triangles, shape (count, 3); the same points every time."""
+    """Return points spread evenly by area over the triangles `facets` (f, 3), shape (count, 3), always the same."""
     from trimesh import Trimesh
     from trimesh.sample import sample_surface
 
@@ -170,11 +170,11 @@ def surface_distances(
     surroundings: TrueShape | None = None,
     tolerance: float = 0.0,
 ) -> SurfaceDistances | None:
-    """Measure a mesh against a body whose shape is known exactly; None if nothing of the boundary is left to measure.
+    """Return the distances between a mesh's surface and the true one; None if nothing of the surface can be measured.
 
-    Cuts by the scene box, and what lies in the surroundings or within the tolerance, [truth units], of them, are left
-    out. Distances from the mesh, [m], are those of 20,000 points of it; those from the truth go from the points (m, 3),
-    which a mesh can be expected to have, to the nearest point of any triangle.
+    Facets on the scene box, which cuts the scene, are left out. Distances from mesh to truth start at 20,000 points,
+    without points within `tolerance` [truth units] of `surroundings` and not of the truth. Distances from truth to mesh
+    go from `true_points` (m, 3), [truth units], to the nearest point of any remaining facet.
     """
     import pyvista as pv
     from trimesh.triangles import points_to_barycentric
@@ -207,22 +207,22 @@ def surface_distances(
 
 @dataclass(frozen=True, eq=False)
 class KnownTruth:
-    """A synthetic scene and the cameras that its training photographs were taken with."""
+    """A synthetic scene, whose coordinates are metres, and the cameras of its training photographs."""
 
     scene: SyntheticScene
     training_poses: FloatArray  # Training cameras, camera to world (OpenGL), shape (c, 4, 4), [m]
-    camera: Camera
+    camera: Camera  # Intrinsics of all training cameras
 
     @property
     def surroundings(self) -> TrueShape | None:
-        """What stands around the scene and is not scored."""
+        """Shape of what stands around the scene's solid and is not scored; None if nothing does."""
         return None if self.scene.around is None else self.scene.around.solid
 
     @cached_property
     def points_seen(self) -> FloatArray:
-        """Points spread evenly over the part of the true surface that enough training cameras see, (m, 3), [m].
+        """Points spread evenly over the part of the true surface that `MIN_VIEWS` training cameras see, (m, 3), [m].
 
-        Raises `SceneError` if they see nothing of it.
+        Raises `SceneError` if no point is seen by so many cameras.
         """
         points, normals = self.scene.solid.surface_points(_SURFACE_POINTS, seed=0)
         seen = visible_surface_points(self.scene, self.training_poses, self.camera, points, normals, MIN_VIEWS)
@@ -241,7 +241,7 @@ class KnownTruth:
         tolerance_m: float,
         within: BoolArray | None,
     ) -> tuple[SurfaceScore, SurfaceScore]:
-        """See `surface_fscore`, for a similarity (4, 4) from the lattice's world to the scene's, [m]."""
+        """Return the two scores of `surface_fscore` for solid voxels, with this scene and its cameras, [m]."""
         scale = _scale_of(world_to_truth)
         poses, camera, count = self.training_poses, self.camera, len(self.training_poses)
         axes = world_to_truth[:3, :3].T / scale  # the inverse of its rotation (and mirror)
@@ -261,9 +261,9 @@ def _scale_of(similarity: FloatArray) -> float:
 
 
 def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
-    """Return the truth of a scene folder (or its ``transforms.json``) with its training cameras; None: not synthetic.
+    """Return the synthetic scene and training cameras of a scene folder (or its json); None if it is not synthetic.
 
-    Raises `SceneError` for a json that is unreadable or names an unknown scene, and for cameras that cannot be used.
+    Raises `SceneError` for a json that is unreadable or names an unknown scene, and for frames that cannot be used.
     """
     folder = Path(scene_folder)
     folder = folder.parent if folder.is_file() else folder
@@ -286,30 +286,29 @@ def compare_with_truth(
     metres_per_unit: float = 1.0,
     within: BoolArray | None = None,
 ) -> dict[str, Any] | None:
-    """Compare solid voxels, and the temperatures of a mesh made from them, with the exact scene.
+    """Compare solid voxels, and the temperatures of a mesh made from them, with the exact scene; return the figures.
 
     Precision is the share of the reconstructed boundary within `TOLERANCE_VOXELS` of the true surface. Recall is the
     share of the true surface seen by `MIN_VIEWS` training cameras that lies within that tolerance of the boundary. The
-    F-score is their harmonic mean. `surface_fscore` says what is left out. Figures named ``..._seen`` are of the part
-    of the boundary that cameras see; the rest is a guess.
-
-    `cells` has the shape `lattice.cell_shape`; `world_to_truth` (4, 4) is the similarity from the lattice's world to
-    the input poses' coordinates, in which a synthetic scene is written in metres; without `mesh` no temperatures are
-    compared; lengths of the result are those times `metres_per_unit`, the scale of the mesh's nodes.
+    F-score is their harmonic mean. `surface_fscore` says which faces are left out. Figures named ``..._seen`` are of
+    the part of the boundary that cameras see; they are 0 if cameras see none. `cells` has the shape
+    `lattice.cell_shape`. `world_to_truth` (4, 4) is the similarity from the lattice's world to the coordinates of the
+    input poses, in which a synthetic scene is written in metres. Lengths, areas and volumes are scaled by
+    `metres_per_unit`, the scale of the mesh's nodes.
 
     Returns:
-        A mapping that json can write, or None if the truth is not known. Scores are 0 to 1; mean distances are of the
-        boundary to the true surface (None without a boundary); volumes and ``area_m2`` are those of the voxels, a
-        staircase, ``filled_volume_m3`` with cavities. With a mesh also: its volume and area; ``chamfer_...`` and
-        ``hausdorff_m`` between its surface and the seen true one; ``share_of_seen_reached``, the share of seen true
-        points within the tolerance of its surface, and ``temperature_seen_mae_c``, the mean absolute error [K] at the
-        surface points closest to those; of the boundary nodes within the tolerance ``temperature_nodes``, the number
-        that a thermal ray measured, ``temperature_mae_c``, their mean absolute error [K], the same of the others
-        (``..._unmeasured...``), and ``temperature_p95_all_c``, the error [K] that 95 % of all stay below.
+        Figures by name, which json can hold; None if the truth is not known. Scores are 0 to 1. Mean distances go from
+        the boundary to the true surface (None without a boundary). ``volume_m3`` and ``area_m2`` are those of the solid
+        voxels, with steps; ``filled_volume_m3`` includes enclosed cavities. With a mesh also its volume and area;
+        ``chamfer_...`` and ``hausdorff_m`` between its surface and the seen true points; ``share_of_seen_reached``, the
+        share of these points within the tolerance of its surface; ``temperature_seen_mae_c``, the mean absolute error
+        [K] at the surface points closest to these; and of the surface nodes within the tolerance of the truth:
+        ``temperature_nodes`` that thermal rays measured, ``temperature_mae_c``, their mean absolute error [K], both for
+        all other nodes (``..._unmeasured...``), and ``temperature_p95_all_c``, the 95 % quantile of all errors [K].
 
     Raises:
         SceneError: The scene folder cannot be used, or no true point is seen by enough training cameras.
-        MeshError: The voxels do not fit the lattice, the 4x4 is no similarity, or the scale is not above 0.
+        MeshError: `cells` does not fit the lattice, the 4x4 is no similarity, or `metres_per_unit` is not above 0.
     """
     known = truth if isinstance(truth, KnownTruth) else load_known_truth(truth)
     if known is None:
@@ -349,20 +348,20 @@ def compare_with_truth(
 def geometry_metrics(
     snapshot: GridSnapshot, world_to_input: FloatArray, known: KnownTruth, say: Callable[[str], None] = print
 ) -> dict[str, float]:
-    """Compare the surface that an export with default options has with the exact scene.
+    """Compare the surface that an export with default options would have with the exact scene; return scores by name.
 
-    The surface is the boundary of the voxels that `SolidSelection` chooses by default; scores and arguments are those
-    of `compare_with_truth`. `say` gets the reason where there is no surface.
+    The surface is the boundary of the voxels that `SolidSelection` chooses by default. `world_to_input` (4, 4) is the
+    similarity from the lattice's world to input coordinates. `say` receives the reason if no voxel is solid.
 
     Returns:
-        ``fscore``, ``precision``, ``recall`` at 1.5 voxels of the snapshot's lattice; ``fscore_128``, at 1.5 voxels of
-        128 along the exact box, to compare resolutions and boxes; ``fscore_seen`` and ``fscore_128_seen``; and the mean
-        distance to the true surface. Without any solid voxel the scores are 0 and there is no distance.
+        ``fscore``, ``precision`` and ``recall`` of `compare_with_truth`, with a tolerance of `TOLERANCE_VOXELS` of the
+        lattice; ``fscore_128`` with voxels of `COMMON_RESOLUTION`, which compares resolutions and boxes;
+        ``fscore_seen`` and ``fscore_128_seen``; and the mean distance. If no voxel is solid: the first four, all 0.
 
     Raises:
         SceneError: No true point is seen by enough training cameras.
     """
-    known.points_seen  # noqa: B018 - before anything slow
+    known.points_seen  # noqa: B018 - raises before anything slow
     try:
         solid = select_solid(snapshot, SolidSelection(), makes_up_volume=False)
     except MeshError as problem:
@@ -390,27 +389,27 @@ def geometry_metrics(
 
 @dataclass(frozen=True, eq=False)
 class RenderedRays:
-    """Rays of a held-out frame, and where a model has them end, [world units]."""
+    """Rays of one held-out frame, and the depth at which a model ends each ray, [world units]."""
 
     origins: FloatArray  # Shape (n, 3)
     directions: FloatArray  # Unit vectors, shape (n, 3)
-    depth: FloatArray  # Distance along each ray at which it ends, shape (n,)
-    ends: BoolArray  # Whether it loses more than half of its light in the lattice's box, shape (n,)
-    in_box: BoolArray  # Whether it meets that box, shape (n,)
+    depth: FloatArray  # Distance along each ray at which the ray ends, shape (n,)
+    ends: BoolArray  # True for a ray that loses more than half of its light in the lattice's box, shape (n,)
+    in_box: BoolArray  # True for a ray that meets the lattice's box, shape (n,)
 
 
 def depth_metrics(
     frames: Iterable[RenderedRays], lattice: Lattice, world_to_input: FloatArray, scene: SyntheticScene
 ) -> dict[str, float]:
-    """Compare where rays end with where they meet the exact scene, pixel by pixel.
+    """Compare the depths at which rays end with those of the exact scene, ray by ray; return figures by name.
 
-    `world_to_input` is that of `geometry_metrics`.
+    `world_to_input` (4, 4) is the similarity from the lattice's world to input coordinates.
 
     Returns:
-        Of the rays that truly end on the scene's solid and meet the lattice's box: ``depth_error``, the median relative
-        error of their depth, and ``depth_off_share``, the share that is off by more than `DEPTH_TOLERANCE`. Of those
-        that truly end outside the box, on what stands around the scene or nowhere: ``sky_filled``, the share that ends
-        in the box. Figures without a ray are left out.
+        ``depth_error`` and ``depth_off_share``, of rays that meet the lattice's box and in truth the scene's solid: the
+        median relative error of depth, and the share with an error above `DEPTH_TOLERANCE`. ``sky_filled``, of rays
+        that in truth miss the solid and end outside the box: the share that the model ends in the box. A figure for
+        which there is no ray is left out.
     """
     transform = check_similarity("world_to_input", world_to_input)
     scale = _scale_of(transform)
@@ -421,7 +420,7 @@ def depth_metrics(
         distance /= scale
         met = own & rays.in_box
         errors.append(np.abs(rays.depth[met] / distance[met] - 1.0))
-        with np.errstate(invalid="ignore"):  # at infinity along an axis
+        with np.errstate(invalid="ignore"):  # an infinite distance times a direction of 0
             index = lattice.world_to_index(rays.origins + distance[:, None] * rays.directions)
             outside = ~((index >= 0) & (index <= lattice.cell_shape)).all(axis=1)
         filled.append(rays.ends[~own & outside])
@@ -433,19 +432,19 @@ def depth_metrics(
 
 
 def _scaled(name: str, value: Any, metres_per_unit: float) -> Any:
-    """A figure in the units of the mesh: the ending of its name says how it grows with the scale."""
+    """Return a figure times the scale, its square or its cube if its name ends in _m, _m2 or _m3; else unchanged."""
     power = next((power for ending, power in (("_m", 1), ("_m2", 2), ("_m3", 3)) if name.endswith(ending)), 0)
     return value if value is None or power == 0 else value * metres_per_unit**power
 
 
 def _num_faces(cells: BoolArray) -> int:
-    """Number of voxel faces between solid and empty, those on the lattice's border included."""
+    """Return the number of voxel faces between solid and empty; what is outside the lattice counts as empty."""
     padded = np.pad(cells, 1)
     return sum(int(np.count_nonzero(np.diff(padded, axis=axis))) for axis in range(3))
 
 
 def _mesh_errors(known: KnownTruth, mesh: TetMesh, voxel_m: float, metres_per_unit: float) -> dict[str, Any]:
-    """Size of the mesh, its distance to the true surface, and temperature errors where they meet."""
+    """Return volume and area of the mesh, and distances and temperature errors at the true points seen, by name."""
     area = facet_areas(mesh.points_m, mesh.facets)
     result: dict[str, Any] = {
         "mesh_volume_m3": float(signed_volumes(mesh.points_m, mesh.tets).sum()) / metres_per_unit**3,
@@ -469,7 +468,7 @@ def _mesh_errors(known: KnownTruth, mesh: TetMesh, voxel_m: float, metres_per_un
 def _temperature_errors(
     scene: SyntheticScene, mesh: TetMesh, tolerance_m: float, metres_per_unit: float
 ) -> dict[str, Any]:
-    """Temperature errors on the part of the boundary that lies where it should: measured nodes, and all of them."""
+    """Return temperature errors at surface nodes within the tolerance of the truth: measured, unmeasured and all."""
     nodes = np.unique(mesh.facets)
     points = mesh.points_m[nodes] / metres_per_unit
     near = np.abs(scene.solid.signed_distance(points)) <= tolerance_m

@@ -1,1 +1,1 @@
-"""What photographs say without a model: depths by multi-view stereo."""
+"""Evidence from photographs without a model: poses, depths by multi-view stereo, backdrops, gains and offsets."""

@@ -1,4 +1,4 @@
-"""Which pixels of photographs show a plain backdrop: a sky, the wall behind an object."""
+"""Search for pixels of photographs that show a plain backdrop: a sky, the wall behind an object."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import numpy as np
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.multiview.photographs import SATURATED, Photographs
 
-PLAIN = 0.03  # Difference of a channel from one pixel to the next, of 1, up to which a photograph is plain
-STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which a photograph has no top
-LEVEL = 10.0  # Weight of how level one side of a photograph is, for finding up, relative to how steep the other is
+PLAIN = 0.03  # A pixel is plain if each channel differs by at most this, of 1, from the four pixels around
+STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which no side of a photograph is its top
+LEVEL = 10.0  # Weight, in finding up, of one image axis being level relative to the other being steep
 COLOUR_TOLERANCE = 0.1
-"""Difference from the backdrop's colour up to which a pixel shows it, of 1. On eight drawn scenes and a real street,
-0.06 finds less of the sky (saharov32: 54 % instead of 69 %), and neither takes more than 1 % of a body's pixels."""
-THERMAL_TOLERANCE = 0.1  # Difference from its temperature, of the scene's range
+"""Largest difference of a pixel's channels from the backdrop's colour, of 1. On eight drawn scenes and a real street,
+0.06 finds less of the sky (saharov32: 54 % instead of 69 %); neither value takes more than 1 % of a body's pixels."""
+THERMAL_TOLERANCE = 0.1  # Largest difference of a pixel from the backdrop's temperature, of the scene's range
 _WIDEST, _ROUNDS = 0.3, 8
-"""Difference up to which colours count in the first of some fits; it shrinks to the tolerance."""
+"""Tolerance of the first of so many fits of the backdrop's colour; it shrinks to `COLOUR_TOLERANCE` in the last."""
 
 
 def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolArray, BoolArray]:
-    """Which pixels show nothing but a plain backdrop, and which beside these look like it, both (pixels,).
+    """Return which pixels show a plain backdrop, and which pixels beside these look like the backdrop, both (pixels,).
 
-    No photograph tells how far away a plain area is. It is taken for a backdrop if plain pixels lead up from it to the
-    edge of the photograph (a wall ends at a roof, at windows, at the ground), and if its colour and temperature are
-    those that most such pixels have, as a function of direction (harmonics of degree 2, fitted to the pixels that agree
-    with it); and so are plain pixels that look the same and touch it, those below an object among them.
-    `depth`, (pixels,), is NaN where unknown. What looks like the backdrop beside it has no depth of its own either: it
-    took that of an outline (drawn courtyard: 2.6 % of all depths lie on the sky, 0.5 % without those).
+    No photograph tells how far away a plain area is. A plain pixel without a known `depth` (pixels,) shows the backdrop
+    if plain pixels lead up from it to the edge of the photograph (a wall ends at a roof, windows or the ground), and if
+    its colour and temperature are those that most such pixels have as a function of direction (harmonics of degree 2).
+    Plain pixels of the same look that touch the backdrop, such as pixels below an object, show it too. Pixels beside
+    the backdrop that look like it have wrong depths, taken from an outline (drawn courtyard: 2.6 % of all depths lie on
+    the sky, 0.5 % without these pixels).
     """
     open_above, plain = (np.zeros(len(photographs.colours), dtype=bool) for _ in range(2))
     directions, up = np.empty((len(open_above), 3)), upwards(photographs)
@@ -61,10 +61,10 @@ def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolA
 
 
 def upwards(photographs: Photographs) -> FloatArray:
-    """The direction that is up in the world, (3,): cameras are held level, upright or all of them on their side.
+    """Return the unit vector that is up in the world, (3,), if cameras are held level, all upright or all on a side.
 
-    It is as perpendicular to one side of the photographs and as parallel to the other as it can be. Upright photographs
-    tell its sign; of those on their side, up is where they are brighter.
+    Up is as perpendicular as possible to one image axis of the photographs and as parallel as possible to the other.
+    Upright photographs tell its sign; with cameras on a side, up is where photographs are brighter.
     """
     sides = np.linalg.inv(photographs.matrices[:, :, :3]).transpose(2, 0, 1)[:2]  # to the right, and down
     right, down = sides / np.linalg.norm(sides, axis=2, keepdims=True)
@@ -79,7 +79,7 @@ def upwards(photographs: Photographs) -> FloatArray:
 
 
 def _turns(inverse: FloatArray, up: FloatArray) -> int | None:
-    """Quarter turns (of `np.rot90`) that bring the side of a photograph at which the sky is to its top."""
+    """Return the quarter turns (of `np.rot90`) that bring up to a photograph's top; None if it looks up or down."""
     right, down, forward = inverse.T @ up / np.linalg.norm(inverse, axis=0)
     if abs(forward) > STEEPEST:
         return None
@@ -89,7 +89,7 @@ def _turns(inverse: FloatArray, up: FloatArray) -> int | None:
 
 
 def _even_pixels(picture: Float32Array) -> BoolArray:
-    """Which pixels of a picture (h, w, 3) differ by at most `PLAIN` from the four around; those at a mask do not."""
+    """Return which pixels of a picture (h, w, 3) differ by at most `PLAIN` from the four around; none beside a mask."""
     even = np.ones(picture.shape[:2], dtype=bool)
     for axis in (0, 1):
         small = np.abs(np.diff(picture, axis=axis)).max(-1) <= PLAIN
@@ -106,10 +106,10 @@ def _alike(
     chosen: BoolArray,
     measured: Float32Array | None = None,
 ) -> BoolArray:
-    """Which pixels look as most of the chosen do, by colour and, where it is known, temperature (pixels, 4).
+    """Return which pixels look like most of the `chosen` ones, by colour and, where known, temperature, (pixels,).
 
-    Between the colour corrected and the colour `measured` (pixels, 3) any will do, as what is nearly overexposed does
-    not follow the exposure; what is saturated may be any brighter.
+    `values` are red, green, blue, temperature (pixels, 4), `directions` (pixels, 3). If colours were corrected, any
+    colour from the `measured` (pixels, 3) to the corrected one may match, and from a saturated one any brighter one.
     """
     x, y, z = directions.T
     basis = np.column_stack((np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0))
@@ -141,9 +141,9 @@ def _alike(
 
 
 def mean_colours(photographs: Photographs, backdrop: BoolArray, points: FloatArray) -> Float32Array:
-    """Mean colour of the pixels onto which points (n, 3) fall, without those of the backdrop, shape (n, 3).
+    """Return the mean colour of the pixels onto which points (n, 3) project, without backdrop pixels, shape (n, 3).
 
-    Where all photographs show the backdrop or none shows the point, it is the mean over all other pixels.
+    A point without such a pixel gets the mean colour of all pixels that do not show the backdrop.
     """
     shown = np.isfinite(photographs.colours).all(1) & ~backdrop
     colours = photographs.colours

@@ -1,4 +1,4 @@
-"""Poses that photographs themselves agree on: features, tracks and bundle adjustment around given poses."""
+"""Adjustment of given poses to photographs: features, tracks and bundle adjustment."""
 
 from __future__ import annotations
 
@@ -12,73 +12,73 @@ import numpy.typing as npt
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 
-MOST_FEATURES = 1000  # Features of one photograph
-SMALLEST_CONTRAST = 0.01  # Of a feature, of 1; SIFT's own default, 0.04, finds hardly any on plaster
-NEIGHBOURS = 10  # Photographs that one is compared with
-WIDEST_DEG = 50.0  # Angle between the axes of two photographs that are compared
-RATIO = 0.8  # Distance of a match relative to the second best one (Lowe 2004)
-REACH = 0.015  # Distance from its epipolar line at which a match is accepted, relative to the photograph's width
-FEWEST_MATCHES = 8
-FEWEST_TRACKS = 100  # In all photographs together; fewer say nothing about poses
-HELD_BACK = 3  # Every n-th track takes no part in the trial, and judges it
+MOST_FEATURES = 1000  # Most features of one photograph
+SMALLEST_CONTRAST = 0.01  # Least contrast of a feature, of 1; with SIFT's default, 0.04, plaster has hardly any
+NEIGHBOURS = 10  # Photographs that each photograph is compared with
+WIDEST_DEG = 50.0  # Largest angle between the optical axes of two photographs that are compared
+RATIO = 0.8  # Largest descriptor distance of a match relative to that of the second best candidate (Lowe 2004)
+REACH = 0.015  # Largest distance of a match from its epipolar line, relative to the photograph's width
+FEWEST_MATCHES = 8  # Photographs with fewer features are not compared
+FEWEST_TRACKS = 100  # Least number of tracks in all photographs together; fewer say nothing about poses
+HELD_BACK = 3  # Every n-th track is held back from the trial adjustment and judges it
 WORTH_IT = 0.8
-"""What the median distance between features and points of the tracks held back must fall to, relative to what it was
-with the poses given."""
+"""Adjusted poses are taken if the median distance between features and points of the tracks held back falls to at most
+this share of the distance with the given poses."""
 POSE_ERROR_DEG = 0.2
-"""Standard deviation of the errors of poses given, about each axis, and of positions by as much as it moves the scene's
-middle. Turns and moves that cancel each other in the photographs are held by it alone."""
-_FLATTEST = 1e-3  # Smallest eigenvalue of a point's normal matrix: rays of an angle of about 2 degrees
-_ROUNDS, _SMALLEST_STEP = 20, 1e-6
-_OUTLYING = 3.0  # Medians of the distance at which a feature counts a quarter
+"""Standard deviation assumed for the errors of given poses: about each axis, and of a position the length that this
+angle spans at the scene's distance. This prior alone holds turns and moves that cancel out in the photographs."""
+_FLATTEST = 1e-3  # Least eigenvalue of a point's normal matrix: two rays at an angle of some 2.6 degrees
+_ROUNDS, _SMALLEST_STEP = 20, 1e-6  # Most Gauss-Newton steps; a smaller step ends the adjustment
+_OUTLYING = 3.0  # A feature this many medians of the distance from its point has a quarter of the full weight
 _OPENCV = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """What stands out in one photograph."""
+    """Features of one photograph: places that other photographs can show too."""
 
-    pixels: FloatArray  # Shape (k, 2)
+    pixels: FloatArray  # Column and row of each feature, shape (k, 2), [pixels]
     descriptors: Float32Array  # Unit vectors, shape (k, 128)
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Features that several photographs show of the same points."""
+    """Sightings of points: features of several photographs that show the same point form its track."""
 
-    photograph: IntArray  # Of each sighting, shape (s,)
-    point: IntArray  # Of each sighting, 0, 1, ..., shape (s,)
-    place: FloatArray  # Where its photograph shows it, at depth 1 in OpenCV axes, shape (s, 2)
+    photograph: IntArray  # Index of the photograph of each sighting, shape (s,)
+    point: IntArray  # Number of the point of each sighting, from 0 without gaps, shape (s,)
+    place: FloatArray  # x, y of each sighting at depth 1 in OpenCV camera axes, shape (s, 2)
 
     def of_points(self, chosen: BoolArray) -> Tracks:
-        """Only some points, one boolean each, numbered anew."""
+        """Return the tracks of the chosen points alone (one boolean per point), with points numbered anew."""
         kept = chosen[self.point]
         number = np.cumsum(chosen) - 1
         return Tracks(self.photograph[kept], number[self.point[kept]], self.place[kept])
 
     @property
     def points(self) -> int:
-        """How many points there are."""
+        """Number of points."""
         return int(self.point.max()) + 1 if len(self.point) else 0
 
 
 @dataclass(frozen=True, eq=False)
 class AdjustedPoses:
-    """Poses that fit what photographs show, and by how much better."""
+    """Poses adjusted to features, and how well features held back fit before and after."""
 
     poses: FloatArray  # Camera to world, OpenGL axes, shape (n, 4, 4)
-    before_px: float  # Median distance between features held back and their points, with the poses given, [pixels]
-    after_px: float  # The same with poses adjusted to the other features
-    tracks: int
+    before_px: float  # Median distance between features held back and their points, with the given poses, [pixels]
+    after_px: float  # The same distance with poses adjusted to the other features, [pixels]
+    tracks: int  # Number of tracks that the poses are adjusted to
 
 
 def features_of(picture: npt.NDArray[np.uint8], mask: BoolArray | None = None) -> Features:
-    """Find features (SIFT, Lowe 2004) in a grey photograph (h, w); only where its `mask` (h, w) is true.
+    """Return the features (SIFT, Lowe 2004) of a grey photograph (h, w), only where its `mask` (h, w) is true.
 
-    Descriptors are roots of normalised histograms, by which brightness and contrast of a photograph do not count
-    (RootSIFT, Arandjelovic and Zisserman 2012).
+    Descriptors are square roots of normalised histograms (RootSIFT, Arandjelovic and Zisserman 2012), so that the
+    brightness and contrast of the photograph do not matter.
     """
     use = None if mask is None else mask.astype(np.uint8)
-    # Without precise upscaling all features lie a quarter of a pixel aside.
+    # Without precise upscaling all features are off by a quarter of a pixel.
     sift = cv2.SIFT_create(MOST_FEATURES, contrastThreshold=SMALLEST_CONTRAST, enable_precise_upscale=True)  # type: ignore[attr-defined]
     found, descriptors = sift.detectAndCompute(picture, use)
     if descriptors is None or not len(found):
@@ -88,10 +88,10 @@ def features_of(picture: npt.NDArray[np.uint8], mask: BoolArray | None = None) -
 
 
 def find_tracks(features: Sequence[Features], cameras: Sequence[Camera], poses: FloatArray) -> Tracks:
-    """Match features of neighbouring photographs, as far as poses (n, 4, 4) that are nearly right allow it.
+    """Match features of neighbouring photographs and return the tracks of the points that the matches link.
 
-    Cameras are those of the pictures in which features were found. Tracks that show two features of one photograph are
-    left out.
+    A match must be near its epipolar line by the given poses (camera to world, (n, 4, 4)). `cameras` belong to the
+    pictures in which features were found. Tracks with two features in one photograph are left out.
     """
     from scipy.sparse import coo_matrix  # slow to import and only needed here
     from scipy.sparse.csgraph import connected_components
@@ -130,22 +130,22 @@ def find_tracks(features: Sequence[Features], cameras: Sequence[Camera], poses: 
 
 
 def adjust_poses(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int = 0) -> AdjustedPoses | None:
-    """Adjust poses to tracks where that helps tracks that took no part in it.
+    """Adjust poses to tracks by bundle adjustment, if tracks held back from a trial adjustment then fit better.
 
-    The adjusted poses as a whole stand where the given ones do, as large as they.
+    Unless some are `fixed`, the adjusted poses as a whole keep the place, orientation and scale of the given poses.
 
     Args:
         tracks: Tracks of all photographs.
-        poses: Camera to world as given, OpenGL axes, shape (n, 4, 4).
-        focal: Focal lengths [pixels], shape (n,): they turn angles into pixels.
-        fixed: The first so many photographs keep their poses.
+        poses: Given poses, camera to world, OpenGL axes, shape (n, 4, 4).
+        focal: Focal lengths, which turn angles into pixels, shape (n,), [pixels].
+        fixed: Number of photographs, the first of the list, that keep their poses.
 
     Returns:
-        None where tracks are too few, or those held back do not get nearer to their points.
+        Adjusted poses; None if there are too few tracks or the tracks held back do not fit better (`WORTH_IT`).
     """
     middle = poses[:, :3, 3].mean(0)
     poses = poses.copy()
-    poses[:, :3, 3] -= middle  # coordinates of a country would cost digits
+    poses[:, :3, 3] -= middle  # large national coordinates would cost precision
     tracks = _plausible(tracks, poses, focal)
     if tracks.points < FEWEST_TRACKS:
         return None
@@ -165,7 +165,7 @@ def adjust_poses(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: in
 
 
 def _pairs(rotations: FloatArray, centres: FloatArray) -> list[tuple[int, int]]:
-    """Photographs that are compared: those beside each other that look the same way."""
+    """Return the pairs of photographs to compare: each with its nearest `NEIGHBOURS` that look the same way."""
     pairs = set()
     for a in range(len(centres)):
         facing = rotations[:, 2] @ rotations[a, 2] > np.cos(np.deg2rad(WIDEST_DEG))
@@ -176,7 +176,7 @@ def _pairs(rotations: FloatArray, centres: FloatArray) -> list[tuple[int, int]]:
 
 
 def _matches(one: Float32Array, other: Float32Array) -> tuple[IntArray, IntArray]:
-    """Features that are each other's nearest, much nearer than the second."""
+    """Return the indices (m,), (m,) of features that are each other's best match, much better than the second best."""
     likeness = one @ other.T
     best = likeness.argmax(1)
     second = np.partition(likeness, -2, axis=1)[:, -2]
@@ -186,12 +186,12 @@ def _matches(one: Float32Array, other: Float32Array) -> tuple[IntArray, IntArray
 
 
 def _opencv(poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations from world to OpenCV camera axes (n, 3, 3) and centres (n, 3)."""
+    """Return the rotations from world to OpenCV camera axes (n, 3, 3) and the camera centres (n, 3) of poses."""
     return _OPENCV @ poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3].copy()
 
 
 def _triangulated(tracks: Tracks, rotations: FloatArray, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points nearest to the rays of their sightings, (points, 3), and their normal matrices (points, 3, 3)."""
+    """Return the points nearest to the rays of their sightings (points, 3), and normal matrices (points, 3, 3)."""
     rays = np.column_stack((tracks.place, np.ones(len(tracks.place))))
     rays = np.einsum("nji,nj->ni", rotations[tracks.photograph], rays)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -205,21 +205,21 @@ def _triangulated(tracks: Tracks, rotations: FloatArray, centres: FloatArray) ->
 def _seen(
     tracks: Tracks, rotations: FloatArray, centres: FloatArray, points: FloatArray, focal: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Points in the axes of the cameras that see them (s, 3), and how far their features are off (s, 2), [pixels]."""
+    """Return per sighting the point in camera axes (s, 3), and its projection minus the feature (s, 2), [pixels]."""
     local = np.einsum("nij,nj->ni", rotations[tracks.photograph], points[tracks.point] - centres[tracks.photograph])
     depth = np.where(np.abs(local[:, 2:]) > 1e-12, local[:, 2:], 1e-12)
     return local, focal[tracks.photograph, None] * (local[:, :2] / depth - tracks.place)
 
 
 def _distances(tracks: Tracks, poses: FloatArray, focal: FloatArray) -> FloatArray:
-    """Distances between features and their triangulated points, [pixels]."""
+    """Return the distance of each sighting's feature from its triangulated point, shape (s,), [pixels]."""
     rotations, centres = _opencv(poses)
     points, _ = _triangulated(tracks, rotations, centres)
     return np.linalg.norm(_seen(tracks, rotations, centres, points, focal)[1], axis=1)
 
 
 def _plausible(tracks: Tracks, poses: FloatArray, focal: FloatArray) -> Tracks:
-    """Tracks in front of their photographs whose rays meet nearly, at an angle."""
+    """Return the tracks whose points are in front of their cameras, and whose rays nearly meet, at a fair angle."""
     if not tracks.points:
         return tracks
     rotations, centres = _opencv(poses)
@@ -232,11 +232,11 @@ def _plausible(tracks: Tracks, poses: FloatArray, focal: FloatArray) -> Tracks:
 
 
 def _adjust(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int) -> FloatArray | None:
-    """Poses and points that bring features and points together (bundle adjustment, Triggs and others 2000).
+    """Return poses (n, 4, 4) that bring features and points together (bundle adjustment, Triggs and others 2000).
 
-    Gauss-Newton steps on robust squared distances (Geman and McClure 1987: corners of roofs and branches, which no two
-    photographs show at the same place, pull hardly at all), points eliminated (Schur complement), with the errors
-    expected of the poses given as a prior. None where it fails.
+    Gauss-Newton steps minimise robust squared distances (Geman and McClure 1987), so that corners of roofs and
+    branches, which look different in each photograph, hardly count. Points are eliminated (Schur complement). The
+    errors expected of the given poses, `POSE_ERROR_DEG`, are a prior. Returns None if a step is not finite.
     """
     from scipy import sparse
     from scipy.spatial.transform import Rotation
@@ -298,7 +298,7 @@ def _adjust(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int) ->
 
 
 def _placed_like(poses: FloatArray, given: FloatArray) -> FloatArray:
-    """Poses turned, scaled and moved together so that, as a whole, they stand where the given ones do."""
+    """Return poses turned, scaled and moved by one similarity that brings them closest to the given poses."""
     u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", given[:, :3, :3], poses[:, :3, :3]))
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     here, there = (each[:, :3, 3] - each[:, :3, 3].mean(0) for each in (poses, given))

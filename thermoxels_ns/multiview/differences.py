@@ -1,4 +1,4 @@
-"""How photographs of the same surface differ from each other: gain of each channel, offset of the temperature."""
+"""Differences between photographs of the same surface: gain of each colour channel, offset of the temperature."""
 
 from __future__ import annotations
 
@@ -10,40 +10,40 @@ from thermoxels_ns.core.arrays import Float32Array, FloatArray, IntArray
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import TOLERANCE, Depths
 
-MOST_PIXELS = 1500  # Pixels of each photograph that are looked up in the others
-DARKEST, BRIGHTEST = 0.06, 0.94  # Channels between which a pixel tells a gain: noise below, saturation above
+MOST_PIXELS = 1500  # Pixels of each photograph, or up to twice as many, that are looked up in the others
+DARKEST, BRIGHTEST = 0.06, 0.94  # Pixels used for gains have channels between: noise below, saturation above
 FEWEST_PAIRS = 30  # Pixels that two photographs must share to be compared
 SYSTEMATIC = 0.02
-"""Standard deviation, of 1, of what a channel's median ratio between two photographs is off by besides noise: gloss,
-shadows, depths that are wrong."""
-SYSTEMATIC_THERMAL = 0.003  # The same of a median difference of normalised temperatures
-SURE = 3.0  # Standard errors from which on values are no chance
-KNOWN = 1.0  # Standard error below which a value is known at all
-FREE = 10.0  # Standard error that stands for not known
-_ROUNDS, _HUBER = 5, 2.0  # Standard errors of a pair from which on it counts less
+"""Standard deviation, of 1, of the error besides noise of a channel's median ratio between two photographs: gloss,
+shadows, wrong depths."""
+SYSTEMATIC_THERMAL = 0.003  # The same error of a median difference of normalised temperatures
+SURE = 3.0  # Values larger than so many standard errors are not due to chance
+KNOWN = 1.0  # A value with at least this standard error is not known
+FREE = 10.0  # Standard error given to a value that is not known
+_ROUNDS, _HUBER = 5, 2.0  # Rounds of robust least squares; a pair off by more standard errors than this counts less
 
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """By what each photograph is off, with standard errors; means over the photographs are 0."""
+    """Gains and temperature offsets of photographs relative to their mean, which is 0, with standard errors."""
 
     log_gain: FloatArray  # Natural logarithm of the gain of each channel, (photographs, 3)
-    log_gain_error: FloatArray
-    offset: FloatArray  # Of normalised temperature, (photographs,)
-    offset_error: FloatArray
+    log_gain_error: FloatArray  # Standard error of `log_gain`, (photographs, 3)
+    offset: FloatArray  # Offset of normalised temperature, (photographs,)
+    offset_error: FloatArray  # Standard error of `offset`, (photographs,)
 
     def without_gains(self, photographs: Photographs) -> Photographs:
-        """The photographs as they would be had all the same gains."""
+        """Return the photographs with colours divided by their gains; `measured` keeps the colours as they were."""
         gain = np.exp(self.log_gain).astype(np.float32)[photographs.numbers]
         return replace(photographs, colours=photographs.colours / gain, measured=photographs.colours)
 
     def without_offsets(self, photographs: Photographs) -> Photographs:
-        """The photographs as they would be had all thermal images the same offset."""
+        """Return the photographs with the offsets subtracted from normalised temperatures."""
         return replace(photographs, thermal=photographs.thermal - self.offset.astype(np.float32)[photographs.numbers])
 
 
 def matters(value: FloatArray, error: FloatArray, least: float) -> bool:
-    """Whether values, as far as they are known, are larger than `least` and than `SURE` of their standard errors."""
+    """Return whether the root mean square of the known values is above `least` and `SURE` times that of errors."""
     known = error < KNOWN
     if not known.any():
         return False
@@ -52,11 +52,11 @@ def matters(value: FloatArray, error: FloatArray, least: float) -> bool:
 
 
 def photograph_differences(depths: Depths, thermal: Float32Array) -> Differences:
-    """Compare what photographs show of the same points, where each of the two has found its own depth there.
+    """Return the gains and offsets of photographs, from points at which two photographs have found the same depth.
 
-    For two photographs a and b the median over shared pixels of ln(a / b), or of the difference of temperatures, is
-    that of their gains or offsets. All pairs together are solved by weighted least squares; only differences are seen,
-    so the mean is set to 0. Photographs that share too little with the others have values of 0 and errors of `FREE`.
+    For two photographs a and b, the median of ln(a / b) over shared pixels is the difference of their log gains, and
+    the median difference of temperatures that of their offsets. All pairs together are solved by weighted least
+    squares with a mean of 0. Photographs not linked to the others by pairs have values of 0 and errors of `FREE`.
 
     Args:
         depths: Depths of the photographs.
@@ -95,7 +95,7 @@ def photograph_differences(depths: Depths, thermal: Float32Array) -> Differences
             told = np.isfinite(off).sum(0)
             off[:, told < FEWEST_PAIRS] = 0.0
             middle = np.nanmedian(off, axis=0)
-            spread = 1.48 * np.nanmedian(np.abs(off - middle), axis=0)  # of a normal distribution
+            spread = 1.48 * np.nanmedian(np.abs(off - middle), axis=0)  # standard deviation of a normal distribution
             # A median's variance is pi / 2 times that of a mean.
             variance = 0.5 * np.pi * spread**2 / np.maximum(told, 1) + systematic**2
             rows.append((a, b))
@@ -110,9 +110,9 @@ def photograph_differences(depths: Depths, thermal: Float32Array) -> Differences
 
 
 def _solve(pairs: IntArray, off: FloatArray, weights: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Values x of photographs from differences x_a - x_b, robustly, and their standard errors.
+    """Return values x of photographs (count,) from differences `off` = x_a - x_b of pairs (a, b), and standard errors.
 
-    Of the photographs that pairs link to each other; their mean is 0. Those of smaller groups have 0 and `FREE`.
+    The robust fit is of the largest group that pairs of weight above 0 link, mean 0. The others have 0 and `FREE`.
     """
     from scipy.sparse import coo_matrix  # slow to import and only needed here
     from scipy.sparse.csgraph import connected_components
@@ -129,7 +129,7 @@ def _solve(pairs: IntArray, off: FloatArray, weights: FloatArray, count: int) ->
     number, use, left = int(linked.sum()), weights, off
     matrix = np.zeros((number, number))
     for _ in range(_ROUNDS):
-        matrix = np.full((number, number), weights.mean())  # holds the mean at 0 and changes nothing else
+        matrix = np.full((number, number), weights.mean())  # sets the mean to 0 and changes nothing else
         for sign, first, second in ((1, 0, 0), (1, 1, 1), (-1, 0, 1), (-1, 1, 0)):
             np.add.at(matrix, (pairs[:, first], pairs[:, second]), sign * use)
         right = np.bincount(pairs[:, 0], use * off, number) - np.bincount(pairs[:, 1], use * off, number)

@@ -1,4 +1,4 @@
-"""What the training photographs of a scene say before there is a model."""
+"""Evidence from the training photographs of a scene before there is a model: depths, backdrop, gains, offsets."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from thermoxels_ns.multiview.stereo import (
     rays_through,
 )
 
-LEAST_SHARE = 0.01  # Share of the pixels whose depth must be sure; less is chance
+LEAST_SHARE = 0.01  # Depths are used if at least this share of the pixels has a sure one; fewer may be chance
 REFINED_SIDE = 640  # Pixels along the longer side of the photographs in which depths are refined
-LEAST_GAIN = 0.01  # Root mean square of the logarithms of gains from which on photographs are corrected
-LEAST_OFFSET_K = 0.1  # The same of offsets of thermal images, [K]
+LEAST_GAIN = 0.01  # Gains are corrected if the root mean square of their logarithms is above this
+LEAST_OFFSET_K = 0.1  # Offsets of thermal images are corrected if their root mean square is above this, [K]
 
 
 @dataclass(frozen=True, eq=False)
 class PhotographEvidence:
-    """What training photographs say before there is a model."""
+    """Evidence from training photographs before there is a model."""
 
-    photographs: Photographs  # The photographs, small, without differences of gain and offset that matter
-    backdrop: BoolArray  # Which of their pixels show a plain backdrop, shape (pixels,)
+    photographs: Photographs  # Small photographs, with gains and offsets corrected where `log_gain` or `offset` is set
+    backdrop: BoolArray  # True for pixels that show a plain backdrop, shape (pixels,)
     feature_rays: FeatureRays | None
-    """Rays to each depth that several photographs agree about; None where these are too few to tell anything."""
+    """Rays to the depths on which several photographs agree; None if there are too few such depths (`LEAST_SHARE`)."""
     log_gain: FloatArray | None
-    """Logarithm of the gain of each photograph and channel, (photographs, 3); None: none that matters was found."""
-    offset: FloatArray | None  # Offset of each thermal image, of the temperature range, (photographs,), or None
+    """Natural logarithm of the gain of each channel, (photographs, 3); None: gains were not corrected."""
+    offset: FloatArray | None  # Offset of normalised temperature, (photographs,); None: offsets were not corrected
 
 
 def depths_of_dataset(dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike) -> Depths | None:
-    """Depths of a `ThermalDataset`'s photographs behind `near`, in the box from `lo` to `hi` and behind it.
+    """Return the depths of a `ThermalDataset`'s photographs in the box from `lo` to `hi` and behind it.
 
-    All in world units; None without perspective photographs.
+    Depths nearer than `near` are not considered. Lengths are in world units. Return None if no camera is perspective.
     """
     photographs = read_photographs(dataset, near)
     if photographs is None:
@@ -61,10 +61,10 @@ def evidence_of_photographs(
     gains: bool = True,
     offsets: bool = True,
 ) -> PhotographEvidence | None:
-    """Compare training photographs with each other, and say what was found; None without perspective photographs.
+    """Compare the photographs of a `ThermalDataset` and return the evidence; None if no camera is perspective.
 
-    Depths are looked for behind `near`, in the box from `lo` to `hi` and beyond it, [world units]. `gains` and
-    `offsets` say which differences between photographs are looked for.
+    Depths are sought farther than `near`, in the box from `lo` to `hi` and behind it, [world units]. Gains and offsets
+    are estimated, and corrected if they matter, where `gains` and `offsets` are True. `say` receives the findings.
     """
     began = time.perf_counter()
     depths = depths_of_dataset(dataset, near, lo, hi)
@@ -91,7 +91,7 @@ def evidence_of_photographs(
 
 
 def rays_through_backdrop(photographs: Photographs, backdrop: BoolArray, beyond: float) -> FeatureRays | None:
-    """Rays through the pixels of a backdrop, to points so far away [world units]; None where hardly any shows one."""
+    """Return rays through the backdrop's pixels to points at depth `beyond` [world units]; None for too few pixels."""
     (chosen,) = np.nonzero(backdrop)
     enough = len(chosen) >= LEAST_SHARE * len(backdrop)
     return rays_through(photographs, chosen, np.full(len(chosen), beyond)) if enough else None

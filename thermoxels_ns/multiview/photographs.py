@@ -1,4 +1,4 @@
-"""Read photographs as small pinhole pictures, to be compared with each other."""
+"""Photographs read as small pinhole pictures, to be compared with each other."""
 
 from __future__ import annotations
 
@@ -13,47 +13,47 @@ import numpy.typing as npt
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 
-MOST_PHOTOGRAPHS = 64  # Photographs compared; of more, that many are taken at equal distances in the list
-SATURATED = 0.98  # Channel from which on a pixel, a mean of several, may have been brighter
-LONGEST_SIDE = 160  # Pixels along the longer side at which photographs are compared; larger ones are averaged down
+MOST_PHOTOGRAPHS = 64  # Most photographs that are compared; from a longer list, evenly spaced ones are taken
+SATURATED = 0.98  # Channel value, of 1, from which on the scene may have been brighter than the pixel shows
+LONGEST_SIDE = 160  # Pixels along the longer side of photographs that are compared; larger ones are averaged down
 
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """Pinhole photographs in one array, for the kernels."""
+    """Pinhole photographs, with the pixels of all of them in one array."""
 
     matrices: FloatArray  # World to homogeneous pixels, depth positive in front, shape (photographs, 3, 4)
     centres: FloatArray  # Camera centres, [world units], shape (photographs, 3)
     sizes: IntArray  # Width and height, [pixels], shape (photographs, 2)
-    firsts: IntArray  # Row of `colours` with each photograph's upper left pixel, shape (photographs,)
+    firsts: IntArray  # Index in `colours` of each photograph's upper left pixel, shape (photographs,)
     colours: Float32Array
-    """Channels in [0, 1], photograph after photograph, row after row, shape (pixels, 3); NaN where masked."""
+    """Red, green, blue in [0, 1], photograph after photograph, row after row, shape (pixels, 3); NaN where masked."""
     thermal: Float32Array
-    """Normalised temperature, shape (pixels,); NaN where unknown, or measured by a camera of its own."""
-    near: float = 0.0  # Depth up to which a photograph shows nothing, [world units]
-    index: IntArray | None = None  # Number of each photograph in its dataset; None: of no dataset
+    """Normalised temperature, shape (pixels,); NaN where unknown or where thermal images have a camera of their own."""
+    near: float = 0.0  # Depth in front of which nothing stands, [world units]
+    index: IntArray | None = None  # Index of each photograph in its dataset; None: not from a dataset
     measured: Float32Array | None = None
-    """Channels before differences of gain were corrected, shape (pixels, 3); None: none was."""
+    """`colours` before gains were corrected, shape (pixels, 3); None: gains were not corrected."""
 
     @property
     def numbers(self) -> IntArray:
-        """Which photograph each pixel belongs to, shape (pixels,)."""
+        """Index of the photograph that each pixel belongs to, shape (pixels,)."""
         return np.repeat(np.arange(len(self)), np.prod(self.sizes, axis=1))
 
     def __len__(self) -> int:
         return len(self.matrices)
 
     def of_pixels(self, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Camera centres of the pixels `chosen` (n,), and their directions of depth 1, both (n, 3), in the world."""
+        """Return camera centres and directions (of depth 1) of the pixels `chosen` (n,), both (n, 3), in the world."""
         number = np.searchsorted(self.firsts, chosen, side="right") - 1
         place, width = chosen - self.firsts[number], self.sizes[number, 0]
         pixel = np.column_stack((place % width + 0.5, place // width + 0.5, np.ones(len(chosen))))
         return self.centres[number], np.einsum("nij,nj->ni", np.linalg.inv(self.matrices[:, :, :3])[number], pixel)
 
     def shown(self, number: int, points: FloatArray) -> tuple[IntArray, FloatArray, BoolArray]:
-        """Pixels of one photograph that show points (n, 3), their depths there, and whether the photograph shows them.
+        """Return for points (n, 3) the pixel of photograph `number`, the depth, and whether it is in view, all (n,).
 
-        A point that it does not show has the photograph's first pixel.
+        A point that the photograph does not show has the photograph's first pixel. Occlusion is not considered.
         """
         seen = points @ self.matrices[number, :, :3].T + self.matrices[number, :, 3]
         depth = seen[:, 2]
@@ -66,10 +66,10 @@ class Photographs:
 def read_photographs(
     dataset: Any, near: float = 0.0, most: int = MOST_PHOTOGRAPHS, longest_side: int = LONGEST_SIDE
 ) -> Photographs | None:
-    """Read a selection of a `ThermalDataset`'s photographs as small pinhole pictures, see `Photographs`.
+    """Read at most `most` evenly spaced photographs of a `ThermalDataset` as small pinhole pictures.
 
-    Of more than `most`, that many are taken at equal distances in the list; those with a side longer than
-    `longest_side` [pixels] are averaged down. None if there are none of perspective cameras.
+    Photographs with a side longer than `longest_side` [pixels] are averaged down to this size. `near` is that of
+    `Photographs`. Return None if no camera of the dataset is perspective.
     """
     usable = np.flatnonzero([dataset.camera(index) is not None for index in range(len(dataset))])
     if len(usable) > most:
@@ -81,12 +81,12 @@ def read_photographs(
 
 
 Pinhole = tuple[Float32Array, Float32Array, FloatArray]
-"""A photograph without distortion, shape (h, w, 3), NaN where masked, its normalised temperature (h, w), NaN where
-unknown, and world -> homogeneous pixels, (3, 4)."""
+"""A photograph without distortion, shape (h, w, 3), NaN where masked; its normalised temperature, (h, w), NaN where
+unknown; and the matrix from the world to homogeneous pixels, (3, 4)."""
 
 
 def gathered(pinholes: Sequence[Pinhole], centres: npt.ArrayLike, near: float = 0.0) -> Photographs:
-    """Put pinhole photographs and their cameras' centres (photographs, 3) into the arrays of `Photographs`."""
+    """Return pinhole photographs and their camera centres (photographs, 3), [world units], as one `Photographs`."""
     sizes = np.array([picture.shape[1::-1] for picture, _, _ in pinholes], dtype=np.int64)
     return Photographs(
         np.stack([matrix for _, _, matrix in pinholes]),
@@ -109,10 +109,10 @@ def _photograph(dataset: Any, index: int, longest_side: int) -> Pinhole:
 
 
 def thermal_at(dataset: Any, photographs: Photographs, depth: Float32Array) -> Float32Array:
-    """Normalised temperature where a photograph's pixels have a known `depth` (pixels,); NaN elsewhere.
+    """Return the normalised temperature at the pixels of photographs, shape (pixels,); NaN where unknown.
 
-    Of a thermal camera of its own: what it shows where the point stands. It is beside the photograph's, so that hardly
-    anything hides a point from it alone.
+    If the dataset has thermal cameras, the temperature is looked up where the thermal image shows the pixel's point at
+    `depth` (pixels,), and is NaN where `depth` is. Occlusion is ignored, as both cameras stand side by side.
     """
     if dataset.thermal_cameras is None:
         return photographs.thermal
@@ -144,10 +144,10 @@ def pinhole(
     longest_side: int = LONGEST_SIDE,
     thermal: Float32Array | None = None,
 ) -> Pinhole:
-    """Average a photograph (h, w, 3) down to `longest_side` [pixels] and remove its camera's distortion.
+    """Return a photograph (h, w, 3) averaged down to `longest_side` [pixels], without its camera's distortion.
 
-    Only pixels of its `mask` (h, w) are used. `thermal`, of any size, is what the same camera saw; the pose is camera
-    to world, (3, 4) or (4, 4), OpenGL axes.
+    Pixels outside its `mask` (h, w) become NaN; None: no mask. `thermal` is the normalised temperature by the same
+    camera, at any resolution; None: unknown. `pose` is camera to world, (3, 4) or (4, 4), OpenGL axes.
     """
     picture = photograph.astype(np.float32)
     picture /= np.float32(255.0)
@@ -174,7 +174,7 @@ def pinhole(
 
 
 def _distorted_places(camera: Camera) -> tuple[Float32Array, Float32Array]:
-    """Where the pixels of a pinhole picture lie in the distorted one: columns and rows for `cv2.remap`."""
+    """Return columns and rows (h, w), for `cv2.remap`, at which the distorted picture shows each undistorted pixel."""
     pinhole = replace(camera, k1=0.0, k2=0.0, k3=0.0, k4=0.0, p1=0.0, p2=0.0)
     rows, columns = np.mgrid[: camera.height, : camera.width]
     pixels = camera.project(pinhole.rays(np.column_stack((columns.ravel() + 0.5, rows.ravel() + 0.5)))) - 0.5

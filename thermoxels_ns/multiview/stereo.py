@@ -1,4 +1,4 @@
-"""Multi-view stereo: depths of photographs by plane sweep, and feature rays to them."""
+"""Multi-view stereo: depths of photographs by plane sweep, and feature rays to these depths."""
 
 from __future__ import annotations
 
@@ -16,63 +16,62 @@ from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo_kernels import aggregate, correlate, refine_depths, weigh_patches
 
 NEIGHBOURS = 4
-"""Photographs that one is compared with; of these the better half counts at each pixel, as others may be hidden."""
+"""Most photographs that each photograph is compared with. At each pixel the better half of these neighbours counts, as
+in the other half the surface may be hidden."""
 ANGLES_DEG = (4.0, 60.0)
-"""Angles between directions to the same point at which two photographs are compared: a smaller one says nothing about
-depth, a larger one shows something else."""
+"""Limits of the angle between the rays of two photographs to a point, for the photographs to be compared: below, the
+angle tells nothing about depth; above, the surface looks too different."""
 BEST_ANGLE_DEG = 15.0  # Neighbours at about this angle are preferred
-RADIUS = 2  # Pixels from the middle of the square that is compared to its sides
+RADIUS = 2  # A patch, the square of pixels that is compared, is 2 RADIUS + 1 pixels wide
 LIKENESS = 0.025
-"""Difference of two pixels, of 1, at which one has 37 % of the weight of the other in its square."""
-SPREAD = 1.0  # The same, relative to how much the pixels around the middle one differ from it, where that is more
-LEAST_WEIGHT = 0.05  # Weight below which it has none
+"""Least difference from the middle pixel of its patch, of 1, at which a pixel has 37 % of the middle pixel's weight."""
+SPREAD = 1.0  # That difference relative to a typical difference of pixels around the middle one; the larger counts
+LEAST_WEIGHT = 0.05  # A smaller weight, of 1, is set to 0
 PLANES = (24, 128)
-"""Planes per photograph: such that the picture moves by about a pixel from one to the next, within these limits."""
+"""Least and most planes per photograph. Within, the picture moves by about a pixel from one plane to the next."""
 NOISE = (1.5 / 255.0, 1.0 / 255.0)
-"""Standard deviations within a patch that are noise: of brightness, of 1, and of temperature, of the scene's range."""
+"""Standard deviations of noise within a patch: of brightness, of 1, and of temperature, of the scene's range."""
 STEP, JUMP = 0.05, 0.6
-"""Cost of a step of one plane from a pixel to the next, and of a longer one, as half of one minus a correlation. Steps
-of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes."""
-EDGE = 0.02  # Difference of two pixels, of 1, at which a jump costs half
-MARGIN = 0.05  # By how much the best plane must beat the best one that is not its neighbour
-TOLERANCE = 0.3
-"""Share of the distance between planes, of both photographs together, by which depths that agree may differ."""
-FEWEST_VIEWS = 2  # Photographs whose own depths must lie where a sure one does
-VIEWS_PER_CONTRADICTION = 2  # As many must do so for each photograph that looks through the point
-VIEWS_TO_CONTRADICT = 3  # Photographs that must agree with a depth behind the point, which is else likely to be wrong
-FEWEST_AROUND = 6
-"""Of the eight pixels around a sure one, those whose depths agree with its own too: outlines and noise have fewer."""
+"""Costs of a change of one plane, and of several planes, between pixels side by side. The cost of a correlation r is
+(1 - r) / 2. Steps of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes."""
+EDGE = 0.02  # Difference of two pixels, of 1, at which a jump between them costs half
+MARGIN = 0.05  # Least cost by which the best plane must beat every plane more than two planes away
+TOLERANCE = 0.3  # Depths of two photographs agree if they differ by this share of the sum of their planes' distances
+FEWEST_VIEWS = 2  # Other photographs whose own depths must agree with a sure depth
+VIEWS_PER_CONTRADICTION = 2  # Other photographs that must agree for each photograph that looks through the point
+VIEWS_TO_CONTRADICT = 3  # A depth may contradict others only if so many other photographs agree with it
+FEWEST_AROUND = 6  # Of the eight pixels around a sure one, this many must have its depth: outlines and noise have fewer
 REFINED_RADIUS, REFINED_LIKENESS = 3, 0.06
-"""The same of refinement in larger photographs. Radii of 2 to 4 and a likeness of 0.025 to 10 tried on house-corner and
-courtyard: the median error falls from 0.34 and 0.36 % to 0.28 and 0.22 %."""
-LEAST_CORRELATION = 0.6  # Correlation below which that does not move a depth, and nothing is as far as the last plane
+"""`RADIUS` and `LIKENESS` of refinement in larger photographs. Radii of 2 to 4 and a likeness of 0.025 to 10 were tried
+on house-corner and courtyard: the median error falls from 0.34 and 0.36 % to 0.28 and 0.22 %."""
+LEAST_CORRELATION = 0.6  # With less, refinement keeps a depth, and the sweep accepts no depth on its farthest plane
 ERROR_PLANES = 0.25  # Standard error of a depth, in planes of the sweep
-_NEAREST = 0.1  # Distance of the nearest plane in the box relative to the farthest
+_NEAREST = 0.1  # Least distance of the nearest plane in the box, relative to the farthest
 _OUTSIDE = -100.0
-"""Brightness that stands for a pixel that a photograph does not show: where it is mixed in, the rest is negative."""
-_PROBES = (5, 4)  # Pixels along each side and depths at which neighbours are looked for
-_FEWEST_PROBES = 0.1  # Share of these that a neighbour must see
+"""Value of a pixel that a photograph does not show. Interpolation between this and other pixels stays below 0."""
+_PROBES = (5, 4)  # Points along each side of a photograph, and depths, at which neighbours are looked for
+_FEWEST_PROBES = 0.1  # Share of these points that a neighbour must see
 _DEPTHS_PER_SPREAD = 2.0 ** np.arange(-6.0, 6.5, 0.5)
-"""Depths tried where no box is known, relative to the root of the cameras' mean squared distance from their middle."""
+"""Depths tried where no box is known, relative to the root mean square distance of the cameras from their middle."""
 
 
 @dataclass(frozen=True, eq=False)
 class Depths:
-    """Depths of the pixels of photographs."""
+    """Photographs with a depth for each pixel for which it is sure."""
 
-    photographs: Photographs  # The photographs
+    photographs: Photographs
     depth: Float32Array
     """Depth of each pixel, in the order of `photographs.colours`, shape (pixels,), [world units]; NaN: not sure."""
-    error: Float32Array  # Depth by which its planes are apart there, shape (pixels,), [world units]
+    error: Float32Array  # Distance between planes of the sweep at each depth, shape (pixels,), [world units]
 
     @property
     def share(self) -> float:
-        """Share of the pixels whose depth is known."""
+        """Share of the pixels whose depth is sure, 0 to 1."""
         return float(np.mean(np.isfinite(self.depth)))
 
 
 def depths_before_backdrop(depths: Depths) -> tuple[Depths, BoolArray]:
-    """Depths without those that an outline gave to the backdrop beside it, and the backdrop's pixels, (pixels,)."""
+    """Return depths without wrong ones beside a backdrop, and which pixels show it, (pixels,); see `plain_backdrop`."""
     backdrop, beside = plain_backdrop(depths.photographs, depths.depth)
     return replace(depths, depth=np.where(beside, np.float32(np.nan), depths.depth)), backdrop
 
@@ -84,26 +83,26 @@ def depths_of(
     views_to_contradict: int = VIEWS_TO_CONTRADICT,
     larger: Photographs | None = None,
 ) -> Depths:
-    """Find the depths of photographs: in a box and behind it, or wherever they see the same from different directions.
+    """Find the depths of the pixels of photographs in a box and behind it, or, without a box, where views overlap.
 
-    For each photograph, its neighbours are drawn onto planes parallel to it, one behind the other, and compared with it
-    patch by patch (plane sweep, Collins 1996; normalised cross-correlation), by brightness and, where the same camera
-    measured it, temperature. How little they agree is a cost, which is added up along paths through the photograph
-    (semi-global matching, Hirschmueller 2008), so that where texture fades, a pixel takes its depth from those beside
-    it that look alike. The plane of least cost is the depth of a pixel if it beats all but its neighbours by `MARGIN`.
-    It counts where depths of other photographs, found on their own, lie in the same place, and not too many that others
-    confirm lie behind it. Within a patch only pixels that look like the middle one count: else an outline gives its
-    depth to all that lies beside it.
+    For each photograph, neighbouring photographs are drawn onto planes parallel to its image, one behind the other, and
+    compared with the photograph patch by patch (plane sweep, Collins 1996; normalised cross-correlation): by brightness
+    and, where the same camera measured it, temperature. Low correlation is a cost. Costs are added up along paths
+    through the photograph (semi-global matching, Hirschmueller 2008), so that a pixel without texture takes the depth
+    of similar pixels beside it. The plane of least cost gives the depth of a pixel if it beats the planes farther away
+    by `MARGIN`. A depth is sure if enough other photographs have found a depth at the same point, and few photographs
+    look through the point. Within a patch only pixels that look like the middle one count: else pixels beside an
+    outline would take the outline's depth.
 
     Args:
-        photographs: Pinhole photographs, best some 160 pixels wide: cost grows with the third power of their size.
+        photographs: Pinhole photographs, best some 160 pixels wide: time grows with the third power of their size.
         lo: Lower corner of the box, [world units]. None: no box.
-        hi: Upper corner.
-        views_to_contradict: Photographs that must agree with a depth for it to contradict others.
-        larger: The same photographs with more pixels, in which depths are refined.
+        hi: Upper corner of the box. None: no box.
+        views_to_contradict: Photographs that must agree with a depth before it may contradict other depths.
+        larger: The same photographs with more pixels, in which depths are refined; None: depths are not refined.
 
     Returns:
-        Depths; not known anywhere where no photograph has a neighbour.
+        Depths, NaN where not sure; all are NaN if no photograph has a neighbour.
     """
     corners = None if lo is None or hi is None else (np.asarray(lo, np.float64), np.asarray(hi, np.float64))
     views = [_View.of(photographs, number) for number in range(len(photographs))]
@@ -144,10 +143,10 @@ def other_views(
     error: Float32Array,
     confirmed: BoolArray | None = None,
 ) -> tuple[IntArray, IntArray]:
-    """Count for each pixel the other photographs whose depth lies where its own does, and those that look through it.
+    """Count for each pixel the other photographs that agree with its depth, and those that look through its point.
 
-    Depths agree if they differ by no more than `TOLERANCE` times the sum of both pixels' errors. A photograph looks
-    through the point if its own depth there is `confirmed` and farther by more than twice that sum. All are (pixels,).
+    Depths agree if they differ by at most `TOLERANCE` times the sum of both pixels' `error`. A photograph looks through
+    the point if its depth there is `confirmed` and farther by more than twice that sum. All arrays are (pixels,).
     """
     agreeing, behind = (np.zeros(len(depth), dtype=np.int64) for _ in range(2))
     (known,) = np.nonzero(np.isfinite(depth))
@@ -158,7 +157,7 @@ def other_views(
         points, number = origins + depth[own, None] * along, np.searchsorted(photographs.firsts, own, side="right") - 1
         for other in range(len(photographs)):
             pixel, far, shown = photographs.shown(other, points)
-            farther, planes = depth[pixel] - far, error[pixel] + error[own]  # NaN is neither
+            farther, planes = depth[pixel] - far, error[pixel] + error[own]  # NaN fails both comparisons
             shown &= number != other
             agreeing[own] += shown & (np.abs(farther) <= TOLERANCE * planes)
             if confirmed is not None:
@@ -175,7 +174,7 @@ def _refine(
     depth: Float32Array,
     error: Float32Array,
 ) -> None:
-    """Refine depths (pixels,) and their errors in `larger` photographs: surfaces are as exact as depths are."""
+    """Refine depths (pixels,) and their errors in place by comparing `larger` photographs, see `refine_depths`."""
     turns, shifts = larger.matrices[:, :, :3], larger.matrices[:, :, 3]
     pictures = [_brightness(larger, number) for number in range(len(larger))]
 
@@ -208,7 +207,7 @@ def _refine(
 
 
 def _brightness(photographs: Photographs, number: int) -> Float32Array:
-    """Brightness of one photograph, shape (h, w); `_OUTSIDE` where masked."""
+    """Return the brightness of one photograph, shape (h, w), in [0, 1]; `_OUTSIDE` where masked."""
     (width, height), first = photographs.sizes[number], photographs.firsts[number]
     mean = photographs.colours[first : first + width * height].mean(axis=1).reshape(height, width)
     return np.nan_to_num(mean, nan=_OUTSIDE)
@@ -216,16 +215,16 @@ def _brightness(photographs: Photographs, number: int) -> Float32Array:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """One photograph."""
+    """One photograph, prepared for the sweep."""
 
     channels: Float32Array
     """Brightness and, where the same camera measured it, temperature, shape (1 or 2, h, w); `_OUTSIDE` where masked."""
     features: Float32Array
-    """What tells which pixels belong together, shape (h, w, 3 or 4): a third of each colour, and temperature, as skies
-    are cold."""
+    """Numbers by which pixels are found to look alike, shape (h, w, 3 or 4): a third of each colour, and temperature,
+    which sets a cold sky apart."""
     matrix: FloatArray  # World to homogeneous pixels, (3, 4)
     inverse: FloatArray  # Homogeneous pixels to directions of depth 1 in the world, (3, 3)
-    centre: FloatArray
+    centre: FloatArray  # Camera centre in the world, (3,)
 
     @classmethod
     def of(cls, photographs: Photographs, number: int) -> _View:
@@ -240,17 +239,17 @@ class _View:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Number of rows and of columns."""
         return self.channels.shape[1], self.channels.shape[2]
 
     @property
     def noise(self) -> Float32Array:
-        """Variance of each channel that is noise."""
+        """Variance of the noise of each channel, shape (channels,)."""
         return np.square(np.array(NOISE[: len(self.channels)], dtype=np.float32))
 
 
 def _span(view: _View, low: FloatArray, high: FloatArray, near: float) -> tuple[float, float] | None:
-    """Least and largest depth at which a photograph looks at the box; None if it does not."""
+    """Return the least and largest depth of the box in a photograph; None if the whole box is nearer than `near`."""
     corners = np.stack(np.meshgrid(*zip(low, high)), -1).reshape(-1, 3)
     depth = corners @ view.matrix[2, :3] + view.matrix[2, 3]
     far = float(depth.max())
@@ -260,7 +259,8 @@ def _span(view: _View, low: FloatArray, high: FloatArray, near: float) -> tuple[
 
 
 def _overlap(photographs: Photographs, number: int) -> tuple[float, float] | None:
-    """Least and largest depth at which enough others look at the same from useful directions; None: nowhere."""
+    """Return the least and largest depth at which two other photographs usefully see enough of the points that
+    photograph `number` sees (`_usefully_seen`); None if fewer than two depths qualify."""
     centres = photographs.centres
     depths = np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()) * _DEPTHS_PER_SPREAD
     points, others = _probes(photographs, number, depths), np.zeros(len(depths) * _PROBES[0] ** 2, int)
@@ -271,7 +271,7 @@ def _overlap(photographs: Photographs, number: int) -> tuple[float, float] | Non
 
 
 def _probes(photographs: Photographs, number: int, depths: FloatArray) -> FloatArray:
-    """Points that a photograph sees, spread over it at each of the depths, (depths * points, 3)."""
+    """Return points that a photograph sees, on a grid of pixels at each of the depths, (depths * pixels, 3)."""
     columns, rows = ((np.arange(_PROBES[0]) + 0.5) * side / _PROBES[0] for side in photographs.sizes[number])
     pixels = np.stack(np.meshgrid(columns, rows, [1.0]), -1).reshape(-1, 3)
     along = pixels @ np.linalg.inv(photographs.matrices[number, :, :3]).T
@@ -281,7 +281,7 @@ def _probes(photographs: Photographs, number: int, depths: FloatArray) -> FloatA
 def _usefully_seen(
     photographs: Photographs, number: int, other: int, points: FloatArray
 ) -> tuple[BoolArray, FloatArray]:
-    """Which points of one photograph another shows from a direction that tells how far they are; angles in degrees."""
+    """Return which points (n, 3) two photographs see at an angle within `ANGLES_DEG`, and that angle, [degrees]."""
     towards, away = (photographs.centres[each] - points for each in (number, other))
     lengths = np.linalg.norm(towards, axis=1) * np.linalg.norm(away, axis=1)
     cosine = np.einsum("ni,ni->n", away, towards) / np.maximum(lengths, 1e-12)
@@ -290,7 +290,7 @@ def _usefully_seen(
 
 
 def _neighbours(photographs: Photographs, number: int, near: float, far: float) -> list[int]:
-    """Photographs that see most of what one sees, from directions that tell how far it is."""
+    """Return the at most `NEIGHBOURS` photographs that see most of what photograph `number` sees, at good angles."""
     points = _probes(photographs, number, 1.0 / np.linspace(1.0 / far, 1.0 / near, _PROBES[1] + 2)[1:-1])
     worth = np.zeros(len(photographs))
     for other in range(len(photographs)):
@@ -302,7 +302,7 @@ def _neighbours(photographs: Photographs, number: int, near: float, far: float) 
 
 
 def _sweep(view: _View, others: list[_View], near: float, far: float, endless: bool) -> tuple[FloatArray, ...]:
-    """Depth of every pixel, NaN where not sure, and distance of planes; if `endless`, on planes behind `far` too."""
+    """Return depths, NaN where not sure, and distances of planes, (pixels,); if `endless`, with planes behind `far`."""
     inverse_depths = np.linspace(1.0 / far, 1.0 / near, _num_planes(view, others, near, far))
     beyond = min(len(inverse_depths), int(inverse_depths[0] / (inverse_depths[1] - inverse_depths[0]))) * endless
     farthest = 0.5 * inverse_depths[0] / max(1, beyond)
@@ -337,7 +337,7 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
     elsewhere = np.where(away, total, np.inf).min(-1)
     sure = elsewhere - np.take_along_axis(total, best[..., None], -1)[..., 0] >= MARGIN
     sure &= (best < total.shape[-1] - 1) & (view.channels[0] >= 0.0)
-    # Nothing is farther than the last plane: only what agrees well there is that far.
+    # Everything behind the farthest plane is matched there, so a depth on it is sure only where patches agree well.
     sure &= (best > 0) | ((beyond > 0) & (agreement[..., 0] <= 0.5 * (1.0 - LEAST_CORRELATION)))
     apart = np.diff(inverse_depths, append=2.0 * inverse_depths[-1] - inverse_depths[-2])[best]
     found = 1.0 / np.maximum(inverse_depths[best] + _between(total, best) * apart, inverse_depths[0])
@@ -346,7 +346,7 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
 
 @dataclass(frozen=True, eq=False)
 class _Patches:
-    """Who belongs to the patch around each pixel of a photograph, and how much the patch varies."""
+    """The patches around all pixels of a photograph, filled by `weigh_patches`."""
 
     weights: Float32Array  # Shape (pixels of a patch, h, w)
     means: Float32Array  # Shape (channels, h, w)
@@ -362,7 +362,7 @@ class _Patches:
 
 
 def _neighbours_agree(depth: Float32Array, error: Float32Array) -> BoolArray:
-    """Which pixels have `FEWEST_AROUND` neighbours whose depths are the same to one plane, shape (h, w)."""
+    """Return which pixels have `FEWEST_AROUND` neighbours with the same depth to within `error`, shape (h, w)."""
     height, width = depth.shape
     framed, count = np.pad(depth, 1, constant_values=np.nan), np.zeros(depth.shape, dtype=np.int64)
     for row in range(3):
@@ -372,7 +372,7 @@ def _neighbours_agree(depth: Float32Array, error: Float32Array) -> BoolArray:
 
 
 def _num_planes(view: _View, others: list[_View], near: float, far: float) -> int:
-    """Planes such that the middle of the picture moves by a pixel in the neighbour where it moves most."""
+    """Return how many planes it takes for the picture's middle to move by a pixel per plane where it moves most."""
     height, width = view.shape
     middle = view.centre + np.outer((near, far), view.inverse @ (0.5 * width, 0.5 * height, 1.0))
     most = 0.0
@@ -384,23 +384,24 @@ def _num_planes(view: _View, others: list[_View], near: float, far: float) -> in
 
 
 def _warped(other: _View, view: _View, depth: float, warped: Float32Array) -> None:
-    """Warp a photograph by the plane at a depth of another into what the other would see; fill `warped` (c, h, w)."""
+    """Fill `warped` (c, h, w) with what `view` would see if `other` were painted on the plane at `depth` of `view`."""
     turn = depth * (other.matrix[:, :3] @ view.inverse)
     turn[:, 2] += other.matrix[:, :3] @ view.centre + other.matrix[:, 3]
-    half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # pixel centres lie at halves, OpenCV's not
+    half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV's pixel centres are whole numbers
     height, width = view.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     to_other = np.linalg.inv(half) @ turn @ half
     for channel, picture in zip(warped, other.channels):
         cv2.warpPerspective(picture, to_other, (width, height), channel, flags, cv2.BORDER_CONSTANT, (_OUTSIDE,))
-    # What lies behind the other photograph would be drawn upside down. Depth in it is linear over the picture.
+    # Points behind the other camera would be drawn upside down. Depth in that camera is linear over the picture.
     if min(turn[2] @ (column, row, 1.0) for column in (0, width) for row in (0, height)) <= 0.0:
         columns, rows = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
         warped[:, turn[2, 0] * columns + turn[2, 1] * rows + turn[2, 2] <= 0.0] = _OUTSIDE
 
 
 def _between(cost: Float32Array, best: IntArray) -> FloatArray:
-    """Where between planes, the last axis, the cost is least: the bottom of a parabola, in -1/2 to 1/2 planes."""
+    """Return where the cost is least relative to plane `best` (of the last axis), in -1/2 to 1/2 planes, (h, w): the
+    bottom of the parabola through the costs of three planes; 0 at the first and last plane."""
     inner = np.clip(best, 1, cost.shape[-1] - 2)
     before, at, behind = (
         np.take_along_axis(cost, inner[..., None] + step, -1)[..., 0].astype(np.float64) for step in (-1, 0, 1)
@@ -411,10 +412,9 @@ def _between(cost: Float32Array, best: IntArray) -> FloatArray:
 
 
 def feature_rays_to_depths(depths: Depths) -> FeatureRays:
-    """One feature ray per sure pixel, to a point of its own.
+    """Return one feature ray per sure pixel, each to a point of its own, photograph after photograph, [world units].
 
-    The rays stand photograph after photograph [world units]. A ray's uncertainty is `ERROR_PLANES` times the distance
-    between the planes of its sweep, along the ray.
+    A ray's uncertainty is `ERROR_PLANES` times the distance between planes of the sweep, measured along the ray.
     """
     (sure,) = np.nonzero(np.isfinite(depths.depth))
     depth, error = (values[sure].astype(np.float64) for values in (depths.depth, depths.error))
@@ -424,7 +424,7 @@ def feature_rays_to_depths(depths: Depths) -> FeatureRays:
 def rays_through(
     photographs: Photographs, chosen: IntArray, depth: FloatArray, error: FloatArray | float = 0.0
 ) -> FeatureRays:
-    """Feature rays through the pixels `chosen` (n,) to depths (n,) with standard errors (n,), [world units]."""
+    """Return feature rays through the pixels `chosen` (n,) to depths (n,) with standard errors (n,), [world units]."""
     origins, along = photographs.of_pixels(chosen)
     points, errors = origins + depth[:, None] * along, np.asarray(error) * np.linalg.norm(along, axis=1)
     return FeatureRays(origins, np.arange(len(chosen)), points, errors)

@@ -1,4 +1,4 @@
-"""Compiled loops over photographs that are compared: patches, costs along paths, and depths refined."""
+"""Compiled loops of stereo: weights and correlation of patches, costs along paths, and refinement of depths."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 
 from thermoxels_ns.core.kernel_cache import kernel
 
-OUTSIDE = -1.0  # Correlation that stands for none
+OUTSIDE = -1.0  # Result where no correlation can be computed
 
 
 @kernel
 def _difference(features, row, column, i, j):
-    """Sum of the differences of the features of two pixels."""
+    """Return the sum of the absolute differences of the features of two pixels."""
     off = 0.0
     for n in range(features.shape[2]):
         off += abs(features[i, j, n] - features[row, column, n])
@@ -20,16 +20,16 @@ def _difference(features, row, column, i, j):
 
 @kernel
 def _weigh(features, row, column, radius, likeness, spread, least_weight, around, weights):
-    """Fill the weights of the patch around one pixel, see `weigh_patches`, which do not sum to 1 yet.
+    """Fill `weights` with those of the patch around one pixel, as in `weigh_patches`, not yet divided by their sum.
 
-    `around` is room for nine numbers.
+    `around` is scratch space for nine numbers.
     """
     k = 0
     for i in range(row - 1, row + 2):
         for j in range(column - 1, column + 2):
             around[k] = _difference(features, row, column, i, j)
             k += 1
-    scale = max(likeness, spread * np.sort(around)[5])  # the first is the pixel itself
+    scale = max(likeness, spread * np.sort(around)[5])  # number 0 is the pixel itself
     k = 0
     for i in range(row - radius, row + radius + 1):
         for j in range(column - radius, column + radius + 1):
@@ -40,14 +40,14 @@ def _weigh(features, row, column, radius, likeness, spread, least_weight, around
 
 @kernel
 def weigh_patches(features, channels, radius, likeness, spread, least_weight, noise, weights, means, variances):
-    """Fill weights, means and variances of the patch around each pixel: who looks like the pixel belongs to it.
+    """Fill `weights`, `means` and `variances` of the patch around each pixel; similar pixels have large weights.
 
-    A neighbour's weight is exp(-(d / s)^2) with d the difference of its `features` (h, w, f) from the pixel's, and
-    nothing below `least_weight` (adaptive support weights, Yoon and Kweon 2006, without distance). s is the fifth
-    smallest d of the eight pixels around, which an outline leaves small and a texture does not, times `spread`, but at
-    least `likeness`. The `weights` of a patch, (patch, h, w), sum to 1. The variance of one of the `channels` (c, h, w)
-    is 0 where the patch reaches beyond the photograph, holds a masked pixel (below 0), or varies by less than its
-    `noise` (c,), a variance, among what belongs to it. Means and variances are (c, h, w).
+    A patch reaches `radius` pixels from its middle. The weight of a pixel in it is exp(-(d / s)^2), or 0 below
+    `least_weight` (adaptive support weights, Yoon and Kweon 2006, without distance). d is the difference between the
+    `features` (h, w, f) of the pixel and of the middle; s is the fifth smallest d of the eight pixels around the middle
+    times `spread`, at least `likeness`. An outline leaves s small, a texture does not. `weights`, (patch, h, w), sum to
+    1 in a patch. The variance of one of the `channels` (c, h, w) is 0 where the patch leaves the photograph, holds a
+    masked pixel (below 0), or has a variance below `noise` (c,). Means and variances are (c, h, w).
     """
     count, height, width = channels.shape
     around, own = np.empty(9), np.empty((2 * radius + 1) ** 2)
@@ -79,12 +79,12 @@ def weigh_patches(features, channels, radius, likeness, spread, least_weight, no
 
 @kernel(fastmath={"contract"})
 def correlate(channels, others, radius, weights, means, variances, noise, count, plane, result):
-    """Fill ``result[row, column, plane]`` with how well the patch of a pixel is met by others drawn onto its pixels.
+    """Fill ``result[row, column, plane]`` with a pixel's mean correlation with the best `count` of `others`.
 
-    Weighted, normalised cross-correlation of each of the `channels` (c, h, w), `noise` (c,) added to both variances;
-    they count by their signal to noise. The mean of the best `count` of `others` (photographs, c, h, w), and `OUTSIDE`
-    where no channel has a variance. A photograph whose patch is masked (below 0) at a corner or in the middle has
-    nothing to say about the channel; if that holds for all channels, it counts as `OUTSIDE`.
+    `others`, (photographs, c, h, w), are photographs drawn onto the pixels of `channels` (c, h, w). A correlation is
+    weighted, normalised cross-correlation with `noise` (c,) added to both variances; channels are averaged by their
+    ratio of signal to noise. A channel is left out for a photograph whose patch is masked (below 0) at a corner or in
+    the middle. Where no channel is left, or none has a variance, the photograph counts as `OUTSIDE`.
     """
     kinds, height, width = channels.shape
     inner = width - 2 * radius
@@ -116,7 +116,7 @@ def correlate(channels, others, radius, weights, means, variances, noise, count,
                 for i in range(row - radius, row + radius + 1):
                     for j in range(2 * radius + 1):
                         weight, line, here = weights[k, row, radius:], other[i, j:], channels[channel, i, j:]
-                        for x in range(inner):  # one instruction for several pixels
+                        for x in range(inner):
                             value = line[x] - mean[x]
                             share = weight[x] * value
                             first[x] += share
@@ -143,11 +143,10 @@ def correlate(channels, others, radius, weights, means, variances, noise, count,
 
 @kernel(fastmath={"contract"})
 def aggregate(cost, features, small, large, edge, total):
-    """Add up costs along the paths that lead to each pixel from eight directions (Hirschmueller 2008, eq. 13).
+    """Fill `total` with the mean of the least costs of paths from eight directions (Hirschmueller 2008, eq. 13).
 
-    From one pixel of a path to the next, a step to the next plane costs `small` and one to any other `large`, but less
-    where the pixels differ: half of it at a difference of `edge` of their `features` (h, w, f). `cost` and `total`,
-    which is filled with the mean over the directions, are (h, w, planes).
+    Between two pixels of a path, a change of one plane costs `small`. A change of more planes costs `large`, or less
+    where the pixels' `features` (h, w, f) differ, half at a difference of `edge`. `cost` and `total`: (h, w, planes).
     """
     rows, columns, planes = cost.shape
     total[:] = 0.0
@@ -182,27 +181,28 @@ def aggregate(cost, features, small, large, edge, total):
 def refine_depths(
     width, depth, error, ratio, features, picture, others, turns, shifts, options, noise, refined, spacing
 ):
-    """Move the depths of a photograph to where larger pictures agree best, and say how far steps are apart.
+    """Move the depths of a small photograph to where larger versions of the photographs correlate best.
 
-    Of a pixel of the small photograph, the patch around its middle is taken from the larger one, weighted as in
-    `weigh_patches`, and laid on the plane that the depths around it say. It is tried at some inverse depths before and
-    behind, between which the larger pictures of `others` move by half a pixel; the top of a parabola through the best
-    counts. What has no texture, agrees badly, or agrees best at an end stays as it is.
+    For each pixel of the small photograph, a patch around its middle is taken from the larger photograph, weighted as
+    in `weigh_patches`, and laid on the plane through the depths around the pixel. The patch is tried at inverse depths
+    before and behind, at steps that move it by at most half a pixel in `others`. The new depth is at the top of the
+    parabola through the best three correlations. A depth stays where the patch has no texture, the best correlation is
+    too low, or the best is the first or last step.
 
     Args:
         width: Columns of the small photograph.
-        depth: Depth of its pixels, (pixels,), [world units]; NaN: not known.
-        error: Distance of the planes on which these were found.
+        depth: Depth of the pixels of the small photograph, (pixels,), [world units]; NaN: not known.
+        error: Distance of the planes on which these depths were found, (pixels,), [world units].
         ratio: Columns of the larger photograph per column of the small one.
         features: Features of the larger photograph, (h, w, f).
-        picture: Its brightness, (h, w).
-        others: Brightness of the photographs that it is compared with, (photographs, h, w); below 0 where unknown.
-        turns: Homogeneous pixels of the larger photograph to homogeneous pixels of each other, at infinity, (n, 3, 3).
-        shifts: What is added per inverse depth, (n, 3).
-        options: Radius, likeness, spread, least weight, steps and least correlation.
-        noise: Variance of brightness that is noise.
-        refined: Depths, (pixels,); filled.
-        spacing: Distance of steps that move a picture by a pixel, [world units], (pixels,); filled where refined.
+        picture: Brightness of the larger photograph, (h, w).
+        others: Brightness of the photographs to compare with, (photographs, h, w); below 0 where unknown.
+        turns: Matrices from homogeneous pixels of `picture` to those of each of `others` at infinity, (n, 3, 3).
+        shifts: Homogeneous pixels that are added per inverse depth, (n, 3).
+        options: Radius, likeness, spread, least weight, steps before and behind, and least correlation.
+        noise: Variance of the noise of brightness.
+        refined: Receives the new depths, (pixels,); unchanged where a depth stays.
+        spacing: Receives the distance in depth that moves `others` by a pixel, (pixels,), where `refined` changes.
     """
     radius, likeness, spread, least_weight, steps, least = options
     height, columns = picture.shape
@@ -243,7 +243,7 @@ def refine_depths(
             variance += weights[k] * own[k] * own[k]
         if variance < 4.0 * noise:
             continue
-        apart = 0.0  # inverse depth by which the picture that moves most moves by a pixel
+        apart = 0.0  # most pixels that the patch moves in any picture per inverse depth; inverted below
         for o in range(count):
             t, s = turns[o], shifts[o]
             w = t[2, 0] * u + t[2, 1] * v + t[2, 2]

@@ -1,4 +1,4 @@
-"""What photographs vote for: which voxels are air, and which surfaces lie where they are said to lie."""
+"""Votes of photographs: which voxels are air, and which surfaces lie where their depths are."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from thermoxels_ns.multiview.stereo import ERROR_PLANES, Depths
 
 CountArray = npt.NDArray[np.int32]
 
-FEWEST_POINTS = 2  # Different points whose rays must cross a voxel: a single one may be wrong
-MARGIN_VOXELS = 1.5  # Voxels before a point that are not judged by the rays to it
-MARGIN_ERRORS = 3.0  # Standard errors of a ray's length that are not judged either
-CLEARANCE = 0.5  # Distance from a camera up to which nothing stands, relative to the nearest thing that it shows
-FEWEST_RAYS = 20  # Feature rays of a camera that tell what it shows
-_NEAREST = 1.0  # Percentile of their lengths that is the nearest: a few may be wrong
-REACH = 1.5  # Distance from a surface up to which a depth or a track's point lies on it, [voxels]
-REACH_ERRORS = 2.0  # Standard errors of a depth that are added
+FEWEST_POINTS = 2  # Points whose rays must cross a voxel before it counts as free: a single point may be wrong
+MARGIN_VOXELS = 1.5  # A ray votes only for voxels at least so far before its point, [voxels]
+MARGIN_ERRORS = 3.0  # Standard errors of the ray's length that are added to this margin
+CLEARANCE = 0.5  # Nothing stands nearer to a camera than this share of the distance to the nearest thing that it shows
+FEWEST_RAYS = 20  # A camera with fewer feature rays is not judged by `around_cameras`
+_NEAREST = 1.0  # Percentile of a camera's ray lengths that is taken as the nearest: a few rays may be wrong
+REACH = 1.5  # A depth or a track's point lies on a surface up to this distance from the surface, [voxels]
+REACH_ERRORS = 2.0  # Standard errors of a depth that are added to this distance
 
 
 def air_voxels(lattice: Lattice, rays: FeatureRays) -> BoolArray:
-    """Find the voxels that are air: one boolean per voxel, shape of the lattice's voxels.
+    """Return which voxels are air, shape `lattice.cell_shape`.
 
     A voxel is free if the rays to at least `FEWEST_POINTS` points cross it and leave it `MARGIN_VOXELS` voxels and
-    `MARGIN_ERRORS` standard errors before their points, and no point lies in it, with rays or without. It is air if its
-    six neighbours are free too: a ray that grazes a surface crosses voxels that hold a part of it. (Of a white house
-    and a courtyard, drawn, with 32 and 128 voxels, 1 to 6 % of the voxels on the surface are free and at most 0.04 %
-    are air, and so are 50 to 75 % of the voxels that it should be.)
+    `MARGIN_ERRORS` standard errors before their points, and if no point, with or without rays, lies in it. A free voxel
+    is air if its six neighbours are free too, because a ray that grazes a surface crosses voxels that hold a part of
+    the surface. (Drawn white house and courtyard, 32 and 128 voxels: 1 to 6 % of the voxels on the surface are free and
+    at most 0.04 % are air; 50 to 75 % of the voxels that truly are air are found.)
     """
     crossing, points = votes(lattice, rays)
     free = (crossing >= FEWEST_POINTS) & (points == 0)
@@ -42,10 +42,10 @@ def air_voxels(lattice: Lattice, rays: FeatureRays) -> BoolArray:
 
 
 def around_cameras(points: FloatArray, rays: FeatureRays, views: Views) -> BoolArray:
-    """Which points (n, 3) are much nearer to a camera than what it shows, and in view of fewer than two photographs.
+    """Return which points (n, 3) are in the empty space around a camera and in view of fewer than two photographs.
 
-    What no second photograph shows, no training ray contradicts, and a lump there hides what stands behind it from
-    views that did not train; but where somebody held a camera is air. (A real room: 21.5 dB without, 23.6 dB with.)
+    The space ends at `CLEARANCE` of the distance to the nearest thing that the camera shows. No training ray refutes a
+    lump there that no second photograph shows. (A real room: 21.5 dB without this rule, 23.6 dB with it.)
     """
     origins, camera_of = np.unique(rays.origins, axis=0, return_inverse=True)
     lengths = np.linalg.norm(rays.points[rays.point] - rays.origins, axis=1)
@@ -64,7 +64,7 @@ def around_cameras(points: FloatArray, rays: FeatureRays, views: Views) -> BoolA
 
 
 def votes(lattice: Lattice, rays: FeatureRays) -> tuple[CountArray, CountArray]:
-    """Count the points to which rays cross each voxel, and the points in it, both of the shape of the voxels."""
+    """Return per voxel how many points have a ray that crosses it (less the margin), and how many points lie in it."""
     shape = np.asarray(lattice.cell_shape)
     origins, ends = lattice.world_to_index(rays.origins), lattice.world_to_index(rays.points)
     margin = MARGIN_VOXELS + MARGIN_ERRORS * rays.uncertainty / lattice.voxel_size
@@ -78,9 +78,9 @@ def votes(lattice: Lattice, rays: FeatureRays) -> tuple[CountArray, CountArray]:
 
 @kernel
 def _count_crossings(origins, point, ends, margin, shape, crossing, last):
-    """Count the voxels that each ray leaves `margin` before its end; coordinates are those of the lattice.
+    """Add to `crossing` 1 per voxel and point, if a ray to the point leaves the voxel `margin` before its end.
 
-    Rays to one point stand together: each point counts once per voxel.
+    Coordinates are corner indices of the lattice. Rays to one point stand together, so that a point counts once.
     """
     cells, faces = np.empty(shape.sum(), np.int64), np.empty(shape.sum() + 1)
     for n in range(len(origins)):
@@ -98,20 +98,20 @@ def _count_crossings(origins, point, ends, margin, shape, crossing, last):
 def supporting_photographs(
     depths: Depths, middle: FloatArray, seen: BoolArray, voxel_size: float, tracks: FeatureRays | None = None
 ) -> BoolArray:
-    """Tell which photographs see a surface at given places where their own depth, or a track's point, lies on it.
+    """Return which photographs support a surface at given places: their own depth, or a track's point, lies on it.
 
-    Depths are those on which photographs agree, see `depths_of`: a plain wall has none of its own, and a surface that
-    hangs in free space is refuted by what they see behind it.
+    A photograph without a sure depth at a place (see `depths_of`), as on a plain wall, supports it by tracks alone. A
+    surface that hangs in free space is not supported, because the depths there are those of what stands behind it.
 
     Args:
         depths: Depths of the photographs.
-        middle: Places, shape (g, 3), [world units].
-        seen: Whether each photograph sees each place, shape (g, photographs).
+        middle: Places on the surface, shape (g, 3), [world units].
+        seen: True where a photograph sees a place, shape (g, photographs).
         voxel_size: Edge of a voxel, [world units].
-        tracks: Lines from photographs to points, in the same world.
+        tracks: Feature rays from photographs to points of tracks, [world units]; None: no tracks.
 
     Returns:
-        Whether each photograph supports each place, only where it sees it, shape (g, photographs).
+        True where a photograph sees and supports a place, shape (g, photographs).
     """
     photographs, result = depths.photographs, np.zeros(seen.shape, dtype=np.bool_)
     for number in range(len(photographs)):
@@ -125,7 +125,7 @@ def supporting_photographs(
 
 
 def _by_tracks(tracks: FeatureRays, centres: FloatArray, middle: FloatArray, reach: float) -> BoolArray:
-    """Which photographs have a line to a point within `reach` of each place, shape (g, photographs)."""
+    """Return which photographs have a feature ray to a point within `reach` of each place, shape (g, photographs)."""
     off, photograph = KDTree(centres).query(tracks.origins)
     own = np.asarray(off) <= 1e-3 * reach
     near = KDTree(middle).query_ball_point(tracks.points, reach)
