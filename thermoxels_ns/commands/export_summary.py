@@ -29,7 +29,7 @@ SKIPPED_EFFECTS = (
     "Space that no camera saw and that the mesh leaves empty, such as the inside of a building seen from outside with "
     "--interior hollow or --wall-thickness. The heat content is that of the mesh.",
 )
-"""Effects that the heat step of an export leaves out of the heat balance."""
+"""Effects missing from the heat balance of the preset concrete; `heat_summary` lists them for every preset."""
 
 
 def lines_on_mesh(
