@@ -267,7 +267,7 @@ class _Fit:
                 f"{np.log(2.0) * sensitive_k:.2g} K. Take it as known, or measure a surface that it acts on."
             )
         told = f"{', '.join(named[:-1])} and {named[-1]} cannot be told apart"
-        power = -float(share[which[1]])  # of two, the first times the second to this power is known
+        power = -float(share[which[1]])  # known is the first property times the second to this power
         if len(which) > 2 or abs(abs(power) - 1.0) >= 0.05:
             return f"{told}: only a combination of them is known. Take all but one of them as known."
         values = [self.start[name] * np.exp(self.logarithm[n]) for n, name in zip(which, named)]

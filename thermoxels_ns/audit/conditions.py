@@ -211,7 +211,7 @@ class Calibrate:
     unknown: tuple[Unknown, ...]  # One to `MOST_UNKNOWN` properties to search for
     layers: dict[str, Layer] = field(default_factory=dict)
     film: dict[str, Annotated[Measured, Unit("W/(m2 K)", 0.0, above=True)]] = field(default_factory=dict)
-    """Coefficient of convection by name or pattern of photographed patches, in place of the film model's own."""
+    """Convection by name or pattern of photographed patches, in place of the film model; radiation is added."""
     behind: tuple[str, ...] = ("interior-*",)  # Patches in contact with the air on the side not photographed
     adiabatic: tuple[str, ...] = ("cut",)  # Patches that no heat crosses
 

@@ -15,7 +15,7 @@ from thermoxels_ns.mesh.quality.checks import component_of, group_sides, triangl
 DefectKind = Literal["line", "point", "area"]
 
 LEAST_DEPARTURE_K = 0.1  # Smallest departure that any camera tells from noise, [K]
-_DEVIATIONS = 3.0  # A triangle departs from this many standard deviations of the undisturbed surface on
+_DEVIATIONS = 3.0  # Least departure of a triangle, in standard deviations of the undisturbed surface
 _CELL_M, _AROUND_M = 0.25, 1.25
 """Edge of the cells whose mean temperatures are taken, and radius within which their median is the background, [m]."""
 _SHORTH = 1.349  # Width of the shortest half of a normal distribution, in standard deviations

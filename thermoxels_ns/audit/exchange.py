@@ -73,7 +73,7 @@ def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
 def part_totals(
     conditions: Conditions, groups: AlikeTriangles, draws: Draws, area_m2: sparse.csr_array, warmer_k: float = 0.0
 ) -> PartTotals:
-    """Sum heat flow and average temperature over parts; `area_m2`, (p, g), is the area of each group in each part."""
+    """Return totals and means over p parts; `area_m2`, shape (p, g), is the area of each group in each part, [m2]."""
     columns, count = area_m2.tocsc(), len(groups.reading_c)
     total = np.asarray(area_m2.sum(axis=1)).reshape(-1, 1)
     flow_w, temperature = np.zeros((len(total), draws.count)), np.zeros((len(total), draws.count))

@@ -69,7 +69,7 @@ class Element:
 
     name: str
     area_m2: float  # Area of the triangles that count
-    unobserved_m2: float  # Area of all other triangles, except those that the scene box or the region cuts
+    unobserved_m2: float  # Area of the part's other triangles, without those that the scene box or the region cuts
     surface_c: Interval  # Mean surface temperature, [degrees Celsius]
     loss_w: Interval  # Heat flow from inside to outside, [W]
     u_w_m2k: Interval
@@ -257,7 +257,7 @@ class _Parts:
         return self.draws.local(self.conditions.camera.repeatability.off_by, number)
 
     def element(self, name: str, row: int, every: IntArray, error_w: FloatArray) -> Element:
-        """Return the results of part `row`, from all of its triangles and draws of its own error, (k,), [W]."""
+        """Return the results of part `row`; `every` are its triangles, `error_w` draws of its own error, (k,), [W]."""
         surface, counted, area = self.surface, self.parts[row], float(self.totals.area_m2[row])
         uncut = every[surface.why_not[every] != list(WHY_NOT).index("cut")]
         flow_w = self.totals.flow_w[row] + error_w

@@ -57,7 +57,7 @@ class Audit:
         from rich.console import Console
 
         console = Console(highlight=False)
-        # The last bits of a product of long vectors depend on how many threads BLAS has.
+        # With more BLAS threads, the last bits of results would depend on the number of threads.
         with threadpool_limits(1, "blas"):
             run_audit(self, lambda line: console.print(line, markup=False, soft_wrap=True))
 
@@ -136,7 +136,7 @@ def _write(folder: Path, options: Audit, found: Found, photographs: Mapping[int,
     from thermoxels_ns.reports.page import write_page
 
     answers = answers_of(options, found)
-    summary_text(answers)  # raises if json cannot hold it
+    summary_text(answers)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
     _write_surface(folder / SURFACE, found)
     pictures = draw_audit(found) if options.pictures else None

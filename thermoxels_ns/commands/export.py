@@ -83,7 +83,7 @@ class ExportOptions:
     region_box: tuple[float, float, float, float, float, float] | None = None
     """In place of auto: export the inside of a box, xmin ymin zmin xmax ymax zmax in coordinates of the input poses."""
     region_near: tuple[float, float, float, float] | None = None
-    """In place of auto: export the surroundings of a point, x y z radius in the coordinates of the input poses."""
+    """In place of auto: export the inside of a ball, x y z radius in the coordinates of the input poses."""
     interior: Literal["solid", "hollow"] = "solid"
     """Treatment of the inside of a body if photographs show only its shell. solid: the inside is filled, but a cavity
     that holds a camera is a room and stays empty. hollow: only the shell is exported, with the thickness that training
@@ -183,7 +183,7 @@ class ExportThermoxelsMesh(ExportOptions):
         from rich.markup import escape
 
         try:
-            # The last bits of a product of long vectors depend on how many threads BLAS has.
+            # With more BLAS threads, the last bits of results would depend on the number of threads.
             with threadpool_limits(1, "blas"):
                 self.run(lambda line: CONSOLE.print(escape(line)))
         except ThermoxelsError as problem:
@@ -242,7 +242,7 @@ def check_options(options: ExportOptions) -> CheckedOptions:
     if not options.formats or len(set(options.formats)) < len(options.formats):
         remedy = "Pass --formats vtu glb, for example."
         raise MeshError("formats", expected="at least one format, each once", got=options.formats, remedy=remedy)
-    MeshOptions(options.boundary, options.coarsest_cell)  # refuses what is out of range
+    MeshOptions(options.boundary, options.coarsest_cell)  # raises if a value is out of range
     selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
     rules = PatchRules() if options.patches is None else load_patch_rules(options.patches)
     return CheckedOptions(selection, rules, distance, *_heat_settings(options))
@@ -305,7 +305,7 @@ def up_of(
 
 
 def prepare_folder(output_dir: Path | str) -> Path:
-    """Make the folder of an export without a killed export's half-written files; `OutputError` if others are there."""
+    """Make the folder of an export, remove half-written files; raises `OutputError` if it holds files of others."""
     from thermoxels_ns.heat.vtk_series import STEP_PATTERN
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS
 
@@ -423,7 +423,7 @@ def export_snapshot(
         **({} if truth is None else {"truth": truth}),
         "files": [*files, _SUMMARY],
     }
-    summary_text(summary)  # raises if json cannot hold it
+    summary_text(summary)  # raises if json cannot hold the summary
 
     remove_file(folder / _SUMMARY)
     write_summary(folder / _QUALITY, report.as_mapping())  # first: marks the folder as an export's for `prepare_folder`
@@ -552,7 +552,7 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
         raise
     except (yaml.YAMLError, AssertionError, KeyError, UnicodeDecodeError) as problem:
         expected = "a config.yml that ns-train of this installation wrote"
-        # nerfstudio's own checks have no message
+        # errors of nerfstudio's own checks have no message
         reason = f"{type(problem).__name__}: {problem}" if str(problem) else "it holds no TrainerConfig of nerfstudio"
         got = f"{load_config}, which cannot be read ({reason})"
         remedy = "Pass the config.yml of the training run."
@@ -589,7 +589,7 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
         return Viewpoint()
     up /= np.linalg.norm(up)
     source = "The mean of what was up in the photographs; cameras that all look down or up tilt it."
-    # People hold pictures level: up is at right angles to the pictures' horizontal axes, if these span a plane.
+    # People hold cameras level: if the pictures' horizontal axes span a plane, up is at right angles to this plane.
     spread, directions = np.linalg.eigh(np.einsum("ni,nj->ij", axes[:, :, 0], axes[:, :, 0]) / len(axes))
     level = directions[:, 0] * np.sign(directions[:, 0] @ up)
     if spread[1] > 0.05 and spread[0] < 0.2 * spread[1] and level @ up > 0.3:

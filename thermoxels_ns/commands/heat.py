@@ -73,7 +73,7 @@ class Heat:
         from rich.console import Console
 
         console = Console(highlight=False)
-        # The last bits of a product of long vectors depend on how many threads BLAS has.
+        # With more BLAS threads, the last bits of results would depend on the number of threads.
         with threadpool_limits(1, "blas"):
             run_heat(self, lambda line: console.print(line, markup=False, soft_wrap=True))
 
@@ -197,7 +197,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     from thermoxels_ns.reports.page import write_page
 
     answers = answers_of(options, run)
-    summary_text(answers)  # raises if json cannot hold it
+    summary_text(answers)  # raises if json cannot hold the answers
     shown, pictures = run.nodes, list[str]()
     remove_file(folder / ANSWERS)
     _write_series(folder / SERIES, run)  # first: marks the folder as a heat run's for `result_folder`

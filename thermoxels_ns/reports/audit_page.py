@@ -18,8 +18,8 @@ from thermoxels_ns.reports.numbers import number_text, stated_text
 from thermoxels_ns.reports.page import Picture, build_page, image_file
 
 AuditPictures: TypeAlias = dict[str, list[bytes]]
-"""PNG files by name, one for each of one or two views: "temperature" with the numbers of defects, "u_value" (heat flow
-if the air outside is not known), "misfit" (measured minus computed temperature). "defects" has one file per defect."""
+"""PNG files by name, one for each view: "temperature" with the numbers of defects, "u_value" (heat flow if no outside
+temperature is stated), "misfit" (measured minus computed temperature). "defects" has one file per defect."""
 
 MOST_DEFECTS = 12  # Number of defects that get a picture
 _ALL_AROUND = 0.35  # If the mean horizontal normal is shorter than this, the building was seen from all around

@@ -24,7 +24,7 @@ from thermoxels_ns.radiometry.thermal_pixels import MIN_FRAMES
 from thermoxels_ns.reports.charts import PERCENTILES, bars, colours, histogram
 from thermoxels_ns.reports.page import build_page, image_file, write_page
 
-_DEPTH_STEP = 4  # Depth is looked up at one of this many pixels along each side, and interpolated in between
+_DEPTH_STEP = 4  # Spacing of the pixels at which depth is looked up, [pixels]; depth is interpolated in between
 _COLOUR_SHARE = 0.55  # Opacity of the thermal colours over the photograph
 _SHOWN = 6  # Number of frames with an overlay
 _SAMPLED_PIXELS = 4000  # About the number of pixels of each thermal image that enter the histogram
@@ -64,7 +64,7 @@ def thermal_in_photograph(
 ) -> Float32Array:
     """Return the temperature that a thermal image, [degrees Celsius], shows at each pixel of a reduced photograph.
 
-    The shape is (height, `width`), NaN beyond the thermal image. Depths between the cameras are those of scene points.
+    The shape is (height, `width`), NaN beyond the thermal image. Depths come from the scene points that `frame` sees.
     """
     height = max(1, round(visible.height * width / visible.width))
     rays = _grid_rays(visible, width, height)
