@@ -1,4 +1,4 @@
-"""Calibration: properties of walls for which the computed surface temperature meets the measured one.
+"""Calibration: find the properties of walls for which computed surface temperatures agree with measured ones.
 
 The package `heat` computes steady heat flow through the mesh, with the conditions' film model on the photographed side
 and ISO 6946 on the other side. Gauss-Newton's method finds the logarithms of the unknown properties with the least sum
@@ -48,7 +48,7 @@ class Calibration:
     moved_most_by: Mapping[str, str]  # By unknown property: the uncertain quantity that moves its value most
     misfit_k: float  # Root mean square of measured minus computed surface temperature, weighted by area, [K]
     difference_k: FloatArray
-    """Measured minus computed surface temperature, shape (f,), [K]; NaN for triangles that take no part."""
+    """Measured minus computed surface temperature, shape (f,), [K]; NaN for triangles outside the fit."""
 
 
 def calibrated(
@@ -276,7 +276,7 @@ class _Fit:
         return f"{told}: their {what} is, {known}. Take one of the two as known."
 
     def _local(self, gain: FloatArray) -> Iterator[tuple[int, FloatArray]]:
-        """Yield each patch with the change, (m,), of `gain`, (m, c), times residuals if its readings err by 1 K."""
+        """Yield each patch and how much `gain`, (m, c), times residuals changes, (m,), if the patch reads 1 K more."""
         patch = self.wall.surface.selection.facet_patch[self.wall.counted]
         for number in np.unique(patch):
             yield int(number), gain[:, patch == number].sum(axis=1)

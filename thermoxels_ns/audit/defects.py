@@ -34,7 +34,7 @@ _NEIGHBOURS = 64  # Number of undisturbed triangles whose mean normal stands for
 
 @dataclass(frozen=True)
 class FoundDefect:
-    """One thermal bridge or other defect, given by boundary triangles; integer arrays are places of triangles."""
+    """One thermal bridge or other defect; integer arrays hold the indices of its boundary triangles."""
 
     kind: DefectKind
     patch: int

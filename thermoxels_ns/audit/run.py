@@ -37,7 +37,7 @@ _LEAST_FLOW_W_M2 = 1e-9
 _OF_A_TRIANGLE, _OF_THE_YEAR = 10**6, 10**6 + 1  # Arguments `number` of `Draws.local`, larger than any part's number
 
 LEAST_DIFFERENCE_K, MOST_WIND_M_S, LEAST_HOURS_WITHOUT_SUN, LEAST_HOURS_DRY = 10.0, 5.0, 2.0, 24.0
-"""Limits of EN 13187: least difference of the airs, most wind, least hours without sun and since wetting."""
+"""Limits of EN 13187: least difference of the airs, most wind, least hours since the sun and since wetness."""
 
 _MEANT_AS_EXACT = ("emissivity set in the camera", "reflected temperature set in the camera")
 _NAMES = {

@@ -147,7 +147,7 @@ def _voxels_found(solid: SolidCells) -> int:
 
 
 def _sums(names: tuple[str, ...], number: IntArray, amount: FloatArray) -> dict[str, float]:
-    """Return by name the sum of the amounts, shape (k,), with each number, shape (k,); unused names are left out."""
+    """Return the sum of `amount`, (k,), over entries with equal `number`, (k,), by name; unused names are left out."""
     total = np.bincount(number, weights=amount, minlength=len(names))
     return {names[n]: float(total[n]) for n in np.unique(number)}
 
