@@ -1,8 +1,8 @@
-"""Calibration: properties of walls for which the computed surface temperature meets the measured one.
+"""Calibration: find the properties of walls for which computed surface temperatures agree with measured ones.
 
-Steady heat flow through the mesh is computed by `heat/`, under the film of the conditions on the photographed side and
-ISO 6946 on the other. Gauss-Newton's method finds the logarithms of the unknown properties for which the squares of
-measured minus computed, by area, are least (Beck and Arnold 1977, Parameter Estimation in Engineering and Science).
+The package `heat` computes steady heat flow through the mesh, with the conditions' film model on the photographed side
+and ISO 6946 on the other side. Gauss-Newton's method finds the logarithms of the unknown properties with the least sum
+of squared differences, weighted by area (Beck and Arnold 1977, Parameter Estimation in Engineering and Science).
 """
 
 from __future__ import annotations
@@ -29,34 +29,34 @@ from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import inside_coefficient, outside_coefficient
 
 _UNITS = {"conductivity": "W/(m K)", "thickness": "m", "film": "W/(m2 K)"}
-_STEP = 1e-4  # For differences with respect to the logarithm of a property
-_MOST_STEP, _ENOUGH, _MOST_STEPS = 1.0, 1e-3, 30  # Of logarithms: largest step, last step; number of steps
-_FAR = 4.0  # Logarithm from which on a property may be as small or large as anyone likes
-_LEAST_K = 0.02  # Root mean square by which surface temperatures must change if a property becomes e times as large
-_MOST_SPREAD = 0.5  # Standard deviation of a logarithm by noise and drift alone from which on nothing is known
-_SMALL_SHARE = 0.1  # What takes part by less than this in a combination is not named
-_OF_A_PATCH, _OF_THE_NOISE, _OF_WHAT_IS_STATED = 3 * 10**6, 4 * 10**6, 5 * 10**6  # Numbers of errors of their own
+_STEP = 1e-4  # Step of difference quotients with respect to the logarithm of a property
+_MOST_STEP, _ENOUGH, _MOST_STEPS = 1.0, 1e-3, 30  # Largest step and stopping step of logarithms; most steps
+_FAR = 4.0  # A property whose logarithm moves farther than this from the start is not determined
+_LEAST_K = 0.02  # Least change of surface temperatures, root mean square, if a property becomes e times as large
+_MOST_SPREAD = 0.5  # Largest standard deviation of a logarithm, by noise and drift alone, of a known property
+_SMALL_SHARE = 0.1  # Properties with a smaller share than this in a combination are not named
+_OF_A_PATCH, _OF_THE_NOISE, _OF_WHAT_IS_STATED = 3 * 10**6, 4 * 10**6, 5 * 10**6  # Numbers that seed random errors
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Properties with which the computed surface temperature meets the measured one."""
+    """Result of a calibration: the values of the unknown properties, or the reason why there are none."""
 
-    found: Mapping[str, Interval]  # By name, such as "conductivity of wall"; empty if refused
-    units: Mapping[str, str]  # Of each property, known or unknown
-    refused: str  # Why no values are given, in sentences; else empty
-    moved_most_by: Mapping[str, str]  # Which stated quantity moves each most within its range
-    misfit_k: float  # Root mean square of measured minus computed, by area, [K]
+    found: Mapping[str, Interval]  # Unknown properties by name, such as "conductivity of wall"; empty if refused
+    units: Mapping[str, str]  # Unit of each property, known or unknown
+    refused: str  # Sentences that say why no values are found; empty if values are found
+    moved_most_by: Mapping[str, str]  # By unknown property: the uncertain quantity that moves its value most
+    misfit_k: float  # Root mean square of measured minus computed surface temperature, weighted by area, [K]
     difference_k: FloatArray
-    """Measured minus computed surface temperature of each triangle, shape (f,), NaN where it does not count, [K]."""
+    """Measured minus computed surface temperature, shape (f,), [K]; NaN for triangles outside the fit."""
 
 
 def calibrated(
     conditions: Conditions, surface: AuditedSurface, groups: AlikeTriangles, draws: Draws
 ) -> Calibration | None:
-    """Find the properties that the conditions ask for; None if they ask for none.
+    """Find the unknown properties of `Conditions.calibrate`; None if the conditions have no `calibrate`.
 
-    Raises `AuditError` or `HeatError` if the model does not fit the mesh.
+    Raises `AuditError` or `HeatError` if the model in the conditions does not fit the mesh.
     """
     asked = conditions.calibrate
     if asked is None:
@@ -82,7 +82,7 @@ def calibrated(
 
 
 class _Wall:
-    """The body with its films: surface temperatures for any properties and conditions."""
+    """The body with its films; computes surface temperatures for given properties and draws."""
 
     def __init__(
         self, conditions: Conditions, asked: Calibrate, surface: AuditedSurface, groups: AlikeTriangles
@@ -118,13 +118,13 @@ class _Wall:
         self._film = {name: self._on("film", self.seen, (name,)) for name in asked.film}
 
     def measured_c(self, draws: Draws) -> FloatArray:
-        """Give the corrected surface temperature of every triangle that counts, shape (c,)."""
+        """Return the corrected temperature of every triangle in `counted`, shape (c,), [degrees Celsius]."""
         return triangle_exchange(self.conditions, self.surface, self.groups, draws)[0][self.counted]
 
     def computed_c(self, values: Mapping[str, float], draws: Draws, measured_c: FloatArray) -> FloatArray:
-        """Give the surface temperature of every triangle that counts in the steady state, shape (c,).
+        """Return the steady temperature of every triangle in `counted`, shape (c,), for `values` of all properties.
 
-        The film of the photographed side is linear in the temperature, by its tangent at the measured one.
+        The film on the photographed side is replaced by its tangent at the measured temperature.
         """
         mesh, names = self.surface.mesh, np.array(self.surface.selection.patch_names)
         start_c = np.full(len(self.surface.counted), float(measured_c.mean()))
@@ -150,7 +150,7 @@ class _Wall:
     def _photographed_side(
         self, values: Mapping[str, float], draws: Draws, at_c: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Give coefficient and temperature of air, (s,) each, for which convection is the tangent of the film."""
+        """Return coefficient and air temperature, (s,) each, with which convection is the film's tangent at `at_c`."""
         surface, up = self.surface, self.surface.selection.up
         normals = surface.selection.facet_normal[self.seen]
         every = np.stack([draws[emissivity_name(self.conditions, n)] for n in range(len(self.conditions.surfaces))])
@@ -177,7 +177,7 @@ class _Wall:
         return coefficient, air_c
 
     def _far_side(self, values: Mapping[str, float]) -> FloatArray:
-        """Give the coefficient of what lies behind, layers included, shape (b,), [W/(m2 K)]."""
+        """Return the coefficient of film and layers on the side not photographed, shape (b,), [W/(m2 K)]."""
         surface = self.surface
         normals = surface.selection.facet_normal[self.behind]
         film = outside_coefficient("iso-6946-combined") * np.ones(len(self.behind))
@@ -190,14 +190,14 @@ class _Wall:
         return 1.0 / resistance
 
     def _on(self, entry: str, facets: IntArray, patterns: tuple[str, ...]) -> BoolArray:
-        """Mark which of some triangles belong to patches that match."""
+        """Return which of the triangles `facets` lie on patches that match `patterns`, shape (k,)."""
         names, patch = self.surface.selection.patch_names, self.surface.selection.facet_patch[facets]
         there = tuple(names[n] for n in np.unique(patch))
         return np.isin(patch, [names.index(name) for name in chosen_names(f"calibrate: {entry}", there, patterns)])
 
 
 class _Fit:
-    """The least squares of measured minus computed by the stated values, and how it moves with what is uncertain."""
+    """The least-squares fit for the stated values, and its change with every uncertain quantity."""
 
     def __init__(self, wall: _Wall, draws: Draws) -> None:
         self.wall, self.draws = wall, draws
@@ -216,10 +216,9 @@ class _Fit:
         return measured - self.wall.computed_c(values, draws, measured)
 
     def _search(self) -> FloatArray:
-        """Find the least squares by Gauss-Newton's method.
+        """Return the logarithms with the least squares, shape (m,), by Gauss-Newton's method.
 
-        A step that does not help is halved; directions that change nothing stay at rest.
-        """
+        Steps that do not lower the squares are halved. There are no steps along directions that change nothing."""
         x = np.zeros(len(self.names))
         residual = self._residual(x, self._first)
         for _ in range(_MOST_STEPS):
@@ -244,7 +243,7 @@ class _Fit:
         return x
 
     def what_cannot_be_told(self, units: Mapping[str, str]) -> str:
-        """Say which properties the readings do not tell, and which combination of them they do; else nothing."""
+        """Return sentences on properties that the readings do not determine; empty if all are determined."""
         far = [
             f"No {name} explains the readings: however {'small' if x < 0.0 else 'large'} it is, the computed surface "
             "is on one side of the measured one. Check the airs, the camera's offset and what is taken as known."
@@ -258,7 +257,7 @@ class _Fit:
         )
 
     def _combination(self, direction: FloatArray, sensitive_k: float, units: Mapping[str, str]) -> str:
-        """Put into words what is not known along a direction of logarithms, and what is across it."""
+        """Return a sentence on the properties that are unknown along a direction of logarithms, shape (m,)."""
         share = direction / direction[np.argmax(np.abs(direction))]
         which = [n for n in np.argsort(-np.abs(share), kind="stable") if abs(share[n]) >= _SMALL_SHARE]
         named = [self.names[n] for n in which]
@@ -268,7 +267,7 @@ class _Fit:
                 f"{np.log(2.0) * sensitive_k:.2g} K. Take it as known, or measure a surface that it acts on."
             )
         told = f"{', '.join(named[:-1])} and {named[-1]} cannot be told apart"
-        power = -float(share[which[1]])  # of two, the first times the second to this power is known
+        power = -float(share[which[1]])  # known is the first property times the second to this power
         if len(which) > 2 or abs(abs(power) - 1.0) >= 0.05:
             return f"{told}: only a combination of them is known. Take all but one of them as known."
         values = [self.start[name] * np.exp(self.logarithm[n]) for n, name in zip(which, named)]
@@ -277,15 +276,15 @@ class _Fit:
         return f"{told}: their {what} is, {known}. Take one of the two as known."
 
     def _local(self, gain: FloatArray) -> Iterator[tuple[int, FloatArray]]:
-        """Yield each patch, and how far its own error of 1 K moves `gain`, (m, c), times the residuals, shape (m,)."""
+        """Yield each patch and how much `gain`, (m, c), times residuals changes, (m,), if the patch reads 1 K more."""
         patch = self.wall.surface.selection.facet_patch[self.wall.counted]
         for number in np.unique(patch):
             yield int(number), gain[:, patch == number].sum(axis=1)
 
     def _noise(self, gain: FloatArray) -> FloatArray:
-        """Give the covariance that the scatter of nodes' readings leaves in `gain` times the residuals, shape (m, m).
+        """Return the covariance, shape (m, m), of `gain` times residuals that noise in the readings of nodes causes.
 
-        A triangle's reading is the mean of three nodes', so its variance a third of theirs.
+        A triangle's reading is the mean of three nodes; its variance is a third of the variance of a node.
         """
         facets = self.wall.surface.mesh.facets[self.wall.counted]
         nodes, number = np.unique(facets, return_inverse=True)
@@ -293,7 +292,7 @@ class _Fit:
         return 3.0 * float(self.weight @ self.residual_k**2) * at_nodes @ at_nodes.T
 
     def _local_spread(self) -> FloatArray:
-        """Give the deviation of the logarithm along each direction by noise and the patches' own errors, shape (m,)."""
+        """Return the standard deviation along each direction due to noise and the patches' own errors, shape (m,)."""
         told = np.maximum(self.sensitive_k, 1e-12)
         gain = (self.directions.T / told[:, None] ** 2) @ (self.slope.T * self.weight)
         variance = np.diag(self._noise(gain)).copy()
@@ -303,10 +302,10 @@ class _Fit:
         return np.sqrt(variance)
 
     def spread(self) -> tuple[FloatArray, list[str]]:
-        """Give the logarithms of the properties in every draw, shape (m, k), and which quantity moves each most.
+        """Return the logarithms of the properties in every draw, (m, k), and which quantity moves each property most.
 
-        What is common to all readings is followed to both ends of its range, and in between by a parabola; effects of
-        several quantities add up.
+        For each quantity that acts on all readings, the fit is repeated at both ends of its range; a parabola stands
+        for the values in between. Effects of several quantities add up.
         """
         gain = np.linalg.solve(self.slope.T @ (self.weight[:, None] * self.slope), self.slope.T * self.weight)
         off, count = self.wall.conditions.camera.repeatability.off_by, self.draws.count
@@ -330,7 +329,7 @@ class _Fit:
         return drawn, most
 
     def _uncertain(self) -> dict[str, FloatArray]:
-        """Give what is uncertain and common to all readings: conditions, and properties that are taken as known."""
+        """Return the draws of uncertain quantities that act on all readings: conditions and known properties."""
         common = {name: values for name, values in self.draws.values.items() if not name.startswith("contact")}
         for number, (name, one) in enumerate(self.stated.items()):
             if name not in self.start:
@@ -338,7 +337,7 @@ class _Fit:
         return {name: values for name, values in common.items() if np.ptp(values) > 0.0}
 
     def _follow(self, gain: FloatArray, name: str, value: float) -> FloatArray:
-        """Find the logarithms for which `gain` sees no residual with another value of a quantity (Broyden's method)."""
+        """Return the logarithms that make `gain` times residuals 0 if a quantity has another value (Broyden)."""
         common = name in self.draws.values
         draws = Draws({**self._first.values, name: np.array([value])}) if common else self._first
         known = {} if common else {name: value}

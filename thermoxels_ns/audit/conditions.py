@@ -1,4 +1,4 @@
-"""The conditions of a survey, from a yaml file; ``configs/conditions-example.yaml`` explains every key."""
+"""The conditions of a survey, read from a yaml file; ``configs/conditions-example.yaml`` explains every key."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ Conductivity: TypeAlias = Annotated[Measured, Unit("W/(m K)", 0.0, above=True)]
 
 Side = Literal["outside", "inside"]
 FilmModel = Literal["iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo", "madding", "given"]
-"""How a surface exchanges heat with what is around it; the formulas stand in `thermoxels_ns.audit.heat_flow`."""
+"""Names of the models of heat exchange at a surface; their formulas stand in `thermoxels_ns.audit.heat_flow`."""
 
 FILM_MODELS: Mapping[Side, tuple[FilmModel, ...]] = {
     "outside": ("iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo", "given"),
     "inside": ("madding", "iso-6946", "iso-6946-combined", "given"),
 }
-WINDY: tuple[FilmModel, ...] = ("iso-6946", "albatici-tonelli", "dallo")  # Models of the open air that need the wind
+WINDY: tuple[FilmModel, ...] = ("iso-6946", "albatici-tonelli", "dallo")  # Models that need the wind if seen outside
 
 EXAMPLE = "conditions-example.yaml"
-MOST_UNKNOWN = 4  # Properties that one calibration may look for
+MOST_UNKNOWN = 4  # Largest number of properties that one calibration may search for
 
 
 @record(AuditError)
 class Camera:
     """The thermal camera and how far its readings may be off."""
 
-    offset: Difference  # What to add to all readings alike, [K]; 0 +- 1 K: they may all be 1 K too low or too high
+    offset: Difference  # Correction to add to all readings, [K]; 0 +- 1 K: all may be 1 K too low or too high
     repeatability: Difference
-    """What to add to the readings of one part of the surface but not of another, 0 +- 0.2 K: what is left of drift
-    between images, and of how the model was made from them."""
-    emissivity: Emissivity = Measured(1.0)  # Emissivity that the readings were taken with, 0 to 1
-    reflected: Temperature | None = None  # Reflected temperature that they were taken with, if that is below 1
+    """Error that the readings of one part of the surface do not share with other parts, such as 0 +- 0.2 K, caused by
+    drift between images and by the reconstruction."""
+    emissivity: Emissivity = Measured(1.0)  # Emissivity that was set in the camera, above 0 and at most 1
+    reflected: Temperature | None = None  # Reflected temperature set in the camera; needed for emissivities below 1
     model: str = ""
     serial_number: str = ""
 
@@ -60,11 +60,11 @@ class Camera:
 
 @record(AuditError)
 class InsideAir:
-    """The air behind the surface, or, seen from inside, before it."""
+    """The air in the building: behind the surface if seen from outside, in front of the surface if seen from inside."""
 
-    air: Air  # [degrees Celsius]
-    lowest_24h: Air | None = None  # During the last 24 hours
-    highest_24h: Air | None = None
+    air: Air  # Temperature at the time of the survey, [degrees Celsius]
+    lowest_24h: Air | None = None  # Lowest temperature during the last 24 hours, [degrees Celsius]
+    highest_24h: Air | None = None  # Highest temperature during the last 24 hours, [degrees Celsius]
 
     def __post_init__(self) -> None:
         low, high = self.lowest_24h, self.highest_24h
@@ -78,14 +78,14 @@ class OutsideAir(InsideAir):
     """The open air."""
 
     air: Air = Measured(math.nan)
-    """[degrees Celsius]; not a number: not known, which only a view from inside may leave out."""
+    """Temperature, [degrees Celsius]; NaN if it was not stated, which is allowed in a view from inside only."""
     wind: Annotated[Measured, Unit("m/s", 0.0, surely=False)] | None = None  # Near the surface, [m/s]
     wind_direction: str = ""
 
 
 @record(AuditError)
 class SkyModel:
-    """A sky whose radiation follows from the air, its moisture and clouds."""
+    """A sky whose radiation is computed from air temperature, dew point and cloud cover."""
 
     cloud: Annotated[Measured, Unit("1", 0.0, 1.0, surely=False)]  # Share of the sky that clouds cover
     dew_point: Temperature  # Dew point of the outside air, [degrees Celsius]
@@ -93,11 +93,11 @@ class SkyModel:
 
 @record(AuditError)
 class Surroundings:
-    """What the surface reflects and exchanges radiation with: one reflected temperature, or a sky above the ground."""
+    """Surroundings that the surface exchanges radiation with: one reflected temperature, or a sky and the ground."""
 
-    reflected: Temperature | None = None  # As measured with crumpled foil, for all of the surface alike
-    sky: SkyModel | None = None  # Each triangle then sees as much of sky, horizon and ground as its tilt says
-    ground: Temperature | None = None  # Of the ground, for a sky model; None: as the outside air
+    reflected: Temperature | None = None  # As measured with crumpled foil; the same for all of the surface
+    sky: SkyModel | None = None  # The tilt of each triangle decides how much sky, horizon and ground it sees
+    ground: Temperature | None = None  # Temperature of the ground below a sky; None: as warm as the outside air
 
     def __post_init__(self) -> None:
         if (self.reflected is None) == (self.sky is None):
@@ -111,11 +111,11 @@ class Surroundings:
 
 @record(AuditError)
 class Film:
-    """The model of heat exchange between surface and surroundings, and how far it may be off."""
+    """The model of heat exchange between surface and surroundings, with its uncertainty."""
 
     model: FilmModel
-    factor: Annotated[Measured, Unit("1", 0.0)]  # What to multiply its convective part by, such as 1.0 +- 0.2
-    coefficient: Annotated[Measured, Unit("W/(m2 K)", 0.0)] | None = None  # Convection, for the model "given" alone
+    factor: Annotated[Measured, Unit("1", 0.0)]  # Factor of convection; of all heat for dallo and iso-6946-combined
+    coefficient: Annotated[Measured, Unit("W/(m2 K)", 0.0)] | None = None  # Of convection, for the model "given" only
 
     def __post_init__(self) -> None:
         if (self.model == "given") != (self.coefficient is not None):
@@ -127,92 +127,92 @@ class Film:
 
 @record(AuditError)
 class Surface:
-    """How patches emit. Of several entries for one patch, the last one holds."""
+    """The emissivity of some patches. Of several entries that match one patch, the last entry holds."""
 
     emissivity: Emissivity  # For long-wave radiation, above 0 and at most 1
-    patches: tuple[str, ...] = ("*",)  # Patches, by name or pattern
+    patches: tuple[str, ...] = ("*",)  # Names or patterns of patches
 
 
 @record(AuditError)
 class Reference:
-    """A surface temperature that was measured by contact, from which the camera's offset follows."""
+    """A surface temperature that was measured by contact; the camera's offset is computed from these references."""
 
-    at: tuple[float, float, float]  # Where, in the coordinates of the mesh, [m]
-    temperature: Temperature  # [degrees Celsius]
+    at: tuple[float, float, float]  # Point of contact in the coordinates of the mesh, [m]
+    temperature: Temperature  # Measured temperature, [degrees Celsius]
 
 
 @record(AuditError)
 class Survey:
-    """What a report after EN 13187 says, and nothing is computed from."""
+    """Facts that a report after EN 13187 states; the audit computes no figures from them."""
 
     client: str = ""
     operator: str = ""
     place: str = ""
-    construction: str = ""  # How the building is built, as far as known
+    construction: str = ""  # Construction of the building, as far as known
     date: datetime | None = None
     camera_positions: str = ""
     parts_observed: str = ""
-    hours_since_sun: Hours | None = None  # Since the sun last shone on the surface
+    hours_since_sun: Hours | None = None  # Hours since the sun last shone on the surface
     sun_last_12h: str = ""
-    hours_dry: Hours | None = None  # Since the surface was last wet
+    hours_dry: Hours | None = None  # Hours since the surface was last wet
     precipitation: str = ""
-    least_difference_24h: Difference | None = None  # Smallest difference of the airs during the last 24 hours
+    least_difference_24h: Difference | None = None  # Smallest inside minus outside air of the last 24 hours, [K]
     pressure_difference: Annotated[Measured, Unit("Pa")] | None = None
 
 
 @record(AuditError)
 class Limits:
-    """What the user asks for; the page says what meets it."""
+    """Limits that the user sets; the page says which limits are met."""
 
     u: dict[str, Annotated[Measured, Unit("W/(m2 K)")]] = field(default_factory=dict)
-    """Largest U-value of patches, by name or pattern; of several that match, the last one holds."""
+    """Largest U-value by name or pattern of patches; of several patterns that match a patch, the last one holds."""
     psi: Annotated[Measured, Unit("W/(m K)")] | None = None  # Largest psi of a linear thermal bridge
-    f_rsi: Share | None = None  # Smallest temperature factor for a resistance inside of 0.25 m2 K / W
-    loss: Annotated[Measured, Unit("W")] | None = None  # Largest heat loss of what was observed
+    f_rsi: Share | None = None  # Smallest temperature factor for an inside surface resistance of 0.25 m2 K / W
+    loss: Annotated[Measured, Unit("W")] | None = None  # Largest heat loss of the observed surface
 
 
 @record(AuditError)
 class Year:
-    """A heating season, and what heat costs."""
+    """A heating season, with the price and the carbon dioxide of heat."""
 
-    degree_days: Annotated[Measured, Unit("K d")]  # Difference of the airs times time
+    degree_days: Annotated[Measured, Unit("K d")]  # Inside minus outside air, summed over the season
     price: Annotated[Measured, Unit("/kWh")] | None = None
     currency: str = ""
-    co2: Annotated[Measured, Unit("kg/kWh")] | None = None
+    co2: Annotated[Measured, Unit("kg/kWh")] | None = None  # Carbon dioxide per heat
 
 
 @record(AuditError)
 class Layer:
-    """A layer that the mesh does not have, such as insulation, on the far side of what was photographed."""
+    """A layer that the mesh does not contain, such as insulation, on the side that was not photographed."""
 
-    patches: tuple[str, ...]  # Patches behind the surface that it lies on, by name or pattern
+    patches: tuple[str, ...]  # Patches that the layer lies on, by name or pattern; `Calibrate.behind` holds them
     thickness: Annotated[Measured, Unit("m", 0.0, above=True)]
     conductivity: Conductivity
 
 
 @record(AuditError)
 class Unknown:
-    """A property that is to be found out; the value that stands for it is where the search starts."""
+    """A property that the calibration searches for, starting from the value stated in `Calibrate`."""
 
     property: Literal["conductivity", "thickness", "film"]
-    of: str  # The entry of `conductivity`, `layers` or `film` that it belongs to
+    of: str  # Key of the property in `conductivity`, `layers` or `film` of `Calibrate`
 
     def name(self) -> str:
-        """Name it as reports do, such as "conductivity of wall"."""
+        """Return the name that reports use, such as "conductivity of wall"."""
         return f"{self.property} of {self.of}"
 
 
 @record(AuditError)
 class Calibrate:
-    """A model of what is behind the surface, some properties of which are to be found out."""
+    """A model of the body behind the surface, and the properties of the model that a calibration searches for."""
 
     conductivity: dict[str, Conductivity]
-    """Of regions of the mesh, by name or pattern; of several that match, the last one holds."""
-    unknown: tuple[Unknown, ...]  # One to four
+    """Conductivity by name or pattern of regions of the mesh; of several that match a region, the last one holds."""
+    unknown: tuple[Unknown, ...]  # One to `MOST_UNKNOWN` properties to search for
     layers: dict[str, Layer] = field(default_factory=dict)
     film: dict[str, Annotated[Measured, Unit("W/(m2 K)", 0.0, above=True)]] = field(default_factory=dict)
-    """Convection of photographed patches, by name or pattern, in place of the film model; radiation stays."""
-    behind: tuple[str, ...] = ("interior-*",)  # Patches that the air on the far side touches
+    """Convection by name or pattern of photographed patches, in place of the film model; radiation is added."""
+    behind: tuple[str, ...] = ("interior-*",)  # Patches in contact with the air on the side not photographed
     adiabatic: tuple[str, ...] = ("cut",)  # Patches that no heat crosses
 
     def __post_init__(self) -> None:
@@ -231,7 +231,7 @@ class Calibrate:
             raise AuditError("unknown", expected=expected, got=strange[0], remedy=remedy)
 
     def stated(self) -> dict[str, Measured]:
-        """Give all properties as they are stated, by names such as "conductivity of wall"."""
+        """Return the stated value of every property, by names such as "conductivity of wall"."""
         every = {f"conductivity of {name}": value for name, value in self.conductivity.items()}
         every |= {f"conductivity of {name}": layer.conductivity for name, layer in self.layers.items()}
         every |= {f"thickness of {name}": layer.thickness for name, layer in self.layers.items()}
@@ -240,19 +240,19 @@ class Calibrate:
 
 @record(AuditError)
 class Conditions:
-    """All that is known beside the photographs."""
+    """All that the user states beside the photographs."""
 
-    side: Side  # From where the surface was seen
+    side: Side  # Side from which the surface was photographed
     inside: InsideAir
     surroundings: Surroundings
     film: Film
     camera: Camera
     surfaces: Annotated[tuple[Surface, ...], Field(min_length=1)]
-    outside: OutsideAir = field(default_factory=OutsideAir)  # In a view from inside it may be left out
-    leave_out: tuple[str, ...] = ()  # Patches that mirror, by name or pattern: glass, metal
-    references: tuple[Reference, ...] = ()  # Without any, the offset of the camera is what is stated
+    outside: OutsideAir = field(default_factory=OutsideAir)  # May be left out if the surface was seen from inside
+    leave_out: tuple[str, ...] = ()  # Patches that mirror, such as glass and metal, by name or pattern
+    references: tuple[Reference, ...] = ()  # If there are none, `Camera.offset` is used as stated
     storeys: dict[str, Annotated[Measured, Unit("m")]] = field(default_factory=dict)
-    """Height at which each storey begins, above the lowest point of the mesh, [m]."""
+    """Height of the floor of each storey above the lowest point of the mesh, [m], by name of the storey."""
     survey: Survey = field(default_factory=Survey)
     limits: Limits = field(default_factory=Limits)
     year: Year | None = None
@@ -283,24 +283,24 @@ class Conditions:
 
     @property
     def outside_known(self) -> bool:
-        """Whether the air outside is known."""
+        """True if the conditions state an air temperature outside."""
         return math.isfinite(self.outside.air.value)
 
     @property
     def difference_k(self) -> float:
-        """Difference of the airs as stated, [K]; not a number if that outside is not known."""
+        """Stated inside minus outside air temperature, [K]; NaN if `outside_known` is False."""
         return self.inside.air.value - self.outside.air.value
 
 
 @raising(AuditError)
 def load_conditions(path: Path | str) -> Conditions:
-    """Read conditions from a yaml file, or raise `AuditError` for what is wrong in it."""
+    """Read conditions from a yaml file; raises `AuditError` if the file is missing or wrong."""
     path = Path(path)
     return as_record(path.name, read_yaml(path), Conditions)
 
 
 def write_example(path: Path) -> None:
-    """Write a file of conditions in which every key is explained; one that is there stays (`AuditError`)."""
+    """Write an example of conditions that explains every key; raises `AuditError` if `path` exists already."""
     if path.exists():
         remedy = "Choose another name."
         raise AuditError("conditions file", expected="a name that is free", got=str(path), remedy=remedy)

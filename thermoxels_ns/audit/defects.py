@@ -14,51 +14,51 @@ from thermoxels_ns.mesh.quality.checks import component_of, group_sides, triangl
 
 DefectKind = Literal["line", "point", "area"]
 
-LEAST_DEPARTURE_K = 0.1  # What no camera tells from noise, [K]
-_DEVIATIONS = 3.0  # Standard deviations of the undisturbed surface from which on a triangle departs
+LEAST_DEPARTURE_K = 0.1  # Smallest departure that any camera tells from noise, [K]
+_DEVIATIONS = 3.0  # Least departure of a triangle, in standard deviations of the undisturbed surface
 _CELL_M, _AROUND_M = 0.25, 1.25
-"""The background of a place is the median of medians of cells of the first size within the second distance, [m]."""
+"""Edge of the cells whose mean temperatures are taken, and radius within which their median is the background, [m]."""
 _SHORTH = 1.349  # Width of the shortest half of a normal distribution, in standard deviations
-_SURE = 2.0  # A defect reaches this many times the least departure somewhere
-LEAST_AREA_M2 = 0.01  # Of what departs: a square decimetre
-_LEAST_TRIANGLES = 4
-_STRAIGHT = 3.0  # A straight line is this many times as long as wide
-_BENT = 6.0  # So is one that bends, or closes, as around a window
-_POINT_M = 0.5  # A point is no longer than this
+_SURE = 2.0  # Somewhere a defect departs by at least this many times the least departure that counts
+LEAST_AREA_M2 = 0.01  # Smallest area of the triangles of a defect that depart: a square decimetre
+_LEAST_TRIANGLES = 4  # Smallest number of the triangles of a defect that depart
+_STRAIGHT = 3.0  # Least ratio of length to width of a straight line
+_BENT = 6.0  # Least ratio of length to width of a line that bends or closes, as around a window
+_POINT_M = 0.5  # Largest extent of a point, [m]
 _NARROWEST_ZONE_M = 0.3  # About a wall's thickness, over which heat spreads sideways
-_WIDEST_ZONE_M = {"line": 0.5, "point": 0.5, "area": 0.3}
-_FARTHEST_OUT_M = 2.0  # What stands out farther from the surface does not belong to a defect
-_GAP_M = 0.3  # Sets of triangles this near to each other are one defect
-_NEIGHBOURS = 64
+_WIDEST_ZONE_M = {"line": 0.5, "point": 0.5, "area": 0.3}  # Largest reach of a zone around its core, [m]
+_FARTHEST_OUT_M = 2.0  # Triangles farther than this from the core never belong to its zone, [m]
+_GAP_M = 0.3  # Sets of triangles no farther apart than this belong to one defect, [m]
+_NEIGHBOURS = 64  # Number of undisturbed triangles whose mean normal stands for the undisturbed surface
 
 
 @dataclass(frozen=True)
 class FoundDefect:
-    """Triangles that depart, and those that they are compared with."""
+    """One thermal bridge or other defect; integer arrays hold the indices of its boundary triangles."""
 
     kind: DefectKind
     patch: int
     core: IntArray  # Triangles that depart by more than noise
-    zone: IntArray  # Those and what is around them, where heat still flows to them
-    reference: IntArray  # Undisturbed triangles near by
-    base_area_m2: float  # Area of the undisturbed surface that the zone stands on
-    length_m: float  # Of a line, else the largest extent
+    zone: IntArray  # The core and the triangles around, from which heat flows sideways to the core
+    reference: IntArray  # Undisturbed triangles near by, which the zone is compared with
+    base_area_m2: float  # Area that the undisturbed surface would have in place of the zone
+    length_m: float  # Length of a line; largest extent of a point or an area
     spot: IntArray  # Triangles of the core that depart most, together at least a square decimetre
-    not_counted: str  # Why it is not to be believed, a sentence; else empty
+    not_counted: str  # Sentence that says why the defect does not count; empty if the defect counts
 
 
 def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, least_k: float) -> list[FoundDefect]:
-    """Find what departs from the undisturbed temperature of its patch.
+    """Find defects: connected triangles whose temperature departs from the undisturbed temperature of their patch.
 
-    A triangle departs where it differs by more than three standard deviations, `least_k` and 0.1 K from what most of
-    its patch has, or from its background: what most of the patch has within 1.25 m. The first finds what is large, the
-    second what is weaker than the slow changes over a wall. Triangles that hang together and reach twice that somewhere
-    are a defect. Rims of what was not measured never count.
+    A triangle departs if its temperature differs by more than three standard deviations, by more than `least_k` and by
+    more than 0.1 K from the patch's `undisturbed_temperature`, or as much from its own `background_c`. The first test
+    finds large defects, the second finds defects weaker than the slow changes over a wall. At least one triangle of a
+    defect differs by twice the least departure. Triangles of `AuditedSurface.rim` never count.
 
     Args:
-        surface: The surface.
-        surface_c: Its temperature, corrected, shape (f,), [degrees Celsius].
-        warm: Look for what is warmer (seen from outside) or colder (seen from inside).
+        surface: The audited surface.
+        surface_c: Corrected temperature of each triangle, shape (f,), [degrees Celsius].
+        warm: True: search for warmer triangles (seen from outside); False: for colder ones (seen from inside).
         least_k: Smallest departure that counts, [K].
 
     Returns:
@@ -83,10 +83,10 @@ def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, lea
 
 
 def background_c(points_m: FloatArray, surface_c: FloatArray, area_m2: FloatArray) -> FloatArray:
-    """Find the temperature that most of the surface has around each point, shape (k,), [degrees Celsius].
+    """Return the temperature of most of the surface around each point, shape (k,), [degrees Celsius].
 
-    The median, by area, of the means of cells of 0.25 m within 1.25 m; strips and spots of less than half of that area
-    do not change it.
+    The surface is divided into cells of 0.25 m. The result is the median, by area, of the mean temperatures of the
+    cells within 1.25 m. Strips and spots of less than half of the area within 1.25 m hardly change the result.
     """
     _, cell = np.unique(np.floor(points_m / _CELL_M).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()
@@ -98,11 +98,11 @@ def background_c(points_m: FloatArray, surface_c: FloatArray, area_m2: FloatArra
 
 
 def undisturbed_temperature(surface_c: FloatArray, area_m2: FloatArray, least_k: float = 0.0) -> tuple[float, float]:
-    """Find the temperature that most of a patch has, and from where on a triangle departs from it, [K].
+    """Return the temperature of most of a patch, [degrees Celsius], and the least departure of a triangle, [K].
 
-    The temperature is the mean of the shortest range that holds half of the area. Of values that scatter normally that
-    range is 1.349 standard deviations wide (Rousseeuw and Leroy 1988, the shorth), whatever the other half does. A
-    triangle departs by three standard deviations, at least by `least_k` and 0.1 K.
+    The temperature is the mean of the shortest range that holds half of the area. For normally distributed values this
+    range is 1.349 standard deviations wide (Rousseeuw and Leroy 1988, the shorth); the other half has no influence.
+    The least departure is three standard deviations, but not below `least_k` or 0.1 K.
 
     >>> undisturbed_temperature(np.array([1.0, 1.1, 1.05, 4.0]), np.ones(4))[0]
     1.025
@@ -126,9 +126,9 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 
 def _cores(surface: AuditedSurface, share: FloatArray) -> list[IntArray]:
-    """Find triangles that depart and hang together within a patch, by edges or over a gap of 0.3 m, if they are enough.
+    """Return the core of each defect: triangles of one patch that depart and are connected by edges or gaps of 0.3 m.
 
-    `share` is the departure over the least one that counts, shape (f,).
+    `share` is the departure of each triangle over the least departure that counts, shape (f,).
     """
     which = np.flatnonzero(share > 1.0)
     pairs, patch = _neighbours(surface, which), surface.selection.facet_patch
@@ -152,14 +152,14 @@ def _cores(surface: AuditedSurface, share: FloatArray) -> list[IntArray]:
 
 
 def _neighbours(surface: AuditedSurface, which: IntArray) -> IntArray:
-    """List pairs of triangles, by their place in `which`, that share an edge and a patch, shape (p, 2)."""
+    """Return pairs of triangles that share an edge and a patch, as places in `which`, shape (p, 2)."""
     pairs = triangles_across_edges(group_sides(surface.mesh.facets[which]))
     patch = surface.selection.facet_patch[which]
     return pairs[patch[pairs[:, 0]] == patch[pairs[:, 1]]]
 
 
 class _Zones:
-    """The surface around cores, the sets of triangles that depart."""
+    """The surface around cores; finds the zone, the reference, the kind and the length of each core."""
 
     def __init__(self, surface: AuditedSurface, sure: BoolArray, departs: BoolArray, cores: list[IntArray]) -> None:
         self.surface, self.departs = surface, departs
@@ -172,11 +172,11 @@ class _Zones:
             self.core_of[core] = number
 
     def around(self, core: IntArray, away: FloatArray) -> FoundDefect:
-        """Describe a core: its zone, what it is compared with, its kind and its length."""
+        """Return the defect of a core; `away` is how far each triangle departs, shape (f,), [K]."""
         surface, patch = self.surface, int(self.patch[core[0]])
         area = surface.area_m2[core]
         edge = float(np.average(self.edge_m[core], weights=area))
-        same = self.of_patch[patch]  # of it what lies in a box around the core, which holds all that may belong to it
+        same = self.of_patch[patch]  # next reduced to a box around the core that holds all of its zone
         at, ends = self.at[same], self.at[core]
         beside = (at > ends.min(axis=0) - _FARTHEST_OUT_M) & (at < ends.max(axis=0) + _FARTHEST_OUT_M)
         same = same[beside.all(axis=1)]
@@ -187,12 +187,12 @@ class _Zones:
         axes = self._plane(core, self._calm(same, near, distance, reach))
         kind, length = _kind(self.at[core] @ axes, area, width, edge)
         reach = min(reach, _WIDEST_ZONE_M[kind])
-        # What stands out from the surface, as a balcony, loses its heat through all of its sides.
+        # The zone holds all sides of what stands out, such as a balcony: distance along the surface's plane decides.
         beside, _ = KDTree(self.at[core] @ axes).query(self.at[same] @ axes, distance_upper_bound=reach)
         near = self._nearest(core, same, distance, (beside <= reach) & (distance <= _FARTHEST_OUT_M))
         near = self._hangs_together(core, same, near)
         zone, reference = same[near], self._calm(same, near, distance, reach)
-        # Reconstructed walls wrinkle: what the undisturbed surface has more of than its plane does not stand out.
+        # Reconstructed walls wrinkle, so even undisturbed triangles have more area than the plane that they cover.
         flat = self._base(reference, reference)
         wrinkled = float(surface.area_m2[reference].sum()) / flat if flat > 0.0 else 1.0
         base = wrinkled * self._base(zone, reference)
@@ -210,7 +210,7 @@ class _Zones:
         )
 
     def _nearest(self, core: IntArray, same: IntArray, distance: FloatArray, near: BoolArray) -> BoolArray:
-        """Take from what is near a core what is nearer to another one."""
+        """Return `near`, with the core itself, but without triangles of `same` that are nearer to another core."""
         own, near = self.core_of[core[0]], near.copy()
         others = same[(self.core_of[same] >= 0) & (self.core_of[same] != own)]
         candidates = np.flatnonzero(near)
@@ -220,7 +220,7 @@ class _Zones:
         return near | (self.core_of[same] == own)
 
     def _hangs_together(self, core: IntArray, same: IntArray, near: BoolArray) -> BoolArray:
-        """Leave what hangs together with the core by edges."""
+        """Return `near` without triangles that no chain of shared edges within `near` connects to the core."""
         chosen = np.flatnonzero(near)
         pairs = _neighbours(self.surface, same[chosen])
         component = component_of(len(chosen), pairs[:, 0], pairs[:, 1])
@@ -230,7 +230,7 @@ class _Zones:
         return found
 
     def _calm(self, same: IntArray, near: BoolArray, distance: FloatArray, reach: float) -> IntArray:
-        """Find undisturbed triangles around a zone, of half its area or more; else all such ones of the patch."""
+        """Return undisturbed triangles around a zone; if they have less than half its area, all of the patch's."""
         calm = ~near & ~self.departs[same]
         ring = calm & (distance <= 2.0 * reach + 0.5)
         wanted = 0.5 * float(self.surface.area_m2[same[near]].sum())
@@ -242,7 +242,7 @@ class _Zones:
         return calm if len(calm) else whole
 
     def _plane(self, core: IntArray, reference: IntArray) -> FloatArray:
-        """Give two axes across the mean normal of the undisturbed surface, shape (3, 2)."""
+        """Return two unit axes at right angles to the mean normal of the undisturbed surface, shape (3, 2)."""
         normal = self.surface.area_m2[core] @ self._reference_normal(core, reference)
         normal /= max(float(np.linalg.norm(normal)), 1e-12)
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
@@ -250,12 +250,12 @@ class _Zones:
         return np.stack([first, np.cross(normal, first)], axis=1)
 
     def _base(self, which: IntArray, reference: IntArray) -> float:
-        """Give the area of the undisturbed surface that triangles stand on, [m2]."""
+        """Return the area of triangles projected onto the undisturbed surface next to them, [m2]."""
         towards = self._reference_normal(which, reference)
         return float(self.surface.area_m2[which] @ np.einsum("ij,ij->i", self.normal[which], towards))
 
     def _reference_normal(self, which: IntArray, reference: IntArray) -> FloatArray:
-        """Give the mean normal of the undisturbed surface next to triangles, (k, 3); their own where there is none."""
+        """Return the mean normal of the reference next to each triangle, (k, 3); its own normal without a reference."""
         if not len(reference):
             return self.normal[which]
         count = min(_NEIGHBOURS, len(reference))
@@ -265,7 +265,7 @@ class _Zones:
         return np.where(length > 0.1, mean / np.maximum(length, 0.1), self.normal[which])
 
     def _width(self, core: IntArray) -> float:
-        """Give the width of a strip, [m], four times the mean distance of its points to its edge."""
+        """Return the width of a strip, [m], as four times the mean distance of its points from its edge."""
         facets, points = self.surface.mesh.facets[core], self.surface.mesh.points_m
         sides = group_sides(facets)
         alone = sides.order[sides.start[sides.sizes == 1]]
@@ -278,7 +278,7 @@ class _Zones:
 
 
 def _kind(footprint: FloatArray, area_m2: FloatArray, width_m: float, edge_m: float) -> tuple[DefectKind, float]:
-    """Tell lines, points and areas apart by the footprint, and measure the length."""
+    """Return the kind of a defect and its length, [m], from the centroids of its core in the plane, shape (k, 2)."""
     centred = footprint - np.average(footprint, axis=0, weights=area_m2)
     _, axes = np.linalg.eigh((centred * area_m2[:, None]).T @ centred)
     along = centred @ axes[:, ::-1]

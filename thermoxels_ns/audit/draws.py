@@ -1,4 +1,4 @@
-"""Draws of all that is not known exactly and acts on every triangle alike: the common errors of a survey."""
+"""Random draws of the uncertain quantities of a survey, whose errors every triangle shares."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.measured import Measured
 
 COUNT, SEED = 1000, 20260115
-"""How many draws intervals are made from, and the seed that makes them the same for the same conditions."""
+"""Number of draws behind each interval, and the seed that makes draws the same for the same conditions."""
 
-CONFIDENCE = 0.90  # Share of the draws that lie in an interval, as many below it as above
+CONFIDENCE = 0.90  # Share of the draws that lie in an interval; as many draws lie below the interval as above
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A number that follows from the stated values, and the range that holds 90 % of the draws."""
+    """A number computed from the stated values, and the range that holds 90 % of the draws."""
 
     value: float
     low: float
@@ -27,17 +27,17 @@ class Interval:
 
     @property
     def at_most(self) -> bool:
-        """Whether only an upper bound is known: the lower end of the range is 0 or less."""
+        """True if only an upper bound is known, because 0 lies in the range: `low` <= 0 < `high`."""
         return self.low <= 0.0 < self.high
 
     @property
     def unknown(self) -> bool:
-        """Whether not even an upper bound above 0 is known."""
+        """True if not even a positive upper bound is known: `high` <= 0."""
         return self.high <= 0.0
 
 
 def interval_of(values: FloatArray) -> Interval:
-    """Make an interval of draws, shape (1 + k,), the first of which is made of the stated values.
+    """Return the interval of draws, shape (1 + k,), of which the first is computed from the stated values.
 
     >>> found = interval_of(np.array([20.0, *np.linspace(0.0, 40.0, 41)]))
     >>> round(found.low, 9), found.value, round(found.high, 9)
@@ -49,11 +49,11 @@ def interval_of(values: FloatArray) -> Interval:
 
 @dataclass(frozen=True)
 class Draws:
-    """Values of each uncertain quantity by its name, shape (1 + k,) each; the first are those that are stated."""
+    """Values of each uncertain quantity by name, shape (1 + k,) each: first the stated value, then k random draws."""
 
     values: Mapping[str, FloatArray]
     seed: int = SEED
-    errors_of_parts: bool = True  # Whether parts of the surface have errors of their own, besides the common ones
+    errors_of_parts: bool = True  # True: `local` draws errors; False: `local` returns zeros
 
     @property
     def count(self) -> int:
@@ -62,19 +62,19 @@ class Draws:
 
     @property
     def stated(self) -> Draws:
-        """The stated values alone, without errors of parts."""
+        """Draws that hold the stated values alone, shape (1,) each."""
         return Draws({name: values[:1] for name, values in self.values.items()})
 
     @property
     def difference_k(self) -> FloatArray:
-        """Difference of the airs, shape (1 + k,), [K], above 0; NaN if the air outside is not known."""
+        """Inside minus outside air, shape (1 + k,), [K], above 0; NaN if no outside temperature is stated."""
         return self["inside air"] - self["outside air"]
 
     def __getitem__(self, name: str) -> FloatArray:
         return self.values[name]
 
     def local(self, off_by: float, number: int) -> FloatArray:
-        """Draw the error of one part of the surface, independent for each `number`, shape (1 + k,)."""
+        """Draw errors of at most `off_by`, independent for each `number`, shape (1 + k,); the first error is 0."""
         if not self.errors_of_parts:
             return np.zeros(self.count)
         drawn = np.random.default_rng((self.seed, number)).uniform(-off_by, off_by, self.count)
@@ -83,7 +83,7 @@ class Draws:
 
 
 def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:
-    """Draw each quantity from its own range, all values as likely, one draw in each of `count` equal parts of it."""
+    """Draw each uncertain quantity uniformly: its range is cut into `count` equal parts, with one draw in each part."""
     generator = np.random.default_rng(seed)
     values = {}
     for name, what in uncertain(conditions).items():
@@ -93,9 +93,9 @@ def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:
 
 
 def one_at_a_time(conditions: Conditions) -> Iterator[tuple[str, Draws]]:
-    """Yield, for each quantity that is not exact, its name and three draws: as stated, its lowest, its highest value.
+    """Yield the name of each quantity that is not exact, with draws in which that quantity alone changes.
 
-    All other quantities are as stated.
+    The three values of the quantity are its stated, its lowest and its highest value.
     """
     every = uncertain(conditions)
     for name, what in every.items():
@@ -106,7 +106,7 @@ def one_at_a_time(conditions: Conditions) -> Iterator[tuple[str, Draws]]:
 
 
 def uncertain(conditions: Conditions) -> dict[str, Measured]:
-    """Give all quantities that results follow from, by the names that reports call them."""
+    """Return all stated quantities that enter the results, by the names that reports use; exact ones are included."""
     film, camera, around = conditions.film, conditions.camera, conditions.surroundings
     named: dict[str, Measured | None] = {
         "inside air": conditions.inside.air,
@@ -128,11 +128,11 @@ def uncertain(conditions: Conditions) -> dict[str, Measured]:
 
 
 def emissivity_name(conditions: Conditions, number: int) -> str:
-    """Name the emissivity of an entry of `surfaces` as reports do."""
+    """Return the name that reports use for the emissivity in place `number` of `Conditions.surfaces`."""
     return f"emissivity of {', '.join(conditions.surfaces[number].patches)}, entry {number + 1}"
 
 
 def _possible(values: dict[str, FloatArray]) -> dict[str, FloatArray]:
-    """Cut off what cannot be: wind below 0, and clouds over less than none or more than all of the sky."""
+    """Clip draws to possible values: wind to 0 or more, and the share of clouds to 0 to 1."""
     limits = {"wind": (0.0, np.inf), "cloud": (0.0, 1.0)}
     return {name: np.clip(drawn, *limits[name]) if name in limits else drawn for name, drawn in values.items()}

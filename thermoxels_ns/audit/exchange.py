@@ -1,4 +1,4 @@
-"""Heat exchange of groups of triangles in every draw, and what contact temperatures say of the readings."""
+"""Compute the heat exchange of groups of triangles in every draw; correct readings by contact temperatures."""
 
 from __future__ import annotations
 
@@ -28,32 +28,32 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.heat.scene_fields import inside_coefficient, outside_coefficient
 
-CHUNK = 2000  # Groups whose draws are in memory together
-HALF_STEP_K = 0.05  # For differences with respect to readings, [K]
+CHUNK = 2000  # Number of groups whose draws are in memory at the same time
+HALF_STEP_K = 0.05  # Half the step of difference quotients with respect to readings, [K]
 _AROUND_M, _FARTHEST_M = 0.15, 0.5
-"""Readings within the first distance of a reference are averaged; none within the second is an error, [m]."""
-_OF_A_REFERENCE = 2 * 10**6  # Numbers of errors of their own
+"""Readings within the first distance of a reference are averaged; no reading within the second is an error, [m]."""
+_OF_A_REFERENCE = 2 * 10**6  # First argument `number` of `Draws.local` for references
 
 
 class Exchange(NamedTuple):
-    """What groups of triangles do in every draw; the first draw is made of the stated values."""
+    """Temperature and heat flow of g groups of triangles in k draws; draw 0 is made of the stated values."""
 
     surface_c: FloatArray  # Surface temperature, corrected, shape (g, k), [degrees Celsius]
-    flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (g, k)
+    flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (g, k), [W/m2]
 
 
 class PartTotals(NamedTuple):
-    """What parts of the surface do together in every draw."""
+    """Totals and means over each of p parts of the surface in k draws; draw 0 is made of the stated values."""
 
-    area_m2: FloatArray  # (p,)
+    area_m2: FloatArray  # Area, shape (p,), [m2]
     surface_c: FloatArray  # Mean surface temperature, shape (p, k), [degrees Celsius]
     flow_w: FloatArray  # Heat flow from inside to outside, shape (p, k), [W]
 
 
 def exchange(conditions: Conditions, groups: AlikeTriangles, draws: Draws, warmer_k: float = 0.0) -> Exchange:
-    """Correct the readings of groups for emissivity and reflection, and let heat flow by the film model.
+    """Return the surface temperature and the heat flow of each group in each draw.
 
-    `warmer_k` is added to all readings, [K].
+    Readings, to which `warmer_k` [K] is added, are corrected for emissivity and reflection; flow is the film model's.
     """
     emissivity = np.stack([draws[emissivity_name(conditions, n)] for n in range(len(conditions.surfaces))])
     emissivity = emissivity[groups.surface_entry]
@@ -65,7 +65,7 @@ def exchange(conditions: Conditions, groups: AlikeTriangles, draws: Draws, warme
 
 
 def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
-    """Give the emissivity and the reflected temperature, [K], that the camera was set to; 0 C if none was stated."""
+    """Return the emissivity and the reflected temperature, [K], set in the camera; 0 C if no temperature was stated."""
     reflected_c = draws.values.get("reflected temperature set in the camera", np.zeros(draws.count))
     return draws["emissivity set in the camera"], celsius_to_kelvin(reflected_c)
 
@@ -73,7 +73,7 @@ def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
 def part_totals(
     conditions: Conditions, groups: AlikeTriangles, draws: Draws, area_m2: sparse.csr_array, warmer_k: float = 0.0
 ) -> PartTotals:
-    """Add up heat flow and surface temperature over parts of the surface; `area_m2` has shape (parts, g)."""
+    """Return totals and means over p parts; `area_m2`, shape (p, g), is the area of each group in each part, [m2]."""
     columns, count = area_m2.tocsc(), len(groups.reading_c)
     total = np.asarray(area_m2.sum(axis=1)).reshape(-1, 1)
     flow_w, temperature = np.zeros((len(total), draws.count)), np.zeros((len(total), draws.count))
@@ -88,9 +88,9 @@ def part_totals(
 def triangle_exchange(
     conditions: Conditions, surface: AuditedSurface, groups: AlikeTriangles, draws: Draws
 ) -> tuple[FloatArray, FloatArray]:
-    """Give surface temperature [degrees Celsius] and heat flow [W/m2] of each triangle by the first draw, (f,) each.
+    """Return surface temperature [degrees Celsius] and heat flow [W/m2] of each triangle, shape (f,) each.
 
-    NaN where a triangle does not count.
+    Both follow from the first draw, the stated values. Both are NaN where a triangle does not count.
     """
     steps = (-HALF_STEP_K, 0.0, HALF_STEP_K)
     low, mean, high = (exchange(conditions, groups, draws, step) for step in steps)
@@ -103,7 +103,7 @@ def triangle_exchange(
 
 
 def radiant_k4(conditions: Conditions, draws: Draws, normals: FloatArray, up: tuple[float, float, float]) -> FloatArray:
-    """Give the fourth power of the radiant temperature of what surfaces see, (g, k), [K^4]; normals are (g, 3)."""
+    """Return the fourth power of the surroundings' radiant temperature, (g, k), [K^4], for normals of shape (g, 3)."""
     if conditions.surroundings.sky is None:
         return np.broadcast_to(
             fourth_power(celsius_to_kelvin(draws["reflected temperature"])), (len(normals), draws.count)
@@ -123,9 +123,9 @@ def film_flow_w_m2(
     normals: FloatArray,
     up: tuple[float, float, float],
 ) -> FloatArray:
-    """Give the heat flow from inside to outside by the film model, shape (g, k), [W/m2].
+    """Return the heat flow from inside to outside by the film model, shape (g, k), [W/m2].
 
-    Surface temperatures, what is around and emissivities have shape (g, k), normals (g, 3).
+    `surface_k`, `around_k4` (see `radiant_k4`) and `emissivity` have shape (g, k), `normals` has shape (g, 3).
     """
     model, factor = conditions.film.model, draws["film factor"]
     around_k = np.sqrt(np.sqrt(around_k4))
@@ -156,7 +156,7 @@ def film_flow_w_m2(
 
 
 def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], ...]:
-    """List the film models that the conditions have the figures for, their own one first, with conditions for each."""
+    """Return each film model for which the conditions state enough, with conditions that use the model; own first."""
     own = conditions.film
     windless = conditions.side == "outside" and conditions.outside.wind is None
     others: list[tuple[FilmModel, Conditions]] = [
@@ -168,13 +168,11 @@ def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], 
 
 
 def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draws) -> Draws:
-    """Replace the offset of the camera by what contact temperatures say of it, in every draw.
+    """Return draws whose "camera offset" is computed from the contact temperatures; without references, `draws`.
 
-    The offset is what must be added to the readings near a reference so that they give the temperature measured there;
-    of several references it is the mean. Errors of emissivity and reflection then largely cancel elsewhere.
-
-    Raises:
-        AuditError: No triangle that counts is near a reference.
+    The offset is the correction with which readings near a reference give the temperature measured there; for several
+    references it is the mean correction. Errors of emissivity and reflection then largely cancel elsewhere.
+    Raises `AuditError` if no triangle that counts is near a reference.
     """
     if not conditions.references:
         return draws
@@ -195,7 +193,7 @@ def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draw
 
 
 def reference_doubts(conditions: Conditions, draws: Draws) -> tuple[str, ...]:
-    """Say if references ask for an offset that is stated to be impossible."""
+    """Return a sentence if the offset that the references ask for lies outside the stated range; else nothing."""
     stated, found = conditions.camera.offset, draws["camera offset"]
     if not conditions.references or (stated.low <= found.max() and found.min() <= stated.high):
         return ()
@@ -206,7 +204,7 @@ def reference_doubts(conditions: Conditions, draws: Draws) -> tuple[str, ...]:
 
 
 def _near(surface: AuditedSurface, conditions: Conditions, number: int) -> IntArray:
-    """Find the triangles that count around a reference, on the patch of the nearest one."""
+    """Return the triangles that count around reference `number`, all on the patch of the nearest triangle."""
     at = np.array(conditions.references[number].at)
     counted = np.flatnonzero(surface.counted)
     distance = np.linalg.norm(surface.centroid_m[counted] - at, axis=1)

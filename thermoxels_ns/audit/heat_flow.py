@@ -1,7 +1,7 @@
-"""The published formulas: heat flow through a surface from its temperature, what a camera reads, and what is around.
+"""Published formulas for the heat flow through a surface, the reading of a camera, and the view of the surroundings.
 
-Heat flows are densities, [W/m2], positive from inside to outside; temperatures are in kelvin; arguments broadcast.
-"""
+Heat flows are densities, [W/m2], positive from inside to outside unless stated otherwise; temperatures are in kelvin
+unless the name ends in `_c`; arguments broadcast."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ WIND_W_S_M3K = 3.8054  # Coefficient of the wind in the formulas of Albatici and
 
 
 def fourth_power(values: Values) -> Values:
-    """Raise to the fourth power, ten times as fast as ``values**4``."""
+    """Return the fourth power of values, ten times as fast as ``values**4``."""
     return np.square(np.square(values))
 
 
 def radiation_w_m2(emissivity: Values, surface_k: Values, surroundings_k: Values) -> Values:
-    """Give the net radiation from a surface, eps sigma (Ts^4 - Trefl^4) (Fokaides and Kalogirou 2011)."""
+    """Return the net radiation that leaves a surface, eps sigma (Ts^4 - Trefl^4) (Fokaides and Kalogirou 2011)."""
     return emissivity * STEFAN_BOLTZMANN_W_M2K4 * (fourth_power(surface_k) - fourth_power(surroundings_k))
 
 
 def albatici_tonelli_w_m2(
     emissivity: Values, wind_m_s: Values, surface_k: Values, air_k: Values, factor: Values = 1.0
 ) -> Values:
-    """Give the flow outside, 5.67 eps ((Ts/100)^4 - (Te/100)^4) + 3.8054 v (Ts - Te) (Albatici and Tonelli 2010).
+    """Return 5.67 eps ((Ts/100)^4 - (Te/100)^4) + 3.8054 v (Ts - Te) (Albatici and Tonelli 2010).
 
-    `factor` multiplies convection.
+    This is the heat flow at an outer surface; `factor` multiplies the second term, convection.
     """
     radiation = 5.67 * emissivity * (fourth_power(surface_k / 100.0) - fourth_power(air_k / 100.0))
     return radiation + factor * WIND_W_S_M3K * wind_m_s * (surface_k - air_k)
 
 
 def dallo_w_m2(wind_m_s: Values, surface_k: Values, air_k: Values, factor: Values = 1.0) -> Values:
-    """Give the flow outside, (5.8 + 3.8054 v) (Ts - Te) (Dall'O, Sarto and Panza 2013); `factor` multiplies it."""
+    """Return `factor` (5.8 + 3.8054 v) (Ts - Te), the flow at an outer surface (Dall'O, Sarto and Panza 2013)."""
     return factor * (5.8 + WIND_W_S_M3K * wind_m_s) * (surface_k - air_k)
 
 
 def madding_w_m2(
     emissivity: Values, surface_k: Values, reflected_k: Values, air_k: Values, factor: Values = 1.0
 ) -> Values:
-    """Give the flow inside, 4 eps sigma Tm^3 (Trefl - Ts) + 1.31 (Ti - Ts)^(4/3) (Madding 2008).
+    """Return 4 eps sigma Tm^3 (Trefl - Ts) + 1.31 (Ti - Ts)^(4/3), the flow at an inner surface (Madding 2008).
 
-    Tm is the mean of Trefl and Ts. Where the surface is warmer than the air, convection changes its sign. `factor`
-    multiplies convection.
+    Tm is the mean of Trefl and Ts. If the surface is warmer than the air, the second term, convection, is negative.
+    `factor` multiplies convection.
     """
     mean = 0.5 * (reflected_k + surface_k)
     radiation = 4.0 * emissivity * STEFAN_BOLTZMANN_W_M2K4 * mean**3 * (reflected_k - surface_k)
@@ -62,16 +62,16 @@ def madding_w_m2(
 def surface_temperature_k(
     reading_k: Values, emissivity: Values, surroundings_k4: Values, set_emissivity: Values, set_reflected_k: Values
 ) -> Values:
-    """Give the temperature of a surface, [K], from a camera's reading of it.
+    """Return the temperature of a surface, [K], from a camera's reading of the surface.
 
-    The camera took eps_set T_read^4 + (1 - eps_set) T_set^4 for what arrives; eps Ts^4 + (1 - eps) T_surr^4 is what
-    arrives. The law of total radiation stands for the camera's band.
+    The surface sends eps Ts^4 + (1 - eps) T_surr^4, which the camera takes for eps_set T_read^4 + (1 - eps_set)
+    T_set^4. The law of total radiation stands in for the radiation in the camera's band.
 
     Args:
-        reading_k: What the camera says, [K].
-        emissivity: Of the surface, above 0, at most 1.
-        surroundings_k4: Fourth power of the radiant temperature of what it reflects, [K^4].
-        set_emissivity: What the camera was set to.
+        reading_k: Temperature that the camera reads, [K].
+        emissivity: True emissivity of the surface, above 0, at most 1.
+        surroundings_k4: Fourth power of the radiant temperature of the surroundings, [K^4].
+        set_emissivity: Emissivity that the camera was set to.
         set_reflected_k: Reflected temperature that the camera was set to, [K].
 
     >>> round(float(surface_temperature_k(280.0, 0.9, 260.0**4, 1.0, 0.0)), 3)
@@ -85,29 +85,29 @@ def surface_temperature_k(
 def reading_k(
     surface_k: Values, emissivity: Values, surroundings_k4: Values, set_emissivity: Values, set_reflected_k: Values
 ) -> Values:
-    """Give a camera's reading of a surface, [K]: the inverse of `surface_temperature_k`, with the same arguments."""
+    """Return a camera's reading, [K], of a surface of temperature `surface_k`; inverse of `surface_temperature_k`."""
     arrives = emissivity * fourth_power(surface_k) + (1.0 - emissivity) * surroundings_k4
     taken_for = (arrives - (1.0 - set_emissivity) * fourth_power(set_reflected_k)) / set_emissivity
     return np.sqrt(np.sqrt(np.maximum(taken_for, 1.0)))
 
 
 def temperature_factor(resistance_to_outside_m2k_w: Values, inside_resistance_m2k_w: float) -> Values:
-    """Give the temperature factor of an inner surface, f_Rsi = R / (R + Rsi) (ISO 13788).
+    """Return the temperature factor of an inner surface, f_Rsi = R / (R + Rsi) (ISO 13788).
 
-    `resistance_to_outside_m2k_w` is that between the surface and the air outside, (Ts - Te) / q.
+    R = (Ts - Te) / q, `resistance_to_outside_m2k_w`, is the resistance between the surface and the air outside.
     """
     return resistance_to_outside_m2k_w / (resistance_to_outside_m2k_w + inside_resistance_m2k_w)
 
 
 def sky_emissivity(dew_point_c: npt.ArrayLike, cloud: npt.ArrayLike) -> FloatArray:
-    """Give the emissivity of the sky for the temperature of the air at the ground.
+    """Return the emissivity of a sky that radiates at the temperature of the air at the ground.
 
     eps_sky = (0.787 + 0.764 ln(T_dp / 273)) (1 + 0.0224 N - 0.0035 N^2 + 0.00028 N^3), T_dp in kelvin, N in tenths
     (EnergyPlus Engineering Reference, "Sky Radiation Modeling"; Clark and Allen 1978, Walton 1983).
 
     Args:
         dew_point_c: Dew point of the air, [degrees Celsius].
-        cloud: Share of the sky that is covered, 0 to 1.
+        cloud: Share of the sky that clouds cover, 0 to 1.
 
     >>> round(float(sky_emissivity(283.0 - 273.15, 0.0)), 4)
     0.8145
@@ -118,10 +118,10 @@ def sky_emissivity(dew_point_c: npt.ArrayLike, cloud: npt.ArrayLike) -> FloatArr
 
 
 def view_shares(normals: FloatArray, up: tuple[float, float, float]) -> FloatArray:
-    """Give the shares of a surface's view that are sky, air near the horizon, and ground, (k, 3); rows add up to 1.
+    """Return the shares of sky, air near the horizon, and ground in a surface's view, (k, 3); rows add up to 1.
 
-    F_ground = (1 - cos tilt) / 2; of the rest, b = sqrt((1 + cos tilt) / 2) is sky and 1 - b air near the horizon,
-    which is about as warm as that at the ground (EnergyPlus Engineering Reference, "External Longwave Radiation";
+    F_ground = (1 - cos tilt) / 2. Of the rest, a share b = sqrt((1 + cos tilt) / 2) is sky, and 1 - b is air near the
+    horizon, about as warm as the air at the ground (EnergyPlus Engineering Reference, "External Longwave Radiation";
     Walton 1983). A wall sees 0.354 sky, 0.146 horizon and 0.5 ground.
 
     Args:

@@ -1,4 +1,4 @@
-"""The course of an audit: from a mesh with readings and conditions to answers with intervals."""
+"""The steps of an audit: heat flows, U-values and defects with intervals, from a mesh with readings and conditions."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from thermoxels_ns.fem.selection import matching_names
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 SEVERE_SHARE, MODERATE_SHARE = 0.05, 0.01
-"""Shares of the observed heat loss from which on a defect is severe or moderate. They are ours, of no standard."""
+"""Least shares of the observed heat loss at which a defect is severe or moderate; no standard defines these shares."""
 F_RSI_M2K_W = (0.13, 0.25)
-"""Resistances inside for which temperature factors are given, [m2 K / W]; the second is that for mould (ISO 13788)."""
+"""Inside surface resistances Rsi of the temperature factors, [m2 K / W]; ISO 13788 judges mould by the second."""
 _LEAST_FLOW_W_M2 = 1e-9
-_OF_A_TRIANGLE, _OF_THE_YEAR = 10**6, 10**6 + 1  # Numbers of errors of their own, beyond those of parts
+_OF_A_TRIANGLE, _OF_THE_YEAR = 10**6, 10**6 + 1  # Arguments `number` of `Draws.local`, larger than any part's number
 
 LEAST_DIFFERENCE_K, MOST_WIND_M_S, LEAST_HOURS_WITHOUT_SUN, LEAST_HOURS_DRY = 10.0, 5.0, 2.0, 24.0
-"""Difference of the airs, wind, time without sun and time since the surface was wet that EN 13187 asks for."""
+"""Limits of EN 13187: least difference of the airs, most wind, least hours since the sun and since wetness."""
 
 _MEANT_AS_EXACT = ("emissivity set in the camera", "reflected temperature set in the camera")
 _NAMES = {
@@ -53,56 +53,56 @@ Severity = Literal["severe", "moderate", "slight", "uncertain"]
 
 @dataclass(frozen=True)
 class Limit:
-    """What was asked for, and whether it is met."""
+    """One limit of `Conditions.limits`, the value found for it, and whether the limit is met."""
 
     name: str
     limit: float
     unit: str
-    at_most: bool  # Whether it is an upper limit
+    at_most: bool  # True: `found` must not exceed the limit; False: `found` must not fall below the limit
     found: Interval
     verdict: Verdict
 
 
 @dataclass(frozen=True)
 class Element:
-    """A part of the envelope: a patch, a storey, or all that was observed."""
+    """Results for one part of the envelope: a patch, a storey, or all observed patches together."""
 
     name: str
-    area_m2: float  # True area that counts
-    unobserved_m2: float  # True area of it of which nothing is known, or that is left out
+    area_m2: float  # Area of the triangles that count
+    unobserved_m2: float  # Area of the part's other triangles, without those that the scene box or the region cuts
     surface_c: Interval  # Mean surface temperature, [degrees Celsius]
-    loss_w: Interval  # Heat flow to the outside, [W]
+    loss_w: Interval  # Heat flow from inside to outside, [W]
     u_w_m2k: Interval
-    u_by_model: Mapping[str, float]  # U-value that each film model would give of the stated values
-    unsupported_share: float  # Share of the area that smoothness alone has placed, 0 to 1
+    u_by_model: Mapping[str, float]  # U-value by each film model, from the stated values, [W/(m2 K)]
+    unsupported_share: float  # Share of the area whose position no photograph supports, 0 to 1
 
 
 @dataclass(frozen=True)
 class Defect:
-    """A thermal bridge or defect; heat flows are beyond those of the undisturbed surface."""
+    """Results for one thermal bridge or other defect; "extra" heat flows are in excess of the undisturbed surface's."""
 
     kind: DefectKind
     patch: str
-    storey: str  # Empty if the conditions name none there
-    centre_m: tuple[float, float, float]
-    height_m: float  # Of its middle above the lowest point of the mesh
-    length_m: float  # Of a line, else its largest extent
-    area_m2: float  # Of what departs by more than noise
-    departure_k: float  # Of its worst square decimetre from the undisturbed surface near by, above 0
-    spot_c: Interval  # Temperature of that, [degrees Celsius]
-    undisturbed_c: float  # Mean temperature of that, [degrees Celsius]
-    incidence: Interval | None  # I_tb; None where the undisturbed surface may be as warm as the air
-    extra_w: Interval  # Extra heat flow
+    storey: str  # Name of the storey; empty if the conditions name no storey there
+    centre_m: tuple[float, float, float]  # Centroid of the core in the coordinates of the mesh
+    height_m: float  # Mean height of the core above the lowest point of the mesh
+    length_m: float  # Length of a line; largest extent of a point or an area
+    area_m2: float  # Area of the core: the triangles that depart by more than noise
+    departure_k: float  # Absolute difference between `spot_c` and `undisturbed_c`, [K]
+    spot_c: Interval  # Mean temperature of the square decimetre that departs most, [degrees Celsius]
+    undisturbed_c: float  # Mean temperature of the undisturbed surface near by, [degrees Celsius]
+    incidence: Interval | None  # Result of `incidence_factor`
+    extra_w: Interval  # Extra heat flow from inside to outside, [W]
     coefficient: Interval
-    """psi of a line, [W/(m K)], chi of a point, or extra heat flow per kelvin of an area, [W/K]."""
-    f_rsi: tuple[Interval, ...]  # Temperature factors for `F_RSI_M2K_W`; empty if seen from outside
+    """Of a line psi, [W/(m K)]; of a point chi, [W/K]; of an area its extra heat flow per kelvin, [W/K]."""
+    f_rsi: tuple[Interval, ...]  # Temperature factors of the spot for `F_RSI_M2K_W`; empty if seen from outside
     severity: Severity
-    not_counted: str  # Why it is not to be believed; else empty
+    not_counted: str  # Sentence that says why the defect does not count; empty if the defect counts
 
 
 @dataclass(frozen=True)
 class YearResult:
-    """A heating season of what was observed."""
+    """Heat that the observed surface loses in one heating season, with its cost and carbon dioxide."""
 
     heat_kwh: Interval
     cost: Interval | None  # In the user's currency
@@ -111,16 +111,16 @@ class YearResult:
 
 @dataclass(frozen=True)
 class SurveyCheck:
-    """What is wrong with a survey, sentences and names."""
+    """Shortcomings of a survey, in words for the report."""
 
-    forbidden: tuple[str, ...]  # Conditions that EN 13187 does not allow
-    doubts: tuple[str, ...]  # What makes the figures less certain than their intervals say
-    missing: tuple[str, ...]  # What a report after EN 13187 has to say and the conditions do not
+    forbidden: tuple[str, ...]  # Sentences on conditions that EN 13187 does not allow
+    doubts: tuple[str, ...]  # Sentences on what makes the figures less certain than their intervals say
+    missing: tuple[str, ...]  # Names of facts that EN 13187 wants in a report and that the conditions do not state
 
 
 @dataclass(frozen=True)
 class Audit:
-    """All that was found."""
+    """All results of one audit, with the conditions and the surface that the results follow from."""
 
     conditions: Conditions
     surface: AuditedSurface
@@ -128,23 +128,23 @@ class Audit:
     patches: tuple[Element, ...]
     storeys: tuple[Element, ...]
     whole: Element
-    defects: tuple[Defect, ...]  # Those with the most extra heat flow first, those that do not count last
-    found: tuple[FoundDefect, ...]  # The triangles of each defect
+    defects: tuple[Defect, ...]  # By falling extra heat flow; defects that do not count come last
+    found: tuple[FoundDefect, ...]  # Triangles of each defect, in the order of `defects`
     limits: tuple[Limit, ...]
     year: YearResult | None
     calibration: Calibration | None
-    f_rsi: tuple[Interval, ...]  # Of the coldest square decimetre of all, for `F_RSI_M2K_W`; empty seen from outside
-    budget: Mapping[str, float]  # How far each uncertain quantity alone moves the loss from lowest to highest, [W]
-    not_counted_m2: Mapping[str, float]  # True area that does not count, by reason
-    triangle_surface_c: FloatArray  # Surface temperature, NaN where it does not count, shape (f,), [degrees Celsius]
-    triangle_flow_w_m2: FloatArray  # Heat flow to the outside, likewise, shape (f,)
-    triangle_u: FloatArray  # U-value, its lower and its upper end, likewise, shape (f, 3), [W/(m2 K)]
+    f_rsi: tuple[Interval, ...]  # Temperature factors of the coldest square decimetre, see `Defect.f_rsi`
+    budget: Mapping[str, float]  # Difference in loss between the lowest and highest value of each quantity alone, [W]
+    not_counted_m2: Mapping[str, float]  # Area that does not count, by the reasons in `WHY_NOT`
+    triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
+    triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
+    triangle_u: FloatArray  # U-value and both ends of its interval, shape (f, 3), [W/(m2 K)]; NaN: does not count
 
 
 def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Audit:
-    """Answer what a survey asks: heat flow, U-values, thermal bridges and their intervals.
+    """Compute heat flows, U-values, thermal bridges and all else that an `Audit` holds, with intervals.
 
-    `up` is a unit vector. Raises `AuditError` if the conditions do not fit the mesh.
+    `up` is the unit vector that points up. Raises `AuditError` if the conditions do not fit the mesh.
     """
     surface = audited_surface(mesh, conditions, up)
     groups = alike_triangles(surface)
@@ -166,7 +166,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     parts += [surface.spot(worst, away), counted]
     work = _Parts(conditions, surface, groups, draws, parts)
 
-    # Readings of each patch have an error of their own, those of a storey the errors of the patches in it.
+    # Each patch has a reading error of its own; a storey has the errors of its patches, by the shares that lie in it.
     own = np.stack([work.slope_w_k[n] * work.own_error_k(n) for n in range(len(patches))])
     observed = np.isin(patch, patches)
     elements = [
@@ -214,7 +214,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
 
 
 def _storey_of(surface: AuditedSurface, conditions: Conditions) -> IntArray:
-    """Give the storey of each triangle by its number in the conditions; -1 below all and without storeys."""
+    """Return the place of each triangle's storey in `Conditions.storeys`, shape (f,); -1 below the lowest storey."""
     begins = np.array([what.value for what in conditions.storeys.values()])
     order = np.argsort(begins, kind="stable")
     place = np.searchsorted(begins[order], surface.height_m + 1e-9, side="right")
@@ -222,14 +222,14 @@ def _storey_of(surface: AuditedSurface, conditions: Conditions) -> IntArray:
 
 
 def _shares(surface: AuditedSurface, part: IntArray, patches: Sequence[IntArray]) -> FloatArray:
-    """Give the share of each patch's area that lies in a part, shape (patches,)."""
+    """Return the share of each patch's area that lies in a part, shape (patches,)."""
     within = np.zeros(len(surface.area_m2))
     within[part] = surface.area_m2[part]
     return np.array([within[patch].sum() / surface.area_m2[patch].sum() for patch in patches])
 
 
 class _Parts:
-    """Parts of the surface, each given by its triangles that count, and what they do in every draw."""
+    """Heat flow and temperature of parts of the surface in every draw; a part is a set of triangles that count."""
 
     def __init__(
         self,
@@ -246,18 +246,18 @@ class _Parts:
             part_totals(conditions, groups, draws.stated, self.rows, step).flow_w[:, 0]
             for step in (-HALF_STEP_K, HALF_STEP_K)
         )
-        self.slope_w_k = (high - low) / (2.0 * HALF_STEP_K)  # By which flows change with the readings, shape (parts,)
+        self.slope_w_k = (high - low) / (2.0 * HALF_STEP_K)  # Change of flow per kelvin of reading, shape (parts,)
         self.u_by_model = dict[str, FloatArray]()  # U-values by each film model from the stated values, shape (parts,)
         for model, chosen in other_models(conditions):
             flow_w = part_totals(chosen, groups, draws.stated, self.rows).flow_w[:, 0]
             self.u_by_model[model] = flow_w / draws.difference_k[0] / np.maximum(self.totals.area_m2, 1e-12)
 
     def own_error_k(self, number: int) -> FloatArray:
-        """Draw the error of readings that a part does not share with others, shape (k,), [K]."""
+        """Draw the reading error that part `number` does not share with other parts, shape (k,), [K]."""
         return self.draws.local(self.conditions.camera.repeatability.off_by, number)
 
     def element(self, name: str, row: int, every: IntArray, error_w: FloatArray) -> Element:
-        """Put figures to the part `row`; `every` are all of its triangles, `error_w` the error of its own readings."""
+        """Return the results of part `row`; `every` are its triangles, `error_w` draws of its own error, (k,), [W]."""
         surface, counted, area = self.surface, self.parts[row], float(self.totals.area_m2[row])
         uncut = every[surface.why_not[every] != list(WHY_NOT).index("cut")]
         flow_w = self.totals.flow_w[row] + error_w
@@ -273,7 +273,7 @@ class _Parts:
         )
 
     def triangle_u(self) -> FloatArray:
-        """Give the U-value of each triangle and the ends of its interval, (f, 3); NaN where it does not count."""
+        """Return the U-value of each triangle and both ends of its interval; see `Audit.triangle_u`."""
         off = self.own_error_k(_OF_A_TRIANGLE)
         ends, found = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE), []
         for start in range(0, len(self.groups.reading_c), CHUNK):
@@ -286,7 +286,7 @@ class _Parts:
         return np.where(self.surface.counted[:, None], of_group[self.groups.of_triangle], np.nan)
 
     def budget(self, own: FloatArray) -> dict[str, float]:
-        """Say how far each uncertain quantity alone moves the loss from one end of its range to the other, [W]."""
+        """Return `Audit.budget`, largest first; `own` are draws of the patches' own errors, shape (patches, k), [W]."""
         rows, found = self.groups.rows([np.flatnonzero(self.surface.counted)], self.surface.area_m2), {}
         for name, stated in one_at_a_time(self.conditions):
             draws = with_references(self.surface, self.conditions, stated)
@@ -296,9 +296,9 @@ class _Parts:
         return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     def temperature_factors(self, part: int, off_k: FloatArray) -> tuple[Interval, ...]:
-        """Give the temperature factors of a part for `F_RSI_M2K_W`, none if seen from outside.
+        """Return the temperature factors of a part for `F_RSI_M2K_W`; empty if seen from outside.
 
-        `off_k` are draws of the error of its own readings, shape (k,), [K].
+        `off_k` are draws of the part's own reading error, shape (k,), [K].
         """
         if self.conditions.side == "outside":
             return ()
@@ -308,11 +308,11 @@ class _Parts:
         return tuple(interval_of(np.asarray(temperature_factor(above / flow, one))) for one in F_RSI_M2K_W)
 
     def defect(self, one: FoundDefect, zone: int, off_k: FloatArray, storey: str, whole_w: float) -> Defect:
-        """Put figures to a defect: the part `zone` is its zone, the next its reference, the one after that its spot.
+        """Return the results of a defect. Part `zone` is its zone, `zone + 1` its reference, `zone + 2` its spot.
 
-        Extra heat flow is that of the zone minus what the undisturbed surface near by would lose on the area that the
-        zone stands on (psi = q_tb - q_uniform per metre, O'Grady and others 2017; areas are those of the outer
-        surface). `off_k` are draws of the error of its own readings, [K]; `whole_w` is the flow of all that was seen.
+        Extra heat flow is the flow of the zone minus the flow that the undisturbed surface near by would have on the
+        area under the zone (psi = q_tb - q_uniform per metre, O'Grady and others 2017; areas are of the seen side).
+        `off_k` are draws of the defect's own reading error, (k,), [K]; `whole_w` is the observed heat loss, [W].
         """
         surface, totals = self.surface, self.totals
         calm, spot = zone + 1, zone + 2
@@ -345,10 +345,10 @@ class _Parts:
 
 
 def incidence_factor(bridge_c: FloatArray, undisturbed_c: FloatArray, air_c: FloatArray) -> Interval | None:
-    """Give I_tb = (Ta - Tp) / (Ta - T1D) of a thermal bridge (Asdrubali and others); shape (k,) each.
+    """Return I_tb = (Ta - Tp) / (Ta - T1D) of a thermal bridge (Asdrubali and others); inputs have shape (k,).
 
-    Tp is the mean temperature of its surface, T1D that of the undisturbed surface, Ta the air on the side seen. None
-    where the undisturbed surface is not on the same side of the air in all draws.
+    Tp is the mean surface temperature of the bridge, T1D of the undisturbed surface, and Ta the temperature of the air
+    on the seen side. None if the undisturbed surface is colder than the air in some draws and warmer in others.
     """
     undisturbed = undisturbed_c - air_c
     if undisturbed.min() <= 0.0 <= undisturbed.max():
@@ -367,7 +367,7 @@ def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ..
 
 
 def verdict(found: Interval, limit: float, at_most: bool = True) -> Verdict:
-    """Say whether an interval lies within a limit, beyond it, or on both sides.
+    """Return "met" or "not met" if all of an interval meets or misses a limit, and "cannot tell" otherwise.
 
     >>> verdict(Interval(0.3, 0.2, 0.4), 0.5), verdict(Interval(0.3, 0.2, 0.4), 0.25)
     ('met', 'cannot tell')
@@ -404,7 +404,7 @@ def _limits(
 
 
 def _year(conditions: Conditions, draws: Draws, coupling_w_k: FloatArray) -> YearResult | None:
-    """Give heat, cost and carbon dioxide of a season: coupling times degree days times 0.024 kWh / (W d)."""
+    """Return heat, cost and carbon dioxide of a season from draws of the heat loss per kelvin, shape (k,), [W/K]."""
     year = conditions.year
     if year is None:
         return None
@@ -419,7 +419,7 @@ def _year(conditions: Conditions, draws: Draws, coupling_w_k: FloatArray) -> Yea
 
 
 def check_survey(conditions: Conditions) -> SurveyCheck:
-    """Hold conditions against what EN 13187 asks for."""
+    """Compare the conditions of a survey with what EN 13187 asks for."""
     survey, wind, difference = conditions.survey, conditions.outside.wind, conditions.difference_k
     least, sun, dry = survey.least_difference_24h, survey.hours_since_sun, survey.hours_dry
     forbidden = []

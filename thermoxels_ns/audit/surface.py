@@ -1,4 +1,4 @@
-"""Which boundary triangles count, and groups of triangles that are so alike that one heat flow holds for all."""
+"""Choose the boundary triangles that count, and group triangles so alike that one heat flow holds for each group."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
 _STEP_K, _STEP_COSINE = 0.05, 0.05
-"""Widths of the bins of readings, [K], and of normals, within which triangles are alike."""
+"""Widths of the bins within which triangles are alike: of readings, [K], and of the cosine between normal and up."""
 
 SPOT_M2 = 0.01  # Area over which the coldest or hottest spot is averaged
 
@@ -25,26 +25,26 @@ WHY_NOT = {
     "no reading": "that no thermal ray measured, or not on all of a triangle",
     "left out": "that the conditions leave out",
 }
-"""Why a triangle does not count."""
+"""Reasons why a triangle does not count; the texts complete a sentence that begins with "triangles"."""
 
 
 @dataclass(frozen=True)
 class AuditedSurface:
-    """The boundary of a mesh with what was measured on it; arrays have one entry per boundary triangle, shape (f,)."""
+    """The boundary of a mesh with the thermal readings on it; arrays have one entry per boundary triangle."""
 
     selection: Selection
-    reading_c: FloatArray  # What the thermal camera says, mean of the triangle, [degrees Celsius]
-    area_m2: FloatArray  # Area
-    centroid_m: FloatArray  # (f, 3)
-    counted: BoolArray  # Where thermal rays measured, and nothing speaks against it
-    why_not: IntArray  # Place in `WHY_NOT` of what speaks against it; -1 where nothing does
-    unsupported: BoolArray  # Photographs see the triangle, but none says that the surface lies there
-    surface_entry: IntArray  # Entry of `Conditions.surfaces` that holds
-    base_m: float  # Height of the lowest node of the mesh
+    reading_c: FloatArray  # Mean reading of the thermal camera, not corrected, shape (f,), [degrees Celsius]
+    area_m2: FloatArray  # Shape (f,)
+    centroid_m: FloatArray  # Shape (f, 3)
+    counted: BoolArray  # True where a triangle counts, which means that `why_not` is -1, shape (f,)
+    why_not: IntArray  # Place in `WHY_NOT` of the reason why a triangle does not count, shape (f,); -1 if it counts
+    unsupported: BoolArray  # True for triangles that count but whose position no photograph supports, shape (f,)
+    surface_entry: IntArray  # Place in `Conditions.surfaces` of the triangle's emissivity, shape (f,); -1: none
+    base_m: float  # Coordinate of the lowest node of the mesh along `selection.up`, [m]
 
     @property
     def mesh(self) -> TetMesh:
-        """The mesh."""
+        """Mesh whose boundary this is."""
         return self.selection.mesh
 
     @property
@@ -54,35 +54,35 @@ class AuditedSurface:
 
     @property
     def rim(self) -> BoolArray:
-        """Where a triangle that counts shares a node with one of which nothing is known, shape (f,)."""
+        """True where a triangle counts but touches a triangle that is cut, unseen or without a reading, shape (f,)."""
         facets = self.mesh.facets
         unknown = np.zeros(len(self.mesh.points_m), dtype=bool)
         unknown[facets[~self.counted & (self.why_not != list(WHY_NOT).index("left out"))]] = True
         return self.counted & unknown[facets].any(axis=1)
 
     def spot(self, which: IntArray, amount: FloatArray) -> IntArray:
-        """Take of some triangles those with the largest amounts, shape (k,), together at least a square decimetre."""
+        """Return the triangles of `which` with the largest `amount`, shape (k,) each, that together reach `SPOT_M2`."""
         ranked = which[np.argsort(-amount, kind="stable")]
         return ranked[: int(np.searchsorted(np.cumsum(self.area_m2[ranked]), SPOT_M2 * (1.0 - 1e-9))) + 1]
 
 
 @dataclass(frozen=True)
 class AlikeTriangles:
-    """Groups of triangles that count, of one patch, with nearly the same reading and normal."""
+    """Groups of triangles that count; a group shares a patch, and nearly the same reading and inclination."""
 
-    reading_c: FloatArray  # Mean of each group, weighted by area, shape (g,), [degrees Celsius]
-    normal: FloatArray  # Mean unit normal, shape (g, 3)
-    surface_entry: IntArray  # Entry of `Conditions.surfaces`, shape (g,)
-    of_triangle: IntArray  # Group of each boundary triangle, -1 where it does not count, shape (f,)
-    up: tuple[float, float, float]  # Unit vector
+    reading_c: FloatArray  # Mean reading of each group, weighted by area, shape (g,), [degrees Celsius]
+    normal: FloatArray  # Unit normal with the group's mean inclination and an arbitrary azimuth, shape (g, 3)
+    surface_entry: IntArray  # Place in `Conditions.surfaces` of the group's emissivity, shape (g,)
+    of_triangle: IntArray  # Group of each boundary triangle, shape (f,); -1 where a triangle does not count
+    up: tuple[float, float, float]  # Unit vector that points up
 
     def some(self, part: slice) -> AlikeTriangles:
-        """Take some of the groups; which triangles they are made of is lost."""
+        """Return the groups in `part`, with an empty `of_triangle`."""
         none = np.zeros(0, dtype=np.int64)
         return AlikeTriangles(self.reading_c[part], self.normal[part], self.surface_entry[part], none, self.up)
 
     def rows(self, parts: list[IntArray], area_m2: FloatArray) -> sparse.csr_array:
-        """Give the area of each group in each part of the surface, a set of triangles that count; shape (parts, g)."""
+        """Return the area of each group within each part, a set of triangles that count, shape (parts, g), [m2]."""
         row = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         which = np.concatenate([*parts, np.zeros(0, dtype=np.int64)]).astype(np.int64)
         shape = (len(parts), len(self.reading_c))
@@ -90,11 +90,11 @@ class AlikeTriangles:
 
 
 def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float]) -> AuditedSurface:
-    """Find what counts: seen, measured by thermal rays at all three nodes, not cut and not left out.
+    """Find the boundary triangles that count: seen, measured at all three nodes, not cut and not left out.
 
     Raises:
-        AuditError: The mesh has no boundary tags, the conditions name a patch that it does not have or no emissivity
-            for one, or nothing counts.
+        AuditError: The mesh has no boundary tags, the conditions name a patch that the mesh does not have, a patch
+            with readings has no emissivity, or no triangle counts.
     """
     if mesh.boundary is None:
         remedy = "Export it with ns-export thermoxels-mesh."
@@ -143,11 +143,11 @@ def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, floa
 
 
 def alike_triangles(surface: AuditedSurface) -> AlikeTriangles:
-    """Group the triangles that count by patch, reading and normal."""
+    """Group the triangles that count by patch, reading and inclination."""
     which = np.flatnonzero(surface.counted)
     normal, area = surface.selection.facet_normal[which], np.maximum(surface.area_m2[which], 1e-300)
     reading, upward = surface.reading_c[which], normal @ np.array(surface.selection.up)
-    # Of normals, only how far they look up matters.
+    # All film and sky models depend on the inclination of a normal alone, not on its azimuth.
     key = np.rint(reading / _STEP_K).astype(np.int64)
     key = (key - key.min()) * (2 + round(2.0 / _STEP_COSINE)) + np.rint((upward + 1.0) / _STEP_COSINE).astype(np.int64)
     key = key * len(surface.selection.patch_names) + surface.selection.facet_patch[which]
@@ -169,7 +169,7 @@ def alike_triangles(surface: AuditedSurface) -> AlikeTriangles:
 
 
 def chosen_names(name: str, names: tuple[str, ...], patterns: Iterable[str], what: str = "patches") -> set[str]:
-    """Give the names that match any pattern; raises `AuditError` for a pattern that matches none."""
+    """Return the names that match any pattern; raises `AuditError` for a pattern that matches no name."""
     chosen = set[str]()
     for pattern in patterns:
         found = matching_names(names, pattern)

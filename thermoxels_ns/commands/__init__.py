@@ -1,1 +1,1 @@
-"""What users type: each command ties rooms together."""
+"""The commands that users type; each command calls functions of several other packages."""

@@ -1,4 +1,4 @@
-"""The command ``thermoxels audit``: heat loss, U-values and thermal bridges from measured temperatures."""
+"""The command ``thermoxels audit``: find heat loss, U-values and thermal bridges from measured temperatures."""
 
 from __future__ import annotations
 
@@ -23,47 +23,47 @@ if TYPE_CHECKING:
     from thermoxels_ns.reports.page import Picture
 
 ANSWERS, PAGE, SURFACE = "answers.json", "audit.html", "surface.vtp"
-"""Files of an audit."""
+"""Files that an audit writes."""
 
 Say = Callable[[str], None]
 
 
 @dataclass
 class Audit:
-    """Say from the temperatures that thermal images measured: heat loss, U-values and thermal bridges, as intervals.
+    """Compute heat loss, U-values and thermal bridges, as intervals, from temperatures that thermal images measured.
 
-    Writes audit.html (open it first, or print it), answers.json, and surface.vtp for ParaView. What was known on site
-    stands in a yaml file: ``thermoxels audit --write-conditions conditions.yaml`` writes one that explains itself."""
+    Writes audit.html (open it first, or print it), answers.json, and surface.vtp for ParaView. A yaml file states the
+    conditions on site: ``thermoxels audit --write-conditions conditions.yaml`` writes an example that explains them."""
 
     mesh: tyro.conf.Positional[Path | None] = None
-    """The mesh.vtu of an export with a known scale; mesh-boundary.vtp lies beside it."""
+    """The mesh.vtu of an export with a known scale; its mesh-boundary.vtp must lie in the same folder."""
     conditions: Path | None = None
     """Conditions of the survey, a yaml file: air inside and outside, wind, sky, emissivities, camera, each with +-."""
     output_dir: Path = Path("audit")
-    """Folder for the results; made if it does not exist. Those of an earlier audit in it are replaced."""
+    """Folder for the results; made if it does not exist. Results of an earlier audit in the folder are replaced."""
     write_conditions: Path | None = None
-    """Write an example of conditions to this file, every key explained, and do nothing else."""
+    """Write an example of conditions that explains every key to this file, and do nothing else."""
     up: tuple[float, float, float] | None = None
-    """Direction that points up in the coordinates of the mesh. Default: that of the export's summary.json beside the
+    """Direction that points up in the coordinates of the mesh. Default: the direction in the summary.json beside the
     mesh, or else z."""
     scene: Path | None = None
     """Folder of the photographs that the mesh was made from, the --data of the training: the page then shows each
-    defect in the photograph and thermal image that show it best."""
+    defect in the photograph and the thermal image in which the defect is largest."""
     pictures: bool = True
     """Draw pictures for the page."""
 
     def main(self) -> None:
-        """Run it; raises `ThermoxelsError` if the mesh, the conditions or an option cannot be used."""
+        """Run; raises `ThermoxelsError` if the mesh, the conditions or an option cannot be used."""
         from rich.console import Console
 
         console = Console(highlight=False)
-        # The last bits of a product of long vectors depend on how many threads BLAS has.
+        # With more BLAS threads, the last bits of results would depend on the number of threads.
         with threadpool_limits(1, "blas"):
             run_audit(self, lambda line: console.print(line, markup=False, soft_wrap=True))
 
 
 def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
-    """Audit, then write everything, answers.json last; or write an example of conditions, which gives None."""
+    """Audit a mesh, write all files and return the result; or, with `write_conditions`, write an example: None."""
     from thermoxels_ns.audit.conditions import load_conditions, write_example
     from thermoxels_ns.audit.run import audit
     from thermoxels_ns.commands.audit_photographs import photographs_of_defects
@@ -112,7 +112,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
 
 
 def answers_of(options: Audit, found: Found) -> dict[str, Any]:
-    """Give everything that answers.json says; null stands for numbers and ends of intervals that are not known."""
+    """Return the content of answers.json; numbers and ends of intervals that are NaN or infinite become null."""
     from pydantic_core import to_jsonable_python
 
     calibration = found.calibration
@@ -136,7 +136,7 @@ def _write(folder: Path, options: Audit, found: Found, photographs: Mapping[int,
     from thermoxels_ns.reports.page import write_page
 
     answers = answers_of(options, found)
-    summary_text(answers)  # raises if json cannot hold it
+    summary_text(answers)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
     _write_surface(folder / SURFACE, found)
     pictures = draw_audit(found) if options.pictures else None
@@ -147,7 +147,7 @@ def _write(folder: Path, options: Audit, found: Found, photographs: Mapping[int,
 
 
 def _write_surface(path: Path, found: Found) -> None:
-    """Write what was found of each boundary triangle, NaN where it does not count, and the number of its defect."""
+    """Write the results of each boundary triangle, NaN where it does not count, and its defect's number, from 1."""
     import pyvista as pv
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 

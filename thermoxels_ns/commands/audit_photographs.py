@@ -1,4 +1,4 @@
-"""Photographs and thermal images of defects, cut out of the view that shows each best."""
+"""Cut photographs and thermal images of defects out of the view that shows each defect largest."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from thermoxels_ns.reports.audit_page import MOST_DEFECTS
 from thermoxels_ns.reports.charts import colours
 from thermoxels_ns.reports.page import Picture, image_file
 
-_MOST_POINTS = 1000  # Triangles of a defect that are looked for in photographs
-_CELLS = 64  # Cells across a photograph in which the nearest triangle hides others
-_HIDDEN = 1.05  # What is this many times as far as the nearest triangle of its cell is hidden
+_MOST_POINTS = 1000  # Most triangles of a defect that are projected into photographs
+_CELLS = 64  # Cells across and along a photograph; in each cell the nearest triangle hides farther ones
+_HIDDEN = 1.05  # A triangle is hidden if it is this many times as far as the nearest triangle of its cell
 _MARGIN, _LEAST_SHARE = 0.6, 0.3
-"""What a cut-out shows around a defect, of its size on each side, and its least width as a share of the image's."""
-_WIDTH = 480
+"""Margin around a defect, as a share of its size, and least width of the cut-out, as a share of the image's width."""
+_WIDTH = 480  # Width of a cut-out, [pixels]
 
 
 def photographs_of_defects(folder: Path, metres_per_unit: float, found: Audit) -> dict[int, tuple[Picture, Picture]]:
-    """Cut the photograph and the thermal image of each defect out of the view that shows it largest.
+    """Cut photograph and thermal image of each defect out of the view that shows it largest, by place in `found.found`.
 
-    Mesh coordinates are those of the scene's poses times `metres_per_unit`. Defects, by their place in `found`, that no
-    photograph shows are left out; raises `SceneError` for a folder that is no scene.
+    `metres_per_unit` is the mesh's length of one unit of the scene's poses. Defects that no photograph shows are left
+    out, and so are defects beyond `MOST_DEFECTS`. Raises `SceneError` if `folder` is no scene.
     """
     scene = read_scene_file(folder, "skip")
     frames = [frame for frame in scene.frames if frame.intrinsics.lens == "perspective"]
@@ -55,7 +55,7 @@ def photographs_of_defects(folder: Path, metres_per_unit: float, found: Audit) -
 
 
 def _nearest(frame: Frame, points: FloatArray) -> FloatArray:
-    """Give the distance of the nearest point in each cell of a photograph, (cells, cells); infinite without any."""
+    """Return the distance of the nearest point in each cell, (`_CELLS`, `_CELLS`); infinite in cells without points."""
     pixels, inside, distance = _seen_from(frame, points)
     nearest = np.full((_CELLS, _CELLS), np.inf)
     np.minimum.at(nearest, _cells(frame.intrinsics, pixels[inside]), distance[inside])
@@ -68,7 +68,7 @@ def _cells(camera: Camera, pixels: FloatArray) -> tuple[IntArray, ...]:
 
 
 def _seen_from(frame: Frame, points: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Give the pixels of points in a photograph, whether they lie in it, and their distance from the camera."""
+    """Return the pixels of points, (k, 2), whether each lies in the photograph, (k,), and distances from the camera."""
     pixels = frame.intrinsics.project_world(frame.pose, points)
     return pixels, frame.intrinsics.contains(pixels), np.linalg.norm(points - frame.pose[:3, 3], axis=1)
 
@@ -76,7 +76,7 @@ def _seen_from(frame: Frame, points: FloatArray) -> tuple[FloatArray, BoolArray,
 def _size_in_view(
     frame: Frame, nearest: FloatArray, points: FloatArray, normals: FloatArray, area: FloatArray
 ) -> float:
-    """Give the solid angle of the triangles that a photograph shows: in it, facing it, nothing nearer in their cell."""
+    """Return the solid angle, [sr], of the triangles that lie in a photograph, face it, and are not hidden."""
     pixels, seen, distance = _seen_from(frame, points)
     if not seen.any():
         return 0.0
@@ -89,7 +89,7 @@ def _size_in_view(
 def _cut_out(
     scene: SceneFile, frame: Frame, points: FloatArray, limits: tuple[float, float]
 ) -> tuple[bytes, bytes] | None:
-    """Cut photograph and thermal image around some points, as JPEG; None where one does not show them."""
+    """Cut photograph and thermal image around some points, as JPEG files; None if either image shows no point."""
     temperature_c = read_thermal_file(frame.thermal, scene.unit).temperature_c
     height, width = temperature_c.shape
     thermal = frame.thermal_intrinsics or frame.intrinsics.resized(width, height)
@@ -110,11 +110,11 @@ def _cut_out(
 
 
 def _framed(picture: npt.NDArray[np.uint8], pixels: FloatArray) -> bytes:
-    """Cut a picture around some pixels and draw a frame around them."""
+    """Cut a picture around some pixels, (k, 2), and draw a frame around the pixels; return a JPEG file."""
     size = np.array(picture.shape[1::-1], dtype=np.float64)
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     half = np.maximum((0.5 + _MARGIN) * (high - low), 0.5 * _LEAST_SHARE * size)
-    half = np.minimum(np.maximum(half, half[::-1] * size / size[::-1]), 0.5 * size)  # as wide as it is high
+    half = np.minimum(np.maximum(half, half[::-1] * size / size[::-1]), 0.5 * size)  # proportions of the picture
     middle = np.clip(0.5 * (low + high), half, size - half)
     (left, top), (right, bottom) = np.floor(middle - half).astype(int), np.ceil(middle + half).astype(int)
     image = Image.fromarray(picture).crop((left, top, right, bottom))

@@ -1,4 +1,4 @@
-"""The command ``thermoxels capture``; only light imports at the top, for its help."""
+"""The command ``thermoxels capture``: make a scene from camera files. Only light imports at the top, for --help."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _LISTED = 10
 @dataclass
 class Capture(CaptureSettings):
     """Turn camera files into a scene: pair photographs with thermal images, read temperatures, find poses, scale, the
-    rig between the two cameras and drift, and write a scene for thermal-data and a page to judge it by."""
+    rig between the two cameras and drift; write a scene for thermal-data, and a page by which to judge the scene."""
 
     source: tyro.conf.Positional[Path] = field(kw_only=True)
     """Folder of camera files; it is only read."""
     output: Path = field(kw_only=True)
-    """Folder for the scene and capture.html; made if it does not exist. An earlier capture in it goes on where it
-    stopped."""
+    """Folder for the scene and capture.html; made if it does not exist. If the folder holds an earlier capture, it is
+    continued where it stopped."""
 
     def main(self) -> None:
-        """Run the capture; raises `ThermoxelsError` for what cannot be used, and without pairs or poses."""
+        """Run the capture; raises `ThermoxelsError` for unusable files or options, and without pairs or poses."""
         from rich.console import Console
 
         console = Console(highlight=False)
@@ -45,7 +45,7 @@ class Capture(CaptureSettings):
 def capture_folder(
     source: Path, output: Path, settings: CaptureSettings, say: Callable[[str], None] = lambda _: None
 ) -> CaptureResult:
-    """Turn a folder of camera files into a scene and write the page about it; raises what `run_capture` does."""
+    """Turn a folder of camera files into a scene and write its page; raises the errors of `run_capture`."""
     from thermoxels_ns.capture.stages import run_capture
     from thermoxels_ns.reports.capture_page import write_capture_page
 
@@ -53,7 +53,7 @@ def capture_folder(
 
 
 def _print_result(result: CaptureResult, folder: Path, console: Console) -> None:
-    """Say what was made, what was left out and what to do next."""
+    """Print the numbers of frames and pairs, what was left out and why, and the next command."""
 
     def say(line: str, style: str | None = None) -> None:
         console.print(line, style=style, markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""The command ``thermoxels cost``: what accuracy costs on a scene, from real training runs."""
+"""The command ``thermoxels cost``: measure time and memory against accuracy on a scene, in real training runs."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 
 class Figure(NamedTuple):
-    """How a measured figure is shown."""
+    """How one measured figure is shown; empty texts leave the figure out."""
 
-    heading: str = ""  # Of its column in the table; a figure without one is in the csv file alone
-    form: str = ""
+    heading: str = ""  # Heading of the figure's column in the table; empty: the figure is in the csv file alone
+    form: str = ""  # Format of the value with its unit
     higher_is_better: bool = False
-    panel: str = ""  # Title of its panel in the plot; a figure without one has no panel
-    short: str = ""  # Its name in the column of Pareto fronts; a figure without one has no front
+    panel: str = ""  # Title of the figure's panel in the plot; empty: no panel
+    short: str = ""  # Name of the figure in the column of Pareto fronts; empty: no front
 
 
 FIGURES: Mapping[str, Figure] = {
@@ -44,26 +44,26 @@ FIGURES: Mapping[str, Figure] = {
     "training_seconds": Figure("training", "{:.0f} s"),
     # Wall time of the whole ns-train command, from its start to its end.
     "seconds": Figure("ns-train", "{:.0f} s"),
-    # Of the held-out views: RGB PSNR [dB] and SSIM, and mean absolute temperature error [degrees Celsius].
+    # RGB PSNR [dB] and SSIM, and mean absolute temperature error [degrees Celsius], on held-out views.
     "psnr": Figure("RGB PSNR", "{:.1f} dB", True, "RGB PSNR [dB], higher is better", "PSNR"),
     "ssim": Figure(),
     "thermal_mae_c": Figure("thermal MAE", "{:.2f} °C", False, "thermal MAE [°C], lower is better", "MAE"),
-    # Of the surface: F-score at 1.5 voxels of a lattice of 128 voxels, and of the setting's own lattice.
+    # F-score of the surface at 1.5 voxels of a lattice of 128 voxels, and at 1.5 voxels of the setting's own lattice.
     "fscore_128": Figure(
         *("F-score, 1.5 of 128 voxels", "{:.2f}", True, "surface F-score at 1.5 of 128 voxels, higher is better")
     ),
     "fscore": Figure("F-score, 1.5 own voxels", "{:.2f}"),
     "precision": Figure(),
     "recall": Figure(),
-    # Mean distance of the surface to the true one, voxels of the setting's own lattice, and metres.
+    # Mean distance between the surface and the true surface, in voxels of the setting's own lattice, and in metres.
     "surface_distance_voxels": Figure("surface distance", "{:.2f} voxels"),
     "surface_distance_m": Figure(),
-    # Share of rays that are neither through nor stopped.
+    # Share of rays that neither pass through the scene nor are stopped.
     "half_transparent": Figure("half-transparent rays", "{:.1%}"),
     # Largest resident memory of the ns-train process, 1e9 bytes.
     "peak_memory_gb": Figure("memory", "{:.1f} GB", False, "peak memory [GB], lower is better"),
 }
-"""What is measured, by the name of its column."""
+"""All measured figures, by the names of their columns in csv files."""
 FRONTS = tuple(name for name, figure in FIGURES.items() if figure.short)
 _EVALUATED = tuple(name for name in FIGURES if name not in ("seconds", "training_seconds", "peak_memory_gb"))
 _TARGETS = {"thermal_mae_c": "a thermal MAE of at most {:g} °C", "psnr": "an RGB PSNR of at least {:g} dB"}
@@ -76,42 +76,42 @@ class Cost:
     """Train a scene at several settings and report what accuracy costs: seconds and memory against image, temperature
     and surface errors, as csv, plot and a table for a README.
 
-    Finished runs are kept in runs.csv in the output folder; a start that was interrupted goes on where it stopped.
-    Run it on an otherwise idle machine."""
+    Finished runs are kept in runs.csv in the output folder; if the command was interrupted, start it again and it goes
+    on where it stopped. The machine should do nothing else."""
 
     scene: tyro.conf.Positional[Path]
-    """Scene folder. For a synthetic scene the surface is compared with the exact one."""
+    """Scene folder. In a synthetic scene the trained surface is compared with the exact surface."""
     output_dir: Path = Path("cost")
     """Folder for runs.csv (single runs), cost.csv (medians), cost.png, cost.md and logs."""
     settings: tuple[str, ...] = ("32:400", "128:800")
-    """What to train, as resolution:steps, voxels along the longest side of the scene box and training steps; the
-    schedule in between is made to fit. May be empty."""
+    """Settings to train, each as resolution:steps: voxels along the longest side of the scene box, and training steps;
+    the training schedule is scaled to both. May be empty."""
     qualities: tuple[str, ...] = ("draft", "standard", "fine")
     """Named qualities of ns-train to train as well. May be empty."""
     methods: tuple[str, ...] = ("thermoxels",)
-    """The first trains all settings and qualities; each further one, such as plenoxels-t, adds a row: the baseline
-    with that method."""
+    """Training methods. The first method trains all settings and qualities; each further method, such as plenoxels-t,
+    adds a row: the baseline with that method."""
     recipes: tuple[str, ...] = ("default",)
-    """Loss recipes: the first is that of all rows (default: the method's own); each further one, such as paper, adds a
-    row: the baseline with that recipe."""
+    """Loss recipes. All rows use the first recipe (default: the method's own); each further recipe, such as paper, adds
+    a row: the baseline with that recipe."""
     baseline: str | None = None
-    """Setting or quality that times are related to and that further methods and recipes are trained at. Default:
-    standard, or else the one named last."""
+    """Setting or quality whose time is 1 in the table, and at which further methods and recipes are trained. Default:
+    standard, or else the last quality, or else the last setting."""
     repeats: int = 1
-    """Runs of each setting; the table shows medians."""
+    """Number of runs of each setting; the table shows medians."""
     target_mae: float | None = None
     """Name the cheapest setting whose thermal MAE is at most this, [degrees Celsius]."""
     target_psnr: float | None = None
     """Name the cheapest setting whose RGB PSNR is at least this, [dB]. With --target-mae both must hold."""
     train_options: str = ""
-    """Further options of every ns-train, as one quoted text after an equals sign, for instance
+    """Further options for all ns-train commands, as one quoted text after an equals sign, for instance
     --train-options="--pipeline.model.near-plane 0.05"."""
     warm_up: bool = True
-    """Train the first setting once before anything counts, so that no run pays for compiling kernels."""
+    """Train the first setting once before the measured runs, so that no measured run compiles kernels."""
     keep_models: bool = False
     """Keep the trained models in the folder models."""
     again: bool = False
-    """Measure again what runs.csv already holds, for instance after a change of the program."""
+    """Measure runs again that runs.csv already holds, for instance after a change of the program."""
 
     def main(self) -> None:
         """Measure and report; raises `ThermoxelsError` if an option or the scene cannot be used, or a run failed."""
@@ -121,43 +121,43 @@ class Cost:
 
 
 class CostSetting(NamedTuple):
-    """One way to train."""
+    """A method and options of ns-train, which make up one row of the table."""
 
-    name: str  # What the user calls it, for instance ``64:800``, ``standard`` or ``standard, recipe paper``
+    name: str  # Name of the row, for instance ``64:800``, ``standard`` or ``standard, recipe paper``
     method: str
     options: tuple[str, ...]
 
     def command(self, *scene: str) -> str:
-        """Write how to train with it as typed in a shell; `scene` are the words that say on what, if any."""
+        """Return the ns-train command as typed in a shell; `scene` are words that name the scene, such as --data."""
         return shlex.join(["ns-train", self.method, *scene, *self.options])
 
 
 class RunKey(NamedTuple):
-    """What a run measures: two runs with equal keys measure the same."""
+    """Identity of a run: runs with equal keys measure the same, so a run in runs.csv is not repeated."""
 
-    setting: str
-    repeat: int  # From 1
-    scene: str  # Fingerprint of the scene
-    version: str  # Of this package
-    training: str  # The words of ns-train
+    setting: str  # `CostSetting.name`
+    repeat: int  # Number of the repetition, from 1
+    scene: str  # Result of `scene_fingerprint`
+    version: str  # Version of this package
+    training: str  # The ns-train command, without the scene
 
 
 Figures = dict[str, float]
-"""Measured figures by the names in `FIGURES`; NaN where the scene or the method has none."""
+"""Values of measured figures by the names in `FIGURES`; NaN if the scene or the method has no such figure."""
 
 
 class CostRow(NamedTuple):
-    """A setting, and the medians of its runs."""
+    """A row of the table: a setting with the medians of its runs."""
 
     setting: CostSetting
-    repeats: int
-    figures: Figures
-    time_ratio: float  # Median wall time over that of the baseline; NaN if the baseline has no run
-    fronts: tuple[str, ...]  # Those of `FRONTS` in which no other setting is better without being slower
+    repeats: int  # Number of runs
+    figures: Figures  # Median of each figure
+    time_ratio: float  # Median wall time divided by the baseline's; NaN if the baseline has no run
+    fronts: tuple[str, ...]  # Names in `FRONTS` of the figures whose Pareto front holds this row
 
 
 def run_cost(cost: Cost, console: Console) -> None:
-    """Train and evaluate every setting that runs.csv does not hold, and write table, plot and page; see `Cost`."""
+    """Train and evaluate every setting that runs.csv does not hold; then write table, plot and page. See `Cost`."""
 
     def say(line: str) -> None:
         console.print(line, markup=False, soft_wrap=True)
@@ -184,7 +184,7 @@ def run_cost(cost: Cost, console: Console) -> None:
     if pending and cost.warm_up:
         first = plan[pending[0]]
         say(f"Warm-up with {first.name}, not counted ...")
-        with suppress(ThermoxelsError):  # its counted run will say why it failed
+        with suppress(ThermoxelsError):  # the first counted run reports the same error
             measure(cost.scene, first, "warm-up", folder, False, console)
     failed: list[str] = []
     for number, key in enumerate(pending, start=1):
@@ -210,7 +210,7 @@ def run_cost(cost: Cost, console: Console) -> None:
         words += [verdict(rows, targets, cost.scene)] if targets else []
         write_table(folder / _TABLE, rows, baseline)
         draw_plot(folder / _PLOT, rows, targets, f"What accuracy costs: {scene}")
-        with replace_when_done(folder / _PAGE) as temporary:  # markup in names stays words
+        with replace_when_done(folder / _PAGE) as temporary:  # names may hold markup, which is escaped
             temporary.write_text(html.escape("\n\n".join(words), quote=False) + "\n", encoding="utf-8")
         for text in ("", *words, f"Written to {folder}: {', '.join((_TABLE, _PLOT, _PAGE, _RUNS))}"):
             say(text)
@@ -220,7 +220,7 @@ def run_cost(cost: Cost, console: Console) -> None:
 
 
 def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
-    """Give the rows of the table, and the name of the baseline among them."""
+    """Return the rows of the table and the name of the baseline; raises `ThermoxelsError` for wrong options."""
     try:
         further = tuple(shlex.split(cost.train_options))
     except ValueError as problem:
@@ -238,7 +238,7 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
         raise ThermoxelsError("baseline", expected=expected, got=baseline, remedy="Name one of them.")
 
     def row(of: str, method: str, recipe: str, kind: str = "") -> CostSetting:
-        # The default is the method's own recipe, which needs no option.
+        # The recipe "default" is the method's own recipe, which needs no option.
         recipe_words = () if recipe == "default" else ("--pipeline.model.recipe", recipe)
         return CostSetting(f"{of}{kind}", method, (*words[of], *recipe_words, *further))
 
@@ -251,7 +251,7 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
 
 
 def _targets(cost: Cost) -> dict[str, float]:
-    """Check the bounds that were given, and give them by the names of figures."""
+    """Return the targets that the user set, by names of `FIGURES`; raises `ThermoxelsError` unless all are above 0."""
     bounds = {"thermal_mae_c": ("target_mae", cost.target_mae), "psnr": ("target_psnr", cost.target_psnr)}
     return {
         figure: check_positive(name, value, f"Correct --{name.replace('_', '-')}, or leave it out.")
@@ -261,7 +261,7 @@ def _targets(cost: Cost) -> dict[str, float]:
 
 
 def training_options(setting: str) -> tuple[str, ...]:
-    """Give the options of ns-train for a setting ``resolution:steps``, or raise a `ThermoxelsError`."""
+    """Return the options of ns-train for a setting ``resolution:steps``; raises `ThermoxelsError` for other texts."""
     from thermoxels_ns.training.schedule import schedule_for
 
     match = re.fullmatch(r"([1-9]\d*):([1-9]\d*)", setting)
@@ -278,7 +278,7 @@ def training_options(setting: str) -> tuple[str, ...]:
 
 
 def scene_fingerprint(scene: Path) -> str:
-    """Hash the names and sizes of all files of a scene, and the contents of the json files beside the photographs."""
+    """Return a hash of the names and sizes of all files of a scene and of the contents of the json files in `scene`."""
     digest = hashlib.sha256()
     for path in sorted(path for path in scene.rglob("*") if path.is_file()):
         digest.update(f"{path.relative_to(scene).as_posix()} {path.stat().st_size}\n".encode())
@@ -288,7 +288,7 @@ def scene_fingerprint(scene: Path) -> str:
 
 
 def read_runs(path: Path) -> dict[RunKey, Figures]:
-    """Read the finished runs, none if there is no file yet; raises `ThermoxelsError` for a file that is damaged."""
+    """Read the finished runs from runs.csv; none if there is no file. Raises `ThermoxelsError` for a damaged file."""
     if not path.is_file():
         return {}
     try:
@@ -310,12 +310,12 @@ def read_runs(path: Path) -> dict[RunKey, Figures]:
 
 
 def write_runs(path: Path, runs: Mapping[RunKey, Figures]) -> None:
-    """Write the finished runs; an interrupted write leaves the old file."""
+    """Write the finished runs to runs.csv; an interrupted write leaves the old file."""
     _write_csv(path, [*RunKey._fields, *FIGURES], ([*key, *_cells(figures)] for key, figures in runs.items()))
 
 
 def write_table(path: Path, rows: Iterable[CostRow], baseline: str) -> None:
-    """Write the rows with all figures."""
+    """Write cost.csv: one line per row with all figures."""
     fronts = [f"front_{name}" for name in FRONTS]
     lines = []
     for row in rows:
@@ -327,7 +327,7 @@ def write_table(path: Path, rows: Iterable[CostRow], baseline: str) -> None:
 
 
 def _cells(figures: Figures) -> list[str]:
-    """Write all figures in their order; cells are empty where there is nothing to measure."""
+    """Return all figures as texts, in the order of `FIGURES`; NaN becomes an empty text."""
     return ["" if math.isnan(figures[name]) else f"{figures[name]:.6g}" for name in FIGURES]
 
 
@@ -337,7 +337,7 @@ def _write_csv(path: Path, head: Sequence[str], lines: Iterable[Sequence[object]
 
 
 def measure(scene: Path, setting: CostSetting, name: str, folder: Path, keep_model: bool, console: Console) -> Figures:
-    """Train a setting anew and evaluate it, under a name of its own."""
+    """Train a setting and evaluate the model; return all figures. Log, model and results are files called `name`."""
     models, logs, evaluations = (writable_folder(folder / part) for part in ("models", "logs", "eval"))
     shutil.rmtree(models / name, ignore_errors=True)
     run_folder, output = models / name / setting.method / "run", evaluations / f"{name}.json"
@@ -354,7 +354,7 @@ def measure(scene: Path, setting: CostSetting, name: str, folder: Path, keep_mod
 
 
 def training_seconds(run_folder: Path) -> float:
-    """Give the seconds from the start of nerfstudio's loop, when it writes its transform, to the last checkpoint."""
+    """Return the seconds from the start of training, told by dataparser_transforms.json, to the last checkpoint."""
     start = run_folder / "dataparser_transforms.json"
     checkpoints = sorted((run_folder / "nerfstudio_models").glob("step-*.ckpt"))
     if not (start.is_file() and checkpoints):
@@ -365,7 +365,7 @@ def training_seconds(run_folder: Path) -> float:
 
 
 def read_evaluation(path: Path) -> Figures:
-    """Read the figures that ns-eval wrote; NaN for those that the scene or the method does not have."""
+    """Read the figures that ns-eval wrote; NaN for figures that are missing. Raises `ThermoxelsError`."""
     expected, remedy = "the results of ns-eval", "Start the command again; finished runs are kept."
     content = read_json(path, expected, remedy)
     try:
@@ -376,20 +376,20 @@ def read_evaluation(path: Path) -> Figures:
 
 
 def _text(figures: Figures, name: str) -> str:
-    """Write a figure with its unit; NaN is a dash."""
+    """Return a figure as text with its unit; a dash for NaN."""
     return "-" if math.isnan(figures[name]) else FIGURES[name].form.format(figures[name])
 
 
 def shown_figures(figures: Sequence[Figures]) -> list[str]:
-    """Name the figures that the table shows, without those that no run has."""
+    """Return the names of figures that have a heading and that are known in at least one run."""
     return [name for name, one in FIGURES.items() if one.heading and not all(math.isnan(f[name]) for f in figures)]
 
 
 def pareto_front(figures: Sequence[Figures], name: str) -> list[bool]:
-    """Mark the points, seconds against a figure, that no other point beats: one that is no slower and no worse.
+    """Return for each run whether it is on the Pareto front of seconds and figure `name`.
 
-    A point whose figure is NaN is not on the front and beats none.
-    """
+    A run is on the front if no other run is at least as fast and at least as good, except with equal values. A run
+    whose figure is NaN is not on the front and keeps no other run off the front."""
     sign = -1.0 if FIGURES[name].higher_is_better else 1.0
     points = [(one["seconds"], sign * one[name]) for one in figures]
     valid = [p for p in points if not any(map(math.isnan, p))]
@@ -397,7 +397,7 @@ def pareto_front(figures: Sequence[Figures], name: str) -> list[bool]:
 
 
 def median_rows(settings: Iterable[CostSetting], runs: Mapping[RunKey, Figures], baseline: str) -> list[CostRow]:
-    """Make a row of every setting that has a run; seconds are related to those of the setting `baseline`."""
+    """Return a row for every setting that has a run; time ratios relate to the row named `baseline`."""
     of_setting = {one: [found for key, found in runs.items() if key.setting == one.name] for one in settings}
     of_setting = {setting: own for setting, own in of_setting.items() if own}
     medians: list[Figures] = []
@@ -413,7 +413,7 @@ def median_rows(settings: Iterable[CostSetting], runs: Mapping[RunKey, Figures],
 
 
 def cheapest(rows: Iterable[CostRow], targets: Mapping[str, float]) -> CostRow | None:
-    """Find the row that keeps the bounds of figures in the least wall time; None if no row does."""
+    """Return the row with the least wall time among the rows that meet all targets; None if no row does."""
 
     def kept(name: str, value: float) -> bool:
         return value >= targets[name] if FIGURES[name].higher_is_better else value <= targets[name]
@@ -423,7 +423,7 @@ def cheapest(rows: Iterable[CostRow], targets: Mapping[str, float]) -> CostRow |
 
 
 def verdict(rows: Sequence[CostRow], targets: Mapping[str, float], scene: Path) -> str:
-    """Say in a sentence which setting meets the targets in the least time, or how far the best are from it."""
+    """Return a sentence on the fastest setting that meets all targets, or else on the best value of each figure."""
     wanted = " and ".join(_TARGETS[name].format(bound) for name, bound in targets.items())
     best = cheapest(rows, targets)
     if best is not None:
@@ -444,7 +444,7 @@ def verdict(rows: Sequence[CostRow], targets: Mapping[str, float], scene: Path) 
 
 
 def markdown_table(rows: Sequence[CostRow], baseline: str) -> str:
-    """Write the rows as a table for a README; columns without any figure are left out."""
+    """Return the rows as a Markdown table; columns in which all figures are NaN are left out."""
     names = shown_figures([row.figures for row in rows])
     time_at = 1 + names.index("seconds")
     heading = [FIGURES[name].heading for name in names]
@@ -459,7 +459,7 @@ def markdown_table(rows: Sequence[CostRow], baseline: str) -> str:
 
 
 def draw_plot(path: Path, rows: Sequence[CostRow], targets: Mapping[str, float], title: str) -> None:
-    """Draw figures against seconds, each that is known in a panel; filled marks are on a panel's Pareto front."""
+    """Draw a panel for each known figure against seconds; filled marks are on the Pareto front of the panel."""
     from matplotlib.figure import Figure as Canvas
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 

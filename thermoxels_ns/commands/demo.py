@@ -1,4 +1,4 @@
-"""The command ``thermoxels demo``: photographs to heat flow, held against the truth."""
+"""The command ``thermoxels demo``: run all steps from photographs to heat flow, and compare with the exact scene."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from thermoxels_ns.commands.demo_results import Target
 
 SceneName = Literal["hot-object", "house-corner", "sphere", "courtyard", "pipes"]
-"""The synthetic scenes."""
+"""Names of the synthetic scenes."""
 
 _MARKER = ".thermoxels-demo"
 _WRITTEN = ("index.html", "scene", "outputs", "eval.json", "eval", "renders", "export", "survey", "audit", "logs")
@@ -36,7 +36,7 @@ class Demo:
     """Make a synthetic scene, train, evaluate, export, simulate and audit, and compare all with the exact truth."""
 
     output_dir: Path = Path("demo")
-    """Folder for all results; made if it does not exist. An earlier demo in it is replaced."""
+    """Folder for all results; made if it does not exist. An earlier demo in the folder is replaced."""
     scene: SceneName = "house-corner"
     """Synthetic scene to photograph."""
     iterations: int | None = None
@@ -45,14 +45,14 @@ class Demo:
     """Show the page in a web browser at the end."""
 
     def main(self) -> None:
-        """Run the demo; raises `ThermoxelsError` for another's folder, a command that failed, or a target missed."""
+        """Run the demo; raises `ThermoxelsError` if a command fails, a target is missed, or the folder is in use."""
         from rich.console import Console
 
         run_demo(self, Console(highlight=False))
 
 
 def run_demo(demo: Demo, console: Console) -> None:
-    """Run all steps; see `Demo`."""
+    """Run all steps of a `Demo`, and write its page."""
     from thermoxels_ns.commands.demo_results import audit_target, compare, demo_page, read_results
     from thermoxels_ns.core.yaml_records import configs_folder
     from thermoxels_ns.reports.page import write_page
@@ -69,7 +69,7 @@ def run_demo(demo: Demo, console: Console) -> None:
 
     @contextmanager
     def step(name: str) -> Iterator[None]:
-        """Announce a step and time what happens in it."""
+        """Announce a step and append the seconds that its body takes to `seconds`."""
         console.rule(f"[bold]{len(seconds) + 1}/{len(commands) + 1}  {name}")
         start = time.monotonic()
         yield
@@ -103,10 +103,10 @@ def run_demo(demo: Demo, console: Console) -> None:
 
 
 def prepare_folder(path: Path) -> Path:
-    """Make the folder of a demo, without the results of an earlier demo.
+    """Make the folder of a demo, remove the results of an earlier demo, and return the folder.
 
-    Only what a demo writes is deleted, and only in a folder that a demo has marked as its own; raises `OutputError` for
-    one that holds something else, or cannot be written to.
+    Only results in a folder that an earlier demo has marked are removed. Raises `OutputError` if the folder holds files
+    but no such mark, or if it cannot be written to.
     """
     folder = writable_folder(path)
     marker = folder / _MARKER
@@ -125,7 +125,7 @@ def prepare_folder(path: Path) -> Path:
 
 
 def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> list[list[str]]:
-    """List the commands of the demo in order: synthetic, train, eval, render, export, and audit of the house."""
+    """Return the commands of the demo in order: synthetic, train, eval, render, export, and for the house audit."""
     config = str(folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml")
     survey = folder / "survey"
     patches = ["--patches", str(survey / "patches.yaml")] if scene == _AUDITED else []
@@ -159,7 +159,7 @@ def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> li
 
 
 def print_targets(targets: Iterable[Target], console: Console) -> None:
-    """Print the figures with a target as a table."""
+    """Print a table of measured figures, their targets, and whether each target is met."""
     from rich.table import Column, Table
 
     table = Table("", Column("measured", justify="right"), Column("target", justify="right"), "met")
@@ -170,7 +170,7 @@ def print_targets(targets: Iterable[Target], console: Console) -> None:
 
 
 def next_steps(folder: Path, scene: str) -> list[tuple[str, str]]:
-    """List commands to try next, and what each does: look at the model, a heat report, a scene of one's own."""
+    """Return commands to try after a demo, each with a sentence on what the command does."""
     config = folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml"
     steps: list[tuple[list[str | Path], str]] = [
         (["ns-viewer", "--load-config", config], "Walk around the trained model in a browser:")

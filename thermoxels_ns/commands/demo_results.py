@@ -1,4 +1,4 @@
-"""What a demo run achieved: its figures beside targets and beside the drawing, and the page that shows them."""
+"""Compare the figures of a demo with targets and with the exact scene, and build the page that shows both."""
 
 from __future__ import annotations
 
@@ -21,42 +21,42 @@ from thermoxels_ns.reports.page import build_page, image_file
 from thermoxels_ns.synthetic.drawn_scenes import BRIDGE_PSI_W_MK, house_corner, true_u_w_m2k
 
 _AGAIN = "Run the demo again."
-_BRIDGE_PATCH = "side-wall"  # Where nothing stands before the band, and its psi is that of the drawing
-_POINTS = 200_000  # On the true surface, from which the mean U-value of each element is told
+_BRIDGE_PATCH = "side-wall"  # Patch on which nothing covers the thermal bridge, so that its psi is known exactly
+_POINTS = 200_000  # Number of points on the true surface over which true U-values are averaged
 _INPUTS_SHOWN = 6
 
 
 @dataclass(frozen=True)
 class Target:
-    """A measured figure and the bound it should keep."""
+    """A measured figure of a demo and the bound that the figure should keep."""
 
     name: str
-    measured: float  # The figure; NaN if it could not be measured
+    measured: float  # Value of the figure; NaN if it could not be measured
     bound: float
-    at_least: bool  # True: the figure should be at least the bound. False: at most
-    form: str  # How to write the figure and the bound, for instance ``{:.1f} dB``
-    meaning: str  # What the figure says, for somebody who meets it for the first time
+    at_least: bool  # True: the figure should be at least the bound; False: at most the bound
+    form: str  # Format of figure and bound with the unit, for instance ``{:.1f} dB``
+    meaning: str  # Sentence that explains the figure to somebody who has never met it
 
     @property
     def met(self) -> bool:
-        """Whether the figure keeps its bound; NaN does not."""
+        """True if the figure keeps its bound; False for NaN."""
         return self.measured >= self.bound if self.at_least else self.measured <= self.bound
 
     @property
     def measured_text(self) -> str:
-        """The figure with its unit."""
+        """The figure with its unit, or "not measured" for NaN."""
         return "not measured" if math.isnan(self.measured) else self.form.format(self.measured)
 
     @property
     def bound_text(self) -> str:
-        """The bound with its unit."""
+        """The bound with its unit, behind "≥" or "≤"."""
         return ("≥ " if self.at_least else "≤ ") + self.form.format(self.bound)
 
 
 def read_results(eval_json: Path, summary_json: Path) -> tuple[tuple[Target, ...], tuple[tuple[str, str], ...]]:
-    """Read what ``ns-eval`` (on held-out views) and ``ns-export thermoxels-mesh`` wrote, or raise `ThermoxelsError`.
+    """Read the results of ``ns-eval`` (on held-out views) and of ``ns-export thermoxels-mesh``.
 
-    Returns the figures with a target, and further ones: name, and value with unit.
+    Returns the figures with a target, and pairs of name and text of further figures. Raises `ThermoxelsError`.
     """
     image = numbers_of(eval_json, "results")
     truth, heat, mesh = (numbers_of(summary_json, name) for name in ("truth", "heat", "mesh"))
@@ -105,10 +105,10 @@ def read_results(eval_json: Path, summary_json: Path) -> tuple[tuple[Target, ...
 
 
 def numbers_of(path: Path, name: str) -> Callable[[str], float]:
-    """Read an object of a json file; returns a function that gives its numbers by key.
+    """Read the object `name` of a json file; return a function from a key to the number that the object has there.
 
-    Null, a figure that does not exist, for instance without a surface, becomes NaN. The function raises
-    `ThermoxelsError` for what is missing or no number.
+    The function returns NaN for null, which stands for a figure that does not exist, for instance without a surface.
+    The function raises `ThermoxelsError` if the key is missing or its value is no number.
     """
     content = read_json_object(path, _AGAIN).get(name)
 
@@ -123,21 +123,21 @@ def numbers_of(path: Path, name: str) -> Callable[[str], float]:
 
 @dataclass(frozen=True)
 class Compared:
-    """A figure of the audit beside the true one."""
+    """A figure of the audit and its true value."""
 
     name: str
     unit: str
     true: float
-    found: Interval | None  # None: not found
+    found: Interval | None  # Interval of the audit; None if the audit does not have the figure
 
     @property
     def held(self) -> bool:
-        """Whether the interval holds the truth."""
+        """True if the true value lies in the interval."""
         return self.found is not None and self.found.low <= self.true <= self.found.high
 
 
 def compare(answers: Path, rules: Path) -> tuple[Compared, ...]:
-    """Hold answers.json of an audit with a file of patches against the drawing, or raise `ThermoxelsError`."""
+    """Compare the U-values and psi in an audit's answers.json with the exact house; `rules` is its file of patches."""
     content, true = read_json_object(answers, _AGAIN), true_u_of_patches(rules)
     found = [
         Compared(one["name"], "W/(m2 K)", true[one["name"]], Interval(**one["u_w_m2k"])) for one in content["patches"]
@@ -150,7 +150,7 @@ def compare(answers: Path, rules: Path) -> tuple[Compared, ...]:
 
 
 def true_u_of_patches(rules: Path) -> dict[str, float]:
-    """Give the mean true U-value of each element that a file of patches cuts out of the house, [W/(m2 K)]."""
+    """Return the mean true U-value of each patch that a file of patches cuts out of the house, [W/(m2 K)]."""
     points, normals = house_corner().solid.surface_points(_POINTS)
     every, none = np.ones(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
     where = {"centroids_m": points, "normals": normals, "up": (0.0, 0.0, 1.0), "seen": every, "on_box": none}
@@ -160,7 +160,7 @@ def true_u_of_patches(rules: Path) -> dict[str, float]:
 
 
 def audit_target(compared: Sequence[Compared]) -> Target:
-    """Say how many of the figures lie in their intervals, which all of them should."""
+    """Return the share of figures whose true value lies in the interval, with the target 100 %."""
     share = sum(one.held for one in compared) / len(compared) if compared else math.nan
     return Target(
         *("Audit: true U-values and psi in their intervals", 100.0 * share, 100.0, True, "{:.0f} %"),
@@ -178,9 +178,9 @@ def demo_page(
     commands: Sequence[str],
     next_steps: Sequence[tuple[str, str]],
 ) -> str:
-    """Build the page of a demo from the pictures in its folder; raises `ThermoxelsError` if one is missing.
+    """Return the html text of a demo's page; raises `ThermoxelsError` if a picture is missing in the demo's folder.
 
-    `seconds` are what each step took, in order; `next_steps` are commands, and what each does.
+    `seconds` has name and duration of each step in order; `next_steps` has commands and what each command does.
     """
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
@@ -218,6 +218,6 @@ def demo_page(
 
 
 def _panels(path: Path, count: int) -> list[bytes]:
-    """Cut a picture of panels side by side, so that a narrow screen can show one below the other."""
+    """Cut a picture into `count` panels side by side; return each panel as a PNG file, for narrow screens."""
     with Image.open(path) as whole:
         return [image_file(panel, "PNG") for panel in np.array_split(np.asarray(whole.convert("RGB")), count, axis=1)]

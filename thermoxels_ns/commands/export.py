@@ -1,4 +1,4 @@
-"""The command ``ns-export thermoxels-mesh``: a trained model to a mesh and its heat."""
+"""The command ``ns-export thermoxels-mesh``: make a mesh from a trained model and let heat flow through the mesh."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 Settings = TypeVar("Settings", "Material", "TimeSteps")
 Say = Callable[[str], None]
 Compare = Callable[["SolidCells", "TetMesh", float], "dict[str, Any] | None"]
-"""Compares solid voxels and mesh with a known truth, in metres by the metres per unit; None if none is known."""
+"""Compares solid voxels and a mesh with the exact scene, given the metres per unit; None if no exact scene is known."""
 
 _SUMMARY, _HEAT, _QUALITY, _HEAT_PICTURE = "summary.json", "heat.pvd", "quality.json", "heat.png"
 _MESH_PICTURES = ("mesh.png", "mesh-measured.png", "quality.png", "region.png")
@@ -55,44 +55,44 @@ INNER_SIDE = (
     "The exact scene is filled, so the inner side of a shell or a wall counts as wrong surface in precision, fscore "
     "and mean distance; precision_seen and fscore_seen are those of the side that photographs show."
 )
-"""What to know of the figures beside the truth if the mesh is not filled: hollow, or a wall of a given thickness."""
+"""Note on the comparison with the truth for meshes that are hollow or have a given wall thickness."""
 
 
 @dataclass
 class ExportOptions:
-    """Everything an export can be told."""
+    """All options of an export that do not name files or folders of its input and output."""
 
     boundary: Literal["conforming", "voxel"] = "conforming"
-    """conforming: the boundary follows the level set of the density; voxel: it follows voxel faces, as in the
+    """conforming: the boundary follows the level set of the density. voxel: the boundary follows voxel faces, as in the
     Thermoxels paper, with up to 1.7 times the area of a slanted surface."""
     voxel_optical_depth: float | None = None
-    """Voxels in which density times edge length is at least this are solid: at 0.5, light that crosses one loses 39 %.
-    Lower it if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: the
-    highest that 95 % of the training rays that end on something meet within half a voxel of where they end."""
+    """Voxels are solid if density times edge length is at least this; at 0.5, light that crosses a voxel loses 39 %.
+    Lower the value if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: the
+    highest that 95 % of the training rays that end on a surface meet within half a voxel of their end."""
     density_percentile: float | None = None
-    """Voxels denser than this share of all voxels of the scene box are solid, [%], 0 to 100; the Thermoxels paper's
-    way, where 90 keeps the densest tenth. Takes the place of the optical depth."""
+    """Voxels are solid if they are denser than this share of all voxels of the scene box, [%], 0 to 100; in the
+    Thermoxels paper 90 keeps the densest tenth. Takes the place of the optical depth."""
     density_threshold: float | None = None
-    """Voxels at least this dense are solid, [1 / world unit]. Takes the place of both."""
+    """Voxels at least this dense are solid, [1 / world unit]. Takes the place of optical depth and percentile."""
     close_gaps: int = 1
-    """Fill gaps and pinholes up to twice this many voxels wide; thin walls are not continuous without it. 0: none."""
+    """Fill gaps and pinholes up to twice this many voxels wide, which thin walls need to be continuous. 0: none."""
     region: Literal["auto", "all"] = "auto"
-    """Which part is exported. auto: what photographs show about as well as what they were taken of, an object with its
-    table, a house with the ground around it, a room with its walls; without bodies below 1 % of the largest, which are
-    mostly floaters. all: everything that was reconstructed."""
+    """Part of the reconstruction to export. auto: all that photographs show about as well as their main subject, such
+    as an object with its table, a house with the ground around, a room with its walls; bodies below 1 % of the largest,
+    mostly floaters, are left out. all: everything that was reconstructed."""
     region_box: tuple[float, float, float, float, float, float] | None = None
-    """In place of auto, what lies in a box in the coordinates of the input poses, xmin ymin zmin xmax ymax zmax."""
+    """In place of auto: export the inside of a box, xmin ymin zmin xmax ymax zmax in coordinates of the input poses."""
     region_near: tuple[float, float, float, float] | None = None
-    """In place of auto, what lies near a point in the coordinates of the input poses, x y z radius."""
+    """In place of auto: export the inside of a ball, x y z radius in the coordinates of the input poses."""
     interior: Literal["solid", "hollow"] = "solid"
-    """What becomes of the inside of a body of which photographs only show the shell. solid: it is filled; a cavity with
-    a camera in it is a room and stays empty. hollow: the shell alone, as thick as the photographs happened to make
-    it."""
+    """Treatment of the inside of a body if photographs show only its shell. solid: the inside is filled, but a cavity
+    that holds a camera is a room and stays empty. hollow: only the shell is exported, with the thickness that training
+    happened to give the shell."""
     seal_openings: int = 2
-    """While looking for the inside, openings in the shell up to twice this many voxels wide count as closed."""
+    """In the search for the inside, openings in the shell up to twice this many voxels wide count as closed."""
     wall_thickness: float | None = None
-    """For facades seen from one side: make the seen surface this thick, [m], growing away from the cameras. Takes the
-    place of filling the interior."""
+    """For facades seen from one side: make the seen surface this thick, [m], growing away from the cameras; the
+    interior is then not filled."""
     coarsest_cell: int = 4
     """Edge of the largest cells deep inside a conforming mesh, a power of two, [voxels]; 1: as fine as the surface."""
     patches: Path | None = None
@@ -100,72 +100,72 @@ class ExportOptions:
     configs/patches-example.yaml."""
     metres_per_unit: float | None = None
     """Length of one unit of the input poses, [m]; 1 if the poses are in metres. Needed for heat, unless the scene's
-    json has metres_per_unit: without a scale the mesh is written in units of the input, without heat."""
+    json has metres_per_unit. Without a scale the mesh is written in units of the input, and no heat is computed."""
     up: tuple[float, float, float] | None = None
-    """Direction that points up, in the coordinates of the input poses; it decides which patches face up, down or
-    sideways. Left out: that of the scene's json, else from the cameras, whose pictures people hold level."""
+    """Direction that points up, in the coordinates of the input poses; decides which patches face up, down or sideways.
+    Left out: the direction in the scene's json, or else a direction computed from the cameras, taken as held level."""
     known_distance: tuple[float, float, float, float, float, float, float] | None = None
-    """In place of metres per unit: two points in the coordinates of the input poses and the distance between them,
+    """In place of metres per unit: two points in the coordinates of the input poses and the distance between the two,
     x y z x y z metres."""
     known_distance_error: float | None = None
-    """Standard error of that distance, with what the two points may be off, [m]; the summary then says how well areas
-    and volumes are known."""
+    """Standard error of the known distance, including the position errors of the two points, [m]; the summary then
+    states the standard errors of area and volume."""
     formats: tuple[Literal["vtu", "xdmf", "msh", "inp", "stl", "ply", "glb"], ...] = ("vtu", "glb")
     """Files to write the mesh to: vtu (ParaView), xdmf (FEniCSx), msh (Gmsh), inp (CalculiX, Abaqus), stl, ply
     (surface), glb (browsers, phones)."""
     heat_preset: str = "concrete"
-    """Heat scene of the heat step, of one material and with equal steps: the name of one of configs/scene-NAME.yaml, or
-    the path of a yaml file. concrete: a body of concrete that is left to itself. The file for CalculiX and Abaqus takes
-    material and steps from it, not what acts on the body."""
+    """Heat scene with one material and equal time steps: the NAME of a configs/scene-NAME.yaml, or the path of a yaml
+    file. concrete: a body of concrete on which nothing acts. The file for CalculiX and Abaqus takes material and time
+    steps from the heat scene, but none of its effects."""
     steps: int | None = None
-    """Number of time steps; the scene's by default (10 for concrete)."""
+    """Number of time steps. Left out: as in the heat scene (10 for concrete)."""
     step_seconds: float | None = None
-    """Length of a time step, [s]; the scene's by default (60 for concrete)."""
+    """Length of a time step, [s]. Left out: as in the heat scene (60 for concrete)."""
     conductivity_w_mk: float | None = None
-    """Thermal conductivity, [W / (m K)]; the scene's by default."""
+    """Thermal conductivity, [W / (m K)]. Left out: as in the heat scene."""
     density_kg_m3: float | None = None
-    """Mass density of the material, [kg / m3]; the scene's by default."""
+    """Mass density of the material, [kg / m3]. Left out: as in the heat scene."""
     specific_heat_j_kgk: float | None = None
-    """Specific heat capacity, [J / (kg K)]; the scene's by default."""
+    """Specific heat capacity, [J / (kg K)]. Left out: as in the heat scene."""
     pictures: bool = True
     """Write PNG pictures of the mesh coloured by temperature, and of its quality."""
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """How pictures look at the mesh, in the coordinates of the input poses."""
+    """Direction from which pictures show the mesh, in the coordinates of the input poses."""
 
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Direction that points up."""
     up_source: str = "Up is assumed to be z."
-    """How it was found."""
+    """Sentence that says how `up` was found."""
     view_direction: tuple[float, float, float] | None = None
-    """Direction from the camera to the mesh; None: obliquely from above."""
+    """Direction from the picture's camera to the mesh; None: obliquely from above."""
 
 
 class CheckedOptions(NamedTuple):
-    """What the options say, once they are known to be in range."""
+    """Settings made from `ExportOptions` whose values are in range; result of `check_options`."""
 
     selection: SolidSelection
     rules: PatchRules
-    distance: SceneScale | None  # The scale that the known distance gives
-    scene: HeatScene  # The scene of the heat step with the options' changes applied
-    material: Material  # What that scene says the body is made of
-    time: TimeSteps  # How long it says the body is followed
+    distance: SceneScale | None  # Scale that follows from the known distance; None without a known distance
+    scene: HeatScene  # Heat scene of the preset, with the changes that options make
+    material: Material  # Material of `scene`
+    time: TimeSteps  # Time steps of `scene`
 
 
 @dataclass(frozen=True)
 class TrainedScene:
-    """A trained field, where it lies, and the folder of its photographs."""
+    """A trained field and all of its training run that an export needs."""
 
     snapshot: GridSnapshot
     world_to_input: FloatArray
-    """Takes homogeneous column vectors of the trained scene to the coordinates of the input poses, shape (4, 4)."""
-    viewpoint: Viewpoint  # From where pictures show most of what the cameras saw
-    scene_folder: Path
-    dataset: Any  # The training photographs, a `ThermalDataset`
-    tracks: FeatureRays | None  # Lines from photographs to points that they see, in the trained scene
-    corrections: dict[str, Any]  # What training corrected in its photographs, see `ThermoxelsPipeline.corrections`
+    """Matrix from homogeneous coordinates of the trained scene to coordinates of the input poses, shape (4, 4)."""
+    viewpoint: Viewpoint  # View for pictures, chosen by `viewpoint_of_cameras`
+    scene_folder: Path  # Path that training took as its scene: a folder, or a json file in a folder
+    dataset: Any  # Training photographs, a `ThermalDataset`
+    tracks: FeatureRays | None  # Lines from photographs to points that the photographs show, in the trained scene
+    corrections: dict[str, Any]  # Result of `ThermoxelsPipeline.corrections`
 
 
 @dataclass(kw_only=True)
@@ -175,15 +175,15 @@ class ExportThermoxelsMesh(ExportOptions):
     load_config: Path
     """The config.yml that ns-train wrote."""
     output_dir: Path
-    """Folder for the results; it is made if it does not exist."""
+    """Folder for the results; made if it does not exist."""
 
     def main(self) -> None:
-        """Run the export; an error of the input is printed as one sentence and the exit status is 1."""
+        """Run the export; a `ThermoxelsError` is printed as one sentence, and the exit status is then 1."""
         from nerfstudio.utils.rich_utils import CONSOLE
         from rich.markup import escape
 
         try:
-            # The last bits of a product of long vectors depend on how many threads BLAS has.
+            # With more BLAS threads, the last bits of results would depend on the number of threads.
             with threadpool_limits(1, "blas"):
                 self.run(lambda line: CONSOLE.print(escape(line)))
         except ThermoxelsError as problem:
@@ -197,11 +197,11 @@ class ExportThermoxelsMesh(ExportOptions):
         say(f"Loading {self.load_config}")
 
         def check_scale(scene_folder: Path) -> None:
-            """Refuse a wrong scale or up, and what needs a scale, before photographs and checkpoint are loaded."""
+            """Raise `ThermoxelsError` early for a wrong scale or up, or for an option that lacks a scale."""
             try:
                 content = scene_json(scene_folder)
             except SceneError:
-                return  # whoever reads the scene says what is wrong with it
+                return  # the reader of the scene reports the error
             if content or scene_folder.is_dir():
                 scale_of(self, checked, content)
                 up_of(self, content, Viewpoint())
@@ -224,7 +224,7 @@ class ExportThermoxelsMesh(ExportOptions):
 
 
 def check_options(options: ExportOptions) -> CheckedOptions:
-    """Check every option, so that a wrong one is refused (`ThermoxelsError`) before anything slow runs."""
+    """Return the checked options; raises `ThermoxelsError` for a wrong option before anything slow runs."""
     from thermoxels_ns.mesh.boundary.patches import PatchRules, load_patch_rules
     from thermoxels_ns.mesh.build import MeshOptions
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
@@ -242,14 +242,14 @@ def check_options(options: ExportOptions) -> CheckedOptions:
     if not options.formats or len(set(options.formats)) < len(options.formats):
         remedy = "Pass --formats vtu glb, for example."
         raise MeshError("formats", expected="at least one format, each once", got=options.formats, remedy=remedy)
-    MeshOptions(options.boundary, options.coarsest_cell)  # refuses what is out of range
+    MeshOptions(options.boundary, options.coarsest_cell)  # raises if a value is out of range
     selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
     rules = PatchRules() if options.patches is None else load_patch_rules(options.patches)
     return CheckedOptions(selection, rules, distance, *_heat_settings(options))
 
 
 def _heat_settings(options: ExportOptions) -> tuple[HeatScene, Material, TimeSteps]:
-    """Read the scene of the heat step, its material and its steps, and apply the options' changes."""
+    """Return the heat scene, its material and its time steps, all with the changes that options make."""
     from thermoxels_ns.fem.problem import TimeSteps
     from thermoxels_ns.heat.scene import load_heat_scene
 
@@ -270,9 +270,9 @@ def _heat_settings(options: ExportOptions) -> tuple[HeatScene, Material, TimeSte
 
 
 def scale_of(options: ExportOptions, checked: CheckedOptions, scene_file: Mapping | None) -> SceneScale | None:
-    """Give the scale of an export: what the user gives, else what the scene's json says; None if nobody does.
+    """Return the scale of an export: from the options, or else from the scene's json; None if neither has a scale.
 
-    Raises `ThermoxelsError` for a scale out of range, or for a format or option that needs one where there is none.
+    Raises `ThermoxelsError` for a scale out of range, or if a format or an option needs a scale and there is none.
     """
     scale = choose_scale(options.metres_per_unit, checked.distance, scene_file)
     asked = {
@@ -291,7 +291,7 @@ def scale_of(options: ExportOptions, checked: CheckedOptions, scene_file: Mappin
 def up_of(
     options: ExportOptions, scene_file: Mapping[str, Any] | None, viewpoint: Viewpoint
 ) -> tuple[tuple[float, float, float], str]:
-    """Give the unit vector up, and where it comes from: the user, else the scene's json, else the cameras."""
+    """Return the unit vector up and a sentence on its source: --up, else the scene's json, else `viewpoint`."""
     if options.up is not None:
         length = math.sqrt(sum(value * value for value in options.up))
         if not (math.isfinite(length) and length > 0.0):
@@ -305,7 +305,7 @@ def up_of(
 
 
 def prepare_folder(output_dir: Path | str) -> Path:
-    """Make the folder of an export, refuse what is in the way, and remove what killed exports left half-written."""
+    """Make the folder of an export, remove half-written files; raises `OutputError` if it holds files of others."""
     from thermoxels_ns.heat.vtk_series import STEP_PATTERN
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS
 
@@ -327,23 +327,23 @@ def export_snapshot(
     tracks: FeatureRays | None = None,
     corrections: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Write the mesh in the formats asked for, quality.json, summary.json, and as asked pictures and the heat series.
+    """Write mesh files, quality.json, summary.json, pictures and the heat series; return the content of summary.json.
 
-    All of it is computed before anything is written. Then the summary of an earlier export goes first and the new one
-    comes last, so the files in a folder with a summary.json belong together; what this export does not make is removed.
+    Everything is computed before anything is written. An old summary.json is removed first and the new summary.json is
+    written last, so files beside a summary.json belong together. Files of earlier exports that are not rewritten go.
 
     Args:
         snapshot: The trained field.
-        world_to_input: Takes the trained scene to the input poses, shape (4, 4).
-        options: What the export was told.
+        world_to_input: Matrix from the trained scene to the input poses, shape (4, 4).
+        options: Options of the export.
         output_dir: Folder for the files.
-        say: Takes lines of progress.
-        viewpoint: How pictures look at the mesh; its up is the mesh's unless an option or the scene's json has one.
+        say: Called with each line of progress.
+        viewpoint: View of the pictures; gives the mesh's up unless an option or the scene's json has an up.
         compare: Compares with a known truth if the scale is known; its `ThermoxelsError` goes into the summary.
-        scene_file: The scene's json, for its scale and up.
-        depths: Depths of photographs, by which boundary triangles are supported.
-        tracks: Lines from photographs to points that they see, which support boundary triangles too.
-        corrections: What training corrected in photographs, for the summary.
+        scene_file: Content of the scene's json, for scale and up.
+        depths: Depths of photographs that support the position of boundary triangles.
+        tracks: Lines from photographs to points that the photographs show, which support boundary triangles too.
+        corrections: Corrections that training made to photographs, for the summary.
 
     Raises:
         ThermoxelsError: An option is wrong, nothing is solid, the heat solver failed, or a file cannot be written.
@@ -423,10 +423,10 @@ def export_snapshot(
         **({} if truth is None else {"truth": truth}),
         "files": [*files, _SUMMARY],
     }
-    summary_text(summary)  # raises if json cannot hold it
+    summary_text(summary)  # raises if json cannot hold the summary
 
     remove_file(folder / _SUMMARY)
-    write_summary(folder / _QUALITY, report.as_mapping())  # first: it tells the next export that the rest is one's, too
+    write_summary(folder / _QUALITY, report.as_mapping())  # first: marks the folder as an export's for `prepare_folder`
     for name in {*_mesh_files(MESH_FORMATS), *_MESH_PICTURES, _HEAT_PICTURE} - set(files):
         remove_file(folder / name)
     if solution is None:
@@ -444,7 +444,7 @@ def export_snapshot(
         picture_of_quality(folder / _MESH_PICTURES[2], report)
         if support_of_facets(mesh) is not None:
             mesh_pictures.add_support(folder / _MESH_PICTURES[2], mesh, look)
-        # In grey the faces of the voxels that are not exported.
+        # Faces of the voxels that are not exported are drawn in grey.
         left_out = built.solid.left_out
         ghost = (
             apply_transform(to_mesh, snapshot.lattice.index_to_world(used_corners(left_out))),
@@ -461,7 +461,7 @@ def export_snapshot(
 
 
 def _mesh_files(suffixes: Iterable[str]) -> list[str]:
-    """Name the files that the mesh is written to in these formats."""
+    """Return the names of the files that the mesh is written to, by suffixes such as ".vtu"."""
     from thermoxels_ns.mesh.files.formats import mesh_file_paths
 
     return [path.name for suffix in suffixes for path in mesh_file_paths(f"mesh{suffix}")]
@@ -474,9 +474,9 @@ def _with_support(
     lattice: Lattice,
     to_mesh: FloatArray,
 ) -> BuiltMesh:
-    """Count for each boundary triangle the photographs that see it, and those that support it.
+    """Return `built` with the numbers of photographs that see and that support each boundary triangle.
 
-    See `facet_views` and `supporting_photographs`. `to_mesh` takes the trained scene to the mesh's coordinates.
+    See `facet_views` and `supporting_photographs`. Matrix `to_mesh`, (4, 4), leads from the trained scene to the mesh.
     """
     from thermoxels_ns.mesh.boundary.visibility import facet_views
     from thermoxels_ns.mesh.build import apply_transform
@@ -496,9 +496,9 @@ def _with_support(
 
 
 def _compared(compare: Compare, built: BuiltMesh, metres: float, inner_side: bool, say: Say) -> dict[str, Any] | None:
-    """Compare with the truth; a truth that cannot be used costs the comparison, not the export.
+    """Return the figures of the comparison with the truth; if the comparison fails, return its error instead.
 
-    A mesh with an inner side, of a shell or of a wall, gets a note on what that does to the figures.
+    With `inner_side`, for a mesh with the inner side of a shell or wall, the note `INNER_SIDE` is added.
     """
     try:
         truth = compare(built.solid, built.mesh, metres)
@@ -516,7 +516,7 @@ def _compared(compare: Compare, built: BuiltMesh, metres: float, inner_side: boo
 
 
 def scene_json(scene_folder: Path) -> dict[str, Any]:
-    """Read the scene's json as it is, for what it says about scale and up; empty if the scene has none (COLMAP)."""
+    """Return the content of the scene's json, unchecked; empty if the scene has no json, as with COLMAP."""
     from thermoxels_ns.data.scene_file import JSON_NAMES
 
     folder = scene_folder if scene_folder.is_dir() else scene_folder.parent
@@ -528,9 +528,9 @@ def scene_json(scene_folder: Path) -> dict[str, Any]:
 
 
 def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] = lambda _: None) -> TrainedScene:
-    """Load a trained Thermoxels model through nerfstudio; raises `CheckpointError` for what is none.
+    """Load a trained Thermoxels model through nerfstudio; raises `CheckpointError` for anything else.
 
-    `check_scene` is called with the photographs' folder before anything slow; what it raises is raised.
+    `check_scene` is called with the path of the scene before anything slow; an error that it raises is passed on.
     """
     if not load_config.is_file():
         remedy = "Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml."
@@ -552,7 +552,7 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
         raise
     except (yaml.YAMLError, AssertionError, KeyError, UnicodeDecodeError) as problem:
         expected = "a config.yml that ns-train of this installation wrote"
-        # nerfstudio's own checks have no message
+        # errors of nerfstudio's own checks have no message
         reason = f"{type(problem).__name__}: {problem}" if str(problem) else "it holds no TrainerConfig of nerfstudio"
         got = f"{load_config}, which cannot be read ({reason})"
         remedy = "Pass the config.yml of the training run."
@@ -577,19 +577,19 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
 
 
 def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.ArrayLike) -> Viewpoint:
-    """Choose a view for pictures: up as the photographer held the camera, from the side the cameras stood on.
+    """Choose a view for pictures: up as the photographer held the camera, seen from the side where the cameras stood.
 
-    Takes poses in the trained scene (x right, y up, z back), shape (n, 3, 4) or (n, 4, 4). If the cameras stood all
-    around, the view is the usual one, obliquely from above.
+    Poses are in the trained scene (x right, y up, z back), shape (n, 3, 4) or (n, 4, 4). If the cameras stood all
+    around, `view_direction` is None, which means obliquely from above.
     """
     rotation = np.asarray(world_to_input, np.float64)[:3, :3]
     axes = np.einsum("ij,njk->nik", rotation / np.cbrt(np.linalg.det(rotation)), np.asarray(camera_to_worlds)[:, :, :3])
     up = axes[:, :, 1].mean(axis=0)
-    if np.linalg.norm(up) < 0.1:  # cameras held every way round
+    if np.linalg.norm(up) < 0.1:  # the cameras' up directions cancel out
         return Viewpoint()
     up /= np.linalg.norm(up)
     source = "The mean of what was up in the photographs; cameras that all look down or up tilt it."
-    # People hold pictures level: up is at right angles to the pictures' horizontal axes, if these span a plane.
+    # People hold cameras level: if the pictures' horizontal axes span a plane, up is at right angles to this plane.
     spread, directions = np.linalg.eigh(np.einsum("ni,nj->ij", axes[:, :, 0], axes[:, :, 0]) / len(axes))
     level = directions[:, 0] * np.sign(directions[:, 0] @ up)
     if spread[1] > 0.05 and spread[0] < 0.2 * spread[1] and level @ up > 0.3:
@@ -604,7 +604,7 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
 
 
 def _check_config(config: TrainerConfig) -> None:
-    """Refuse another method's run, or one without a checkpoint, before its photographs are loaded."""
+    """Raise `CheckpointError` for a run of another method or a run without a checkpoint."""
     pipeline: Any = config.pipeline
     if not callable(getattr(pipeline._target, "grid_snapshot", None)):
         expected = "a model trained with a Thermoxels method"

@@ -1,4 +1,4 @@
-"""What an export says of its mesh: lines of progress, and what summary.json holds."""
+"""Describe the mesh of an export, in lines of progress and in the parts of summary.json."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ SKIPPED_EFFECTS = (
     "Space that no camera saw and that the mesh leaves empty, such as the inside of a building seen from outside with "
     "--interior hollow or --wall-thickness. The heat content is that of the mesh.",
 )
-"""What the heat balance of a reconstruction leaves out."""
+"""Effects missing from the heat balance of the preset concrete; `heat_summary` lists them for every preset."""
 
 
 def lines_on_mesh(
     built: BuiltMesh, region: Mapping[str, Any], volume: float, unit: str, voxel_size: float
 ) -> Iterator[str]:
-    """Yield how the solid was found, step by step, and what the mesh has; `voxel_size` is in `unit`."""
+    """Yield lines on each step that found the solid, and on the mesh; `volume` and `voxel_size` are in `unit`."""
     for step in built.solid.steps:
         amounts = []
         for sign, voxels in (("+", step.added), ("-", step.removed)):
@@ -74,7 +74,7 @@ def lines_on_mesh(
 def mesh_summary(
     built: BuiltMesh, report: QualityReport, selection: SolidSelection, scale: SceneScale | None, voxel_size: float
 ) -> dict[str, Any]:
-    """Give counts, sizes, and how the solid was found; lengths are in the unit that the summary names."""
+    """Return the entry "mesh" of summary.json: counts, sizes and steps; lengths are in the summary's length_unit."""
     mesh, solid = built.mesh, built.solid
     assert mesh.boundary is not None
     temperature = mesh.temperature_c
@@ -85,7 +85,7 @@ def mesh_summary(
     if selection.density_percentile is not None and selection.density_threshold is None:
         asked = {
             "share_of_voxels_asked_for": 1.0 - selection.density_percentile / 100.0,
-            "share_of_voxels_kept": _voxels_found(solid) / solid.cells.size,  # before a region was chosen
+            "share_of_voxels_kept": _voxels_found(solid) / solid.cells.size,  # before the choice of a region
         }
     return {
         "boundary": report.boundary_mode,
@@ -129,7 +129,7 @@ def mesh_summary(
 
 
 def region_summary(built: BuiltMesh, selection: SolidSelection) -> dict[str, Any]:
-    """Say which part is exported, how large the mesh is [unit], and what share of the solid it was made from."""
+    """Return the entry "region" of summary.json: the exported part, the mesh's extents, and the share of the solid."""
     near, box, points = selection.region_near, selection.region_box, built.mesh.points_m
     left_out, found = int(built.solid.left_out.sum()), _voxels_found(built.solid)
     return {
@@ -142,18 +142,18 @@ def region_summary(built: BuiltMesh, selection: SolidSelection) -> dict[str, Any
 
 
 def _voxels_found(solid: SolidCells) -> int:
-    """Count the voxels that are solid in the whole lattice, before anything is left out or filled."""
+    """Return the number of solid voxels in the whole lattice, before regions are left out and interiors are filled."""
     return sum(step.added for step in solid.steps if step.name in ("threshold", "close gaps"))
 
 
 def _sums(names: tuple[str, ...], number: IntArray, amount: FloatArray) -> dict[str, float]:
-    """Add up the amounts of each number, by its name; names without any amount are left out."""
+    """Return the sum of `amount`, (k,), over entries with equal `number`, (k,), by name; unused names are left out."""
     total = np.bincount(number, weights=amount, minlength=len(names))
     return {names[n]: float(total[n]) for n in np.unique(number)}
 
 
 def support_shares(mesh: TetMesh) -> dict[str, float] | None:
-    """Give the share of the area, without what the scene box cuts, in each class of `SUPPORT`; None if unknown."""
+    """Return the share of the area in each class of `SUPPORT`, without cut triangles; None if support is unknown."""
     support = support_of_facets(mesh)
     if support is None or not (support >= 0).any():
         return None
@@ -164,7 +164,7 @@ def support_shares(mesh: TetMesh) -> dict[str, float] | None:
 
 
 def heat_summary(material: Material, time: TimeSteps, solution: HeatSolution) -> dict[str, Any]:
-    """Give the heat balance and how it was computed."""
+    """Return the entry "heat" of summary.json: the heat balance in joules, and how it was computed."""
     return {
         "computed": True,
         "material": asdict(material),
@@ -186,6 +186,6 @@ def heat_summary(material: Material, time: TimeSteps, solution: HeatSolution) ->
 
 
 def versions() -> dict[str, str]:
-    """Give the versions of what made the export."""
+    """Return the versions of this package, of Python and of the packages that an export depends on."""
     packages = ("numpy", "scipy", "torch", "nerfstudio", "pyvista", "scikit-fem")
     return {"thermoxels": __version__, "python": platform.python_version()} | {name: version(name) for name in packages}

@@ -1,4 +1,4 @@
-"""The command ``thermoxels heat``: heat flow through an exported mesh in a scene."""
+"""The command ``thermoxels heat``: compute the heat flow through an exported mesh in a heat scene."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from thermoxels_ns.heat.run import HeatRun
 
 ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "report.html", "heat.pvd", "heat.vtu"
-"""Files of a run; pictures come on top."""
+"""Files that a run writes beside its pictures."""
 
 Say = Callable[[str], None]
 
@@ -37,49 +37,49 @@ class Heat:
     heat.vtu of a steady state) and pictures."""
 
     mesh: tyro.conf.Positional[Path]
-    """The mesh.vtu of an export with a known scale; mesh-boundary.vtp lies beside it."""
+    """The mesh.vtu of an export with a known scale; its mesh-boundary.vtp must lie in the same folder."""
     scene: str
-    """Heat scene: the path of a yaml file, or the name of one of configs/scene-NAME.yaml, such as winter-night."""
+    """Heat scene: the path of a yaml file, or the NAME of a configs/scene-NAME.yaml, such as winter-night."""
     output_dir: Path = Path("heat")
-    """Folder for the results; made if it does not exist. Those of an earlier run in it are replaced."""
+    """Folder for the results; made if it does not exist. Results of an earlier run in the folder are replaced."""
     probes: tuple[tuple[float, float, float], ...] = ()
-    """Points whose temperature is followed, x y z in the coordinates of the mesh, one after the other, [m]."""
+    """Points whose temperature is reported, x y z in the coordinates of the mesh, one after the other, [m]."""
     tolerance: float | None = None
     """Largest error that any temperature may have, [K], such as 0.05. Linear or quadratic tetrahedra, the mesh size and
-    the time steps are then chosen so that the estimated error meets it; of the scene's time settings only
-    the duration and the times at which temperatures are kept remain. The error is that of the heat equation in the
-    body as the mesh describes it. Left out: the mesh as it is, with the scene's own steps; of a steady state the error
-    is estimated all the same."""
+    the time steps are then chosen so that the estimated error stays below; of the scene's time settings only the
+    duration and the times at which temperatures are kept remain. The error is that of solving the heat equation in the
+    body as the mesh describes it. Left out: the mesh and the scene's time steps are used as they are; the error of a
+    steady state is estimated all the same."""
     flow_tolerance: float | None = None
     """Largest error that the mean heat flow of any effect may have, as a share of all heat that flows through the body,
-    such as 0.01; alone or beside --tolerance, without which a scene with a duration cannot do."""
+    such as 0.01. A scene with a duration needs --tolerance as well; for a steady scene this option is enough."""
     memory_gb: float = 4.0
-    """Most memory that solving may take, [GiB]. What needs more is refused before any of it is taken."""
+    """Most memory that solving may take, [GiB]. A computation that needs more is refused before it starts."""
     allow_unmet: bool = False
-    """If a tolerance cannot be met within the memory, write the best that fits and say so, instead of an error. The
-    first estimate needs room for quadratic tetrahedra, through time for a mesh of half the size."""
+    """If a tolerance cannot be met within the memory, write the best result that fits, marked as such, instead of an
+    error. The first estimate needs memory for quadratic tetrahedra; over time, for a mesh of half the size."""
     leave_out_below: float | None = None
     """Effects that together bring less than this share of all heat that flows are left out; the report lists each with
-    its watts at the solution. 0 builds all that brings heat; so does a tolerance. Left out: 0.005, half of what
-    building physics asks of a heat flow."""
+    its watts at the solution. With 0, and with a tolerance, all effects that bring heat are used. Left out: 0.005, half
+    the accuracy that building physics asks of a heat flow."""
     up: tuple[float, float, float] | None = None
-    """Direction that points up in the coordinates of the mesh, if the scene does not say. Default: that of the
-    export's summary.json beside the mesh, or else z."""
+    """Direction that points up in the coordinates of the mesh, if the scene has none. Default: the direction in the
+    summary.json beside the mesh, or else z."""
     pictures: bool = True
     """Draw pictures of the surface."""
 
     def main(self) -> None:
-        """Run it; raises `ThermoxelsError` if the mesh, the scene or an option cannot be used, or the solver fails."""
+        """Run; raises `ThermoxelsError` if the mesh, the scene or an option cannot be used, or the solver fails."""
         from rich.console import Console
 
         console = Console(highlight=False)
-        # The last bits of a product of long vectors depend on how many threads BLAS has.
+        # With more BLAS threads, the last bits of results would depend on the number of threads.
         with threadpool_limits(1, "blas"):
             run_heat(self, lambda line: console.print(line, markup=False, soft_wrap=True))
 
 
 def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
-    """Compute everything, then write it; answers.json comes last, so that files beside one belong together."""
+    """Compute a heat run, write all of its files and return it; answers.json marks a complete folder, so comes last."""
     from thermoxels_ns.heat.vtk_series import STEP_PATTERN
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES
 
@@ -92,7 +92,7 @@ def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
 
 
 def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
-    """Do what `run_heat` does without writing anything."""
+    """Read mesh and scene and compute the heat run of `run_heat`, without writing files."""
     from thermoxels_ns.heat.run import run_scene
     from thermoxels_ns.heat.scene import load_heat_scene
     from thermoxels_ns.heat.solving import Goals
@@ -119,7 +119,7 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
 
 
 def read_export_summary(mesh: Path, say: Say) -> dict[str, Any]:
-    """Read what the export says about a mesh (empty without summary.json); `HeatError` for one without a scale."""
+    """Read the summary.json beside a mesh; empty if there is none. Raises `HeatError` if the mesh has no scale."""
     path = mesh.with_name("summary.json")
     if not path.is_file():
         say(f"Warning: {path} is missing; the mesh is taken to be in metres.")
@@ -140,7 +140,7 @@ def read_export_summary(mesh: Path, say: Say) -> dict[str, Any]:
 
 
 def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
-    """Give everything that answers.json says."""
+    """Return the content of answers.json."""
     solution, accuracy = run.solution, run.accuracy
     error, time_error_k = getattr(solution, "error", None), getattr(solution, "time_error_k", math.nan)
     return {
@@ -188,7 +188,7 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
 
 
 def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> None:
-    """Write everything into a folder that is ready for it, answers.json last, or raise `OutputError`."""
+    """Write all files of a run into an existing folder, answers.json last; raises `OutputError` if writing fails."""
     from thermoxels_ns.fem.solution import SteadySolution
     from thermoxels_ns.heat.vtk_series import remove_heat_series, write_heat_series
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtu
@@ -197,10 +197,10 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     from thermoxels_ns.reports.page import write_page
 
     answers = answers_of(options, run)
-    summary_text(answers)  # raises if json cannot hold it
+    summary_text(answers)  # raises if json cannot hold the answers
     shown, pictures = run.nodes, list[str]()
     remove_file(folder / ANSWERS)
-    _write_series(folder / SERIES, run)  # first: it tells the next run that the rest is a heat run's, too
+    _write_series(folder / SERIES, run)  # first: marks the folder as a heat run's for `result_folder`
     for name in (PAGE, STEADY, *HEAT_PICTURES):
         remove_file(folder / name)
     if isinstance(run.solution, SteadySolution):
@@ -219,7 +219,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
 
 
 def _write_series(path: Path, run: HeatRun) -> None:
-    """Write temperatures at each time, and mean heat flows during the interval that ends there."""
+    """Write a csv line for each time: temperatures, and mean heat flows since the time before."""
     times, states = run.nodes.times_s, run.nodes.states_c
     effects = run.solution.effects
     head = ["time_s", "min_c", "mean_c", "max_c"]

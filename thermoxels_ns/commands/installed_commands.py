@@ -1,4 +1,4 @@
-"""Run the console commands of this installation; show what they say, measure what they take."""
+"""Run the console commands of this installation; show their output, and measure their time and memory."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ import numpy as np
 from thermoxels_ns.core.errors import ThermoxelsError, explain
 
 if TYPE_CHECKING:
-    # The peak that Linux reports for a process is at least that of the process which started it, so this stays small.
+    # Linux reports for a process at least the peak memory of the process that started it: import little here.
     from rich.console import Console
 
 PLAIN_TRAINING = (
     *("--timestamp", "run", "--vis", "tensorboard"),
-    # One line every hundred steps instead of a block that is drawn over and over.
+    # Training then writes one line every hundred steps instead of redrawing a block.
     *("--logging.steps-per-log", "100", "--logging.local-writer.max-log-size", "0", "--logging.profiler", "none"),
 )
-"""Options of an ns-train whose output somebody reads, or a file keeps."""
+"""Options of ns-train that make its output fit for a log file."""
 
-_QUIET_S = 20.0
-_LAST_LINES = 12
-# What nerfstudio 1.1 and torch tell their programmers, not their users.
+_QUIET_S = 20.0  # Time without output after which a line says that the command still runs, [s]
+_LAST_LINES = 12  # Lines of output that an error shows
+# Warnings of nerfstudio 1.1 and torch that are meant for programmers are not shown.
 _SILENCED = (
     "ignore::FutureWarning,ignore::DeprecationWarning,ignore:Using a non-tuple sequence:UserWarning,"
     "ignore:Converting a tensor with requires_grad:UserWarning"
@@ -41,16 +41,16 @@ _SILENCED = (
 
 
 class ProcessCost(NamedTuple):
-    """What a finished process took."""
+    """Time and memory that a finished process took."""
 
     seconds: float  # Wall time, [s]
     peak_memory_gb: float
-    """Largest resident memory of the process, [1e9 bytes]; NaN where it cannot be told: the system has no `wait4`, or
-    the command stayed smaller than the process that started it."""
+    """Largest resident memory of the process, [1e9 bytes]; NaN if the system has no `wait4`, or if the process took no
+    more memory than the process that started it."""
 
 
 def command_line(arguments: Sequence[str | Path]) -> str:
-    """Write a command as it is typed in a shell.
+    """Return a command as it is typed in a shell.
 
     >>> command_line(["ns-train", "thermoxels", "--data", "my scene"])
     "ns-train thermoxels --data 'my scene'"
@@ -59,9 +59,9 @@ def command_line(arguments: Sequence[str | Path]) -> str:
 
 
 def command_of(name: str, options: Any) -> str:
-    """Write a command of ours as it is typed, from a dataclass of its options, the first of which has no name.
+    """Return ``thermoxels NAME`` with options as typed in a shell; `options` is a dataclass such as `Heat`.
 
-    Options at their default are left out.
+    The first field is positional, so its name is not written; options at their default are left out.
     """
     words = ["thermoxels", name, str(getattr(options, fields(options)[0].name))]
     for field in fields(options)[1:]:
@@ -73,10 +73,10 @@ def command_of(name: str, options: Any) -> str:
 
 
 def run_command(arguments: Sequence[str | Path], log: Path, console: Console) -> ProcessCost:
-    """Run a command of this installation with its output in a file, whose folder exists, and measure it.
+    """Run a command of this installation, write its output to the file `log`, and return its time and memory.
 
-    `console` shows the output as it comes, progress bars included; elsewhere than on a terminal a line says now and
-    then that a quiet command still runs. Raises `ThermoxelsError` with the last lines if it failed or does not exist.
+    The folder of `log` must exist. `console` shows the output as it comes; off a terminal, a line says now and then
+    that a quiet command still runs. Raises `ThermoxelsError` if the command fails or does not exist.
     """
     words = [str(argument) for argument in arguments]
     folder = Path(sys.executable).parent
@@ -111,7 +111,7 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
 def _wait(process: subprocess.Popen[bytes], log: Path, console: Console, quiet: str) -> float:
     """Show the output until a process ends; return its peak memory [1e9 bytes]."""
     start = heard = time.monotonic()
-    decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")  # what has arrived may end within a character
+    decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")  # output so far may end within a character
     with log.open("rb") as output:
         while True:
             ended, peak_memory_gb = _ended(process)
@@ -129,7 +129,7 @@ def _wait(process: subprocess.Popen[bytes], log: Path, console: Console, quiet: 
 
 
 def _ended(process: subprocess.Popen[bytes]) -> tuple[bool, float]:
-    """Say whether a process has ended, and its peak memory [1e9 bytes] then."""
+    """Return whether a process has ended, and its peak memory, [1e9 bytes]; NaN if it runs or memory is not known."""
     wait4 = getattr(os, "wait4", None)  # POSIX; elsewhere memory is not measured
     if wait4 is None:
         return process.poll() is not None, math.nan
@@ -137,7 +137,7 @@ def _ended(process: subprocess.Popen[bytes]) -> tuple[bool, float]:
     if pid != process.pid:
         return False, math.nan
     process.returncode = os.waitstatus_to_exitcode(status)
-    # Linux reports at least the peak of the process that started it.
+    # Linux reports at least the peak of the process that started the command: such a figure tells nothing.
     own = Path("/proc/self/status")
     found = re.search(r"^VmHWM:\s*(\d+) kB", own.read_text(), re.MULTILINE) if own.is_file() else None
     if found and usage.ru_maxrss <= int(found[1]):

@@ -1,1 +1,1 @@
-"""Pages, charts and pictures; no physics."""
+"""Html pages, charts and pictures of results; this package computes no results of its own."""

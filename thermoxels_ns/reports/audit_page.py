@@ -1,4 +1,4 @@
-"""The page of an audit, and its pictures: the surface from fixed views, and a thermogram of each defect."""
+"""Build the page of an audit and draw its pictures: the surface from one or two sides, and each defect."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from thermoxels_ns.reports.numbers import number_text, stated_text
 from thermoxels_ns.reports.page import Picture, build_page, image_file
 
 AuditPictures: TypeAlias = dict[str, list[bytes]]
-"""PNG files, from one or two sides each: surface "temperature" with the numbers of defects, "u_value" (heat flow if the
-air outside is not known), "misfit" (measured minus computed in a calibration); one each of "defects"."""
+"""PNG files by name, one for each view: "temperature" with the numbers of defects, "u_value" (heat flow if no outside
+temperature is stated), "misfit" (measured minus computed temperature). "defects" has one file per defect."""
 
-MOST_DEFECTS = 12  # How many get a picture
-_ALL_AROUND = 0.35  # Share of the area that normals add up to, below which a building was seen from all around
-_AROUND_DEFECT_M = 0.8
+MOST_DEFECTS = 12  # Number of defects that get a picture
+_ALL_AROUND = 0.35  # If the mean horizontal normal is shorter than this, the building was seen from all around
+_AROUND_DEFECT_M = 0.8  # Least margin around a defect in its picture, [m]
 
 
 def audit_page(
@@ -34,9 +34,9 @@ def audit_page(
     command: str,
     files: Sequence[str],
 ) -> str:
-    """Build the html text on an audit: the client's questions first, then elements and defects, method and limits last.
+    """Return the html text of an audit's page; `command` made the audit, `files` lie beside the page.
 
-    `photographs` are those of defects, by their place.
+    `photographs` are pictures of defects by place in `audit.defects`; without `pictures` the page has no drawings.
     """
     numbered, asked = list(enumerate(audit.defects, start=1)), audit.conditions.calibrate
     counted = [(number, one) for number, one in numbered if not one.not_counted]
@@ -72,7 +72,7 @@ def audit_page(
 
 
 def _survey(survey: Survey) -> list[tuple[str, str]]:
-    """Name what a survey says of itself."""
+    """Return name and text of each fact that a survey states."""
     units = {"pressure_difference": "Pa", "least_difference_24h": "K", "hours_since_sun": "h", "hours_dry": "h"}
     said = [(field.name, getattr(survey, field.name)) for field in fields(survey)]
     return [
@@ -83,7 +83,7 @@ def _survey(survey: Survey) -> list[tuple[str, str]]:
 
 
 def draw_audit(audit: Audit) -> AuditPictures:
-    """Draw all pictures; colours of all temperatures have one scale, what does not count is grey."""
+    """Draw all pictures; pictures of temperatures share one range of colours, triangles that do not count are grey."""
     surface, calibration, up = audit.surface, audit.calibration, audit.surface.selection.up
     shown = np.unique(surface.mesh.facets[surface.counted])
     known = audit.conditions.outside_known
@@ -115,18 +115,18 @@ def draw_audit(audit: Audit) -> AuditPictures:
 
 
 def _at_nodes(audit: Audit, values: FloatArray) -> FloatArray:
-    """Average at each node the triangles around it that count, by area; 0 where there are none."""
+    """Return for each node the mean, by area, of `values` of its triangles that count, shape (n,); 0 without any."""
     surface = audit.surface
     facets, area = surface.mesh.facets[surface.counted], surface.area_m2[surface.counted]
     weight, count = np.repeat(area, 3), len(surface.mesh.points_m)
-    known = np.nan_to_num(values[surface.counted])  # a calibration may leave out patches
+    known = np.nan_to_num(values[surface.counted])  # NaN where a calibration leaves out patches
     total = np.bincount(facets.ravel(), weight * np.repeat(known, 3), count)
     share = np.bincount(facets.ravel(), weight, count)
     return total / np.where(share > 0.0, share, 1.0)
 
 
 def _labels(audit: Audit, direction: FloatArray) -> list[tuple[str, tuple[float, float, float]]]:
-    """Number the defects that face the camera, and say where they are."""
+    """Return number and centre, [m], of the defects that count and face a camera that looks along `direction`."""
     surface, labels = audit.surface, []
     for number, (one, found) in enumerate(zip(audit.defects, audit.found), start=1):
         normal = surface.area_m2[found.core] @ surface.selection.facet_normal[found.core]
@@ -136,7 +136,7 @@ def _labels(audit: Audit, direction: FloatArray) -> list[tuple[str, tuple[float,
 
 
 def _views(audit: Audit) -> list[FloatArray]:
-    """Choose directions to look in: at what was seen, or from two corners where it was seen from all around."""
+    """Return directions to look in: one towards the seen side, or two from corners if all sides were seen."""
     surface, up = audit.surface, np.array(audit.surface.selection.up)
     area = surface.area_m2 * surface.counted
     mean = area @ surface.selection.facet_normal / area.sum()
@@ -153,7 +153,7 @@ def _views(audit: Audit) -> list[FloatArray]:
 
 
 def _defect(audit: Audit, number: int, surface_c: FloatArray, same: dict[str, Any]) -> bytes:
-    """Draw a defect and what is around it, seen along the mean normal of both."""
+    """Draw a defect and its surroundings, seen obliquely against the mean normal of the defect's zone."""
     surface, found, defect = audit.surface, audit.found[number], audit.defects[number]
     low, high = surface.centroid_m[found.core].min(axis=0), surface.centroid_m[found.core].max(axis=0)
     margin = max(_AROUND_DEFECT_M, 0.25 * float(np.max(high - low)))
@@ -178,7 +178,7 @@ def _defect(audit: Audit, number: int, surface_c: FloatArray, same: dict[str, An
 
 
 def _picture(audit: Audit, chosen: BoolArray, values: FloatArray, **look: Any) -> bytes:
-    """Draw some triangles, those that do not count in grey; of a room without what stands between it and the eye."""
+    """Draw chosen triangles, grey if they do not count; without cut and unseen triangles in a view from inside."""
     from thermoxels_ns.reports.mesh_pictures import image_of_surface
 
     mesh = audit.surface.mesh

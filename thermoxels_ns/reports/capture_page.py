@@ -1,4 +1,4 @@
-"""The page of a capture, by which a person judges what was found."""
+"""Build the page of a capture, by which a person judges poses, rig and temperatures."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from thermoxels_ns.radiometry.thermal_pixels import MIN_FRAMES
 from thermoxels_ns.reports.charts import PERCENTILES, bars, colours, histogram
 from thermoxels_ns.reports.page import build_page, image_file, write_page
 
-_DEPTH_STEP = 4  # Depth is looked up at every so many pixels of the reduced photograph, and linear between
-_COLOUR_SHARE = 0.55  # How much of the thermal colours covers the photograph
-_SHOWN = 6
-_SAMPLED_PIXELS = 4000  # Of every thermal image, for the histogram
+_DEPTH_STEP = 4  # Spacing of the pixels at which depth is looked up, [pixels]; depth is interpolated in between
+_COLOUR_SHARE = 0.55  # Opacity of the thermal colours over the photograph
+_SHOWN = 6  # Number of frames with an overlay
+_SAMPLED_PIXELS = 4000  # About the number of pixels of each thermal image that enter the histogram
 
 Overlay = tuple[str, bytes, bytes, bytes, str]
-"""A frame's name, its thermal colours over its photograph with the rig's start value and as found, the thermal image
-alone, and what the ends of its colours stand for."""
+"""Name of a frame; JPEG files of the overlay with the rig's start value, the overlay with the rig that was found, and
+the thermal image alone; and a caption on the colours of the thermal image."""
 
 
 def write_capture_page(result: CaptureResult) -> None:
-    """Draw the overlays and write the page of a capture, whole or not at all."""
+    """Draw the overlays of a capture and write its page; an interrupted write leaves no broken file."""
     scene, names = result.scene, scene_names(len(result.scene.frames))
     paired = rig_frames(scene.model, scene.frames)
     overlays: list[Overlay] = []
@@ -62,9 +62,9 @@ def write_capture_page(result: CaptureResult) -> None:
 def thermal_in_photograph(
     frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: RigEstimate, width: int = 640
 ) -> Float32Array:
-    """Carry a thermal image, [degrees C], into the photograph's view, through the depth of the scene points.
+    """Return the temperature that a thermal image, [degrees Celsius], shows at each pixel of a reduced photograph.
 
-    Returns temperatures by pixel of the photograph reduced to a width, NaN where the thermal image does not reach.
+    The shape is (height, `width`), NaN beyond the thermal image. Depths come from the scene points that `frame` sees.
     """
     height = max(1, round(visible.height * width / visible.width))
     rays = _grid_rays(visible, width, height)
@@ -73,7 +73,7 @@ def thermal_in_photograph(
     inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=np.isfinite(depth)).reshape(coarse[::-1])
     parallax = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR).ravel()
     rotation, shift = rig.visible_to_thermal[:3, :3], rig.visible_to_thermal[:3, 3]
-    local = rays @ rotation.T + parallax[:, None] * shift  # a point times its inverse depth projects alike
+    local = rays @ rotation.T + parallax[:, None] * shift  # points divided by depth, which project to the same pixel
     pixels = rig.thermal_camera.project(local).reshape(height, width, 2).astype(np.float32) - np.float32(0.5)
     return cv2.remap(
         temperature_c.astype(np.float32),
@@ -86,13 +86,13 @@ def thermal_in_photograph(
 
 
 def _grid_rays(camera: Camera, width: int, height: int) -> FloatArray:
-    """Give rays of depth 1 through the pixels of a reduced photograph, row by row, shape (width * height, 3)."""
+    """Return rays of depth 1 through the pixels of a reduced photograph, row by row, shape (width * height, 3)."""
     grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
     return camera.resized(width, height).rays(grid)
 
 
 def overlay(frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: RigEstimate) -> npt.NDArray:
-    """Draw a photograph in grey with its edges, the thermal image in colours over it, shape (height, width, 3)."""
+    """Draw a thermal image in colours over its photograph in grey, with edges in white, shape (height, width, 3)."""
     carried = thermal_in_photograph(frame, temperature_c, visible, rig)
     height, width = carried.shape
     if isinstance(frame.photograph, np.ndarray):
@@ -111,9 +111,9 @@ def overlay(frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: R
 def capture_page(
     result: CaptureResult, overlays: Sequence[Overlay], temperatures_c: Float32Array, masked_share: float
 ) -> str:
-    """Build the html text from its arguments alone.
+    """Return the html text of a capture's page; equal arguments give equal text.
 
-    Temperatures are a sample of all, corrected, and the share is that of all thermal pixels without one.
+    `temperatures_c` is a sample of corrected temperatures; `masked_share` is the share of masked thermal pixels.
     """
     scene, rig, drift = result.scene, result.scene.rig, result.scene.drift
     errors, known_c = scene.model.sighting_error_px(), temperatures_c[np.isfinite(temperatures_c)]
@@ -146,7 +146,7 @@ def capture_page(
 
 
 def _cameras(result: CaptureResult) -> list[tuple[str, ...]]:
-    """Describe the photographs' camera, and the thermal camera at the start and as found, in rows of a table."""
+    """Return table rows on the photographs' camera, and on the thermal camera as assumed at first and as found."""
     rig = result.scene.rig
     errors = dict(rig.standard_errors)
     errors["focal"] = errors.get("log_focal", math.nan) * rig.thermal_camera.fl_x
@@ -164,7 +164,7 @@ def _cameras(result: CaptureResult) -> list[tuple[str, ...]]:
 
 
 def with_error(value: float, error: float, decimals: int) -> str:
-    """Write a number with its standard error, where it has one.
+    """Return a number as text, with its standard error if the error is finite and above 0.
 
     >>> with_error(70.04, 0.26, 1), with_error(1.0, float("nan"), 2), with_error(1.0, 0.0, 2)
     ('70.0 ± 0.3', '1.00', '1.00')

@@ -1,4 +1,4 @@
-"""Charts as SVG text, for pages that fetch nothing, and temperatures in colours."""
+"""Draw charts as SVG text, which pages can contain, and show temperatures in colours."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, SOFT, LINE, ACCENT = "#1d2430", "#9aa3ae", "#e1e5ea", "#b3431e"
-"""Colours of the pages' style sheet."""
+"""Colours of the pages' style sheet, ``templates/page.css``."""
 
-PERCENTILES = (2.0, 98.0)  # Of a thermal image's temperatures, for its darkest and brightest colours
-_MOST_CURVES = 8  # Probes or effects in one plot; more cannot be told apart
+PERCENTILES = (2.0, 98.0)  # Percentiles of a thermal image's temperatures at its darkest and brightest colour
+_MOST_CURVES = 8  # Most probes or effects in one plot; more curves look alike
 
 
 @contextmanager
 def chart(width: float, height: float, rows: int = 1) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Give a figure whose axes stand one above the other, in the look of the pages; sizes in font heights / 10."""
+    """Yield a figure, `width` by `height` inches, in the look of the pages, with `rows` axes one above the other."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -45,7 +45,7 @@ def chart(width: float, height: float, rows: int = 1) -> Iterator[tuple[Figure, 
 
 
 def svg_text(figure: Figure) -> str:
-    """Write a figure as an svg element, the same for the same figure."""
+    """Return a figure as the text of an svg element; equal figures give equal text."""
     text = StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
     svg = text.getvalue()
@@ -53,7 +53,7 @@ def svg_text(figure: Figure) -> str:
 
 
 def histogram(values: npt.NDArray, label: str, percentiles: tuple[float, float] = (0.0, 100.0)) -> str:
-    """Draw how often finite values occur between two of their percentiles, as an svg element; empty without values."""
+    """Return a histogram of the finite values between two percentiles, as an svg element; empty without values."""
     values = values[np.isfinite(values)]
     if not values.size:
         return ""
@@ -65,7 +65,7 @@ def histogram(values: npt.NDArray, label: str, percentiles: tuple[float, float] 
 
 
 def bars(values: Sequence[float], label: str) -> str:
-    """Draw one bar per item, from zero up or down, as an svg element; empty without values."""
+    """Return a chart with one bar per value, up or down from zero, as an svg element; empty without values."""
     if not len(values):
         return ""
     with chart(7.0, 2.2) as (figure, (axis,)):
@@ -76,10 +76,10 @@ def bars(values: Sequence[float], label: str) -> str:
 
 
 def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatArray, probe_names: Sequence[str]) -> str:
-    """Draw temperatures over time, and below them each effect's heat flow, as an svg element.
+    """Return charts of temperatures and, below, of each effect's heat flow over time, as an svg element.
 
-    `mean_c` is that of the volume, shape (s + 1,), `probes_c` has shape (s + 1, p), [degrees Celsius]. Heat flows are
-    means over the intervals between the times.
+    `mean_c` is the mean of the volume, shape (s + 1,); `probes_c` has shape (s + 1, p); both are in [degrees Celsius].
+    Heat flows are means over the intervals between the s + 1 times.
     """
     unit, length_s = time_unit(float(solution.times_s[-1]))
     times, states = solution.times_s / length_s, solution.temperature_c
@@ -89,7 +89,7 @@ def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatAr
         above.fill_between(times, states.min(axis=1), states.max(axis=1), color="#e9dcd6", label="coldest to hottest")
         above.plot(times, mean_c, label="mean of the volume", color=INK, linewidth=2)
         for name, values in list(zip(probe_names, probes_c.T))[:_MOST_CURVES]:
-            above.plot(times, values, label=name.replace("$", r"\$"))  # no formula
+            above.plot(times, values, label=name.replace("$", r"\$"))  # matplotlib would read $ as a formula
         below.axhline(0.0, color=SOFT, linewidth=0.8)
         for heat in acting:
             below.stairs(heat.heat_w, times, baseline=None, label=heat.effect.replace("$", r"\$"), linewidth=1.4)
@@ -103,7 +103,7 @@ def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatAr
 
 
 def colours(temperature_c: npt.NDArray, limits: tuple[float, float] | None = None) -> npt.NDArray[np.uint8]:
-    """Show temperatures as red, green and blue, 0 to 255, black where NaN; `limits` are by default the middle 96 %."""
+    """Return temperatures, (h, w), as colours, (h, w, 3), black where NaN; `limits` default to `PERCENTILES`."""
     import cv2
 
     known = np.isfinite(temperature_c)

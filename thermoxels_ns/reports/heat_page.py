@@ -1,4 +1,4 @@
-"""The report of a heat computation."""
+"""Build the page of a heat run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _CAPTIONS = {
 
 
 def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, command: str, files: Sequence[str]) -> str:
-    """Build the html text on a run: `pictures` are PNG files by name, `command` made it, `files` lie beside it."""
+    """Return the html text of a heat run's page; `pictures` are PNG files by name, `files` lie beside the page."""
     results, solution, accuracy = run.results, run.solution, run.accuracy
     flows = [flow for effect in results.effects for flow in (effect.heat_w, effect.last_heat_w)]
     least_w = least_flow(flows, sum(patch.area_m2 for patch in results.patches))
@@ -60,7 +60,7 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, comma
 
 
 def _values(effect: Effect, selection: Selection) -> str:
-    """Write the quantities of an effect with their units."""
+    """Return the quantities of an effect as text with units, without quantities at their default."""
     shown = []
     for field in fields(effect):  # type: ignore[arg-type]
         if field.name not in effect.bounds or getattr(effect, field.name) == field.default:
@@ -85,7 +85,7 @@ def _values(effect: Effect, selection: Selection) -> str:
 
 
 def _how_time_was_followed(time: TimeSteps | AdaptiveSteps | None, accuracy: ToleratedSolution | None) -> str:
-    """Say in words how a body was followed, by the scene's own steps or to a tolerance."""
+    """Return words on the time steps of a run: steady, chosen by a tolerance, or as in the scene."""
     if time is None:
         return "the steady state"
     if accuracy is not None:
@@ -97,7 +97,7 @@ def _how_time_was_followed(time: TimeSteps | AdaptiveSteps | None, accuracy: Tol
 
 
 def _effort(run: HeatRun) -> str:
-    """Say what the solver did, as a sentence."""
+    """Return a sentence on the time steps and the iterations that the solver took."""
     solution, newton = run.solution, int(np.sum(run.solution.newton_iterations))
     words = [f"{int(np.sum(solution.iterations)):,} iterations of the linear solver"]
     if isinstance(solution, HeatSolution):

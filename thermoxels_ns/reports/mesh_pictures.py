@@ -1,4 +1,4 @@
-"""Pictures of a mesh coloured by temperature, drawn without a screen."""
+"""Draw pictures of a mesh coloured by temperature, without a screen."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
 
     from thermoxels_ns.fem.solution import HeatSolution
 
-# The part of the picture that the mesh may fill, as (left, bottom, right, top) shares of width and height: the title
-# is above, the colour bar to the right, the axes and the size below.
+# Part of the picture that the mesh may fill, as (left, bottom, right, top) shares of width and height. The title is
+# above this part, the colour bar is to the right, and the axes and the size of the mesh are below.
 _MESH_AREA = (0.04, 0.16, 0.80, 0.90)
 _INK = "#202020"
 _SUPPORT_COLOURS: tuple[str, ...] = ("green", "gold", "red", "grey")
-_LEAST_CHANGE_K = 1e-3  # Half the span of the smallest scale of changes, [K]
-_SHARE_OF_CHANGES = 0.95
+_LEAST_CHANGE_K = 1e-3  # Smallest end of a colour bar of changes, [K]; the other end is its negative
+_SHARE_OF_CHANGES = 0.95  # Share of the nodes whose changes the colours span if a few nodes change far more
 HEAT_PICTURES = ("surface-start.png", "surface-end.png", "surface-change.png", "cut.png")
-"""Pictures of a heat computation; of a steady state there are the second and the last only."""
-_MATTER = {"ambient": 0.5, "diffuse": 0.65, "smooth_shading": False}  # Colours stay readable in the shade
-_DARKEST = 0.1  # Share of inferno left out at its dark end, where shading could not be told from cold
+"""File names of the pictures of a heat run; a steady state only has the second and the last picture."""
+_MATTER = {"ambient": 0.5, "diffuse": 0.65, "smooth_shading": False}  # Light that keeps colours readable in the shade
+_DARKEST = 0.1  # Share of the colour map inferno left out at its dark end, where shading would look like cold
 
 
 def image_of_surface(
@@ -54,32 +54,32 @@ def image_of_surface(
     ghost: tuple[FloatArray, IntArray] | None = None,
     window_size: tuple[int, int] = (1200, 900),
 ) -> npt.NDArray[np.uint8]:
-    """Draw a surface coloured by values at its nodes, all of it, in parallel projection.
+    """Draw a whole surface, coloured by values at its nodes, in parallel projection.
 
     Args:
         points_m: Nodes, shape (n, 3).
         facets: Triangles of the surface, shape (f, 3).
         values: Nodal values, shape (n,), such as temperatures [degrees Celsius].
         title: Text above the picture.
-        clim: Values at the ends of the colour bar. If left out, the data's extremes; or, where a few nodes stretch
-            the range to more than twice that of the middle 99 %, the range of those, and the words below the picture
-            give the extremes.
+        clim: Values at the ends of the colour bar. If left out, the lowest and highest value; but if a few nodes
+            stretch this range to more than twice the range of the middle 99 % of the nodes, the colours span the middle
+            99 %, and a line below the picture gives the lowest and highest value.
         up: Direction that points up in the picture.
         view_direction: Direction from the camera to the surface; obliquely from above if left out.
-        painted: Triangles that do not show values: what they are, their colour, and a boolean for each triangle. The
-            words below the picture say which colour is what.
+        painted: Groups of triangles that show one colour instead of values: a description, the colour, and a boolean
+            for each triangle, shape (f,). A line below the picture explains the colours.
         colour_map: Name of a colour map of matplotlib, such as "coolwarm" for changes to both sides of 0.
         bar_title: Quantity and unit, written beside the colour bar.
         words: Lines below the picture.
-        labels: Short words and the points that they stand at, in front of everything.
-        ghost: Points (n, 3) and triangles (m, 3) of something beside the surface, in a grey that one looks through.
+        labels: Short texts and the points where the texts stand, in front of everything else.
+        ghost: Points (n, 3) and triangles (m, 3) of a second surface, drawn in transparent grey.
         window_size: Width and height, [pixels].
 
     Returns:
         The picture, shape (height, width, 3).
     """
-    # Without a screen VTK draws through Mesa, which loads the system's LLVM. A triton (torch's compiler) that is loaded
-    # after that ends in a segmentation fault; loaded before, both work.
+    # Without a screen VTK draws through Mesa, which loads the system's LLVM. If triton (torch's compiler) is loaded
+    # after Mesa, the program ends in a segmentation fault; if triton is loaded first, both work.
     with suppress(ImportError):
         import triton  # noqa: F401
     import matplotlib
@@ -92,7 +92,7 @@ def image_of_surface(
     shown = np.asarray(values[nodes], dtype=np.float64)
     ends = _without_outliers(shown) if clim is None else np.array(clim)
     low, high = float(ends.min()), float(ends.max())
-    if not high - low > 1e-3:  # a constant temperature gets 1 K around it
+    if not high - low > 1e-3:  # the colours of a constant temperature span 1 K
         low, high = low - 0.5, high + 0.5
     plain = np.any([which for *_, which in painted], axis=0) if painted else np.zeros(len(facets), dtype=bool)
     below = [
@@ -143,7 +143,7 @@ def image_of_surface(
 
 
 def write_picture(path: Path, image: npt.NDArray[np.uint8]) -> None:
-    """Write a picture, shape (h, w, 3), as a PNG; the file is complete or absent."""
+    """Write a picture, shape (h, w, 3), as a PNG file; an interrupted write leaves no broken file."""
     with replace_when_done(path) as temporary:
         temporary.write_bytes(image_file(image, "PNG"))
 
@@ -151,9 +151,9 @@ def write_picture(path: Path, image: npt.NDArray[np.uint8]) -> None:
 def image_of_mesh(
     mesh: TetMesh, values: FloatArray | None = None, length_unit: str = "m", note: str = "", **look: Any
 ) -> npt.NDArray[np.uint8]:
-    """Draw the boundary of a mesh, its size written below; `values` are its temperatures if left out.
+    """Draw the boundary of a mesh, shape (height, width, 3), with the size of the mesh and `note` written below.
 
-    The other arguments are those of `image_of_surface`.
+    `values`, shape (n,), are the mesh's temperatures if left out; `look` are arguments of `image_of_surface`.
     """
     shown = mesh.temperature_c if values is None else values
     return image_of_surface(mesh.points_m, mesh.facets, shown, words=(_size_of(mesh, length_unit), note), **look)
@@ -167,10 +167,10 @@ def _size_of(mesh: TetMesh, length_unit: str) -> str:
 def before_after_change(
     states_c: FloatArray, times_s: FloatArray, shown: IntArray
 ) -> list[tuple[FloatArray, dict[str, Any]]]:
-    """Choose how to show the first and the last of some states in one range of colours, and the change in its own.
+    """Return values, (n,), and arguments of `image_of_mesh` for pictures of the first state, the last and the change.
 
-    Colours span the values at the nodes `shown`. Returns nodal values and arguments of `image_of_mesh` for each of the
-    three pictures.
+    The two states share one range of colours. Colours span the values at the nodes `shown`. `states_c` has shape
+    (s, n), `times_s` has shape (s,).
     """
     before, after = states_c[0], states_c[-1]
     first, last = duration_text(float(times_s[0])), duration_text(float(times_s[-1]))
@@ -187,10 +187,10 @@ def before_after_change(
 
 
 def change_colours(change: npt.NDArray[np.floating]) -> dict[str, Any]:
-    """Choose colours for changes to both sides of 0, [K], and a note to write below, as arguments of `image_of_mesh`.
+    """Return arguments of `image_of_mesh` for changes, [K], above and below 0: colours, and a note below the picture.
 
-    Where a few nodes changed far more than the rest, all others would be as grey as no change: the scale then ends
-    where 95 % of the sizes do, and the note says so; else it is empty.
+    If a few nodes changed far more than the rest, the colours end at the size of change that 95 % of the nodes do not
+    exceed, and the note says so; otherwise the note is empty.
     """
     size = np.abs(change)
     most, end = float(size.max()), float(np.quantile(size, _SHARE_OF_CHANGES))
@@ -202,7 +202,7 @@ def change_colours(change: npt.NDArray[np.floating]) -> dict[str, Any]:
 
 
 def _towards_camera(up: Sequence[float], view_direction: Sequence[float] | None) -> FloatArray:
-    """Give the unit vector from the surface to the camera; obliquely from above without a direction."""
+    """Return the unit vector from the surface to the camera; obliquely upwards if `view_direction` is None."""
     if view_direction is not None:
         return -_unit("view_direction", view_direction)
     upwards = _unit("up", up)
@@ -216,28 +216,28 @@ def _unit(name: str, vector: npt.ArrayLike) -> FloatArray:
 
 
 def _without_outliers(values: FloatArray) -> FloatArray:
-    """Give the values, or the middle 99 % of them where the others stretch their range to more than twice as much."""
+    """Return the values; without the outer 1 % if these stretch the range to more than twice the range of the rest."""
     low, high = np.quantile(values, (0.005, 0.995))
     few = np.ptp(values) > 2.0 * (high - low) > 0.0
     return values[(values >= low) & (values <= high)] if few else values
 
 
 def _colour_bar(title: str, span: float, height: int) -> dict[str, Any]:
-    """Say how the colour bar of values over so wide a span looks, in a picture of so many rows of pixels."""
+    """Return pyvista's arguments of a colour bar for values of range `span`, in a picture of `height` [pixels]."""
     import pyvista as pv
 
     decimals = 1 if span > 2.0 else 2 + max(0, math.ceil(-math.log10(span)))
     place = {"vertical": True, "position_x": 0.86, "position_y": 0.2, "width": 0.06, "height": 0.6}
     points = round(height / 38)
     size = {"title_font_size": points, "label_font_size": points, "unconstrained_font_size": True}
-    # VTK 9.6 went from printf's to Python's way of writing formats.
+    # From VTK 9.6 on, formats are written as in Python instead of as in printf.
     form = f"{{:.{decimals}f}}" if pv.vtk_version_info >= (9, 6) else f"%.{decimals}f"
     return {"title": f"{title}\n", "fmt": form, "color": _INK, "n_labels": 5, **place, **size}
 
 
 def _frame(plotter: pv.Plotter, points: FloatArray, up: FloatArray, towards_camera: FloatArray) -> None:
-    """Point a parallel camera so that `points` just fill the mesh's area."""
-    if np.linalg.norm(np.cross(up, towards_camera)) < 1e-6:  # any direction across the up axis is as good as another
+    """Set a parallel camera so that `points` just fill `_MESH_AREA`."""
+    if np.linalg.norm(np.cross(up, towards_camera)) < 1e-6:  # seen along up: any other axis may point up instead
         up = np.eye(3)[np.argmin(np.abs(towards_camera))]
     right = _unit("right", np.cross(up, towards_camera))
     axes = np.stack((right, np.cross(towards_camera, right), towards_camera))
@@ -252,15 +252,15 @@ def _frame(plotter: pv.Plotter, points: FloatArray, up: FloatArray, towards_came
     camera.focal_point = tuple(middle)
     camera.position = tuple(middle + (4.0 * camera.parallel_scale + depth) * towards_camera)
     camera.up = tuple(axes[1])
-    camera.SetWindowCenter(1.0 - left - area_right, 1.0 - bottom - top)  # the area's is off the picture's
+    camera.SetWindowCenter(1.0 - left - area_right, 1.0 - bottom - top)  # the area's centre is not the picture's
     plotter.camera_set = True
     plotter.reset_camera_clipping_range()
 
 
 def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], length_unit: str) -> None:
-    """Draw the mesh twice: all temperatures, and with grey where no thermal ray measured one.
+    """Draw two pictures of a mesh: with all temperatures, and with grey where no thermal ray measured a temperature.
 
-    `look` are the arguments `up` and `view_direction` of `image_of_surface`.
+    `paths` are the two files; `look` are the arguments `up` and `view_direction` of `image_of_surface`.
     """
     painted = [("no thermal ray", "grey", ~mesh.observed[mesh.facets].all(axis=1))]
     every = image_of_mesh(mesh, title="Surface temperature", length_unit=length_unit, **look)
@@ -270,7 +270,7 @@ def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], len
 
 
 def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[str, Any]) -> None:
-    """Draw the temperatures before and after in one range of colours, and beside them the change in its own.
+    """Draw one picture with three panels: temperatures before and after, in one range of colours, and their change.
 
     `look` are the arguments `up` and `view_direction` of `image_of_surface`.
     """
@@ -281,10 +281,10 @@ def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[s
 def draw_surface(
     folder: Path, mesh: TetMesh, states_c: FloatArray, times_s: FloatArray, up: tuple[float, float, float]
 ) -> list[str]:
-    """Draw the surface at the start, at the end, and the change (of a steady state once), and a cut through the body.
+    """Draw the pictures `HEAT_PICTURES` of a heat run into a folder; return the names of the files.
 
-    Colours of the surface span what photographs show of it: inside a heated building it is far warmer. States are nodal
-    temperatures, shape (s, n), [degrees Celsius], at times of shape (s,), [s]. Returns the names of the files.
+    Colours of the surface span the part that photographs show, because the inside of a heated building is far warmer.
+    States are nodal temperatures, shape (s, n), [degrees Celsius], at times of shape (s,), [s].
     """
     seen = mesh.facet_tags != FACET_BOX
     if mesh.boundary is not None:
@@ -312,16 +312,16 @@ def draw_surface(
 def cut_open(
     mesh: TetMesh, nodal_c: FloatArray, up: tuple[float, float, float]
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
-    """Take away the half of a body in front of an upright plane through its middle.
+    """Cut a body by an upright plane through its middle, and remove the half in front of the plane.
 
-    Returns nodes (n, 3), triangles (f, 3) and nodal values (n,) of the surface of what is left, and the direction to
-    look in, shape (3,).
+    Returns nodes (n, 3), triangles (f, 3) and nodal values (n,) of the surface of the other half, and a direction from
+    the camera to the cut, shape (3,).
     """
     import pyvista as pv
     from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
 
     upwards = np.array(up) / np.linalg.norm(up)
-    # Across the shorter of the two sides, so that the cut is the larger one.
+    # The plane is at right angles to the shorter horizontal extent, so that the cut is as large as possible.
     sides = [axis - (axis @ upwards) * upwards for axis in np.eye(3)]
     sides = [side / np.linalg.norm(side) for side in sides if np.linalg.norm(side) > 0.5]
     towards = min(sides, key=lambda side: float(np.ptp(mesh.points_m @ side)))
@@ -339,9 +339,9 @@ def cut_open(
 
 
 def add_support(path: Path, mesh: TetMesh, look: Mapping[str, Any]) -> None:
-    """Add to a picture of a mesh's quality two views, from opposite sides, of how photographs support its surface.
+    """Append to a picture file two views of the mesh, from opposite sides, coloured by the classes of `SUPPORT`.
 
-    `look` are the arguments `up` and `view_direction` of `image_of_surface`. The mesh must know its photographs.
+    `look` are the arguments `up` and `view_direction` of `image_of_surface`; `mesh.boundary.photographs` must be known.
     """
     from PIL import Image
 

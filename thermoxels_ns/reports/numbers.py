@@ -1,4 +1,4 @@
-"""Numbers as pages write them: figures, temperatures, coordinates, units, durations, and intervals."""
+"""Write numbers as texts for pages: figures, temperatures, coordinates, units, durations, and intervals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from thermoxels_ns.core.measured import Measured
 
 
 def figure(value: float) -> str:
-    """Write four digits, without powers of ten where figures are of everyday size.
+    """Return a number with at least four significant digits; with a power of ten below 0.001 and from a million on.
 
     >>> figure(1234.56), figure(0.0123456), figure(0.0)
     ('1,235', '0.01235', '0')
@@ -25,7 +25,7 @@ def figure(value: float) -> str:
 
 
 def flow_text(heat_w: float, least_w: float, per_area: float | None = None) -> str:
-    """Write a heat flow, [W], or what it is per area, [W/m^2]; flows below `least_w` are round-off and written as 0.
+    """Return a heat flow, [W], as text, or `per_area`, [W/m^2], if given; "0" if the heat flow is below `least_w`.
 
     >>> flow_text(6e-10, 1e-6), flow_text(6e-10, 1e-6, 1e5), flow_text(-12.5, 1e-6), flow_text(1e-2, 1e-6, 1e-3)
     ('0', '0', '-12.50', '0.001000')
@@ -34,9 +34,9 @@ def flow_text(heat_w: float, least_w: float, per_area: float | None = None) -> s
 
 
 def least_flow(flows_w: Sequence[float], area_m2: float) -> float:
-    """Give the size from which on heat flows are more than round-off in a body of so much surface, [W].
+    """Return the size below which heat flows count as round-off in a body with surface `area_m2`, [W].
 
-    It is a billionth of the largest of all flows, or, if larger, a billionth of a watt per square metre.
+    This size is 1e-9 times the largest flow, or, if larger, 1e-9 W/m2 times the area.
 
     >>> f"{least_flow((1e3, -1e3), 200.0):g} {least_flow((), 200.0):g}"
     '1e-06 2e-07'
@@ -45,7 +45,7 @@ def least_flow(flows_w: Sequence[float], area_m2: float) -> float:
 
 
 def degrees(value_c: float) -> str:
-    """Write a temperature to a hundredth of a degree; what rounds to 0 has no sign.
+    """Return a temperature with two decimals; values that round to 0 have no sign.
 
     >>> degrees(-0.001), degrees(-0.006)
     ('0.00', '-0.01')
@@ -54,7 +54,7 @@ def degrees(value_c: float) -> str:
 
 
 def point_text(point_m: Sequence[float]) -> str:
-    """Write coordinates to three digits, but not below the millimetre.
+    """Return coordinates, [m], with three significant digits, but never finer than 1 mm or coarser than 1 m.
 
     >>> point_text((0.00625, 3.14159, -12.04)), point_text((51234.5, -0.0002, 1.0))
     ('(0.006, 3.14, -12)', '(51234, 0, 1)')
@@ -68,7 +68,7 @@ def point_text(point_m: Sequence[float]) -> str:
 
 
 def unit_signs(unit: str) -> str:
-    """Write the powers of a unit as signs, and keep it on one line.
+    """Return a unit with raised digits for powers and no-break spaces.
 
     >>> unit_signs("W/(m2 K4)") == "W/(m²\\N{NO-BREAK SPACE}K⁴)"
     True
@@ -79,7 +79,7 @@ def unit_signs(unit: str) -> str:
 
 
 def time_unit(duration_s: float) -> tuple[str, float]:
-    """Choose a unit that suits a duration, and its length in seconds.
+    """Return a unit that suits a duration, and the length of the unit in seconds.
 
     >>> time_unit(86400.0)
     ('h', 3600.0)
@@ -92,7 +92,7 @@ def time_unit(duration_s: float) -> tuple[str, float]:
 
 
 def duration_text(seconds: float) -> str:
-    """Write a duration in the unit that suits it.
+    """Return a duration as text, in the unit that `time_unit` chooses.
 
     >>> duration_text(5400.0)
     '90 min'
@@ -102,7 +102,7 @@ def duration_text(seconds: float) -> str:
 
 
 def stated_text(value: Measured | datetime | str, unit: str = "") -> str:
-    """Write what somebody stated: a number with how far it may be off, a date, or words.
+    """Return a stated value as text: a number with its half range and `unit`, a date, or words.
 
     >>> stated_text(Measured(20.0, 0.5), "°C"), stated_text("dry")
     ('20 ± 0.5 °C', 'dry')
@@ -116,10 +116,10 @@ def stated_text(value: Measured | datetime | str, unit: str = "") -> str:
 
 
 def interval_text(interval: Interval, unit: str, bounds: bool = True) -> str:
-    """Write a number with the range that holds it, to two digits of half its width.
+    """Return an interval as text: the value and its range, to two significant digits of half the range's width.
 
-    If only the upper end is known, the text says "at most", else "at least". With `bounds` the quantity
-    cannot be below 0, and no number is given if it may be nothing at all; else any sign is a result.
+    NaN gives "not known", an infinite upper end gives "at least". With `bounds` the quantity is above 0: a range that
+    reaches down to 0 gives "at most", or "not measurable" if it has no finite upper end above 0.
 
     >>> interval_text(Interval(0.8851, 0.211, 1.552), "W/(m2 K)").replace("\\N{NO-BREAK SPACE}", " ")
     '0.89 (0.21 to 1.55) W/(m² K)'
@@ -143,7 +143,7 @@ def interval_text(interval: Interval, unit: str, bounds: bool = True) -> str:
 
 
 def interval_lines(interval: Interval, bounds: bool = True) -> str:
-    """Write an interval without a unit for a cell of a table, its range on a second line.
+    """Return an interval as text without a unit, for a cell of a table; the range is on a second line.
 
     >>> interval_lines(Interval(0.8851, 0.211, 1.552)), interval_lines(Interval(0.3, -0.2, 0.8))
     ('0.89\\n0.21 to 1.55', 'at most 0.80')
@@ -152,7 +152,7 @@ def interval_lines(interval: Interval, bounds: bool = True) -> str:
 
 
 def area_text(area_m2: float) -> str:
-    """Write an area to a tenth of a square metre, small ones to a square decimetre.
+    """Return an area as text, [m2]: with one decimal from 10 m2 on, with two decimals below.
 
     >>> area_text(12.04), area_text(0.4812)
     ('12.0', '0.48')
@@ -161,7 +161,7 @@ def area_text(area_m2: float) -> str:
 
 
 def number_text(value: float, half_width: float) -> str:
-    """Write a number to two digits of the half width of its range, at most four behind the point.
+    """Return a number rounded to two significant digits of `half_width`, with at most four decimals.
 
     >>> number_text(1234.56, 30.0), number_text(0.123456, 0.01), number_text(-0.001, 0.5), number_text(17732.0, 3800.0)
     ('1,235', '0.123', '0.00', '17,700')

@@ -1,4 +1,4 @@
-"""Html pages from templates: complete in one file, nothing fetched, no script."""
+"""Build html pages from templates; a page is one file that loads nothing else and runs no script."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 
 
 def build_page(template: str, **shown: Any) -> str:
-    """Build the html text of a page from a template in the folder ``templates`` and what it shows, by name.
+    """Return the html text of a page, made from a file in the folder ``templates`` and the values of its variables.
 
-    It depends on the arguments alone; raises `ThermoxelsError` for a picture that is neither PNG nor JPEG.
+    Equal arguments give equal text. Raises `ThermoxelsError` for a picture that is neither PNG nor JPEG.
     """
     return _environment().get_template(template).render(**shown)
 
 
 def write_page(path: Path, text: str) -> None:
-    """Write a page, whole or not at all."""
+    """Write a page to a file; an interrupted write leaves no broken file."""
     with replace_when_done(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def image_file(picture: npt.NDArray[np.uint8], kind: Literal["PNG", "JPEG"] = "JPEG", quality: int = 82) -> bytes:
-    """Encode a picture, shape (height, width, 3), as the content of a PNG or JPEG file."""
+    """Return the content of a PNG or JPEG file that shows a picture, shape (height, width, 3)."""
     stream = io.BytesIO()
     Image.fromarray(picture).save(stream, format=kind, quality=quality)
     return stream.getvalue()
 
 
 def image_address(image: bytes, words: str) -> str:
-    """Put a PNG or JPEG file into its own address, or raise a `ThermoxelsError` that names it by `words`."""
+    """Return the ``data:`` address that holds a PNG or JPEG file; raises a `ThermoxelsError` on `words` for others."""
     kind = next((kind for signature, kind in _SIGNATURES.items() if image.startswith(signature)), None)
     if kind is None:
         got, remedy = f"{len(image)} bytes that begin with {image[:8]!r}", "Draw the picture again."
@@ -58,7 +58,7 @@ def image_address(image: bytes, words: str) -> str:
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("thermoxels_ns.reports"),
-        autoescape=True,  # charts, which are ours, are marked as safe where they stand
+        autoescape=True,  # templates mark charts, which this package writes, as safe
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
