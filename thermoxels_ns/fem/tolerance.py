@@ -145,7 +145,10 @@ def solve_to_tolerance(
     run = _Run(problem, tolerance, memory_bytes, log)
     if duration_s is None:
         return run.close(_solve_steady(run), allow_unmet)
-    assert tolerance.temperature_k is not None, "steps in time are chosen by it"
+    if tolerance.temperature_k is None:
+        raise HeatError(
+            "tolerance", expected="kelvins, by which steps in time are chosen", got="none", remedy="Give 0.1."
+        )
     steps = AdaptiveSteps(duration_s, _STEPS_OVER_ERROR * tolerance.temperature_k, outputs=outputs)
     return run.close(_solve_in_time(run, steps, progress), allow_unmet)
 
