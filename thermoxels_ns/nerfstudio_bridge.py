@@ -75,9 +75,9 @@ def allow_checkpoint_globals() -> None:
 def extend_commands() -> None:
     """Add ``thermoxels-mesh`` to ``ns-export``, and make ``ns-*`` commands check their output paths at the start.
 
-    nerfstudio's scripts call ``tyro.cli`` when they start. In the modules of export, train, eval and render, `tyro` is
-    replaced by a copy whose `cli` is `_cli`. Modules that are not loaded, in this process or as its main script, are
-    left alone.
+    nerfstudio's scripts call ``tyro.cli`` when they start. Where the script of export, train, eval or render is loaded,
+    as a module or as ``__main__``, its name `tyro` is bound to a copy whose `cli`, our `_cli`, does this. Scripts that
+    are loaded later are not changed.
     """
     main = sys.modules.get("__main__")
     for name in (_EXPORTER, _TRAIN, *_EVALUATIONS):
@@ -159,9 +159,9 @@ def _with_mesh_export(commands: Any) -> Any:
 
 
 def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
-    """Return `geometry_metrics` of the trained surface and `depth_metrics` of held-out rays, against the exact scene.
+    """Compare the trained surface, and depths along held-out rays, with the exact scene; return figures by name.
 
-    The result is empty if the exact scene is not known. This function is here because `training` imports no evaluation.
+    See `geometry_metrics` and `depth_metrics`, which `training` may not import; no figures without an exact scene.
     """
     from nerfstudio.utils.rich_utils import CONSOLE
     from rich.markup import escape

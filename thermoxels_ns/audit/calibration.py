@@ -54,9 +54,9 @@ class Calibration:
 def calibrated(
     conditions: Conditions, surface: AuditedSurface, groups: AlikeTriangles, draws: Draws
 ) -> Calibration | None:
-    """Find the unknown properties of `Conditions.calibrate`; None if the conditions have no `calibrate`.
+    """Find the unknown properties of `Conditions.calibrate`; return None if the conditions have no `calibrate`.
 
-    Raises `AuditError` or `HeatError` if the model in the conditions does not fit the mesh.
+    `groups` are the `alike_triangles` of `surface`. Raises `AuditError` or `HeatError` if mesh and model do not fit.
     """
     asked = conditions.calibrate
     if asked is None:

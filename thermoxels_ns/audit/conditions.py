@@ -33,7 +33,7 @@ FILM_MODELS: Mapping[Side, tuple[FilmModel, ...]] = {
     "outside": ("iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo", "given"),
     "inside": ("madding", "iso-6946", "iso-6946-combined", "given"),
 }
-WINDY: tuple[FilmModel, ...] = ("iso-6946", "albatici-tonelli", "dallo")  # Models that need the wind if seen outside
+WINDY: tuple[FilmModel, ...] = ("iso-6946", "albatici-tonelli", "dallo")  # Models that need the wind on outer sides
 
 EXAMPLE = "conditions-example.yaml"
 MOST_UNKNOWN = 4  # Largest number of properties that one calibration may search for
@@ -114,8 +114,8 @@ class Film:
     """The model of heat exchange between surface and surroundings, with its uncertainty."""
 
     model: FilmModel
-    factor: Annotated[Measured, Unit("1", 0.0)]  # Factor of convection; of all heat for dallo and iso-6946-combined
-    coefficient: Annotated[Measured, Unit("W/(m2 K)", 0.0)] | None = None  # Of convection, for the model "given" only
+    factor: Annotated[Measured, Unit("1", 0.0)]  # Multiplies convection; all heat for dallo and iso-6946-combined
+    coefficient: Annotated[Measured, Unit("W/(m2 K)", 0.0)] | None = None  # Convection, for model "given" only
 
     def __post_init__(self) -> None:
         if (self.model == "given") != (self.coefficient is not None):
@@ -176,7 +176,7 @@ class Year:
     """A heating season, with the price and the carbon dioxide of heat."""
 
     degree_days: Annotated[Measured, Unit("K d")]  # Inside minus outside air, summed over the season
-    price: Annotated[Measured, Unit("/kWh")] | None = None
+    price: Annotated[Measured, Unit("/kWh")] | None = None  # Price of heat, in `currency`
     currency: str = ""
     co2: Annotated[Measured, Unit("kg/kWh")] | None = None  # Carbon dioxide per heat
 
@@ -185,7 +185,7 @@ class Year:
 class Layer:
     """A layer that the mesh does not contain, such as insulation, on the side that was not photographed."""
 
-    patches: tuple[str, ...]  # Patches that the layer lies on, by name or pattern; `Calibrate.behind` holds them
+    patches: tuple[str, ...]  # Names or patterns of patches in `Calibrate.behind` on which the layer lies
     thickness: Annotated[Measured, Unit("m", 0.0, above=True)]
     conductivity: Conductivity
 
@@ -211,7 +211,7 @@ class Calibrate:
     unknown: tuple[Unknown, ...]  # One to `MOST_UNKNOWN` properties to search for
     layers: dict[str, Layer] = field(default_factory=dict)
     film: dict[str, Annotated[Measured, Unit("W/(m2 K)", 0.0, above=True)]] = field(default_factory=dict)
-    """Convection by name or pattern of photographed patches, in place of the film model; radiation is added."""
+    """Coefficient of convection by name or pattern of photographed patches, in place of the film model's."""
     behind: tuple[str, ...] = ("interior-*",)  # Patches in contact with the air on the side not photographed
     adiabatic: tuple[str, ...] = ("cut",)  # Patches that no heat crosses
 
@@ -249,7 +249,7 @@ class Conditions:
     camera: Camera
     surfaces: Annotated[tuple[Surface, ...], Field(min_length=1)]
     outside: OutsideAir = field(default_factory=OutsideAir)  # May be left out if the surface was seen from inside
-    leave_out: tuple[str, ...] = ()  # Patches that mirror, such as glass and metal, by name or pattern
+    leave_out: tuple[str, ...] = ()  # Names or patterns of patches that do not count, such as glass or metal
     references: tuple[Reference, ...] = ()  # If there are none, `Camera.offset` is used as stated
     storeys: dict[str, Annotated[Measured, Unit("m")]] = field(default_factory=dict)
     """Height of the floor of each storey above the lowest point of the mesh, [m], by name of the storey."""

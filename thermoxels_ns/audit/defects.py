@@ -37,7 +37,7 @@ class FoundDefect:
     """One thermal bridge or other defect; integer arrays hold the indices of its boundary triangles."""
 
     kind: DefectKind
-    patch: int
+    patch: int  # Place in `Selection.patch_names`
     core: IntArray  # Triangles that depart by more than noise
     zone: IntArray  # The core and the triangles around, from which heat flows sideways to the core
     reference: IntArray  # Undisturbed triangles near by, which the zone is compared with
@@ -50,10 +50,10 @@ class FoundDefect:
 def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, least_k: float) -> list[FoundDefect]:
     """Find defects: connected triangles whose temperature departs from the undisturbed temperature of their patch.
 
-    A triangle departs if its temperature differs by more than three standard deviations, by more than `least_k` and by
-    more than 0.1 K from the patch's `undisturbed_temperature`, or as much from its own `background_c`. The first test
-    finds large defects, the second finds defects weaker than the slow changes over a wall. At least one triangle of a
-    defect differs by twice the least departure. Triangles of `AuditedSurface.rim` never count.
+    A triangle departs if its temperature differs from the patch's `undisturbed_temperature` by the least departure: the
+    largest of three standard deviations, `least_k` and 0.1 K. It also departs if its difference from its `background_c`
+    does so, which finds defects weaker than slow changes over a wall. In every defect at least one triangle departs by
+    twice the least departure. Triangles of `AuditedSurface.rim` never belong to a defect's core.
 
     Args:
         surface: The audited surface.
@@ -85,8 +85,8 @@ def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, lea
 def background_c(points_m: FloatArray, surface_c: FloatArray, area_m2: FloatArray) -> FloatArray:
     """Return the temperature of most of the surface around each point, shape (k,), [degrees Celsius].
 
-    The surface is divided into cells of 0.25 m. The result is the median, by area, of the mean temperatures of the
-    cells within 1.25 m. Strips and spots of less than half of the area within 1.25 m hardly change the result.
+    Points are centroids of triangles, (k, 3), in cells of 0.25 m. The result is the median, by area, of the mean
+    temperatures of cells within 1.25 m. Strips and spots of less than half of this area hardly change the result.
     """
     _, cell = np.unique(np.floor(points_m / _CELL_M).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()

@@ -74,7 +74,7 @@ class Draws:
         return self.values[name]
 
     def local(self, off_by: float, number: int) -> FloatArray:
-        """Draw errors of at most `off_by`, independent for each `number`, shape (1 + k,); the first error is 0."""
+        """Return random errors within +- `off_by`, (1 + k,), the first 0; each `number`, a seed, has its own errors."""
         if not self.errors_of_parts:
             return np.zeros(self.count)
         drawn = np.random.default_rng((self.seed, number)).uniform(-off_by, off_by, self.count)
@@ -83,7 +83,7 @@ class Draws:
 
 
 def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:
-    """Draw each uncertain quantity uniformly: its range is cut into `count` equal parts, with one draw in each part."""
+    """Draw `count` values of each uncertain quantity, one at random in each of `count` equal parts of its range."""
     generator = np.random.default_rng(seed)
     values = {}
     for name, what in uncertain(conditions).items():
@@ -106,7 +106,7 @@ def one_at_a_time(conditions: Conditions) -> Iterator[tuple[str, Draws]]:
 
 
 def uncertain(conditions: Conditions) -> dict[str, Measured]:
-    """Return all stated quantities that enter the results, by the names that reports use; exact ones are included."""
+    """Return all stated quantities that enter the results, by the names that reports use; also exact quantities."""
     film, camera, around = conditions.film, conditions.camera, conditions.surroundings
     named: dict[str, Measured | None] = {
         "inside air": conditions.inside.air,
@@ -128,7 +128,7 @@ def uncertain(conditions: Conditions) -> dict[str, Measured]:
 
 
 def emissivity_name(conditions: Conditions, number: int) -> str:
-    """Return the name that reports use for the emissivity in place `number` of `Conditions.surfaces`."""
+    """Return the name that reports use for the emissivity of entry `number`, from 0, of `Conditions.surfaces`."""
     return f"emissivity of {', '.join(conditions.surfaces[number].patches)}, entry {number + 1}"
 
 

@@ -53,7 +53,7 @@ class PartTotals(NamedTuple):
 def exchange(conditions: Conditions, groups: AlikeTriangles, draws: Draws, warmer_k: float = 0.0) -> Exchange:
     """Return the surface temperature and the heat flow of each group in each draw.
 
-    Readings, to which `warmer_k` [K] is added, are corrected for emissivity and reflection; flow is the film model's.
+    Readings plus `warmer_k` [K] are corrected for emissivity and reflection; the film model gives the heat flow.
     """
     emissivity = np.stack([draws[emissivity_name(conditions, n)] for n in range(len(conditions.surfaces))])
     emissivity = emissivity[groups.surface_entry]
@@ -73,7 +73,7 @@ def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
 def part_totals(
     conditions: Conditions, groups: AlikeTriangles, draws: Draws, area_m2: sparse.csr_array, warmer_k: float = 0.0
 ) -> PartTotals:
-    """Return totals and means over p parts; `area_m2`, shape (p, g), is the area of each group in each part, [m2]."""
+    """Return totals of p parts; `area_m2`, (p, g), is each group's area in each part; `warmer_k`: see `exchange`."""
     columns, count = area_m2.tocsc(), len(groups.reading_c)
     total = np.asarray(area_m2.sum(axis=1)).reshape(-1, 1)
     flow_w, temperature = np.zeros((len(total), draws.count)), np.zeros((len(total), draws.count))
@@ -156,7 +156,7 @@ def film_flow_w_m2(
 
 
 def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], ...]:
-    """Return each film model for which the conditions state enough, with conditions that use the model; own first."""
+    """Return the film models for which the conditions suffice, with conditions that use them; the stated one first."""
     own = conditions.film
     windless = conditions.side == "outside" and conditions.outside.wind is None
     others: list[tuple[FilmModel, Conditions]] = [
@@ -193,7 +193,7 @@ def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draw
 
 
 def reference_doubts(conditions: Conditions, draws: Draws) -> tuple[str, ...]:
-    """Return a sentence if the offset that the references ask for lies outside the stated range; else nothing."""
+    """Return one sentence if the offset in `draws`, from `with_references`, is outside its stated range; else none."""
     stated, found = conditions.camera.offset, draws["camera offset"]
     if not conditions.references or (stated.low <= found.max() and found.min() <= stated.high):
         return ()

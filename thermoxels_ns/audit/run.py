@@ -91,7 +91,7 @@ class Defect:
     departure_k: float  # Absolute difference between `spot_c` and `undisturbed_c`, [K]
     spot_c: Interval  # Mean temperature of the square decimetre that departs most, [degrees Celsius]
     undisturbed_c: float  # Mean temperature of the undisturbed surface near by, [degrees Celsius]
-    incidence: Interval | None  # Result of `incidence_factor`
+    incidence: Interval | None  # I_tb, the result of `incidence_factor`, which may be None
     extra_w: Interval  # Extra heat flow from inside to outside, [W]
     coefficient: Interval
     """Of a line psi, [W/(m K)]; of a point chi, [W/K]; of an area its extra heat flow per kelvin, [W/K]."""
@@ -134,8 +134,8 @@ class Audit:
     year: YearResult | None
     calibration: Calibration | None
     f_rsi: tuple[Interval, ...]  # Temperature factors of the coldest square decimetre, see `Defect.f_rsi`
-    budget: Mapping[str, float]  # Difference in loss between the lowest and highest value of each quantity alone, [W]
-    not_counted_m2: Mapping[str, float]  # Area that does not count, by the reasons in `WHY_NOT`
+    budget: Mapping[str, float]  # By quantity, the change of loss from its lowest to its highest value, [W]
+    not_counted_m2: Mapping[str, float]  # Area of triangles that do not count, by the texts of `WHY_NOT`
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
     triangle_u: FloatArray  # U-value and both ends of its interval, shape (f, 3), [W/(m2 K)]; NaN: does not count
@@ -367,7 +367,7 @@ def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ..
 
 
 def verdict(found: Interval, limit: float, at_most: bool = True) -> Verdict:
-    """Return "met" or "not met" if all of an interval meets or misses a limit, and "cannot tell" otherwise.
+    """Return "met" or "not met", or "cannot tell" if `limit`, an upper bound with `at_most`, lies in the interval.
 
     >>> verdict(Interval(0.3, 0.2, 0.4), 0.5), verdict(Interval(0.3, 0.2, 0.4), 0.25)
     ('met', 'cannot tell')
@@ -419,7 +419,7 @@ def _year(conditions: Conditions, draws: Draws, coupling_w_k: FloatArray) -> Yea
 
 
 def check_survey(conditions: Conditions) -> SurveyCheck:
-    """Compare the conditions of a survey with what EN 13187 asks for."""
+    """Return in what the conditions of a survey fall short of EN 13187, in sentences."""
     survey, wind, difference = conditions.survey, conditions.outside.wind, conditions.difference_k
     least, sun, dry = survey.least_difference_24h, survey.hours_since_sun, survey.hours_dry
     forbidden = []

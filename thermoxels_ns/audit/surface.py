@@ -61,7 +61,7 @@ class AuditedSurface:
         return self.counted & unknown[facets].any(axis=1)
 
     def spot(self, which: IntArray, amount: FloatArray) -> IntArray:
-        """Return the triangles of `which` with the largest `amount`, shape (k,) each, that together reach `SPOT_M2`."""
+        """Return the triangles of `which`, (k,), with largest `amount`, (k,), that just reach the area `SPOT_M2`."""
         ranked = which[np.argsort(-amount, kind="stable")]
         return ranked[: int(np.searchsorted(np.cumsum(self.area_m2[ranked]), SPOT_M2 * (1.0 - 1e-9))) + 1]
 
@@ -77,12 +77,12 @@ class AlikeTriangles:
     up: tuple[float, float, float]  # Unit vector that points up
 
     def some(self, part: slice) -> AlikeTriangles:
-        """Return the groups in `part`, with an empty `of_triangle`."""
+        """Return the groups in the slice `part`, with an empty `of_triangle`."""
         none = np.zeros(0, dtype=np.int64)
         return AlikeTriangles(self.reading_c[part], self.normal[part], self.surface_entry[part], none, self.up)
 
     def rows(self, parts: list[IntArray], area_m2: FloatArray) -> sparse.csr_array:
-        """Return the area of each group within each part, a set of triangles that count, shape (parts, g), [m2]."""
+        """Return each group's area in each of `parts`, indices of triangles that count; shape (parts, g), [m2]."""
         row = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         which = np.concatenate([*parts, np.zeros(0, dtype=np.int64)]).astype(np.int64)
         shape = (len(parts), len(self.reading_c))
@@ -169,7 +169,7 @@ def alike_triangles(surface: AuditedSurface) -> AlikeTriangles:
 
 
 def chosen_names(name: str, names: tuple[str, ...], patterns: Iterable[str], what: str = "patches") -> set[str]:
-    """Return the names that match any pattern; raises `AuditError` for a pattern that matches no name."""
+    """Return those of `names` that match a pattern; raises `AuditError` on entry `name` if a pattern has no match."""
     chosen = set[str]()
     for pattern in patterns:
         found = matching_names(names, pattern)

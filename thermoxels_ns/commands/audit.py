@@ -53,7 +53,7 @@ class Audit:
     """Draw pictures for the page."""
 
     def main(self) -> None:
-        """Run; raises `ThermoxelsError` if the mesh, the conditions or an option cannot be used."""
+        """Run the audit; raises `ThermoxelsError` if the mesh, the conditions or an option cannot be used."""
         from rich.console import Console
 
         console = Console(highlight=False)
@@ -63,7 +63,7 @@ class Audit:
 
 
 def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
-    """Audit a mesh, write all files and return the result; or, with `write_conditions`, write an example: None."""
+    """Audit a mesh, write all files, return the result; with `options.write_conditions`, only write an example."""
     from thermoxels_ns.audit.conditions import load_conditions, write_example
     from thermoxels_ns.audit.run import audit
     from thermoxels_ns.commands.audit_photographs import photographs_of_defects

@@ -337,7 +337,7 @@ def _write_csv(path: Path, head: Sequence[str], lines: Iterable[Sequence[object]
 
 
 def measure(scene: Path, setting: CostSetting, name: str, folder: Path, keep_model: bool, console: Console) -> Figures:
-    """Train a setting and evaluate the model; return all figures. Log, model and results are files called `name`."""
+    """Train a setting, evaluate the model, return all figures. Logs, model and results in `folder` are named `name`."""
     models, logs, evaluations = (writable_folder(folder / part) for part in ("models", "logs", "eval"))
     shutil.rmtree(models / name, ignore_errors=True)
     run_folder, output = models / name / setting.method / "run", evaluations / f"{name}.json"
@@ -354,7 +354,7 @@ def measure(scene: Path, setting: CostSetting, name: str, folder: Path, keep_mod
 
 
 def training_seconds(run_folder: Path) -> float:
-    """Return the seconds from the start of training, told by dataparser_transforms.json, to the last checkpoint."""
+    """Return the seconds of training, from the file time of dataparser_transforms.json to the last checkpoint's."""
     start = run_folder / "dataparser_transforms.json"
     checkpoints = sorted((run_folder / "nerfstudio_models").glob("step-*.ckpt"))
     if not (start.is_file() and checkpoints):
@@ -365,7 +365,7 @@ def training_seconds(run_folder: Path) -> float:
 
 
 def read_evaluation(path: Path) -> Figures:
-    """Read the figures that ns-eval wrote; NaN for figures that are missing. Raises `ThermoxelsError`."""
+    """Read the figures that ns-eval wrote; NaN for missing figures. Raises `ThermoxelsError` for a damaged file."""
     expected, remedy = "the results of ns-eval", "Start the command again; finished runs are kept."
     content = read_json(path, expected, remedy)
     try:

@@ -56,7 +56,7 @@ class Target:
 def read_results(eval_json: Path, summary_json: Path) -> tuple[tuple[Target, ...], tuple[tuple[str, str], ...]]:
     """Read the results of ``ns-eval`` (on held-out views) and of ``ns-export thermoxels-mesh``.
 
-    Returns the figures with a target, and pairs of name and text of further figures. Raises `ThermoxelsError`.
+    Returns the figures with a target, and name and text of further ones. Raises `ThermoxelsError` if one is missing.
     """
     image = numbers_of(eval_json, "results")
     truth, heat, mesh = (numbers_of(summary_json, name) for name in ("truth", "heat", "mesh"))
@@ -105,7 +105,7 @@ def read_results(eval_json: Path, summary_json: Path) -> tuple[tuple[Target, ...
 
 
 def numbers_of(path: Path, name: str) -> Callable[[str], float]:
-    """Read the object `name` of a json file; return a function from a key to the number that the object has there.
+    """Return a function that takes a key and returns the number under it in the object `name` of a json file.
 
     The function returns NaN for null, which stands for a figure that does not exist, for instance without a surface.
     The function raises `ThermoxelsError` if the key is missing or its value is no number.
@@ -137,7 +137,7 @@ class Compared:
 
 
 def compare(answers: Path, rules: Path) -> tuple[Compared, ...]:
-    """Compare the U-values and psi in an audit's answers.json with the exact house; `rules` is its file of patches."""
+    """Compare the U-values and psi in an audit's answers.json with the exact house; `rules`: the house's patch file."""
     content, true = read_json_object(answers, _AGAIN), true_u_of_patches(rules)
     found = [
         Compared(one["name"], "W/(m2 K)", true[one["name"]], Interval(**one["u_w_m2k"])) for one in content["patches"]
@@ -180,7 +180,7 @@ def demo_page(
 ) -> str:
     """Return the html text of a demo's page; raises `ThermoxelsError` if a picture is missing in the demo's folder.
 
-    `seconds` has name and duration of each step in order; `next_steps` has commands and what each command does.
+    `others`: names and texts of figures; `seconds`: names and durations of steps; `next_steps`: commands and sentences.
     """
     from matplotlib import colormaps
     from matplotlib.colors import to_hex

@@ -156,7 +156,7 @@ class CheckedOptions(NamedTuple):
 
 @dataclass(frozen=True)
 class TrainedScene:
-    """A trained field and all of its training run that an export needs."""
+    """A trained field, and what else an export needs from the training run."""
 
     snapshot: GridSnapshot
     world_to_input: FloatArray
@@ -305,7 +305,7 @@ def up_of(
 
 
 def prepare_folder(output_dir: Path | str) -> Path:
-    """Make the folder of an export, remove half-written files; raises `OutputError` if it holds files of others."""
+    """Make and return an export's folder without half-written files; raises `OutputError` if it has files of others."""
     from thermoxels_ns.heat.vtk_series import STEP_PATTERN
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS
 

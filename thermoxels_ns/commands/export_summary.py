@@ -29,13 +29,13 @@ SKIPPED_EFFECTS = (
     "Space that no camera saw and that the mesh leaves empty, such as the inside of a building seen from outside with "
     "--interior hollow or --wall-thickness. The heat content is that of the mesh.",
 )
-"""What is missing from the heat balance where no effect acts; where some do, the last entry alone."""
+"""What the heat balance lacks if no effect acts; if any effect acts, it lacks only what the last sentence says."""
 
 
 def lines_on_mesh(
     built: BuiltMesh, region: Mapping[str, Any], volume: float, unit: str, voxel_size: float
 ) -> Iterator[str]:
-    """Yield lines on each step that found the solid, and on the mesh; `volume` and `voxel_size` are in `unit`."""
+    """Yield lines on each step to the solid, and on the mesh; `region` is the `region_summary`, lengths in `unit`."""
     for step in built.solid.steps:
         amounts = []
         for sign, voxels in (("+", step.added), ("-", step.removed)):

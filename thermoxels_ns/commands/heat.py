@@ -140,7 +140,7 @@ def read_export_summary(mesh: Path, say: Say) -> dict[str, Any]:
 
 
 def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
-    """Return the content of answers.json."""
+    """Return the content of answers.json for a heat run."""
     solution, accuracy = run.solution, run.accuracy
     error, time_error_k = getattr(solution, "error", None), getattr(solution, "time_error_k", math.nan)
     return {

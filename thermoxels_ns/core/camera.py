@@ -22,9 +22,9 @@ _MOST_PIXELS = 1_000_000  # Most pixels along a side
 class Camera:
     """The projection of one camera; fields are named as in transforms.json, lengths are in pixels.
 
-    Poses passed to methods are camera to world with x right, y up, z back (OpenGL), as in transforms.json. Points in
-    camera axes have x right, y down, z ahead (OpenCV). The centre of the top left pixel is at (0.5, 0.5). `project`,
-    `rays` and `directions` are right for perspective lenses only.
+    Poses passed to methods, (3, 4) or (4, 4), are camera to world with x right, y up, z back (OpenGL), as in
+    transforms.json. Points in camera axes have x right, y down, z ahead (OpenCV). The centre of the top left pixel is
+    at (0.5, 0.5). `project`, `rays` and `directions` are right for perspective lenses only.
     """
 
     width: int
@@ -76,7 +76,7 @@ class Camera:
         return replace(self, width=width, height=height, **lengths)
 
     def scaled(self, factor: float) -> Camera:
-        """Return the same camera with `factor` times as many pixels along each side; a last fraction is cut off."""
+        """Return the same camera with `factor` times as many pixels along each side, rounded down."""
         width, height = (max(int(length * factor + 1e-6), 1) for length in (self.width, self.height))
         lengths = {name: getattr(self, name) * factor for name in ("fl_x", "fl_y", "cx", "cy")}
         return replace(self, width=width, height=height, **lengths)
@@ -89,13 +89,13 @@ class Camera:
         return self._distort(local[:, :2] * scale[:, None]) * (self.fl_x, self.fl_y) + (self.cx, self.cy)
 
     def project_world(self, pose: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
-        """Return the pixels (n, 2) of world points (n, 3) by a pose (3, 4) or (4, 4); NaN for points not ahead."""
+        """Return the pixels (n, 2) of world points (n, 3) for a camera at `pose`; NaN for points not ahead."""
         pose = np.asarray(pose, dtype=np.float64)
         local = (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
         return self.project(local * (1.0, -1.0, -1.0))
 
     def rays(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Return the points (n, 3) at depth 1 in OpenCV camera axes that project to pixels (n, 2): undo `project`."""
+        """Return the points (n, 3) at depth 1, in OpenCV camera axes, that `project` maps to the pixels (n, 2)."""
         pixels = np.asarray(pixels, dtype=np.float64)
         distorted = (pixels - (self.cx, self.cy)) / (self.fl_x, self.fl_y)
         plane = distorted

@@ -33,14 +33,17 @@ def is_number(value: object) -> TypeGuard[float]:
 
 
 def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> float:
-    """Return `value` as a float if it is a finite number above zero (True is no number), else raise `error`."""
+    """Return `value` as a float if it is a finite number above 0, else raise `error` with `name` and `remedy`."""
     if not (is_number(value) and math.isfinite(value) and value > 0):
         raise error(name, expected="a finite number above 0", got=repr(value), remedy=remedy)
     return float(value)
 
 
 def check_ranges(prefix: str, values: Mapping[str, tuple[Any, float, float, str]]) -> None:
-    """Raise `ThermoxelsError` for an option out of range; `values` holds (value, least, largest, range in words)."""
+    """Raise `ThermoxelsError` if the value of an option is out of range or NaN.
+
+    `values` maps names to (value, least, largest, range in words); messages put `prefix`, such as "--", before them.
+    """
     for name, (value, low, high, expected) in values.items():
         if not low <= value <= high:  # NaN fails too
             remedy = f"Correct {prefix}{name.replace('_', '-')}."
@@ -83,9 +86,9 @@ def check_direction(
 
 
 def writable_folder(path: Path | str, room_bytes: float = 0.0) -> Path:
-    """Make the folder `path` if needed and return it, or raise `OutputError`.
+    """Make the folder `path` if needed and return it.
 
-    The folder must take a temporary file, as permission bits lie (root, network drives), and have `room_bytes` free.
+    Raises `OutputError` if no temporary file can be made in the folder, or if fewer than `room_bytes` are free there.
     """
     folder = Path(path)
     try:
@@ -114,7 +117,7 @@ def plain_os_errors(
     remedy: str = "Check free space, permissions and the length of names.",
     error: type[ThermoxelsError] = OutputError,
 ) -> Iterator[None]:
-    """Raise an OSError of the block as `error`, which names the file, or `what` if the system names none."""
+    """Turn an OSError of a with block into `error`, about the file that the system names, or else about `what`."""
     try:
         yield
     except ThermoxelsError:
@@ -125,13 +128,13 @@ def plain_os_errors(
 
 
 def remedy_of(problem: Exception, remedy: str) -> str:
-    """Return the remedy for an error of reading a file: `remedy`, or another if the file exists but cannot be read."""
+    """Return `remedy` for an error of reading a file, or advice on permissions if the system refused."""
     refused = isinstance(problem, OSError) and problem.errno not in (None, errno.ENOENT)
     return "Check its permissions and the disk, or copy it again." if refused else remedy
 
 
 def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock:
-    """Lock `file` in an output folder for this process, or raise `OutputError` if another process has locked it.
+    """Lock `file` in an output folder and return the lock; raise `OutputError` if another process has locked `file`.
 
     The system releases the lock when the process ends in any way. On a drive without locks, `say` receives a warning.
     """
@@ -156,10 +159,8 @@ def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock
 def replace_when_done(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename the file there to `path` only if the block ends without an error.
 
-    The temporary name keeps the suffix, by which writers choose their format.
-
-    Raises:
-        OutputError: The block or the renaming ended in an error of the operating system.
+    The temporary name keeps the suffix, by which writers choose their format. Raises `OutputError` if the block or the
+    renaming ends in an error of the operating system.
     """
     final = Path(path)
     temporary = final.with_name(f".{final.stem}.{os.getpid()}.part{final.suffix}")
@@ -214,11 +215,10 @@ def result_folder(
     if the command would replace or remove files that it did not write.
 
     Args:
-        path: The folder.
-        files: Names of all files that the command may write.
+        files: Names of all files in the folder `path` that the command may write.
         own: Names of files that a run writes first and last. If none exists, the command wrote none of `files`.
         others: Names of files by which results of another command are recognised.
-        series: Pattern of files in a subfolder, as ``heat/step-*.vtu``; None: the command writes no such files.
+        series: Pattern of files in a subfolder, as ``heat/step-*.vtu``; None if the command writes no such files.
     """
     folder, steps = writable_folder(path), [] if series is None else [series]
     refuse_what_is_in_the_way(folder, files, [Path(name).parent.name for name in steps])

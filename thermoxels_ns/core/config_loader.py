@@ -108,7 +108,7 @@ def typed_value(option: str) -> str | None:
 
 
 class ModuleWith(ModuleType):
-    """A module that has the names of another module, some of them `replaced`."""
+    """A stand-in for `module`: names in `replaced` have the values given there, all others those of `module`."""
 
     def __init__(self, module: ModuleType, **replaced: Any) -> None:
         super().__init__(module.__name__, doc=module.__doc__)

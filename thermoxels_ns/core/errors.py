@@ -6,7 +6,7 @@ _UNPRINTED = ("Cc", "Cs")  # categories of control characters, which break lines
 
 
 class ThermoxelsError(Exception):
-    """Base of all errors caused by the input, not by the program. Without `expected`, `what` is the whole message."""
+    """Base of all errors caused by the input. `what` names the wrong entry; without `expected`, it is the message."""
 
     def __init__(self, what: str, *, expected: str | None = None, got: object = None, remedy: str = "") -> None:
         super().__init__(what if expected is None else explain(what, expected=expected, got=got, remedy=remedy))
@@ -29,7 +29,7 @@ class CheckpointError(ThermoxelsError, ValueError):
 
 
 class PruningError(ThermoxelsError, RuntimeError):
-    """Pruning would open too many rays that end on something: it would remove a part of the scene."""
+    """Pruning was refused: rays that end on a surface would pass, because voxels of that surface would go."""
 
 
 class MemoryBudgetError(ThermoxelsError, MemoryError):
@@ -37,11 +37,11 @@ class MemoryBudgetError(ThermoxelsError, MemoryError):
 
 
 class MeshError(ThermoxelsError, ValueError):
-    """No valid mesh can be cut from the density field."""
+    """No valid mesh can be made, read or written with these options or this input."""
 
 
 class HeatError(ThermoxelsError, ValueError):
-    """A heat problem is not well posed, or the solver did not converge."""
+    """A heat scene is wrong or does not fit its mesh, or the solver failed."""
 
 
 class AuditError(ThermoxelsError, ValueError):

@@ -22,7 +22,7 @@ _RAYS_AT_ONCE = 1 << 18  # Rays whose neighbours are sought at once, to limit me
 
 @dataclass(frozen=True, eq=False)
 class FeatureRays:
-    """Rays from camera centres to points on which photographs agree; the space between is air. [world units]"""
+    """Rays from camera centres to points on which photographs agree, in world units; rays pass through air only."""
 
     origins: FloatArray  # Camera centre of each ray, shape (s, 3)
     point: IntArray  # Index into `points` of each ray, ascending, shape (s,)
@@ -46,13 +46,13 @@ class FeatureRays:
 
 
 def agrees_with_neighbours(rays: FeatureRays) -> BoolArray:
-    """Return which points are about as far away as their neighbours in the photographs, (n,); wrong matches are not.
+    """Return which points, (n,), are about as far from the cameras as their neighbours; wrong matches rarely are.
 
-    Neighbours of a point in a photograph (all rays of one origin) are the `NEIGHBOURS` points seen nearest to it. The
-    photograph vouches for the point if at least half of these agree in distance, within the largest of `STEEPEST` times
-    their distance across the ray, the share `LEAST_TOLERANCE` of the distance, and `TOLERANCE_ERRORS` standard errors,
-    or if there are fewer than `FEWEST_NEIGHBOURS`. A point passes if at least half of its photographs vouch for it, or
-    if it has no rays. A point on a thin thing in front of other things may fail.
+    A photograph is all rays of one origin. A point's neighbours are the `NEIGHBOURS` points seen nearest to the point
+    in a photograph. The photograph vouches for the point if it shows fewer than `FEWEST_NEIGHBOURS`, or if at least
+    half of them differ in distance by at most the largest of: `STEEPEST` times their distance across the ray, the share
+    `LEAST_TOLERANCE` of the distance, `TOLERANCE_ERRORS` standard errors. A point is True if at least half of its
+    photographs vouch for it, or if it has no rays. A point on a thin thing in front of other things may be False.
     """
     from scipy.spatial import KDTree  # slow to import and only needed here
 

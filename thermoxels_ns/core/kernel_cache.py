@@ -16,11 +16,11 @@ _DIGEST = "thermoxels-kernels.sha256"
 
 
 def kernel(function: Callable | None = None, **options: Any) -> Any:
-    """Return the function compiled with numba at its first call, without the interpreter's lock, cached on disk.
+    """Decorate a function so that numba compiles it at its first call, caches it on disk, and releases Python's lock.
 
-    A kernel may call kernels of its own room (subpackage) and of ``core``, and holds constants of their files. As numba
-    watches only the kernel's own file, all compiled kernels of a room are removed when any file of the room or of
-    ``core`` has changed. Plain use is ``@kernel``; `options` are those of `numba.njit`, such as
+    A kernel may use kernels and constants of its own room (subpackage) and of ``core``. As numba watches only the
+    kernel's own file, all compiled kernels of a room are removed when any file of the room or of ``core`` has changed.
+    Plain use is ``@kernel``; `options` are those of `numba.njit`, such as
     ``fastmath={"contract"}``. Division by zero gives inf or NaN, as in numpy.
     """
     import numba

@@ -56,7 +56,7 @@ class Lattice:
         return cls(tuple(start.tolist()), h, tuple((cells + 1).tolist()))
 
     def refined(self, factor: int) -> Lattice:
-        """Return the lattice with every voxel split into `factor`^3 voxels; old corners are corners of it too."""
+        """Return the lattice with every voxel split into `factor`^3 voxels; its corners include all old corners."""
         nx, ny, nz = ((n - 1) * factor + 1 for n in self.shape)
         return Lattice(self.lo, self.voxel_size / factor, (nx, ny, nz))
 
@@ -104,7 +104,7 @@ class Lattice:
 
 
 def input_from_world(transform: npt.ArrayLike, scale: float) -> FloatArray:
-    """Return the inverse (4, 4) of a nerfstudio dataparser's p_world = scale * (R p_input + t); `transform` is [R | t].
+    """Return the matrix (4, 4) from world to input, where p_world = scale * (R p_input + t) and `transform` is [R | t].
 
     >>> input_from_world([[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]], 2.0) @ [12, 0, 4, 1]
     array([1., 0., 2., 1.])

@@ -62,8 +62,8 @@ class Unit:
     above: bool = False  # True: the value must be above `low`, not equal to it
 
     def read(self, content: object) -> Measured:
-        """Return `content`, written by a person or a `Measured`, as a value in this unit. Raises a ValueError, which
-        holds a `ThermoxelsError` without a name, if `read_measured` fails or the value is not within the limits."""
+        """Return `content`, a `Measured` or what `read_measured` can read, as a value in this unit. Raises ValueError,
+        made from a `ThermoxelsError` without a name, if it cannot be read or is not within the limits."""
         try:
             found = content if isinstance(content, Measured) else read_measured("", content, self.name)
             low, high = (found.low, found.high) if self.surely else (found.value, found.value)
@@ -84,7 +84,7 @@ class Unit:
 
 
 def read_measured(name: str, content: object, unit: str) -> Measured:
-    """Return in `unit` ("1": none) a value that a person wrote, such as ``20.0 +- 0.5 C``, ``3 ± 1 m/s``, ``0.93``.
+    """Read a value as people write it, such as ``20.0 +- 0.5 C`` or ``0.93``; return it in `unit`, "1" for no unit.
 
     Raises `ThermoxelsError`, which starts with `name`, if the text is no number or its unit is wrong or missing.
 

@@ -22,7 +22,7 @@ class Views:
     size: IntArray  # Image widths and heights, shape (c, 2), [pixels]
 
     def matrices(self) -> FloatArray:
-        """Return matrices from the world to (column, row, 1) times depth, positive ahead of the camera, (c, 3, 4)."""
+        """Return matrices, (c, 3, 4), from points (x, y, z, 1) to depth * (column, row, 1), with depth > 0 ahead."""
         turned = self.camera_to_world[:, :, :3].transpose(0, 2, 1) * [[1.0], [-1.0], [-1.0]]
         local = np.concatenate((turned, -turned @ self.camera_to_world[:, :, 3:]), axis=2)
         local[:, :2] = self.focal[..., None] * local[:, :2] + self.centre[..., None] * local[:, 2:]
@@ -36,11 +36,11 @@ class RayEvidence:
     voxel_weight: Float32Array
     """Sum of the weights that rays spent in each voxel, shape `lattice.cell_shape`, [rays]."""
     half_depth_density: Float32Array
-    """One density per ray with an opacity above 1/2, shape (rays,), [1 / world unit]: the highest at centres of voxels
-    that the ray crosses within half a voxel of the point at which half of its weight is spent."""
+    """For each ray whose opacity exceeds 1/2, the highest density at the centres of the voxels that the ray crosses
+    within half a voxel of the point at which half of its weight is spent, shape (rays,), [1 / world unit]."""
     voxel_ends: Float32Array | None = None
-    """Number of rays that end on a surface and reach half of their weight in each voxel, `lattice.cell_shape`, [rays].
-    None: not known."""
+    """For each voxel, the number of rays that end on a surface and reach half of their weight in the voxel, shape
+    `lattice.cell_shape`. None: not known."""
 
 
 @dataclass(frozen=True)

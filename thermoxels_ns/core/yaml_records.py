@@ -51,7 +51,7 @@ def configs_folder() -> Path:
 
 @contextmanager
 def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
-    """Raise a `ThermoxelsError` of the block as `error`, with `before` in front of its text; context or decorator."""
+    """Turn a `ThermoxelsError` of a with block or decorated function into `error`, with `before` before its text."""
     try:
         yield
     except ThermoxelsError as problem:
@@ -59,7 +59,7 @@ def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the mapping in a yaml file; raises `ThermoxelsError` if there is none, or it is empty or repeats a key."""
+    """Return the mapping in a yaml file; raises `ThermoxelsError` if the file is missing, has no key or one twice."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
     except OSError as problem:
@@ -75,18 +75,18 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def wrong(name: str, expected: str, got: object, remedy: str = "Correct the file.") -> RecordError:
-    """Return the error for a wrong file or an entry called `name`."""
+    """Return an error about file or entry `name`: it should be `expected` but is `got`; `remedy` says what to do."""
     return RecordError(name, expected=expected, got=got, remedy=remedy)
 
 
 def shown(content: object) -> str:
-    """Return content of a file in the form in which messages show it."""
+    """Return a value from a file as text for messages, at most 200 characters; "nothing" for None."""
     return "nothing" if content is None else repr(content)[:200]
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def record(error: type[ThermoxelsError]) -> Callable[[type[Record]], type[Record]]:
-    """Return a decorator for frozen dataclasses whose values pydantic checks by type; all mistakes raise one `error`.
+    """Return a decorator that makes a frozen dataclass with values checked by type; one `error` lists all mistakes.
 
     A class may check several fields together in ``__post_init__`` by raising an error of ours that is a ValueError.
     """
@@ -252,7 +252,7 @@ def read_preset(name: str) -> dict[str, Any]:
 def with_overrides(config: Config, overrides: Mapping[str, Any], name: str = "preset") -> Config:
     """Return a copy of a (nested) dataclass, or a mapping of dataclasses, with the fields in `overrides` replaced.
 
-    A list becomes a tuple where the old value is one. Raises `ThermoxelsError` for a name that `config` does not have.
+    A list in place of a tuple becomes a tuple. Raises `ThermoxelsError` for a name that `config` does not have.
     """
     fields, changed = dict(config) if isinstance(config, Mapping) else vars(config), {}
     for key, value in overrides.items():

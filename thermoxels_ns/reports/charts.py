@@ -53,7 +53,7 @@ def svg_text(figure: Figure) -> str:
 
 
 def histogram(values: npt.NDArray, label: str, percentiles: tuple[float, float] = (0.0, 100.0)) -> str:
-    """Return a histogram of the finite values between two percentiles, as an svg element; empty without values."""
+    """Return an svg element with a histogram of finite values between two percentiles, `label` below; "" if none."""
     values = values[np.isfinite(values)]
     if not values.size:
         return ""
@@ -65,7 +65,7 @@ def histogram(values: npt.NDArray, label: str, percentiles: tuple[float, float] 
 
 
 def bars(values: Sequence[float], label: str) -> str:
-    """Return a chart with one bar per value, up or down from zero, as an svg element; empty without values."""
+    """Return an svg element with one bar per value, up or down from zero, and `label` below; "" without values."""
     if not len(values):
         return ""
     with chart(7.0, 2.2) as (figure, (axis,)):
@@ -103,7 +103,7 @@ def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatAr
 
 
 def colours(temperature_c: npt.NDArray, limits: tuple[float, float] | None = None) -> npt.NDArray[np.uint8]:
-    """Return temperatures, (h, w), as colours, (h, w, 3), black where NaN; `limits` default to `PERCENTILES`."""
+    """Return colours, (h, w, 3), of temperatures, (h, w), from `limits` (default: `PERCENTILES`); black where NaN."""
     import cv2
 
     known = np.isfinite(temperature_c)

@@ -25,7 +25,7 @@ def figure(value: float) -> str:
 
 
 def flow_text(heat_w: float, least_w: float, per_area: float | None = None) -> str:
-    """Return a heat flow, [W], as text, or `per_area`, [W/m^2], if given; "0" if the heat flow is below `least_w`.
+    """Return `per_area`, [W/m^2], or without it `heat_w`, as text; "0" if the size of `heat_w` is below `least_w`, [W].
 
     >>> flow_text(6e-10, 1e-6), flow_text(6e-10, 1e-6, 1e5), flow_text(-12.5, 1e-6), flow_text(1e-2, 1e-6, 1e-3)
     ('0', '0', '-12.50', '0.001000')

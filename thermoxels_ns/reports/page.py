@@ -46,7 +46,7 @@ def image_file(picture: npt.NDArray[np.uint8], kind: Literal["PNG", "JPEG"] = "J
 
 
 def image_address(image: bytes, words: str) -> str:
-    """Return the ``data:`` address that holds a PNG or JPEG file; raises a `ThermoxelsError` on `words` for others."""
+    """Return a PNG or JPEG file as a ``data:`` address; raises a `ThermoxelsError` about `words` for other content."""
     kind = next((kind for signature, kind in _SIGNATURES.items() if image.startswith(signature)), None)
     if kind is None:
         got, remedy = f"{len(image)} bytes that begin with {image[:8]!r}", "Draw the picture again."
