@@ -33,7 +33,7 @@ FILM_MODELS: Mapping[Side, tuple[FilmModel, ...]] = {
     "outside": ("iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo", "given"),
     "inside": ("madding", "iso-6946", "iso-6946-combined", "given"),
 }
-WINDY: tuple[FilmModel, ...] = ("iso-6946", "albatici-tonelli", "dallo")  # Models that need the wind on outer sides
+WINDY: tuple[FilmModel, ...] = ("iso-6946", "albatici-tonelli", "dallo")  # Need the wind speed for an outer surface
 
 EXAMPLE = "conditions-example.yaml"
 MOST_UNKNOWN = 4  # Largest number of properties that one calibration may search for
@@ -115,7 +115,7 @@ class Film:
 
     model: FilmModel
     factor: Annotated[Measured, Unit("1", 0.0)]  # Multiplies convection; all heat for dallo and iso-6946-combined
-    coefficient: Annotated[Measured, Unit("W/(m2 K)", 0.0)] | None = None  # Convection, for model "given" only
+    coefficient: Annotated[Measured, Unit("W/(m2 K)", 0.0)] | None = None  # Convection coefficient; model "given" only
 
     def __post_init__(self) -> None:
         if (self.model == "given") != (self.coefficient is not None):
@@ -211,7 +211,7 @@ class Calibrate:
     unknown: tuple[Unknown, ...]  # One to `MOST_UNKNOWN` properties to search for
     layers: dict[str, Layer] = field(default_factory=dict)
     film: dict[str, Annotated[Measured, Unit("W/(m2 K)", 0.0, above=True)]] = field(default_factory=dict)
-    """Coefficient of convection by name or pattern of photographed patches, in place of the film model's."""
+    """Convection coefficient, beside radiation, by name or pattern of photographed patches; replaces the film model."""
     behind: tuple[str, ...] = ("interior-*",)  # Patches in contact with the air on the side not photographed
     adiabatic: tuple[str, ...] = ("cut",)  # Patches that no heat crosses
 

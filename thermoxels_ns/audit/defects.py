@@ -51,9 +51,9 @@ def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, lea
     """Find defects: connected triangles whose temperature departs from the undisturbed temperature of their patch.
 
     A triangle departs if its temperature differs from the patch's `undisturbed_temperature` by the least departure: the
-    largest of three standard deviations, `least_k` and 0.1 K. It also departs if its difference from its `background_c`
-    does so, which finds defects weaker than slow changes over a wall. In every defect at least one triangle departs by
-    twice the least departure. Triangles of `AuditedSurface.rim` never belong to a defect's core.
+    largest of three standard deviations, `least_k` and 0.1 K. Triangles whose difference from their `background_c`
+    passes the same test depart too: this finds defects weaker than slow changes over a wall. In every defect a
+    triangle departs by twice the least departure. Triangles of `AuditedSurface.rim` never belong to a defect's core.
 
     Args:
         surface: The audited surface.
@@ -86,7 +86,7 @@ def background_c(points_m: FloatArray, surface_c: FloatArray, area_m2: FloatArra
     """Return the temperature of most of the surface around each point, shape (k,), [degrees Celsius].
 
     Points are centroids of triangles, (k, 3), in cells of 0.25 m. The result is the median, by area, of the mean
-    temperatures of cells within 1.25 m. Strips and spots of less than half of this area hardly change the result.
+    temperatures of cells within 1.25 m. Strips and spots of less than half of these cells hardly change the result.
     """
     _, cell = np.unique(np.floor(points_m / _CELL_M).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()

@@ -106,7 +106,7 @@ def one_at_a_time(conditions: Conditions) -> Iterator[tuple[str, Draws]]:
 
 
 def uncertain(conditions: Conditions) -> dict[str, Measured]:
-    """Return all stated quantities that enter the results, by the names that reports use; also exact quantities."""
+    """Return all stated quantities that enter the results, exact ones too, by the names that reports use."""
     film, camera, around = conditions.film, conditions.camera, conditions.surroundings
     named: dict[str, Measured | None] = {
         "inside air": conditions.inside.air,

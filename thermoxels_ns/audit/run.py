@@ -134,7 +134,7 @@ class Audit:
     year: YearResult | None
     calibration: Calibration | None
     f_rsi: tuple[Interval, ...]  # Temperature factors of the coldest square decimetre, see `Defect.f_rsi`
-    budget: Mapping[str, float]  # By quantity, the change of loss from its lowest to its highest value, [W]
+    budget: Mapping[str, float]  # By quantity, how much its range changes the heat loss of `whole`, [W]
     not_counted_m2: Mapping[str, float]  # Area of triangles that do not count, by the texts of `WHY_NOT`
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
@@ -367,7 +367,7 @@ def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ..
 
 
 def verdict(found: Interval, limit: float, at_most: bool = True) -> Verdict:
-    """Return "met" or "not met", or "cannot tell" if `limit`, an upper bound with `at_most`, lies in the interval.
+    """Return whether an interval keeps an upper (`at_most`) or a lower limit; "cannot tell" if the limit is inside.
 
     >>> verdict(Interval(0.3, 0.2, 0.4), 0.5), verdict(Interval(0.3, 0.2, 0.4), 0.25)
     ('met', 'cannot tell')
@@ -419,7 +419,7 @@ def _year(conditions: Conditions, draws: Draws, coupling_w_k: FloatArray) -> Yea
 
 
 def check_survey(conditions: Conditions) -> SurveyCheck:
-    """Return in what the conditions of a survey fall short of EN 13187, in sentences."""
+    """Return sentences on what EN 13187 forbids or misses in the conditions of a survey, and on doubts."""
     survey, wind, difference = conditions.survey, conditions.outside.wind, conditions.difference_k
     least, sun, dry = survey.least_difference_24h, survey.hours_since_sun, survey.hours_dry
     forbidden = []

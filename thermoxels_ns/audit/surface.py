@@ -61,7 +61,7 @@ class AuditedSurface:
         return self.counted & unknown[facets].any(axis=1)
 
     def spot(self, which: IntArray, amount: FloatArray) -> IntArray:
-        """Return the triangles of `which`, (k,), with largest `amount`, (k,), that just reach the area `SPOT_M2`."""
+        """Return the triangles of `which`, (k,), of largest `amount`, (k,), whose areas just add up to `SPOT_M2`."""
         ranked = which[np.argsort(-amount, kind="stable")]
         return ranked[: int(np.searchsorted(np.cumsum(self.area_m2[ranked]), SPOT_M2 * (1.0 - 1e-9))) + 1]
 

@@ -27,7 +27,7 @@ _WIDTH = 480  # Width of a cut-out, [pixels]
 
 
 def photographs_of_defects(folder: Path, metres_per_unit: float, found: Audit) -> dict[int, tuple[Picture, Picture]]:
-    """Return photograph and thermal image of each defect, cut from its largest view, by its place in `found.found`.
+    """Cut each defect out of photograph and thermal image that show it largest; return both by place in `found.found`.
 
     `metres_per_unit` is the length of one unit of the scene's poses, [m]. Defects that no photograph shows are left
     out, and so are defects beyond `MOST_DEFECTS`. Raises `SceneError` if `folder` is no scene.

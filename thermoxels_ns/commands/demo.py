@@ -125,7 +125,7 @@ def prepare_folder(path: Path) -> Path:
 
 
 def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> list[list[str]]:
-    """Return the commands of the demo in order: synthetic, train, eval, render, export; audit for house-corner."""
+    """Return the commands of the demo in order: synthetic, train, eval, render, export and, for house-corner, audit."""
     config = str(folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml")
     survey = folder / "survey"
     patches = ["--patches", str(survey / "patches.yaml")] if scene == _AUDITED else []

@@ -305,7 +305,7 @@ def up_of(
 
 
 def prepare_folder(output_dir: Path | str) -> Path:
-    """Make and return an export's folder without half-written files; raises `OutputError` if it has files of others."""
+    """Make an export's folder, without half-written files; raises `OutputError` if it holds another command's files."""
     from thermoxels_ns.heat.vtk_series import STEP_PATTERN
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS
 

@@ -29,13 +29,13 @@ SKIPPED_EFFECTS = (
     "Space that no camera saw and that the mesh leaves empty, such as the inside of a building seen from outside with "
     "--interior hollow or --wall-thickness. The heat content is that of the mesh.",
 )
-"""What the heat balance lacks if no effect acts; if any effect acts, it lacks only what the last sentence says."""
+"""Sentences on what the heat balance lacks if no effect acts; if any effect acts, only the last one holds."""
 
 
 def lines_on_mesh(
     built: BuiltMesh, region: Mapping[str, Any], volume: float, unit: str, voxel_size: float
 ) -> Iterator[str]:
-    """Yield lines on each step to the solid, and on the mesh; `region` is the `region_summary`, lengths in `unit`."""
+    """Yield lines on each step to the solid, and on the mesh; `region` is `region_summary`, lengths are in `unit`."""
     for step in built.solid.steps:
         amounts = []
         for sign, voxels in (("+", step.added), ("-", step.removed)):

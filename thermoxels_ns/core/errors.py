@@ -6,7 +6,7 @@ _UNPRINTED = ("Cc", "Cs")  # categories of control characters, which break lines
 
 
 class ThermoxelsError(Exception):
-    """Base of all errors caused by the input. `what` names the wrong entry; without `expected`, it is the message."""
+    """Base of all errors caused by the input. `what` names the wrong entry, or, without `expected`, is the message."""
 
     def __init__(self, what: str, *, expected: str | None = None, got: object = None, remedy: str = "") -> None:
         super().__init__(what if expected is None else explain(what, expected=expected, got=got, remedy=remedy))
@@ -29,7 +29,7 @@ class CheckpointError(ThermoxelsError, ValueError):
 
 
 class PruningError(ThermoxelsError, RuntimeError):
-    """Pruning was refused: rays that end on a surface would pass, because voxels of that surface would go."""
+    """Pruning was refused because it would remove surfaces on which too many rays end."""
 
 
 class MemoryBudgetError(ThermoxelsError, MemoryError):

@@ -43,7 +43,7 @@ def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] =
 
 
 def write_json(path: Path, content: Any, error: type[ThermoxelsError] = ThermoxelsError) -> None:
-    """Write `plain_values(content)` as json, or no file: raises `error` for bad values, `OutputError` by the system."""
+    """Write `plain_values(content)` to a json file; raises `error` for bad values, `OutputError` if writing fails."""
     text = json.dumps(plain_values(content, path.stem, error), indent=1, allow_nan=False)
     with replace_when_done(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -74,7 +74,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_json_object(path: Path, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> dict[str, Any]:
-    """Return the object in a json file; raises `error` if the file is missing or damaged, or its content no object."""
+    """Return the object in a json file; raises `error` if the file is missing or damaged or holds another value."""
     content = read_json(path, "a readable json file", remedy, error)
     if not isinstance(content, dict):
         raise error(str(path), expected="a json object", got=type(content).__name__, remedy=remedy)

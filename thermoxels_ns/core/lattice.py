@@ -104,7 +104,7 @@ class Lattice:
 
 
 def input_from_world(transform: npt.ArrayLike, scale: float) -> FloatArray:
-    """Return the matrix (4, 4) from world to input, where p_world = scale * (R p_input + t) and `transform` is [R | t].
+    """Return the matrix (4, 4) from world to input points if p_world = scale * (R p_input + t), `transform` [R | t].
 
     >>> input_from_world([[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]], 2.0) @ [12, 0, 4, 1]
     array([1., 0., 2., 1.])

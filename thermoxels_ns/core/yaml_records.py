@@ -59,7 +59,7 @@ def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the mapping in a yaml file; raises `ThermoxelsError` if the file is missing, has no key or one twice."""
+    """Return the mapping in a yaml file; raises `ThermoxelsError` if the file is missing or empty or repeats a key."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
     except OSError as problem:

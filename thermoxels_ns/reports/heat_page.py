@@ -28,7 +28,7 @@ _CAPTIONS = {
 
 
 def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, command: str, files: Sequence[str]) -> str:
-    """Return the html text of a heat run's page; `pictures` are PNG contents by file name, `files` names beside it."""
+    """Return a heat run's page as html; `pictures` are PNG contents by file name, `files` names of files beside it."""
     results, solution, accuracy = run.results, run.solution, run.accuracy
     flows = [flow for effect in results.effects for flow in (effect.heat_w, effect.last_heat_w)]
     least_w = least_flow(flows, sum(patch.area_m2 for patch in results.patches))
