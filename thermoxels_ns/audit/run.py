@@ -419,7 +419,7 @@ def _year(conditions: Conditions, draws: Draws, coupling_w_k: FloatArray) -> Yea
 
 
 def check_survey(conditions: Conditions) -> SurveyCheck:
-    """Return sentences on what EN 13187 forbids or misses in the conditions of a survey, and on doubts."""
+    """Return what EN 13187 forbids and misses in the conditions of a survey, and what makes results doubtful."""
     survey, wind, difference = conditions.survey, conditions.outside.wind, conditions.difference_k
     least, sun, dry = survey.least_difference_24h, survey.hours_since_sun, survey.hours_dry
     forbidden = []
