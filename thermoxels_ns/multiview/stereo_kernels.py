@@ -145,8 +145,8 @@ def correlate(channels, others, radius, weights, means, variances, noise, count,
 def aggregate(cost, features, small, large, edge, total):
     """Fill `total` with the mean of the least costs of paths from eight directions (Hirschmueller 2008, eq. 13).
 
-    Between two pixels of a path, a change of one plane costs `small`. A change of more planes costs `large`, or less
-    where the pixels' `features` (h, w, f) differ, half at a difference of `edge`. `cost` and `total`: (h, w, planes).
+    Between two pixels of a path, a change of one plane costs `small`. A larger change costs `large` / (1 + d / `edge`),
+    at least `small`; d is the difference of the pixels' `features` (h, w, f). `cost` and `total`: (h, w, planes).
     """
     rows, columns, planes = cost.shape
     total[:] = 0.0

@@ -109,7 +109,7 @@ def conditions_text(conditions: Conditions) -> str:
 
 
 def check_between(name: str, value: float, low: float, high: float, expected: str, *, zero: bool = True) -> None:
-    """Raise `ThermoxelsError` if setting `name` is no number from `low` to `high`, or not above 0 with `zero` False."""
+    """Raise `ThermoxelsError` unless setting `name` has a `value` from `low` to `high`, above 0 if `zero` is False."""
     if not (is_number(value) and low <= value <= high and (zero or value > 0)):
         remedy = f"Pass a right --{name.replace('_', '-')}."
         raise ThermoxelsError(name, expected=expected, got=repr(value), remedy=remedy)
