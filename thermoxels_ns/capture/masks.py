@@ -41,7 +41,7 @@ class PhotographMasks:
         return self.overlay is not None or bool(self.files)
 
     def of(self, frame: str) -> BoolArray:
-        """Return the mask of the frame named `frame`, True where usable, (height, width); raise `SceneError` if bad."""
+        """Return a frame's mask (height, width), True where usable; raise `SceneError` if the mask's file is unfit."""
         width, height = self.size
         use = np.ones((height, width), dtype=bool) if self.overlay is None else self.overlay.copy()
         return use & read_mask(self.files[frame], width, height) if frame in self.files else use

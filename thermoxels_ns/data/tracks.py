@@ -95,7 +95,7 @@ def feature_rays(
     ray's length is that of triangulation: reprojection error / focal length / sine of the angle, times the length.
 
     Raises:
-        SceneError: No frame is in the tracks, or they belong to other poses; the message has `name` and `remedy`.
+        SceneError: No frame is in `tracks`, or `tracks` are of other poses; the message has `name` and `remedy`.
     """
     place = {frame.name: number for number, frame in enumerate(frames)}
     number = np.array([place.get(known, -1) for known in tracks.frames], dtype=np.int64)

@@ -51,7 +51,7 @@ class Photographs:
         return self.centres[number], np.einsum("nij,nj->ni", np.linalg.inv(self.matrices[:, :, :3])[number], pixel)
 
     def shown(self, number: int, points: FloatArray) -> tuple[IntArray, FloatArray, BoolArray]:
-        """Return where photograph `number` shows points (n, 3): index in `colours`, depth, and whether in view, (n,).
+        """Return where photograph `number` shows points (n, 3): index in `colours`, depth, and if in view, each (n,).
 
         A point that is not in view has the index of the photograph's first pixel. Occlusion is not considered.
         """

@@ -25,7 +25,7 @@ BEST_ANGLE_DEG = 15.0  # Neighbours at about this angle are preferred
 RADIUS = 2  # A patch, the square of pixels that is compared, is 2 RADIUS + 1 pixels wide
 LIKENESS = 0.025
 """Least difference s, of 1, from the middle pixel of a patch at which a pixel has 37 % of the middle pixel's weight."""
-SPREAD = 1.0  # Where a typical difference around the middle pixel times this exceeds `LIKENESS`, s is that product
+SPREAD = 1.0  # s is this times a typical difference around the middle pixel, if that is above `LIKENESS`
 LEAST_WEIGHT = 0.05  # A smaller weight, of 1, is set to 0
 PLANES = (24, 128)
 """Least and most planes per photograph. Within, the picture moves by about a pixel from one plane to the next."""
@@ -71,7 +71,7 @@ class Depths:
 
 
 def depths_before_backdrop(depths: Depths) -> tuple[Depths, BoolArray]:
-    """Return depths, NaN where wrong beside a backdrop, and which pixels show it, (pixels,); see `plain_backdrop`."""
+    """Set wrong depths beside a backdrop to NaN; return the depths and which pixels show the backdrop, (pixels,)."""
     backdrop, beside = plain_backdrop(depths.photographs, depths.depth)
     return replace(depths, depth=np.where(beside, np.float32(np.nan), depths.depth)), backdrop
 

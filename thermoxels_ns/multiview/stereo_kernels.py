@@ -192,7 +192,7 @@ def refine_depths(
     Args:
         width: Columns of the small photograph.
         depth: Depth of the pixels of the small photograph, (pixels,), [world units]; NaN: not known.
-        error: Distance of the planes on which these depths were found, (pixels,), [world units].
+        error: Distance between the planes of the sweep at these depths, (pixels,), [world units].
         ratio: Columns of the larger photograph per column of the small one.
         features: Features of the larger photograph, (h, w, f).
         picture: Brightness of the larger photograph, (h, w).

@@ -196,7 +196,7 @@ LONG_WAVE = PlanckBand()  # the band of microbolometer cameras, 7.5 to 13 microm
 
 @dataclass(frozen=True)
 class AirConstants:
-    """Constants of the transmission of humid air in the sensor's band; all FLIR files hold the default values."""
+    """Constants of the transmission of humid air, a sum of two parts; all FLIR files hold the default values."""
 
     alpha1: float = 0.006569  # attenuation of the first part, [1/sqrt(m)]
     alpha2: float = 0.01262  # attenuation of the second part, [1/sqrt(m)]

@@ -124,7 +124,7 @@ def rig_from_boards(
 
 
 def board_of(settings: CaptureSettings) -> CheckerBoard | None:
-    """Return the settings' checker board, or None; raise `SceneError` for a board half described or beside --rig."""
+    """Return the settings' checker board, or None; raise `SceneError` if it is half described or beside --rig."""
     photos, size, square_m = settings.board_photos, settings.board, settings.board_square_m
     if photos is None and size is None and square_m is None:
         return None

@@ -75,7 +75,7 @@ class RigPosterior:
         return self._full(z + root @ best.x)
 
     def covariance(self, change: FloatArray, stated_share: float = 1.0) -> FloatArray:
-        """Return the ten changes' covariance (10, 10) at a maximum, with `stated_share` of the score's information."""
+        """Return the ten changes' covariance (10, 10) at a maximum; `stated_share` scales the score's information."""
         free = self.sigmas > 0.0
         _, information = self._information(change[free] / self.sigmas[free])
         inverse = np.linalg.inv(stated_share * information + np.eye(len(information)))
@@ -241,7 +241,7 @@ class WindowScore:
 def refine(
     prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: FloatArray
 ) -> tuple[FloatArray, FloatArray, int] | None:
-    """Move a rig that is right to about a pixel to where the windows of photographs and thermal images agree best.
+    """Improve a rig that is off by about a pixel until the windows of photographs and thermal images agree best.
 
     The comparison of edges leaves a bias of some tenths of a pixel, because edges in a photograph and in a thermal
     image differ in strength. Windows with R2 above `_AGREEMENT` do not have this bias; they are chosen anew before each

@@ -277,7 +277,7 @@ def find_up(
 
 
 def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
-    """Return the rotation (3, 3) that turns `up` to z, and `ahead`, made perpendicular to `up`, to y if it is not 0.
+    """Return the rotation (3, 3) that turns `up` to z, and the part of `ahead` perpendicular to `up` to y, if not 0.
 
     >>> level_rotation([0, 1, 0], [0, 0, -1]).round(9).tolist()
     [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
