@@ -76,7 +76,7 @@ def natural_key(path: Path) -> list[tuple[int, str, int]]:
 def scan_folder(
     folder: Path, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None
 ) -> CameraFolder:
-    """Return what every picture and table in a folder and its subfolders is, except in the folders `without`.
+    """Identify every picture and table in a folder and its subfolders, except in the folders `without`.
 
     Hidden files and folders, linked folders and pipes are skipped; `say` reports folders that cannot be opened.
     Raises `SceneError` if `folder` is no folder.
@@ -126,7 +126,7 @@ def shown_name(path: Path) -> str:
 
 
 def identify(path: Path, folder: Path) -> CameraFile:
-    """Return what a file holds, by its content (a thermal picture: by its name); raise `ThermoxelsError` if damaged."""
+    """Identify a file by content, a thermal picture by its name or folder; raise `ThermoxelsError` if damaged."""
     with errors_name(path, "a camera file that can be decoded"):
         check_file_size(path)
         suffix = path.suffix.lower()

@@ -185,7 +185,7 @@ def _without_stuck_pixels(
 
 
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:
-    """Return (name, text) rows on thermal file formats and on settings of the temperatures, most frequent first."""
+    """Return lines (name, text) for the report on formats of thermal files and settings of their temperatures."""
     formats = Counter(
         f.format + ("" if f.celsius_per_count is None else f" with {f.celsius_per_count:.4g} K per count")
         for f in frames

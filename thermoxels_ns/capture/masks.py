@@ -41,14 +41,14 @@ class PhotographMasks:
         return self.overlay is not None or bool(self.files)
 
     def of(self, frame: str) -> BoolArray:
-        """Return the frame's mask, True where usable, shape (height, width); raise `SceneError` for an unfit file."""
+        """Return a frame's mask (height, width), True where usable; raise `SceneError` if the mask's file is unfit."""
         width, height = self.size
         use = np.ones((height, width), dtype=bool) if self.overlay is None else self.overlay.copy()
         return use & read_mask(self.files[frame], width, height) if frame in self.files else use
 
 
 def find_masks(frames: Sequence[CaptureFrame], folder: Path | None, look_for_overlays: bool) -> PhotographMasks:
-    """Return the overlay (if looked for) and the user's masks from `folder` (None: no masks) of the photographs.
+    """Return the masks of photographs: the user's files in `folder`, if any, and the overlay if `look_for_overlays`.
 
     Only photographs of the most frequent size count. Raises `SceneError` for an unreadable photograph or mask folder.
     """
@@ -61,7 +61,7 @@ def find_masks(frames: Sequence[CaptureFrame], folder: Path | None, look_for_ove
 
 
 def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str, Path]:
-    """Return the user's mask file of each frame, named like its photograph or frame; frames without one are absent.
+    """Return the user's mask file of each frame, named like its photograph or frame; frames without a mask are absent.
 
     Raises `SceneError` if `folder` does not exist or no mask fits; without `folder` the result is empty.
     """

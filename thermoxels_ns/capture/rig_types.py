@@ -111,8 +111,8 @@ class RigEstimate:
 
 
 def prior_sigmas(start: RigStart, median_depth: float) -> FloatArray:
-    """Return the standard deviations of the ten changes (`PARAMETERS`) that `start` states, shape (10,). If it states
-    none for the shift, that of the shift is 3 % of `median_depth` [world units]."""
+    """Return the standard deviations of the ten changes (`PARAMETERS`) that `start` states, shape (10,). A shift
+    without a stated deviation gets 3 % of `median_depth` [world units]."""
     shift = _TRANSLATION_SHARE * median_depth if start.translation_sigma is None else start.translation_sigma
     turn, centre = np.radians(start.rotation_sigma_deg), start.centre_sigma * start.thermal_camera.width
     return np.array([turn] * 3 + [shift] * 3 + [start.focal_sigma, centre, centre, start.k1_sigma])
@@ -134,7 +134,7 @@ class RigModel:
         return RigModel(self.camera.resized(width, height), self.transform, share)
 
     def changed(self, change: FloatArray) -> tuple[Camera, FloatArray]:
-        """Return the thermal camera and the transform (4, 4) with the ten changes applied."""
+        """Return the thermal camera and `transform` after the ten changes `PARAMETERS`, given as `change` (10,)."""
         transform = self.transform.copy()
         transform[:3, :3] = cv2.Rodrigues(change[:3])[0] @ self.transform[:3, :3]
         transform[:3, 3] += change[3:6]

@@ -50,7 +50,7 @@ class Scene:
 
 
 def scene_names(count: int) -> list[str]:
-    """Return a scene's frame names without suffix; every 8th frame is for evaluation (of three or more, not the first).
+    """Return a scene's frame names without suffix; every 8th is for evaluation, but not the first of three or more.
 
     >>> scene_names(5)[3:]
     ['frame_eval_00004', 'frame_train_00005']

@@ -70,7 +70,7 @@ class CaptureResult:
     scene: Scene
     start: RigEstimate  # the rig that the search started from
     scale_missing: str  # reason why no metric scale was found; empty where a scale was found
-    poses_source: str
+    poses_source: str  # phrase for the report that says where the poses come from
     seconds: Sequence[tuple[str, float]]  # stages and the time each took, [s]
 
     @property

@@ -43,7 +43,7 @@ def find_feature_rays(scene: SceneFile, training: Sequence[int], source: TrackSo
     """Return the feature rays of the photographs that train, in input coordinates; None if there are no tracks.
 
     `training` holds indices of frames. "auto" takes the file of tracks that the json names, else a COLMAP model in the
-    scene's folder, which gives a warning and None if it cannot be used. "given" takes the file alone.
+    scene's folder, which gives a warning and None if it cannot be used. "given": only the file; "off": None.
 
     Raises:
         SceneError: The file that the json names lies outside the scene, cannot be used, or does not fit the poses.

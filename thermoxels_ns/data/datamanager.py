@@ -124,7 +124,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         return self.eval_rays.draw(generator, rgb_rays, max(round(rgb_rays * share), 1))
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
-        """Return the camera and the item of one evaluation image, chosen by seed and step alone."""
+        """Return camera (1,) and item (see `ThermalDataset`) of one evaluation image, chosen by seed and step alone."""
         generator = draw_generator(self.config.seed, self.local_rank, _EVAL_IMAGE, step)
         index = int(torch.randint(len(self.eval_dataset), (1,), generator=generator))
         return self.eval_dataloader.get_camera(index)

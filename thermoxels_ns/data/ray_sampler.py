@@ -32,7 +32,7 @@ class RaySampler:
     If photographs and thermal images share cameras, a ray through a photograph's pixel carries both targets, and the
     thermal target only where the thermal pixel is valid. Else the thermal cameras have rays of their own, through valid
     pixels. Photographs are decoded at the first draw, so that grids, which need no colour, are cheap. Tables are kept
-    on the device `storage`; batches are moved to `device`.
+    on the device `storage`; batches are moved to `device`. `streams` names the images that train.
     """
 
     def __init__(
@@ -232,7 +232,7 @@ class CameraRays:
         return int(self.first_pixel[-1])
 
     def columns(self, pixels: Int[Tensor, " n"]) -> dict[str, Tensor]:
-        """Return fields of a `RayBundle` for the centres of pixels, given by numbers (n,) on `self.device`: origins
+        """Return rays through the centres of `pixels`, numbers (n,) on `self.device`, as fields of `RayBundle`: origins
         (n, 3), unit directions (n, 3), pixel_area (n, 1) and camera_indices (n, 1)."""
         image = torch.searchsorted(self._first_pixel, pixels, right=True) - 1
         if self.has_table:

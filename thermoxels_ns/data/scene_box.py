@@ -67,7 +67,7 @@ class BoxEvidence:
         """Return the width that a pixel covers at the typical distance of surfaces in `box`, in input units.
 
         This is the median over the points in the box and the photographs that have them in view; without points, the
-        width of a pixel in the middle of the nearer half of the box. It is infinite if no perspective camera sees it.
+        width of a pixel in the middle of the nearer half of the box. Infinite if no perspective camera sees the box.
         """
         low, high = box
         if self.points is not None:
@@ -137,9 +137,9 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame], tail: float = _TA
 
     Along each axis the box leaves out `tail` [%] of the points at either end, and is then wider by `_MARGIN` on every
     side, because parts without texture have no points and a flat scene needs some depth. Points that are not finite or
-    in no photograph's view do not count. Points that few photographs have in view, or that lie far behind others, are
-    left out where `_worth_keeping` says so. For a photograph with hardly any of the remaining points in view, as of a
-    plain wall, the box also holds the point on the optical axis that is as far away as points are in the others.
+    in no photograph's view do not count. Points in view of few photographs, or far behind others, are left out if the
+    box then holds clearly more points per length. If a photograph has hardly any of the remaining points in view, as of
+    a plain wall, the box also holds the point on its optical axis at the median depth of the other photographs.
     """
     points = points[np.isfinite(points).all(axis=1)]
     points, frames = points[:: max(len(points) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)

@@ -87,7 +87,7 @@ def read_tracks(path: Path) -> SparseTracks:
 def feature_rays(
     tracks: SparseTracks, frames: Sequence[Frame], name: str = "tracks", remedy: str = _REMEDY
 ) -> FeatureRays:
-    """Return the feature rays from `frames` (at least one) to the points of tracks whose place is well known.
+    """Return the feature rays from `frames` (at least one) to the points in `tracks` whose places are well known.
 
     A point counts if at least `FEWEST_VIEWS` frames see it, from directions more than `LEAST_PARALLAX_DEG` apart, with
     a mean reprojection error of at most `MOST_ERROR_PX`. A counting point that does not agree with its neighbours
@@ -95,7 +95,7 @@ def feature_rays(
     ray's length is that of triangulation: reprojection error / focal length / sine of the angle, times the length.
 
     Raises:
-        SceneError: None of the frames is in the tracks, or the tracks belong to other poses.
+        SceneError: No frame is in `tracks`, or `tracks` are of other poses; the message has `name` and `remedy`.
     """
     place = {frame.name: number for number, frame in enumerate(frames)}
     number = np.array([place.get(known, -1) for known in tracks.frames], dtype=np.int64)

@@ -66,8 +66,8 @@ def read_pose(values: Any, where: str, turned: bool = True) -> FloatArray:
 
 
 def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | None, where: str) -> Camera:
-    """Return a frame's camera by values of its `entry`, else of the scene's `meta`; w and h else are those of `image`.
-    Raises `SceneError` for values that are missing, that no lens has, or that do not fit the size of `image`."""
+    """Return a frame's camera from its json `entry`, else from the scene's `meta`; missing w and h are the `image`'s.
+    Raises `SceneError`, naming `where`, for values that are missing, that no lens has, or that do not fit `image`."""
     values = {**meta, **entry}
     remedy = "Correct the json."
     model = values.get("camera_model", "OPENCV")

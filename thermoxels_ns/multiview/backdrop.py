@@ -10,7 +10,7 @@ from thermoxels_ns.multiview.photographs import SATURATED, Photographs
 
 PLAIN = 0.03  # A pixel is plain if each channel differs by at most this, of 1, from the four pixels around
 STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which no side of a photograph is its top
-LEVEL = 10.0  # Weight, in finding up, of one image axis being level relative to the other being steep
+LEVEL = 10.0  # Weight, in `upwards`, of one image axis being level against that of the other being steep
 COLOUR_TOLERANCE = 0.1
 """Largest difference of a pixel's channels from the backdrop's colour, of 1. On eight drawn scenes and a real street,
 0.06 finds less of the sky (saharov32: 54 % instead of 69 %); neither value takes more than 1 % of a body's pixels."""
@@ -141,7 +141,7 @@ def _alike(
 
 
 def mean_colours(photographs: Photographs, backdrop: BoolArray, points: FloatArray) -> Float32Array:
-    """Return the mean colour of the pixels onto which points (n, 3) project, without backdrop pixels, shape (n, 3).
+    """Return for each point (n, 3) the mean colour of the pixels that it projects to, without backdrop pixels, (n, 3).
 
     A point without such a pixel gets the mean colour of all pixels that do not show the backdrop.
     """

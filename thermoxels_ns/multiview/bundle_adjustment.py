@@ -132,7 +132,7 @@ def find_tracks(features: Sequence[Features], cameras: Sequence[Camera], poses: 
 def adjust_poses(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int = 0) -> AdjustedPoses | None:
     """Adjust poses to tracks by bundle adjustment, if tracks held back from a trial adjustment then fit better.
 
-    Unless some are `fixed`, the adjusted poses as a whole keep the place, orientation and scale of the given poses.
+    If `fixed` is 0, the adjusted poses as a whole keep the place, orientation and scale of the given poses.
 
     Args:
         tracks: Tracks of all photographs.

@@ -16,7 +16,7 @@ FEWEST_PAIRS = 30  # Pixels that two photographs must share to be compared
 SYSTEMATIC = 0.02
 """Standard deviation, of 1, of the error besides noise of a channel's median ratio between two photographs: gloss,
 shadows, wrong depths."""
-SYSTEMATIC_THERMAL = 0.003  # The same error of a median difference of normalised temperatures
+SYSTEMATIC_THERMAL = 0.003  # As `SYSTEMATIC`, of the median difference of normalised temperatures
 SURE = 3.0  # Values larger than so many standard errors are not due to chance
 KNOWN = 1.0  # A value with at least this standard error is not known
 FREE = 10.0  # Standard error given to a value that is not known
@@ -43,7 +43,7 @@ class Differences:
 
 
 def matters(value: FloatArray, error: FloatArray, least: float) -> bool:
-    """Return whether the root mean square of the known values is above `least` and `SURE` times that of errors."""
+    """Return whether the root mean square of known values is above `least` and `SURE` times that of their errors."""
     known = error < KNOWN
     if not known.any():
         return False

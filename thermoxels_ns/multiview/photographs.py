@@ -51,9 +51,9 @@ class Photographs:
         return self.centres[number], np.einsum("nij,nj->ni", np.linalg.inv(self.matrices[:, :, :3])[number], pixel)
 
     def shown(self, number: int, points: FloatArray) -> tuple[IntArray, FloatArray, BoolArray]:
-        """Return for points (n, 3) the pixel of photograph `number`, the depth, and whether it is in view, all (n,).
+        """Return where photograph `number` shows points (n, 3): index in `colours`, depth, and if in view, each (n,).
 
-        A point that the photograph does not show has the photograph's first pixel. Occlusion is not considered.
+        A point that is not in view has the index of the photograph's first pixel. Occlusion is not considered.
         """
         seen = points @ self.matrices[number, :, :3].T + self.matrices[number, :, 3]
         depth = seen[:, 2]

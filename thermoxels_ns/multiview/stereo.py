@@ -24,8 +24,8 @@ angle tells nothing about depth; above, the surface looks too different."""
 BEST_ANGLE_DEG = 15.0  # Neighbours at about this angle are preferred
 RADIUS = 2  # A patch, the square of pixels that is compared, is 2 RADIUS + 1 pixels wide
 LIKENESS = 0.025
-"""Least difference from the middle pixel of its patch, of 1, at which a pixel has 37 % of the middle pixel's weight."""
-SPREAD = 1.0  # That difference relative to a typical difference of pixels around the middle one; the larger counts
+"""Least difference s, of 1, from the middle pixel of a patch at which a pixel has 37 % of the middle pixel's weight."""
+SPREAD = 1.0  # s is this times a typical difference around the middle pixel, if that is above `LIKENESS`
 LEAST_WEIGHT = 0.05  # A smaller weight, of 1, is set to 0
 PLANES = (24, 128)
 """Least and most planes per photograph. Within, the picture moves by about a pixel from one plane to the next."""
@@ -57,7 +57,7 @@ _DEPTHS_PER_SPREAD = 2.0 ** np.arange(-6.0, 6.5, 0.5)
 
 @dataclass(frozen=True, eq=False)
 class Depths:
-    """Photographs with a depth for each pixel for which it is sure."""
+    """Photographs, with the depth of each pixel where a depth is sure."""
 
     photographs: Photographs
     depth: Float32Array
@@ -71,7 +71,7 @@ class Depths:
 
 
 def depths_before_backdrop(depths: Depths) -> tuple[Depths, BoolArray]:
-    """Return depths without wrong ones beside a backdrop, and which pixels show it, (pixels,); see `plain_backdrop`."""
+    """Set wrong depths beside a backdrop to NaN; return the depths and which pixels show the backdrop, (pixels,)."""
     backdrop, beside = plain_backdrop(depths.photographs, depths.depth)
     return replace(depths, depth=np.where(beside, np.float32(np.nan), depths.depth)), backdrop
 

@@ -145,8 +145,8 @@ def correlate(channels, others, radius, weights, means, variances, noise, count,
 def aggregate(cost, features, small, large, edge, total):
     """Fill `total` with the mean of the least costs of paths from eight directions (Hirschmueller 2008, eq. 13).
 
-    Between two pixels of a path, a change of one plane costs `small`. A change of more planes costs `large`, or less
-    where the pixels' `features` (h, w, f) differ, half at a difference of `edge`. `cost` and `total`: (h, w, planes).
+    Between two pixels of a path, a change of one plane costs `small`. A larger change costs `large` / (1 + d / `edge`),
+    at least `small`; d is the difference of the pixels' `features` (h, w, f). `cost` and `total`: (h, w, planes).
     """
     rows, columns, planes = cost.shape
     total[:] = 0.0
@@ -192,7 +192,7 @@ def refine_depths(
     Args:
         width: Columns of the small photograph.
         depth: Depth of the pixels of the small photograph, (pixels,), [world units]; NaN: not known.
-        error: Distance of the planes on which these depths were found, (pixels,), [world units].
+        error: Distance between the planes of the sweep at these depths, (pixels,), [world units].
         ratio: Columns of the larger photograph per column of the small one.
         features: Features of the larger photograph, (h, w, f).
         picture: Brightness of the larger photograph, (h, w).

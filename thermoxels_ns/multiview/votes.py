@@ -64,7 +64,7 @@ def around_cameras(points: FloatArray, rays: FeatureRays, views: Views) -> BoolA
 
 
 def votes(lattice: Lattice, rays: FeatureRays) -> tuple[CountArray, CountArray]:
-    """Return per voxel how many points have a ray that crosses it (less the margin), and how many points lie in it."""
+    """Return two counts per voxel: points with a ray that crosses it and ends a margin behind it, and points in it."""
     shape = np.asarray(lattice.cell_shape)
     origins, ends = lattice.world_to_index(rays.origins), lattice.world_to_index(rays.points)
     margin = MARGIN_VOXELS + MARGIN_ERRORS * rays.uncertainty / lattice.voxel_size
@@ -98,7 +98,7 @@ def _count_crossings(origins, point, ends, margin, shape, crossing, last):
 def supporting_photographs(
     depths: Depths, middle: FloatArray, seen: BoolArray, voxel_size: float, tracks: FeatureRays | None = None
 ) -> BoolArray:
-    """Return which photographs support a surface at given places: their own depth, or a track's point, lies on it.
+    """Return which photographs support a surface at given places, as their own depth or a track's point lies on it.
 
     A photograph without a sure depth at a place (see `depths_of`), as on a plain wall, supports it by tracks alone. A
     surface that hangs in free space is not supported, because the depths there are those of what stands behind it.

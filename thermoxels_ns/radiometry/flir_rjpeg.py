@@ -91,7 +91,7 @@ class FlirImage:
         return (self.counts < low) | (self.counts > high)
 
     def temperature_c(self, conditions: Conditions | None = None) -> Float32Array:
-        """Return degrees C, shape (height, width), under `conditions` (None: the camera's); NaN if uncalibrated."""
+        """Return degrees C, (height, width), under `conditions` or else the camera's; NaN if `outside_calibration`."""
         model = RadiometricModel(conditions or self.camera.conditions, self.camera.planck, self.camera.air)
         temperature_c = model.temperature_c(self.counts)
         return np.where(self.outside_calibration, np.nan, temperature_c).astype(np.float32)

@@ -109,7 +109,7 @@ def conditions_text(conditions: Conditions) -> str:
 
 
 def check_between(name: str, value: float, low: float, high: float, expected: str, *, zero: bool = True) -> None:
-    """Raise `ThermoxelsError` if setting `name` is no number from `low` to `high`, or not above 0 with `zero` False."""
+    """Raise `ThermoxelsError` unless setting `name` has a `value` from `low` to `high`, above 0 if `zero` is False."""
     if not (is_number(value) and low <= value <= high and (zero or value > 0)):
         remedy = f"Pass a right --{name.replace('_', '-')}."
         raise ThermoxelsError(name, expected=expected, got=repr(value), remedy=remedy)
@@ -196,7 +196,7 @@ LONG_WAVE = PlanckBand()  # the band of microbolometer cameras, 7.5 to 13 microm
 
 @dataclass(frozen=True)
 class AirConstants:
-    """Constants of the transmission of humid air in the sensor's band; all FLIR files hold the default values."""
+    """Constants of the transmission of humid air, a sum of two parts; all FLIR files hold the default values."""
 
     alpha1: float = 0.006569  # attenuation of the first part, [1/sqrt(m)]
     alpha2: float = 0.01262  # attenuation of the second part, [1/sqrt(m)]

@@ -99,7 +99,7 @@ class Thermogram:
 
 @dataclass(frozen=True)
 class RadiometryOptions(ConditionOverrides):
-    """Options for converting camera files to degrees C; raise `ThermalFileError` if they contradict each other."""
+    """Options for converting camera files to degrees C. Contradicting options raise `ThermalFileError`."""
 
     camera: CameraName | None = None
     """Camera whose counts a TIFF or PNG holds (None: recognised from the file, which some files do not allow)."""

@@ -124,7 +124,7 @@ def rig_from_boards(
 
 
 def board_of(settings: CaptureSettings) -> CheckerBoard | None:
-    """Return the board that the settings describe (None: none); raise `SceneError` if incomplete or beside --rig."""
+    """Return the settings' checker board, or None; raise `SceneError` if it is half described or beside --rig."""
     photos, size, square_m = settings.board_photos, settings.board, settings.board_square_m
     if photos is None and size is None and square_m is None:
         return None
@@ -174,7 +174,7 @@ def rig_from_board_photos(
 
 
 def in_scene_units(rig: RigEstimate, scale: MetricScale | None, missing: str) -> RigEstimate:
-    """Convert a rig's lengths from metres to scene units; raise `SceneError` (reason: `missing`) without a scale."""
+    """Convert a rig's lengths from metres to scene units; raise `SceneError` (text: `missing`) if `scale` is None."""
     if scale is None:
         expected = "a known scale, because a board gives the distance of the lenses in metres"
         remedy = "Pass --known-distance or --marker-side-m; poses that were found are kept."

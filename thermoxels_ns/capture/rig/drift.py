@@ -60,7 +60,7 @@ def estimate_drift(
 
 
 def no_drift(frames: int, why: str, before_k: float = np.nan) -> DriftEstimate:
-    """Return a `DriftEstimate` without correction for so many frames; `why` is its explanation."""
+    """Return a `DriftEstimate` without correction for `frames` thermal images; `why` is its explanation."""
     return DriftEstimate(np.zeros(frames), (), before_k, before_k, False, why)
 
 

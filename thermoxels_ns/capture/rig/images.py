@@ -26,7 +26,7 @@ _STRONGEST_SHARE = 0.35
 _WEAKEST_EDGE = 0.05
 FARTHEST_FROM_POINT = 0.06
 """If the nearest scene point is farther from an edge (on the plane at depth 1), the edge's depth counts as unknown."""
-SURE_DISTANCE = 0.01  # at this distance on the plane at depth 1, the weight of an edge has fallen to a half
+SURE_DISTANCE = 0.01  # an edge so far from the nearest scene point, both drawn to depth 1, has half the weight
 _EDGE_REACH = 2.0  # half the width of an edge, in standard deviations of its blur
 _MARGIN_SHARE = 0.15
 _FINER = 1.23
@@ -62,7 +62,7 @@ class ThermalEdges:
         self._planes = padded, np.gradient(padded, axis=1), np.gradient(padded, axis=0)
 
     def sample(self, pixels: FloatArray, *, slopes: bool = False) -> npt.NDArray[np.complex64]:
-        """Return edge values (1, n) at pixels (n, 2), with `slopes` also derivatives by x and y (3, n); 0 outside."""
+        """Return edge values (1, n) at pixels (n, 2), 0 outside; if `slopes`, (3, n) with derivatives by x and y."""
         return np.stack([_bilinear(plane, pixels) for plane in self._planes[: 3 if slopes else 1]])
 
     def weight_at(self, pixels: FloatArray) -> FloatArray:
@@ -86,14 +86,14 @@ class RigScore:
     def __init__(
         self, edges: Sequence[EdgePoints], thermal: Sequence[ThermalEdges], rig: RigModel, around: FloatArray
     ) -> None:
-        """Store the edges of each frame and the start `rig`; the weights are those at the ten changes `around`."""
+        """Store the edges of each frame and the start `rig`; the weights are those at the changes `around` (10,)."""
         self.edges, self.thermal, self.rig = edges, thermal, rig
         self._weights = [t.weight_at(rig.project(around, e.points)) for e, t in zip(edges, thermal)]
         self._own = sum(float(w @ np.abs(e.value) ** 2) for e, w in zip(edges, self._weights))
         self._norm = self._sums(around)[1]
 
     def around(self, change: FloatArray) -> RigScore:
-        """Return the score of the same images with the points' weights taken at the ten changes `change`."""
+        """Return a `RigScore` of the same images whose weights are those at the ten changes `change`."""
         return RigScore(self.edges, self.thermal, self.rig, change)
 
     def value(self, change: FloatArray) -> float:
@@ -111,7 +111,7 @@ class RigScore:
         return product, float(np.sqrt(max(self._own * other, _TINY)))
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
-        """Return sum(w Re a* b) / norm, the norm fixed, and each frame's part of its derivative, shape (frames, 10)."""
+        """Return sum(w Re a* b) / the root at `around`, and its derivative by `change` per frame, (frames, 10)."""
         total, rows = 0.0, []
         for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
             sampled = thermal.sample(self.rig.project(change, one.points), slopes=True)
@@ -146,7 +146,7 @@ class PreparedFrames:
         return [(round(width / 2**k), round(height / 2**k)) for k in range(halvings, -1, -1)]
 
     def score(self, rig: RigModel, change: npt.NDArray, size: tuple[int, int], blur_px: float) -> RigScore:
-        """Return the score of rigs near `change` (ten changes of `rig`) at one size and blur of the thermal images."""
+        """Return the `RigScore` around `change` (10,) for thermal images of `size` (width, height) and edges' blur."""
         level = rig.at_size(*size)
         edges, thermal = [], []
         for frame in self.frames:
@@ -198,7 +198,7 @@ def prepare_frames(frames: Sequence[RigFrame], visible: Camera, thermal: Camera)
 
 
 def read_temperatures(frame: RigFrame, camera: Camera) -> FloatImage:
-    """Return a frame's temperatures [degrees C], shape (height, width) of `camera`; raise `SceneError` for another."""
+    """Return a frame's temperatures [degrees C], in the shape (height, width) of `camera`; else raise `SceneError`."""
     source = frame.temperature_c
     image = np.load(source, allow_pickle=False) if isinstance(source, Path) else np.asarray(source)
     if image.shape != (camera.height, camera.width):

@@ -50,13 +50,13 @@ point and turn erred by one to two times the standard errors that follow from th
 
 @dataclass(frozen=True, eq=False)
 class RigPosterior:
-    """A score of rigs combined with a prior, the standard deviations of the ten changes (`PARAMETERS`)."""
+    """A score of rigs, combined with a prior: normal distributions around 0 of the ten changes (`PARAMETERS`)."""
 
     score: RigScore | WindowScore
     sigmas: FloatArray  # prior standard deviations of the changes, shape (10,); a change with 0 stays 0
     median_depth: float  # median depth of the scene points [world units]
     correlated: float = 1.0
-    """Number of parts of the score that show the same things; the variance of the score's slope is multiplied by it."""
+    """Number of parts (of `score.slopes`) that show the same things; multiplies the variance of the score's slope."""
 
     def maximum(self, change: FloatArray) -> FloatArray:
         """Return the ten changes that maximise weight * score - sum((change / sigma)^2) / 2 (BFGS from `change`)."""
@@ -75,7 +75,7 @@ class RigPosterior:
         return self._full(z + root @ best.x)
 
     def covariance(self, change: FloatArray, stated_share: float = 1.0) -> FloatArray:
-        """Return the covariance (10, 10) of the ten changes at a maximum, using a share of the score's information."""
+        """Return the ten changes' covariance (10, 10) at a maximum; `stated_share` scales the score's information."""
         free = self.sigmas > 0.0
         _, information = self._information(change[free] / self.sigmas[free])
         inverse = np.linalg.inv(stated_share * information + np.eye(len(information)))
@@ -196,8 +196,8 @@ class WindowScore:
         self._noise = float(np.median([image.noise_k for image in thermal])) if len(thermal) else 0.0
 
     def agreement(self, change: FloatArray, shift_px: tuple[float, float] = (0.0, 0.0)) -> list[FloatArray]:
-        """Return R2 of every window, one array (windows,) per frame, with the windows moved by `shift_px` in the
-        thermal image; R2 is 0 if a window leaves the image."""
+        """Return R2 of every window at the ten changes `change`, one array (windows,) per frame. Windows are moved by
+        `shift_px`, [thermal pixels]; R2 is 0 if a window leaves the image."""
         result = []
         for windows, thermal in self.frames:
             pixels = self.rig.project(change, windows.points) + shift_px
@@ -206,7 +206,7 @@ class WindowScore:
         return result
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
-        """Return the score, a mean over windows, and each image part's share of its derivative, shape (parts, 10)."""
+        """Return the score, a mean over windows, and its derivative by `change`, a row per image part, (parts, 10)."""
         total, rows, share = 0.0, [np.zeros((0, 10))], 0.5 / max(self.count, 1)
         for windows, thermal in self.frames:
             pixels = self.rig.project(change, windows.points)
@@ -241,7 +241,7 @@ class WindowScore:
 def refine(
     prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: FloatArray
 ) -> tuple[FloatArray, FloatArray, int] | None:
-    """Move a rig that is right to about a pixel to where the windows of photographs and thermal images agree best.
+    """Improve a rig that is off by about a pixel until the windows of photographs and thermal images agree best.
 
     The comparison of edges leaves a bias of some tenths of a pixel, because edges in a photograph and in a thermal
     image differ in strength. Windows with R2 above `_AGREEMENT` do not have this bias; they are chosen anew before each

@@ -187,7 +187,7 @@ class CoarseSearch:
         self._rolls = _steps(_REACH_SIGMAS * float(sigmas[2]), _STEP_PX / corner_px)
 
     def best(self) -> list[_Found]:
-        """Return the best few rigs that differ in turn by `_APART_PX` or more, best first: scores and ten changes."""
+        """Return score and ten changes of the few best rigs, best first; their turns differ by `_APART_PX` or more."""
         found = self._found([self._spectra(edges.field, edges.weight) for edges in self._thermal])
         kept: list[_Found] = []
         for score, change in sorted(found, key=lambda each: -each[0]):

@@ -28,7 +28,7 @@ _BELIEVED_DEG = (3.0, 150.0)  # angles of view outside these limits are ignored;
 
 
 def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame]:
-    """Return a `RigFrame` for each frame of the model, in the model's order; badly projecting points are left out."""
+    """Return a `RigFrame` for each frame of the model, in the model's order; points that project badly are left out."""
     by_name = {frame.name: frame for frame in frames}
     good = model.point_error_px <= _MOST_ERROR_PX
     result = []
@@ -94,7 +94,7 @@ def rig_start(
 def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float | None = None) -> RigEstimate:
     """Read ``thermal_camera`` and ``rig`` of an earlier capture's transforms.json.
 
-    Lengths are converted if both captures have a scale. Raises `ThermoxelsError` for a bad file or another image size.
+    Lengths are converted if both captures have a scale. Raises `ThermoxelsError` for a bad file or another size.
     """
     content: Any = read_json(file)
     if not isinstance(content, dict) or not isinstance(content.get("thermal_camera"), dict):

@@ -52,7 +52,7 @@ class ReducedPhotographs:
 
 
 def image_pairs(count: int, matching: Matching) -> IntArray:
-    """Return the pairs of photographs to match, shape (p, 2): numbers in order of time, smaller first, sorted.
+    """Return the pairs of photographs to match, sorted, shape (p, 2): indices in order of time, the smaller first.
 
     "exhaustive" gives every pair, "sequential" neighbours in time and some far pairs; "auto" chooses by `count`.
 

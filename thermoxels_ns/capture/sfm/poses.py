@@ -48,7 +48,7 @@ def find_poses(
     """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
 
     `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length.
-    Results of an interrupted run in `folder` are reused. Only the largest group that fits together is in the model.
+    Results of an interrupted run in `folder` are reused. Only the largest set of photographs that fit together is kept.
 
     Raises:
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.

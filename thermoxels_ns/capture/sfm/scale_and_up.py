@@ -75,7 +75,7 @@ def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple
 
 
 def local_metres(fixes: Sequence[GpsFix]) -> FloatArray:
-    """Return each fix east, north and up of the mean fix, (n, 3), [m]; a missing altitude counts as the mean."""
+    """Return how far east, north and above the mean each fix is, (n, 3), [m]; a missing altitude counts as the mean."""
     latitude = np.radians([fix.latitude_deg for fix in fixes])
     longitude = np.radians([fix.longitude_deg for fix in fixes])
     heights = [fix.altitude_m for fix in fixes]
@@ -277,7 +277,7 @@ def find_up(
 
 
 def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
-    """Return the rotation (3, 3) that turns `up` to z and the level part of `ahead` (if 0, any level axis) to y.
+    """Return the rotation (3, 3) that turns `up` to z, and the part of `ahead` perpendicular to `up` to y, if not 0.
 
     >>> level_rotation([0, 1, 0], [0, 0, -1]).round(9).tolist()
     [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]

@@ -53,7 +53,7 @@ class SfmModel:
         return (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3] @ OPENGL_FROM_OPENCV[:3, :3]
 
     def ray(self, frame: int, pixel: npt.NDArray[np.floating]) -> FloatArray:
-        """Return the vector (3,), in world axes, from the camera to what a frame's pixel (2,) sees at depth 1."""
+        """Return the world vector (3,) from frame number `frame`'s camera to what a pixel (2,) shows at depth 1."""
         pose = self.camera_to_world[frame]
         return (self.camera.rays(pixel[None]) * (1.0, -1.0, -1.0))[0] @ pose[:3, :3].T
 
@@ -104,7 +104,7 @@ class SparseDepth:
         self._tree = KDTree(self._places) if len(ahead) else None
 
     def at(self, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return depths (n,) along rays (n, 3) of depth 1, and distances (n,) at depth 1 to the nearest point."""
+        """Return depths (n,) along rays (n, 3) whose z is 1, and distances (n,) at depth 1 to the nearest point."""
         if self._tree is None:
             return np.full(len(rays), np.inf), np.full(len(rays), np.inf)
         count = min(_NEIGHBOURS, len(self._inverse))
