@@ -123,7 +123,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
     """Solve a problem without its negligible effects; `say` is called with lines of progress.
 
     Effects that bring little heat at any temperature of start and surroundings are left out at first. If at the
-    solution these bring more than `goals.left_out_share` of all heat, the largest are taken in, and all solved again.
+    solution these bring more than `goals.left_out_share` of all heat, the strongest are put back for a new solution.
 
     Raises `HeatError` if it needs more memory than allowed, the solver fails, or the tolerance cannot be met.
     """
