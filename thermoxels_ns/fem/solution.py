@@ -96,7 +96,7 @@ class HeatSolution:
     """Largest change of the heat content that no heat flow accounts for, relative to the heat content at the start or
     to all heat exchanged, whichever is more."""
     energy_residual_of_spread: float
-    """The same change over a smaller heat: that in the initial differences, sum m_i |T_i - mean T|, plus all heat
+    """The same change relative to the heat in the initial differences, sum m_i |T_i - mean T|, plus all heat
     exchanged; 0 if heat flows account for every change."""
     status: str  # Sentences on how the steps converged
     iterations: IntArray  # Iterations of the linear solver in each interval, shape (s,)

@@ -64,7 +64,7 @@ class HeatScene:
     """Time steps in which the body is followed; None: the steady state is asked for."""
     initial_c: Celsius | None = None
     """Temperature of the whole body at the start, [degrees Celsius]; None: temperatures of the photographs."""
-    up: Direction | None = None  # Direction that points up in the coordinates of the mesh; None: see `problem`
+    up: Direction | None = None  # Direction that points up in the mesh's coordinates; None: that given to `problem`
     inside_air: InsideAir | None = None  # The air of a room
     outside_air: OutsideAir | None = None  # The open air and its wind
     surfaces: tuple[Surface, ...] = ()  # Emissivity and absorptivity by patches; for one patch the last entry holds

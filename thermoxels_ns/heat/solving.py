@@ -92,7 +92,7 @@ class Goals:
         return np.inf if self.memory_gb is None else self.memory_gb * 2**30
 
     def check_fits(self, time: Time) -> None:
-        """Raise `HeatError` if time steps are to be chosen by a tolerance of heat flows without one of temperature."""
+        """Raise `HeatError` if a solution through `time` has a tolerance of heat flows but none of temperature."""
         if time is not None and self.flow_tolerance is not None and self.tolerance_k is None:
             expected = "--tolerance beside it if the scene has a duration"
             remedy = "Pass --tolerance too: steps in time are chosen by it."

@@ -150,7 +150,7 @@ def warm_scene(
 def painted_scene(
     plan: Plan, texture_seed: int, light: SunLight, *, scene_box: Box, solid: Solid | None = None, **rest: Any
 ) -> SyntheticScene:
-    """Return a scene of a plan in metres, with textured paints; `rest` are the other fields of the scene by name."""
+    """Return a textured scene of a plan in metres; `solid` None: the plan's; `rest` are the scene's other fields."""
     texture = SolidTexture(scene_box, texture_seed)
     mirrors = np.array([paint.mirror for paint in plan.paints], dtype=np.float32)
     return SyntheticScene(
