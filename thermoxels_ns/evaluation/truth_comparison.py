@@ -31,7 +31,7 @@ from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 MIN_VIEWS = 3  # A point of a surface counts as seen if at least this many training cameras see it
 TOLERANCE_VOXELS = 1.5  # Two surfaces agree where their distance is at most this, [voxels]
 DEPTH_TOLERANCE = 0.02  # A depth is off if it differs from the true depth by more than this share of the true depth
-COMMON_RESOLUTION = 128  # `fscore_128` has voxels of the exact box's longest side over this number
+COMMON_RESOLUTION = 128  # Voxels in the exact box's longest side, for the tolerance of `fscore_128`
 
 _SURFACE_POINTS = 20_000
 _PER_SIDE = 2  # Sample points along each side of a voxel's face
@@ -155,7 +155,7 @@ class SurfaceDistances:
 
 
 def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArray:
-    """Return points spread evenly by area over the triangles `facets` (f, 3), shape (count, 3), always the same."""
+    """Return points spread evenly by area over the triangles `facets` (f, 3), the same in each call, (count, 3)."""
     from trimesh import Trimesh
     from trimesh.sample import sample_surface
 
@@ -172,9 +172,9 @@ def surface_distances(
 ) -> SurfaceDistances | None:
     """Return the distances between a mesh's surface and the true one; None if nothing of the surface can be measured.
 
-    Facets on the scene box, which cuts the scene, are left out. Distances from mesh to truth start at 20,000 points,
-    without points within `tolerance` [truth units] of `surroundings` and not of the truth. Distances from truth to mesh
-    go from `true_points` (m, 3), [truth units], to the nearest point of any remaining facet.
+    Facets on the scene box, which cuts the scene, are left out. Distances from mesh to truth start at 20,000 points of
+    the other facets; a point within `tolerance` [truth units] of `surroundings` and not of the truth does not count.
+    Distances from truth to mesh go from `true_points` (m, 3), [truth units], to the nearest point of these facets.
     """
     import pyvista as pv
     from trimesh.triangles import points_to_barycentric
@@ -241,7 +241,7 @@ class KnownTruth:
         tolerance_m: float,
         within: BoolArray | None,
     ) -> tuple[SurfaceScore, SurfaceScore]:
-        """Return the two scores of `surface_fscore` for solid voxels, with this scene and its cameras, [m]."""
+        """Return the two scores of `surface_fscore` for solid voxels against this scene, with its cameras, [m]."""
         scale = _scale_of(world_to_truth)
         poses, camera, count = self.training_poses, self.camera, len(self.training_poses)
         axes = world_to_truth[:3, :3].T / scale  # the inverse of its rotation (and mirror)
@@ -301,10 +301,10 @@ def compare_with_truth(
         the boundary to the true surface (None without a boundary). ``volume_m3`` and ``area_m2`` are those of the solid
         voxels, with steps; ``filled_volume_m3`` includes enclosed cavities. With a mesh also its volume and area;
         ``chamfer_...`` and ``hausdorff_m`` between its surface and the seen true points; ``share_of_seen_reached``, the
-        share of these points within the tolerance of its surface; ``temperature_seen_mae_c``, the mean absolute error
-        [K] at the surface points closest to these; and of the surface nodes within the tolerance of the truth:
-        ``temperature_nodes`` that thermal rays measured, ``temperature_mae_c``, their mean absolute error [K], both for
-        all other nodes (``..._unmeasured...``), and ``temperature_p95_all_c``, the 95 % quantile of all errors [K].
+        share of these points within the tolerance of its surface; and ``temperature_seen_mae_c``, the mean absolute
+        error [K] where its surface is closest to these points. Of its surface nodes within the tolerance of the truth,
+        ``temperature_nodes`` counts those measured by thermal rays, and ``temperature_mae_c`` is their mean absolute
+        error [K]; names with ``unmeasured`` are for the others, ``temperature_p95_all_c`` is the 95 % quantile for all.
 
     Raises:
         SceneError: The scene folder cannot be used, or no true point is seen by enough training cameras.
@@ -354,9 +354,9 @@ def geometry_metrics(
     similarity from the lattice's world to input coordinates. `say` receives the reason if no voxel is solid.
 
     Returns:
-        ``fscore``, ``precision`` and ``recall`` of `compare_with_truth`, with a tolerance of `TOLERANCE_VOXELS` of the
-        lattice; ``fscore_128`` with voxels of `COMMON_RESOLUTION`, which compares resolutions and boxes;
-        ``fscore_seen`` and ``fscore_128_seen``; and the mean distance. If no voxel is solid: the first four, all 0.
+        ``fscore``, ``fscore_seen``, ``precision`` and ``recall`` of `compare_with_truth`; ``fscore_128`` and
+        ``fscore_128_seen``, whose tolerance does not depend on the lattice (`COMMON_RESOLUTION`); and the mean distance
+        to the truth. If no voxel is solid: ``fscore``, ``precision``, ``recall`` and ``fscore_128``, all 0.
 
     Raises:
         SceneError: No true point is seen by enough training cameras.
@@ -406,10 +406,10 @@ def depth_metrics(
     `world_to_input` (4, 4) is the similarity from the lattice's world to input coordinates.
 
     Returns:
-        ``depth_error`` and ``depth_off_share``, of rays that meet the lattice's box and in truth the scene's solid: the
-        median relative error of depth, and the share with an error above `DEPTH_TOLERANCE`. ``sky_filled``, of rays
-        that in truth miss the solid and end outside the box: the share that the model ends in the box. A figure for
-        which there is no ray is left out.
+        ``depth_error`` and ``depth_off_share``: of rays that meet the lattice's box and hit the true solid, the median
+        relative error of depth, and the share with an error above `DEPTH_TOLERANCE`. ``sky_filled``: of rays that truly
+        pass the solid and end outside the box, the share that the model ends inside it. Figures without rays are
+        left out.
     """
     transform = check_similarity("world_to_input", world_to_input)
     scale = _scale_of(transform)

@@ -71,12 +71,12 @@ class _Boundary(ABC):
         self._kept: dict[int, dict[float, Vector]] = {}
 
     def at(self, number: int, time_s: float) -> Vector:
-        """Return quantity `number` of the term, one value per triangle (taken at its centroid), shape (k, 1)."""
+        """Return entry `number` of `Term.quantities`, evaluated at the centroid of each triangle, shape (k, 1)."""
         quantity, kept = self.quantities[number], self._kept.setdefault(number, {})
         return at_time(kept, time_s if quantity.in_time else 0.0, lambda t: quantity.at(self.places, t)[:, None])
 
     def surface_k(self, relative_k: Vector) -> Vector:
-        """Return the temperature at the q points of integration of each triangle, shape (k, q), from that of nodes."""
+        """Return temperatures at the q points of integration per triangle, (k, q), from those of all nodes, (n,)."""
         nodal = relative_k[self.nodes]
         return nodal if self._space.order == 1 else np.einsum("ka,aq->kq", nodal, self._shapes)
 
@@ -87,7 +87,7 @@ class _Boundary(ABC):
         return sums_by_number(self._numbers, shares.ravel(), self._space.num_nodes)
 
     def matrix(self, coefficient_w_m2k: Vector) -> sparse.csr_matrix:
-        """Return integral(h phi_i phi_j), shape (n, n), [W / K]; diagonal if points of integration are the nodes."""
+        """Return integral(h phi_i phi_j), (n, n), [W / K], for h of shape (k, q) or (k, 1); lumped if `order` is 1."""
         if self._space.order == 1:
             matrix = sparse.csr_matrix(sparse.diags(self.vector(coefficient_w_m2k), format="csr"))
         else:
@@ -105,7 +105,7 @@ class _Boundary(ABC):
         return (self.flux_w_m2(relative_k, time_s) * self.basis.dx).sum(axis=1)
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat flow into the body through each patch of `groups`, shape (g,), [W]."""
+        """Return the heat flow into the body through each of the patches named in `groups`, shape (g,), [W]."""
         return sums_by_number(self.group, self.part_heat_w(relative_k, time_s), len(self.groups))
 
 
@@ -121,7 +121,7 @@ class _Exchange(_Boundary):
         return self.at(1, time_s) - self._reference_c
 
     def exchanging_nodes(self, time_s: float) -> IntArray:
-        """Return the nodes, ascending, that exchange heat with the surroundings, the strength being above 0."""
+        """Return the numbers, ascending, of the nodes of those triangles whose `strength` is above 0."""
         return np.unique(self.nodes[self.strength(time_s)[:, 0] > 0.0])
 
 
@@ -176,11 +176,11 @@ class SourceForm:
         return self._space.source_load(self._tets, self.part_heat_w(np.zeros(0), time_s))
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat set free at each point of integration, [W]; `relative_k` has no influence."""
+        """Return the heat set free at each of the `Space.source_points`, [W]; `relative_k` has no influence."""
         return self._source.at(self._places, time_s) * self._volumes
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat set free in each region of `groups`, shape (g,), [W]; `relative_k` has no influence."""
+        """Return the heat set free in each region named in `groups`, (g,), [W]; `relative_k` has no influence."""
         return sums_by_number(self._group, self.part_heat_w(np.zeros(0), time_s), len(self.groups))
 
 
@@ -246,7 +246,7 @@ class FixedNodes:
 
     @cached_property
     def facet_shares(self) -> sparse.csr_matrix:
-        """Share of each fixed node's heat by triangle, in proportion to area; rows: triangles, effect after effect."""
+        """Share of each fixed node's heat (column) that each triangle (row) gets by its area, effect after effect."""
         if not self._forms:
             return sparse.csr_matrix((0, 0))
         owners = np.concatenate([form.owners for form in self._forms])
@@ -258,7 +258,7 @@ class FixedNodes:
 
     @cached_property
     def shares(self) -> sparse.csr_matrix:
-        """Share of each fixed node's heat that belongs to each entry of `groups`, shape (g, d)."""
+        """Share of each fixed node's heat (column) that each effect and patch in `groups` gets (row), shape (g, d)."""
         if not self._forms:
             return sparse.csr_matrix((0, 0))
         counts = np.cumsum([0, *(len(form.groups) for form in self._forms)])
@@ -268,7 +268,7 @@ class FixedNodes:
         return sparse.csr_matrix(sums @ self.facet_shares)
 
     def facet_heat_w(self, kept_w: Vector) -> list[tuple[str, IntArray, Vector]]:
-        """Return effect, triangles and heat flow into the body through each, [W], from that at `nodes`, shape (d,)."""
+        """Share out `kept_w`, heat flows into `nodes`, (d,), [W]; return effect, triangles, flows for each effect."""
         heat_w, begin, found = self.facet_shares @ kept_w, 0, []
         for form in self._forms:
             found.append((form.effect, form.facets, heat_w[begin : begin + len(form.owners)]))
@@ -327,8 +327,8 @@ def effect_forms(
 ) -> EffectForms:
     """Return the forms of a problem's effects; an effect that acts on no triangle or tetrahedron gets no form.
 
-    Temperatures are relative to `reference_c`. `assembled` counts only fixed temperatures here; the system counts the
-    other forms. Raises `HeatError` if the mesh lacks a patch or region of an effect.
+    Temperatures are relative to `reference_c`. The forms of fixed temperatures are counted in `assembled`; `HeatSystem`
+    counts the other forms. Raises `HeatError` if the mesh lacks a patch or region of an effect.
     """
     made = {
         "convection": ConvectionForm,

@@ -156,7 +156,7 @@ class Residual:
 
     heat_w: Vector  # Unbalanced heat at each node, 0 at fixed nodes, shape (n,), [W]
     piece_w: Vector
-    """Unbalanced heat of each connected piece, without conduction and its round-off; 0 with fixed nodes; (p,), [W]."""
+    """Unbalanced heat of each connected piece, summed without conduction, (p,), [W]; 0 for pieces with fixed nodes."""
     moved_w: Vector  # Sum of the sizes of all heat exchanged and stored in each piece, shape (p,), [W]
     flows_w: float  # Heat that flows through the body or is stored in it, [W]
     round_off_w: float  # Round-off to expect in the sum over all free nodes, [W]
@@ -277,7 +277,7 @@ class ImplicitEquation:
         )
 
     def damped(self, heat_w: Vector, piece_w: Vector, relative_k: Vector, time_s: float) -> Vector:
-        """Estimate e, shape (n,), [K], of (M / step + K + R + slope of radiation at `relative_k`) e = `heat_w`.
+        """Return an estimate e, (n,), [K]: (M / step + K + R + radiation's slope at `relative_k`) e = `heat_w`.
 
         `piece_w`, shape (p,), [W], sums `heat_w` over each piece without conduction and its round-off.
         """

@@ -30,7 +30,7 @@ FACET_EDGES = np.array([(0, 1), (1, 2), (0, 2)])  # The same for the edges of a 
 
 @dataclass(frozen=True)
 class MeshEdges:
-    """The e edges of a tetrahedral mesh of n nodes, each listed once, in the order of smaller, then larger node."""
+    """The e edges of a tetrahedral mesh of n nodes, each listed once, sorted by smaller, then by larger node."""
 
     first: IntArray  # Edges whose smaller node is i have numbers first[i] to first[i + 1] - 1; shape (n + 1,)
     other: npt.NDArray[np.int32]  # The larger node number of each edge, shape (e,)
@@ -49,7 +49,7 @@ class MeshEdges:
         return 0.5 * (nodal[self.smaller_nodes()] + nodal[self.other])
 
     def numbers(self, elements: IntArray, ends: IntArray) -> IntArray:
-        """Return the numbers of the edges of elements, (k, j); `ends` is `TET_EDGES` or `FACET_EDGES`, (j, 2).
+        """Return the numbers of the j edges, (k, j), of k tets or triangles; `ends` is `TET_EDGES` or `FACET_EDGES`.
 
         >>> edges = mesh_edges(np.array([[3, 0, 2, 1]]), 4)
         >>> edges.numbers(np.array([[0, 2, 3]]), FACET_EDGES).tolist()

@@ -121,7 +121,7 @@ class Term:
     """The term that an effect adds to the heat equation; heat flows and fluxes are positive into the body."""
 
     kind: Literal["convection", "flux", "radiation", "source", "fixed"]
-    parts: IntArray  # Numbers of the boundary triangles, or for a source of the tetrahedra, that it acts on, shape (k,)
+    parts: IntArray  # Numbers of the boundary triangles, for a source the tetrahedra, where the term acts, (k,)
     quantities: tuple[Bounded, ...]
     """convection: h, T_ambient of the flux h (T_ambient - T); flux: the factors whose product is the flux; radiation:
     eps, T_s of the flux factor eps (T_s^4 - T^4); source: heat, [W / m3]; fixed: temperature of the nodes. Quantities
@@ -161,7 +161,7 @@ class Effect(ABC):
 
     @abstractmethod
     def term(self, selection: Selection) -> Term:
-        """Return the effect's term in the heat equation; raise `HeatError` if the mesh lacks one of its parts."""
+        """Return the effect's term in the heat equation; raise `HeatError` if the mesh lacks what `where` names."""
 
 
 def _checked_names(field: str, names: object) -> tuple[str, ...]:
@@ -228,7 +228,7 @@ class HeatProblem:
 
     @property
     def resolution_s(self) -> float:
-        """Longest time between two evaluations of the effects that misses no change, [s]; inf if none is known."""
+        """Longest time between two evaluations at which no effect's change is missed, [s]; inf if unknown."""
         return min((e.bounded(name).resolution_s for e in self.effects for name in e.bounds), default=math.inf)
 
     @property

@@ -15,8 +15,8 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 def refine_mesh(mesh: TetMesh) -> TetMesh:
     """Return a conforming mesh of the same body with all edges halved: each tetrahedron becomes eight.
 
-    Cutting off its four corners makes a tetrahedron into four children of the same shape and an octahedron. Of the
-    three diagonals of the octahedron, it is cut into four along that for which the largest angle between faces is
+    Cutting off its four corners makes a tetrahedron into four children of the same shape and an octahedron. The
+    octahedron has three diagonals and is cut into four along the one that makes the largest angle between faces
     smallest. Children of the six tetrahedra of a cube (Kuhn) are such tetrahedra again, so no angle becomes obtuse.
 
     Nodes keep their numbers; the middles of the edges follow in the order of `mesh_edges`. Children inherit regions,

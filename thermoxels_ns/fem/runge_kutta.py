@@ -31,7 +31,7 @@ class Scheme:
     order: int  # Order p: at a given time the error is proportional to the step length to the power p
     nodes: tuple[float, ...]  # c: time of each stage as a share of the step
     weights: tuple[tuple[float, ...], ...]
-    """a, lower triangular, a row per stage; the last row is b. A stage whose row is all 0 is the start of the step."""
+    """The lower triangular matrix a, a row per stage; its last row is b. A row of zeros stands for the step's start."""
     estimate: tuple[float, ...] | None = None
     """Weights of a scheme one order higher for the flows at the start and in each stage; None: no error estimate."""
 
@@ -70,7 +70,7 @@ class Step:
     """The outcome of `RungeKutta.step`."""
 
     relative_k: Vector  # Temperatures at the end of the step, relative to the system's reference, shape (n,), [K]
-    group_heat_w: Vector  # Mean heat flow into the body of each of the system's `groups`, shape (g,), [W]
+    group_heat_w: Vector  # Mean heat flow into the body for each entry of `HeatSystem.groups`, (g,), [W]
     iterations: int  # Iterations of the linear solver in all stages
     newton_iterations: int  # Steps of Newton's method in all stages; 0 without radiation
     error_k: float

@@ -19,7 +19,7 @@ class Selection:
     """A mesh's patches and regions, which effects name, and the geometry of its f boundary triangles."""
 
     def __init__(self, mesh: TetMesh, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> None:
-        """Check the tags of a mesh (`HeatError` if they do not fit); `up` is a unit vector, passed on in `Places`."""
+        """Check the tags of a mesh (`HeatError` if they do not fit); `up` is the unit vector for `Places.up`."""
         self.mesh, self.up = mesh, up
         self._check()
         tags = mesh.boundary
@@ -39,11 +39,11 @@ class Selection:
         return facet_normals(self.mesh.points_m, self.mesh.facets)
 
     def facets(self, patterns: tuple[str, ...]) -> IntArray:
-        """Return the numbers of the triangles of patches that match any pattern; `HeatError` if a pattern has none."""
+        """Return the numbers of the triangles of patches that match a pattern; `HeatError` if a pattern fits none."""
         return np.flatnonzero(_matching("patches", patterns, self.patch_names)[self.facet_patch])
 
     def tets(self, patterns: tuple[str, ...]) -> IntArray:
-        """Return the numbers of the tetrahedra of regions that match any pattern; `HeatError` if a pattern has none."""
+        """Return the numbers of the tetrahedra of regions that match a pattern; `HeatError` if a pattern fits none."""
         return np.flatnonzero(_matching("regions", patterns, self.mesh.region_names)[self.mesh.region])
 
     def facet_places(self, facets: IntArray) -> Places:

@@ -96,8 +96,8 @@ class HeatSolution:
     """Largest change of the heat content that no heat flow accounts for, relative to the heat content at the start or
     to all heat exchanged, whichever is more."""
     energy_residual_of_spread: float
-    """The same change relative to the heat stored in the initial differences, sum m_i |T_i - mean T|, plus all heat
-    exchanged, which makes the measure stricter; 0 if heat flows account for every change."""
+    """The same change relative to the heat in the initial differences, sum m_i |T_i - mean T|, plus all heat
+    exchanged; 0 if heat flows account for every change."""
     status: str  # Sentences on how the steps converged
     iterations: IntArray  # Iterations of the linear solver in each interval, shape (s,)
     effects: tuple[EffectHeat, ...] = ()  # Heat that each effect of the problem brought, in the order of the problem
@@ -141,7 +141,7 @@ class SteadySolution:
 def heat_by_effect(
     effects: Sequence[str], groups: Iterable[tuple[str, str]], group_heat_w: FloatArray
 ) -> tuple[EffectHeat, ...]:
-    """Return the heat of each of `effects` from that of groups (effect, patch or region), shape (s, g), [W]."""
+    """Sort heat flows `group_heat_w`, (s, g), [W], by effect; `groups` has effect and patch or region per column."""
     columns: dict[str, list[tuple[int, str]]] = {effect: [] for effect in effects}
     for number, (owner, name) in enumerate(groups):
         columns[owner].append((number, name))
@@ -184,7 +184,7 @@ class SolutionNodes:
     quadratic: bool  # True if the tetrahedra that were solved are quadratic
 
     def of_facets(self, values: npt.NDArray) -> npt.NDArray:
-        """Return `values`, given per boundary triangle that was solved, per triangle of `mesh`, shape (f, ...)."""
+        """Return values per boundary triangle of `mesh`, (f, ...), from those per triangle of the unrefined mesh."""
         return np.repeat(values, _CHILD_FACETS, axis=0) if self.quadratic else values
 
 

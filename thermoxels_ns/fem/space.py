@@ -74,7 +74,7 @@ class Space:
         return self.from_mesh_nodes(self.selection.mesh.points_m)
 
     def from_mesh_nodes(self, nodal: Vector) -> Vector:
-        """Return values at the unknowns, shape (n, ...), from values at the mesh's nodes; edges get means."""
+        """Return values at the unknowns, shape (n, ...), from those at the mesh's nodes; middles of edges get means."""
         return nodal if self.order == 1 else np.concatenate([nodal, self.edges.midpoints(nodal)])
 
     def tet_nodes(self) -> Numbers:
@@ -91,7 +91,7 @@ class Space:
         return np.concatenate([corners, len(self.selection.mesh.points_m) + self.edges.numbers(corners, ends)], axis=1)
 
     def stiffness(self, conductivity_w_mk: Vector) -> sparse.csr_matrix:
-        """Return K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]; the conductivity has shape (t,)."""
+        """Return K, integral(k grad phi_i . grad phi_j), (n, n), [W / K], for a conductivity k per tetrahedron."""
         mesh = self.selection.mesh
         if self.order == 1:
             return stiffness_matrix(mesh.points_m, mesh.tets, conductivity_w_mk, edges=self.edges)

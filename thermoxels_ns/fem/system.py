@@ -228,7 +228,7 @@ class HeatSystem:
         return self.exchanged_heat(relative_k, time_s)[nodes] - self._fixed_rows @ self.pieces.without_means(relative_k)
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat flow into the body of each entry of `groups` before those of fixed nodes, shape (g,), [W]."""
+        """Return the heat flow into the body, [W], for each entry of `groups` before the last ones, `fixed.groups`."""
         forms = (*self._convection, *self._loads, *self._radiation)
         return np.concatenate([np.zeros(0), *(form.group_heat_w(relative_k, time_s) for form in forms)])
 
@@ -249,22 +249,22 @@ class HeatSystem:
         return marks
 
     def is_still(self, relative_k: Vector, time_s: float) -> bool:
-        """Return whether temperatures of body and surroundings differ by at most `NOTHING` times the absolute one."""
+        """Return whether all temperatures, of body and surroundings, are equal up to `NOTHING` times absolute ones."""
         ends = np.array([*self.surroundings_k(time_s), relative_k.min(), relative_k.max()])
         ends = ends[np.isfinite(ends)]
         level_k = float(np.abs(ends).max()) + abs(self.reference_c + ZERO_CELSIUS_K)
         return float(np.ptp(ends)) <= NOTHING * level_k
 
     def allowed_range_k(self, start_k: tuple[float, float], times_s: tuple[float, ...]) -> tuple[float, float]:
-        """Return the lowest and highest temperature, [K], of `start_k` and of all surroundings at `times_s`.
+        """Widen the range `start_k`, (lowest, highest), [K], by the temperatures of all surroundings at `times_s`.
 
-        No temperature leaves this range in a step. A flux or source makes its end -inf (cooling) or inf (heating).
+        No temperature leaves the range in a step. Cooling by a flux or source widens it to -inf, heating to inf.
         """
         ends = [start_k, *map(self.surroundings_k, times_s)]
         return min(low for low, _ in ends), max(high for _, high in ends)
 
     def surroundings_k(self, time_s: float) -> tuple[float, float]:
-        """Return the lowest and highest temperature around the body, [K]; -inf or inf with a flux or source."""
+        """Return lowest, highest temperature around the body, [K]; -inf if a flux or source cools, inf if it heats."""
         return at_time(self._ranges_at, time_s, self._surroundings_k, most=_KEPT_RANGES)
 
     def _surroundings_k(self, time_s: float) -> tuple[float, float]:

@@ -247,7 +247,7 @@ class HeatBalance:
         return max(low - float(relative_k.min()), float(relative_k.max()) - high)
 
     def success(self, repeated: int) -> str:
-        """Return sentences on how the steps converged and by how much any temperature left its range."""
+        """Return sentences on convergence, on the number of steps `repeated`, and on temperatures out of range."""
         sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
         sentence += f" {repeated} more were repeated with a shorter length." if repeated else ""
         if self._overshooting:
@@ -258,7 +258,7 @@ class HeatBalance:
         return sentence
 
     def close(self, status: str, *, adaptive: bool) -> HeatSolution:
-        """Return the solution with the account of its heat; states become degrees Celsius in place, to save memory."""
+        """Return the solution with its heat and `status`; converts `states_k` to Celsius in place, to save memory."""
         system, states_k, times_s, heat_j = self._system, self._states, self._times, self._heat_j
         mass = system.nodal_mass_j_k
         total_mass = float(mass.sum())

@@ -61,7 +61,7 @@ class Tolerance:
             raise HeatError("tolerance", expected="temperature_k, heat_flow or both, above 0", got=got, remedy=remedy)
 
     def excess(self, error: ErrorSize) -> float:
-        """Return the larger ratio of an error, times `MARGIN`, to its allowed value; at most 1 is good."""
+        """Return `MARGIN` times the larger ratio of an error to its allowed value; the tolerance is met up to 1."""
         pairs = (error.temperature_k, self.temperature_k), (error.heat_flow, self.heat_flow)
         return MARGIN * max(found / allowed for found, allowed in pairs if allowed is not None)
 
@@ -101,7 +101,7 @@ class ToleratedSolution:
     problem: HeatProblem  # The problem that was solved: the given problem, or the same on a finer mesh
     tolerance: Tolerance  # Errors that were allowed
     settings: Level  # Order, refinements and steps of `solution`, and its estimated errors
-    met: bool  # Whether the estimated errors are within the tolerance
+    met: bool  # True if the estimated errors are within the tolerance
     status: str  # The outcome as a sentence, with the estimate and the seconds
     seconds: float  # Time for all solutions together, [s]
     levels: tuple[Level, ...]  # All solutions that were computed; the last entry is `settings`
@@ -118,7 +118,7 @@ def solve_to_tolerance(
     log: Callable[[str], None] = print,
     progress: Callable[[float, int], None] | None = None,
 ) -> ToleratedSolution:
-    """Solve a problem with order, mesh size and time steps whose estimated error is allowed.
+    """Solve a problem on a mesh and in time steps so fine that the estimated errors are within `tolerance`.
 
     The difference of two solutions tells the errors of both, because the error of the finer solution is a known share
     of the error of the coarser one (Richardson 1911): `TO_QUADRATIC` or `HALVED`.

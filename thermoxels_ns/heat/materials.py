@@ -50,7 +50,7 @@ class MaterialRow(Material):
 
 
 def with_names(content: Any) -> Any:
-    """Return a file's mapping of materials with each key as the `name` of its entry; other content is unchanged."""
+    """Return a mapping of materials, read from a file, with each key put into its entry as `name`; else `content`."""
     if not isinstance(content, dict):
         return content
     return {key: {**entry, "name": key} if isinstance(entry, dict) else entry for key, entry in content.items()}
@@ -58,7 +58,7 @@ def with_names(content: Any) -> Any:
 
 @cache
 def material_table() -> dict[str, MaterialRow]:
-    """Read the rows of ``configs/materials.yaml`` by name, once."""
+    """Return the materials of ``configs/materials.yaml`` by name; the file is read only once."""
     file = configs_folder() / "materials.yaml"
     return as_record(file.name, with_names(read_yaml(file)), dict[str, MaterialRow])
 
@@ -80,7 +80,7 @@ def material(name: str) -> Material:
 
 
 def materials_by_region(problem: HeatProblem) -> dict[str, Material]:
-    """Return the material of each region of a problem by name; regions without a tetrahedron are left out."""
+    """Return materials by the names of the regions of a problem; regions without a tetrahedron are left out."""
     names = [problem.mesh.region_names[number] for number in np.unique(problem.mesh.region)]
     made_of = {
         name: problem.material[name] if isinstance(problem.material, Mapping) else problem.material for name in names

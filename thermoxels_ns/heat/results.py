@@ -112,7 +112,7 @@ class HeatResults:
 
 
 def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes | None = None) -> HeatResults:
-    """Return the results of a solution of `problem`; `nodes` are its `solution_nodes`, None: they are made here."""
+    """Return the results of a solution of `problem`; if `nodes` is None, `solution_nodes` makes it."""
     nodes = solution_nodes(problem, solution) if nodes is None else nodes
     times, states, selection = nodes.times_s, nodes.states_c, Selection(nodes.mesh, problem.up)
     lengths = np.diff(times) if len(times) > 1 else np.ones(1)
@@ -130,7 +130,7 @@ def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes 
 
 
 def region_behind_facets(mesh: TetMesh) -> IntArray:
-    """Return the number of the region behind each boundary triangle, shape (f,)."""
+    """Return the region behind each boundary triangle, as an index into `mesh.region_names`, shape (f,)."""
     return mesh.region[facet_owners(mesh.tets, mesh.facets)[0]]
 
 
@@ -267,7 +267,7 @@ class WallPart:
 
 @dataclass(frozen=True)
 class WallResult:
-    """A body as a wall between the air inside and the air outside, in a steady state."""
+    """Figures of a body that parts the air inside from the air outside, as a wall does, in a steady state."""
 
     inside_c: float  # Temperature of the air inside, [degrees Celsius]
     outside_c: float  # Temperature of the air outside, [degrees Celsius]
@@ -289,10 +289,10 @@ class WallResult:
 def wall_of_scene(
     scene: HeatScene, problem: HeatProblem, solution: Solution, nodes: SolutionNodes, *, doubtful: bool
 ) -> WallResult | str:
-    """Return a body as a wall if its steady state between two airs was asked for, else why it is no wall.
+    """Return the `wall_result` of a body in a steady state between two airs; else a sentence on why there is none.
 
-    The reason is a sentence; it is "" through time, without two airs, or if both have the same temperature. `doubtful`
-    is True if the airs probably act on other surfaces than was meant; there is no wall then.
+    The sentence is empty through time, without two airs, or if both airs have the same temperature. `doubtful` is True
+    if the airs probably act on other surfaces than was meant; then there is no result.
     """
     inside, outside = scene.inside_air, scene.outside_air
     if not isinstance(solution, SteadySolution) or inside is None or outside is None:

@@ -111,14 +111,14 @@ class HeatRun:
     accuracy: ToleratedSolution | None  # Solution with estimated errors; None if no tolerance was given
     warnings: tuple[str, ...]  # Sentences on what looks wrong about the scene on this mesh
     solution: Solution  # Temperatures and heat flows
-    results: HeatResults  # Results of the solution
+    results: HeatResults  # Heat by patch, effect and region, the heat balance, and the coldest and hottest spot
     wall: WallResult | None
-    """The body as a wall; None unless a steady state between two airs was asked for and no other effect acts."""
-    no_wall: str  # Sentence on why there is no wall although there are two airs; else empty
+    """U-value and f_Rsi of the body between two airs in a steady state; None without airs, or if `no_wall` says why."""
+    no_wall: str  # Sentence on why a steady state between two unlike airs gave no `wall`; else empty
     mean_c: Vector  # Mean temperature of the volume at each time, shape (s,), [degrees Celsius]
     probes: Probes  # Points where temperatures are followed, in the mesh of `nodes`
     probes_c: Vector  # Temperatures at `probes`, shape (s, p), [degrees Celsius]
-    seconds: Mapping[str, float]  # Time that each part took, [s]: "solve" and "answers"
+    seconds: Mapping[str, float]  # Time to solve, "solve", and then to work out the results, "answers", [s]
 
 
 def run_scene(
@@ -133,9 +133,9 @@ def run_scene(
 ) -> HeatRun:
     """Put a scene on a mesh, solve the problem, and return the solution with results and warnings.
 
-    `up`, None: z, is used if the scene has none. Temperatures are followed at `probes_m`, shape (p, 3), [m]. Warnings
-    also use `export`, the summary of the export that wrote the mesh; `say` is called with lines of progress. Raises
-    `HeatError` if the scene does not fit the mesh, a probe lies outside the body, or the solver fails.
+    If the scene has no `up`, the argument `up` counts, or z if it is None. Temperatures are followed at `probes_m`,
+    shape (p, 3), [m]. `export`, the summary of the export that wrote the mesh, adds warnings; `say` gets lines of
+    progress. Raises `HeatError` if the scene does not fit the mesh, a probe lies outside it, or the solver fails.
     """
     start = clock.perf_counter()
     problem = scene.problem(mesh, up=up)
@@ -182,7 +182,7 @@ def run_scene(
 
 
 def mesh_error_in_words(solution: Solution) -> str:
-    """Return words on the error of the mesh of a solution without tolerance: its estimate, if there is one."""
+    """Return in words the estimated mesh error of a solution without tolerance, or that there is no estimate."""
     error = solution.error if isinstance(solution, SteadySolution) else None
     if error is None:
         return "not estimated; --tolerance estimates it"
@@ -258,7 +258,7 @@ def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tu
 
 
 def unused_settings(scene: HeatScene) -> tuple[str, ...]:
-    """Return warnings on an initial temperature of a steady scene and on air series that are too short."""
+    """Return warnings on a steady scene's initial temperature and on air series that do not cover the scene's time."""
     if scene.time is None:
         if scene.initial_c is None:
             return ()
@@ -310,7 +310,7 @@ def body_warnings(mesh: TetMesh) -> tuple[str, ...]:
 
 
 def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a warning on the thickness of walls if `export`, the summary of the mesh's export, is of a shell."""
+    """Return a warning if `export`, the mesh's export summary, tells of a shell of unknown or unwanted thickness."""
     options, mesh = export.get("options"), export.get("mesh")
     if scene.inside_air is None or not isinstance(options, dict) or not isinstance(mesh, dict):
         return ()

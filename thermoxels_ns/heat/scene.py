@@ -64,7 +64,7 @@ class HeatScene:
     """Time steps in which the body is followed; None: the steady state is asked for."""
     initial_c: Celsius | None = None
     """Temperature of the whole body at the start, [degrees Celsius]; None: temperatures of the photographs."""
-    up: Direction | None = None  # Direction that points up in the coordinates of the mesh; None: see `problem`
+    up: Direction | None = None  # Direction that points up in the mesh's coordinates; None: that given to `problem`
     inside_air: InsideAir | None = None  # The air of a room
     outside_air: OutsideAir | None = None  # The open air and its wind
     surfaces: tuple[Surface, ...] = ()  # Emissivity and absorptivity by patches; for one patch the last entry holds
@@ -110,7 +110,7 @@ class HeatScene:
         return self.time is None
 
     def problem(self, mesh: TetMesh, *, up: Vector | None = None) -> HeatProblem:
-        """Return the heat problem on a mesh; `up` (None: z) serves a scene without `up`. Raises as `effects` does."""
+        """Return the problem on a mesh. If the scene has no `up`, the argument counts, or z. Raises as `effects`."""
         initial = None if self.initial_c is None else np.full(len(mesh.points_m), self.initial_c)
         return HeatProblem(mesh, self._material(mesh), initial, self.effects(mesh), self.up or up or _Z_UP)
 
@@ -313,9 +313,9 @@ class ScenePatches:
     def of_surfaces(
         self, surfaces: Sequence[Surface], value: Callable[[Surface], float | None], allowed: set[str] | None = None
     ) -> list[tuple[tuple[str, ...], float]]:
-        """Return groups of patches, written as patterns, whose surfaces share a property, each with its value.
+        """Return, for each value of a property, the patches that have this value, written as patterns, and the value.
 
-        `value` returns the property of a surface or None; the last entry for a patch holds; `allowed` None: any patch.
+        `value` reads the property of a surface, if any; the last entry for a patch holds; `allowed` None: all patches.
         """
         chosen: dict[str, float] = {}
         for number, surface in enumerate(surfaces, start=1):
@@ -347,7 +347,7 @@ class ScenePatches:
 
 
 def check_disjoint(what: str, entries: Sequence[tuple[str, set[str]]], remedy: str) -> None:
-    """Raise `HeatError` if two of the entries, given as name and patches, act on the same patch."""
+    """Raise `HeatError`, worded with `what` and `remedy`, if two entries (name and patches) share a patch."""
     taken: dict[str, str] = {}
     for second, elsewhere in entries:
         for first in sorted({taken[patch] for patch in elsewhere & taken.keys()})[:1]:

@@ -43,9 +43,9 @@ def inside_coefficient(
 ) -> Varying:
     """Return the coefficient of surfaces in a room by their orientation, for `Convection.coefficient_w_m2k`.
 
-    ISO 6946 distinguishes three directions of the heat flow, because warm air rises; "horizontal" includes flows up to
-    30 degrees off. iso-6946-combined is 1 / Rsi, convection and radiation between surfaces of emissivity 0.9;
-    iso-6946-convection is hci; iso-6946-separate is hci + hr, hr being `radiative_coefficient` at `mean_c`, the mean
+    ISO 6946 has one value each for heat that flows up, down or horizontally (up to 30 degrees off), as warm air rises.
+    iso-6946-combined is 1 / Rsi, for convection and radiation between surfaces of emissivity 0.9; iso-6946-convection
+    is hci; iso-6946-separate is hci + hr, hr being the `radiative_coefficient` of `emissivity` at `mean_c`, the mean
     temperature of surface and room.
     """
     directions: tuple[HeatDirection, ...] = ("up", "horizontal", "down")
@@ -68,9 +68,9 @@ def outside_coefficient(
 ) -> float:
     """Return the coefficient of surfaces in the open air at a wind speed v, [W / (m2 K)].
 
-    It is 1 / Rse (iso-6946-combined), 4 + 4 v + hr (-separate), 4 + 4 v (-convection), or 18.6 v^0.605 of the original
-    Thermoxels code, which is 0 in calm air and about twice the value of ISO 6946 in wind. hr is
-    `radiative_coefficient` at `mean_c`, the mean temperature of surface and surroundings.
+    iso-6946-combined is 1 / Rse, iso-6946-separate 4 + 4 v + hr, iso-6946-convection 4 + 4 v, thermoxels-original
+    18.6 v^0.605, which is 0 in calm air and about twice the value of ISO 6946 in wind. hr is the
+    `radiative_coefficient` of `emissivity` at `mean_c`, the mean temperature of surface and surroundings.
 
     >>> outside_coefficient("iso-6946-combined")
     25.0
@@ -325,5 +325,5 @@ def _check_only_if(name: str, value: float | None, needed: bool, coefficient: st
 
 
 def unclear(name: str, expected: str, got: object, remedy: str) -> HeatError:
-    """Return the error for an entry of a scene."""
+    """Return an error about entry `name` of a scene: what was `expected`, what was `got`, and what helps."""
     return HeatError(name, expected=expected, got=got, remedy=remedy)

@@ -35,7 +35,7 @@ def swinbank_sky_c(air_c: float) -> float:
 
 
 def sky_view(normals: FloatArray, up: Vector) -> FloatArray:
-    """Return the share of sky in the view of surfaces, (1 + cos tilt) / 2, shape (k,); outward normals, shape (k, 3).
+    """Return the share of sky, (1 + cos tilt) / 2, in the view of surfaces with outward normals (k, 3), shape (k,).
 
     >>> sky_view(np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, -1]]), (0.0, 0.0, 1.0)).tolist()
     [1.0, 0.5, 0.0]
@@ -145,12 +145,12 @@ def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
 
 
 def air_mass(elevation_deg: float) -> float:
-    """Return the path of light through the air over the path at the zenith, at 0 to 90 degrees (Kasten, Young 1989)."""
+    """Return the path of light through the air over that from the zenith, for 0 to 90 degrees (Kasten, Young 1989)."""
     return 1.0 / (math.sin(math.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.07995) ** -1.6364)
 
 
 def meinel_clear_sky(elevation_deg: float, distance_au: float = 1.0) -> Sunlight:
-    """Return the sunlight under a clear sky at sea level, estimated to a tenth; 0 if the sun is below the horizon.
+    """Return the sunlight under a clear sky at sea level, right to about a tenth; 0 if the sun is below the horizon.
 
     Direct light is E0 * 0.7^(AM^0.678) with the air mass AM (Meinel and Meinel 1976). Diffuse light is E0 sin(h)
     (0.271 - 0.294 tau), h being the elevation and tau the transmitted share of direct light (Liu and Jordan 1960). E0
@@ -170,7 +170,7 @@ def facet_irradiance(
     """Return the sunlight that falls on facets, per area of the facet, shape (k,), [W / m2]; no facet shades another.
 
     Direct light counts by the cosine of its angle to the normal, diffuse light by (1 + cos tilt) / 2, and light that
-    the ground reflects by (1 - cos tilt) / 2 (Liu and Jordan 1963: sky and ground are alike in all directions).
+    the ground reflects by (1 - cos tilt) / 2 (Liu and Jordan 1963: sky and ground are evenly bright).
     `normals` are outward unit vectors, shape (k, 3); `up` and `towards` (to the sun) are unit vectors. If the sun is
     below the horizon, all values are 0.
     """
@@ -184,7 +184,7 @@ def facet_irradiance(
 
 
 def fixed_sun(towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0) -> Varying:
-    """Return the irradiance of facets by a sun that stands at `towards`, for `AbsorbedSolar.irradiance_w_m2`."""
+    """Return the sunlight on facets from a sun fixed in direction `towards`; for `AbsorbedSolar.irradiance_w_m2`."""
     x, y, z = _unit(towards).tolist()
     return Varying(
         lambda places, _: facet_irradiance(places.normals, places.up, (x, y, z), sunlight, ground_reflectance),
@@ -200,7 +200,7 @@ def moving_sun(
     sunlight: Sunlight | None = None,
     ground_reflectance: float = 0.0,
 ) -> Varying:
-    """Return the irradiance of facets by the sun at a date and place, for `AbsorbedSolar.irradiance_w_m2`.
+    """Return the sunlight on facets from the moving sun at a date and place; for `AbsorbedSolar.irradiance_w_m2`.
 
     `start` is the moment of the time 0, with a time zone. Latitudes north and longitudes east are positive. `north` is
     the direction north in the coordinates of the mesh. Without `sunlight` the light is that of `meinel_clear_sky`.

@@ -92,7 +92,7 @@ class Goals:
         return np.inf if self.memory_gb is None else self.memory_gb * 2**30
 
     def check_fits(self, time: Time) -> None:
-        """Raise `HeatError` if time steps are to be chosen by a tolerance of heat flows without one of temperature."""
+        """Raise `HeatError` if a solution through `time` has a tolerance of heat flows but none of temperature."""
         if time is not None and self.flow_tolerance is not None and self.tolerance_k is None:
             expected = "--tolerance beside it if the scene has a duration"
             remedy = "Pass --tolerance too: steps in time are chosen by it."
@@ -123,7 +123,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
     """Solve a problem without its negligible effects; `say` is called with lines of progress.
 
     Effects that bring little heat at any temperature of start and surroundings are left out at first. If at the
-    solution these bring more than `goals.left_out_share` of all heat, the largest are taken in, and all solved again.
+    solution these bring more than `goals.left_out_share` of all heat, the strongest are put back for a new solution.
 
     Raises `HeatError` if it needs more memory than allowed, the solver fails, or the tolerance cannot be met.
     """

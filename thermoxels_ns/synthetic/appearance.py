@@ -102,7 +102,7 @@ def painted(
 def sky_temperature_c(directions: npt.ArrayLike, horizon_c: float, drop_k: float) -> FloatArray:
     """Return the apparent temperature [C] of sky and far ground along unit directions (n, 3), shape (n,).
 
-    Temperature is linear in z from the horizon to the zenith, `drop_k` colder, and to straight below, 2 K warmer.
+    It is `horizon_c` at the horizon, `drop_k` less at the zenith, 2 K more straight below, and linear in z between.
     """
     z = np.asarray(directions, dtype=np.float64)[:, 2]
     return horizon_c - drop_k * _rise(z) + _GROUND_RISE_K * _rise(-z)

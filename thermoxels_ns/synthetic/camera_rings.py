@@ -15,7 +15,7 @@ from thermoxels_ns.synthetic.solids import Vector
 
 
 def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:
-    """Return the pose (4, 4) of a camera at `position` that looks at `target`, not vertically, with world z up."""
+    """Return the pose (4, 4) of a camera at `position` that looks at `target`, not straight up or down; z is up."""
     position = np.asarray(position, dtype=np.float64)
     back = position - np.asarray(target, dtype=np.float64)
     right = np.cross((0.0, 0.0, 1.0), back)
@@ -51,7 +51,7 @@ class CameraRing:
 
 
 def rings_around(middle: tuple[float, float], *rings: Vector, **arc: float) -> tuple[CameraRing, ...]:
-    """Return rings about a vertical axis at `middle` (x, y), each from z of its target, radius and z of cameras [m]."""
+    """Return a `CameraRing` about `middle` (x, y) for each z of target, radius and z of cameras [m], all with `arc`."""
     return tuple(CameraRing((*middle, aim), radius, height, **arc) for aim, radius, height in rings)
 
 
@@ -61,7 +61,7 @@ class CameraWalk:
 
     ends: tuple[Vector, Vector]  # begin and end of the line of cameras [m]
     aims: tuple[Vector, Vector]  # points at which cameras at begin and end look [m]
-    closed: bool = False  # as of `CameraRing`: the last camera is no neighbour of the first
+    closed: bool = False  # the last camera is no neighbour of the first
 
     def pose(self, share: float) -> FloatArray:
         """Return the pose (4, 4) at a share of the line, 0 to 1, camera to world."""

@@ -194,7 +194,7 @@ def house_corner(white: bool = False) -> SyntheticScene:
 
 
 def true_u_w_m2k(points: npt.ArrayLike) -> FloatArray:
-    """Return the U-value behind the temperature of the house's walls and panes at points (n, 3), (n,), [W/(m2 K)]."""
+    """Return the U-value [W/(m2 K)] of the house's walls and panes, (n,), which sets their warmth, at points (n, 3)."""
     return (house_corner().surface_temperature_c(points) - _HOUSE_AIR_C) / _KELVIN_PER_U
 
 

@@ -55,7 +55,7 @@ class Imperfections:
     """Share of the thermal pixels that always read the same value."""
     rig_error_deg: float = 0.0
     """Standard deviation of the angle, about each axis, by which the given poses of a separate thermal camera are
-    turned against those of the photographs, [degrees]; all poses are turned alike."""
+    turned against those of the photographs, [degrees], by the same angles in all poses."""
     passers_by: float = 0.0
     """Share of the pairs of images in which a person, 31 C warm, walks before the scene."""
 
@@ -76,7 +76,7 @@ PERFECT = Imperfections()
 
 
 class DrawnFlaws:
-    """The flaws drawn for the photographs of one scene, which corrections are to find, and their effect on images.
+    """The flaws of one scene's images and poses, drawn at random; methods apply these flaws to images and poses.
 
     Args:
         flaws: Sizes of the flaws.
@@ -128,7 +128,7 @@ class DrawnFlaws:
         return turn
 
     def bounds_c(self, lowest_c: float, highest_c: float) -> tuple[float, float]:
-        """Return the range of readings of thermal images [degrees Celsius] for the range of a scene's temperatures."""
+        """Return the lowest and highest reading of thermal images of a scene of `lowest_c` to `highest_c`, [C]."""
         flaws = self.flaws
         margin = _NOISE_SIGMAS * float(np.hypot(flaws.noise_k, flaws.fixed_pattern_k))
         low = min(float(self.drifts_k.min()), 0.0) - margin - flaws.thermal_vignetting_k
@@ -140,7 +140,7 @@ class DrawnFlaws:
         return replace(camera, fl_x=stretch * camera.fl_x, fl_y=stretch * camera.fl_y)
 
     def photograph(self, number: int, rgb: Float32Array) -> npt.NDArray[np.uint8]:
-        """Return what the camera stores in photograph `number`, counts (h, w, 3), for true colours in [0, 1]."""
+        """Return photograph `number`, counts (h, w, 3), taken where a flawless camera sees colours `rgb`, 0 to 1."""
         flaws, draw = self.flaws, np.random.default_rng([self._seed, 7, number])
         angle, side, place = draw.uniform(0.0, 2.0 * np.pi), draw.random(), draw.random()
         seen = rgb.astype(np.float64)
@@ -155,7 +155,7 @@ class DrawnFlaws:
         return np.clip(np.round(counts), 0, 255).astype(np.uint8)
 
     def thermogram(self, number: int, temperature_c: FloatArray) -> FloatArray:
-        """Return what thermal image `number` reads, (h, w), for true apparent temperatures, [degrees Celsius]."""
+        """Return the readings (h, w) of thermal image `number` where a flawless camera reads `temperature_c`."""
         from scipy import ndimage
 
         flaws, shape, seen = self.flaws, temperature_c.shape, temperature_c.copy()
@@ -170,7 +170,7 @@ class DrawnFlaws:
         return np.where(draw.random(shape) < flaws.dead_pixels, draw.uniform(*self._range_c, shape), seen)
 
     def truth(self) -> dict[str, object]:
-        """Return the entries of ``truth.json`` about the flaws."""
+        """Return the entries of ``truth.json`` by name: sizes of the flaws, drawn values, and the true poses."""
         return {
             "imperfections": vars(self.flaws),
             "gains": self.gains.tolist(),

@@ -159,7 +159,7 @@ def facade(plan: Plan) -> None:
 
 
 def railing(plan: Plan) -> None:
-    """Put thin bars under a rail along the front edge of the ground, which must be the plan's first piece."""
+    """Put thin bars under a rail along the front edge of the ground, the first of `plan.pieces`."""
     u = plan.u
     ground = plan.pieces[0].shape
     assert isinstance(ground, tuple)

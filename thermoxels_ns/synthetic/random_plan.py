@@ -62,7 +62,7 @@ class Glow:
     """A box, or a point, of one warmth that fades into the warmth around it."""
 
     core: Box  # box that has the full warmth; a point if both corners agree
-    warmth: float
+    warmth: float  # as of `Piece`
     reach: float  # distance from the core beyond which the glow changes nothing [units of length]
 
 
@@ -70,7 +70,7 @@ class Glow:
 class Plan:
     """The pieces, openings and glows of a scene; a point has the paint of the last piece that contains it."""
 
-    draw: np.random.Generator
+    draw: np.random.Generator  # source of all random choices
     pieces: list[Piece] = field(default_factory=list)
     """Pieces in the order in which they were put; boxes may overlap and touch, round pieces must not."""
     removed: list[Box] = field(default_factory=list)  # boxes that are cut out of all other boxes
@@ -89,7 +89,7 @@ class Plan:
         return bool(self.draw.random() < share)
 
     def paint(self, material: str) -> int:
-        """Draw a paint of a material (random base colour, shade and contrast), add it, and return its number."""
+        """Draw a paint of a material (random base colour, shade and contrast), add it, and return its index."""
         base = np.asarray(_BASES[material][int(self.draw.integers(len(_BASES[material])))])
         mixed = np.clip(base + self.u(-_SHADE, _SHADE) + self.draw.uniform(-0.03, 0.03, 3), 0.12, 0.85)
         red, green, blue = mixed.tolist()
@@ -99,12 +99,12 @@ class Plan:
         return self.add_paint(Paint((red, green, blue), contrast, self.mirror if material == "glass" else 0.0))
 
     def add_paint(self, paint: Paint) -> int:
-        """Add a paint to the plan and return its number."""
+        """Add a paint to the plan and return its index in `paints`."""
         self.paints.append(paint)
         return len(self.paints) - 1
 
     def put(self, shape: Shape, paint: int, warmth: float = 0.0) -> None:
-        """Add a piece whose warmth has a gentle random slope."""
+        """Add a `Piece` with this shape, paint (index) and warmth, and with a gentle random slope."""
         lo, hi = bounds_of(shape)
         slope = self.draw.uniform(-0.12, 0.12, 3) / max(float(np.subtract(hi, lo).max()), 1.0)
         self.pieces.append(Piece(shape, paint, warmth, slope))
@@ -122,7 +122,7 @@ class Plan:
         self.glows.append(Glow(pane, warmth, depth))
 
     def spot(self, box: Box, warmth: float, reach: float) -> None:
-        """Add a glow at a random point on the top or on an upright side of a box."""
+        """Add a `Glow` with this warmth and reach at a random point on the top or an upright side of a box."""
         lo, hi = np.asarray(box[0]), np.asarray(box[1])
         point = self.draw.uniform(lo, hi)
         side = int(self.draw.integers(5))
@@ -155,7 +155,7 @@ class Plan:
         return parts[0] if len(parts) == 1 else SolidUnion(tuple(parts))
 
     def part(self, points: npt.ArrayLike, normals: npt.ArrayLike) -> IntArray:
-        """Return the paint number of the last piece at each surface point, (n,); points and outward normals: (n, 3)."""
+        """Return the paint index (n,) of the last piece that contains each surface point (n, 3); normals: (n, 3)."""
         inner = np.asarray(points, dtype=np.float64) - 0.01 * self.unit * np.asarray(normals, dtype=np.float64)
         number = np.zeros(len(inner), dtype=np.int64)
         x, y, z = np.ascontiguousarray(inner.T)

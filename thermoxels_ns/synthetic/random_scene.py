@@ -150,7 +150,7 @@ def warm_scene(
 def painted_scene(
     plan: Plan, texture_seed: int, light: SunLight, *, scene_box: Box, solid: Solid | None = None, **rest: Any
 ) -> SyntheticScene:
-    """Return a scene of a plan in metres, with textured paints; `rest` are the other fields of the scene by name."""
+    """Return a textured scene of a plan in metres; `solid` None: the plan's; `rest` are the scene's other fields."""
     texture = SolidTexture(scene_box, texture_seed)
     mirrors = np.array([paint.mirror for paint in plan.paints], dtype=np.float32)
     return SyntheticScene(
@@ -199,7 +199,7 @@ _FARTHEST_SHARE = 1.10
 def random_rings(
     draw: np.random.Generator, boxes: Sequence[Box], focal_share: float, arc_deg: tuple[float, float]
 ) -> tuple[CameraRing, ...]:
-    """Draw two or three rings of cameras around boxes [m], all of which every picture shows, from low to high.
+    """Draw two or three rings of cameras, from low to high, whose every picture shows all of the boxes [m].
 
     `arc_deg` is begin and length of each ring's arc. `focal_share` is the focal length over the width of a 4:3 image.
     Cameras stand at most a tenth farther away than the least distance from which all boxes show.
@@ -315,9 +315,9 @@ def _place(scene: SyntheticScene, seed: int) -> tuple[Plan, tuple[float, float],
 def surrounded(
     scene: SyntheticScene, plan: Plan, seed: int, range_k: float, windows: tuple[range, float, float] | None = None
 ) -> SyntheticScene:
-    """Return a scene with a plan around it; warmth 0 to 1 is 0 to `range_k` above the temperature at the horizon.
+    """Return a scene with a plan around it, whose warmth w means w * `range_k` above the temperature of the horizon.
 
-    `windows`: numbers of the paints of walls with windows, z at which storeys begin [m], height of a storey [m].
+    `windows`: indices of the paints of walls with windows, z at which storeys begin [m], height of a storey [m].
     """
     lo = np.asarray(scene.scene_box[0])
     texture, light = SolidTexture(box_between(lo, lo + 3.0 * scene.size), seed), SunLight()

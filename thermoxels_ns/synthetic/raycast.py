@@ -50,7 +50,7 @@ def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samp
 
 
 def first_surface(scene: SyntheticScene, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Find the first surface, of the scene or around it, that rays meet: origins (n, 3) or (3,) [m], directions (n, 3).
+    """Find the first surface, the scene's or one around it, on rays; origins (n, 3) or (3,) [m], directions (n, 3).
 
     Returns:
         Distances (n,) in lengths of the directions, infinite for no surface, and whether it is the scene's solid (n,).

@@ -26,7 +26,7 @@ class Body:
     solid: Solid  # everything that is not air; lengths in metres
     colour: RgbFunction  # function of points (n, 3) and normals (n, 3) to red, green, blue in [0, 1] (n, 3)
     surface_temperature_c: DegreesFunction
-    """Function of points (n, 3) to temperatures (n,) [C], the same from every direction; smooth off the surface too."""
+    """Function of points (n, 3) to temperatures (n,) [C], the same from all sides; smooth, also off the surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class SyntheticScene(Body):
     temperature_bounds_c: tuple[float, float]
     """Bounds of the temperatures of all surfaces and of the background."""
     background_rgb: RgbFunction  # function of unit directions (n, 3), away from the camera, to colours (n, 3)
-    background_temperature_c: DegreesFunction  # function of such directions to apparent temperatures (n,)
+    background_temperature_c: DegreesFunction  # function of such directions to temperatures (n,) [C]
     rings: tuple[CameraRing | CameraWalk, ...]  # where cameras stand
     focal_share: float  # focal length over the image width, for a 4:3 image
     around: Body | None = None
