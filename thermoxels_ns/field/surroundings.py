@@ -37,7 +37,7 @@ class Surroundings(nn.Module):
     an empty layer of voxels between, so that the renderers of a grid can render them.
 
     `box` (2, 3) is in world units. At the start a face is `across` voxels wide and infinity lies `deep` voxels away;
-    densities are per edge of such a voxel.
+    densities are per edge of such a voxel. `start_density`, `activation`: see `VoxelGrid`; `colour`: False: no colour.
     """
 
     centre: Tensor
@@ -75,7 +75,7 @@ class Surroundings(nn.Module):
     def segments(
         self, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"] | None = None
     ) -> Segments:
-        """Return rays, from where they leave the box to distance `far`, cut where they pass between two frusta.
+        """Cut rays, from where they leave the box to `far` (None: infinity), into straight pieces, one per frustum.
 
         Rays and `far` are in world units. A ray that misses the box begins where it is nearest to the box's middle, so
         that the space before a camera outside the box stays empty.

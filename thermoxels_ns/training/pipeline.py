@@ -146,7 +146,7 @@ class ThermoxelsPipeline(VanillaPipeline):
         super().load_pipeline(state, step)
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Return metrics averaged over held-out images; in ns-eval with `geometry_metrics`."""
+        """Return metrics averaged over held-out images and, in ns-eval, those of `geometry_metrics`."""
         averages = super().get_average_eval_image_metrics(*args, **kwargs)
         if self.test_mode == "test":  # ns-eval; training has "val"
             averages |= self.geometry_metrics()
