@@ -58,10 +58,10 @@ class VoxelGrid(nn.Module):
         activation: Function from interpolated raw density to density, see `activate_density`.
     """
 
-    lo: Tensor
+    lo: Tensor  # This and the next two: `lo`, `voxel_size` and `shape` of the lattice
     voxel_size: Tensor
     corner_shape: Tensor
-    cells: Tensor
+    cells: Tensor  # `KeptVoxels.cells`
 
     def __init__(
         self,

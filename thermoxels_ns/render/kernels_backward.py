@@ -56,7 +56,7 @@ def find_sample_gradients(
     grads: RayGradients,
     samples: SampleGradients,
 ):
-    """Write the gradients of the samples of rays `first` to before `last` into `samples`, over part of `records`.
+    """Write the gradients of the samples of rays `first` to before `last` into `samples`, which overwrites `records`.
 
     With w_i = T_i (1 - exp(-x_i)), T_{i+1} = T_i exp(-x_i) and x_i the optical depth of step i,
     dL/dx_i = g_i T_{i+1} - sum_{j>i} g_j w_j - g_T T_end, where g_i = dL/dw_i and g_T = dL/dT_end.

@@ -52,7 +52,7 @@ class ThermoxelsPipeline(VanillaPipeline):
 
     compare_with_truth: ClassVar[Callable[[Any], dict[str, float]] | None] = None
     """Function from pipeline to metrics of the surface, which `config.py` sets; None: there are no such metrics."""
-    world_from_input: torch.Tensor
+    world_from_input: torch.Tensor  # Transform, scene box and mean camera, (3, 10), by which a checkpoint is compared
 
     def __init__(self, config: ThermoxelsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         if config.cpu_threads is not None and config.cpu_threads < 1:

@@ -91,7 +91,7 @@ _END_STEPS = 5
 
 @dataclass(frozen=True)
 class CornerTemperature:
-    """The temperature that thermal rays see around each stored corner."""
+    """The temperature that thermal rays see around each corner of a kept voxel."""
 
     thermal: Float[Tensor, " rows"]
     """Normalised temperature, clipped to [0, 1]; the stored value at corners that no thermal ray reaches."""

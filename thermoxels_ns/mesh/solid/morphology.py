@@ -74,7 +74,7 @@ def shrink(cells: BoolArray, size: int | tuple[int, ...], origin: int | tuple[in
 
 
 def close_gaps(cells: BoolArray, by: int) -> BoolArray:
-    """Return the solid voxels and the gaps into which no cube of 2 `by` + 1 empty voxels along an edge fits.
+    """Return the solid voxels and all gaps too narrow for a cube of empty voxels with an edge of 2 `by` + 1 voxels.
 
     >>> close_gaps(np.array([[[True, False, True]]]), 1)[0, 0].tolist()
     [True, True, True]
