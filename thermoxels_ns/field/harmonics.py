@@ -53,5 +53,5 @@ def harmonics(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n
 
 
 def harmonics_with_unit_mean(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
-    """Return `harmonics` scaled so that the first is 1: the first coefficient is then the mean over directions."""
+    """Return `harmonics` scaled so that the first is 1; a sum's first coefficient is then its mean over directions."""
     return harmonics(directions, degree) / _Y00

@@ -1,4 +1,4 @@
-"""Trilinear interpolation of rows on the corners of kept voxels, and its gradient."""
+"""Trilinear interpolation of values at the corners of kept voxels, one row per corner, and its gradient."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class TrilinearPoints:
 
 
 def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Float[Tensor, "n channels"]:
-    """Return values at points in kept voxels: f(p) = sum over the voxel's corners c of w_c(p) rows[c].
+    """Return values at points in kept voxels: the sum over the voxel's corners c of their weight w_c times rows[c].
 
     The gradient for `rows` is summed in the order of the points, so its bits do not depend on the number of threads.
     """
@@ -59,7 +59,7 @@ def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Fl
 
 
 def splat(values: Float[Tensor, "n channels"], at: TrilinearPoints) -> Float[Tensor, "rows channels"]:
-    """Return for each row the sum of values at points times the trilinear weight of its corner, (rows, channels)."""
+    """Return for each corner's row the sum of `values` of points times the corner's trilinear weight at the point."""
     total = values.new_zeros((at.voxels.num_rows, values.shape[1]))
     if values.shape[0] == 0:
         return total

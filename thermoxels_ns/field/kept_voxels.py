@@ -95,7 +95,7 @@ class KeptVoxels:
         return np.asarray(maximum_filter(grown, 2 * by + 1, mode="constant"), dtype=bool).reshape(-1)[self.cells]
 
     def tables(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-        """Return int64 tensors: rows of all eight corners (voxels, 8), `block_slot` and `voxel_number`."""
+        """Return int64 tensors on `device`: rows of all eight corners (voxels, 8), `block_slot` and `voxel_number`."""
         if device not in self._tables:
             four = torch.from_numpy(self.voxel_rows).to(device, torch.int64)
             eight = torch.stack((four, four + 1), dim=-1).flatten(1)  # order of CORNER_OFFSETS
@@ -133,9 +133,9 @@ class MemoryNeed:
 
 
 def memory_need(lattice: Lattice, voxels: int, channels: int) -> MemoryNeed:
-    """Predict the memory of training on a number of kept voxels of a lattice, with `channels` columns per row.
+    """Predict the memory of training on `voxels` kept voxels of a lattice, with `channels` numbers per corner.
 
-    Each channel of a row takes a value, two moments of the optimiser and a gradient, each of four bytes.
+    Each channel of a corner takes a value, two moments of the optimiser and a gradient, each of four bytes.
     """
     total = int(np.prod([float(n) for n in lattice.cell_shape]))
     rows = lattice.num_corners if voxels >= total else min(lattice.num_corners, int(_ROWS_PER_VOXEL * voxels))

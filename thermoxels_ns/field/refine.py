@@ -76,7 +76,7 @@ def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
 
 @torch.no_grad()
 def prune(grid: VoxelGrid, keep: BoolArray) -> RowChange:
-    """Drop voxels of `grid` where `keep` (voxels,) is False, in place; return the selection of the rows that stay."""
+    """Drop voxels of `grid` where `keep` (voxels,) is False, in place; return the function that picks the rows kept."""
     voxels = grid.voxels
     new = KeptVoxels(voxels.lattice, voxels.cells[keep])
     stay: IntArray = np.searchsorted(voxels.corners, new.corners)

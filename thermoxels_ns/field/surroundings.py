@@ -37,11 +37,11 @@ class Surroundings(nn.Module):
     an empty layer of voxels between, so that the renderers of a grid can render them.
 
     `box` (2, 3) is in world units. At the start a face is `across` voxels wide and infinity lies `deep` voxels away;
-    densities are per edge of such a voxel.
+    densities are per edge of such a voxel. `start_density`, `activation`: see `VoxelGrid`; `colour`: False: no colour.
     """
 
-    centre: Tensor
-    half_sides: Tensor
+    centre: Tensor  # Middle of the box, (3,), world units
+    half_sides: Tensor  # Half of each side of the box, (3,), world units
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class Surroundings(nn.Module):
     def segments(
         self, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"] | None = None
     ) -> Segments:
-        """Return rays, from where they leave the box to distance `far`, cut where they pass between two frusta.
+        """Cut rays, from where they leave the box to `far` (None: infinity), into straight pieces, one per frustum.
 
         Rays and `far` are in world units. A ray that misses the box begins where it is nearest to the box's middle, so
         that the space before a camera outside the box stays empty.
@@ -115,7 +115,7 @@ def seen_behind(
 
 
 class SphereImage(nn.Module):
-    """Colour at infinity: an equirectangular image around the z axis, of colours before the sigmoid, bilinear.
+    """Colour at infinity: an equirectangular image around the z axis that holds colours before the sigmoid.
 
     Args:
         height: Number of rows from the +z pole to the -z pole; the image has twice as many columns.
@@ -126,7 +126,7 @@ class SphereImage(nn.Module):
         self.image = nn.Parameter(torch.zeros(height, 2 * height, 3))
 
     def forward(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return the colour seen along unit directions, each channel in [0, 1]."""
+        """Return the colour seen along unit directions, interpolated bilinearly, each channel in [0, 1]."""
         height, width, _ = self.image.shape
         x, y, z = directions.unbind(-1)
         column = (torch.atan2(y, x) / (2 * math.pi) + 0.5) * width - 0.5

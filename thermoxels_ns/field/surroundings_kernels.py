@@ -11,10 +11,10 @@ MOST_SEGMENTS = 6  # Most frusta through which a ray can pass
 
 @kernel
 def cut_rays(at, along, reaches, across: int, deep: int, ends, ray, rank):
-    """Cut rays into pieces for `Surroundings.segments`, scaled so that the box is -1 to 1, and return their number.
+    """Cut rays into straight pieces, one per frustum of `Surroundings`, and return the number of pieces.
 
     Writes the two ends of each piece in lattice coordinates into `ends` (n, 2, 3), its ray and its rank into `ray` and
-    `rank` (n,). Origins `at`, directions `along` (rays, 3) and distances `reaches` (rays,) are the input.
+    `rank` (n,). Origins `at` and directions `along` (rays, 3) are scaled so that the box is -1 to 1; `reaches`: ends.
     """
     count = 0
     for r in range(len(at)):

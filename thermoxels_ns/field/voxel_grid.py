@@ -16,7 +16,7 @@ from thermoxels_ns.field.kept_voxels import KeptVoxels
 
 DensityActivation = Literal["relu", "softplus", "exp"]
 COLOUR_CHANNELS = tuple(3 * num_coefficients(degree) for degree in range(MAX_DEGREE + 1))
-"""Columns of colour by the degree of its harmonics."""
+"""Numbers of columns that the colour of a corner has, for each degree of its harmonics."""
 
 _PALEST = 0.02  # `VoxelGrid.paint` clips colours to 0.02 .. 0.98, because a sigmoid reaches neither 0 nor 1
 
@@ -58,10 +58,10 @@ class VoxelGrid(nn.Module):
         activation: Function from interpolated raw density to density, see `activate_density`.
     """
 
-    lo: Tensor
+    lo: Tensor  # This and the next two: `lo`, `voxel_size` and `shape` of the lattice
     voxel_size: Tensor
     corner_shape: Tensor
-    cells: Tensor
+    cells: Tensor  # `KeptVoxels.cells`
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class VoxelGrid(nn.Module):
     def replace_voxels(self, voxels: KeptVoxels, rows: dict[str, Tensor], keep_identity: bool = False) -> None:
         """Set the kept voxels, of this lattice or another, and the new rows of each parameter by name.
 
-        `keep_identity`: keep the parameter objects and exchange their data, allowed only while no graph uses them.
+        `keep_identity`: keep the parameter objects and exchange their data, only while no autograd graph uses them.
         """
         for name, parameter in self.row_parameters().items():
             data = rows[name].to(parameter.device, parameter.dtype).contiguous()
@@ -172,7 +172,7 @@ class VoxelGrid(nn.Module):
 
     @torch.no_grad()
     def corner_values(self, rows: Float[Tensor, " rows"], fill: float = 0.0) -> Float[Tensor, "x y z"]:
-        """Return values on all corners of the lattice from one value per row; other corners get `fill`."""
+        """Return values on all corners of the lattice from one value per row; corners without a row get `fill`."""
         values = torch.full((self.lattice.num_corners,), fill, dtype=rows.dtype, device=rows.device)
         values[torch.from_numpy(self.voxels.corners).to(rows.device)] = rows
         return values.view(self.lattice.shape)

@@ -55,9 +55,9 @@ class BuiltMesh:
     mesh: TetMesh
     solid: SolidCells
     unobserved_parts: int  # number of connected parts left out because no thermal ray saw any of their nodes
-    unobserved_voxels: int  # number of voxels of these parts: in `solid.component_sizes`, not in `solid.cells`
+    unobserved_voxels: int  # number of voxels of these parts; `solid.component_sizes` counts them, `solid.cells` not
     observed_range_c: tuple[float, float]
-    """Lowest and highest temperature of the field's measured corners, [degrees Celsius]; no node is outside."""
+    """Lowest and highest temperature of the field's measured corners, [degrees Celsius]; all nodes are within it."""
     idle_rules: tuple[str, ...] = ()
     """The user's rules that no triangle or tetrahedron of the mesh follows, such as "patch roof (entry 2)"."""
 
@@ -194,7 +194,7 @@ def _tagged(
 
 
 def check_similarity(name: str, matrix: npt.ArrayLike) -> FloatArray:
-    """Return `matrix` (4, 4) as float64; raise `MeshError` if it is no similarity. Reflections are allowed."""
+    """Return `matrix` (4, 4) as float64. Raise `MeshError` about `name` if it is no similarity, reflected or not."""
     remedy = "Pass a 4x4 matrix made of a rotation, one scale above 0 and a shift, with last row 0 0 0 1."
     transform = check_shape(name, np.asarray(matrix, dtype=np.float64), (4, 4), remedy, MeshError)
     check_finite(name, transform, remedy, MeshError)

@@ -58,7 +58,7 @@ class TetMesh:
 
         Raises:
             MeshError: An array has a shape that does not fit the others, is not finite or has an index out of range;
-                there is no tetrahedron; or names of patches or regions are missing, alike or not printable.
+                there is no tetrahedron; or names of patches or regions are missing, equal or not printable.
         """
         nodes, tets, facets, tags = len(self.points_m), len(self.tets), len(self.facets), self.boundary
         arrays: list[tuple[str, npt.NDArray, tuple[int | None, ...], int | None]] = [

@@ -47,7 +47,7 @@ def used_corners(cells: BoolArray) -> IntArray:
 
 
 def lattice_edges(cells: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return the edges of solid voxels (e, 2), by node numbers of `kuhn_tets`, and each edge's number of solid voxels.
+    """Return the edges of solid voxels, (e, 2) nodes of `kuhn_tets`, and how many solid voxels have each edge, (e,).
 
     Two neighbouring corners with only empty voxels around their connection are not joined by an edge.
     """
@@ -90,7 +90,7 @@ def voxel_facets(cells: BoolArray) -> IntArray:
 
 
 def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tuple[int, ...]) -> IntArray:
-    """Return per triangle `FACET_BOX` if it lies on a side of the lattice of corners, else `FACET_SURFACE`, (f,)."""
+    """Return `FACET_BOX` for facets on a side of the lattice, else `FACET_SURFACE`, (f,); points are corner indices."""
     # Each side of the lattice has one bit; a triangle lies on the sides that its three nodes have in common.
     sides = np.zeros(len(points_index), dtype=np.uint8)
     for axis, count in enumerate(lattice_shape):

@@ -24,7 +24,7 @@ from thermoxels_ns.render.reference import SMALLEST_VARIATION
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
 VOXELS_AT_ONCE = 1 << 14  # Voxels whose total variation one task sums
-FEWEST_SAMPLES = 24  # Samples per ray, on average over a range of rays, for which the first batch takes memory
+FEWEST_SAMPLES = 24  # Mean number of samples per ray for which the first batch takes memory
 MOST_GROUPS = 1 << 12  # Most groups of voxels by which samples are put in order (one group more may occur)
 RANGES_PER_THREAD = 4  # Ranges of rows per thread over which gradients are summed
 VARIATION_SHARE = 0.02  # Work for the variation of one channel in one voxel, relative to the work for one sample
@@ -238,7 +238,7 @@ def _gradient(gradient: Tensor | None, like: np.ndarray) -> np.ndarray:
 
 
 def row_gradients(rays: Rays, volume: Volume, of_samples: SampleGradients, blocks: Blocks) -> list[Tensor | None]:
-    """Return the gradients of density, colour and temperature as row-sparse tensors; None for one without rows."""
+    """Return the gradients of density, colour and temperature as row-sparse tensors; None if no row has one."""
     parameters, num_rows = list(_parameters(volume).values()), len(volume.density)
     order = _ordered(of_samples, len(volume.voxel_rows))
     bounds = _row_ranges(volume.voxel_rows, num_rows, order, blocks, [p.shape[1] for p in parameters])

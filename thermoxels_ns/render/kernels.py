@@ -60,7 +60,7 @@ class Volume(NamedTuple):
     lo: Floats  # Lower corner of the lattice, (3,) float64
     hi: Floats  # Upper corner of the lattice, (3,) float64
     size: float  # Edge of a voxel
-    cells: Ints  # Voxels along x, y, z, (3,) int64
+    cells: Ints  # Number of voxels along x, y and z, (3,) int64
     block_slot: Ints  # This and the next two: the attributes of `KeptVoxels` of that name
     voxel_number: Ints
     voxel_rows: Ints
@@ -99,7 +99,7 @@ class Records(NamedTuple):
 
     offset: Ints  # First record of each ray, (rays,) int64
     used: Ints  # Number of records of each ray, (rays,) int64
-    number: Ints  # Number of the kept voxel, (records,) int32
+    number: Ints  # Index of the kept voxel in `KeptVoxels.cells`, (records,) int32
     step: Ints  # Number of the step along the ray, from 0, (records,) int32
     fraction: Floats  # Place in the voxel, each coordinate from 0 to 1, (records, 3)
     density: Floats  # Density, [1 / world unit], (records,)
@@ -222,7 +222,7 @@ def basis_of(directions: Floats, r: int, count: int, scale: float, basis: Floats
 
 @kernel(fastmath={"contract"})
 def gather(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, into: Floats):
-    """Write all channels of `values` (rows, channels), interpolated at (fx, fy, fz) in a voxel, into `into`."""
+    """Write into `into` all channels of `values` at the place (fx, fy, fz) in a voxel; arguments as of `gather_one`."""
     gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
     a, b, c, d = rows[number, 0], rows[number, 1], rows[number, 2], rows[number, 3]
     one = values.dtype.type
@@ -238,7 +238,7 @@ def gather(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: fl
 
 @kernel(fastmath={"contract"})
 def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, k: int):
-    """Return channel `k` of `values` (rows, channels), interpolated at (fx, fy, fz) in voxel `number`."""
+    """Return channel `k` of `values` at (fx, fy, fz), each 0 to 1, in voxel `number`; `rows` is `Volume.voxel_rows`."""
     gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
     a, b = np.uint64(rows[number, 0]), np.uint64(rows[number, 1])
     c, d = np.uint64(rows[number, 2]), np.uint64(rows[number, 3])
@@ -254,7 +254,7 @@ def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz
 
 @kernel
 def prefetch_corners(values: Floats, rows: Ints, number: int):
-    """Prefetch the first channel of a voxel's corners."""
+    """Load the first channel of `values` at the corners of voxel `number` into the cache, as `prefetch_colours`."""
     for corner in range(4):
         row = np.int64(rows[number, corner])
         prefetch(values, row, 0)
@@ -364,7 +364,7 @@ def march_rays(
 
 @kernel
 def prefetch_colours(values: Floats, rows: Ints, number: int):
-    """Prefetch the colours of a voxel's corners; with harmonics, the rows of two corners take several cache lines."""
+    """Load the colours `values` at the corners of voxel `number` into the cache; `rows` is `Volume.voxel_rows`."""
     channels = values.shape[1]
     if channels == 3:
         prefetch_corners(values, rows, number)

@@ -40,7 +40,7 @@ class RayGradients(NamedTuple):
 
     rgb: Floats
     thermal: Floats
-    transmittance: Floats  # For the transmittance, less that for the accumulation, which is 1 - transmittance
+    transmittance: Floats  # Gradient for the transmittance minus that for the accumulation, 1 - transmittance
     distortion: Floats
     sparsity: Floats
 
@@ -56,7 +56,7 @@ def find_sample_gradients(
     grads: RayGradients,
     samples: SampleGradients,
 ):
-    """Write the gradients of the samples of rays `first` to before `last` into `samples`, over part of `records`.
+    """Write the gradients of the samples of rays `first` to before `last` into `samples`, which overwrites `records`.
 
     With w_i = T_i (1 - exp(-x_i)), T_{i+1} = T_i exp(-x_i) and x_i the optical depth of step i,
     dL/dx_i = g_i T_{i+1} - sum_{j>i} g_j w_j - g_T T_end, where g_i = dL/dw_i and g_T = dL/dT_end.
@@ -133,28 +133,28 @@ def find_sample_gradients(
 
 
 class Order(NamedTuple):
-    """The samples with a gradient, by groups of successive voxels; within a group in the order of rays."""
+    """The samples with a gradient, sorted by groups of 2^`shift` successive voxels, and within a group by rays."""
 
-    shift: int  # A group has 2^shift voxels
-    group: Ints  # Index at which each group begins in the two lists below, and their length, (groups + 1,) int64
-    record: Ints  # Record of each sample, int32
-    ray: Ints  # Ray of each sample, int32
+    shift: int  # Logarithm to base 2 of the number of voxels in a group
+    group: Ints  # Index in `record` and `ray` where each group begins, and their used length, (groups + 1,) int64
+    record: Ints  # Index in `SampleGradients` of each sample, int32
+    ray: Ints  # Index in `Rays` of the ray of each sample, int32
 
 
 class Blocks(NamedTuple):
-    """The block of voxels whose total variation has a gradient: entries for density, colour, temperature."""
+    """Blocks of voxels whose total variation has a gradient: one each for density, colour and temperature."""
 
-    first: Ints  # First voxel of the block, (3,) int64
-    last: Ints  # One behind the last voxel, (3,) int64; equal to `first` for a parameter without a block
-    push: Floats  # Gradient of the loss for the block's `total_variation`, (3,) float64
+    first: Ints  # Number of the first voxel of each block, (3,) int64
+    last: Ints  # One behind the last voxel of each block, (3,) int64; equal to `first` where there is no block
+    push: Floats  # Gradient of the loss for the `total_variation` of each block, (3,) float64
     smallest: float  # Number added under the root of the total variation
 
 
 class RowGradients(NamedTuple):
-    """Sums of gradients, one for each row that a gradient reaches."""
+    """Sums of gradients by row (corner) of a `Volume`; the last three arrays hold only rows that have a gradient."""
 
-    uses: Ints  # Parameters for which each row has a gradient, (rows,) uint8: bits DENSITY, COLOUR, TEMPERATURE
-    place: Ints  # Index of each row in the three arrays below, (rows, 3) int32
+    uses: Ints  # Parameters that have a gradient at each row, (rows,) uint8: bits DENSITY, COLOUR, TEMPERATURE
+    place: Ints  # Where each row's sum lies in `density`, `sh` and `temperature`, (rows, 3) int32; else undefined
     density: Floats  # (rows with a gradient of density, 1)
     sh: Floats  # (rows with a gradient of colour, columns)
     temperature: Floats  # (rows with a gradient of temperature, columns)
@@ -183,7 +183,7 @@ def order_samples(samples: SampleGradients, order: Order):
 
 @kernel
 def first_voxel(voxel_rows: Ints, corner: int, row: int):
-    """Return the first voxel whose row in column `corner` of `voxel_rows`, which ascends, is at least `row`."""
+    """Return the first voxel n with `voxel_rows[n, corner]` of at least `row`; the columns of `voxel_rows` ascend."""
     low, high = 0, len(voxel_rows)
     while low < high:
         middle = (low + high) >> 1
@@ -226,7 +226,7 @@ def _groups_before(number: int, order: Order):
 
 @kernel
 def list_rows(first_row: int, last_row: int, kind: int, at: int, rows: RowGradients, listed: Ints, sums: Floats):
-    """List the rows of a range with a gradient of parameter `kind` (0 to 2) from place `at` on; set their sums to 0."""
+    """Write the rows of a range with a gradient of parameter `kind` (0 to 2) to `listed[at:]`; set `sums` to 0."""
     for row in range(first_row, last_row):
         if rows.uses[row] & (1 << kind):
             rows.place[row, kind], listed[at] = at, row
@@ -236,7 +236,7 @@ def list_rows(first_row: int, last_row: int, kind: int, at: int, rows: RowGradie
 
 @kernel
 def prefetch_sample(samples: SampleGradients, n: int):
-    """Prefetch the gradients and the place of record `n`."""
+    """Load the gradients and the place of sample `n` into the cache."""
     prefetch(samples.number, n, 0)
     prefetch(samples.fraction, n, 0)
     prefetch(samples.raw_density, n, 0)
@@ -246,7 +246,7 @@ def prefetch_sample(samples: SampleGradients, n: int):
 
 @kernel
 def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
-    """Prefetch the sums of a voxel's corners; for a corner outside the thread's rows another sum may be fetched."""
+    """Load the sums of the corners of voxel `number` into the cache; corners outside the thread's rows load any sum."""
     for corner in range(4):
         row = voxel_rows[number, corner]
         prefetch(rows.density, rows.place[row, 0], 0)
@@ -256,7 +256,7 @@ def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
 
 @kernel
 def corner_shares(samples: SampleGradients, n: int, shares: Floats):
-    """Write the trilinear weights of a sample's corners into `shares` (8,), in the order of `CORNER_OFFSETS`."""
+    """Write the trilinear weights of the corners around sample `n` to `shares` (8,), in order of `CORNER_OFFSETS`."""
     one = shares.dtype.type(1.0)
     fx, fy, fz = samples.fraction[n, 0], samples.fraction[n, 1], samples.fraction[n, 2]
     gx, gy, gz = one - fx, one - fy, one - fz
@@ -337,7 +337,7 @@ def add_samples(
 
 @kernel(fastmath={"contract"})
 def total_variation(values: Floats, voxel_rows: Ints, first: int, last: int, smallest: float):
-    """Return sqrt(dx^2 + dy^2 + dz^2) summed over voxels `first` to before `last` and channels (Plenoxels, eq. 4)."""
+    """Return the sum of sqrt(dx^2 + dy^2 + dz^2) over voxels `first` to before `last` and all channels of `values`."""
     channels = values.shape[1]
     tiny = values.dtype.type(smallest)
     totals = np.zeros(channels)
@@ -365,7 +365,7 @@ def add_variation(
     place: Ints,
     gradient: Floats,
 ):
-    """Add the gradient of the total variation of parameter `kind` to rows `first_row` to before `last_row`."""
+    """Add the total variation's gradient for parameter `kind` to `gradient`, rows `first_row` to before `last_row`."""
     channels = values.shape[1]
     first, last = blocks.first[kind], blocks.last[kind]
     one = values.dtype.type

@@ -19,8 +19,8 @@ class RayRequest:
     directions: Float[Tensor, "rays 3"]  # Unit vectors
     near: float | Float[Tensor, " rays"] = 0.0  # Distance where sampling starts, world units
     far: Float[Tensor, " rays"] | None = None  # Distance where sampling ends, world units; None: behind the grid
-    rgb_rays: Bool[Tensor, " rays"] | None = None  # True for rays that want colour, 0 for the others; None: all
-    thermal_rays: Bool[Tensor, " rays"] | None = None  # True for rays that want temperature, else 0; None: all
+    rgb_rays: Bool[Tensor, " rays"] | None = None  # True for rays that want colour, others get 0; None: all want it
+    thermal_rays: Bool[Tensor, " rays"] | None = None  # The same for temperature
 
     def near_and_far(self) -> tuple[Tensor, Tensor]:
         """Return `near` and `far` with one number per ray, shape (rays,); `far` is infinite where it is None."""
@@ -48,7 +48,7 @@ class RenderOptions:
     yet count as 0. None: the stored channels."""
     sparsity: bool = False  # True: compute the Cauchy sparsity of each ray, over its samples
     variation: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Blocks whose total variation is computed: parameter name to first and one behind last number of kept voxels."""
+    """Blocks of kept voxels whose total variation is computed, by parameter: first number, and one behind the last."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class RayRender:
     thermal: Float[Tensor, "rays 1"]  # Sum of weight times normalised temperature
     transmittance: Float[Tensor, " rays"]  # Share of the light from behind the grid that passes the grid
     accumulation: Float[Tensor, " rays"]  # Opacity, 1 - transmittance, with all digits when it is small
-    depth: Float[Tensor, " rays"]  # Mean distance by weight, world units; infinite at opacity 0. Carries no gradient
+    depth: Float[Tensor, " rays"]  # Weighted mean distance, world units; infinite at opacity 0. Carries no gradient
     distortion: Float[Tensor, " rays"] | None = None  # See `reference.ray_distortion`; None where not requested
     sparsity: Float[Tensor, " rays"] | None = None  # Sum of log(1 + 2 density^2) over the samples of each ray
     variation: dict[str, Float[Tensor, ""]] = field(default_factory=dict)  # Total variation by parameter name

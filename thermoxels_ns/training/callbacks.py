@@ -30,10 +30,10 @@ from thermoxels_ns.training.ray_statistics import (
     voxel_weights,
 )
 
-FEWEST_OPEN_RAYS = 0.002  # Least share of rays that leave the box with half of their light for a background to stay
+FEWEST_OPEN_RAYS = 0.002  # A background stays if at least this share of rays leaves the box with half of its light
 FEWEST_SKY_DIFFERENCE = 0.01
 """Share of the temperature range by which the learned sky must differ from the scene's minimum to be kept."""
-MOST_OPENED_RAYS = 0.01  # Largest share of the rays of opacity above one half that pruning may open
+MOST_OPENED_RAYS = 0.01  # Of the rays of opacity above one half, the largest share that pruning may open
 OPAQUE_DEPTH = 0.7  # Optical depth across a voxel from which the voxel counts as opaque: half of the light is lost
 PRUNING_ATTEMPTS = 4  # Number of thresholds tried before pruning fails
 RAYS_PER_IMAGE = 4096  # Training rays per image from which statistics are made
@@ -163,7 +163,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
 
 def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> PhotographEvidence | None:
-    """Find the evidence of photographs, give it to the model, and return it; None if no depths are wanted or possible.
+    """Find depths in photographs, give the evidence to the model and return it; None if depths are off or impossible.
 
     The model gets feature rays to depths, rays through a plain backdrop, and, unless the training is resumed, gains,
     offsets and first colours. See `ThermoxelsModelConfig.photo_depth`; depths need photographs in training.
@@ -221,7 +221,7 @@ class PruningReport:
 def prune_by_rays(
     model: ThermoxelsModel, datamanager, threshold: float, dilation: int
 ) -> tuple[PruningReport, RowChange]:
-    """Prune to voxels to which some training ray of either stream gives more than `threshold` of its light.
+    """Drop all voxels but those to which some training ray of either stream gives more than `threshold` of its light.
 
     Also kept are voxels in which a ray that ends on something completes half of its weight (else soft surfaces would
     open), kept voxels up to `dilation` voxels away, and opaque neighbours (the rays of statistics miss some voxels of a

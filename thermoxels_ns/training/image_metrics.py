@@ -33,7 +33,7 @@ def psnr_of_blocks(
 ) -> float:
     """Return the `psnr` of both images after averaging over blocks of `side` x `side` pixels, [dB].
 
-    A block is the mean of its valid pixels, or left out without any. The result is NaN if no pixel is valid.
+    A block is the mean of its valid pixels; blocks without any are left out. The result is NaN if no pixel is valid.
 
     >>> fine = torch.tensor([[[0.0], [1.0]], [[1.0], [0.0]]])
     >>> round(psnr_of_blocks(torch.full((2, 2, 1), 0.6), fine, side=2), 3)  # pixels are 0.4 and 0.6 off, their mean 0.1

@@ -13,8 +13,8 @@ from torch import Tensor
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.render.ray_render import RayRequest
 
-MARGIN_VOXELS = 1.5  # The surface may lie so many voxels before or behind a point, plus `MARGIN_ERRORS`
-LARGEST_ERROR = 0.25  # Rays end in the surroundings if `MARGIN_ERRORS` errors are a smaller share of the length
+MARGIN_VOXELS = 1.5  # The surface may lie this many voxels, plus `MARGIN_ERRORS`, before or behind a point
+LARGEST_ERROR = 0.25  # A point outside the box counts if `MARGIN_ERRORS` errors are a smaller share of a ray's length
 MARGIN_ERRORS = 2.0  # Standard errors of a ray's length that are added to the margin before and behind its point
 
 COARSE_LIGHT = 0.5
@@ -37,7 +37,7 @@ def thermal_loss(
 
 
 def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple[int, int]:
-    """Return the first and one behind the last number of a random block of kept voxels, about `share` of all.
+    """Draw a random block of kept voxels, about `share` of all `voxels`; return its first number and its last plus 1.
 
     Kept voxels are numbered slab by slab along x, so that a block is contiguous in space too.
     """
@@ -60,8 +60,8 @@ class FeatureRaySampler:
 
     Args:
         rays: Feature rays, world units; at least one.
-        box: Lower and upper corner, (2, 3). No surface is expected at points outside the box.
-        surroundings: True if a surface is expected at points outside whose distance is known well enough.
+        box: Lower and upper corner, (2, 3). A surface is expected at all points inside the box.
+        surroundings: True: a surface is expected outside, too, at points of known distance (`LARGEST_ERROR`).
         coarse_light: Share of the light that may pass a point while the lattice is coarse.
     """
 
@@ -92,11 +92,11 @@ class FeatureRaySampler:
         device: torch.device,
         surroundings_step: float = 0.0,
     ) -> RayRequest:
-        """Return 2 `count` rays: random feature rays that end a margin before their points, then behind the points.
+        """Return 2 `count` rays: random feature rays that end a margin before their points, then the same ones again.
 
-        In the second half, a ray to a point without an expected surface has length 0. The rays want neither colour nor
-        temperature. Lengths are in world units; the generator is on the CPU. `surroundings_step` is
-        `Surroundings.step`, or 0 without surroundings.
+        In the second half, rays end a margin behind their points, or have length 0 where no surface is expected. The
+        rays want neither colour nor temperature. Lengths are in world units; the generator is on the CPU.
+        `surroundings_step` is `Surroundings.step`, or 0 without surroundings.
         """
         chosen = torch.randint(len(self._length), (count,), generator=generator)
         margin = (

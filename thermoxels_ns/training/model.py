@@ -57,10 +57,10 @@ class ThermoxelsModel(Model):
     """A voxel grid with its surroundings and background, trained on RGB and thermal rays."""
 
     config: ThermoxelsModelConfig
-    temperature_bounds_c: Tensor
-    backdrop_on: Tensor
-    corrected: Tensor
-    trained_steps: Tensor
+    temperature_bounds_c: Tensor  # Temperatures that stand for 0 and 1, (2,), [degrees Celsius]
+    backdrop_on: Tensor  # Whether colour at infinity, temperature at infinity and surroundings are rendered, (3,)
+    corrected: Tensor  # Whether gains and temperature offsets of training images are applied, (2,)
+    trained_steps: Tensor  # Step of training that was reached
 
     def populate_modules(self) -> None:
         """Build grid, surroundings, background and corrections; raise `SceneError` without a temperature range."""

@@ -226,10 +226,10 @@ class ThermoxelsModelConfig(ModelConfig):
     def suited_to(self, voxels: float) -> ThermoxelsModelConfig:
         """Return the settings for a scene along whose longest side `voxels` voxels of width `voxel_pixels` fit.
 
-        Up to `MOST_STRETCH` times the last resolution all resolutions are scaled alike; so are resolutions and steps
-        that are not those of `schedule_for`. Beyond, up to `MOST_VOXELS` times, `schedule_for` gives resolutions and
-        steps for the voxels wanted. Numbers are rounded by `_in_steps`, rather up: too few voxels lose shape
-        (courtyard: F of the seen surface is 0.81, 0.86 and 0.89 with 96, 112 and 128 voxels).
+        If `voxels` is at most `MOST_STRETCH` times the last resolution, or resolutions and steps are not those of
+        `schedule_for`, one factor scales all resolutions, by `MOST_STRETCH` at most. Else `schedule_for` gives them and
+        the steps, for `MOST_VOXELS` times the last resolution at most. Numbers are rounded, rather up: too few voxels
+        lose shape (courtyard: F of the seen surface is 0.81, 0.86 and 0.89 with 96, 112 and 128 voxels).
         """
         if not self.voxel_pixels or not math.isfinite(voxels):
             return self
@@ -250,13 +250,13 @@ class ThermoxelsModelConfig(ModelConfig):
         return 0 if self.sh_degree is not None and self.view_dependence_from > 0 else self.sh_degree
 
     def row_channels(self, resolution: int) -> int:
-        """Return the most columns of a row, all parameters together, while the lattice has a resolution."""
+        """Return the most numbers that a corner stores, of all parameters, while the lattice has this `resolution`."""
         gives_way = dict(zip(self.resolutions, self.refine_at)).get(resolution, math.inf)
         degree = self.sh_degree if gives_way > self.view_dependence_from else self.first_sh_degree()
         return 1 + num_coefficients(self.temperature_degree) + (0 if degree is None else 3 * num_coefficients(degree))
 
     def checkpoint_columns(self) -> dict[str, tuple[int, ...]]:
-        """Return for each parameter of the grid the numbers of columns that are possible in a checkpoint."""
+        """Return by name of the grid's parameters the numbers of columns that each may have in a checkpoint."""
         columns: dict[str, tuple[int, ...]] = {"density": (1,)}
         columns["temperature"] = (num_coefficients(self.temperature_degree),)
         if self.sh_degree is not None:  # one per channel until colour depends on the direction

@@ -11,20 +11,20 @@ from thermoxels_ns.core.kernel_cache import kernel
 def adam_rows(
     begin: int,
     end: int,
-    rows,
-    gradient,
-    values,
-    first,
-    second,
-    updates,
+    rows,  # numbers of the rows with a gradient, (n,)
+    gradient,  # their gradients, (n, channels)
+    values,  # the parameter, (all rows, channels)
+    first,  # mean of gradients, (all rows, channels)
+    second,  # mean of squared gradients, (all rows, channels)
+    updates,  # number of updates of each row, (all rows,)
     lr,
     beta1,
     beta2,
     eps,
-    correction1,
-    correction2,
+    correction1,  # 1 - beta1^t by the number t of updates
+    correction2,  # 1 - beta2^t by the number t of updates
 ):
-    """Take one step of Adam on ``rows[begin:end]``, in place; `correction1` and `2` are tables of 1 - beta^t."""
+    """Take one step of Adam on ``values[rows[begin:end]]`` and the state of these rows, in place; see `RowAdam`."""
     last1, last2 = len(correction1) - 1, len(correction2) - 1
     one = values.dtype.type  # constants in the parameter's precision, so that the inner loop has one width
     b1, c1, b2, c2, tiny = one(beta1), one(1.0 - beta1), one(beta2), one(1.0 - beta2), one(eps)
@@ -42,7 +42,7 @@ def adam_rows(
 
 @kernel
 def rmsprop_rows(begin: int, end: int, rows, gradient, values, square, lr, alpha, eps):
-    """Take one step of RMSprop on ``rows[begin:end]``, in place."""
+    """Take one step of RMSprop on `values` and `square` (mean of squares) at ``rows[begin:end]``; see `adam_rows`."""
     one = values.dtype.type
     keep, take, rate, tiny = one(alpha), one(1.0 - alpha), one(lr), one(eps)
     for n in range(begin, end):

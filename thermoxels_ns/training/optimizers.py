@@ -50,7 +50,7 @@ class RowOptimizer(torch.optim.Optimizer):
     def update_rows(
         self, parameter: Tensor, rows: Tensor, gradient: Tensor, state: dict[str, Tensor], group: dict[str, Any]
     ) -> None:
-        """Update ``parameter[rows]`` and `state`; `parameter` has shape (n, channels), `gradient` (rows, channels)."""
+        """Update ``parameter[rows]``, (rows, channels) as `gradient`, and `state`; `group` has settings such as lr."""
         raise TypeError(f"{type(self).__name__} does not say how rows are updated")
 
     def change_rows(self, old: Tensor, new: torch.nn.Parameter, change: RowChange) -> None:

@@ -52,7 +52,7 @@ class ThermoxelsPipeline(VanillaPipeline):
 
     compare_with_truth: ClassVar[Callable[[Any], dict[str, float]] | None] = None
     """Function from pipeline to metrics of the surface, which `config.py` sets; None: there are no such metrics."""
-    world_from_input: torch.Tensor
+    world_from_input: torch.Tensor  # Transform, scene box and mean camera, (3, 10), by which a checkpoint is compared
 
     def __init__(self, config: ThermoxelsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         if config.cpu_threads is not None and config.cpu_threads < 1:
@@ -146,7 +146,7 @@ class ThermoxelsPipeline(VanillaPipeline):
         super().load_pipeline(state, step)
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Return metrics averaged over held-out images; in ns-eval with `geometry_metrics`."""
+        """Return metrics averaged over held-out images and, in ns-eval, those of `geometry_metrics`."""
         averages = super().get_average_eval_image_metrics(*args, **kwargs)
         if self.test_mode == "test":  # ns-eval; training has "val"
             averages |= self.geometry_metrics()

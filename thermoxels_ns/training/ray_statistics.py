@@ -41,7 +41,7 @@ class VoxelWeights:
 
 @torch.no_grad()
 def voxel_weights(model: RaySampler, rays: Iterable[RayBundle]) -> VoxelWeights:
-    """Return for each kept voxel the largest weight on any of the rays, and whether some ray ends in it."""
+    """Return for each kept voxel the largest weight of a sample on any ray, and whether some ray ends in the voxel."""
     density = model.grid.density
     largest = torch.zeros(len(model.grid.voxels), device=density.device)
     ends = torch.zeros(len(model.grid.voxels), dtype=torch.bool, device=density.device)
@@ -65,9 +65,9 @@ def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
 
 @torch.no_grad()
 def share_of_rays_opened(model: RaySampler, rays: Iterable[RayBundle], keep: Bool[Tensor, " voxels"]) -> float:
-    """Return the share of rays, of those with opacity above one half, that pruning to `keep` would open.
+    """Of the rays with opacity above one half, return the share that pruning to `keep` would open.
 
-    A ray is opened if more than half of its weight lies in voxels that go: in a body, not in half-transparent voxels.
+    A ray is opened if more than half of its weight lies in voxels that are False in `keep`.
     """
     device = model.grid.density.device
     hit, opened = 0, 0
@@ -91,7 +91,7 @@ _END_STEPS = 5
 
 @dataclass(frozen=True)
 class CornerTemperature:
-    """The temperature that thermal rays see around each stored corner."""
+    """The temperature that thermal rays see around each corner of a kept voxel."""
 
     thermal: Float[Tensor, " rows"]
     """Normalised temperature, clipped to [0, 1]; the stored value at corners that no thermal ray reaches."""

@@ -8,7 +8,7 @@ from typing import Literal
 
 from thermoxels_ns.core.errors import ThermoxelsError
 
-COARSEST = 32  # Fewest voxels along the longest side with which `schedule_for` lets a training start that refines
+COARSEST = 32  # Least first resolution, [voxels along the longest side], of a training that refines
 # The shares of the run below were set by hand while the losses were tuned; only all of them together were measured.
 _REFINE: Mapping[int, tuple[float, ...]] = {
     0: (),

@@ -134,7 +134,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
             raise ThermoxelsError("device_type", expected=expected, got=self.machine.device_type, remedy=remedy)
 
     def follow_checkpoint(self) -> None:
-        """Take resolutions and schedules that were not typed from the run to resume, unless a quality is given."""
+        """Unless a quality is given, take resolutions and schedules that were not typed from the resumed run."""
         folder = self.load_dir or (self.load_checkpoint.parent if self.load_checkpoint else None)
         if self.quality is not None or folder is None or not (folder.parent / "config.yml").is_file():
             return

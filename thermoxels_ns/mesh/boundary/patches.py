@@ -22,7 +22,7 @@ from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, wrong
 
 FACINGS = ("up", "side", "down")  # The directions that `facing` tells apart
 DEFAULT_PATCHES = (*(f"{where}-{facing}" for where in ("exterior", "interior") for facing in FACINGS), "cut")
-"""Names of the patches that every mesh has, in the order of their numbers."""
+"""Names of the patches that every mesh has, from exterior-up to cut; the index of a name is the patch's number."""
 DEFAULT_REGION = "solid"  # Name of region 0
 
 Vector = tuple[float, float, float]
@@ -34,10 +34,10 @@ _COS_45 = math.sqrt(0.5) + 1e-9
 
 @dataclass(frozen=True)
 class Box:
-    """Condition of a rule: the element's centroid lies in an axis-aligned box or on its border; corners in [m]."""
+    """Condition of a rule: the element's centroid lies in an axis-aligned box or on its border."""
 
-    lower: Vector
-    upper: Vector
+    lower: Vector  # Corner with the smallest x, y and z, [m]
+    upper: Vector  # Corner with the largest x, y and z, [m]
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.lower, self.upper)):
@@ -47,10 +47,10 @@ class Box:
 
 @dataclass(frozen=True)
 class Plane:
-    """Condition of a rule: the element's centroid lies on a plane, [m], or on the side to which `normal` points."""
+    """Condition of a rule: the element's centroid lies on a plane or on the side to which `normal` points."""
 
-    point: Vector
-    normal: Vector
+    point: Vector  # Any point of the plane, [m]
+    normal: Vector  # Direction across the plane, of any length above 0
 
     def __post_init__(self) -> None:
         if not (all(map(math.isfinite, self.point)) and 0.0 < math.hypot(*self.normal) < math.inf):
@@ -60,9 +60,9 @@ class Plane:
 
 @dataclass(frozen=True)
 class Colour:
-    """Condition of a rule: the element's colour is near `rgb`, in whole numbers up to 255 or decimals up to 1.0."""
+    """Condition of a rule: the element's colour is at most `max_distance` from `rgb`."""
 
-    rgb: tuple[int | float, int | float, int | float]
+    rgb: tuple[int | float, int | float, int | float]  # Whole numbers from 0 to 255 or decimals from 0.0 to 1.0
     max_distance: float = math.inf  # Largest Euclidean distance to `rgb`, on the same scale
 
     def __post_init__(self) -> None:
@@ -80,7 +80,7 @@ class Colour:
             raise wrong("max_distance", "a number above 0, on the scale of rgb", self.max_distance)
 
     def distance(self, colours: npt.NDArray) -> FloatArray:
-        """Return the distance of colours (n, 3) in [0, 1] to `rgb`, infinite beyond `max_distance`, shape (n,)."""
+        """Return the distances (n,) of colours (n, 3), in [0, 1], to `rgb`; infinite if beyond `max_distance`."""
         whole = all(isinstance(part, int) for part in self.rgb) or max(map(float, self.rgb)) > 1.0
         scale = 255.0 if whole else 1.0
         distance = np.linalg.norm(colours - np.array(self.rgb, dtype=np.float64) / scale, axis=1)
@@ -89,13 +89,13 @@ class Colour:
 
 @dataclass(frozen=True)
 class RegionRule:
-    """A user's rule for a region: elements that meet all conditions that are not None belong to it."""
+    """A user's rule for a region: a tetrahedron meets the rule if it meets all conditions that are not None."""
 
     name: str  # Name of the patch or region; several rules may have one name
     box: Box | None = None
     plane: Plane | None = None
     nearest_colour: Colour | None = None
-    """Of all rules with a colour whose other conditions hold, an element follows the rule with the nearest colour."""
+    """Of all rules with a colour whose other conditions hold, an element meets only the one with the nearest colour."""
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -108,15 +108,15 @@ class RegionRule:
 
 @dataclass(frozen=True)
 class PatchRule(RegionRule):
-    """A user's rule for a patch, with two more conditions than a rule for a region."""
+    """A user's rule for a patch of boundary triangles, with two more conditions than a rule for a region."""
 
     only: Literal["exterior", "interior", "cut", "all"] | None = None  # Part of the boundary that the rule applies to
-    facing: Literal["up", "side", "down", "any"] | None = None  # Direction of the normal, see `facing`
+    facing: Literal["up", "side", "down", "any"] | None = None  # Where the normal points, see `facing`; None: any
 
 
 @dataclass(frozen=True)
 class PatchRules:
-    """A user's rules for patches and regions, in the order of the file; where several hold, the last one counts."""
+    """A user's rules for patches and regions, in the order of the file; the last that an element meets counts."""
 
     patches: tuple[PatchRule, ...] = ()  # Rules for boundary triangles
     regions: tuple[RegionRule, ...] = ()  # Rules for tetrahedra
@@ -126,8 +126,7 @@ class PatchRules:
 def load_patch_rules(path: Path | str) -> PatchRules:
     """Read a user's rules for patches and regions from a yaml file.
 
-    Raises:
-        MeshError: The file does not exist or is no yaml, or an entry, named in the message, is not valid.
+    Raises `MeshError` if the file does not exist or is no yaml, or if an entry, named in the message, is not valid.
     """
     path = Path(path)
     rules = as_record(path.name, read_yaml(path), PatchRules)
@@ -149,7 +148,7 @@ def load_patch_rules(path: Path | str) -> PatchRules:
 class Applied(NamedTuple):
     """The patches of triangles, or the regions of tetrahedra, after all rules were applied."""
 
-    number: IntArray  # Index of each element's patch or region, shape (n,)
+    number: IntArray  # Index in `names` of each element's patch or region, shape (n,)
     names: tuple[str, ...]  # Names of all patches or regions
     idle: tuple[str, ...]
     """Rules that no element follows, such as "patch roof (entry 2)": no element meets the conditions, or all that do
@@ -177,7 +176,8 @@ def default_patches(
 ) -> tuple[IntArray, tuple[str, ...]]:
     """Return each triangle's default patch, shape (f,), and the names of all default patches.
 
-    The patch is "cut" where `on_box`, else exterior (`seen`) or interior with the `facing`. Arguments: `apply_patches`.
+    The patch is "cut" where `on_box` is True, else "exterior" where `seen` is True and "interior" where it is False,
+    followed by the direction of `facing`, as in "exterior-up". The arguments are those of `apply_patches`.
     """
     patch = np.where(seen, 0, len(FACINGS)) + facing(normals, up)
     return np.where(on_box, DEFAULT_PATCHES.index("cut"), patch).astype(np.int64), DEFAULT_PATCHES
@@ -193,7 +193,7 @@ def apply_patches(
     on_box: BoolArray,
     colours: npt.NDArray | None = None,
 ) -> Applied:
-    """Return each triangle's patch: that of the last rule that holds, else the default. Default names come first.
+    """Return each triangle's patch: by the last rule that it meets, else by `default_patches`, whose names come first.
 
     Args:
         rules: The user's rules; without any, the default patches come back.

@@ -18,9 +18,9 @@ steps of voxel faces; the second is used if the first leads into a solid voxel, 
 
 @dataclass(frozen=True)
 class FacetViews:
-    """Which cameras see which groups of boundary triangles; all triangles of a group share one answer."""
+    """Which cameras see which boundary triangles; triangles are in groups, and one answer holds for a whole group."""
 
-    group: IntArray  # Number of each triangle's group, shape (f,)
+    group: IntArray  # Index in the arrays below of each triangle's group, shape (f,)
     middle: FloatArray  # Mean centroid of each group, shape (g, 3), [world units]
     normal: FloatArray  # Unit mean normal of each group, shape (g, 3)
     seen: BoolArray  # True where a camera sees a group, shape (g, cameras)
@@ -41,9 +41,9 @@ def facet_views(
     line between the two. Triangles in one voxel whose normals have the same main direction (one of six) share one
     answer, found at their mean centroid.
 
-    `cells` (`lattice.cell_shape`) is True for solid voxels. `matrices` (cameras, 3, 4) map world coordinates to
-    homogeneous pixels with positive depth in front. `centres` (cameras, 3) and `centroids_world` (f, 3) are in [world
-    units], `sizes` (cameras, 2) in [pixels]; `normals_world` (f, 3) are unit normals.
+    `cells`, shape `lattice.cell_shape`, is True for solid voxels. `matrices` (cameras, 3, 4) map world coordinates to
+    homogeneous pixels with positive depth in front. Camera `centres` (cameras, 3) and `centroids_world` (f, 3) are in
+    [world units], image widths and heights `sizes` (cameras, 2) in [pixels]; `normals_world` (f, 3) are unit normals.
     """
     # The shift by 1e-3 chooses one of two voxels for a triangle on their common face.
     centroids, shape = lattice.world_to_index(centroids_world), np.array(lattice.cell_shape)
@@ -76,7 +76,7 @@ def facet_views(
 def seen_facets(
     cells: BoolArray, views: Views, lattice: Lattice, centroids_world: FloatArray, normals_world: FloatArray
 ) -> BoolArray:
-    """Return which boundary triangles at least one training camera sees, shape (f,); arguments as in `facet_views`."""
+    """Return True for boundary triangles that a camera of `views` sees, (f,); other arguments as in `facet_views`."""
     cameras = views.matrices(), views.camera_to_world[:, :, 3], views.size
     found = facet_views(cells, lattice, *cameras, centroids_world, normals_world)
     return found.seen.any(axis=1)[found.group]

@@ -16,7 +16,7 @@ from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 
 
 def checked_mesh(mesh: TetMesh, temperature_c: FloatArray | None = None) -> tuple[TetMesh, Boundary]:
-    """Return a mesh after `TetMesh.check`, and its tags; if it has none, all triangles are seen, in patch "boundary".
+    """Check a mesh, and return the mesh and its tags; without tags, all triangles are seen and in the patch "boundary".
 
     The argument `temperature_c`, shape (n,), [degrees Celsius], replaces the mesh's own if given.
 
@@ -35,7 +35,7 @@ def checked_mesh(mesh: TetMesh, temperature_c: FloatArray | None = None) -> tupl
 
 
 def node_arrays(mesh: TetMesh) -> dict[str, npt.NDArray]:
-    """Return the arrays per node that body files hold, by name; `colour`, in bytes, only if the mesh has colours."""
+    """Return arrays per node by name: `temperature_c`, `temperature_k`, `observed` and, if known, `colour` in bytes."""
     arrays: dict[str, npt.NDArray] = {
         "temperature_c": mesh.temperature_c,
         "temperature_k": celsius_to_kelvin(mesh.temperature_c),
@@ -47,7 +47,7 @@ def node_arrays(mesh: TetMesh) -> dict[str, npt.NDArray]:
 
 
 def write_bytes(path: Path, chunks: Iterable[bytes]) -> None:
-    """Write a file, completely or not at all, in a folder that is made if missing."""
+    """Write `chunks`, one after another, to a file, completely or not at all; the folder is made if missing."""
     writable_folder(path.parent)
     with replace_when_done(path) as temporary, open(temporary, "wb") as file:
         file.writelines(chunks)
@@ -68,11 +68,11 @@ class Surface:
 
     points_m: FloatArray  # nodes on the boundary, shape (m, 3), [m]
     triangles: IntArray  # indices into `points_m`, shape (f, 3), right-hand normals outwards
-    nodes: IntArray  # index of each node in the mesh, rising, shape (m,)
+    nodes: IntArray  # index in the mesh of each node of `points_m`, ascending, shape (m,)
 
 
 def surface_of(points_m: FloatArray, facets: IntArray) -> Surface:
-    """Return a surface of the triangles `facets` (f, 3), renumbered to the nodes that any triangle uses.
+    """Return the triangles `facets` (f, 3) as a surface that holds only the nodes of `points_m` that they use.
 
     >>> surface_of(np.arange(12.0).reshape(4, 3), np.array([[3, 0, 2]])).triangles.tolist()
     [[2, 0, 1]]

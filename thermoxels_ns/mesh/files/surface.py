@@ -34,7 +34,7 @@ def write_stl(path: Path | str, mesh: TetMesh) -> None:
 
 
 def check_stl(mesh: TetMesh) -> None:
-    """Check that a mesh is near enough to the origin for STL, which has single precision, to hold its shape.
+    """Check that the single precision of STL suffices for a mesh's shape, as it does near the origin.
 
     Raises:
         MeshError: Rounding would move nodes by more than a hundredth of the side of a mean triangle.

@@ -58,7 +58,7 @@ def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
 
 
 def write_vtk(writer: Any, path: Path, data: Any) -> None:
-    """Write a VTK data set with the XML `writer` for its kind; make the folder; raise `OutputError` on failure."""
+    """Write `data` by VTK's XML `writer` for such data sets, making the folder; raise `OutputError` on failure."""
     writable_folder(path.parent)
     with replace_when_done(path) as temporary:
         writer.SetFileName(str(temporary))
@@ -92,7 +92,7 @@ def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
     """Write a nested mapping of figures as indented json, in its order, in a folder that is made if missing.
 
     Raises:
-        MeshError: A number is NaN or infinite (json has neither), or a value has no place in json.
+        MeshError: A number is NaN or infinite (json has neither), or a value has a type that json lacks.
     """
     write_bytes(Path(path), [summary_text(summary).encode()])
 

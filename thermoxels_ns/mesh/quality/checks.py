@@ -1,4 +1,4 @@
-"""Faces, edges and components of a mesh: grouping of shared ones, and counts of missing, wrong and doubled ones."""
+"""Faces, edges and components of a mesh: which elements share them, and how many are missing, wrong or doubled."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]],
 
 @dataclass(frozen=True)
 class Groups:
-    """Rows of a table, grouped by equality: group g is `order[start[g]:start[g + 1]]`, the last ends with `order`."""
+    """Rows of a table in groups of equal rows: group g has the row numbers `order[start[g]:start[g + 1]]`."""
 
     order: IntArray  # row numbers, group after group, shape (rows,)
-    start: IntArray  # where each group starts in `order`, shape (groups,); groups are sorted by content
+    start: IntArray  # where each group starts in `order`, (groups,); the last ends with `order`; sorted by content
 
     @property
     def sizes(self) -> IntArray:
@@ -42,7 +42,7 @@ class Groups:
         return np.add.reduceat(values[self.order], self.start) if len(self.start) else values[:0]
 
     def pairs(self) -> tuple[IntArray, IntArray]:
-        """Return the pairs of rows that follow each other within a group, as two arrays: rows before, rows after."""
+        """Return all pairs of rows that follow each other in a group, as two arrays: first and second row of each."""
         follows = np.ones(len(self.order), dtype=bool)
         follows[self.start] = False
         at = np.flatnonzero(follows)
@@ -50,7 +50,7 @@ class Groups:
 
 
 def group_pairs(first: IntArray, second: IntArray) -> Groups:
-    """Return the rows grouped by equal pairs (first[row], second[row]) of whole numbers of at least 0.
+    """Group row numbers: rows of a group have the same pair (first[row], second[row]), whole numbers of at least 0.
 
     Rows are sorted by the first number with a counting sort (scipy's csr to csc) and then, where it is the same, by the
     second number: for a million tetrahedra this is several times faster than one sort of all rows.
@@ -100,13 +100,13 @@ def triangles_across_edges(sides: Groups) -> IntArray:
 
 
 def component_of(num: int, first: IntArray, second: IntArray) -> IntArray:
-    """Return the connected component's number of each of `num` things; a link joins things first[i] and second[i]."""
+    """Return the number of each node's connected component, (num,); link i joins nodes first[i] and second[i]."""
     links = sparse.coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
     return connected_components(links, directed=False)[1].astype(np.int64) if num else np.zeros(0, dtype=np.int64)
 
 
 def boundary_facets(tets: IntArray, faces: Groups | None = None) -> IntArray:
-    """Return the faces of exactly one tetrahedron, normals outwards, shape (f, 3), ordered by sorted node numbers.
+    """Return the faces that only one tetrahedron has, normals outwards, shape (f, 3), ordered by sorted node numbers.
 
     `faces` is `group_faces(tets)`, computed if left out.
 
@@ -119,7 +119,7 @@ def boundary_facets(tets: IntArray, faces: Groups | None = None) -> IntArray:
 
 
 def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
-    """Return each boundary triangle's tetrahedron and the position (0 to 3) of the node opposite, two arrays (f,).
+    """Return each boundary triangle's tetrahedron, and which of its nodes (0 to 3) is opposite the triangle; (f,) each.
 
     Only faces whose nodes all lie on the boundary are sorted, so the time grows with the surface, not with the volume.
 
@@ -174,7 +174,7 @@ def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
 def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
     """Return the number of pairs of triangles that share an edge and lie in one plane on the same side of the edge.
 
-    Such pairs show cracks, where faces of neighbours do not match and lie one upon the other. `sides`: `group_sides`.
+    Such pairs show cracks, where faces of neighbours lie one upon the other. `sides` is `group_sides(facets)`.
     """
     normals = facet_normals(points, facets)
     facet, side = np.divmod(sides.order, 3)
@@ -268,6 +268,6 @@ def surface_topology(points: FloatArray, facets: IntArray, sides: Groups) -> dic
 
 
 def count_open_edges(facets: IntArray, sides: Groups) -> int:
-    """Return the number of edges that triangles do not pass equally often in both directions; 0: a closed surface."""
+    """Return the number of edges that triangles pass more often in one direction than back; 0 for a closed surface."""
     upwards = facets < np.roll(facets, -1, axis=1)
     return int(np.count_nonzero(sides.sums(np.where(upwards.ravel(), 1, -1))))

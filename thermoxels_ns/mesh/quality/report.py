@@ -62,12 +62,12 @@ class Criterion:
     name: str  # short name, the same for every mesh
     sentence: str  # what the criterion asks for
     kept: bool  # True if the mesh meets the criterion
-    figure: float  # the figure that decides, with a unit that depends on the criterion
-    found: str  # that figure in words
+    figure: float  # number by which the criterion is met or not; its unit depends on the criterion
+    found: str  # what was found, in words
 
 
 def angle_edges(boundary_mode: BoundaryMode) -> FloatArray:
-    """Return the edges of the angle histogram's bins, [degrees]: 0 to 180 is covered, and no bin contains a bound.
+    """Return the edges of the angle histogram's bins, [degrees]; they cover 0 to 180, and the angle bounds are edges.
 
     >>> angle_edges("voxel")[[0, 1, -1]].round(2)
     array([ -0. ,   4.5, 180. ])

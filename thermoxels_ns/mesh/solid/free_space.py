@@ -40,7 +40,7 @@ class CameraCounts:
 
 
 def count_cameras(cells: BoolArray, lattice: Lattice, views: Views) -> CameraCounts:
-    """Count for each voxel the cameras that see it, of `MOST_CAMERAS` at most; solid voxels `cells` block the view.
+    """Count for each voxel the cameras that see it, of at most `MOST_CAMERAS`; voxels True in `cells` block the view.
 
     The space around each camera is six pyramids, one per side of the lattice. In each, rays that are one voxel apart at
     the far end are followed from layer to layer. They meet a layer in a regular grid, so that the ray of a voxel takes
@@ -163,9 +163,9 @@ def _runs(number: IntArray, count: int) -> list[tuple[slice, IntArray]]:
 def first_solid(
     cells: BoolArray, eye: FloatArray, directions: FloatArray, reach: FloatArray | float = np.inf
 ) -> FloatArray:
-    """Return the distances (n,), [voxels], from `eye` (corner indices) along unit vectors (n, 3) to the first solid.
+    """Return the distances (n,), [voxels], from `eye` (corner indices) along unit vectors (n, 3) to solid voxels.
 
-    Rays that meet none within `reach` get infinity. Solid nearer to `eye` than `CLEAR_OF_CAMERA` blocks no ray.
+    A ray that meets none within `reach`, [voxels], gets infinity. Solid nearer than `CLEAR_OF_CAMERA` blocks no ray.
     """
     found = np.empty(len(directions))
     reach = np.broadcast_to(np.asarray(reach, dtype=np.float64), len(directions))

@@ -17,7 +17,7 @@ from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow, repeated
 
-LARGEST_PASS = 4_000_000  # with more voxels than this, `_hidden` has one answer per block of 2^3, 4^3, ... voxels
+LARGEST_PASS = 4_000_000  # in larger lattices, hidden space is found per block of 2^3, 4^3, ... voxels
 SHADOW_SURROUNDED = 0.1
 """Least winding number, in the seen surfaces, of inside space that the shell hides from cameras. The number is up to
 one half behind a surface seen from one side only, and at most 0 in the shadow before a wall."""

@@ -28,12 +28,12 @@ def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
 
 
 def face_connected(cells: BoolArray) -> npt.NDArray[np.int32]:
-    """Return each voxel's body number, 1, 2, ... in C order of first voxels, 0 if empty; bodies connect by faces."""
+    """Return each voxel's body number, from 1 in C order of first voxels, 0 if empty; voxels of a body share faces."""
     return connected(cells, connectivity=1)
 
 
 def connected(cells: BoolArray, connectivity: int = 3) -> npt.NDArray[np.int32]:
-    """Return body numbers as `face_connected`; voxels connect by faces (`connectivity` 1), edges (2) or corners (3)."""
+    """Return body numbers as `face_connected`; bodies join by faces (`connectivity` 1), edges (2) or corners (3)."""
     # Labels are found in the box of the solid only, because most of a lattice is empty.
     labels, box = np.zeros(cells.shape, dtype=np.int32), bounding_box(cells)
     inside = np.zeros(cells[box].shape, dtype=np.int32)
@@ -74,7 +74,7 @@ def shrink(cells: BoolArray, size: int | tuple[int, ...], origin: int | tuple[in
 
 
 def close_gaps(cells: BoolArray, by: int) -> BoolArray:
-    """Return the solid voxels and the gaps into which no cube of 2 `by` + 1 empty voxels along an edge fits.
+    """Return the solid voxels and all gaps too narrow for a cube of empty voxels with an edge of 2 `by` + 1 voxels.
 
     >>> close_gaps(np.array([[[True, False, True]]]), 1)[0, 0].tolist()
     [True, True, True]

@@ -51,15 +51,15 @@ MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` inte
 class SolidSelection:
     """The rules that tell solid voxels from empty ones; the fields are the export's options of the same names."""
 
-    voxel_optical_depth: float | None = None  # least density times voxel edge; without any threshold, rays choose
+    voxel_optical_depth: float | None = None  # least density times edge; rays choose if the first three are None
     density_percentile: float | None = None
     """Percentile, 0 to 100, of the density of all voxels, as in the Thermoxels paper; overrides the optical depth."""
     density_threshold: float | None = None  # least density, [1 / world unit]; overrides both rules above
     close_gaps: int = 1  # gaps up to twice this many voxels wide are filled (a morphological closing)
-    region: RegionKind = "auto"
+    region: RegionKind = "auto"  # auto: the voxels of `where_cameras_look`; all: all voxels
     region_box: Box | None = None  # xmin ymin zmin xmax ymax zmax, in coordinates of the input poses; replaces `region`
     region_near: Ball | None = None  # x y z radius in the same coordinates; replaces `region`
-    interior: InteriorKind = "solid"
+    interior: InteriorKind = "solid"  # solid: the voxels of `interior` are filled; hollow: they stay empty
     seal_openings: int = 2  # to find the interior, openings up to twice this many voxels wide count as closed
     wall_thickness: float | None = None  # thickness that walls get instead of a filled interior, [m]
 
@@ -111,7 +111,7 @@ class SolidCells:
     """The solid voxels of a field, their surface level, and the steps that found them."""
 
     cells: BoolArray  # True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is
-    level: Float32Array  # what `level_of` returns: trilinear between voxel centres, its zero is the surface
+    level: Float32Array  # `level_of` at voxel centres; the surface is where the trilinear level is 0
     threshold: float  # least density at the centre of a voxel that counts as dense, [1 / world unit]
     explanation: str  # which rule chose the threshold, and why
     steps: tuple[SolidStep, ...]  # all steps in order; the first is the threshold
@@ -235,8 +235,8 @@ class Threshold:
 def dense_voxels(snapshot: GridSnapshot, density: FloatArray, selection: SolidSelection) -> Threshold:
     """Return the voxels that are dense enough by the rule of `selection`; `density` is given at voxel centres.
 
-    If no rule is asked for, training rays choose, see `_where_rays_end`. With fewer than `FEWEST_RAYS` of them, voxels
-    are dense enough whose density times edge length is at least `FALLBACK_OPTICAL_DEPTH`.
+    If no rule is asked for, the threshold lets the share `SHARE_OF_RAYS` of training rays end on dense voxels, within
+    `OPTICAL_DEPTH_BOUNDS`. With fewer than `FEWEST_RAYS` rays, it is `FALLBACK_OPTICAL_DEPTH` over the voxel edge.
 
     Raises:
         MeshError: A percentile above 0 is asked for, and all voxels have the same density.

@@ -74,7 +74,7 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
 
     Args:
         level: Levels at the voxel centres, above 0 in solid voxels, shape (cx, cy, cz). Only their ratios matter.
-        coarsest: Edge of the largest cells inside the solid, [voxels], a power of two; 1 makes all cells alike. Larger
+        coarsest: Edge of the largest cells inside the solid, [voxels], a power of two; 1 makes all equal. Larger
             cells than 4 save little, because most tetrahedra are at the surface.
 
     Returns:
@@ -203,7 +203,7 @@ def _fill_bundles(bundles: _Bundles, sign: npt.NDArray[np.int8], nodes: _Nodes) 
 
 @cache
 def stencil_table() -> tuple[IntArray, IntArray]:
-    """Return the tetrahedra of all bundle codes, shape (t, 4), positively oriented, and the first row of each code.
+    """Return tetrahedra for all bundle codes (`CODE_WEIGHTS`), (t, 4), positively oriented, and each code's first row.
 
     A bundle is the four lattice tetrahedra around the long edge from the voxel centre below a voxel face to the centre
     above it; each of them holds one side of the face. Points and cuts of a bundle are numbered

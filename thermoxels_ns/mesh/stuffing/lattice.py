@@ -288,7 +288,7 @@ def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
 
 
 def split_in_eight(level: BoolArray, shape: tuple[int, ...]) -> BoolArray:
-    """Return values for cubes of half the edge, each copied from the larger cube around it, cut to `shape`."""
+    """Return the values `level` of cubes copied to the eight cubes of half the edge in each, cut to `shape`."""
     return repeated(level, 2)[tuple(slice(n) for n in shape)]
 
 
