@@ -58,13 +58,12 @@ class Rays:
 def test_pruning_keeps_what_rays_see_and_its_neighbours(dilation, layers):
     model = model_of()
     old = model.grid.voxels
-    report, change = prune_by_rays(model, Rays(), 0.01, dilation)
+    said, change = prune_by_rays(model, Rays(), 0.01, dilation)
     kept = model.grid.kept
     assert [x for x in range(8) if bool(kept[x].any())] == layers and bool(kept[layers].all())
-    assert report.kept_voxels == len(model.grid.voxels) == 64 * len(layers) and report.total_voxels == 512
-    assert report.opened == 0.0 and report.threshold == 0.01
+    assert len(model.grid.voxels) == 64 * len(layers)
     assert change(torch.arange(old.num_rows)[:, None].float()).shape == (model.grid.voxels.num_rows, 1)
-    assert str(report).startswith(f"kept {64 * len(layers)} of 512 voxels")
+    assert said.startswith(f"kept {64 * len(layers)} of 512 voxels") and "threshold 0.01, 0.00% of the rays" in said
 
 
 def test_no_hole_opens_where_no_ray_was_drawn():
@@ -85,8 +84,7 @@ def test_a_threshold_that_would_open_rays_is_lowered():
     """A ray spends a fifth of its light in its first sample of fog: 0.3 keeps the slab and opens half of the rays."""
     model = model_of()
     fog(model, 1.5)
-    report, _ = prune_by_rays(model, Rays(), 0.3, 0)
-    assert report.threshold == pytest.approx(0.3 / 4) and report.opened <= 0.01
+    assert "threshold 0.075" in prune_by_rays(model, Rays(), 0.3, 0)[0]
     kept = model.grid.kept
     assert bool(kept[7, 5:].all()) and not bool(kept[7, :3].any()) and bool(kept[2, :4].all())
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,11 +24,7 @@ from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_pho
 from thermoxels_ns.multiview.votes import air_voxels, around_cameras
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
-from thermoxels_ns.training.ray_statistics import (
-    backdrop_evidence,
-    share_of_rays_opened,
-    voxel_weights,
-)
+from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 
 FEWEST_OPEN_RAYS = 0.002  # A background stays if at least this share of rays leaves the box with half of its light
 FEWEST_SKY_DIFFERENCE = 0.01
@@ -117,9 +113,9 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         threshold = model.config.thin_threshold if thin else model.config.prune_threshold
         if step in steps and threshold > 0:
             old = model.grid.row_parameters()
-            report, change = prune_by_rays(model, datamanager, threshold, 0 if thin else model.config.prune_dilation)
+            said, change = prune_by_rays(model, datamanager, threshold, 0 if thin else model.config.prune_dilation)
             follow(old, change)
-            CONSOLE.log(f"step {step}: {'thinning' if thin else 'pruning'} {report}")
+            CONSOLE.log(f"step {step}: {'thinning' if thin else 'pruning'} {said}")
         if step in steps:
             change_surroundings(step)
         if step in factors:
@@ -202,31 +198,13 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
     return found
 
 
-@dataclass(frozen=True)
-class PruningReport:
-    """Result of one pruning."""
-
-    kept_voxels: int  # Kept voxels after pruning
-    total_voxels: int  # Voxels of the whole lattice
-    threshold: float  # Voxels that gave some ray more than this share of a pixel were kept
-    opened: float  # `share_of_rays_opened` of this pruning
-
-    def __str__(self) -> str:
-        return (
-            f"kept {self.kept_voxels:,} of {self.total_voxels:,} voxels ({self.kept_voxels / self.total_voxels:.1%}); "
-            f"threshold {self.threshold:.2g}, {self.opened:.2%} of the rays lost what they ended on"
-        )
-
-
-def prune_by_rays(
-    model: ThermoxelsModel, datamanager, threshold: float, dilation: int
-) -> tuple[PruningReport, RowChange]:
+def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilation: int) -> tuple[str, RowChange]:
     """Drop all voxels but those to which some training ray of either stream gives more than `threshold` of its light.
 
     Also kept are voxels in which a ray that ends on something completes half of its weight (else soft surfaces would
     open), kept voxels up to `dilation` voxels away, and opaque neighbours (the rays of statistics miss some voxels of a
     fine surface, and each would be a hole). If this opens more than `MOST_OPENED_RAYS`, the threshold is divided by 4
-    and the pruning tried again. Returns a report and the change of rows.
+    and the pruning tried again. Returns a sentence for the log and the change of rows.
 
     Raises:
         PruningError: Even the lowest threshold would open more rays; the grid stays as it was.
@@ -246,8 +224,11 @@ def prune_by_rays(
         keep = voxels.dilated(chosen, dilation) | (voxels.dilated(chosen, 1) & opaque)
         opened = share_of_rays_opened(model, rays(), torch.from_numpy(keep).to(weights.largest.device))
         if opened <= MOST_OPENED_RAYS:
-            total = math.prod(voxels.lattice.cell_shape)
-            return PruningReport(int(keep.sum()), total, threshold, opened), prune(model.grid, keep)
+            kept, total = int(keep.sum()), math.prod(voxels.lattice.cell_shape)
+            said = (
+                f"kept {kept:,} of {total:,} voxels ({kept / total:.1%}); threshold {threshold:.2g}, {opened:.2%} of "
+            )
+            return f"{said}the rays lost what they ended on", prune(model.grid, keep)
     expected = f"to open at most {MOST_OPENED_RAYS:.0%} of the rays that end on something"
     remedy = "Lower --pipeline.model.prune-threshold, or prune later when surfaces have formed."
     raise PruningError("pruning", expected=expected, got=f"{opened:.1%} at threshold {threshold:.2g}", remedy=remedy)
