@@ -226,7 +226,7 @@ def _groups_before(number: int, order: Order):
 
 @kernel
 def list_rows(first_row: int, last_row: int, kind: int, at: int, rows: RowGradients, listed: Ints, sums: Floats):
-    """Write the rows of a range with a gradient of parameter `kind` (0 to 2) to `listed[at:]`; set `sums` to 0."""
+    """Write rows of a range with a gradient of parameter `kind` (0 to 2) to `listed[at:]`; set their `sums` to 0."""
     for row in range(first_row, last_row):
         if rows.uses[row] & (1 << kind):
             rows.place[row, kind], listed[at] = at, row

@@ -226,10 +226,10 @@ class ThermoxelsModelConfig(ModelConfig):
     def suited_to(self, voxels: float) -> ThermoxelsModelConfig:
         """Return the settings for a scene along whose longest side `voxels` voxels of width `voxel_pixels` fit.
 
-        If `voxels` is at most `MOST_STRETCH` times the last resolution, or resolutions and steps are not those of
-        `schedule_for`, one factor scales all resolutions, by `MOST_STRETCH` at most. Else `schedule_for` gives them and
-        the steps, for `MOST_VOXELS` times the last resolution at most. Numbers are rounded, rather up: too few voxels
-        lose shape (courtyard: F of the seen surface is 0.81, 0.86 and 0.89 with 96, 112 and 128 voxels).
+        If `voxels` is at most `MOST_STRETCH` times the last resolution, or if `resolutions`, `refine_at` and `prune_at`
+        are not those of `schedule_for`, one factor, at most `MOST_STRETCH`, scales all resolutions. Else `schedule_for`
+        gives all three, for at most `MOST_VOXELS` times the last resolution. Numbers are rounded, rather up: too few
+        voxels lose shape (courtyard: F of the seen surface is 0.81, 0.86 and 0.89 with 96, 112 and 128 voxels).
         """
         if not self.voxel_pixels or not math.isfinite(voxels):
             return self
