@@ -83,10 +83,10 @@ def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, lea
 
 
 def background_c(points_m: FloatArray, surface_c: FloatArray, area_m2: FloatArray) -> FloatArray:
-    """Return the temperature of most of the surface around each point, shape (k,), [degrees Celsius].
+    """Return the temperature typical of the surface around each triangle, shape (k,), [degrees Celsius].
 
-    Points are centroids of triangles, (k, 3), in cells of 0.25 m. The result is the median, by area, of the mean
-    temperatures of cells within 1.25 m. Strips and spots of less than half of these cells hardly change the result.
+    Triangles, given by centroids (k, 3), are grouped into cubes of 0.25 m. The result is the median, weighted by area,
+    of the cubes' mean temperatures within 1.25 m; a strip or spot on less than half of that area hardly changes it.
     """
     _, cell = np.unique(np.floor(points_m / _CELL_M).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()

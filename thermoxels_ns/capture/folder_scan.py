@@ -126,7 +126,7 @@ def shown_name(path: Path) -> str:
 
 
 def identify(path: Path, folder: Path) -> CameraFile:
-    """Identify a file by content, a thermal picture by its name or folder; raise `ThermoxelsError` if damaged."""
+    """Return a file's role by content, for pictures by names below `folder`; raise `ThermoxelsError` if damaged."""
     with errors_name(path, "a camera file that can be decoded"):
         check_file_size(path)
         suffix = path.suffix.lower()

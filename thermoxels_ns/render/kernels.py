@@ -207,7 +207,7 @@ def next_sample(i: int, enter: float, length: float, step: float, path, volume: 
 
 @kernel
 def basis_of(directions: Floats, r: int, count: int, scale: float, basis: Floats):
-    """Write the first `count` of `harmonics.harmonics` in the direction of ray `r`, times `scale`, into `basis`."""
+    """Write the first `count` spherical harmonics in the direction of ray `r`, times `scale`, into `basis`."""
     basis[0] = Y00 * scale
     if count > 1:
         x, y, z = float(directions[r, 0]), float(directions[r, 1]), float(directions[r, 2])

@@ -246,7 +246,7 @@ def prefetch_sample(samples: SampleGradients, n: int):
 
 @kernel
 def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
-    """Load the sums of the corners of voxel `number` into the cache; corners outside the thread's rows load any sum."""
+    """Load the gradient sums at the corners of voxel `number` into the cache; for other threads' rows it is no use."""
     for corner in range(4):
         row = voxel_rows[number, corner]
         prefetch(rows.density, rows.place[row, 0], 0)

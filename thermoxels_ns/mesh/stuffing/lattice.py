@@ -190,9 +190,9 @@ def warp(lattice: BccLattice, buried: BoolArray) -> WarpedLattice:
     nearer than alpha (`ALPHA_INSIDE`, `ALPHA_OUTSIDE`) times the edge moves to the nearest cut and gets sign 0, and its
     edges are cut no more (Labelle and Shewchuk 2007, section 3). `buried` points and their neighbours are all inside.
 
-    Beyond the paper, thin parts are kept: an inside point stays if its neighbour opposite the nearest cut is not
-    inside, or if the solid would split, close up or vanish without it; likewise outside points in the empty space. The
-    cuts of a point that stays are kept alpha times the edge length away, which the bounds on the angles allow.
+    Beyond the paper, thin parts are kept: an inside point stays if the point on its far side, away from the nearest
+    cut, is not inside, or if moving it could split, close or remove the solid there; the same holds for outside points
+    and gaps. Cuts left are then put at least alpha edge lengths from both ends, within the paper's bounds on angles.
     """
     level = lattice.level
     sign = (level > 0.0).astype(np.int8)
