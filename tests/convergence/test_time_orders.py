@@ -72,7 +72,7 @@ def test_steps_of_an_adaptive_computation_can_be_repeated_and_halved(name) -> No
     """All steps halved leave a quarter of the error."""
     given = problem(name)
     adaptive = solve_heat(given, AdaptiveSteps(DURATION_S, 1.0, outputs=2))
-    steps = GivenSteps(DURATION_S, adaptive.step_lengths_s, 1.0)
+    steps = GivenSteps(DURATION_S, adaptive.step_lengths_s)
     again, halved = solve_heat(given, steps), solve_heat(given, steps.halved())
     np.testing.assert_array_equal(again.temperature_c, adaptive.temperature_c)
     assert halved.steps == 2 * again.steps == 2 * adaptive.steps

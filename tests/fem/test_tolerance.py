@@ -161,9 +161,9 @@ def test_the_error_of_linear_tetrahedra_is_estimated_within_a_factor_of_two(name
     true, estimate = difference_between(found, exact, len(problem.mesh.points_m)), steady_error(problem, found)
     ratios = true.temperature_k / estimate.temperature_k, true.heat_flow / estimate.heat_flow
     assert all(1 / 2 < ratio < 2 for ratio in ratios), ratios
-    within = solve_to_tolerance(problem, Tolerance(None, 0.01), allow_unmet=True, log=silent)
-    if within.settings.order == 1 and within.settings.refinements == 0:  # what is said to be met is
-        assert not within.met or true.heat_flow <= 0.01
+    allowed = 1.1 * estimate.heat_flow  # what is said to be met is
+    met = Tolerance(None, allowed).excess(estimate) <= 1.0
+    assert not met or true.heat_flow <= allowed
 
 
 @pytest.mark.parametrize(
@@ -179,11 +179,11 @@ def test_radiation_and_changing_coefficients_in_time(effect) -> None:
     axis = np.linspace(0.0, 0.1, 5)
     mesh = box_mesh(axis, axis, [0.0, 0.025], temperature_c=200.0)
     problem = HeatProblem(mesh, Material("ceramic", 2.0, 2000.0, 900.0), effects=(effect,))
-    found = solve_to_tolerance(problem, Tolerance(4.0), duration_s=1800.0, outputs=4, log=silent)
+    found = solve_to_tolerance(problem, Tolerance(3.0), duration_s=1800.0, outputs=4, log=silent)
     exact = solve_heat(finer(problem, 2), AdaptiveSteps(1800.0, 0.1, outputs=4))
     true = true_error(found, problem, exact)
     assert found.met and found.settings.refinements < 2
-    assert true.temperature_k <= 4.0
+    assert true.temperature_k <= 3.0
     assert 1 / WITHIN < found.settings.error.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
 
 

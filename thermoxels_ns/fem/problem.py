@@ -89,21 +89,19 @@ class AdaptiveSteps:
 class GivenSteps:
     """Time steps of given lengths, such as the halved steps of an adaptive computation.
 
-    >>> GivenSteps(6.0, (np.array([1.0, 2.0]), np.array([3.0])), 0.1).halved().lengths_s[0].tolist()
+    >>> GivenSteps(6.0, (np.array([1.0, 2.0]), np.array([3.0]))).halved().lengths_s[0].tolist()
     [0.5, 0.5, 1.0, 1.0]
     """
 
     duration_s: float  # Time over which to follow the body, [s]
     lengths_s: tuple[FloatArray, ...]
     """Lengths of the steps in each interval, [s]; temperatures are kept at the ends of the (equal) intervals."""
-    tolerance_k: float
-    """Tolerance of the adaptive steps from which these lengths come, [K]; the steps themselves do not depend on it."""
 
     def halved(self, times: int = 1) -> GivenSteps:
         """Return these steps with every step halved `times` times."""
         parts = 2**times
         lengths_s = tuple(np.repeat(interval_s / parts, parts) for interval_s in self.lengths_s)
-        return GivenSteps(self.duration_s, lengths_s, self.tolerance_k)
+        return GivenSteps(self.duration_s, lengths_s)
 
     @property
     def times_s(self) -> FloatArray:

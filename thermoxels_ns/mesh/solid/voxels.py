@@ -326,10 +326,8 @@ def _region(
         return np.ones_like(cells), "All is taken."
     if views is None or len(views.focal) == 0:
         return np.ones_like(cells), "The cameras are not known, so all is taken."
-    within = where_cameras_look(cells, snapshot.lattice, views)
-    if not (cells & within).any():
-        return np.ones_like(cells), "Nothing solid stands where cameras look, so all is taken."
-    return within, "What photographs show about as well as what they were taken of is taken."
+    what = "What photographs show about as well as what they were taken of is taken."
+    return where_cameras_look(cells, snapshot.lattice, views), what
 
 
 def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> BoolArray:
