@@ -57,7 +57,12 @@ class ThermalDataParserConfig(DataParserConfig):
     """Scene folder (with transforms.json or transforms_thermal.json), or the json itself."""
     downscale_factor: Optional[int] = None  # noqa: UP045 - read by tyro
     """Divide the resolution of the colour photographs by this number. Photographs are resized when loaded; no file is
-    written. Thermal images keep their resolution. Default: full resolution."""
+    written. Thermal images keep their resolution. Default: held-out photographs keep their resolution; photographs
+    that train are averaged down if they are much finer than voxels can be (1: these keep theirs too)."""
+    finest_lattice: int = 0
+    """Most voxels that a training puts along the longest side of the scene box, which ns-train sets by its options.
+    Photographs that train are averaged down until a pixel is up to half as wide as such a voxel, and with them thermal
+    images that have the same pixels. 0: none is."""
     scene_box: Optional[tuple[tuple[float, float, float], tuple[float, float, float]]] = None  # noqa: UP045
     """Box to reconstruct, in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax. Default: scene_box in
     the json, else found from the sparse points, else from depths that photographs agree on, else from the cameras."""
@@ -113,6 +118,7 @@ class ThermalDataParser(DataParser):
     The metadata of its outputs hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``,
     ``thermal_cameras`` (`Cameras`; None if all pairs share camera and resolution), ``thermal_unit``, ``valid_range_c``,
     ``thermal_dead_pixels`` (masks of stuck pixels by shape of the image), ``image_scale`` (1 / downscale_factor),
+    ``thermal_averaged`` (pixels of a thermal image that become one, along a side),
     ``pixel_size`` (width of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the
     scene box in input coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None unless train has tracks).
     If `refine_poses` adjusted poses, ``adjusted_poses`` of train maps file names to poses (camera to world, input
@@ -135,15 +141,19 @@ class ThermalDataParser(DataParser):
             raise SceneError("split", expected="train, val or test", got=split, remedy="Choose one of them.")
         chosen: list[int] = getattr(scene.split, split)
         frames = [scene.file.frames[index] for index in chosen]
-        factor = 1.0 / (self.config.downscale_factor or 1.0)
-        poses = [frame.pose for frame in frames]
-        cameras = _cameras([frame.intrinsics.scaled(factor) for frame in frames], scene.placed(poses))
-        thermal_cameras = _cameras(
-            [_thermal_intrinsics(frame, scene.shapes[frame.thermal]) for frame in frames],
-            scene.placed([f.pose if f.thermal_pose is None else f.thermal_pose for f in frames]),
-        )
+        poses, training = [frame.pose for frame in frames], split == "train"
+        thermal_poses = scene.placed([f.pose if f.thermal_pose is None else f.thermal_pose for f in frames])
+        lenses = [frame.intrinsics for frame in frames]
+        thermal_lenses = [_thermal_intrinsics(frame, scene.shapes[frame.thermal]) for frame in frames]
+        pixels_averaged = self.pixels_averaged(scene.metadata["pixel_size"]) if training else 1
+        factor = 1.0 / (self.config.downscale_factor or pixels_averaged)
+        cameras = _cameras(lenses, scene.placed(poses))
+        thermal_cameras = _cameras(thermal_lenses, thermal_poses)
+        shared = _same_cameras(cameras, thermal_cameras)
+        if factor < 1.0:
+            cameras = _cameras([lens.scaled(factor) for lens in lenses], scene.placed(poses))
+            shared &= pixels_averaged > 1
         fitted = [scene.fitted.get(number, pose) for number, pose in zip(chosen, poses)]
-        training = split == "train"
         return DataparserOutputs(
             image_filenames=[frame.image for frame in frames],
             cameras=cameras,
@@ -155,13 +165,29 @@ class ThermalDataParser(DataParser):
                 **scene.metadata,
                 "image_scale": factor,
                 "thermal_filenames": [frame.thermal for frame in frames],
-                "thermal_cameras": None if _same_cameras(cameras, thermal_cameras) else thermal_cameras,
+                "thermal_cameras": None if shared else thermal_cameras,
+                "thermal_averaged": pixels_averaged if shared else 1,
                 "pixel_size": scene.metadata["pixel_size"] / factor,
                 "feature_rays": scene.feature_rays if training else None,
                 "fitted_poses": scene.placed(fitted) if scene.fitted.keys() & set(chosen) else None,
                 "adjusted_poses": {f.image.name: f.pose for f in frames} if scene.adjusted and training else None,
             },
         )
+
+    def pixels_averaged(self, pixel_size: float) -> int:
+        """Return how many pixels of a training photograph become one, along a side; say so if these are several.
+
+        `pixel_size` is the width of a pixel at the distance of most of the scene, in nerfstudio's world.
+        """
+        if self.config.downscale_factor is not None or not self.config.finest_lattice:
+            return 1
+        pixels = int(0.5 * SCENE_SIZE / self.config.finest_lattice / pixel_size)
+        if pixels > 1:
+            CONSOLE.print(
+                f"Photographs are finer than {self.config.finest_lattice} voxels can show: those that train are "
+                f"averaged over {pixels} x {pixels} pixels (--downscale-factor 1 keeps all pixels)."
+            )
+        return max(pixels, 1)
 
     def _read_scene(self) -> _Scene:
         config = self.config
