@@ -156,7 +156,7 @@ def test_downscaled_photographs_are_block_means_with_matching_intrinsics(scene_f
 
 
 @pytest.mark.parametrize("thermal_size", [(25, 18), (12, 9)])
-def test_photographs_finer_than_voxels_can_show_are_averaged_for_training_alone(scene_folder, thermal_size):
+def test_photographs_that_need_more_memory_than_they_may_are_averaged_for_training_alone(scene_folder, thermal_size):
     scene = scene_folder(size=(25, 18), thermal_size=thermal_size)
     degrees = np.random.default_rng(0).uniform(12.0, 28.0, thermal_size[::-1])
     degrees[:3, :3], degrees[4, 4] = np.nan, np.nan
@@ -165,8 +165,8 @@ def test_photographs_finer_than_voxels_can_show_are_averaged_for_training_alone(
     frame["thermal_file_path"] = "thermal/frame_train_000.npy"
     scene.rewrite()
     plain = parse(scene.path)
-    finest = int(1.0 / (3.5 * plain.metadata["pixel_size"]))  # half a voxel is 3.5 pixels wide
-    given = ThermalDataset(plain), ThermalDataset(parse(scene.path, finest_lattice=finest))
+    room = 8 * 8 * 25 * 18 / 7.0 / 1e9  # of eight photographs with a seventh of their pixels
+    given = ThermalDataset(plain), ThermalDataset(parse(scene.path, photographs_gb=room))
     (full, thermal, valid), (small, averaged, where) = (
         [one[0][key].numpy().astype(float) for key in ("image", "thermal", "thermal_valid")] for one in given
     )
@@ -180,9 +180,9 @@ def test_photographs_finer_than_voxels_can_show_are_averaged_for_training_alone(
         np.testing.assert_allclose(averaged[..., 0], total / np.maximum(count, 1), atol=1e-6)
     else:
         assert not given[1].shares_camera and averaged.shape == thermal.shape
-    held_out = parse(scene.path, "val", finest_lattice=finest)
+    held_out = parse(scene.path, "val", photographs_gb=room)
     assert int(held_out.cameras.width[0]) == 25 and held_out.metadata["thermal_averaged"] == 1
-    typed = parse(scene.path, finest_lattice=finest, downscale_factor=1)
+    typed = parse(scene.path, photographs_gb=room, downscale_factor=1)
     assert int(typed.cameras.width[0]) == 25, "all pixels, as asked"
 
 
@@ -435,6 +435,7 @@ def test_what_has_no_partner_is_left_out_if_one_asks_for_it(scene_folder):
     "options",
     [
         {"downscale_factor": 0},
+        {"photographs_gb": 0.0},
         {"eval_mode": "interval", "eval_interval": 1},
         *({"valid_range_c": limits} for limits in ((math.nan, 30.0), (30.0, -100.0), (-300.0, 10.0))),
     ],

@@ -245,10 +245,6 @@ class ThermoxelsModelConfig(ModelConfig):
         found = schedule_for(_in_steps(wanted / 2**splits) * 2**splits, self.steps)
         return replace(self, resolutions=found.resolutions, refine_at=found.refine_at, prune_at=found.prune_at)
 
-    def finest_lattice(self) -> int:
-        """Return the most voxels along the longest side with which a scene may end, see `suited_to`."""
-        return round((MOST_VOXELS if self.voxel_pixels else 1.0) * self.resolutions[-1])
-
     def first_sh_degree(self) -> int | None:
         """Return the degree of colour at the start: 0, unless colour depends on the direction from step 0 on."""
         return 0 if self.sh_degree is not None and self.view_dependence_from > 0 else self.sh_degree

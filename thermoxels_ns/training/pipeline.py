@@ -22,12 +22,10 @@ from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.core.threads import set_num_threads
-from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import choose_backend, render_rays
 from thermoxels_ns.training.model import ThermoxelsModel
-from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.optimizers import RowAdam
 
 _GRID = "_model.grid."
@@ -63,9 +61,6 @@ class ThermoxelsPipeline(VanillaPipeline):
         for module in map(sys.modules.get, ("nerfstudio.engine.trainer", "nerfstudio.utils.eval_utils")):
             if module is not None:  # these modules call torch.load(path, map_location="cpu")
                 vars(module)["torch"] = ModuleWith(torch, load=load_checkpoint)
-        parser = getattr(config.datamanager, "dataparser", None)
-        if isinstance(parser, ThermalDataParserConfig) and isinstance(config.model, ThermoxelsModelConfig):
-            parser.finest_lattice = config.model.finest_lattice()
         if "OMP_NUM_THREADS" not in os.environ:
             torch.set_num_threads(max(1, (os.cpu_count() or 2) // 2))
         super().__init__(config, *args, **kwargs)
