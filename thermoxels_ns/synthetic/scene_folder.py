@@ -22,6 +22,7 @@ from thermoxels_ns.synthetic.imperfections import PERFECT, DrawnFlaws, Imperfect
 from thermoxels_ns.synthetic.raycast import first_surface, render_view
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
+_Frames = list[dict[str, Any]]
 ThermalFormat = Literal["png16", "tiff", "npy"]
 """16-bit PNG that spans the temperature bounds; uint16 TIFF of centikelvin counts; float32 numpy in Celsius."""
 LayoutName = Literal["thermoscenes", "nerfstudio", "thermalnerf", "rgbt-scenes", "thermalmix", "colmap", "rgb"]
@@ -116,7 +117,7 @@ def write_scene(
         unit = _CENTIKELVIN
 
     target = _prepared_folder(folder, layout)
-    frames: list[dict[str, Any]] = []
+    frames: _Frames = []
     for number, name in enumerate(track(names, description=f"Photographing {scene.name}", disable=not progress)):
         view = thermal_view = render_view(scene, poses[number], camera)
         if thermal_camera != camera:
@@ -164,7 +165,7 @@ def write_scene(
     return target
 
 
-def _separate_frames(frames: list[dict[str, Any]], camera: dict[str, Any], own: dict[str, Any]) -> list[dict[str, Any]]:
+def _separate_frames(frames: _Frames, camera: dict[str, Any], own: dict[str, Any]) -> _Frames:
     """Return the frames of pairs as ThermalNeRF has them: all photographs, then all thermal images, each with its
     camera. The keys of `camera`, the photographs', are removed from it."""
     poses = [frame.get("thermal_transform_matrix", frame["transform_matrix"]) for frame in frames]
@@ -178,13 +179,7 @@ def _separate_frames(frames: list[dict[str, Any]], camera: dict[str, Any], own: 
 
 
 def _write_colmap_model(
-    folder: Path,
-    scene: SyntheticScene,
-    poses: FloatArray,
-    frames: list[dict[str, Any]],
-    camera: Camera,
-    given: Camera,
-    seed: int,
+    folder: Path, scene: SyntheticScene, poses: FloatArray, frames: _Frames, camera: Camera, given: Camera, seed: int
 ) -> None:
     """Write a COLMAP model as text, with points of the surface and the photographs that see them from `poses`."""
     generator, points = np.random.default_rng(seed), []
