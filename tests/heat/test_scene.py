@@ -38,7 +38,6 @@ def effects(mesh=None, adiabatic=("*",), **named) -> tuple[Effect, ...]:
 
 
 def test_a_mesh_without_temperatures_starts_from_those_of_the_scene() -> None:
-    """Through time; a steady state does not depend on the start."""
     mesh, steady = room(), HeatScene(ALL, outside_air=OUTSIDE, adiabatic=("*",))
     bare, through_time = replace(mesh, temperature_c=np.full(len(mesh.points_m), np.nan)), TimeSteps(1, 60.0)
     with pytest.raises(HeatError, match="initial"):

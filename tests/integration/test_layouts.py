@@ -27,16 +27,14 @@ def test_a_layout_is_trained_evaluated_and_exported(layout, tmp_path):
     assert found["psnr"] > 15 and "fscore" in found
     assert any(name.startswith("thermal") for name in found) == warm
     out = tmp_path / "mesh"
-    said = succeed(
+    succeed(
         *("ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", str(out)),
         *("--metres-per-unit", "1", "--formats", "vtu", "xdmf", "msh", "ply", "glb"),
     )
     mesh, summary = read_mesh(out / "mesh.vtu"), json.loads((out / "summary.json").read_text())
     assert mesh.has_temperatures == summary["heat"]["computed"] == warm and mesh.colour is not None
-    assert (b"_TEMPERATURE_C" in (out / "mesh.glb").read_bytes()) == warm
-    assert (b"temperature_c" in (out / "mesh.ply").read_bytes()) == warm
-    assert (b'"temperature_c"' in (out / "mesh.msh").read_bytes()) == warm
-    assert ("temperature_c" in (out / "mesh.xdmf").read_text()) == warm
+    for suffix in ("glb", "ply", "msh", "xdmf"):
+        assert (b"temperature_c" in (out / f"mesh.{suffix}").read_bytes().lower()) == warm, suffix
     if warm:
         return
     command = "thermoxels", "heat", str(out / "mesh.vtu"), "--output-dir", str(tmp_path / "heat"), "--scene"

@@ -14,7 +14,7 @@ from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")
 BOUNDS_NAME = "temperature_bounds.json"
 LayoutName = Literal["thermalnerf", "thermoscenes", "nerfstudio", "rgb", "rgbt-scenes", "thermalmix", "colmap"]
-_FRAMES = "frames: "
+_FRAMES = "frames with "
 _NAMES_OF_PARAMETER = {"f": ("fl_x", "fl_y"), "fx": ("fl_x",), "fy": ("fl_y",), "k": ("k1",)}
 """Keys of transforms.json by COLMAP's names of the parameters of its cameras; all others have the same name."""
 _THERMAL_CAMERA = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
@@ -26,7 +26,7 @@ class Layout:
 
     name: LayoutName
     marks: tuple[str, ...]
-    """Files, folders or keys of frames in the json (``frames: KEY``), of which one must be there; none: all folders."""
+    """Files, folders or keys of frames in a json (``frames with KEY``), one of which must be there; none: all fit."""
     thermal: tuple[str, ...] = ("thermal",)
     """Folders of thermal files, best first; a file belongs to the photograph with its stem. None: photographs alone."""
     photographs: tuple[str, ...] = ()

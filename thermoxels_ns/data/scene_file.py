@@ -172,22 +172,15 @@ def read_scene_file(
     up_from_scene_file(meta)
     bounds, swapped = _read_bounds(folder) if thermal_bounds is None else thermal_bounds, False
     if thermal_bounds is not None and not -ZERO_CELSIUS_K <= thermal_bounds[0] < thermal_bounds[1] <= _HOTTEST_C:
-        expected, got = (
-            "the temperatures of black and of white, degrees Celsius",
-            "{:g} and {:g}".format(*thermal_bounds),
-        )
-        raise SceneError(
-            "thermal_bounds", expected=expected, got=got, remedy="Pass --thermal-bounds -5 42, for example."
-        )
+        expected, got = "degrees Celsius of black and, higher, of white", "{:g} and {:g}".format(*thermal_bounds)
+        remedy = "Pass --thermal-bounds -5 42, for example."
+        raise SceneError("thermal_bounds", expected=expected, got=got, remedy=remedy)
     if bounds is not None and bounds[0] > bounds[1]:  # some published scenes have the two keys swapped
         bounds, swapped = (bounds[1], bounds[0]), True
     frames.sort(key=lambda frame: frame.name)
     unit = _unit({} if thermal_bounds else meta, json_path, bounds)
-    cameras = json_path.relative_to(folder).as_posix()
-    read = (
-        "photographs alone" if alone else f"thermal images in {place}" if there else "thermal images named in the json"
-    )
-    words = f"{source.layout.name}: poses from {cameras}, {read}"
+    read = "photographs alone" if alone else f"thermal images {f'in {place}' if there else 'named in the json'}"
+    words = f"{source.layout.name}: poses from {json_path.relative_to(folder).as_posix()}, {read}"
     every = [*source.left_out, *left_out, *orphans]
     return SceneFile(folder, json_path, frames, unit, bounds, meta, every, swapped, words)
 

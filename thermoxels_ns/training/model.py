@@ -466,7 +466,7 @@ def _seen_and_measured(
 ) -> tuple[Tensor, Tensor] | None:
     """Return the rendered and the measured values of the rays of a stream, rgb or thermal; None without such rays."""
     (chosen,) = outputs[f"{name}_rays"].nonzero(as_tuple=True)
-    if outputs[name] is None or not len(chosen):
+    if outputs.get(name) is None or not len(chosen):
         return None
     return outputs[name].index_select(0, chosen), batch[target].index_select(0, chosen)
 
