@@ -37,8 +37,11 @@ class Synthetic:
     for white plaster under a white sky (house-corner only); for example house-corner+sky=0.55,0.57,0.60 or
     random-3+street."""
     output_dir: Path
-    """Folder for the scene, in the ThermoScenes layout; made if it does not exist. An earlier synthetic scene in it is
-    replaced."""
+    """Folder for the scene; made if it does not exist. An earlier synthetic scene in it is replaced."""
+    layout: Literal["thermoscenes", "nerfstudio", "thermalnerf", "rgbt-scenes", "thermalmix", "colmap", "rgb"] = (
+        "thermoscenes"
+    )
+    """Layout of the folder, see docs/data.md; rgb: photographs alone."""
     num_train: int = 42
     """Number of training views."""
     num_eval: int = 6

@@ -8,5 +8,6 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 
 thermal_data = DataParserSpecification(
-    config=ThermalDataParserConfig(), description="Paired RGB and thermal photographs (ThermoScenes layout)."
+    config=ThermalDataParserConfig(),
+    description="Paired RGB and thermal photographs, or photographs alone (docs/data.md).",
 )

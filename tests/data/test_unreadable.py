@@ -17,10 +17,11 @@ from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.core.yaml_records import read_yaml
+from thermoxels_ns.data.colmap_model import read_model
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.scene_box import _read_ply
-from thermoxels_ns.data.tracks import read_model, read_tracks
+from thermoxels_ns.data.tracks import read_tracks
 from thermoxels_ns.radiometry.thermogram import read_thermogram
 from thermoxels_ns.training.pipeline import load_checkpoint
 

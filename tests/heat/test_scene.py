@@ -6,8 +6,10 @@ import pytest
 
 from tests.support.scene_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Effect, GroundContact, Radiation
 from thermoxels_ns.heat.materials import material, material_table
 from thermoxels_ns.heat.scene import HeatScene
@@ -33,6 +35,16 @@ GROUND = (GroundContact(("exterior-down",), 1.5, 10.0),)
 
 def effects(mesh=None, adiabatic=("*",), **named) -> tuple[Effect, ...]:
     return HeatScene(ALL, adiabatic=adiabatic, **named).effects(mesh or room())
+
+
+def test_a_mesh_without_temperatures_starts_from_those_of_the_scene() -> None:
+    mesh, steady = room(), HeatScene(ALL, outside_air=OUTSIDE, adiabatic=("*",))
+    bare, through_time = replace(mesh, temperature_c=np.full(len(mesh.points_m), np.nan)), TimeSteps(1, 60.0)
+    with pytest.raises(HeatError, match="initial"):
+        replace(steady, time=through_time).problem(bare)
+    assert (replace(steady, time=through_time, initial_c=15.0).problem(bare).start_c == 15.0).all()
+    found, expected = (solve_steady(steady.problem(each)).temperature_c for each in (bare, mesh))
+    np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
 def test_what_is_not_named_is_not_built() -> None:

@@ -89,7 +89,9 @@ def _size_in_view(
 def _cut_out(
     scene: SceneFile, frame: Frame, points: FloatArray, limits: tuple[float, float]
 ) -> tuple[bytes, bytes] | None:
-    """Cut photograph and thermal image around some points, as JPEG files; None if either image shows no point."""
+    """Cut photograph and thermal image around some points, as JPEG files; None if either shows no point, or is none."""
+    if frame.thermal is None:
+        return None
     temperature_c = read_thermal_file(frame.thermal, scene.unit).temperature_c
     height, width = temperature_c.shape
     thermal = frame.thermal_intrinsics or frame.intrinsics.resized(width, height)

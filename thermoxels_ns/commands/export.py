@@ -51,6 +51,10 @@ HEAT_SKIPPED = (
     "Heat step skipped: the size of the scene is not known. Pass --metres-per-unit, the length in metres of one unit "
     "of the input poses (1 if they are in metres), or --known-distance."
 )
+NO_START = (
+    "Heat step skipped: photographs alone tell no temperature to start from. Pass --heat-preset a yaml file of a scene "
+    "with initial: {temperature_c: 15}, for example, or run thermoxels heat with such a scene on the mesh."
+)
 INNER_SIDE = (
     "The exact scene is filled, so the inner side of a shell or a wall counts as wrong surface in precision, fscore "
     "and mean distance; precision_seen and fscore_seen are those of the side that photographs show."
@@ -354,7 +358,7 @@ def export_snapshot(
     from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, write_heat_series
     from thermoxels_ns.mesh.build import MeshOptions, apply_transform, build_mesh
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
-    from thermoxels_ns.mesh.files.solvers import HeatStep
+    from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
     from thermoxels_ns.mesh.files.surface import check_stl
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
     from thermoxels_ns.mesh.quality.report import check_mesh, picture_of_quality
@@ -376,6 +380,11 @@ def export_snapshot(
     suffixes = [f".{name}" for name in options.formats]
     if ".stl" in suffixes:
         check_stl(mesh)
+    begin_c, starting = checked.scene.initial_c, mesh
+    if not mesh.has_temperatures and begin_c is not None:
+        starting = replace(mesh, temperature_c=np.full(len(mesh.points_m), begin_c))
+    if ".inp" in suffixes:
+        check_start(starting)
     voxel_size = snapshot.lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(to_mesh[:3, :3]))))
     report = check_mesh(mesh, options.boundary, built.observed_range_c, length_unit=unit)
     say(f"Up: {', '.join(f'{value:.3g}' for value in up)}. {up_source}")
@@ -390,25 +399,27 @@ def export_snapshot(
 
     scene, material, time = checked.scene, checked.material, checked.time
     solution: HeatSolution | None = None
-    truth = None
-    if scale is not None:
+    truth, skipped = None, HEAT_SKIPPED if scale is None else None
+    if not starting.has_temperatures:
+        skipped = skipped or NO_START
+    if skipped is None:
         say(f"Heat: {time.steps} steps of {time.step_seconds:g} s through {material.name}")
         everything = Goals(leave_out_below=0.0, memory_gb=None)
         found = solve_problem(scene.problem(mesh, up=up), time, everything, say).solution
         assert isinstance(found, HeatSolution), "the scene has time steps"
         solution = found
         say(f"Heat: {solution.status} Energy conserved to {solution.energy_residual:.1e}.")
-        inner_side = options.interior == "hollow" or options.wall_thickness is not None
-        truth = None if compare is None else _compared(compare, built, metres, inner_side, say)
     else:
-        say(HEAT_SKIPPED)
+        say(skipped)
+    if scale is not None and compare is not None:
+        inner_side = options.interior == "hollow" or options.wall_thickness is not None
+        truth = _compared(compare, built, metres, inner_side, say)
 
     files = [*_mesh_files(suffixes), _QUALITY]
     if solution is not None:
         files += [p.relative_to(folder).as_posix() for p in heat_series_paths(folder / _HEAT, len(solution.times_s))]
     if options.pictures:
         files += [*_MESH_PICTURES, *([] if solution is None else [_HEAT_PICTURE])]
-    skipped = {"computed": False, "reason": HEAT_SKIPPED}
     summary = {
         "options": {field.name: getattr(options, field.name) for field in fields(options)},
         "versions": export_summary.versions(),
@@ -418,7 +429,9 @@ def export_snapshot(
         "up_source": up_source,
         "region": region,
         "mesh": export_summary.mesh_summary(built, report, checked.selection, scale, voxel_size),
-        "heat": skipped if solution is None else export_summary.heat_summary(material, time, solution),
+        "heat": {"computed": False, "reason": skipped}
+        if solution is None
+        else export_summary.heat_summary(material, time, solution),
         "corrections": dict(corrections or {}),
         **({} if truth is None else {"truth": truth}),
         "files": [*files, _SUMMARY],
@@ -435,7 +448,7 @@ def export_snapshot(
         material.conductivity_w_mk, material.density_kg_m3, material.specific_heat_j_kgk, time.steps, time.step_seconds
     )
     for suffix in suffixes:
-        write_mesh(folder / f"mesh{suffix}", mesh, heat_step=heat_step, up=up)
+        write_mesh(folder / f"mesh{suffix}", starting if suffix == ".inp" else mesh, heat_step=heat_step, up=up)
     if solution is not None:
         write_heat_series(folder / _HEAT, mesh, solution)
     if options.pictures:
@@ -517,7 +530,7 @@ def _compared(compare: Compare, built: BuiltMesh, metres: float, inner_side: boo
 
 def scene_json(scene_folder: Path) -> dict[str, Any]:
     """Return the content of the scene's json, unchecked; empty if the scene has no json, as with COLMAP."""
-    from thermoxels_ns.data.scene_file import JSON_NAMES
+    from thermoxels_ns.data.layouts import JSON_NAMES
 
     folder = scene_folder if scene_folder.is_dir() else scene_folder.parent
     names = [scene_folder] if scene_folder.is_file() else [folder / name for name in JSON_NAMES]

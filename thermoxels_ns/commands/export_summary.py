@@ -119,7 +119,9 @@ def mesh_summary(
         "rules_without_effect": built.idle_rules,
         "patches": _sums(mesh.boundary.patch_names, mesh.boundary.patch, of_triangles),
         "regions": _sums(mesh.region_names, mesh.region, signed_volumes(mesh.points_m, mesh.tets)),
-        "temperature_c": {
+        "temperature_c": None
+        if not mesh.has_temperatures
+        else {
             "min": float(temperature.min()),
             "max": float(temperature.max()),
             "mean_of_nodes": float(temperature.mean()),

@@ -49,9 +49,10 @@ class GridSnapshot:
 
     lattice: Lattice
     density: Float32Array  # Density after activation at the corners, [1 / world unit], >= 0
-    temperature_c: Float32Array
+    temperature_c: Float32Array | None
     """Temperature at the corners, [degrees Celsius]: the mean over samples of thermal training rays at their first hit,
-    weighted by their share of the pixel. Where `observed_weight` is 0, the value is not a measurement."""
+    weighted by their share of the pixel. Where `observed_weight` is 0, the value is not a measurement. None: only
+    photographs trained."""
     observed_weight: Float32Array
     """Sum of the weights that thermal training rays gave each corner; 0: no thermal ray saw the corner."""
     voxel_density: Float32Array | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import Literal
 
 import numpy as np
@@ -14,16 +14,9 @@ from scipy.spatial.transform import Rotation
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_model, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
-from thermoxels_ns.data.tracks import (
-    COLMAP_FOLDERS,
-    TRACKS_KEY,
-    SparseTracks,
-    camera_to_world,
-    feature_rays,
-    read_model,
-    read_tracks,
-)
+from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, feature_rays, read_tracks
 from thermoxels_ns.data.transforms_json import path_inside
 
 MOST_OFF_PX = 2.0
@@ -31,7 +24,6 @@ MOST_OFF_PX = 2.0
 (median over its points)."""
 LEAST_AGREEING = 0.7
 """Share of the photographs with points whose poses must agree; with fewer, the model belongs to other poses."""
-_PARTS = ("cameras", "images", "points3D")
 _ROUNDS = 20  # most rounds of `align_poses`
 _FEWEST = 3  # least number of cameras for a similarity; fewer cannot outvote a wrong pose
 _STRAY = 5.0  # a camera whose misfit is above so many medians takes no part in the last fit
@@ -74,7 +66,7 @@ def read_colmap_tracks(scene: SceneFile) -> SparseTracks | None:
     Raises:
         SceneError: The model is damaged, is not of these photographs, or too few of its poses agree.
     """
-    folder = next((name for name in COLMAP_FOLDERS if _is_model(scene.folder / name)), None)
+    folder = next((name for name in COLMAP_FOLDERS if is_model(scene.folder / name)), None)
     if folder is None:
         return None
     for path in sorted((scene.folder / folder).iterdir()):
@@ -128,10 +120,6 @@ def read_colmap_tracks(scene: SceneFile) -> SparseTracks | None:
         CONSOLE.print(f"Tracks: other poses than COLMAP's, left out: {', '.join(strays)}", style="bold yellow")
     kept = agree[frame]
     return SparseTracks(moved, error_px, tuple(one.name for one in frames), frame[kept], point[kept])
-
-
-def _is_model(folder: Path) -> bool:
-    return all(any((folder / f"{part}.{suffix}").is_file() for suffix in ("bin", "txt")) for part in _PARTS)
 
 
 def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, int]]:

@@ -19,6 +19,7 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
@@ -74,12 +75,23 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     eval_dataset: ThermalDataset
 
     def setup_train(self) -> None:
-        """Make the rays and load the photographs of the training split; print how many thermal pixels are masked."""
+        """Make the rays and load the photographs of the training split; print how many thermal pixels are masked.
+
+        Raises `SceneError` if thermal images alone are to train and there are none.
+        """
+        if self.train_dataset.temperature_range is None:
+            if self.config.streams == "thermal":
+                remedy = "Use the method thermoxels, which trains on photographs alone too."
+                raise SceneError("thermal images", expected="some to train on", got="none", remedy=remedy)
+            self.config.streams = "rgb"
         # Stock exporters and dynamic batches set the number of rays on this object.
         self.train_pixel_sampler = PixelSamplerConfig(num_rays_per_batch=self.config.train_num_rays_per_batch).setup()
         self.train_rays.load()
         dataset = self.train_dataset
         temperatures = dataset.temperature_range
+        if temperatures is None:
+            CONSOLE.print(f"Training on {len(dataset)} photographs alone: the mesh will have no temperatures.")
+            return
         CONSOLE.print(
             f"Training on {len(dataset)} pairs ("
             + ("one ray carries colour and temperature" if dataset.shares_camera else "thermal cameras of their own")
@@ -91,7 +103,10 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         self.eval_pixel_sampler = PixelSamplerConfig(num_rays_per_batch=self.config.eval_num_rays_per_batch).setup()
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
         self.eval_dataloader = RandIndicesEvalDataloader(self.eval_dataset, device=self.device)
-        CONSOLE.print(f"Evaluating on {len(self.eval_dataset)} pairs; thermal: {self.eval_dataset.thermal_report()}.")
+        dataset = self.eval_dataset
+        pairs = dataset.temperature_range is not None
+        kind = f"pairs; thermal: {dataset.thermal_report()}" if pairs else "photographs"
+        CONSOLE.print(f"Evaluating on {len(dataset)} {kind}.")
 
     @cached_property
     def train_rays(self) -> RaySampler:

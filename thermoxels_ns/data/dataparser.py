@@ -25,8 +25,9 @@ from thermoxels_ns.core.errors import SceneError, ThermalFileError
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
 from thermoxels_ns.data.colmap_tracks import TrackSource, find_feature_rays
+from thermoxels_ns.data.layouts import BOUNDS_NAME, LayoutName
 from thermoxels_ns.data.scene_box import find_scene_box
-from thermoxels_ns.data.scene_file import BOUNDS_NAME, Frame, SceneFile, read_scene_file
+from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixels, read_thermal_file
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
@@ -51,12 +52,17 @@ _KEYS = {"train": "train_filenames", "val": "val_filenames", "test": "test_filen
 
 @dataclass
 class ThermalDataParserConfig(DataParserConfig):
-    """Scenes of paired colour and thermal photographs, as in ThermoScenes or with thermal cameras of their own."""
+    """Scenes of paired colour and thermal photographs, or of photographs alone; docs/data.md has the layouts."""
 
     _target: type = field(default_factory=lambda: ThermalDataParser)
     """Class to instantiate."""
     data: Path = Path()
-    """Scene folder (with transforms.json or transforms_thermal.json), or the json itself."""
+    """Scene folder, with a transforms.json or a COLMAP model, or the json itself."""
+    layout: Optional[LayoutName] = None  # noqa: UP045 - read by tyro
+    """Layout of the scene folder, see docs/data.md. Default: the first that fits; the log says which. rgb: photographs
+    alone, also where there are thermal images."""
+    thermal_bounds: Optional[tuple[float, float]] = None  # noqa: UP045
+    """Degrees Celsius of black and of white in grey thermal pictures. Default: those of temperature_bounds.json."""
     downscale_factor: Optional[int] = None  # noqa: UP045 - read by tyro
     """Divide the resolution of the colour photographs by this number. Photographs are resized when loaded; no file is
     written. Thermal images keep their resolution. Default: full resolution, but for `photographs_gb`."""
@@ -115,8 +121,9 @@ class _Scene:
 class ThermalDataParser(DataParser):
     """Reader of a scene of paired photographs, with the options of `ThermalDataParserConfig`.
 
-    The metadata of its outputs hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``,
-    ``thermal_cameras`` (`Cameras`; None if all pairs share camera and resolution), ``thermal_unit``, ``valid_range_c``,
+    The metadata of its outputs hold: ``temperature_range`` (`TemperatureRange`; None for photographs alone),
+    ``thermal_filenames`` (None for photographs alone), ``thermal_cameras`` (`Cameras`; None if all pairs share camera
+    and resolution), ``thermal_unit``, ``valid_range_c``,
     ``thermal_dead_pixels`` (masks of stuck pixels by shape of the image), ``image_scale`` (1 / downscale_factor),
     ``thermal_averaged`` (pixels of a thermal image that become one, along a side),
     ``pixel_size`` (width of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the
@@ -144,15 +151,14 @@ class ThermalDataParser(DataParser):
         poses, training = [frame.pose for frame in frames], split == "train"
         thermal_poses = scene.placed([f.pose if f.thermal_pose is None else f.thermal_pose for f in frames])
         lenses = [frame.intrinsics for frame in frames]
-        thermal_lenses = [_thermal_intrinsics(frame, scene.shapes[frame.thermal]) for frame in frames]
         pixels_averaged = self.pixels_averaged(lenses) if training else 1
         factor = 1.0 / (self.config.downscale_factor or pixels_averaged)
         cameras = _cameras(lenses, scene.placed(poses))
-        thermal_cameras = _cameras(thermal_lenses, thermal_poses)
+        thermal_cameras = _cameras([_thermal_intrinsics(frame, scene.shapes) for frame in frames], thermal_poses)
         shared = _same_cameras(cameras, thermal_cameras)
         if factor < 1.0:
             cameras = _cameras([lens.scaled(factor) for lens in lenses], scene.placed(poses))
-            shared &= pixels_averaged > 1
+            shared &= pixels_averaged > 1 or not scene.file.has_thermal
         fitted = [scene.fitted.get(number, pose) for number, pose in zip(chosen, poses)]
         return DataparserOutputs(
             image_filenames=[frame.image for frame in frames],
@@ -164,7 +170,7 @@ class ThermalDataParser(DataParser):
             metadata={
                 **scene.metadata,
                 "image_scale": factor,
-                "thermal_filenames": [frame.thermal for frame in frames],
+                "thermal_filenames": [frame.thermal for frame in frames] if scene.file.has_thermal else None,
                 "thermal_cameras": None if shared else thermal_cameras,
                 "thermal_averaged": pixels_averaged if shared else 1,
                 "pixel_size": scene.metadata["pixel_size"] / factor,
@@ -201,7 +207,8 @@ class ThermalDataParser(DataParser):
         if config.downscale_factor is not None and not config.downscale_factor >= 1:
             expected, got = "a number of at least 1", config.downscale_factor
             raise SceneError("downscale_factor", expected=expected, got=got, remedy="Pass 2, 4 or 8.")
-        file = read_scene_file(Path(config.data), config.missing_thermal)
+        file = read_scene_file(Path(config.data), config.missing_thermal, config.layout, config.thermal_bounds)
+        CONSOLE.print(f"Layout {file.layout} (--layout takes another).", markup=False)
         names = [frame.name for frame in file.frames]
         split = split_frames(names, file.meta, config.eval_mode, config.eval_interval, file.left_out)
         rays, given, fitted = find_feature_rays(file, split.train, config.tracks), file, {}
@@ -214,11 +221,12 @@ class ThermalDataParser(DataParser):
             # nerfstudio keeps dataparser_transform in single precision; unrounded, the two would differ by metres.
             translation = translation.astype(np.float32).astype(np.float64)
         scale = SCENE_SIZE / longest
-        paths, training = [f.thermal for f in file.frames], [file.frames[index] for index in split.train]
-        shapes, temperatures, dead = survey_thermal_files(
-            paths, file.unit, config.valid_range_c, file.bounds_c, {frame.thermal for frame in training}
-        )
-        _refuse_several_sizes(file.frames, shapes)
+        training, shapes, temperatures, dead = [file.frames[index] for index in split.train], {}, None, {}
+        if file.has_thermal:
+            paths, those = ([f.thermal for f in some if f.thermal is not None] for some in (file.frames, training))
+            surveyed = survey_thermal_files(paths, file.unit, config.valid_range_c, file.bounds_c, set(those))
+            shapes, temperatures, dead = surveyed
+            _refuse_several_sizes(file.frames, shapes)
         metadata = {
             "temperature_range": temperatures,
             "thermal_unit": file.unit,
@@ -239,7 +247,8 @@ class ThermalDataParser(DataParser):
         CONSOLE.print(
             f"Scene {metadata['scene_name']}: {len(names)} frames, {len(split.train)} train, "
             f"{len({*split.val, *split.test})} evaluate ({split.how}); box from {evidence.source}, {size}, which "
-            f"{met:.0%} of the rays meet; {temperatures.min_c:.2f} to {temperatures.max_c:.2f} C."
+            f"{met:.0%} of the rays meet; "
+            + (f"{temperatures.min_c:.2f} to {temperatures.max_c:.2f} C." if temperatures else "no temperatures.")
         )
         if file.bounds_swapped and file.bounds_c is not None:
             said = "{} has its lowest temperature above its highest; read as {:g} to {:g} C."
@@ -279,17 +288,17 @@ def _share_that_meets(frames: list[Frame], poses: torch.Tensor, box: SceneBox, s
 
 def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int]]) -> None:
     """Raise `SceneError` if thermal images without a thermal camera differ in size and their photographs do not."""
-    shared = [frame for frame in frames if frame.thermal_intrinsics is None]
+    shared = [(f.thermal, f.intrinsics) for f in frames if f.thermal_intrinsics is None and f.thermal is not None]
     sizes: defaultdict[tuple[int, int], Counter[tuple[int, int]]] = defaultdict(Counter)
-    for frame in shared:
-        sizes[frame.intrinsics.width, frame.intrinsics.height][shapes[frame.thermal]] += 1
-    for frame in shared:
-        ((height, width), _), *_ = sizes[frame.intrinsics.width, frame.intrinsics.height].most_common(1)
-        found = shapes[frame.thermal]
+    for thermal, camera in shared:
+        sizes[camera.width, camera.height][shapes[thermal]] += 1
+    for thermal, camera in shared:
+        ((height, width), _), *_ = sizes[camera.width, camera.height].most_common(1)
+        found = shapes[thermal]
         if found != (height, width):
             expected = f"thermal images of one size, {width} x {height} pixels as most have"
             remedy = "Remove the frame, or give it a 'thermal_camera' of its own in the json."
-            raise SceneError(frame.thermal.name, expected=expected, got=f"{found[1]} x {found[0]}", remedy=remedy)
+            raise SceneError(thermal.name, expected=expected, got=f"{found[1]} x {found[0]}", remedy=remedy)
 
 
 def _refuse_beyond_bounds(middles_c: dict[Path, float], bounds_c: tuple[float, float]) -> None:
@@ -371,9 +380,14 @@ def survey_thermal_files(
     return shapes, TemperatureRange.spanning(low, high), dead
 
 
-def _thermal_intrinsics(frame: Frame, shape: tuple[int, int]) -> Camera:
-    """Return the camera of a thermal image of `shape` (h, w), or raise `SceneError` if that shape does not fit it."""
-    height, width = shape
+def _thermal_intrinsics(frame: Frame, shapes: Mapping[Path, tuple[int, int]]) -> Camera:
+    """Return the camera of a frame's thermal image, whose shape (h, w) is in `shapes`; without one, the photograph's.
+
+    Raises `SceneError` if the shape does not fit the camera.
+    """
+    if frame.thermal is None:
+        return frame.intrinsics
+    height, width = shape = shapes[frame.thermal]
     own = frame.thermal_intrinsics
     if own is not None:
         if (own.height, own.width) != shape:

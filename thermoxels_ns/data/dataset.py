@@ -25,7 +25,7 @@ from thermoxels_ns.radiometry.thermal_pixels import PixelReport, read_thermal_fi
 
 
 class ThermalDataset(InputDataset):
-    """Photographs of one split with their thermal images.
+    """Photographs of one split with their thermal images; `temperature_range` is None for photographs alone.
 
     An item holds ``image_idx``, ``image`` (h, w, 3), ``mask`` if the scene has masks, ``thermal`` (ht, wt, 1) float32,
     normalised by the scene's range and 0 where invalid, and ``thermal_valid`` (ht, wt, 1) bool; if thermal cameras
@@ -39,7 +39,7 @@ class ThermalDataset(InputDataset):
             expected = "thermal-data, which finds the thermal images"
             remedy = "Write: ns-train thermoxels thermal-data --data SCENE."
             raise SceneError("dataparser", expected=expected, got="one that gives photographs only", remedy=remedy)
-        self.temperature_range: TemperatureRange = self.metadata["temperature_range"]
+        self.temperature_range: TemperatureRange | None = self.metadata["temperature_range"]
         self.thermal_cameras: Cameras | None = self.metadata["thermal_cameras"]
         if self.thermal_cameras is None and scale_factor != 1.0:
             # `scale_factor` changes the resolution of the photographs, not of the thermal images.
@@ -126,7 +126,7 @@ class ThermalDataset(InputDataset):
         return torch.from_numpy(resized > 0)[..., None]
 
     def get_thermal(self, image_idx: int) -> tuple[Float[Tensor, "ht wt 1"], Bool[Tensor, "ht wt 1"]]:
-        """Return normalised temperatures, 0 where invalid, and a mask of valid ones; the file is read only once."""
+        """Return normalised temperatures, 0 where invalid (all, without a thermal image), and a mask of valid ones."""
         return self._read_thermal(image_idx)[:2]
 
     def thermal_report(self) -> PixelReport:
@@ -134,6 +134,9 @@ class ThermalDataset(InputDataset):
         return sum((self._read_thermal(index)[2] for index in range(len(self))), PixelReport())
 
     def _read_thermal(self, image_idx: int) -> tuple[Tensor, Tensor, PixelReport]:
+        if self.temperature_range is None:
+            size = int(self.cameras.height[image_idx]), int(self.cameras.width[image_idx]), 1
+            return torch.zeros(size), torch.zeros(size, dtype=torch.bool), PixelReport()
         if image_idx not in self._thermal:
             path, given = self.metadata["thermal_filenames"][image_idx], self.metadata
             image = read_thermal_file(path, given["thermal_unit"], given["valid_range_c"])

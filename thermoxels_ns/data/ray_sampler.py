@@ -57,7 +57,9 @@ class RaySampler:
             if self.shared:
                 self._valid &= self._allowed
         self._rgb_pixels = _numbers(self._allowed, "colour pixels", "Check the masks.")
-        self._thermal_pixels = _numbers(self._valid, "thermal pixels", "Check the masks and the thermal files.")
+        self._thermal_pixels = None
+        if dataset.temperature_range is not None:
+            self._thermal_pixels = _numbers(self._valid, "thermal pixels", "Check the masks and the thermal files.")
         self._valid = self._valid.to(self.storage)
 
     @cached_property

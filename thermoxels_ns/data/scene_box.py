@@ -12,8 +12,8 @@ import numpy as np
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
-from thermoxels_ns.data.tracks import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.transforms_json import read_pose
 
 Box = FloatArray  # Lowest and highest corner, shape (2, 3)

@@ -15,13 +15,12 @@ from thermoxels_ns.core.checks import is_number, plain_os_errors
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.data.layouts import BOUNDS_NAME, LayoutName, find_source
 from thermoxels_ns.data.scene_scale import scale_from_scene_file, up_from_scene_file
 from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH, read_intrinsics, read_pose
 from thermoxels_ns.radiometry.decoders import errors_name
 from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES, ThermalUnit
 
-JSON_NAMES = ("transforms.json", "transforms_thermal.json")
-BOUNDS_NAME = "temperature_bounds.json"
 _HOTTEST_C = 10_000  # no thermal camera measures more
 
 
@@ -31,7 +30,7 @@ class Frame:
 
     name: str  # `file_path` of the photograph in the json, with forward slashes; frames are sorted by name
     image: Path
-    thermal: Path
+    thermal: Path | None  # None in a scene of photographs alone
     mask: Path | None  # image that is white where the photograph may be used; None: no mask
     pose: FloatArray  # camera to world, shape (4, 4), OpenGL axes, input coordinates
     intrinsics: Camera  # camera of the photograph
@@ -61,39 +60,52 @@ class SceneFile:
     """The checked content of a scene folder."""
 
     folder: Path
-    json_path: Path
+    json_path: Path  # the json, or the folder of the COLMAP model that poses come from
     frames: list[Frame]  # sorted by name
     unit: ThermalUnit  # unit of the numbers in thermal files
     bounds_c: tuple[float, float] | None  # lowest and highest temperature of temperature_bounds.json, [degrees Celsius]
-    meta: dict[str, Any]  # the json as it is (split lists, scene_box, ply_file_path, applied_transform)
+    meta: dict[str, Any]  # the json (split lists, scene_box, ply_file_path, ...), or what stands for it
     left_out: list[str] = field(default_factory=list)  # names of frames and files that missing_thermal="skip" left out
     bounds_swapped: bool = False  # True if temperature_bounds.json has the lowest temperature above the highest
+    layout: str = ""  # the layout and where its parts are, in words
+
+    @property
+    def has_thermal(self) -> bool:
+        """False for a scene of photographs alone."""
+        return self.frames[0].thermal is not None
 
 
 @plain_os_errors("scene folder", "a file or folder that can be read", "Check permissions and names.", SceneError)
-def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "error") -> SceneFile:
+def read_scene_file(
+    data: Path,
+    missing_thermal: Literal["error", "skip"] = "error",
+    layout: LayoutName | None = None,
+    thermal_bounds: tuple[float, float] | None = None,
+) -> SceneFile:
     """Read a scene folder (or the json in it) and check everything that can be checked without decoding images.
 
-    The thermal image of a photograph is the file that `thermal_file_path` names, else the file with the same stem in
-    thermal/. `missing_thermal` "skip" leaves out frames without a thermal image and lists them in `SceneFile.left_out`.
+    `layout` is one of `thermoxels_ns.data.layouts`; None: the first that fits. The thermal image of a photograph is the
+    file that `thermal_file_path` names, else the file with the same stem in the layout's folder of thermal files.
+    `missing_thermal` "skip" leaves out frames without a thermal image and lists them in `SceneFile.left_out`.
+    `thermal_bounds`, the temperatures [degrees Celsius] of black and white, replace those of temperature_bounds.json.
 
     Raises:
         SceneError: An entry or a file is missing, doubled, not finite or contradictory; the message names it.
     """
-    json_path = _find_json(data)
-    folder = json_path.parent
-    meta = read_json_object(json_path, "Write the file again.", SceneError)
+    source = find_source(data, layout)
+    json_path, folder, meta = source.origin, source.folder, source.content
+    alone, thermal_folder = not source.layout.thermal, source.thermal or folder / "thermal"
     entries = meta.get("frames")
     if not isinstance(entries, list) or not entries:
         expected = "a list 'frames' with one posed photograph per entry"
         remedy = "Run structure from motion (ns-process-data) on the photographs first."
         raise SceneError(json_path.name, expected=expected, got="no frames: the scene has no poses", remedy=remedy)
     by_stem: dict[str, list[Path]] = {}
-    for path in sorted((folder / "thermal").iterdir()) if (folder / "thermal").is_dir() else []:
+    for path in sorted(thermal_folder.rglob("*")) if source.thermal else []:
         if path.suffix.lower() in THERMAL_SUFFIXES and not path.name.startswith("."):
             by_stem.setdefault(path.stem, []).append(path)
     there = sum(map(len, by_stem.values()))
-    frames, left_out, by_name_alone = [], [], True
+    frames, left_out, by_name_alone, place = [], [], True, f"{thermal_folder.name}/"
     for index, entry in enumerate(entries):
         where = f"{json_path.name}: frame {index}"
         if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
@@ -101,10 +113,15 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
         name = Path(entry["file_path"]).as_posix()
         where = f"{where} ({name})"
         image = _existing(folder, name, where, "file_path")
+        if alone:
+            frames.append(_frame(meta, entry, name, image, None, folder, where))
+            continue
         if "thermal_file_path" in entry:
             partners = [path] if (path := folder / str(entry["thermal_file_path"])).is_file() else []
         else:
             partners, by_name_alone = by_stem.get(image.stem, []), False
+        beside = [path for path in partners if path.parent.name == image.parent.name]  # as in rgb/train, thermal/train
+        partners = beside if len(partners) > 1 and beside else partners
         if len(partners) > 1:
             remedy = "Keep one of them, or name it with 'thermal_file_path' in the frame."
             got = ", ".join(path.name for path in partners)
@@ -114,8 +131,11 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
         else:
             left_out.append(name)
     if not frames:
-        remedy = "Put them in thermal/, named like the photographs, or name them with 'thermal_file_path'."
-        got = f"{len(entries)} frames, none with one ({there} files in thermal/)"
+        remedy = (
+            f"Put them in {place}, named like the photographs, or name them with 'thermal_file_path' in the json; or "
+            "pass --layout rgb to train on the photographs alone."
+        )
+        got = f"{len(entries)} frames, none with one ({there} files in {place})"
         raise SceneError(json_path.name, expected="frames with a thermal image", got=got, remedy=remedy)
     stems = {frame.image.stem for frame in frames}
     for parent in {frame.image.parent for frame in frames}:  # photographs without a pose may have thermal images too
@@ -127,16 +147,17 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
         if not by_name_alone and stem not in stems
     ]
     if missing_thermal == "error" and left_out:
-        expected = f"a thermal image for each of the {len(entries)} frames (thermal_file_path, or the stem in thermal/)"
-        got = f"none for {len(left_out)}: {_some(left_out)} ({there} files in thermal/)"
+        expected = f"a thermal image for each of the {len(entries)} frames (thermal_file_path, or the stem in {place})"
+        got = f"none for {len(left_out)}: {_some(left_out)} ({there} files in {place})"
         remedy = "Restore the thermal images, remove these frames, or pass --missing-thermal skip."
         raise SceneError(json_path.name, expected=expected, got=got, remedy=remedy)
     if missing_thermal == "error" and orphans:
-        expected = "one photograph in images/ for every thermal image"
+        expected = "one photograph for every thermal image"
         got = f"{there} thermal images, {len(orphans)} of them without a photograph: {_some(orphans)}"
         remedy = "Restore the photographs, remove these files, or pass --missing-thermal skip."
-        raise SceneError(f"{folder.name}/thermal", expected=expected, got=got, remedy=remedy)
-    for kind, paths in (("photograph", [f.image for f in frames]), ("thermal image", [f.thermal for f in frames])):
+        raise SceneError(f"{folder.name}/{place}", expected=expected, got=got, remedy=remedy)
+    warm = [frame.thermal for frame in frames if frame.thermal is not None]
+    for kind, paths in (("photograph", [frame.image for frame in frames]), ("thermal image", warm)):
         twice = [path.name for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
         if twice:
             remedy = "Remove the duplicate frames: one of them could leak from training to evaluation."
@@ -149,23 +170,19 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
         raise SceneError(f"{json_path.name}: mask_path", expected=expected, got=got, remedy=remedy)
     scale_from_scene_file(meta)
     up_from_scene_file(meta)
-    bounds, swapped = _read_bounds(folder), False
+    bounds, swapped = _read_bounds(folder) if thermal_bounds is None else thermal_bounds, False
+    if thermal_bounds is not None and not -ZERO_CELSIUS_K <= thermal_bounds[0] < thermal_bounds[1] <= _HOTTEST_C:
+        expected, got = "degrees Celsius of black and, higher, of white", "{:g} and {:g}".format(*thermal_bounds)
+        remedy = "Pass --thermal-bounds -5 42, for example."
+        raise SceneError("thermal_bounds", expected=expected, got=got, remedy=remedy)
     if bounds is not None and bounds[0] > bounds[1]:  # some published scenes have the two keys swapped
         bounds, swapped = (bounds[1], bounds[0]), True
     frames.sort(key=lambda frame: frame.name)
-    unit = _unit(meta, json_path, bounds)
-    return SceneFile(folder, json_path, frames, unit, bounds, meta, left_out + orphans, swapped)
-
-
-def _find_json(data: Path) -> Path:
-    if data.is_file() and data.suffix == ".json":
-        return data
-    for name in JSON_NAMES:
-        if (data / name).is_file():
-            return data / name
-    remedy = "Pass --data the folder that holds it (ns-process-data writes it)."
-    got = "neither" if data.is_dir() else "no such folder"
-    raise SceneError(f"scene folder {data}", expected=" or ".join(JSON_NAMES), got=got, remedy=remedy)
+    unit = _unit({} if thermal_bounds else meta, json_path, bounds)
+    read = "photographs alone" if alone else f"thermal images {f'in {place}' if there else 'named in the json'}"
+    words = f"{source.layout.name}: poses from {json_path.relative_to(folder).as_posix()}, {read}"
+    every = [*source.left_out, *left_out, *orphans]
+    return SceneFile(folder, json_path, frames, unit, bounds, meta, every, swapped, words)
 
 
 def _read_bounds(folder: Path) -> tuple[float, float] | None:
@@ -201,12 +218,12 @@ def _unit(meta: dict[str, Any], json_path: Path, bounds: tuple[float, float] | N
 
 
 def _frame(
-    meta: dict[str, Any], entry: dict[str, Any], name: str, image: Path, thermal: Path, folder: Path, where: str
+    meta: dict[str, Any], entry: dict[str, Any], name: str, image: Path, thermal: Path | None, folder: Path, where: str
 ) -> Frame:
     thermal_pose = thermal_intrinsics = None
-    if "thermal_transform_matrix" in entry:
+    if thermal is not None and "thermal_transform_matrix" in entry:
         thermal_pose = read_pose(entry["thermal_transform_matrix"], f"{where}: thermal_transform_matrix")
-    camera = entry.get("thermal_camera", meta.get("thermal_camera"))
+    camera = None if thermal is None else entry.get("thermal_camera", meta.get("thermal_camera"))
     if camera is not None:
         if not isinstance(camera, dict):
             raise SceneError(where, expected="'thermal_camera' as an object", got=camera, remedy="Correct the json.")

@@ -1,14 +1,12 @@
-"""Tracks of structure from motion: their file, the COLMAP model in a scene's folder, and feature rays from tracks."""
+"""Tracks of structure from motion: their file, and feature rays from tracks."""
 
 from __future__ import annotations
 
 import io
-import struct
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,14 +23,6 @@ LEAST_ERROR_PX = 0.3  # a smaller reprojection error of a point is due to luck a
 LEAST_PARALLAX_DEG = 2.0  # a point is left out if the largest angle between its rays is not above this
 MOST_BEHIND = 0.1  # if a larger share of sightings lies behind the camera, the tracks belong to other poses
 _REMEDY = f"Write the scene again with thermoxels capture, or remove {TRACKS_KEY} from the json to train without it."
-
-COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "sparse")
-"""Places of a COLMAP model in a scene's folder; the first that holds a model counts."""
-
-_LEAST_CAMERA_BYTES = 48  # size of a camera with three parameters in cameras.bin; cameras with more are larger
-_LAYOUT = {"frames": (64, "<I", 16), "images": (64, "<Q", 24), "points3D": (43, "<Q", 8)}
-"""Layout of an entry in a .bin file: bytes before the number of its parts (of an image: before its name), the format of
-that number, bytes of each part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,59 +127,3 @@ def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray
     across = np.linalg.norm(np.cross(directions, mean[point]), axis=1)
     np.maximum.at(off, point, np.arctan2(across, (directions * mean[point]).sum(axis=1)))
     return 2.0 * off
-
-
-def read_model(folder: Path) -> Any:
-    """Read the COLMAP model in a folder as a `pycolmap.Reconstruction`, or raise `SceneError` if it cannot be read."""
-    import pycolmap  # slow to import and only needed here
-
-    check_complete(folder)
-    try:
-        return pycolmap.Reconstruction(str(folder))
-    except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
-        raise SceneError(f"it cannot be read, {(str(problem).strip() or repr(problem)).splitlines()[-1]}") from problem
-
-
-def camera_to_world(image: Any) -> FloatArray:
-    """Return the camera-to-world pose (4, 4) of a pycolmap image, with camera axes x right, y up, z back (OpenGL)."""
-    pose = np.eye(4)
-    pose[:3] = image.cam_from_world().inverse().matrix()
-    return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def check_complete(folder: Path) -> None:
-    """Raise `SceneError` if a file of a COLMAP model cannot be opened, or ends before the last entry that it announces.
-
-    pycolmap says of an unreadable file that it is no model, and may read a truncated file for ever.
-    """
-    for name in ("cameras", "frames", "images", "points3D"):
-        for path in (folder / f"{name}.txt", folder / f"{name}.bin"):
-            if not path.is_file():
-                continue
-            try:
-                with path.open("rb") as file:
-                    whole = path.suffix == ".txt" or _complete(name, file.read())
-            except OSError as problem:
-                said = f"it cannot be read, {path.name}: {problem.strerror}; check its permissions and the disk"
-                raise SceneError(said) from problem
-            if not whole:
-                said = f"{path.name} ends before its last entry, as after an interrupted copy"
-                raise SceneError(f"it cannot be read, {said}")
-
-
-def _complete(name: str, data: bytes) -> bool:
-    try:
-        (count,) = struct.unpack_from("<Q", data)
-        end = 8
-        if name == "cameras":
-            return len(data) >= end + count * _LEAST_CAMERA_BYTES
-        before, kind, size = _LAYOUT[name]
-        for _ in range(count):
-            end += before
-            if name == "images":
-                end = data.index(b"\0", end) + 1
-            (parts,) = struct.unpack_from(kind, data, end)
-            end += struct.calcsize(kind) + parts * size
-    except (struct.error, ValueError):  # a number, or the end of a name, lies behind the end of the data
-        return False
-    return end <= len(data)

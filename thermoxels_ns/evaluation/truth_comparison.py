@@ -341,7 +341,8 @@ def compare_with_truth(
     }
     if mesh is not None:
         result |= _mesh_errors(known, mesh, voxel_m, metres_per_unit)
-        result |= _temperature_errors(known.scene, mesh, tolerance_m, metres_per_unit)
+        if mesh.has_temperatures:
+            result |= _temperature_errors(known.scene, mesh, tolerance_m, metres_per_unit)
     return {name: _scaled(name, value, metres_per_unit) for name, value in result.items()}
 
 
@@ -460,7 +461,7 @@ def _mesh_errors(known: KnownTruth, mesh: TetMesh, voxel_m: float, metres_per_un
         "chamfer_voxels": distances.chamfer / voxel_m,
         "chamfer_m": distances.chamfer,
         "hausdorff_m": distances.hausdorff,
-        "temperature_seen_mae_c": float(error_k.mean()) if len(error_k) else None,
+        "temperature_seen_mae_c": float(error_k.mean()) if len(error_k) and mesh.has_temperatures else None,
         "share_of_seen_reached": float(reached.mean()),
     }
 

@@ -293,6 +293,9 @@ class HeatProblem:
     def _check_temperatures(self) -> None:
         name = "mesh temperature_c" if self.initial_temperature_c is None else "initial_temperature_c"
         remedy = "Give one temperature in degrees Celsius per mesh node."
+        if self.initial_temperature_c is None and not self.mesh.has_temperatures:
+            remedy = "Add initial: {temperature_c: 15} to the scene, for example: photographs alone tell none."
+            raise HeatError(name, expected="temperatures at the start", got="a mesh without", remedy=remedy)
         start = check_shape(name, self.start_c, (len(self.mesh.points_m),), remedy, HeatError)
         check_finite(name, start, remedy, HeatError)
         if start.min() < -ZERO_CELSIUS_K:

@@ -51,6 +51,7 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 Value = TypeVar("Value")
 
 _Z_UP: Vector = (0.0, 0.0, 1.0)
+_ANY_START_C = 10.0  # where the iterations to a steady state start on a mesh without temperatures, [degrees Celsius]
 _PATCHES_OF_THEIR_OWN = "Give each of the two its own patches: [names]."
 
 
@@ -111,7 +112,10 @@ class HeatScene:
 
     def problem(self, mesh: TetMesh, *, up: Vector | None = None) -> HeatProblem:
         """Return the problem on a mesh. If the scene has no `up`, the argument counts, or z. Raises as `effects`."""
-        initial = None if self.initial_c is None else np.full(len(mesh.points_m), self.initial_c)
+        start_c = self.initial_c
+        if start_c is None and self.steady and not mesh.has_temperatures:
+            start_c = _ANY_START_C
+        initial = None if start_c is None else np.full(len(mesh.points_m), start_c)
         return HeatProblem(mesh, self._material(mesh), initial, self.effects(mesh), self.up or up or _Z_UP)
 
     def effects(self, mesh: TetMesh) -> tuple[Effect, ...]:

@@ -56,8 +56,9 @@ class BuiltMesh:
     solid: SolidCells
     unobserved_parts: int  # number of connected parts left out because no thermal ray saw any of their nodes
     unobserved_voxels: int  # number of voxels of these parts; `solid.component_sizes` counts them, `solid.cells` not
-    observed_range_c: tuple[float, float]
-    """Lowest and highest temperature of the field's measured corners, [degrees Celsius]; all nodes are within it."""
+    observed_range_c: tuple[float, float] | None
+    """Lowest and highest temperature of the field's measured corners, [degrees Celsius]; all nodes are within it. None:
+    no temperatures."""
     idle_rules: tuple[str, ...] = ()
     """The user's rules that no triangle or tetrahedron of the mesh follows, such as "patch roof (entry 2)"."""
 
@@ -71,7 +72,8 @@ def build_mesh(
 ) -> BuiltMesh:
     """Return a mesh of the solid part of a trained field, with nodal temperatures, regions and boundary tags.
 
-    Connected parts that no thermal ray saw have no known temperature and are left out.
+    Connected parts that no thermal ray saw have no known temperature and are left out. The mesh of a field that
+    photographs alone trained has no temperatures.
 
     Args:
         snapshot: The trained field on its corner lattice.
@@ -94,10 +96,12 @@ def build_mesh(
     else:
         stuffed = sharpen(stuff(solid.level, options.coarsest_cell), solid.level.shape)
         points, tets, facets = stuffed.points, stuffed.tets, stuffed.facets
-    # Temperatures are interpolated from measured corners alone.
-    measured = np.where(snapshot.observed_weight >= MIN_OBSERVED_WEIGHT, snapshot.observed_weight, 0.0)
-    temperature_c, weight = interpolate_corners(points, snapshot.temperature_c, measured)
-    observed = weight >= MIN_OBSERVED_WEIGHT
+    known, observed_range_c = snapshot.temperature_c, None
+    temperature_c, observed = np.full(len(points), np.nan), np.zeros(len(points), dtype=bool)
+    if known is not None:  # temperatures are interpolated from measured corners alone
+        measured = np.where(snapshot.observed_weight >= MIN_OBSERVED_WEIGHT, snapshot.observed_weight, 0.0)
+        temperature_c, weight = interpolate_corners(points, known, measured)
+        observed = weight >= MIN_OBSERVED_WEIGHT
 
     body = component_of(len(points), tets[:, :3].ravel(), tets[:, 1:].ravel())
     unseen = np.bincount(body, observed) == 0
@@ -112,7 +116,10 @@ def build_mesh(
         tets, facets = number[tets[stays[tets[:, 0]]]], number[facets[stays[facets[:, 0]]]]
         points, temperature_c, observed = points[stays], temperature_c[stays], observed[stays]
     edges, conductance = lattice_edges(solid.cells) if voxel else tet_conductances(points, tets)
-    temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
+    if known is not None:
+        temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
+        measured_c = known[snapshot.observed_weight >= MIN_OBSERVED_WEIGHT]
+        observed_range_c = float(measured_c.min()), float(measured_c.max())
 
     on_border = boundary_tags(facets, points, snapshot.lattice.shape)
     facet_tags = np.where(_cut_by_region(points, facets, solid.within), FACET_BOX, on_border)
@@ -121,8 +128,8 @@ def build_mesh(
     points_m = apply_transform(transform, snapshot.lattice.index_to_world(points))
     colour = None
     if snapshot.colour is not None:  # interpolated from corners with density; grey where no corner around has any
-        found, known = interpolate_corners(points, snapshot.colour, snapshot.density > 0.0)
-        colour = np.where(known[:, None] > 0.0, found, 0.5).astype(np.float32)
+        found, near = interpolate_corners(points, snapshot.colour, snapshot.density > 0.0)
+        colour = np.where(near[:, None] > 0.0, found, 0.5).astype(np.float32)
     of_tets = points_m[tets].mean(axis=1), None if colour is None else colour[tets].mean(axis=1)
     region, region_names, idle_regions = apply_regions(options.rules, *of_tets)
     mesh = TetMesh(
@@ -137,8 +144,6 @@ def build_mesh(
         colour=colour,
     )
     boundary, idle_patches = _tagged(mesh, points, solid, snapshot, transform[:3, :3] / scale, options)
-    measured_c = snapshot.temperature_c[snapshot.observed_weight >= MIN_OBSERVED_WEIGHT]
-    observed_range_c = float(measured_c.min()), float(measured_c.max())
     return BuiltMesh(
         replace(mesh, boundary=boundary), solid, parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
     )

@@ -40,7 +40,7 @@ class TetMesh:
 
     points_m: FloatArray  # nodes, shape (n, 3), [m]
     tets: IntArray  # node indices, shape (t, 4), positively oriented: det(p1 - p0, p2 - p0, p3 - p0) > 0
-    temperature_c: FloatArray  # nodal temperature, shape (n,), [degrees Celsius]
+    temperature_c: FloatArray  # nodal temperature, shape (n,), [degrees Celsius]; NaN everywhere if not known
     observed: BoolArray
     """True where thermal rays measured the node's temperature; elsewhere it is a harmonic extension. Shape (n,)."""
     facets: IntArray  # boundary triangles, shape (f, 3), oriented so that the right-hand normal points out of the body
@@ -50,6 +50,11 @@ class TetMesh:
     boundary: Boundary | None = None  # tags of the boundary triangles; None if the mesh has no tags
     colour: Float32Array | None = None
     """Colour of each node, red, green, blue in [0, 1], shape (n, 3); None if colours are not known."""
+
+    @property
+    def has_temperatures(self) -> bool:
+        """False for the mesh of a training on photographs alone, where no temperature is known."""
+        return not bool(np.isnan(self.temperature_c).all())
 
     def check(self, name: str = "mesh", remedy: str = "Build the mesh with thermoxels_ns.mesh.build.") -> None:
         """Check that the arrays fit each other; `quality.report.check_mesh` checks the geometry.
@@ -64,7 +69,7 @@ class TetMesh:
         arrays: list[tuple[str, npt.NDArray, tuple[int | None, ...], int | None]] = [
             ("points_m", self.points_m, (None, 3), None),
             ("tets", self.tets, (None, 4), nodes),
-            ("temperature_c", self.temperature_c, (nodes,), None),
+            ("temperature_c", self.temperature_c if self.has_temperatures else np.zeros(nodes), (nodes,), None),
             ("observed", self.observed, (nodes,), None),
             ("facets", self.facets, (None, 3), nodes),
             ("facet_tags", self.facet_tags, (facets,), None),

@@ -72,7 +72,8 @@ def evidence_of_photographs(
         return None
     photographs = depths.photographs
     few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
-    span_k = dataset.temperature_range.span_k
+    temperatures = dataset.temperature_range
+    span_k = 1.0 if temperatures is None else temperatures.span_k
     found = photograph_differences(depths, thermal_at(dataset, photographs, depths.depth)) if gains or offsets else None
     log_gain = offset = None
     if gains and found is not None and matters(found.log_gain, found.log_gain_error, LEAST_GAIN):

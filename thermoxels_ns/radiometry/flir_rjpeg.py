@@ -166,6 +166,10 @@ def _counts(path: Path, content: bytes) -> npt.NDArray[np.uint16]:
     record, data = _Record.marked(content), content[_IMAGE_HEADER_BYTES:]
     width, height = (int(number) for number in record.numbers(2, "HH"))
     check_thermal_size(path, width, height)
+    if data.startswith(JPEG_START) and len(data) < 2 * width * height:
+        expected, got = "counts stored as plain numbers or as PNG", "counts as a JPEG (JPEG-LS), which is not read"
+        remedy = "Remove this file and pass --missing-thermal skip."
+        raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
     if not data.startswith(PNG_START):
         counts = np.frombuffer(data, dtype=f"{record.order}u2", count=width * height)
         return counts.reshape(height, width).astype(np.uint16)

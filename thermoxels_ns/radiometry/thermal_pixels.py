@@ -38,7 +38,10 @@ _EXPECTED = "a readable thermal file"
 _REMEDY = "The file is damaged or not what its suffix says; copy it again or remove its frame."
 _TIFF_SUFFIXES = (".tif", ".tiff")
 _LINEAR_UNIT = 'in transforms.json "thermal_unit": {"celsius_per_count": ..., "celsius_offset": ...}'
-_UNIT_REMEDY = f"Give temperature_bounds.json (absolute_min_temperature, absolute_max_temperature) or, {_LINEAR_UNIT}."
+_UNIT_REMEDY = (
+    "Pass --thermal-bounds -5 42 with the degrees of black and white, or give temperature_bounds.json "
+    f"(absolute_min_temperature, absolute_max_temperature) or, {_LINEAR_UNIT}."
+)
 _COUNTS_REMEDY = (
     f"Give {_LINEAR_UNIT}, as the camera's manual has them; counts from 0 to 65535 that span the bounds have "
     "(highest - lowest) / 65535 per count and an offset of the lowest."
@@ -265,7 +268,10 @@ def _read_image(path: Path) -> tuple[npt.NDArray[Any], BoolArray | None]:
     has_alpha = pixels.shape[-1] in (2, 4)
     colours = pixels[..., :-1] if has_alpha else pixels
     if not (colours == colours[..., :1]).all():
-        remedy = "Export the radiometric data (16-bit PNG or TIFF, .npy, .csv) or a grey palette."
+        remedy = (
+            "Export the radiometric data (16-bit PNG or TIFF, .npy, .csv), or a grey palette: pass --thermal-bounds; "
+            "or put the camera's own R-JPEG files into raw_images/ beside rgb/; or pass --layout rgb to train without."
+        )
         got = "a false-colour picture: its palette cannot be turned back into temperatures"
         raise ThermalFileError(str(path), expected="a grey image (all channels equal)", got=got, remedy=remedy)
     return np.ascontiguousarray(colours[..., 0]), pixels[..., -1] == 0 if has_alpha else None

@@ -156,6 +156,8 @@ def image_of_mesh(
     `values`, shape (n,), are the mesh's temperatures if left out; `look` are arguments of `image_of_surface`.
     """
     shown = mesh.temperature_c if values is None else values
+    if values is None and not mesh.has_temperatures and "painted" not in look:
+        look["painted"] = [("no temperatures, photographs alone", "grey", np.ones(len(mesh.facets), dtype=bool))]
     return image_of_surface(mesh.points_m, mesh.facets, shown, words=(_size_of(mesh, length_unit), note), **look)
 
 

@@ -19,14 +19,30 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.synthetic.catalogue import make_scene
 from thermoxels_ns.synthetic.imperfections import PERFECT, DrawnFlaws, Imperfections
-from thermoxels_ns.synthetic.raycast import render_view
+from thermoxels_ns.synthetic.raycast import first_surface, render_view
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
+_Frames = list[dict[str, Any]]
 ThermalFormat = Literal["png16", "tiff", "npy"]
 """16-bit PNG that spans the temperature bounds; uint16 TIFF of centikelvin counts; float32 numpy in Celsius."""
+LayoutName = Literal["thermoscenes", "nerfstudio", "thermalnerf", "rgbt-scenes", "thermalmix", "colmap", "rgb"]
 PhotoFormat = Literal["jpeg", "png"]  # JPEG as cameras write, of quality 92 by default; PNG, which loses nothing
 
 _SUFFIXES = {"png16": ".png", "tiff": ".tiff", "npy": ".npy"}
+_FOLDERS: dict[LayoutName, tuple[str, str, str]] = {
+    "thermoscenes": ("images", "thermal", ""),
+    "nerfstudio": ("images", "thermal", ""),
+    "thermalnerf": ("images", "images_thermal", ""),
+    "rgbt-scenes": ("rgb/{}", "thermal/{}", "sparse/0"),
+    "thermalmix": ("rgb", "warped_thermal", "colmap_sparse/0"),
+    "colmap": ("images", "thermal", "sparse/0"),
+    "rgb": ("images", "", ""),
+}
+"""Folders of photographs ({}: train or test), of thermal images and of the COLMAP model ("": none) in each layout."""
+_BOUNDS, _JSON = "temperature_bounds.json", "transforms.json"
+_OPENCV = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+_SAME_POINT = 1e-6  # share of the way to a point by which rounding may be off
+_POINTS_PER_VIEW = 50  # points of the COLMAP model that are drawn in each view
 _PHOTO_SUFFIXES: dict[str, str] = {"jpeg": ".jpg", "png": ".png"}
 TRUTH = "truth.json"
 _LARGEST_COUNT = 65535
@@ -52,13 +68,15 @@ def write_scene(
     photo_format: PhotoFormat = "jpeg",
     imperfections: Imperfections = PERFECT,
     progress: bool = True,
+    layout: LayoutName = "thermoscenes",
 ) -> Path:
     """Write photographs and thermal images of a scene, and their poses, into a folder, and return the folder.
 
-    The layout is that of ThermoScenes: ``images/``, ``thermal/``, ``transforms.json`` (written last) and
-    ``temperature_bounds.json``, with ``frame_train_`` and ``frame_eval_`` names. ``transforms.json`` also has the scale
-    (metres) and up (z), as after a capture, and the unit of TIFF counts as ``thermal_unit``. The scene's name and exact
-    box and the drawn `imperfections` go to ``truth.json``, which training never reads.
+    The `layout` "thermoscenes" is that of ThermoScenes: ``images/``, ``thermal/``, ``transforms.json`` (written last)
+    and ``temperature_bounds.json``, with ``frame_train_`` and ``frame_eval_`` names. ``transforms.json`` also has the
+    scale (metres) and up (z), as after a capture, and the unit of TIFF counts as ``thermal_unit``. ``docs/data.md`` has
+    the other layouts; "nerfstudio" and "thermalmix" hold degrees as ``.npy``. The scene's name and exact box and the
+    drawn `imperfections` go to ``truth.json``, which training never reads.
 
     The folder is made if absent; an earlier synthetic scene in it is removed, any other scene is refused. Held-out
     views lie half-way between training views. `thermal_width` [pixels] is by default the width of photographs, or half
@@ -73,10 +91,18 @@ def write_scene(
     for name, text, known in (
         ("photo_format", photo_format, _PHOTO_SUFFIXES),
         ("thermal_format", thermal_format, _SUFFIXES),
+        ("layout", layout, _FOLDERS),
     ):
         if text not in known:
             expected = f"one of {', '.join(known)}"
-            raise SceneError(name, expected=expected, got=repr(text), remedy="Choose one of these formats.")
+            raise SceneError(name, expected=expected, got=repr(text), remedy="Choose one of these.")
+    photographs, thermals, model = _FOLDERS[layout]
+    if own_thermal_camera and (model or not thermals):
+        expected = "one camera for both, which is all that this layout can say"
+        remedy = "Leave --own-thermal-camera out, or pass --layout thermalnerf."
+        raise SceneError("own_thermal_camera", expected=expected, got=f"True and layout {layout}", remedy=remedy)
+    if layout in ("nerfstudio", "thermalmix"):
+        thermal_format = "npy"
     imperfections.check()
     camera = scene.camera(width, height)
     train, held_out = scene.poses(num_train, num_eval)
@@ -90,42 +116,107 @@ def write_scene(
     if thermal_format == "tiff":
         unit = _CENTIKELVIN
 
-    target = _prepared_folder(folder)
-    frames: list[dict[str, Any]] = []
+    target = _prepared_folder(folder, layout)
+    frames: _Frames = []
     for number, name in enumerate(track(names, description=f"Photographing {scene.name}", disable=not progress)):
         view = thermal_view = render_view(scene, poses[number], camera)
         if thermal_camera != camera:
             thermal_view = render_view(scene, poses[number] @ offset, thermal_camera)
         measured_c = flaws.thermogram(number, thermal_view.temperature_c)
+        side = "train" if number < num_train else "test"
         frame: dict[str, Any] = {
-            "file_path": f"images/{name}{_PHOTO_SUFFIXES[photo_format]}",
-            "thermal_file_path": f"thermal/{name}{_SUFFIXES[thermal_format]}",
+            "file_path": f"{photographs.format(side)}/{name}{_PHOTO_SUFFIXES[photo_format]}",
+            "thermal_file_path": f"{thermals.format(side)}/{name}{_SUFFIXES[thermal_format]}",
             "transform_matrix": given_poses[number].tolist(),
         }
         if own_thermal_camera:
             frame["thermal_transform_matrix"] = (given_poses[number] @ given_offset).tolist()
         with replace_when_done(target / frame["file_path"]) as path:
             Image.fromarray(flaws.photograph(number, view.rgb)).save(path, quality=imperfections.jpeg_quality)
+        frames.append(frame)
+        if not thermals:
+            continue
         with replace_when_done(target / frame["thermal_file_path"]) as path:
             if thermal_format == "npy":
                 np.save(path, measured_c.astype(np.float32))
             else:
                 counts = np.round((measured_c - unit["celsius_offset"]) / unit["celsius_per_count"])
                 Image.fromarray(np.clip(counts, 0, _LARGEST_COUNT).astype(np.uint16)).save(path)
-        frames.append(frame)
 
-    named = {"absolute_min_temperature": bounds[0], "absolute_max_temperature": bounds[1]}
-    _write_json(target / "temperature_bounds.json", named)
+    if layout == "thermoscenes" or (thermals and thermal_format == "png16"):
+        named = {"absolute_min_temperature": bounds[0], "absolute_max_temperature": bounds[1]}
+        _write_json(target / _BOUNDS, named)
     transforms: dict[str, Any] = _intrinsics(flaws.given_camera(camera))
-    if own_thermal_camera:
+    if layout == "thermalnerf":
+        frames = _separate_frames(frames, transforms, _intrinsics(thermal_camera))
+    elif layout != "thermoscenes":  # thermal images belong to the photographs of the same name
+        frames = [{key: value for key, value in frame.items() if key != "thermal_file_path"} for frame in frames]
+    if own_thermal_camera and layout != "thermalnerf":
         transforms["thermal_camera"] = _intrinsics(thermal_camera)
     if thermal_format == "tiff":  # counts of a 16-bit PNG span the temperature bounds, which are written above
         transforms["thermal_unit"] = unit
     transforms |= {"metres_per_unit": 1.0, "up": [0, 0, 1], "frames": frames}
     truth = {"synthetic_scene": scene.name, "scene_box": scene.scene_box, "seed": seed}
     _write_json(target / TRUTH, truth | flaws.truth())
-    _write_json(target / "transforms.json", transforms)
+    if model:
+        _write_colmap_model(target / model, scene, poses, frames, camera, flaws.given_camera(camera), seed)
+    else:
+        _write_json(target / _JSON, transforms)
     return target
+
+
+def _separate_frames(frames: _Frames, camera: dict[str, Any], own: dict[str, Any]) -> _Frames:
+    """Return the frames of pairs as ThermalNeRF has them: all photographs, then all thermal images, each with its
+    camera. The keys of `camera`, the photographs', are removed from it."""
+    poses = [frame.get("thermal_transform_matrix", frame["transform_matrix"]) for frame in frames]
+    kept = {key: camera.pop(key) for key in own if key != "camera_model"}
+    seen = [{k: frame[k] for k in ("file_path", "transform_matrix")} | kept | {"is_thermal": 0} for frame in frames]
+    warm = [
+        {"file_path": frame["thermal_file_path"], "transform_matrix": pose} | own | {"is_thermal": 1}
+        for frame, pose in zip(frames, poses)
+    ]
+    return seen + warm
+
+
+def _write_colmap_model(
+    folder: Path, scene: SyntheticScene, poses: FloatArray, frames: _Frames, camera: Camera, given: Camera, seed: int
+) -> None:
+    """Write a COLMAP model as text, with points of the surface and the photographs that see them from `poses`."""
+    generator, points = np.random.default_rng(seed), []
+    for pose in poses:
+        rays = camera.directions(pose).reshape(-1, 3)
+        rays = rays[generator.choice(len(rays), min(_POINTS_PER_VIEW, len(rays)), replace=False)]
+        length, own = first_surface(scene, pose[:3, 3], rays)
+        points.append(pose[:3, 3] + length[own, None] * rays[own])
+    points = np.concatenate(points)
+    tracks: list[list[str]] = [[] for _ in points]
+    images = []
+    for number, (pose, frame) in enumerate(zip(poses, frames), start=1):
+        pixels = camera.project_world(pose, points)
+        (inside,) = np.nonzero(camera.contains(pixels))
+        reached, _ = first_surface(scene, pose[:3, 3], points[inside] - pose[:3, 3])
+        shown = inside[reached >= 1.0 - _SAME_POINT]
+        for place, point in enumerate(shown):
+            tracks[point].append(f"{number} {place}")
+        world = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+        x, y, z, w = Rotation.from_matrix(world[:3, :3]).as_quat()
+        placed = " ".join(map(repr, map(float, (w, x, y, z, *world[:3, 3]))))
+        images.append(f"{number} {placed} 1 {Path(frame['file_path']).name}")
+        images.append(" ".join(f"{u:.3f} {v:.3f} {point + 1}" for (u, v), point in zip(pixels[shown], shown)))
+    lens = " ".join(repr(float(getattr(given, name))) for name in _OPENCV)
+    seen = [
+        f"{number} {x!r} {y!r} {z!r} 128 128 128 0.5 {' '.join(track)}"
+        for number, ((x, y, z), track) in enumerate(zip(points.tolist(), tracks), start=1)
+        if len(track) > 1
+    ]
+    writable_folder(folder)
+    for name, lines in (
+        ("cameras", [f"1 OPENCV {given.width} {given.height} {lens}"]),
+        ("images", images),
+        ("points3D", seen),
+    ):
+        with replace_when_done(folder / f"{name}.txt") as path:
+            path.write_text("\n".join(lines) + "\n")
 
 
 def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
@@ -170,24 +261,30 @@ def _thermal_camera(
     return scene.camera(chosen, height * chosen // width), np.eye(4)
 
 
-def _prepared_folder(folder: Path | str) -> Path:
+def _prepared_folder(folder: Path | str, layout: LayoutName) -> Path:
     """Make the folders and remove an earlier synthetic scene; raise `SceneError` for any other scene in the folder."""
     target = writable_folder(folder)
+    models = [f"{model}/{part}.txt" for *_, model in _FOLDERS.values() for part in ("cameras", "images", "points3D")]
     if (target / TRUTH).is_file():
-        for path in (target / "transforms.json", *target.glob("images/frame_*"), *target.glob("thermal/frame_*")):
+        pictures = {f"{name.format('*')}/frame_*" for one in _FOLDERS.values() for name in one[:2] if name}
+        for path in (
+            *(target / name for name in (_JSON, _BOUNDS, *models)),
+            *(p for g in pictures for p in target.glob(g)),
+        ):
             remove_file(path)  # truth.json stays until it is replaced: it marks the folder as synthetic
-    elif (target / "transforms.json").exists():
+    elif any((target / name).exists() for name in (_JSON, *models)):
         expected = "an empty folder or one with an earlier synthetic scene"
-        got = f"{target}, whose transforms.json describes other photographs"
+        got = f"{target}, which holds a scene of other photographs"
         raise SceneError("output folder", expected=expected, got=got, remedy="Choose another folder.")
-    for name in ("images", "thermal"):
-        writable_folder(target / name)
+    for name in _FOLDERS[layout][:2]:
+        for side in ("train", "test") if name else ():
+            writable_folder(target / name.format(side))
     return target
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:
-    names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
-    return {"camera_model": "OPENCV", "w": camera.width, "h": camera.height} | {n: getattr(camera, n) for n in names}
+    lens = {name: getattr(camera, name) for name in _OPENCV}
+    return {"camera_model": "OPENCV", "w": camera.width, "h": camera.height} | lens
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

@@ -74,13 +74,16 @@ class ThermoxelsModel(Model):
         self.config = config = self.config.suited_to(longest / voxel if 0.0 < voxel < math.inf else math.inf)
         torch.manual_seed(config.seed)
         self.loss_weights = config.loss_weights()
-        temperatures = metadata.get("temperature_range")
+        temperatures = metadata.get("temperature_range", "none")
+        self.has_temperatures = temperatures is not None
+        if temperatures is None:  # photographs alone
+            temperatures = TemperatureRange(0.0, 1.0)
         if not isinstance(temperatures, TemperatureRange):
             remedy = "Use the dataparser thermal-data."
             raise SceneError("scene", expected="thermal images with a temperature range", got="none", remedy=remedy)
         bounds_c = torch.tensor([temperatures.min_c, temperatures.max_c], dtype=torch.float64)
         self.register_buffer("temperature_bounds_c", bounds_c)
-        self.degrees_view = DegreesView(temperatures, self._read_ray)
+        self.degrees_view = DegreesView(temperatures, self._read_ray) if self.has_temperatures else None
         if 0.0 < voxel < math.inf:
             pixels = config.voxel_pixels * longest / config.resolutions[-1] / voxel
             CONSOLE.log(
@@ -274,10 +277,10 @@ class ThermoxelsModel(Model):
         # A ray that hits nothing is drawn behind the box: image writers cannot show infinity.
         lo, hi = torch.tensor([self.grid.lattice.lo, self.grid.lattice.hi], dtype=origins.dtype, device=origins.device)
         far = torch.linalg.norm(origins - 0.5 * (lo + hi), dim=-1) + 0.5 * torch.linalg.norm(hi - lo)
+        warm = {"thermal": thermal, "temperature_c": self.temperature_range.to_celsius(thermal)}
         return {
             "rgb": rgb.clamp(0, 1),
-            "thermal": thermal,
-            "temperature_c": self.temperature_range.to_celsius(thermal),
+            **(warm if self.has_temperatures else {}),
             "depth": torch.minimum(seen.box.depth, far)[:, None],
             "accumulation": seen.box.accumulation[:, None],
             "in_box": intersect_box(origins, request.directions, lo, hi, request.near)[2][:, None].to(origins.dtype),
@@ -378,7 +381,11 @@ class ThermoxelsModel(Model):
         seen = outputs
         if batch.get("thermal_camera") is not None:
             seen = self._rendered(batch["thermal_camera"], THERMAL_STREAM)
+        images["accumulation"] = colormaps.apply_colormap(outputs["accumulation"])
+        images["depth"] = colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"])
         thermal, valid = batch["thermal"].to(self.device), batch["thermal_valid"].to(self.device)
+        if not self.has_temperatures:
+            return metrics | self._fitted_metrics(outputs, seen, batch, valid), images
         if "mask" in batch and batch["mask"].shape == valid.shape and seen is outputs:
             valid = valid & batch["mask"].to(self.device).bool()
         span_k = self.temperature_range.span_k
@@ -387,8 +394,6 @@ class ThermoxelsModel(Model):
         images["thermal"] = colormaps.apply_float_colormap(
             torch.cat((thermal, seen["thermal"]), dim=1).clamp(0, 1), "inferno"
         )
-        images["accumulation"] = colormaps.apply_colormap(outputs["accumulation"])
-        images["depth"] = colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"])
         return metrics, images
 
     def _fitted_metrics(
@@ -405,9 +410,11 @@ class ThermoxelsModel(Model):
             outputs = self._rendered(batch["fitted_camera"], RGB_STREAM | THERMAL_STREAM)
             own = batch.get("fitted_thermal_camera")
             seen = outputs if own is None else self._rendered(own, THERMAL_STREAM)
-            thermal, span_k = batch["thermal"].to(self.device), self.temperature_range.span_k
-            warm = thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], seen["in_box"] > 0, span_k)
-            metrics["thermal_mae_debiased_c"] = warm["thermal_mae_debiased_c"]
+            if self.has_temperatures:
+                thermal, span_k = batch["thermal"].to(self.device), self.temperature_range.span_k
+                box = seen["in_box"] > 0
+                warm = thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], box, span_k)
+                metrics["thermal_mae_debiased_c"] = warm["thermal_mae_debiased_c"]
         if self.grid.sh is not None:
             target, predicted = batch["image"][..., :3].to(self.device), outputs["rgb"]
             if "mask" in batch:
@@ -421,7 +428,7 @@ class ThermoxelsModel(Model):
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Return the outputs of a camera's image, in a viewer also ``degrees``, see `DegreesView.picture`."""
         outputs = super().get_outputs_for_camera(camera, obb_box)
-        if self.degrees_view.shown:
+        if self.degrees_view is not None and self.degrees_view.shown:
             outputs["degrees"] = self.degrees_view.picture(outputs["temperature_c"])
         return outputs
 
@@ -475,7 +482,7 @@ def _seen_and_measured(
 ) -> tuple[Tensor, Tensor] | None:
     """Return the rendered and the measured values of the rays of a stream, rgb or thermal; None without such rays."""
     (chosen,) = outputs[f"{name}_rays"].nonzero(as_tuple=True)
-    if outputs[name] is None or not len(chosen):
+    if outputs.get(name) is None or not len(chosen):
         return None
     return outputs[name].index_select(0, chosen), batch[target].index_select(0, chosen)
 

@@ -8,7 +8,7 @@ import pickle
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
@@ -210,7 +210,8 @@ class ThermoxelsPipeline(VanillaPipeline):
         """Return the trained field for the mesher, with the training cameras and the evidence of their rays."""
         datamanager: Any = self.datamanager
         rays = datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, rays_per_image)
-        return self.model.grid_snapshot(rays, datamanager.training_views())
+        found = self.model.grid_snapshot(rays, datamanager.training_views())
+        return replace(found, temperature_c=None) if datamanager.config.streams == "rgb" else found
 
 
 def load_checkpoint(path: Any, **options: Any) -> dict[str, Any]:

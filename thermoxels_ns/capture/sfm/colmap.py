@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
-from thermoxels_ns.data.tracks import camera_to_world, read_model
+from thermoxels_ns.data.colmap_model import camera_to_world, read_model
 
 Say = Callable[[str], None]
 _Result = TypeVar("_Result")

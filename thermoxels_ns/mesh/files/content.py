@@ -35,12 +35,12 @@ def checked_mesh(mesh: TetMesh, temperature_c: FloatArray | None = None) -> tupl
 
 
 def node_arrays(mesh: TetMesh) -> dict[str, npt.NDArray]:
-    """Return arrays per node by name: `temperature_c`, `temperature_k`, `observed` and, if known, `colour` in bytes."""
-    arrays: dict[str, npt.NDArray] = {
-        "temperature_c": mesh.temperature_c,
-        "temperature_k": celsius_to_kelvin(mesh.temperature_c),
-        "observed": mesh.observed.astype(np.uint8),
-    }
+    """Return arrays per node by name: `temperature_c`, `temperature_k`, `observed`, and `colour` in bytes, if known."""
+    arrays: dict[str, npt.NDArray] = {}
+    if mesh.has_temperatures:
+        arrays["temperature_c"] = mesh.temperature_c
+        arrays["temperature_k"] = celsius_to_kelvin(mesh.temperature_c)
+        arrays["observed"] = mesh.observed.astype(np.uint8)
     if mesh.colour is not None:
         arrays["colour"] = colour_bytes(mesh.colour)
     return arrays

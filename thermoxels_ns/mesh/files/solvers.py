@@ -124,7 +124,8 @@ def _index(regions: Sequence[str], patches: Sequence[str], arrays: dict[str, npt
     add_values(boundary, "patch", "Cell")
     for grid in (body, boundary):
         for name in ("temperature_c", "temperature_k", "observed"):
-            add_values(grid, name, "Node")
+            if name in arrays:
+                add_values(grid, name, "Node")
         if "colour" in arrays:
             add_values(grid, "colour", "Node", "Vector")
     ElementTree.indent(root)
@@ -169,7 +170,8 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
             file.write(f"${section}\n".encode())
             file.writelines(chunks)
             file.write(f"\n$End{section}\n".encode())
-        file.write(_view_of_nodes(TEMPERATURE_VIEW, mesh.temperature_c[order]))
+        if mesh.has_temperatures:
+            file.write(_view_of_nodes(TEMPERATURE_VIEW, mesh.temperature_c[order]))
 
 
 def _ints(*values: int) -> bytes:
@@ -286,7 +288,8 @@ def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> No
     - Initial temperatures, and a heat transfer step without boundary conditions that prints temperatures (``NT``).
 
     Names are in capitals, and other characters than letters, digits and underscores become underscores. Empty regions
-    and patches are left out, because an empty set stops a solver. Raises `MeshError` if `heat_step` is None.
+    and patches are left out, because an empty set stops a solver. Raises `MeshError` if `heat_step` is None or the mesh
+    has no temperatures.
     """
     path = Path(path)
     if heat_step is None:
@@ -294,6 +297,7 @@ def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> No
         remedy = "Pass heat_step=HeatStep(...), or choose another format."
         raise MeshError("heat_step", expected=expected, got=None, remedy=remedy)
     mesh, tags = checked_mesh(mesh)
+    check_start(mesh)
     regions = _set_names("region_names", mesh.region_names)
     patches = _set_names("boundary.patch_names", tags.patch_names)
     # What can fail on a bad mesh is done before the file is opened.
@@ -311,6 +315,13 @@ def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> No
         length, total = _REAL % heat_step.step_seconds, _REAL % (heat_step.steps * heat_step.step_seconds)
         file.write(f"*STEP, INC={heat_step.steps}\n*HEAT TRANSFER\n{length}, {total}, {length}, {length}\n")
         file.write("*NODE PRINT, NSET=NALL\nNT\n*NODE FILE\nNT\n*END STEP\n")
+
+
+def check_start(mesh: TetMesh) -> None:
+    """Raise `MeshError` if a mesh has no temperatures, with which a computation by an .inp file starts."""
+    if not mesh.has_temperatures:
+        remedy = "Pass --heat-preset a yaml file with initial: {temperature_c: 15}, or leave inp out of --formats."
+        raise MeshError("mesh for .inp", expected="temperatures at the start", got="none", remedy=remedy)
 
 
 def _set_names(name: str, names: Sequence[str]) -> list[str]:

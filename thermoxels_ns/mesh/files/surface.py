@@ -62,18 +62,19 @@ def write_ply(path: Path | str, mesh: TetMesh) -> None:
     mesh, _ = checked_mesh(mesh)
     surface = surface_of(mesh.points_m, mesh.facets)
     temperature_c = mesh.temperature_c[surface.nodes]
-    if mesh.colour is None:
+    if mesh.colour is None and mesh.has_temperatures:
         low, high = _range_c(temperature_c)
         shown = f"{_COLOUR_MAP} from {low:.6g} to {high:.6g} degrees Celsius"
         colours = colour_bytes(_temperature_colours(temperature_c))
     else:
-        shown, colours = "photographs", colour_bytes(np.asarray(mesh.colour, dtype=np.float64)[surface.nodes])
+        shown, colours = "photographs", colour_bytes(_photographed_colours(mesh)[surface.nodes])
     columns = {
         **{name: ("double", "<f8", values) for name, values in zip("xyz", surface.points_m.T)},
         **{name: ("uchar", "u1", values) for name, values in zip(("red", "green", "blue"), colours.T)},
-        "temperature_c": ("float", "<f4", temperature_c),
-        "observed": ("uchar", "u1", mesh.observed[surface.nodes]),
     }
+    if mesh.has_temperatures:
+        columns["temperature_c"] = ("float", "<f4", temperature_c)
+        columns["observed"] = ("uchar", "u1", mesh.observed[surface.nodes])
     vertices = np.empty(len(surface.nodes), dtype=[(name, kind) for name, (_, kind, _) in columns.items()])
     for name, (_, _, values) in columns.items():
         vertices[name] = values
@@ -96,7 +97,8 @@ def write_ply(path: Path | str, mesh: TetMesh) -> None:
 
 
 def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:
-    """Write the boundary as binary glTF 2.0, lengths in [m], with a colour per node that stands for its temperature.
+    """Write the boundary as binary glTF 2.0, lengths in [m], with a colour per node that stands for its temperature, or
+    is that of the photographs if the mesh has no temperatures.
 
     Up is +y in glTF, so the file holds a matrix that turns `up` to +y. Colours are stored as light intensities and
     shown without lamps (``KHR_materials_unlit``), so that shading does not change them. Positions have single
@@ -122,16 +124,18 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
     far = np.abs(surface.points_m).max() > _FAR_SIZES * (upper - lower).max()
     origin = np.round(0.5 * (lower + upper)) if far else np.zeros(3)
     turn = turn @ trimesh.transformations.translation_matrix(origin)
-    low, high = _range_c(temperature_c)
+    meaning: dict[str, Any] = {"colours": "photographs"}
+    attributes: dict[str, Any] = {"_COLOR_0": _light(_photographed_colours(mesh)[surface.nodes])}
+    if mesh.has_temperatures:
+        meaning = dict(zip(("colours", "lowest_c", "highest_c"), ("temperature", *_range_c(temperature_c))))
+        attributes["_COLOR_0"] = _light(_temperature_colours(temperature_c))
+        attributes["_TEMPERATURE_C"] = temperature_c.astype(np.float32)
     triangles = trimesh.Trimesh(
         surface.points_m - origin,
         surface.triangles,
         process=False,
-        metadata={"colours": "temperature", "lowest_c": low, "highest_c": high},
-        vertex_attributes={
-            "_COLOR_0": _light(_temperature_colours(temperature_c)),
-            "_TEMPERATURE_C": temperature_c.astype(np.float32),
-        },
+        metadata=meaning,
+        vertex_attributes=attributes,
     )
     scene = trimesh.Scene()
     scene.add_geometry(triangles, node_name="surface", geom_name="surface", transform=turn)
@@ -141,6 +145,11 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
 def _range_c(temperature_c: FloatArray) -> tuple[float, float]:
     """Return the lowest and highest temperature, the ends of the colour map, [degrees Celsius]; 0, 0 without nodes."""
     return (float(temperature_c.min()), float(temperature_c.max())) if len(temperature_c) else (0.0, 0.0)
+
+
+def _photographed_colours(mesh: TetMesh) -> FloatArray:
+    """Return the colour of each node in the photographs, grey if not known, shape (n, 3)."""
+    return np.full((len(mesh.points_m), 3), 0.5) if mesh.colour is None else np.asarray(mesh.colour, dtype=np.float64)
 
 
 def _temperature_colours(temperature_c: FloatArray) -> FloatArray:

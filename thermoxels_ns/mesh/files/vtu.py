@@ -33,9 +33,10 @@ _MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and 
 def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None) -> None:
     """Write a mesh as a VTK unstructured grid (.vtu, read by ParaView, pyvista and meshio).
 
-    Point arrays are `temperature_c` [degrees Celsius], `temperature_k` [K], `observed` (1: measured, 0: extended) and,
-    if the mesh has colours, `colour` (red, green, blue as bytes). The cell array is `region`; field arrays
-    `region:NAME` hold the number of each region. The argument `temperature_c`, if given, replaces the mesh's own.
+    Point arrays are `temperature_c` [degrees Celsius], `temperature_k` [K] and `observed` (1: measured, 0: extended)
+    where temperatures are known, and `colour` (red, green, blue as bytes) where colours are. The cell array is
+    `region`; field arrays `region:NAME` hold the number of each region. The argument `temperature_c`, if given,
+    replaces the mesh's own.
 
     Raises:
         MeshError: An array does not fit the mesh or is not finite.
@@ -53,7 +54,8 @@ def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
     # Regions are field arrays of numbers, because meshio refuses a file that holds text.
     for number, name in enumerate(mesh.region_names):
         grid.field_data[f"region:{name}"] = [number]
-    grid.set_active_scalars("temperature_c")
+    if mesh.has_temperatures:
+        grid.set_active_scalars("temperature_c")
     write_vtk(vtkXMLUnstructuredGridWriter(), path, grid)
 
 
@@ -151,7 +153,8 @@ def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
     for name in tags.patch_names:
         names.InsertNextValue(name)
     data.GetFieldData().AddArray(names)
-    data.set_active_scalars("temperature_c")
+    if mesh.has_temperatures:
+        data.set_active_scalars("temperature_c")
     write_vtk(vtkXMLPolyDataWriter(), path, data)
 
 
@@ -176,11 +179,16 @@ def read_mesh(path: Path | str) -> TetMesh:
     colour = body.point_data.get("colour")
     facets, tags = _boundary(surface, points, beside.name)
     on_box = _array(surface.cell_data, "on_box", beside.name) != 0
+    alone = not {"temperature_c", "observed"} & set(body.point_data.keys())  # photographs alone trained
+    temperature_c, observed = np.full(len(points), np.nan), np.zeros(len(points), dtype=bool)
+    if not alone:
+        temperature_c = _array(body.point_data, "temperature_c", path.name).astype(np.float64)
+        observed = _array(body.point_data, "observed", path.name) != 0
     mesh = TetMesh(
         points_m=points,
         tets=np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4),
-        temperature_c=_array(body.point_data, "temperature_c", path.name).astype(np.float64),
-        observed=_array(body.point_data, "observed", path.name) != 0,
+        temperature_c=temperature_c,
+        observed=observed,
         facets=facets,
         facet_tags=np.where(on_box, FACET_BOX, FACET_SURFACE).astype(np.int64),
         region=_array(body.cell_data, "region", path.name).astype(np.int64),

@@ -185,6 +185,8 @@ def quality_report(
     """
     mesh.check()
     points, tets, temperature = mesh.points_m, mesh.tets, mesh.temperature_c
+    if not mesh.has_temperatures:
+        temperature = np.zeros(len(points))
     observed_c = temperature[mesh.observed] if mesh.observed.any() else temperature
     low_c, high_c = observed_range_c or (float(observed_c.min()), float(observed_c.max()))
     figures, volumes = _measure_shapes(mesh, angle_edges(boundary_mode))

@@ -1,0 +1,168 @@
+"""Layouts of scene folders: how each is recognised, and what stands for the transforms.json of those without one."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.json_values import read_json_object
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_model, read_model
+
+JSON_NAMES = ("transforms.json", "transforms_thermal.json")
+BOUNDS_NAME = "temperature_bounds.json"
+LayoutName = Literal["thermalnerf", "thermoscenes", "nerfstudio", "rgb", "rgbt-scenes", "thermalmix", "colmap"]
+_FRAMES = "frames with "
+_NAMES_OF_PARAMETER = {"f": ("fl_x", "fl_y"), "fx": ("fl_x",), "fy": ("fl_y",), "k": ("k1",)}
+"""Keys of transforms.json by COLMAP's names of the parameters of its cameras; all others have the same name."""
+_THERMAL_CAMERA = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A layout of scene folders: by what it is recognised, and where its parts are."""
+
+    name: LayoutName
+    marks: tuple[str, ...]
+    """Files, folders or keys of frames in a json (``frames with KEY``), one of which must be there; none: all fit."""
+    thermal: tuple[str, ...] = ("thermal",)
+    """Folders of thermal files, best first; a file belongs to the photograph with its stem. None: photographs alone."""
+    photographs: tuple[str, ...] = ()
+    """Folders of photographs, one of which must be there, with poses from COLMAP; none: a json names and poses them."""
+
+
+LAYOUTS = (
+    Layout("thermalnerf", (f"{_FRAMES}is_thermal",), ("images_thermal",)),
+    Layout("thermoscenes", (BOUNDS_NAME, "msx")),
+    Layout("nerfstudio", ("thermal", f"{_FRAMES}thermal_file_path")),
+    Layout("thermalmix", ("warped_thermal",), ("warped_thermal",), ("rgb", "images")),
+    Layout("rgbt-scenes", ("raw_images", "thermal"), ("raw_images", "thermal"), ("rgb",)),
+    Layout("colmap", ("thermal",), photographs=("images",)),
+    Layout("rgb", (), ()),
+    Layout("rgb", (), (), ("images", "rgb")),
+)
+"""All layouts, in the order in which they are tried; the first that fits a folder is its layout."""
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """Where the parts of a scene are, and its json or what stands for it."""
+
+    layout: Layout
+    folder: Path
+    origin: Path  # the json, or the folder of the COLMAP model
+    content: dict[str, Any]  # as in transforms.json
+    thermal: Path | None  # folder of thermal files; None: no such folder
+    left_out: list[str] = field(default_factory=list)  # names of photographs that only the COLMAP model has
+
+
+def find_source(data: Path, wanted: LayoutName | None = None) -> SceneSource:
+    """Recognise the layout of a scene folder (or of that of a json), or take the one that is `wanted`.
+
+    Raises:
+        SceneError: There are no poses, or not the parts of the layout; the json or the COLMAP model cannot be used.
+    """
+    named = [data] if data.is_file() and data.suffix == ".json" else [data / name for name in JSON_NAMES]
+    json_path = next((path for path in named if path.is_file()), None)
+    folder = data if json_path is None else json_path.parent
+    content = {} if json_path is None else read_json_object(json_path, "Write the file again.", SceneError)
+    frames = content.get("frames")
+    keys = {key for frame in frames if isinstance(frame, dict) for key in frame} if isinstance(frames, list) else set()
+    model = next((folder / place for place in COLMAP_FOLDERS if is_model(folder / place)), None)
+
+    def there(mark: str) -> bool:
+        return mark.removeprefix(_FRAMES) in keys if mark.startswith(_FRAMES) else (folder / mark).exists()
+
+    for layout in LAYOUTS:
+        origin = model if layout.photographs else json_path
+        root = next((name for name in layout.photographs if (folder / name).is_dir()), "")
+        fits = wanted in (None, layout.name) and (not layout.marks or any(map(there, layout.marks)))
+        if not fits or origin is None or bool(root) != bool(layout.photographs):
+            continue
+        left_out: list[str] = []
+        if layout.photographs:
+            content, left_out = _content_of_model(folder, origin, root)
+        elif "is_thermal" in keys:
+            content = _paired(content, origin.name, alone=not layout.thermal)
+        thermal = next((folder / name for name in layout.thermal if (folder / name).is_dir()), None)
+        return SceneSource(layout, folder, origin, content, thermal, left_out)
+    expected = f"{' or '.join(JSON_NAMES)}, or a COLMAP model in {COLMAP_FOLDERS[-2]} beside images/ or rgb/"
+    got = "none of them" if data.is_dir() else "no such folder"
+    remedy = "Pass --data the folder that holds it (thermoxels capture and ns-process-data write it)."
+    if wanted is not None and (json_path or model):
+        one = next(layout for layout in LAYOUTS if layout.name == wanted)
+        needs = (
+            [JSON_NAMES[:1], one.marks] if not one.photographs else [("a COLMAP model",), one.photographs, one.marks]
+        )
+        expected = f"as parts of the layout {wanted}: {', and '.join(' or '.join(each) for each in needs if each)}"
+        got, remedy = "a folder without them", "Leave --layout out: it is then recognised."
+    raise SceneError(f"scene folder {data}", expected=expected, got=got, remedy=remedy)
+
+
+def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, Any], list[str]]:
+    """Return what a transforms.json would say of a COLMAP model's photographs in ``folder / root``, found by name, else
+    by stem, and the names of those that are not there. Subfolders train, val and test become split lists."""
+    try:
+        model = read_model(place)
+    except SceneError as problem:
+        remedy = "Copy the model again, or run COLMAP again."
+        raise SceneError(str(place), expected="a readable COLMAP model", got=problem, remedy=remedy) from problem
+    files = defaultdict[str, list[str]](list)
+    for path in sorted((folder / root).rglob("*")):
+        within = path.relative_to(folder / root)
+        if path.is_file():
+            for key in {within.as_posix(), within.name, f"{within.stem}.*"}:
+                files[key].append(path.relative_to(folder).as_posix())
+    frames, left_out = [], []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        name = PurePosixPath(image.name)
+        found = next((files[key] for key in (str(name), name.name, f"{name.stem}.*") if key in files), [])
+        if len(found) > 1:
+            got, remedy = ", ".join(found), "Rename them in the folder and in COLMAP, and run COLMAP again."
+            raise SceneError(f"{place}: {name}", expected="one photograph of this name", got=got, remedy=remedy)
+        if not found or not image.has_pose:
+            left_out.append(str(name))
+            continue
+        camera = model.cameras[image.camera_id]
+        lens = {"camera_model": camera.model.name, "w": camera.width, "h": camera.height}
+        for parameter, value in zip(camera.params_info.split(", "), map(float, camera.params)):
+            lens |= dict.fromkeys(_NAMES_OF_PARAMETER.get(parameter, (parameter,)), value)
+        frames.append({"file_path": found[0], "transform_matrix": camera_to_world(image).tolist(), **lens})
+    if not frames:
+        got = f"{len(model.images)} others, such as {', '.join(left_out[:2]) or 'none'}"
+        remedy = "Put the photographs there that COLMAP saw, with the names that it saw."
+        raise SceneError(str(place), expected=f"photographs in {folder / root}", got=got, remedy=remedy)
+    lists = {
+        f"{side}_filenames": [one["file_path"] for one in frames if side in PurePosixPath(one["file_path"]).parts[:-1]]
+        for side in ("val", "test")
+    }
+    return {"frames": frames} | {key: names for key, names in lists.items() if names}, left_out
+
+
+def _paired(content: dict[str, Any], name: str, alone: bool) -> dict[str, Any]:
+    """Return the content of a ThermalNeRF json with one frame per pair: photograph i of n and thermal image n + i, or
+    the thermal image with its stem; photographs `alone` without. Raise `SceneError` for unequal numbers of both."""
+    frames = content["frames"]
+    if not all(isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames):
+        return content  # the reader of frames says which is wrong
+    thermal = [frame for frame in frames if frame.get("is_thermal")]
+    photographs = [frame for frame in frames if not frame.get("is_thermal")]
+    if len(thermal) != len(photographs) and not alone:
+        got = f"{len(photographs)} photographs and {len(thermal)} thermal images"
+        remedy = "Remove the frames without a partner, or pass --layout rgb to train on photographs alone."
+        raise SceneError(f"{name}: is_thermal", expected="as many of both kinds", got=got, remedy=remedy)
+    by_stem = {PurePosixPath(frame["file_path"]).stem: frame for frame in thermal}
+    pairs = photographs if alone else []
+    for photograph, warm in zip([] if alone else photographs, thermal):
+        warm = by_stem.get(PurePosixPath(photograph["file_path"]).stem, warm)
+        pair = {**photograph, "thermal_file_path": warm["file_path"]}
+        if "fl_x" in warm:
+            pair["thermal_camera"] = {key: both[key] for key in _THERMAL_CAMERA if key in (both := {**content, **warm})}
+        if warm.get("transform_matrix") != photograph.get("transform_matrix"):
+            pair["thermal_transform_matrix"] = warm.get("transform_matrix")
+        pairs.append(pair)
+    lists = {key: names for key, names in content.items() if key.endswith("_filenames") and isinstance(names, list)}
+    left = [frame["file_path"] for frame in thermal]
+    return content | {"frames": pairs} | {key: [n for n in names if n not in left] for key, names in lists.items()}
