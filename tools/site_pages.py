@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
@@ -22,12 +23,27 @@ def _moved(text: str) -> str:
     return text
 
 
+def _rooms() -> dict[str, str]:
+    """The rooms of the package by name, with the first line of what each says of itself."""
+    files = sorted(PACKAGE.glob("*/__init__.py"))
+    return {file.parent.name: (ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or "") for file in files}
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Add the reference to the last part of the navigation."""
+    (pages,) = config.nav[-1].values()
+    pages.append({"Reference": ["reference/index.md", *({name: f"reference/{name}.md"} for name in _rooms())]})
+    return config
+
+
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     """Add the pages to those of docs."""
     pages = {page: _moved((ROOT / file).read_text(encoding="utf-8")) for file, page in BESIDE.items()}
-    rooms = sorted(folder for folder in PACKAGE.iterdir() if (folder / "__init__.py").is_file())
-    for room in rooms:
-        pages[f"reference/{room.name}.md"] = f"# {room.name}\n\n::: {PACKAGE.name}.{room.name}\n"
+    lines = [f"- [{room}]({room}.md): {said.splitlines()[0]}" for room, said in _rooms().items()]
+    public = f"::: {PACKAGE.name}\n    options: {{show_submodules: false, show_root_heading: false, heading_level: 2}}"
+    pages["reference/index.md"] = "\n".join(["# Reference", "", public, "", "The rooms of the code:", "", *lines, ""])
+    for room in _rooms():
+        pages[f"reference/{room}.md"] = f"::: {PACKAGE.name}.{room}\n"
     for name, content in pages.items():
         files.append(File.generated(config, name, content=content))
     return files
