@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from datetime import timedelta
 from statistics import median
 
 import tyro
@@ -47,19 +48,6 @@ class ProgressLines(writer.LocalWriter):
             return
         self.said_s, self.said_part = now, part
         # The median: a step at which voxels are split takes seconds.
-        left = f"; at this pace {spoken((steps - done) * median(timings['buffer']))} more" if done < steps else ""
-        CONSOLE.print(f"step {done:,} of {steps:,} ({100 * done / steps:.0f} %){left}", highlight=False)
-
-
-def spoken(seconds: float) -> str:
-    """Return a time in words, to two digits or so.
-
-    >>> spoken(4.4), spoken(130), spoken(7500)
-    ('4 s', '2 min 10 s', '2 h 5 min')
-    """
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
+        left = timedelta(seconds=round((steps - done) * median(timings["buffer"])))
+        more = f"; at this pace {left} more" if done < steps else ""
+        CONSOLE.print(f"step {done:,} of {steps:,} ({100 * done / steps:.0f} %){more}", highlight=False)
