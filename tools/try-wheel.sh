@@ -20,7 +20,6 @@ python -m hatchling build --target sdist >/dev/null
 mkdir "$work/sdist"
 tar -xzf dist/thermoxels_ns-*.tar.gz --strip-components 1 -C "$work/sdist"
 (cd "$work/sdist" && python -m hatchling build --target wheel -d "$checkout/dist" >/dev/null)
-say "built $(cd dist && echo *)"
 
 python -m venv "$work/venv"
 own=$("$work/venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
@@ -43,14 +42,15 @@ checkout, own = map(Path, sys.argv[1:])
 package = Path(thermoxels_ns.__file__).parent
 assert package == own / "thermoxels_ns", f"imported from {package}"
 for folder, copy in ((checkout / "thermoxels_ns", package), (checkout / "configs", package / "configs")):
-    files = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc"]
+    files = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
+    files = [file for file in files if "__pycache__" not in file.parts]
     missing = [str(file) for file in files if not (copy / file).is_file()]
     assert files and not missing, f"the wheel lacks {missing}"
     print(f"wheel: {len(files)} files of {folder.name} are in it")
 PYTHON
 
 # Console scripts: ours, and nerfstudio's with our method, trained for a few steps and evaluated from its config.yml.
-# The other environment's console scripts of nerfstudio would run its python: they are called as modules instead.
+# nerfstudio's are called as modules: its console scripts lie in the other environment and run that one's python.
 thermoxels --help >/dev/null
 thermoxels synthetic hot-object --output-dir scene --num-train 8 --num-eval 1 --width 64 --height 48 >/dev/null
 python -m nerfstudio.scripts.train thermoxels --data scene --quality draft --max-num-iterations 20 --vis tensorboard \

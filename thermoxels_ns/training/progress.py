@@ -37,7 +37,7 @@ class ProgressLines(writer.LocalWriter):
         super().__init__(config)
         for line in banner_messages or ():  # where the viewer is
             CONSOLE.print(line)
-        self.said_s, self.said_part = time.monotonic(), -1
+        self.said_s, self.said_part = time.monotonic(), 0  # the first steps say nothing about the pace
 
     def write_stats_log(self, step: int) -> None:
         """Print a line if one is due after step `step`, counted from 0."""
