@@ -95,7 +95,9 @@ def _cli(script: ModuleType, name: str, f: Any, *, args: Sequence[str] | None = 
     words = sys.argv[1:] if args is None else list(args)
     stock = name == _EXPORTER and f is vars(script).get("Commands")
     if name == _TRAIN and words and words[0] in METHODS:
-        if {"-h", "--help"} & set(words) and not {_DATAPARSER, "--help-all"} & set(words):
+        from nerfstudio.configs.dataparser_configs import all_dataparsers
+
+        if {"-h", "--help"} & set(words) and not {*all_dataparsers, "--help-all"} & set(words):
             from thermoxels_ns.commands.train_help import print_first_page
 
             print_first_page(words[0])
