@@ -37,6 +37,11 @@ def test_links_lead_somewhere(page: Path):
         assert not anchor or anchor in anchors(target), link
 
 
+def test_every_page_is_in_the_navigation_of_the_site():
+    named = set(re.findall(r"^ +- (?:.*: )?(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
+    assert {page.name for page in PAGES[3:]} == named - {"index.md", "contributing.md", "changes.md"}
+
+
 def test_the_tables_of_figures_show_the_kept_ones():
     assert FIGURES["main"](["--check"]) == 0
     changed = SHOWN | {"psnr": SHOWN["psnr"] + 0.1}

@@ -53,9 +53,9 @@ PYTHON
 # nerfstudio's are called as modules: its console scripts lie in the other environment and run that one's python.
 thermoxels --help >/dev/null
 thermoxels synthetic hot-object --output-dir scene --num-train 8 --num-eval 1 --width 64 --height 48 >/dev/null
-python -m nerfstudio.scripts.train thermoxels --data scene --quality draft --max-num-iterations 20 --vis tensorboard \
+python -m nerfstudio.scripts.train thermoxels --data scene --max-num-iterations 20 --vis tensorboard \
     --timestamp run >train.log 2>&1 || { cat train.log; exit 1; }
-say "a draft training of 20 steps wrote $(cd outputs/scene/thermoxels/run && ls nerfstudio_models)," \
+say "a training of 20 steps wrote $(cd outputs/scene/thermoxels/run && ls nerfstudio_models)," \
     "$(wc -l <train.log) lines of output"
 python -m nerfstudio.scripts.exporter thermoxels-mesh --help | grep -q metres-per-unit
 say "ns-export knows thermoxels-mesh"
