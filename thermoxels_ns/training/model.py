@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.base_model import Model
 from nerfstudio.utils import colormaps
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -32,6 +33,7 @@ from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.reference import intersect_box
 from thermoxels_ns.render.renderers import GridSamples, Scene, SceneRender, render_scene, sample_rays
 from thermoxels_ns.training import losses
+from thermoxels_ns.training.degrees_view import DegreesView
 from thermoxels_ns.training.image_metrics import (
     SATURATED,
     fitted_gain,
@@ -78,6 +80,7 @@ class ThermoxelsModel(Model):
             raise SceneError("scene", expected="thermal images with a temperature range", got="none", remedy=remedy)
         bounds_c = torch.tensor([temperatures.min_c, temperatures.max_c], dtype=torch.float64)
         self.register_buffer("temperature_bounds_c", bounds_c)
+        self.degrees_view = DegreesView(temperatures, self._read_ray)
         if 0.0 < voxel < math.inf:
             pixels = config.voxel_pixels * longest / config.resolutions[-1] / voxel
             CONSOLE.log(
@@ -414,6 +417,19 @@ class ThermoxelsModel(Model):
             gain = fitted_gain(predicted, target)
             metrics["psnr_fitted"] = psnr((gain * predicted).clamp(max=1.0), target)
         return metrics
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Return the outputs of a camera's image, in a viewer also ``degrees``, see `DegreesView.picture`."""
+        outputs = super().get_outputs_for_camera(camera, obb_box)
+        if self.degrees_view.shown:
+            outputs["degrees"] = self.degrees_view.picture(outputs["temperature_c"])
+        return outputs
+
+    def _read_ray(self, origin: Tensor, direction: Tensor) -> tuple[float, float]:
+        """Return the temperature, [degrees Celsius], that a ray ends on and its opacity; both arguments are (1, 3)."""
+        direction = torch.nn.functional.normalize(direction.to(self.device, torch.float32), dim=-1)
+        seen = self._image_outputs(self._request(origin.to(self.device, torch.float32), direction))
+        return float(seen["temperature_c"]), float(seen["accumulation"])
 
     def _rendered(self, camera: Cameras, stream: int) -> dict[str, Tensor]:
         """Return the outputs of `get_outputs` for the image of a camera, shape (1,), in a stream."""
