@@ -13,7 +13,7 @@ export PYTHON
 activate = PATH="$(abspath $(1))/bin:$$PATH" VIRTUAL_ENV="$(abspath $(1))"
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-newest nightly lint format clean
+.PHONY: help setup demo figures test test-newest nightly lint site wheel format clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -23,6 +23,9 @@ setup: ## Make the environment (VENV=.venv), or bring it up to date
 
 demo: setup ## A synthetic scene from photographs to heat flow, with pictures
 	$(call activate,$(VENV)) thermoxels demo $(ARGS)
+
+figures: setup ## Write the results in demo/ into the tables of README and docs (ARGS="--check demo" compares them)
+	$(call activate,$(VENV)) python tools/figures.py $(or $(ARGS),demo)
 
 test: setup ## Run the tests
 	$(call activate,$(VENV)) OMP_NUM_THREADS=1 pytest --numprocesses logical --dist loadfile $(ARGS)
@@ -39,11 +42,17 @@ lint: setup ## Check format, style and types
 	$(call activate,$(VENV)) ruff check .
 	$(call activate,$(VENV)) PYRIGHT_PYTHON_IGNORE_WARNINGS=1 pyright --pythonpath "$(abspath $(VENV))/bin/python"
 
+site: setup ## Build the pages of docs/ and a reference of the code into site/; a warning is an error
+	$(call activate,$(VENV)) NO_MKDOCS_2_WARNING=1 mkdocs build --quiet $(ARGS)
+
+wheel: setup ## Build wheel and sdist into dist/, install the wheel beside the packages of VENV, and try its commands
+	$(call activate,$(VENV)) tools/try-wheel.sh
+
 format: setup ## Put the code into the format that lint checks
 	$(call activate,$(VENV)) ruff check --fix .
 	$(call activate,$(VENV)) ruff format .
 
 clean: ## Remove the environments and what the tests leave
 	for made in "$(VENV)" "$(NEWEST_VENV)"; do if [ -e "$$made/.thermoxels-setup" ]; then rm -rf "$$made"; fi; done
-	rm -rf .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf .pytest_cache .ruff_cache .hypothesis build dist site
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

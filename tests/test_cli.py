@@ -1,4 +1,5 @@
 import json
+import os
 import subprocess
 import sys
 import warnings
@@ -8,6 +9,7 @@ import pytest
 
 from thermoxels_ns import cli
 from thermoxels_ns.commands.demo import SceneName
+from thermoxels_ns.core.quiet_warnings import PROGRAMMERS_WARNINGS, environment_value
 from thermoxels_ns.synthetic.catalogue import SCENE_NAMES
 from thermoxels_ns.synthetic.scene_folder import load_truth
 
@@ -64,11 +66,12 @@ def test_an_interrupted_command_has_its_own_status(monkeypatch, capsys):
     assert "Interrupted" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("asked", "seen"), [([], ["another"]), (["default"], ["`torch.jit.script` is deprecated."])])
-def test_one_warning_for_programmers_is_not_shown_unless_warnings_are_asked_for(monkeypatch, asked, seen):
+@pytest.mark.parametrize(("asked", "seen"), [([], ["another"]), (["default"], ["`torch.jit.script` is deprecated: x"])])
+def test_warnings_for_programmers_are_not_shown_unless_warnings_are_asked_for(monkeypatch, asked, seen):
     def warn() -> int:
-        for words in ("`torch.jit.script` is deprecated.", "another"):
-            warnings.warn(words, FutureWarning, stacklevel=1)
+        for begin, kind in PROGRAMMERS_WARNINGS:
+            warnings.warn(f"{begin}: x", kind, stacklevel=1)
+        warnings.warn("another", FutureWarning, stacklevel=1)
         return 0
 
     monkeypatch.setattr(cli, "main", warn)
@@ -77,6 +80,17 @@ def test_one_warning_for_programmers_is_not_shown_unless_warnings_are_asked_for(
         warnings.simplefilter("always")
         cli.entrypoint()
     assert [str(one.message) for one in caught][: len(seen)] == seen
+
+
+def test_commands_that_we_start_hide_the_same_warnings():
+    script = (
+        "import warnings\nfrom thermoxels_ns.core.quiet_warnings import PROGRAMMERS_WARNINGS\n"
+        "for begin, kind in (*PROGRAMMERS_WARNINGS, ('another', FutureWarning)):\n"
+        "    warnings.warn(begin + ' x', kind)\n"
+    )
+    environment = {**os.environ, "PYTHONWARNINGS": environment_value()}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0 and done.stderr.count("Warning") == 1 and "another" in done.stderr
 
 
 def test_the_entry_point_hands_the_status_to_the_shell(tmp_path):

@@ -14,6 +14,7 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_meth
 import thermoxels_ns
 from thermoxels_ns import cli
 from thermoxels_ns.commands.export import ExportThermoxelsMesh
+from thermoxels_ns.commands.train_help import TASKS, print_first_page
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.config_loader import typed
 from thermoxels_ns.core.errors import SceneError
@@ -55,6 +56,18 @@ def test_every_option_in_a_remedy_is_one_of_a_command(monkeypatch):
     advised = advice()
     assert len(advised) > 50
     assert sorted(pair for pair in advised if pair[0] not in there | ELSEWHERE) == []
+
+
+def test_the_first_page_of_help_is_one_screen_of_options_that_there_are(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "300")
+    config = deepcopy(thermoxels.config)
+    there = options_of(type(config), [], default=config) | options_of(type(config), ["thermal-data"], default=config)
+    named = {option for options in TASKS.values() for example in options for option in OPTION.findall(example)}
+    assert len(named) > 15 and sorted(named - there) == []
+    monkeypatch.setenv("COLUMNS", "100")
+    print_first_page("thermoxels")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 40 and len(next(iter(TASKS.values()))) == 5
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, Union
@@ -18,12 +17,10 @@ from thermoxels_ns.commands.capture import Capture
 from thermoxels_ns.commands.cost import Cost
 from thermoxels_ns.commands.demo import Demo
 from thermoxels_ns.commands.heat import Heat
+from thermoxels_ns.core import quiet_warnings
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.synthetic.catalogue import SceneWord
 from thermoxels_ns.synthetic.imperfections import Imperfections
-
-_NEWS_FOR_PROGRAMMERS = r"`torch\.jit\.script` is deprecated"
-"""Regular expression for the warning of newer versions of torch when nerfstudio 1.1.5 is imported."""
 
 
 @dataclass
@@ -123,8 +120,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def entrypoint() -> None:
     """Run `main` as the console script and end the process with its exit status."""
-    if not sys.warnoptions:  # a user who set warning filters keeps them
-        warnings.filterwarnings("ignore", _NEWS_FOR_PROGRAMMERS, FutureWarning)
+    quiet_warnings.silence()
     try:
         try:
             status = main()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import re
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -37,8 +36,6 @@ def install() -> None:
     yaml.Loader = ConfigLoader  # nerfstudio loads with Loader=yaml.Loader, which would run code from a file
     extend_commands()
     print_our_errors_plainly()
-    # nerfstudio 1.1.5 indexes rays with lists, of which recent torch warns several times per camera.
-    warnings.filterwarnings("ignore", message="Using a non-tuple sequence for multidimensional indexing")
 
 
 def print_our_errors_plainly() -> None:
@@ -92,11 +89,20 @@ def extend_commands() -> None:
 def _cli(script: ModuleType, name: str, f: Any, *, args: Sequence[str] | None = None, **kwargs: Any) -> Any:
     """Return the command that `tyro.cli` parses; raise `OutputError` if its results could not be written.
 
-    ns-export gets our subcommand too; with ns-train, options of our dataparser may stand anywhere after the method.
+    ns-export gets our subcommand too; with ns-train, options of our dataparser may stand anywhere after the method, and
+    --help shows one page, --help-all every option.
     """
     words = sys.argv[1:] if args is None else list(args)
     stock = name == _EXPORTER and f is vars(script).get("Commands")
-    words = _with_dataparser_last(words) if name == _TRAIN else words
+    if name == _TRAIN and words and words[0] in METHODS:
+        from nerfstudio.configs.dataparser_configs import all_dataparsers
+
+        if {"-h", "--help"} & set(words) and not {*all_dataparsers, "--help-all"} & set(words):
+            from thermoxels_ns.commands.train_help import print_first_page
+
+            print_first_page(words[0])
+            raise SystemExit(0)
+        words = _with_dataparser_last(["--help" if word == "--help-all" else word for word in words])
     command = tyro.cli(_with_mesh_export(f) if stock else f, args=words, **kwargs)
     for name in ("output_path", "output_dir", "render_output_path"):
         path = getattr(command, name, None)

@@ -95,7 +95,7 @@ class Recorder:
         top = self.help_of("thermoxels")
         listed = re.search(r"\{([\w,-]+)\}", top["text"][0])
         commands = [("thermoxels", name) for name in (listed[1].split(",") if listed else ())]
-        commands += [("ns-train", method) for method in _METHODS]
+        commands += [("ns-train", method, "--help-all") for method in _METHODS]
         commands += [("ns-train", "thermoxels", "thermal-data"), ("ns-export", "thermoxels-mesh")]
         return {"thermoxels": top, **{" ".join(words): self.help_of(*words) for words in commands}}
 

@@ -107,6 +107,6 @@ else
     "$python" -m venv "$venv"
     pip install --quiet --upgrade "$@" pip
 fi
-pip install "$@" --editable '.[dev]'
+pip install "$@" --editable '.[dev,docs]'
 write_stamp
 say "done: $venv/bin/thermoxels, $venv/bin/ns-train and the others"

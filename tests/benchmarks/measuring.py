@@ -90,7 +90,7 @@ def train_and_evaluate(
         [
             *(*launcher, "ns-train", method, "--output-dir", str(folder / "outputs"), "--experiment-name", "scene"),
             *("--timestamp", "run", "--vis", "tensorboard", "--logging.steps-per-log", "100"),
-            *("--logging.local-writer.max-log-size", "0", *options),
+            *options,
             *("thermal-data", "--data", str(scene)),
         ],
         folder / "train.log",

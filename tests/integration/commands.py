@@ -17,7 +17,7 @@ SHORT_TRAINING = [
     *("--pipeline.model.resolutions", "12", "24", "--pipeline.model.refine-at", "15"),
     *("--pipeline.model.prune-at", "30", "--pipeline.model.thin-at", "35"),
     *("--pipeline.model.view-dependence-from", "25", "--pipeline.datamanager.train-num-rays-per-batch", "512"),
-    *("--logging.local-writer.enable", "False", "--save-only-latest-checkpoint", "False"),
+    *("--save-only-latest-checkpoint", "False"),
 ]
 SCREEN = {"COLUMNS": "200", "TERM": "dumb"}
 _LOADED = [f"nerfstudio.scripts.{name}" for name in ("train", "eval", "exporter")]
@@ -108,6 +108,8 @@ class Trained:
 
     scene: Path
     run_folder: Path
+    log: str
+    """What ns-train wrote to its standard output and error, as into a file."""
 
     @property
     def config(self) -> Path:

@@ -24,4 +24,4 @@ def trained(tiny_scene, tmp_path_factory) -> Trained:
         *("thermal-data", "--data", str(tiny_scene)),
     )
     assert result.returncode == 0, result.stdout
-    return Trained(tiny_scene, outputs / "tiny" / "thermoxels" / "run")
+    return Trained(tiny_scene, outputs / "tiny" / "thermoxels" / "run", result.stdout)

@@ -34,6 +34,15 @@ def test_training_reports_evaluation_batches(trained: Trained, tmp_path):
     assert "the run ends before step 3: no refinement or pruning at 15, 30, 35" in said
 
 
+def test_a_training_says_little_and_nothing_that_a_user_cannot_act_on(trained: Trained):
+    lines = trained.log.splitlines()
+    warned = [line for line in lines if "Warning" in line]
+    assert all("torch.jit.script" in line for line in warned)  # before nerfstudio loads any plugin
+    assert len(lines) < 70 and not any("TrainerConfig(" in line for line in lines)
+    assert sum("of 40 (" in line for line in lines) == 20 and any(line.startswith("step 40 of 40") for line in lines)
+    assert f"ns-export thermoxels-mesh --load-config {trained.config}" in lines[-1]
+
+
 def test_training_refines_prunes_and_saves(trained: Trained):
     saved = sorted(p.name for p in trained.checkpoints.iterdir())
     assert saved == ["step-000000020.ckpt", "step-000000039.ckpt"]

@@ -18,26 +18,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from thermoxels_ns.core import quiet_warnings
 from thermoxels_ns.core.errors import ThermoxelsError, explain
 
 if TYPE_CHECKING:
     # Linux reports for a process at least the peak memory of the process that started it: import little here.
     from rich.console import Console
 
-PLAIN_TRAINING = (
-    *("--timestamp", "run", "--vis", "tensorboard"),
-    # Training then writes one line every hundred steps instead of redrawing a block.
-    *("--logging.steps-per-log", "100", "--logging.local-writer.max-log-size", "0", "--logging.profiler", "none"),
-)
-"""Options of ns-train that make its output fit for a log file."""
+PLAIN_TRAINING = ("--timestamp", "run", "--vis", "tensorboard", "--logging.steps-per-log", "100")
+"""Options of ns-train for a run that nobody watches in the viewer, in a folder whose name is known."""
 
 _QUIET_S = 20.0  # Time without output after which a line says that the command still runs, [s]
 _LAST_LINES = 12  # Lines of output that an error shows
-# Warnings of nerfstudio 1.1 and torch that are meant for programmers are not shown.
-_SILENCED = (
-    "ignore::FutureWarning,ignore::DeprecationWarning,ignore:Using a non-tuple sequence:UserWarning,"
-    "ignore:Converting a tensor with requires_grad:UserWarning"
-)
 
 
 class ProcessCost(NamedTuple):
@@ -85,7 +77,7 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
         remedy = "Install this package and nerfstudio into the environment of this Python."
         raise ThermoxelsError(words[0], expected=f"a command in {folder}", got="none", remedy=remedy)
     environment = dict(os.environ, PYTHONUNBUFFERED="1", PYTHONIOENCODING="utf-8")
-    environment.setdefault("PYTHONWARNINGS", _SILENCED)
+    environment.setdefault("PYTHONWARNINGS", quiet_warnings.environment_value())
     if console.is_terminal:
         environment |= {"FORCE_COLOR": "1", "COLUMNS": str(console.width)}
     console.print(f"$ {command_line(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)

@@ -41,6 +41,8 @@ class ThermoxelsTrainerConfig(TrainerConfig):
     some minutes) or fine (1.6 pixels, up to 512, 4000 steps: many minutes); `thermoxels cost` measures all three.
     A quality replaces max-num-iterations, the lengths of the learning rate schedules, and the model's resolutions,
     refine-at, voxel-pixels, steps, prune-at, thin-at, distortion-ramp and view-dependence-from."""
+    show_settings: bool = False
+    """Print all settings before training begins; config.yml in the folder of the run has them, too."""
     replaced: tyro.conf.Suppress[str] = ""
     """Voxels and steps that the quality replaced, as text for the log."""
 
@@ -90,6 +92,11 @@ class ThermoxelsTrainerConfig(TrainerConfig):
                 expected, remedy = "one name of a folder", f"Pass --{name.replace('_', '-')} with a plain name."
                 raise OutputError(name, expected=expected, got=repr(text), remedy=remedy)
         return super().get_base_dir()
+
+    def print_to_terminal(self) -> None:
+        """Print all settings, some 300 lines, if they were asked for."""
+        if self.show_settings:
+            super().print_to_terminal()
 
     def save_config(self) -> None:
         """Check all options, lock the run's folder while this process lives, and write config.yml.
@@ -199,9 +206,16 @@ class ThermoxelsTrainer(Trainer):
             path.write_text(yaml.dump(kept), encoding="utf-8")
 
     def train(self) -> None:
-        """Run the training; raise `OutputError` if results cannot be written."""
+        """Run the training and say what may follow; raise `OutputError` if results cannot be written."""
         with plain_os_errors(self.base_dir):
             super().train()
+        if self.local_rank == 0:
+            config = shlex.quote(str(self.base_dir / "config.yml"))
+            next_command = f"ns-export thermoxels-mesh --load-config {config} --output-dir export"
+            CONSOLE.print(f"To make a mesh: {next_command}", markup=False, highlight=False, soft_wrap=True)
+
+    def _check_viewer_warnings(self) -> None:
+        """Say nothing: nerfstudio's note is about evaluations while training, which are off by default."""
 
     def _load_checkpoint(self) -> None:
         """Load the named checkpoint, if any, and log to which step training goes on; may raise `CheckpointError`."""

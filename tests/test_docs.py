@@ -1,0 +1,75 @@
+import json
+import re
+from pathlib import Path
+from runpy import run_path
+
+import pytest
+
+from thermoxels_ns.audit.draws import Interval
+from thermoxels_ns.commands import demo_results
+from thermoxels_ns.commands.demo_results import Compared
+
+ROOT = Path(__file__).parents[1]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+FIGURES = run_path(str(ROOT / "tools" / "figures.py"))
+SHOWN = json.loads((ROOT / "docs" / "figures.json").read_text())
+
+
+def test_the_first_page_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+
+
+def anchors(page: Path) -> set[str]:
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path):
+    links = re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
+    for link in links:
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert link.startswith("https:") or target.is_file(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def test_every_page_is_in_the_navigation_of_the_site():
+    named = set(re.findall(r"^ +- (?:.*: )?(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
+    assert {page.name for page in PAGES[3:]} == named - {"index.md", "contributing.md", "changes.md"}
+
+
+def test_the_tables_of_figures_show_the_kept_ones():
+    assert FIGURES["main"](["--check"]) == 0
+    changed = SHOWN | {"psnr": SHOWN["psnr"] + 0.1}
+    page = FIGURES["PAGES"][0].read_text(encoding="utf-8")
+    assert FIGURES["with_table"](page, SHOWN) == page != FIGURES["with_table"](page, changed)
+
+
+@pytest.mark.parametrize("name", SHOWN)
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_demo_may_differ_from_the_kept_figures_by_noise_alone(name, sign):
+    noise = 1e-9 if name == "energy_residual" else FIGURES["NOISE"].get(name, 0)
+    for share, found in ((0.9, 0), (1.1, 1)):
+        changed = SHOWN | {name: SHOWN[name] + sign * (share * noise or (share > 1) * 0.01)}
+        assert len(FIGURES["differences"](SHOWN, changed)) == found
+
+
+@pytest.mark.parametrize(("psnr", "status"), [(SHOWN["psnr"], 0), (SHOWN["psnr"] - 1, 1)])
+def test_a_demo_is_read_and_compared(tmp_path, capsys, monkeypatch, psnr, status):
+    s = SHOWN
+    areas = {"mesh_area_m2": s["true_area_m2"] * (1 + s["area_percent"] / 100), "voxel_size_m": s["voxel_cm"] / 100}
+    areas |= {
+        "mesh_volume_m3": s["true_volume_m3"] * (1 + s["volume_percent"] / 100),
+        "chamfer_m": s["chamfer_cm"] / 100,
+    }
+    (tmp_path / "export").mkdir()
+    (tmp_path / "export/summary.json").write_text(json.dumps({"truth": s | areas, "heat": s}))
+    (tmp_path / "eval.json").write_text(json.dumps({"results": s | {"psnr": psnr}}))
+    held = [Compared("wall", "W", 1.0, Interval(1.0, 0.9, 1.1))] * int(s["compared"])
+    monkeypatch.setattr(demo_results, "compare", lambda answers, rules: held)
+    assert FIGURES["main"](["--check", str(tmp_path)]) == status
+    assert ("psnr: shown" in capsys.readouterr().out) == bool(status)
