@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
-from thermoxels_ns.audit.conditions import FILM_MODELS, WINDY, Conditions, Film, FilmModel
-from thermoxels_ns.audit.draws import Draws, emissivity_name
+from thermoxels_ns.audit.conditions import BALANCE, FILM_MODELS, WINDLESS, Conditions, Film, FilmModel
+from thermoxels_ns.audit.draws import FORMULA, Draws, emissivity_name
 from thermoxels_ns.audit.heat_flow import (
+    CONVECTION,
     albatici_tonelli_w_m2,
     dallo_w_m2,
     fourth_power,
     madding_w_m2,
+    mixed_w_m2k,
     radiation_w_m2,
     reading_k,
     sky_emissivity,
@@ -28,7 +31,7 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.heat.scene_fields import inside_coefficient, outside_coefficient
 
-CHUNK = 2000  # Number of groups whose draws are in memory at the same time
+CHUNK = 400_000  # Values, groups times draws, of one array that are in memory at the same time
 HALF_STEP_K = 0.05  # Half the step of difference quotients with respect to readings, [K]
 _AROUND_M, _FARTHEST_M = 0.15, 0.5
 """Readings within the first distance of a reference are averaged; no reading within the second is an error, [m]."""
@@ -77,12 +80,17 @@ def part_totals(
     columns, count = area_m2.tocsc(), len(groups.reading_c)
     total = np.asarray(area_m2.sum(axis=1)).reshape(-1, 1)
     flow_w, temperature = np.zeros((len(total), draws.count)), np.zeros((len(total), draws.count))
-    for start in range(0, count, CHUNK):
-        part = slice(start, start + CHUNK)
+    for part in chunks(count, draws):
         some = exchange(conditions, groups.some(part), draws, warmer_k)
         flow_w += columns[:, part] @ some.flow_w_m2
         temperature += columns[:, part] @ some.surface_c
     return PartTotals(total[:, 0], temperature / np.where(total > 0.0, total, 1.0), flow_w)
+
+
+def chunks(count: int, draws: Draws) -> Iterator[slice]:
+    """Yield slices that divide `count` groups so that draws of a slice have about `CHUNK` values."""
+    step = max(1, CHUNK // draws.count)
+    yield from (slice(start, start + step) for start in range(0, count, step))
 
 
 def triangle_exchange(
@@ -141,14 +149,19 @@ def film_flow_w_m2(
     combined = model == "iso-6946-combined"
     if model == "given":
         coefficient = draws["film coefficient"]
-    elif inside:
-        name = "iso-6946-combined" if combined else "iso-6946-convection"
+    elif inside and combined:
         here = Places(np.zeros_like(normals), normals, up)
-        coefficient = np.asarray(inside_coefficient(name).function(here, 0.0))[:, None]
+        coefficient = np.asarray(inside_coefficient("iso-6946-combined").function(here, 0.0))[:, None]
     elif combined:
         coefficient = outside_coefficient("iso-6946-combined")
     else:
-        coefficient = 4.0 + 4.0 * draws["wind"]
+        formulas, wind = CONVECTION[conditions.side], draws.values.get("wind", np.zeros(draws.count))
+        where = wind, surface_k - air_k, (normals @ np.array(up))[:, None]
+        if model == BALANCE:
+            drawn = draws.values.get(FORMULA, np.full(draws.count, -1)).astype(np.int64)
+            coefficient = mixed_w_m2k(formulas, drawn, conditions.film_shares, *where)
+        else:
+            coefficient = formulas[model].coefficient_w_m2k(*where)
     flow = outward * factor * coefficient * (surface_k - air_k)
     if not combined:
         flow = flow + outward * radiation_w_m2(emissivity, surface_k, around_k)
@@ -162,7 +175,7 @@ def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], 
     others: list[tuple[FilmModel, Conditions]] = [
         (model, replace(conditions, film=Film(model, own.factor)))
         for model in FILM_MODELS[conditions.side]
-        if model not in (own.model, "given") and not (windless and model in WINDY)
+        if model not in (own.model, "given") and (not windless or model in WINDLESS)
     ]
     return ((own.model, conditions), *others)
 

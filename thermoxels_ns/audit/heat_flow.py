@@ -5,13 +5,16 @@ unless the name ends in `_c`; arguments broadcast."""
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4
+from thermoxels_ns.heat.scene_fields import inside_coefficient
 from thermoxels_ns.heat.sky import ground_view, sky_view
 
 Values: TypeAlias = Any  # A number or an array
@@ -43,6 +46,114 @@ def albatici_tonelli_w_m2(
 def dallo_w_m2(wind_m_s: Values, surface_k: Values, air_k: Values, factor: Values = 1.0) -> Values:
     """Return `factor` (5.8 + 3.8054 v) (Ts - Te), the flow at an outer surface (Dall'O, Sarto and Panza 2013)."""
     return factor * (5.8 + WIND_W_S_M3K * wind_m_s) * (surface_k - air_k)
+
+
+def natural_w_m2k(warmer_k: Values, upward: Values) -> Values:
+    """Return the coefficient of natural convection, [W/(m2 K)], of a surface `warmer_k` warmer than the air.
+
+    9.482 |dT|^(1/3) / (7.238 - |u|) where warm air rises from the surface or cold air sinks from it, and 1.810
+    |dT|^(1/3) / (1.382 + |u|) elsewhere; both are 1.31 |dT|^(1/3) for walls (Walton 1983, TARP; EnergyPlus Engineering
+    Reference, "Outside Convection"). `upward`, u, is the upward part of the outward unit normal.
+
+    >>> np.round(natural_w_m2k(8.0, np.array([0.0, 1.0, -1.0])), 2).tolist()
+    [2.62, 3.04, 1.52]
+    """
+    free, held = 9.482 / (7.238 - np.abs(upward)), 1.810 / (1.382 + np.abs(upward))
+    return np.cbrt(np.abs(warmer_k)) * np.where(np.asarray(warmer_k) * upward > 0.0, free, held)
+
+
+def mowitt_w_m2k(warmer_k: Values, wind_m_s: Values, factor: float, power: float) -> Values:
+    """Return sqrt((0.84 |dT|^(1/3))^2 + (factor v^power)^2), measured on windows (Yazdanian and Klems 1994)."""
+    return np.hypot(0.84 * np.cbrt(np.abs(warmer_k)), factor * np.power(wind_m_s, power))
+
+
+def sparrow_w_m2k(wind_m_s: Values) -> Values:
+    """Return 2.537 Rf sqrt(P v / A), forced convection on a windward wall; a leeward one has half (Sparrow 1979).
+
+    The roughness factor Rf is 1.67, that of brick (EnergyPlus). Perimeter over area, P / A, is taken as 0.5 per metre,
+    that of a facade of 6 by 12 m.
+    """
+    return 2.537 * 1.67 * np.sqrt(0.5 * wind_m_s)
+
+
+def _iso_inside_w_m2k(upward: FloatArray) -> FloatArray:
+    normals = np.stack([np.zeros_like(upward), np.zeros_like(upward), upward], axis=-1).reshape(-1, 3)
+    here = Places(np.zeros_like(normals), normals, (0.0, 0.0, 1.0))
+    coefficient = np.asarray(inside_coefficient("iso-6946-convection").function(here, 0.0))
+    return coefficient.reshape(np.shape(upward))
+
+
+class Convection(NamedTuple):
+    """A published formula for the coefficient of convection, without radiation."""
+
+    weight: float  # Share of draws that use it, if the conditions name no weights; shares need not add up to 1
+    coefficient_w_m2k: Callable[[Values, Values, Values], Values]
+    """From the wind beside the surface [m/s], how much warmer than the air the surface is [K], and the upward part of
+    its outward normal."""
+
+
+CONVECTION: Mapping[str, Mapping[str, Convection]] = {
+    "outside": {
+        "iso-6946": Convection(1.0, lambda wind, warmer, upward: 4.0 + 4.0 * wind),
+        "jurges": Convection(0.5, lambda wind, warmer, upward: 5.8 + 3.94 * wind),
+        "mcadams": Convection(0.5, lambda wind, warmer, upward: 5.7 + 3.8 * wind),
+        "watmuff": Convection(1.0, lambda wind, warmer, upward: 2.8 + 3.0 * wind),
+        "mowitt-windward": Convection(0.5, lambda wind, warmer, upward: mowitt_w_m2k(warmer, wind, 3.26, 0.89)),
+        "mowitt-leeward": Convection(0.5, lambda wind, warmer, upward: mowitt_w_m2k(warmer, wind, 3.55, 0.617)),
+        "tarp-windward": Convection(
+            0.5, lambda wind, warmer, upward: natural_w_m2k(warmer, upward) + sparrow_w_m2k(wind)
+        ),
+        "tarp-leeward": Convection(
+            0.5, lambda wind, warmer, upward: natural_w_m2k(warmer, upward) + 0.5 * sparrow_w_m2k(wind)
+        ),
+        "emmel-windward": Convection(
+            0.5, lambda wind, warmer, upward: natural_w_m2k(warmer, upward) + 5.15 * np.power(wind, 0.81)
+        ),
+        "emmel-leeward": Convection(
+            0.5, lambda wind, warmer, upward: natural_w_m2k(warmer, upward) + 3.54 * np.power(wind, 0.76)
+        ),
+    },
+    "inside": {
+        "iso-6946": Convection(1.0, lambda wind, warmer, upward: _iso_inside_w_m2k(upward)),
+        "walton": Convection(1.0, lambda wind, warmer, upward: natural_w_m2k(warmer, upward)),
+        "khalifa": Convection(1.0, lambda wind, warmer, upward: 2.30 * np.power(np.abs(warmer), 0.24)),
+    },
+}
+"""Formulas of the full balance by the side of the surface, each beside radiation to what the surface sees.
+
+Outside: iso-6946, 4 + 4 v (ISO 6946 annex C); jurges, 5.8 + 3.94 v (Nusselt and Juerges 1922) and mcadams, 5.7 + 3.8 v
+(McAdams 1954), one set of measurements in a wind tunnel and so one weight; watmuff, 2.8 + 3 v, the same without the
+radiation that Watmuff, Charters and Proctor 1977 found in it; mowitt, `mowitt_w_m2k`; tarp, `natural_w_m2k` and
+`sparrow_w_m2k` (Walton 1983); emmel, 5.15 v^0.81 and 3.54 v^0.76 (Emmel, Abadie and Mendes 2007, for walls), with
+`natural_w_m2k` as EnergyPlus adds it. Windward and leeward share a weight, as surveys rarely know which it was. Jurges,
+McAdams, Watmuff and ISO take the wind beside the surface, the others the wind that comes up to the building.
+Inside: iso-6946, hci by the direction of the heat flow; walton, `natural_w_m2k`; khalifa, 2.30 |dT|^0.24 for walls
+without a heater (Khalifa and Marshall 1990, equation 6)."""
+
+
+def mixed_w_m2k(
+    formulas: Mapping[str, Convection],
+    drawn: IntArray,
+    shares: FloatArray,
+    wind: FloatArray,
+    warmer_k: FloatArray,
+    upward: FloatArray,
+) -> FloatArray:
+    """Return the coefficient of convection, [W/(m2 K)], by a formula of its own in every draw, shape (g, k).
+
+    Args:
+        formulas: The formulas, m of them.
+        drawn: Place in `formulas` of each draw's formula, shape (k,); -1: the mean of all, weighted by `shares`, (m,).
+        wind: Wind beside the surface, shape (k,), [m/s].
+        warmer_k: Surface minus air temperature, shape (g, k), [K].
+        upward: Upward part of the outward unit normals, shape (g, 1).
+    """
+    found, mean = np.zeros(np.broadcast_shapes(warmer_k.shape, (len(upward), len(drawn)))), drawn < 0
+    for number, (formula, share) in enumerate(zip(formulas.values(), shares)):
+        for which, part in ((drawn == number, 1.0), (mean, share)):
+            if which.any() and part > 0.0:
+                found[:, which] += part * formula.coefficient_w_m2k(wind[which], warmer_k[:, which], upward)
+    return found
 
 
 def madding_w_m2(
