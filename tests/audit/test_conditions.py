@@ -46,7 +46,7 @@ def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) 
     assert conditions == load_conditions(configs_folder() / EXAMPLE)
     found = check_survey(conditions)
     assert (found.forbidden, found.missing) == ((), ())
-    assert conditions.film.factor == Measured(1.0, 0.2) and conditions.survey.date.hour == 6
+    assert conditions.film.model == "balance" and conditions.survey.date.hour == 6
     with pytest.raises(AuditError, match=r"expected a name that is free"):
         write_example(tmp_path / "new" / "mine.yaml")
 

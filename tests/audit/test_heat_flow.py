@@ -51,7 +51,7 @@ def test_u_values_between_20_and_0_c_after_published_formulas(flow_w_m2, publish
     ],
 )
 def test_convection_on_a_wall_after_published_formulas(side, name, wind_m_s, warmer_k, published) -> None:
-    found = CONVECTION[side][name].coefficient_w_m2k(wind_m_s, warmer_k, np.zeros(1))
+    found = CONVECTION[side][name].w_m2k(wind_m_s, warmer_k, np.zeros(1))
     assert np.ravel(found).item() == pytest.approx(published, abs=1e-3)
 
 

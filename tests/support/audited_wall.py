@@ -160,7 +160,7 @@ def solve_wall(mesh: TetMesh, conditions: Conditions, draws: Draws) -> Truth:
     for _ in range(5 if balance else 1):
         coefficient = {one: value["film factor"] * (2.5 if inside else 4.0 + 4.0 * value["wind"]) for one in seen}
         if balance:
-            drawn = formulas[int(value[FORMULA])].coefficient_w_m2k
+            drawn = formulas[int(value[FORMULA])].w_m2k
             coefficient = {one: np.ravel(drawn(value["wind"], warmer_k[one], np.zeros(1))).item() for one in seen}
         effects = (
             Convection(patches if inside else ("room",), 25.0 if inside else 1.0 / R_INSIDE, other_air),

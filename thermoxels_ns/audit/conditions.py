@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from thermoxels_ns.audit.heat_flow import CONVECTION
+from thermoxels_ns.audit.weather import with_weather
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import AuditError
@@ -255,6 +256,16 @@ class Calibrate:
 
 
 @record(AuditError)
+class Weather:
+    """A file of the weather before the survey; entries that say "weather" instead of a number take theirs from it."""
+
+    file: str  # Csv file beside the conditions; its first line names hours (0: the survey) and columns of `COLUMNS`
+    time_constant: Annotated[Measured, Unit("h", 0.0, above=True)] | None = None
+    """Time in which a change of the air fades in the walls, [h]; the audit then says what they still remember."""
+    absorptance: Annotated[Measured, Unit("1", 0.0, 1.0)] = Measured(0.6, 0.2)  # Of the walls for sunlight
+
+
+@record(AuditError)
 class Conditions:
     """All that the user states beside the photographs."""
 
@@ -273,6 +284,7 @@ class Conditions:
     limits: Limits = field(default_factory=Limits)
     year: Year | None = None
     calibrate: Calibrate | None = None
+    weather: Weather | None = None
     title: str = ""
 
     def __post_init__(self) -> None:
@@ -323,7 +335,7 @@ class Conditions:
 def load_conditions(path: Path | str) -> Conditions:
     """Read conditions from a yaml file; raises `AuditError` if the file is missing or wrong."""
     path = Path(path)
-    return as_record(path.name, read_yaml(path), Conditions)
+    return as_record(path.name, with_weather(read_yaml(path), path.parent), Conditions)
 
 
 def write_example(path: Path) -> None:

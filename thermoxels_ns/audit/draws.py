@@ -18,6 +18,7 @@ BLOCKS = 10  # Sets of draws whose intervals are compared to tell how far the en
 FORMULA, REPEATABILITY = "film formula", "camera repeatability"  # Causes of uncertainty that have no `Measured`
 
 CONFIDENCE = 0.90  # Share of the draws that lie in an interval; as many draws lie below the interval as above
+ENDS = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE)
 
 
 @dataclass(frozen=True)
@@ -46,22 +47,20 @@ def interval_of(values: FloatArray) -> Interval:
     >>> round(found.low, 9), found.value, round(found.high, 9)
     (2.0, 20.0, 38.0)
     """
-    low, high = np.quantile(values[1:], (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE))
+    low, high = np.quantile(values[1:], ENDS)
     return Interval(float(values[0]), float(low), float(high))
 
 
 def width_of(values: FloatArray) -> FloatArray:
-    """Return how wide the intervals of draws are, shape (...,), for draws of shape (..., 1 + k)."""
-    low, high = np.quantile(values[..., 1:], (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE), axis=-1)
-    return np.asarray(high - low)
+    """Return the widths of intervals, shape (n,), of draws of shape (n, 1 + k)."""
+    return np.asarray(np.ptp(np.quantile(values[:, 1:], ENDS, axis=1), axis=0))
 
 
 def ends_off_by(values: FloatArray) -> float:
-    """Return the standard deviation of the ends of `interval_of(values)`, because draws are finite in number.
+    """Return the standard deviation of the ends of `interval_of(values)` due to the finite number of draws.
 
-    It is that of the ends in `BLOCKS` sets of the draws, divided by the root of their number (JCGM 101, 7.9.4)."""
-    blocks = np.array_split(values[1:], BLOCKS)
-    ends = np.array([np.quantile(one, (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE)) for one in blocks])
+    It is that of the ends in `BLOCKS` sets of the draws over the root of `BLOCKS` (JCGM 101, 7.9.4)."""
+    ends = np.array([np.quantile(one, ENDS) for one in np.array_split(values[1:], BLOCKS)])
     return float((ends.std(axis=0, ddof=1) / np.sqrt(BLOCKS)).max())
 
 

@@ -17,7 +17,6 @@ from thermoxels_ns.audit.heat_flow import (
     dallo_w_m2,
     fourth_power,
     madding_w_m2,
-    mixed_w_m2k,
     radiation_w_m2,
     reading_k,
     sky_emissivity,
@@ -155,17 +154,27 @@ def film_flow_w_m2(
     elif combined:
         coefficient = outside_coefficient("iso-6946-combined")
     else:
-        formulas, wind = CONVECTION[conditions.side], draws.values.get("wind", np.zeros(draws.count))
-        where = wind, surface_k - air_k, (normals @ np.array(up))[:, None]
-        if model == BALANCE:
-            drawn = draws.values.get(FORMULA, np.full(draws.count, -1)).astype(np.int64)
-            coefficient = mixed_w_m2k(formulas, drawn, conditions.film_shares, *where)
-        else:
-            coefficient = formulas[model].coefficient_w_m2k(*where)
+        coefficient = _convection_w_m2k(conditions, draws, surface_k - air_k, (normals @ np.array(up))[:, None])
     flow = outward * factor * coefficient * (surface_k - air_k)
     if not combined:
         flow = flow + outward * radiation_w_m2(emissivity, surface_k, around_k)
     return flow
+
+
+def _convection_w_m2k(conditions: Conditions, draws: Draws, warmer_k: FloatArray, upward: FloatArray) -> FloatArray:
+    """Return the coefficient of convection by the formula of each draw, shape (g, k); draws without one take the mean.
+
+    `warmer_k` is surface minus air, shape (g, k), `upward` the upward part of normals, shape (g, 1).
+    """
+    formulas, model = CONVECTION[conditions.side], conditions.film.model
+    drawn = draws.values.get(FORMULA, np.full(draws.count, -1.0))
+    shares = conditions.film_shares if model == BALANCE else [float(name == model) for name in formulas]
+    wind, found = draws.values.get("wind", np.zeros(draws.count)), np.zeros(warmer_k.shape)
+    for number, (one, share) in enumerate(zip(formulas.values(), shares)):
+        for which, part in ((drawn == number, 1.0), (drawn < 0.0, share)):
+            if part > 0.0 and which.any():
+                found[:, which] += part * one.w_m2k(wind[which], warmer_k[:, which], upward)
+    return found
 
 
 def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], ...]:

@@ -11,10 +11,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.fem.quantities import Places
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4
-from thermoxels_ns.heat.scene_fields import inside_coefficient
+from thermoxels_ns.heat.scene_fields import INSIDE_CONVECTION_W_M2K
 from thermoxels_ns.heat.sky import ground_view, sky_view
 
 Values: TypeAlias = Any  # A number or an array
@@ -62,98 +61,60 @@ def natural_w_m2k(warmer_k: Values, upward: Values) -> Values:
     return np.cbrt(np.abs(warmer_k)) * np.where(np.asarray(warmer_k) * upward > 0.0, free, held)
 
 
-def mowitt_w_m2k(warmer_k: Values, wind_m_s: Values, factor: float, power: float) -> Values:
-    """Return sqrt((0.84 |dT|^(1/3))^2 + (factor v^power)^2), measured on windows (Yazdanian and Klems 1994)."""
-    return np.hypot(0.84 * np.cbrt(np.abs(warmer_k)), factor * np.power(wind_m_s, power))
-
-
-def sparrow_w_m2k(wind_m_s: Values) -> Values:
-    """Return 2.537 Rf sqrt(P v / A), forced convection on a windward wall; a leeward one has half (Sparrow 1979).
-
-    The roughness factor Rf is 1.67, that of brick (EnergyPlus). Perimeter over area, P / A, is taken as 0.5 per metre,
-    that of a facade of 6 by 12 m.
-    """
-    return 2.537 * 1.67 * np.sqrt(0.5 * wind_m_s)
-
-
-def _iso_inside_w_m2k(upward: FloatArray) -> FloatArray:
-    normals = np.stack([np.zeros_like(upward), np.zeros_like(upward), upward], axis=-1).reshape(-1, 3)
-    here = Places(np.zeros_like(normals), normals, (0.0, 0.0, 1.0))
-    coefficient = np.asarray(inside_coefficient("iso-6946-convection").function(here, 0.0))
-    return coefficient.reshape(np.shape(upward))
-
-
 class Convection(NamedTuple):
     """A published formula for the coefficient of convection, without radiation."""
 
-    weight: float  # Share of draws that use it, if the conditions name no weights; shares need not add up to 1
-    coefficient_w_m2k: Callable[[Values, Values, Values], Values]
-    """From the wind beside the surface [m/s], how much warmer than the air the surface is [K], and the upward part of
-    its outward normal."""
+    weight: float  # How often it is drawn beside the others, if the conditions name no weights
+    w_m2k: Callable[[Values, Values, Values], Values]
+    """The coefficient, from the wind beside the surface [m/s], how much warmer than the air the surface is [K], and the
+    upward part of its outward unit normal."""
 
+
+def _mowitt(factor: float, power: float) -> Convection:
+    return Convection(0.5, lambda v, dt, up: np.hypot(0.84 * np.cbrt(np.abs(dt)), factor * np.power(v, power)))
+
+
+def _mixed(factor: float, power: float) -> Convection:
+    return Convection(0.5, lambda v, dt, up: natural_w_m2k(dt, up) + factor * np.power(v, power))
+
+
+_SPARROW = 2.537 * 1.67 * 0.5**0.5  # For walls of brick with a perimeter over area of 0.5 per metre
+_HCI, _SLANT = INSIDE_CONVECTION_W_M2K, 0.5 + 1e-9
 
 CONVECTION: Mapping[str, Mapping[str, Convection]] = {
     "outside": {
-        "iso-6946": Convection(1.0, lambda wind, warmer, upward: 4.0 + 4.0 * wind),
-        "jurges": Convection(0.5, lambda wind, warmer, upward: 5.8 + 3.94 * wind),
-        "mcadams": Convection(0.5, lambda wind, warmer, upward: 5.7 + 3.8 * wind),
-        "watmuff": Convection(1.0, lambda wind, warmer, upward: 2.8 + 3.0 * wind),
-        "mowitt-windward": Convection(0.5, lambda wind, warmer, upward: mowitt_w_m2k(warmer, wind, 3.26, 0.89)),
-        "mowitt-leeward": Convection(0.5, lambda wind, warmer, upward: mowitt_w_m2k(warmer, wind, 3.55, 0.617)),
-        "tarp-windward": Convection(
-            0.5, lambda wind, warmer, upward: natural_w_m2k(warmer, upward) + sparrow_w_m2k(wind)
-        ),
-        "tarp-leeward": Convection(
-            0.5, lambda wind, warmer, upward: natural_w_m2k(warmer, upward) + 0.5 * sparrow_w_m2k(wind)
-        ),
-        "emmel-windward": Convection(
-            0.5, lambda wind, warmer, upward: natural_w_m2k(warmer, upward) + 5.15 * np.power(wind, 0.81)
-        ),
-        "emmel-leeward": Convection(
-            0.5, lambda wind, warmer, upward: natural_w_m2k(warmer, upward) + 3.54 * np.power(wind, 0.76)
-        ),
+        "iso-6946": Convection(1.0, lambda v, dt, up: 4.0 + 4.0 * v),
+        "jurges": Convection(0.5, lambda v, dt, up: 5.8 + 3.94 * v),
+        "mcadams": Convection(0.5, lambda v, dt, up: 5.7 + 3.8 * v),
+        "watmuff": Convection(1.0, lambda v, dt, up: 2.8 + 3.0 * v),
+        "mowitt-windward": _mowitt(3.26, 0.89),
+        "mowitt-leeward": _mowitt(3.55, 0.617),
+        "tarp-windward": _mixed(_SPARROW, 0.5),
+        "tarp-leeward": _mixed(0.5 * _SPARROW, 0.5),
+        "emmel-windward": _mixed(5.15, 0.81),
+        "emmel-leeward": _mixed(3.54, 0.76),
     },
     "inside": {
-        "iso-6946": Convection(1.0, lambda wind, warmer, upward: _iso_inside_w_m2k(upward)),
-        "walton": Convection(1.0, lambda wind, warmer, upward: natural_w_m2k(warmer, upward)),
-        "khalifa": Convection(1.0, lambda wind, warmer, upward: 2.30 * np.power(np.abs(warmer), 0.24)),
+        "iso-6946": Convection(
+            1.0,
+            lambda v, dt, up: np.select([up < -_SLANT, up > _SLANT], [_HCI["up"], _HCI["down"]], _HCI["horizontal"]),
+        ),
+        "walton": Convection(1.0, lambda v, dt, up: natural_w_m2k(dt, up)),
+        "khalifa": Convection(1.0, lambda v, dt, up: 2.30 * np.power(np.abs(dt), 0.24)),
     },
 }
-"""Formulas of the full balance by the side of the surface, each beside radiation to what the surface sees.
+"""Formulas of the full balance by the side of the surface; radiation to what the surface sees is added to each.
 
-Outside: iso-6946, 4 + 4 v (ISO 6946 annex C); jurges, 5.8 + 3.94 v (Nusselt and Juerges 1922) and mcadams, 5.7 + 3.8 v
-(McAdams 1954), one set of measurements in a wind tunnel and so one weight; watmuff, 2.8 + 3 v, the same without the
-radiation that Watmuff, Charters and Proctor 1977 found in it; mowitt, `mowitt_w_m2k`; tarp, `natural_w_m2k` and
-`sparrow_w_m2k` (Walton 1983); emmel, 5.15 v^0.81 and 3.54 v^0.76 (Emmel, Abadie and Mendes 2007, for walls), with
-`natural_w_m2k` as EnergyPlus adds it. Windward and leeward share a weight, as surveys rarely know which it was. Jurges,
-McAdams, Watmuff and ISO take the wind beside the surface, the others the wind that comes up to the building.
-Inside: iso-6946, hci by the direction of the heat flow; walton, `natural_w_m2k`; khalifa, 2.30 |dT|^0.24 for walls
-without a heater (Khalifa and Marshall 1990, equation 6)."""
-
-
-def mixed_w_m2k(
-    formulas: Mapping[str, Convection],
-    drawn: IntArray,
-    shares: FloatArray,
-    wind: FloatArray,
-    warmer_k: FloatArray,
-    upward: FloatArray,
-) -> FloatArray:
-    """Return the coefficient of convection, [W/(m2 K)], by a formula of its own in every draw, shape (g, k).
-
-    Args:
-        formulas: The formulas, m of them.
-        drawn: Place in `formulas` of each draw's formula, shape (k,); -1: the mean of all, weighted by `shares`, (m,).
-        wind: Wind beside the surface, shape (k,), [m/s].
-        warmer_k: Surface minus air temperature, shape (g, k), [K].
-        upward: Upward part of the outward unit normals, shape (g, 1).
-    """
-    found, mean = np.zeros(np.broadcast_shapes(warmer_k.shape, (len(upward), len(drawn)))), drawn < 0
-    for number, (formula, share) in enumerate(zip(formulas.values(), shares)):
-        for which, part in ((drawn == number, 1.0), (mean, share)):
-            if which.any() and part > 0.0:
-                found[:, which] += part * formula.coefficient_w_m2k(wind[which], warmer_k[:, which], upward)
-    return found
+Outside: iso-6946, 4 + 4 v (ISO 6946, annex C); jurges, 5.8 + 3.94 v (Nusselt and Juerges 1922) and mcadams, 5.7 + 3.8 v
+(McAdams 1954), of the same wind tunnel and so of one weight; watmuff, 2.8 + 3 v, these without the radiation and free
+convection in them (Watmuff, Charters and Proctor 1977); mowitt, sqrt((0.84 dT^(1/3))^2 + (3.26 v^0.89)^2) windward and
+with 3.55 v^0.617 leeward, measured on windows (Yazdanian and Klems 1994); tarp, `natural_w_m2k` + 2.537 Rf sqrt(v P/A),
+half of the wind's part leeward (Sparrow and others 1979, Walton 1983), Rf 1.67 for brick, P/A 0.5 per metre; emmel,
+`natural_w_m2k` + 5.15 v^0.81 windward, 3.54 v^0.76 leeward (Emmel, Abadie and Mendes 2007, walls; sum as in
+EnergyPlus). Windward and leeward are each drawn half as often, as surveys rarely know. ISO, Juerges, McAdams, Watmuff
+mean the wind beside the surface, the others the wind that comes up to the building.
+Inside: iso-6946, hci by the direction of the heat flow; walton, `natural_w_m2k`; khalifa, 2.30 dT^0.24, walls without a
+heater (Khalifa and Marshall 1990)."""
 
 
 def madding_w_m2(

@@ -12,7 +12,7 @@ from thermoxels_ns.audit.calibration import Calibration, calibrated
 from thermoxels_ns.audit.conditions import BALANCE, SIMPLE, Conditions
 from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
 from thermoxels_ns.audit.draws import (
-    CONFIDENCE,
+    ENDS,
     Draws,
     Interval,
     causes,
@@ -34,6 +34,7 @@ from thermoxels_ns.audit.exchange import (
 )
 from thermoxels_ns.audit.heat_flow import temperature_factor
 from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
+from thermoxels_ns.audit.weather import read_weather, remembered_share
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
@@ -157,6 +158,9 @@ class Audit:
     failing_models: tuple[str, ...]
     """Film models that give a U-value of 0 or less of all that was observed, because they take the surroundings to be
     as warm as the air, where a full balance gives a positive one."""
+    remembered: Interval | None
+    """Share by which heat flow through walls differs from the steady one, because they store heat (`Weather`); its ends
+    are those of the stated time constant and absorptance. None if no time constant is stated."""
     not_counted_m2: Mapping[str, float]  # Area of triangles that do not count, by the texts of `WHY_NOT`
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
@@ -189,15 +193,9 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     work = _Parts(conditions, surface, groups, draws, parts)
 
     # Each patch has a reading error of its own; a storey has the errors of its patches, by the shares that lie in it.
-    of_patches = np.concatenate(
-        [
-            np.eye(len(patches)),
-            *[_shares(surface, part, parts[: len(patches)])[None] for part in parts[len(patches) :][: len(storeys)]],
-            np.ones((1, len(patches))),
-        ]
-    )
+    rows = [*range(len(patches) + len(storeys)), len(parts) - 1]
+    of_patches = np.stack([_shares(surface, parts[row], parts[: len(patches)]) for row in rows])
     own = of_patches @ work.own_w(draws, len(patches))
-    rows = [*range(len(own) - 1), len(parts) - 1]
     budget, shares = work.narrower(rows, of_patches)
     observed = np.isin(patch, patches)
     chosen = [(names[n], patch == n) for n in patches] + [(storey_names[n], (storey == n) & observed) for n in storeys]
@@ -216,7 +214,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     ]
     order = sorted(range(len(found)), key=lambda n: (bool(defects[n].not_counted), -defects[n].extra_w.value))
     found, defects = [found[n] for n in order], [defects[n] for n in order]
-    last, check = len(parts) - 2, check_survey(conditions)
+    last, check, (remembered, told) = len(parts) - 2, check_survey(conditions), _remembered(conditions)
     factors = work.temperature_factors(last, work.own_error_k(last))
     loss = work.totals.flow_w[-1] + own[-1]
     drawn = [(one.name, work.u(row, own[row])) for row, one in enumerate(elements[: len(patches)])]
@@ -225,7 +223,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     return Audit(
         conditions=conditions,
         surface=surface,
-        check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, draws))),
+        check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, draws), *told)),
         patches=tuple(elements[: len(patches)]),
         storeys=tuple(elements[len(patches) : -1]),
         whole=whole,
@@ -239,6 +237,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
         draws=draws.count - 1,
         ends_off_by_w=ends_off_by(loss),
         failing_models=failing,
+        remembered=remembered,
         not_counted_m2={why: area for why, area in left.items() if area > 0.0},
         triangle_surface_c=surface_c,
         triangle_flow_w_m2=flow,
@@ -325,13 +324,13 @@ class _Parts:
     def triangle_u(self) -> FloatArray:
         """Return the U-value of each triangle and both ends of its interval; see `Audit.triangle_u`."""
         off = self.own_error_k(_OF_A_TRIANGLE)
-        ends, found = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE), []
+        found = []
         for part in chunks(len(self.groups.reading_c), self.draws):
             some = self.groups.some(part)
             flow = exchange(self.conditions, some, self.draws).flow_w_m2
             warmer = exchange(self.conditions, some, self.draws.stated, HALF_STEP_K).flow_w_m2
             u = (flow + (warmer - flow[:, :1]) / HALF_STEP_K * off) / self.draws.difference_k
-            found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ends, axis=1).T], axis=1))
+            found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ENDS, axis=1).T], axis=1))
         of_group = np.concatenate(found)
         return np.where(self.surface.counted[:, None], of_group[self.groups.of_triangle], np.nan)
 
@@ -353,7 +352,7 @@ class _Parts:
         for cause in causes(self.conditions):
             flow_w, u = widths(few.frozen(cause))
             budget[cause] = max(float(every_w[-1] - flow_w[-1]), 0.0)
-            for one, share in zip(found, np.maximum(1.0 - u / np.maximum(every_u, 1e-12), 0.0).tolist()):
+            for one, share in zip(found, np.maximum(1.0 - u / np.maximum(every_u, 1e-300), 0.0).tolist()):
                 one[cause] = share
         return _largest_first(budget), [_largest_first(one) for one in found]
 
@@ -563,6 +562,39 @@ def _doubts(conditions: Conditions) -> tuple[str, ...]:
     if conditions.side == "inside" and conditions.outside_known:
         found.append("U-values hold where the open air is behind the surface; the mesh does not say where that is.")
     return tuple(found)
+
+
+def _remembered(conditions: Conditions) -> tuple[Interval | None, tuple[str, ...]]:
+    """Return `Audit.remembered` with sentences on it; raises `AuditError` if the weather file is unfit."""
+    weather = conditions.weather
+    if weather is None or weather.time_constant is None:
+        return None, ()
+    series, constant, taken = read_weather(weather.file), weather.time_constant, weather.absorptance
+    if "outside_c" not in series or not conditions.outside_known:
+        remedy = "Add the column outside_c to the weather file, and outside: {air: weather +- 0.5 C}."
+        raise AuditError("weather: time_constant", expected="the air outside", got="none", remedy=remedy)
+
+    def share(hours: float, absorptance: float, *earlier_c: float) -> float:
+        before = {name: np.append([values[0]] * len(earlier_c), values) for name, values in series.items()}
+        for air_c in earlier_c:  # the air before the file begins
+            before["hours"][0], before["outside_c"][0] = series["hours"][0] - 0.1, air_c
+        return remembered_share(before, conditions.inside.air.value, hours, absorptance, conditions.side == "inside")
+
+    value, air = share(constant.value, taken.value), series["outside_c"]
+    ends = [share(hours, part) for hours in (constant.low, constant.high) for part in (taken.low, taken.high)]
+    open_share = max(abs(share(constant.value, taken.value, float(one)) - value) for one in (air.min(), air.max()))
+    low, high = min(value, *ends), max(value, *ends)
+    sentences = [
+        f"A uniform wall that forgets within {constant.value:g} h stores heat: at the survey the heat flow through its "
+        f"surface is {100.0 * low:+.0f} to {100.0 * high:+.0f} % off the steady one. U-values of such walls are off by "
+        "as much, which their intervals do not hold."
+    ]
+    if open_share >= 0.01:
+        sentences.append(
+            f"The weather file begins {-series['hours'][0]:g} h before the survey, too late for such a wall: what was "
+            f"before may change that by {100.0 * open_share:.0f} %."
+        )
+    return Interval(value, low, high), tuple(sentences)
 
 
 def _missing(conditions: Conditions) -> tuple[str, ...]:
