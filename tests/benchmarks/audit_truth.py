@@ -10,12 +10,13 @@ with four pixels to a node, emissivity and reflection. Each wall is audited from
 known to 1 K and with one contact temperature known to 0.2 K in its place, and once from inside without the window.
 
 With --calibrate conductivities are estimated instead, from starts that are off by factors of two: of wall and glazing
-from outside with a contact temperature, of the wall from inside.
+from outside with a contact temperature, of the wall from inside. With --balance the formula of convection is drawn, too,
+for the truth as for the audits, and a calm, clear night is added, whose sky cools the wall below the air.
 """
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -25,6 +26,7 @@ from measuring import print_head, print_row
 from tests.support.audited_wall import (
     INSIDE,
     LENGTH_M,
+    NIGHT,
     STATED,
     UP,
     Truth,
@@ -35,7 +37,7 @@ from tests.support.audited_wall import (
     true_draws,
     with_contact,
 )
-from thermoxels_ns.audit.conditions import Conditions
+from thermoxels_ns.audit.conditions import Conditions, Film
 from thermoxels_ns.audit.draws import Interval
 from thermoxels_ns.audit.run import audit
 
@@ -75,6 +77,8 @@ class AuditTruth:
     """Size of the cells, [m]."""
     calibrate: bool = False
     """Estimate conductivities instead."""
+    balance: bool = False
+    """Draw the formula of convection."""
 
     def main(self) -> None:
         rows: Rows = {}
@@ -89,6 +93,9 @@ class AuditTruth:
             "outside": (STATED, audited_wall(self.step), audited_wall(self.step, slab=False)),
             "inside": (INSIDE, audited_wall(self.step, **within), audited_wall(self.step, slab=False, **within)),
         }
+        if self.balance:
+            walls = {side: (replace(stated, film=Film()), *meshes) for side, (stated, *meshes) in walls.items()}
+            walls["night"] = (NIGHT, *walls["outside"][1:])
         false_bridges: Counter[str] = Counter()
         for seed, (side, (stated, slab, plain_mesh)) in product(range(self.seeds), walls.items()):
             draws = true_draws(stated, seed)

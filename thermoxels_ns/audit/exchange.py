@@ -17,7 +17,7 @@ from thermoxels_ns.audit.heat_flow import (
     dallo_w_m2,
     fourth_power,
     madding_w_m2,
-    radiation_w_m2,
+    net_radiation_w_m2,
     reading_k,
     sky_emissivity,
     surface_temperature_k,
@@ -73,16 +73,20 @@ def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
 
 
 def part_totals(
-    conditions: Conditions, groups: AlikeTriangles, draws: Draws, area_m2: sparse.csr_array, warmer_k: float = 0.0
+    conditions: Conditions, groups: AlikeTriangles, draws: Draws, rows: sparse.csr_array, warmer_k: float = 0.0
 ) -> PartTotals:
-    """Return totals of p parts; `area_m2`, (p, g), is each group's area in each part; `warmer_k`: see `exchange`."""
-    columns, count = area_m2.tocsc(), len(groups.reading_c)
-    total = np.asarray(area_m2.sum(axis=1)).reshape(-1, 1)
-    flow_w, temperature = np.zeros((len(total), draws.count)), np.zeros((len(total), draws.count))
-    for part in chunks(count, draws):
+    """Return totals of p parts, whose `AlikeTriangles.rows` are `rows`, (2 p, g); `warmer_k`: see `exchange`."""
+    parts = (len(rows.indptr) - 1) // 2
+    area, off = rows[:parts].tocsc(), rows[parts:]
+    total = np.asarray(area.sum(axis=1)).reshape(-1, 1)
+    low, high = (exchange(conditions, groups, draws.stated, warmer_k + step) for step in (-HALF_STEP_K, HALF_STEP_K))
+    temperature, flow_w = (
+        np.repeat(off @ (above - below) / (2.0 * HALF_STEP_K), draws.count, axis=1) for below, above in zip(low, high)
+    )
+    for part in chunks(len(groups.reading_c), draws):
         some = exchange(conditions, groups.some(part), draws, warmer_k)
-        flow_w += columns[:, part] @ some.flow_w_m2
-        temperature += columns[:, part] @ some.surface_c
+        flow_w += area[:, part] @ some.flow_w_m2
+        temperature += area[:, part] @ some.surface_c
     return PartTotals(total[:, 0], temperature / np.where(total > 0.0, total, 1.0), flow_w)
 
 
@@ -101,7 +105,7 @@ def triangle_exchange(
     """
     steps = (-HALF_STEP_K, 0.0, HALF_STEP_K)
     low, mean, high = (exchange(conditions, groups, draws, step) for step in steps)
-    off = (surface.reading_c - groups.reading_c[groups.of_triangle]) / (2.0 * HALF_STEP_K)
+    off = groups.off_k / (2.0 * HALF_STEP_K)
     temperature, flow = (
         np.where(surface.counted, at[groups.of_triangle, 0] + off * (above - below)[groups.of_triangle, 0], np.nan)
         for below, at, above in zip(low, mean, high)
@@ -135,7 +139,6 @@ def film_flow_w_m2(
     `surface_k`, `around_k4` (see `radiant_k4`) and `emissivity` have shape (g, k), `normals` has shape (g, 3).
     """
     model, factor = conditions.film.model, draws["film factor"]
-    around_k = np.sqrt(np.sqrt(around_k4))
     inside = conditions.side == "inside"
     air_k = celsius_to_kelvin(draws["inside air" if inside else "outside air"])
     if model == "albatici-tonelli":
@@ -143,7 +146,7 @@ def film_flow_w_m2(
     if model == "dallo":
         return dallo_w_m2(draws["wind"], surface_k, air_k, factor)
     if model == "madding":
-        return madding_w_m2(emissivity, surface_k, around_k, air_k, factor)
+        return madding_w_m2(emissivity, surface_k, np.sqrt(np.sqrt(around_k4)), air_k, factor)
     outward = -1.0 if inside else 1.0
     combined = model == "iso-6946-combined"
     if model == "given":
@@ -157,7 +160,7 @@ def film_flow_w_m2(
         coefficient = _convection_w_m2k(conditions, draws, surface_k - air_k, (normals @ np.array(up))[:, None])
     flow = outward * factor * coefficient * (surface_k - air_k)
     if not combined:
-        flow = flow + outward * radiation_w_m2(emissivity, surface_k, around_k)
+        flow = flow + outward * net_radiation_w_m2(emissivity, surface_k, around_k4)
     return flow
 
 

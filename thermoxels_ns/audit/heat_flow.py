@@ -28,7 +28,12 @@ def fourth_power(values: Values) -> Values:
 
 def radiation_w_m2(emissivity: Values, surface_k: Values, surroundings_k: Values) -> Values:
     """Return the net radiation that leaves a surface, eps sigma (Ts^4 - Trefl^4) (Fokaides and Kalogirou 2011)."""
-    return emissivity * STEFAN_BOLTZMANN_W_M2K4 * (fourth_power(surface_k) - fourth_power(surroundings_k))
+    return net_radiation_w_m2(emissivity, surface_k, fourth_power(surroundings_k))
+
+
+def net_radiation_w_m2(emissivity: Values, surface_k: Values, surroundings_k4: Values) -> Values:
+    """Return `radiation_w_m2` from the fourth power of the temperature of the surroundings, [K^4]."""
+    return emissivity * STEFAN_BOLTZMANN_W_M2K4 * (fourth_power(surface_k) - surroundings_k4)
 
 
 def albatici_tonelli_w_m2(

@@ -46,7 +46,7 @@ SEVERE_SHARE, MODERATE_SHARE = 0.05, 0.01
 F_RSI_M2K_W = (0.13, 0.25)
 """Inside surface resistances Rsi of the temperature factors, [m2 K / W]; ISO 13788 judges mould by the second."""
 _LEAST_FLOW_W_M2 = 1e-9
-_FREEZING = 2000  # Number of draws that tell by how much a cause widens an interval
+_FEW = 2000  # Number of draws that tell by how much a cause widens an interval, and of those of single triangles
 _OF_A_TRIANGLE, _OF_THE_YEAR = 10**6, 10**6 + 1  # Arguments `number` of `Draws.local`, larger than any part's number
 
 LEAST_DIFFERENCE_K, MOST_WIND_M_S, LEAST_HOURS_WITHOUT_SUN, LEAST_HOURS_DRY = 10.0, 5.0, 2.0, 24.0
@@ -323,18 +323,20 @@ class _Parts:
 
     def triangle_u(self) -> FloatArray:
         """Return the U-value of each triangle and both ends of its interval; see `Audit.triangle_u`."""
-        off = self.own_error_k(_OF_A_TRIANGLE)
-        found = []
-        for part in chunks(len(self.groups.reading_c), self.draws):
+        few, found, slopes = self.draws.first(_FEW), [], []
+        off = few.local(self.conditions.camera.repeatability.off_by, _OF_A_TRIANGLE)
+        for part in chunks(len(self.groups.reading_c), few):
             some = self.groups.some(part)
-            flow = exchange(self.conditions, some, self.draws).flow_w_m2
-            warmer = exchange(self.conditions, some, self.draws.stated, HALF_STEP_K).flow_w_m2
-            u = (flow + (warmer - flow[:, :1]) / HALF_STEP_K * off) / self.draws.difference_k
+            flow = exchange(self.conditions, some, few).flow_w_m2
+            warmer = exchange(self.conditions, some, few.stated, HALF_STEP_K).flow_w_m2
+            slopes.append((warmer - flow[:, :1]) / HALF_STEP_K)
+            u = (flow + slopes[-1] * off) / few.difference_k
             found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ENDS, axis=1).T], axis=1))
-        of_group = np.concatenate(found)
-        return np.where(self.surface.counted[:, None], of_group[self.groups.of_triangle], np.nan)
+        of_group, slope = (np.concatenate(one)[self.groups.of_triangle] for one in (found, slopes))
+        u = of_group + slope * self.groups.off_k[:, None] / few.difference_k[0]
+        return np.where(self.surface.counted[:, None], u, np.nan)
 
-    def narrower(self, rows: Sequence[int], of_patches: FloatArray) -> tuple[dict[str, float], list[dict[str, float]]]:
+    def narrower(self, rows: list[int], of_patches: FloatArray) -> tuple[dict[str, float], list[dict[str, float]]]:
         """Return `Audit.budget` and the `Element.width_shares` of parts, the last of which is all that was observed.
 
         Each cause is frozen in turn. `of_patches`, (n, patches), is the share of each patch's own error in each part.
@@ -342,12 +344,13 @@ class _Parts:
 
         def widths(draws: Draws) -> tuple[FloatArray, FloatArray]:
             draws = with_references(self.surface, self.conditions, draws)
-            flow_w = part_totals(self.conditions, self.groups, draws, self.rows[rows]).flow_w
+            flow_w = part_totals(self.conditions, self.groups, draws, few_rows).flow_w
             flow_w = flow_w + of_patches @ self.own_w(draws, of_patches.shape[1])
             u = flow_w / draws.difference_k if self.conditions.outside_known else flow_w
             return width_of(flow_w), width_of(u)
 
-        few, budget, found = self.draws.first(_FREEZING), dict[str, float](), [dict[str, float]() for _ in rows]
+        few_rows = self.rows[[*rows, *[len(self.parts) + row for row in rows]]]
+        few, budget, found = self.draws.first(_FEW), dict[str, float](), [dict[str, float]() for _ in rows]
         every_w, every_u = widths(few)
         for cause in causes(self.conditions):
             flow_w, u = widths(few.frozen(cause))
