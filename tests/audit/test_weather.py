@@ -1,12 +1,16 @@
 """The weather before a survey, from a csv file, and what a wall still remembers of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
 from scipy.optimize import brentq
 
+from tests.support.audited_wall import UP, audited_wall
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.audit.conditions import load_conditions
+from thermoxels_ns.audit.run import audit
 from thermoxels_ns.audit.weather import remembered_share
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
@@ -52,6 +56,18 @@ def test_conditions_take_their_values_and_extremes_from_the_weather_at_the_surve
     assert found.surroundings.sky.dew_point == Measured(-3.0, 1.0) and found.film.model == "balance"
     assert (found.outside.lowest_24h.value, found.outside.highest_24h.value) == (1.0, 9.0)
     assert found.survey.hours_since_sun == Measured(12.0)
+
+
+@pytest.mark.parametrize(("file", "too_late"), [(FILE, False), ("hours,outside_c,inside_c\n-9,8,20\n0,0,20\n", True)])
+def test_an_audit_says_what_walls_remember_and_what_the_file_is_too_short_for(conditions, file, too_late) -> None:
+    """It cools before the survey: the wall still gives off heat, the more the longer it remembers."""
+    changes = {"surroundings": {"reflected": "0 C"}, "outside": {"air": "weather", "wind": "1 m/s"}}
+    stated = conditions(file, **changes)
+    mesh = audited_wall(0.3, slab=False, window=False)
+    found = audit(replace(mesh, temperature_c=np.full(len(mesh.points_m), 3.0)), stated, UP)
+    assert found.remembered is not None and 0.1 < found.remembered.low < found.remembered.value < found.remembered.high
+    told = [one for one in found.check.doubts if "stores heat" in one or "too late" in one]
+    assert len(told) == 1 + too_late and f"{100 * found.remembered.high:+.0f} %" in told[0]
 
 
 @pytest.mark.parametrize(

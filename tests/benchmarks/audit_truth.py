@@ -10,8 +10,8 @@ with four pixels to a node, emissivity and reflection. Each wall is audited from
 known to 1 K and with one contact temperature known to 0.2 K in its place, and once from inside without the window.
 
 With --calibrate conductivities are estimated instead, from starts that are off by factors of two: of wall and glazing
-from outside with a contact temperature, of the wall from inside. With --balance the formula of convection is drawn, too,
-for the truth as for the audits, and a calm, clear night is added, whose sky cools the wall below the air.
+from outside with a contact temperature, of the wall from inside. With --balance the formula of convection is drawn,
+too, for the truth as for the audits, and a calm, clear night is added, whose sky cools the wall below the air.
 """
 
 from collections import Counter

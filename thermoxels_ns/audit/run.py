@@ -473,21 +473,18 @@ def _limits(
 
 
 def _failing_models(conditions: Conditions, elements: Sequence[Element]) -> tuple[str, ...]:
-    """Return `Audit.failing_models`; raises `AuditError` if the chosen model fails on a patch or on all, the last one.
+    """Return `Audit.failing_models`; raises `AuditError` if the chosen model fails for one of `elements`.
 
-    A night sky cools a wall below the air. Models without it then give U-values of 0 and less (Zhang, Lucchi and
-    Garzulino 2026, after EN ISO 6781-1).
+    The last element is all that was observed. Such nights: Zhang, Lucchi and Garzulino 2026, after EN ISO 6781-1.
     """
-    simple, chosen, failing = SIMPLE[conditions.side], conditions.film.model, tuple[str, ...]()
+    chosen, failing = conditions.film.model, tuple[str, ...]()
     for one in elements:
-        u = {name: one.u_by_model.get(name, np.nan) for name in (*simple, BALANCE)}
-        failing = tuple(name for name in simple if u[name] <= 0.0 < u[BALANCE])
+        u = {name: one.u_by_model.get(name, np.nan) for name in (*SIMPLE[conditions.side], BALANCE)}
+        failing = tuple(name for name in SIMPLE[conditions.side] if u[name] <= 0.0 < u[BALANCE])
         if chosen in failing:
-            told = (
-                f"{chosen}, by which the U-value of {one.name} is {u[chosen]:.2f}; with what it sees, {u[BALANCE]:.2f}"
-            )
-            expected = f"one that knows that the surface sees other temperatures than that of the air {conditions.side}"
-            raise AuditError("film: model", expected=expected, got=told, remedy=f"Write model: {BALANCE}.")
+            expected = f"one that knows what the surface sees, which is not as warm as the air {conditions.side}"
+            got = f"{chosen}, by which the U-value of {one.name} is {u[chosen]:.2f}; by the full balance, {u[BALANCE]:.2f}"
+            raise AuditError("film: model", expected=expected, got=got, remedy=f"Write model: {BALANCE}.")
     return failing
 
 
