@@ -71,7 +71,7 @@ def test_an_offset_of_the_camera_counts_once_for_all_readings(walls) -> None:
 
 
 def test_each_formula_of_convection_is_followed_to_a_conductivity_of_its_own(walls) -> None:
-    """Two formulas, in a quarter and three quarters of the draws: the ends of the interval are the values by one alone."""
+    """Two formulas, in 1/4 and 3/4 of the draws: the ends of the interval are the values by one alone."""
     sure = replace(OFFSET_ALONE, camera=Camera(Measured(0.0), Measured(0.0)), **exact())
     films = (Film(weights={"iso-6946": 1.0, "watmuff": 3.0}), Film("iso-6946"), Film("watmuff"))
     warm = replace(

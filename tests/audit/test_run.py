@@ -150,7 +150,6 @@ def test_formulas_of_convection_are_drawn_by_their_weights_and_widen_the_interva
     share = both.whole.width_shares
     assert 0.0 < share[FORMULA] < 1.0 and FORMULA not in iso.whole.width_shares
     assert list(share.values()) == sorted(share.values(), reverse=True) and min(share.values()) >= 0.0
-    assert both.ends_off_by_w < 0.01 * (both.whole.loss_w.high - both.whole.loss_w.low)
 
 
 def test_what_freezing_takes_from_an_interval_is_what_stating_it_exactly_takes(walls) -> None:

@@ -12,9 +12,7 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.measured import Measured
 
 COUNT, SEED = 10_000, 20260115
-"""Number of draws behind each interval (JCGM 101, 7.2.2 asks for 10^4 and more), and the seed that makes draws the
-same for the same conditions."""
-BLOCKS = 10  # Sets of draws whose intervals are compared to tell how far the ends of intervals are off
+"""Number of draws behind each interval (JCGM 101, 7.2), and the seed that makes them repeat for the same conditions."""
 FORMULA, REPEATABILITY = "film formula", "camera repeatability"  # Causes of uncertainty that have no `Measured`
 
 CONFIDENCE = 0.90  # Share of the draws that lie in an interval; as many draws lie below the interval as above
@@ -54,14 +52,6 @@ def interval_of(values: FloatArray) -> Interval:
 def width_of(values: FloatArray) -> FloatArray:
     """Return the widths of intervals, shape (n,), of draws of shape (n, 1 + k)."""
     return np.asarray(np.ptp(np.quantile(values[:, 1:], ENDS, axis=1), axis=0))
-
-
-def ends_off_by(values: FloatArray) -> float:
-    """Return the standard deviation of the ends of `interval_of(values)` due to the finite number of draws.
-
-    It is that of the ends in `BLOCKS` sets of the draws over the root of `BLOCKS` (JCGM 101, 7.9.4)."""
-    ends = np.array([np.quantile(one, ENDS) for one in np.array_split(values[1:], BLOCKS)])
-    return float((ends.std(axis=0, ddof=1) / np.sqrt(BLOCKS)).max())
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from thermoxels_ns.audit.draws import (
     Interval,
     causes,
     draw,
-    ends_off_by,
     interval_of,
     uncertain,
     width_of,
@@ -154,13 +153,8 @@ class Audit:
     budget: Mapping[str, float]
     """By cause, largest first, by how much the interval of `whole.loss_w` would be narrower if it were exact, [W]."""
     draws: int  # Number of draws behind each interval
-    ends_off_by_w: float  # Standard deviation of the ends of `whole.loss_w`, because draws are finite in number, [W]
-    failing_models: tuple[str, ...]
-    """Film models that give a U-value of 0 or less of all that was observed, because they take the surroundings to be
-    as warm as the air, where a full balance gives a positive one."""
-    remembered: Interval | None
-    """Share by which heat flow through walls differs from the steady one, because they store heat (`Weather`); its ends
-    are those of the stated time constant and absorptance. None if no time constant is stated."""
+    failing_models: tuple[str, ...]  # Of `SIMPLE`, those by which `whole` has a U-value of 0 or less, not the balance
+    remembered: Interval | None  # `remembered_share` over the stated ranges; None if no time constant is stated
     not_counted_m2: Mapping[str, float]  # Area of triangles that do not count, by the texts of `WHY_NOT`
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
@@ -235,7 +229,6 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
         f_rsi=tuple(interval_of(one) for one in factors),
         budget=budget,
         draws=draws.count - 1,
-        ends_off_by_w=ends_off_by(loss),
         failing_models=failing,
         remembered=remembered,
         not_counted_m2={why: area for why, area in left.items() if area > 0.0},
@@ -483,7 +476,7 @@ def _failing_models(conditions: Conditions, elements: Sequence[Element]) -> tupl
         failing = tuple(name for name in SIMPLE[conditions.side] if u[name] <= 0.0 < u[BALANCE])
         if chosen in failing:
             expected = f"one that knows what the surface sees, which is not as warm as the air {conditions.side}"
-            got = f"{chosen}, by which the U-value of {one.name} is {u[chosen]:.2f}; by the full balance, {u[BALANCE]:.2f}"
+            got = f"{chosen}, by which {one.name} has a U-value of {u[chosen]:.2f}; by the balance, {u[BALANCE]:.2f}"
             raise AuditError("film: model", expected=expected, got=got, remedy=f"Write model: {BALANCE}.")
     return failing
 

@@ -126,7 +126,7 @@ def answers_of(options: Audit, found: Found) -> dict[str, Any]:
         "doubts": found.check.doubts,
         "missing_for_en_13187": found.check.missing,
         "loss_narrower_by_w": found.budget,
-        **{name: getattr(found, name) for name in ("draws", "ends_off_by_w", "failing_models", "remembered")},
+        **{name: getattr(found, name) for name in ("draws", "failing_models", "remembered")},
     }
     return to_jsonable_python(told, inf_nan_mode="null")
 
