@@ -85,6 +85,7 @@ def test_an_audit_says_what_walls_remember_and_what_the_file_is_too_short_for(co
             {"weather": {"file": "weather.csv", "time_constant": "0 h"}},
             r"conditions\.yaml: weather: time_constant",
         ),
+        (FILE, {"outside": {"air": "weather +- 0.4 C", "wind": "weather +- 2 km/h"}}, r"outside: wind"),
         (FILE, {"weather": None}, r"conditions\.yaml: inside: air"),
     ],
 )
@@ -120,8 +121,8 @@ def test_what_a_wall_remembers_is_what_its_heat_flow_differs_from_the_steady_one
     effects = (Convection(("x0",), film_out, airs[0]), Convection(("x1",), film_in, airs[1]))
     problem = HeatProblem(mesh, Material("wall", conductivity, 1000.0, capacity / 1000.0), start_c, effects)
     end_c = solve_heat(problem, TimeSteps(720, 360.0), scheme=SDIRK2).temperature_c[-1]
-    flow = (20.0 - series["outside_c"][-1]) / 1.17
+    difference_k = float(20.0 - series["outside_c"][-1])
     for inside, film, at, air_c in ((False, film_out, 0.0, series["outside_c"][-1]), (True, -film_in, depth, 20.0)):
-        found = remembered_share(series, 20.0, time_constant_h, 0.6, inside)
-        exact = film * (end_c[mesh.points_m[:, 0] == at].mean() - air_c) / flow - 1.0
+        found = remembered_share(series, difference_k, time_constant_h, 0.6, inside)
+        exact = film * (end_c[mesh.points_m[:, 0] == at].mean() - air_c) * 1.17 / difference_k - 1.0
         assert found == pytest.approx(exact, abs=0.01) and abs(exact) > 0.01

@@ -571,7 +571,7 @@ def _remembered(conditions: Conditions) -> tuple[Interval | None, tuple[str, ...
         before = {name: np.append([values[0]] * len(earlier_c), values) for name, values in series.items()}
         for air_c in earlier_c:  # the air before the file begins
             before["hours"][0], before["outside_c"][0] = series["hours"][0] - 0.1, air_c
-        return remembered_share(before, conditions.inside.air.value, hours, absorptance, conditions.side == "inside")
+        return remembered_share(before, conditions.difference_k, hours, absorptance, conditions.side == "inside")
 
     value, air = share(constant.value, taken.value), series["outside_c"]
     ends = [share(hours, part) for hours in (constant.low, constant.high) for part in (taken.low, taken.high)]

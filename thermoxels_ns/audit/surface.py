@@ -93,11 +93,8 @@ class AlikeTriangles:
         row = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         which = np.concatenate([*parts, np.zeros(0, dtype=np.int64)]).astype(np.int64)
         area, place = area_m2[which], self.of_triangle[which]
-        found = (
-            np.concatenate([area, area * self.off_k[which]]),
-            (np.append(row, row + len(parts)), np.append(place, place)),
-        )
-        return sparse.coo_array(found, shape=(2 * len(parts), len(self.reading_c))).tocsr()
+        values, at = np.append(area, area * self.off_k[which]), (np.append(row, row + len(parts)), np.tile(place, 2))
+        return sparse.coo_array((values, at), shape=(2 * len(parts), len(self.reading_c))).tocsr()
 
 
 def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float]) -> AuditedSurface:
