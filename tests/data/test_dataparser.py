@@ -155,6 +155,37 @@ def test_downscaled_photographs_are_block_means_with_matching_intrinsics(scene_f
     assert thermal is not None and int(thermal.width[0]) == 25
 
 
+@pytest.mark.parametrize("thermal_size", [(25, 18), (12, 9)])
+def test_photographs_that_need_more_memory_than_they_may_are_averaged_for_training_alone(scene_folder, thermal_size):
+    scene = scene_folder(size=(25, 18), thermal_size=thermal_size)
+    degrees = np.random.default_rng(0).uniform(12.0, 28.0, thermal_size[::-1])
+    degrees[:3, :3], degrees[4, 4] = np.nan, np.nan
+    np.save(scene.path / "thermal" / "frame_train_000.npy", degrees)
+    frame = next(frame for frame in scene.meta["frames"] if "train_000" in frame["file_path"])
+    frame["thermal_file_path"] = "thermal/frame_train_000.npy"
+    scene.rewrite()
+    plain = parse(scene.path)
+    room = 8 * 8 * 25 * 18 / 7.0 / 1e9  # of eight photographs with a seventh of their pixels
+    given = ThermalDataset(plain), ThermalDataset(parse(scene.path, photographs_gb=room))
+    (full, thermal, valid), (small, averaged, where) = (
+        [one[0][key].numpy().astype(float) for key in ("image", "thermal", "thermal_valid")] for one in given
+    )
+    np.testing.assert_allclose(small, full[:, :24].reshape(6, 3, 8, 3, 3).mean(axis=(1, 3)), atol=2 / 255)
+    if thermal_size == (25, 18):  # one ray carries both, so both have the same pixels
+        assert given[1].shares_camera
+        blocks = (valid[:, :24].reshape(6, 3, 8, 3), (valid * thermal)[:, :24].reshape(6, 3, 8, 3))
+        count, total = (block.sum(axis=(1, 3)) for block in blocks)
+        assert {0, 8, 9} == set(count.ravel().tolist())
+        np.testing.assert_array_equal(where[..., 0], count > 0)
+        np.testing.assert_allclose(averaged[..., 0], total / np.maximum(count, 1), atol=1e-6)
+    else:
+        assert not given[1].shares_camera and averaged.shape == thermal.shape
+    held_out = parse(scene.path, "val", photographs_gb=room)
+    assert int(held_out.cameras.width[0]) == 25 and held_out.metadata["thermal_averaged"] == 1
+    typed = parse(scene.path, photographs_gb=room, downscale_factor=1)
+    assert int(typed.cameras.width[0]) == 25, "all pixels, as asked"
+
+
 def test_dataset_item(scene_folder):
     scene = scene_folder(own_camera=True, thermal_size=(12, 10))
     data = ThermalDataset(parse(scene.path))[1]
@@ -404,6 +435,7 @@ def test_what_has_no_partner_is_left_out_if_one_asks_for_it(scene_folder):
     "options",
     [
         {"downscale_factor": 0},
+        {"photographs_gb": 0.0},
         {"eval_mode": "interval", "eval_interval": 1},
         *({"valid_range_c": limits} for limits in ((math.nan, 30.0), (30.0, -100.0), (-300.0, 10.0))),
     ],

@@ -42,7 +42,7 @@ WALL_M, LENGTH_M, HEIGHT_M = 0.3, 4.0, 3.0
 SLAB_M = (1.4, 1.6)  # From where to where the balcony slab goes, [m] above the floor
 SLAB_DEPTH_M = 0.6
 WINDOW_M = ((2.2, 3.4), (0.3, 1.1))
-CONDUCTIVITY = {"wall": 0.30, "glazing": 0.36, "slab": 2.3}  # [W/(m K)]
+CONDUCTIVITY = {"wall": 0.30, "glazing": 0.36, "slab": 2.3, "door": 0.9}  # [W/(m K)]
 R_INSIDE = INSIDE_RESISTANCE_M2K_W["horizontal"]
 
 STATED = Conditions(
@@ -127,6 +127,8 @@ class Truth:
     mesh: TetMesh  # With true temperatures
     loss_w: float  # Through what was photographed
     u_w_m2k: dict[str, float]  # By patch
+    area_m2: dict[str, float]
+    flow_w: dict[str, float]  # From inside to outside
     draws: Draws  # The true value of each quantity, one draw
 
 
@@ -138,16 +140,22 @@ def true_draws(conditions: Conditions, seed: int | None) -> Draws:
     return Draws({name: values[1:] for name, values in draw(conditions, 1, 1000 + seed).values.items()})
 
 
+def radiant_c(conditions: Conditions, draws: Draws, normals: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Temperature of what surfaces of these normals exchange radiation with, (n,)."""
+    return kelvin_to_celsius(radiant_k4(conditions, draws, normals, UP)[:, 0] ** 0.25)
+
+
 def solve_wall(mesh: TetMesh, conditions: Conditions, draws: Draws) -> Truth:
     """Let heat flow through the wall under the true conditions, by iso-6946 on the side that was photographed.
 
     For the model `BALANCE`, convection is by the formula that was drawn, at the mean temperature of each patch.
     """
     value = {name: float(values[0]) for name, values in draws.values.items()}
-    patches = tuple(name for name in ("facade", "window") if name in mesh.boundary.patch_names)
+    used = (mesh.boundary.patch_names[number] for number in np.unique(mesh.boundary.patch))
+    patches = tuple(name for name in used if name not in ("room", "cut"))
 
     def around_c(places, _):
-        return kelvin_to_celsius(radiant_k4(conditions, draws, places.normals, UP)[:, 0] ** 0.25)
+        return radiant_c(conditions, draws, places.normals)
 
     inside = conditions.side == "inside"
     seen = ("room",) if inside else patches
@@ -178,7 +186,7 @@ def solve_wall(mesh: TetMesh, conditions: Conditions, draws: Draws) -> Truth:
     area = {one.patch: one.area_m2 for one in results.patches}
     difference = value["inside air"] - value["outside air"]
     u = {name: flow[name] / area[name] / difference for name in seen}
-    return Truth(replace(mesh, temperature_c=solution.temperature_c), sum(flow.values()), u, draws)
+    return Truth(replace(mesh, temperature_c=solution.temperature_c), sum(flow.values()), u, area, flow, draws)
 
 
 def photographed(truth: Truth, conditions: Conditions, seed: int | None = None) -> TetMesh:
@@ -210,13 +218,15 @@ def photographed(truth: Truth, conditions: Conditions, seed: int | None = None) 
 CONTACT_M, CONTACT_OFF_K = (1.0, 0.0, 2.5), 0.2
 
 
-def with_contact(conditions: Conditions, truth: Truth, seed: int) -> Conditions:
+def with_contact(
+    conditions: Conditions, truth: Truth, seed: int, at: tuple[float, float, float] = CONTACT_M
+) -> Conditions:
     """The conditions with a contact temperature that is as wrong as it may be."""
     points = truth.mesh.points_m
-    nearest = int(np.argmin(np.linalg.norm(points - np.array(CONTACT_M), axis=1)))
+    nearest = int(np.argmin(np.linalg.norm(points - np.array(at), axis=1)))
     off = np.random.default_rng((seed, 11)).uniform(-CONTACT_OFF_K, CONTACT_OFF_K)
     measured = Measured(float(truth.mesh.temperature_c[nearest]) + off, CONTACT_OFF_K)
-    return replace(conditions, references=(Reference(CONTACT_M, measured),))
+    return replace(conditions, references=(Reference(at, measured),))
 
 
 def calibrated(side: Side, seed: int, step: float = 0.1) -> Iterator[tuple[str, float, Interval]]:

@@ -181,13 +181,16 @@ def test_a_run_stays_in_the_output_folder(name, text):
         config.get_checkpoint_dir()
 
 
+@pytest.mark.parametrize("behind", [False, True])
 @pytest.mark.parametrize(("data", "name"), [(".", "scene"), ("../scene", "scene"), ("..", "above")])
-def test_a_run_is_named_by_the_folder_of_its_scene(tmp_path, monkeypatch, data, name):
+def test_a_run_is_named_by_the_folder_of_its_scene(tmp_path, monkeypatch, data, name, behind):
     (tmp_path / "above" / "scene").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "above" / "scene")
     config = deepcopy(thermoxels.config)
-    config.pipeline.datamanager.data = Path(data)
-    assert config.get_base_dir().parts[:3] == ("outputs", name, "thermoxels")
+    manager = config.pipeline.datamanager
+    (manager.dataparser if behind else manager).data = Path(data)
+    expected = "unnamed" if behind and data == "." else name  # "." is what the dataparser has if nothing is typed
+    assert config.get_base_dir().parts[:3] == ("outputs", expected, "thermoxels")
 
 
 @pytest.mark.parametrize(

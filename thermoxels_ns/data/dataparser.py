@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -38,6 +39,7 @@ _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
 """A file whose median is at least the first holds kelvins if the median less 273.15 is within the second of others."""
 _MOST_FRAMES = 64  # training files in which stuck pixels are sought
 
+_BYTES_PER_PIXEL = 8  # Three colours, and of masked photographs the mask and the pixel's number
 LONGEST_SIDE = 640  # pixels along the longer side of the pictures in which features are sought
 MOST_PHOTOGRAPHS = 500  # with more, poses stay as given: the normal equations would take minutes
 FEWEST_PHOTOGRAPHS = 3  # with fewer, poses stay as given
@@ -57,7 +59,10 @@ class ThermalDataParserConfig(DataParserConfig):
     """Scene folder (with transforms.json or transforms_thermal.json), or the json itself."""
     downscale_factor: Optional[int] = None  # noqa: UP045 - read by tyro
     """Divide the resolution of the colour photographs by this number. Photographs are resized when loaded; no file is
-    written. Thermal images keep their resolution. Default: full resolution."""
+    written. Thermal images keep their resolution. Default: full resolution, but for `photographs_gb`."""
+    photographs_gb: float = 1.0
+    """Memory for the pixels of photographs that train, [GB]. Photographs that need more are averaged down, and with
+    them thermal images that have the same pixels; held-out photographs keep their resolution."""
     scene_box: Optional[tuple[tuple[float, float, float], tuple[float, float, float]]] = None  # noqa: UP045
     """Box to reconstruct, in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax. Default: scene_box in
     the json, else found from the sparse points, else from depths that photographs agree on, else from the cameras."""
@@ -113,6 +118,7 @@ class ThermalDataParser(DataParser):
     The metadata of its outputs hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``,
     ``thermal_cameras`` (`Cameras`; None if all pairs share camera and resolution), ``thermal_unit``, ``valid_range_c``,
     ``thermal_dead_pixels`` (masks of stuck pixels by shape of the image), ``image_scale`` (1 / downscale_factor),
+    ``thermal_averaged`` (pixels of a thermal image that become one, along a side),
     ``pixel_size`` (width of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the
     scene box in input coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None unless train has tracks).
     If `refine_poses` adjusted poses, ``adjusted_poses`` of train maps file names to poses (camera to world, input
@@ -135,15 +141,19 @@ class ThermalDataParser(DataParser):
             raise SceneError("split", expected="train, val or test", got=split, remedy="Choose one of them.")
         chosen: list[int] = getattr(scene.split, split)
         frames = [scene.file.frames[index] for index in chosen]
-        factor = 1.0 / (self.config.downscale_factor or 1.0)
-        poses = [frame.pose for frame in frames]
-        cameras = _cameras([frame.intrinsics.scaled(factor) for frame in frames], scene.placed(poses))
-        thermal_cameras = _cameras(
-            [_thermal_intrinsics(frame, scene.shapes[frame.thermal]) for frame in frames],
-            scene.placed([f.pose if f.thermal_pose is None else f.thermal_pose for f in frames]),
-        )
+        poses, training = [frame.pose for frame in frames], split == "train"
+        thermal_poses = scene.placed([f.pose if f.thermal_pose is None else f.thermal_pose for f in frames])
+        lenses = [frame.intrinsics for frame in frames]
+        thermal_lenses = [_thermal_intrinsics(frame, scene.shapes[frame.thermal]) for frame in frames]
+        pixels_averaged = self.pixels_averaged(lenses) if training else 1
+        factor = 1.0 / (self.config.downscale_factor or pixels_averaged)
+        cameras = _cameras(lenses, scene.placed(poses))
+        thermal_cameras = _cameras(thermal_lenses, thermal_poses)
+        shared = _same_cameras(cameras, thermal_cameras)
+        if factor < 1.0:
+            cameras = _cameras([lens.scaled(factor) for lens in lenses], scene.placed(poses))
+            shared &= pixels_averaged > 1
         fitted = [scene.fitted.get(number, pose) for number, pose in zip(chosen, poses)]
-        training = split == "train"
         return DataparserOutputs(
             image_filenames=[frame.image for frame in frames],
             cameras=cameras,
@@ -155,7 +165,8 @@ class ThermalDataParser(DataParser):
                 **scene.metadata,
                 "image_scale": factor,
                 "thermal_filenames": [frame.thermal for frame in frames],
-                "thermal_cameras": None if _same_cameras(cameras, thermal_cameras) else thermal_cameras,
+                "thermal_cameras": None if shared else thermal_cameras,
+                "thermal_averaged": pixels_averaged if shared else 1,
                 "pixel_size": scene.metadata["pixel_size"] / factor,
                 "feature_rays": scene.feature_rays if training else None,
                 "fitted_poses": scene.placed(fitted) if scene.fitted.keys() & set(chosen) else None,
@@ -163,12 +174,30 @@ class ThermalDataParser(DataParser):
             },
         )
 
+    def pixels_averaged(self, lenses: Sequence[Camera]) -> int:
+        """Return how many pixels of the photographs that train become one, along a side, to fit into `photographs_gb`.
+
+        More than one is said. With `downscale_factor` it is 1.
+        """
+        need_gb = _BYTES_PER_PIXEL * sum(lens.width * lens.height for lens in lenses) / 1e9
+        if self.config.downscale_factor is not None or need_gb <= self.config.photographs_gb:
+            return 1
+        side = math.ceil(math.sqrt(need_gb / self.config.photographs_gb))
+        CONSOLE.print(
+            f"{len(lenses)} photographs need {need_gb:.2g} GB: for training they are averaged over {side} x {side} "
+            f"pixels, {need_gb / side**2:.2g} GB (--photographs-gb {math.ceil(need_gb)} keeps all pixels)."
+        )
+        return side
+
     def _read_scene(self) -> _Scene:
         config = self.config
         low, high = config.valid_range_c
         if not -ZERO_CELSIUS_K <= low < high:
             expected, got = "a lower and a higher temperature in degrees Celsius", f"{low} and {high}"
             raise SceneError("valid_range_c", expected=expected, got=got, remedy="Pass --valid-range-c -100 2000.")
+        if not config.photographs_gb > 0.0:
+            got, remedy = config.photographs_gb, "Pass --photographs-gb 1."
+            raise SceneError("photographs_gb", expected="a number above 0", got=got, remedy=remedy)
         if config.downscale_factor is not None and not config.downscale_factor >= 1:
             expected, got = "a number of at least 1", config.downscale_factor
             raise SceneError("downscale_factor", expected=expected, got=got, remedy="Pass 2, 4 or 8.")

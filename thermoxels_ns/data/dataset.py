@@ -15,7 +15,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from torch import Tensor
 
-from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.units import TemperatureRange
@@ -144,7 +144,10 @@ class ThermalDataset(InputDataset):
                 valid &= ~dead
             # float32 would lose 16-bit steps of a narrow range far from 0 C.
             normalised = self.temperature_range.normalise(image.temperature_c.astype(np.float64))
-            thermal = np.where(valid, normalised, 0.0).astype(np.float32)
+            thermal = np.where(valid, normalised, 0.0)
+            if (side := given.get("thermal_averaged", 1)) > 1:
+                thermal, valid = _averaged(thermal, valid, side)
+            thermal = thermal.astype(np.float32)
             tensors = torch.from_numpy(thermal)[..., None], torch.from_numpy(valid)[..., None]
             self._thermal[image_idx] = (*tensors, report)
         return self._thermal[image_idx]
@@ -157,6 +160,21 @@ class ThermalDataset(InputDataset):
         factor = 1.0 / (self.scale_factor * self.metadata["image_scale"])
         part = (0.0, 0.0, min(width * factor, picture.size[0]), min(height * factor, picture.size[1]))
         return picture.resize((width, height), filter_, box=part)
+
+
+def _averaged(values: FloatArray, valid: BoolArray, side: int) -> tuple[FloatArray, BoolArray]:
+    """Return the mean of the valid values (h, w) of each block of `side` x `side` pixels, and where it has one.
+
+    Without a valid pixel the mean is 0. A last fraction of a block is cut off, as in `Camera.scaled`.
+    """
+    height, width = (length // side for length in values.shape)
+
+    def total(pixels: npt.NDArray) -> FloatArray:
+        blocks = pixels[: height * side, : width * side].reshape(height, side, width, side)
+        return blocks.sum(axis=(1, 3), dtype=np.float64)
+
+    count = total(valid)
+    return total(values) / np.maximum(count, 1.0), count > 0.0
 
 
 def _square(pose: Tensor) -> Tensor:

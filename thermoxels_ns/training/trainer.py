@@ -66,7 +66,10 @@ class ThermoxelsTrainerConfig(TrainerConfig):
 
     def set_experiment_name(self) -> None:
         """Name the run by the folder of its scene, found for ``--data ..`` too, if no name is given."""
-        data = self.pipeline.datamanager.data
+        manager: Any = self.pipeline.datamanager
+        data = manager.data
+        if data is None and manager.dataparser.data != Path():  # --data behind thermal-data
+            data = manager.dataparser.data
         if self.experiment_name is None and data is not None:
             self.experiment_name = Path(os.path.abspath(data.parent if data.is_file() else data)).stem
         super().set_experiment_name()
