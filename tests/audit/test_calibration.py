@@ -18,7 +18,7 @@ from tests.support.audited_wall import (
     true_draws,
 )
 from thermoxels_ns.audit.calibration import Calibration
-from thermoxels_ns.audit.conditions import Calibrate, Camera, Layer, Unknown
+from thermoxels_ns.audit.conditions import Calibrate, Camera, Film, Layer, Unknown
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
@@ -68,6 +68,18 @@ def test_an_offset_of_the_camera_counts_once_for_all_readings(walls) -> None:
     warmer = audit(mesh, replace(shifted, calibrate=WALL), UP).calibration
     ends = [one.found["conductivity of wall"] for one in (stated, warmer)]
     assert ends[0].high == pytest.approx(ends[1].value, rel=0.01) and ends[1].value > 1.05 * ends[0].value
+
+
+def test_each_formula_of_convection_is_followed_to_a_conductivity_of_its_own(walls) -> None:
+    """Two formulas, in 1/4 and 3/4 of the draws: the ends of the interval are the values by one alone."""
+    sure = replace(OFFSET_ALONE, camera=Camera(Measured(0.0), Measured(0.0)), **exact())
+    films = (Film(weights={"iso-6946": 1.0, "watmuff": 3.0}), Film("iso-6946"), Film("watmuff"))
+    warm = replace(
+        walls["plain"], mesh=replace(walls["plain"].mesh, temperature_c=walls["plain"].mesh.temperature_c + 1.0)
+    )
+    both, iso, watmuff = (calibrate(warm, WALL, replace(sure, film=film)).found for film in films)
+    interval, ends = both["conductivity of wall"], [one["conductivity of wall"].value for one in (watmuff, iso)]
+    assert (interval.low, interval.high) == pytest.approx(ends, rel=5e-3) and ends[0] < 0.95 * ends[1]
 
 
 def exact() -> dict:

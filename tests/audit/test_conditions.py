@@ -46,7 +46,7 @@ def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) 
     assert conditions == load_conditions(configs_folder() / EXAMPLE)
     found = check_survey(conditions)
     assert (found.forbidden, found.missing) == ((), ())
-    assert conditions.film.factor == Measured(1.0, 0.2) and conditions.survey.date.hour == 6
+    assert conditions.film.model == "balance" and conditions.survey.date.hour == 6
     with pytest.raises(AuditError, match=r"expected a name that is free"):
         write_example(tmp_path / "new" / "mine.yaml")
 
@@ -73,6 +73,10 @@ def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) 
         (("film", "model"), "madding", r"film: model"),
         (("film", "model"), "given", r"film: coefficient"),
         (("film", "factor"), "0.1 +- 0.2", r"film: factor"),
+        (("film", "weights"), {"watmuff": 1}, r"film: weights: .*got weights beside iso-6946"),
+        (("film",), {"weights": {"watmuff": 0}}, r"film: weights: .*got none above 0"),
+        (("film",), {"weights": {"watt": 1}}, r"film: weights: .*got watt"),
+        (("film",), {"model": "watt"}, r"film: model"),
         (("camera", "offset"), None, r"camera: expected the key offset"),
         (("camera", "emissivity"), 0.95, r"camera: reflected"),
         (("references",), [{"at": [float("nan"), 0.0, 1.2], "temperature": "1.4 C"}], r"references entry 1: at"),

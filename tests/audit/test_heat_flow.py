@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.audit.heat_flow import (
+    CONVECTION,
     albatici_tonelli_w_m2,
     dallo_w_m2,
     madding_w_m2,
@@ -29,6 +30,29 @@ K = 273.15
 )
 def test_u_values_between_20_and_0_c_after_published_formulas(flow_w_m2, published_u) -> None:
     assert flow_w_m2 / 20.0 == pytest.approx(published_u, abs=5e-6)
+
+
+@pytest.mark.parametrize(
+    ("side", "name", "wind_m_s", "warmer_k", "published"),
+    [
+        ("outside", "iso-6946", 2.0, 1.0, 12.0),
+        ("outside", "jurges", 2.0, 1.0, 13.68),
+        ("outside", "mcadams", 2.0, 1.0, 13.3),
+        ("outside", "watmuff", 2.0, 1.0, 8.8),
+        ("outside", "mowitt-windward", 0.0, -8.0, 1.68),  # calm air: natural convection alone
+        ("outside", "mowitt-leeward", 1.0, 0.0, 3.55),
+        ("outside", "tarp-windward", 2.0, 0.0, 2.537 * 1.67),
+        ("outside", "tarp-leeward", 0.0, 8.0, 2.62),
+        ("outside", "emmel-windward", 1.0, 1.0, 5.15 + 1.31),
+        ("outside", "emmel-leeward", 4.0, 0.0, 3.54 * 4.0**0.76),
+        ("inside", "iso-6946", 0.0, -1.0, 2.5),
+        ("inside", "walton", 0.0, -8.0, 2.62),
+        ("inside", "khalifa", 0.0, -1.0, 2.30),
+    ],
+)
+def test_convection_on_a_wall_after_published_formulas(side, name, wind_m_s, warmer_k, published) -> None:
+    found = CONVECTION[side][name].w_m2k(wind_m_s, warmer_k, np.zeros(1))
+    assert np.ravel(found).item() == pytest.approx(published, abs=1e-3)
 
 
 def test_temperature_factors_of_a_known_wall() -> None:

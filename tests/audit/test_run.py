@@ -9,6 +9,7 @@ from tests.support.audited_wall import (
     CONDUCTIVITY,
     INSIDE,
     LENGTH_M,
+    NIGHT,
     R_INSIDE,
     SLAB_M,
     STATED,
@@ -21,10 +22,20 @@ from tests.support.audited_wall import (
     true_draws,
 )
 from tests.support.heat_meshes import box_mesh, planes
-from thermoxels_ns.audit.conditions import Camera, Film, Limits, OutsideAir, Reference, Surface, Surroundings, Year
+from thermoxels_ns.audit.conditions import (
+    SIMPLE,
+    Camera,
+    Film,
+    Limits,
+    OutsideAir,
+    Reference,
+    Surface,
+    Surroundings,
+    Year,
+)
 from thermoxels_ns.audit.defects import find_defects, undisturbed_temperature
-from thermoxels_ns.audit.draws import Interval, interval_of
-from thermoxels_ns.audit.heat_flow import radiation_w_m2
+from thermoxels_ns.audit.draws import COUNT, FORMULA, Interval, draw, interval_of
+from thermoxels_ns.audit.heat_flow import CONVECTION, radiation_w_m2
 from thermoxels_ns.audit.run import Audit, audit, incidence_factor
 from thermoxels_ns.audit.surface import audited_surface
 from thermoxels_ns.core.errors import AuditError
@@ -107,6 +118,50 @@ def test_intervals_hold_the_truth_though_all_is_off(seed) -> None:
     assert found.defects == ()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_on_a_clear_calm_night_the_balance_holds_the_truth_and_simple_formulas_are_refused(seed) -> None:
+    """The sky cools the wall below the air: what takes all around to be as warm as the air gives a negative U-value."""
+    truth = solve_wall(audited_wall(slab=False, window=False), NIGHT, true_draws(NIGHT, seed))
+    mesh = photographed(truth, NIGHT, seed)
+    found = audit(mesh, NIGHT, UP)
+    assert found.whole.surface_c.value < truth.draws["outside air"][0] and truth.u_w_m2k["facade"] > 0.7
+    assert found.whole.u_w_m2k.low < truth.u_w_m2k["facade"] < found.whole.u_w_m2k.high
+    assert found.failing_models == SIMPLE["outside"] and found.whole.u_by_model["dallo"] < 0.0
+    for model in SIMPLE["outside"]:
+        with pytest.raises(AuditError, match=r"^film: model: .*Write model: balance"):
+            audit(mesh, replace(NIGHT, film=Film(model, Measured(1.0, 0.2))), UP)
+
+
+def test_formulas_of_convection_are_drawn_by_their_weights_and_widen_the_interval(walls) -> None:
+    """Weights 1 and 3: a quarter of the draws is by ISO 6946, whose 4 + 4 v is the largest here; the mean is stated."""
+    stated = replace(STATED, film=Film(weights={"iso-6946": 1.0, "watmuff": 3.0}))
+    drawn = draw(stated)[FORMULA]
+    names = list(CONVECTION["outside"])
+    assert drawn[0] == -1.0 and drawn.shape == (COUNT + 1,)
+    shares = {names[int(n)]: float(np.mean(drawn[1:] == n)) for n in np.unique(drawn[1:])}
+    assert shares == pytest.approx({"iso-6946": 0.25, "watmuff": 0.75}, abs=1e-3)
+    mesh = photographed(walls["plain"], STATED)
+    mesh = replace(mesh, temperature_c=mesh.temperature_c + 2.0)
+    both, iso, watmuff = (
+        audit(mesh, replace(stated, film=film), UP) for film in (stated.film, Film("iso-6946"), Film("watmuff"))
+    )
+    u = [one.whole.u_w_m2k.value for one in (both, iso, watmuff)]
+    assert u[0] == pytest.approx(0.25 * u[1] + 0.75 * u[2], rel=1e-9) and u[1] > u[2] + 0.1
+    share = both.whole.width_shares
+    assert 0.0 < share[FORMULA] < 1.0 and FORMULA not in iso.whole.width_shares
+    assert list(share.values()) == sorted(share.values(), reverse=True) and min(share.values()) >= 0.0
+
+
+def test_what_freezing_takes_from_an_interval_is_what_stating_it_exactly_takes(walls) -> None:
+    mesh = photographed(walls["window"], STATED)
+    sure = replace(STATED, camera=replace(STATED.camera, offset=Measured(0.0)))
+    found, exact = (audit(mesh, one, UP) for one in (STATED, sure))
+    for wide, narrow in zip((*found.patches, found.whole), (*exact.patches, exact.whole)):
+        width, left = (one.u_w_m2k.high - one.u_w_m2k.low for one in (wide, narrow))
+        assert wide.width_shares["camera offset"] == pytest.approx(1.0 - left / width, abs=0.03)
+        assert "camera offset" not in narrow.width_shares
+
+
 def test_storeys_divide_the_whole_and_a_heating_season_is_coupling_times_degree_days(walls) -> None:
     storeys = {"upper": Measured(1.5), "lower": Measured(0.0)}
     year = Year(Measured(3000.0), price=Measured(0.1), currency="EUR", co2=Measured(0.2))
@@ -130,13 +185,18 @@ def test_limits_are_judged_by_intervals(walls) -> None:
         u={"*": Measured(2.5), "window": Measured(0.2)}, psi=Measured(0.1), loss=Measured(1.0), f_rsi=Measured(0.7)
     )
     near = replace(STATED, camera=Camera(Measured(0.0, 0.1), Measured(0.0, 0.05)), limits=limits)
-    verdicts = {one.name: one.verdict for one in audit(photographed(walls["window"], near), near, UP).limits}
+    judged = audit(photographed(walls["window"], near), near, UP).limits
+    verdicts = {one.name: one.verdict for one in judged}
     assert u["facade"] < 2.5 and u["window"] > 0.2
     assert verdicts == {
         "U-value of facade": "met",
         "U-value of window": "not met",
         "heat loss of what was observed": "not met",
     }
+    assert [one.missed_share for one in judged] == [0.0, 1.0, 1.0]
+    middle = replace(near, limits=Limits(u={"facade": Measured(u["facade"] * 1.005)}))
+    (close,) = audit(photographed(walls["window"], middle), middle, UP).limits
+    assert close.verdict == "cannot tell" and 0.2 < close.missed_share < 0.8
 
 
 def test_what_was_not_measured_never_counts(walls) -> None:
@@ -192,13 +252,14 @@ def test_what_does_not_fit_the_mesh_is_refused(walls, change, named) -> None:
 
 def test_film_models_are_shown_beside_each_other_and_may_be_chosen(walls) -> None:
     mesh = photographed(walls["plain"], STATED)
+    mesh = replace(mesh, temperature_c=mesh.temperature_c + 1.0)  # so warm that simple formulas are not refused
     found = audit(mesh, STATED, UP)
-    assert set(found.whole.u_by_model) == {"iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo"}
+    assert {"iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo", "balance"} < set(found.whole.u_by_model)
     assert found.whole.u_by_model["iso-6946"] == pytest.approx(found.whole.u_w_m2k.value)
     above = found.whole.surface_c.value
     assert found.whole.u_by_model["iso-6946-combined"] == pytest.approx(25.0 * above / 20.0)
     assert found.whole.u_by_model["dallo"] == pytest.approx((5.8 + 3.8054) * above / 20.0)
-    for model in ("dallo", "albatici-tonelli", "iso-6946-combined"):
+    for model in ("dallo", "albatici-tonelli", "iso-6946-combined", "watmuff", "balance"):
         chosen = audit(mesh, replace(STATED, film=Film(model, Measured(1.0, 0.2))), UP).whole
         assert chosen.u_w_m2k.value == pytest.approx(found.whole.u_by_model[model], rel=1e-12)
 

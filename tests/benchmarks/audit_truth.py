@@ -17,7 +17,8 @@ the solved mesh itself ("no training"), so that what reconstruction adds shows. 
 ``audit_truth.csv`` in the output folder, written as they come; seeds that are there are not run again.
 
 With --calibrate conductivities are estimated instead, from starts that are off by factors of two: of wall and glazing
-from outside with a contact temperature, of the wall from inside.
+from outside with a contact temperature, of the wall from inside. With --balance the formula of convection is drawn,
+too, for the truth as for the audits, and a calm, clear night is added, whose sky cools the wall below the air.
 """
 
 import csv
@@ -46,6 +47,7 @@ from tests.support.audited_house import (
 from tests.support.audited_wall import (
     INSIDE,
     LENGTH_M,
+    NIGHT,
     STATED,
     UP,
     Truth,
@@ -56,7 +58,7 @@ from tests.support.audited_wall import (
     true_draws,
     with_contact,
 )
-from thermoxels_ns.audit.conditions import Conditions
+from thermoxels_ns.audit.conditions import Conditions, Film
 from thermoxels_ns.audit.draws import Interval
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -204,7 +206,8 @@ class AuditTruth:
     """Size of the cells, [m]."""
     calibrate: bool = False
     """Estimate conductivities instead."""
-
+    balance: bool = False
+    """Draw the formula of convection."""
     trained: Literal["draft", "standard"] | None = None
     """Photograph, train and export solved houses of this quality, and audit these."""
     output: Path = Path("audit-truth")
@@ -225,6 +228,9 @@ class AuditTruth:
             "outside": (STATED, audited_wall(self.step), audited_wall(self.step, slab=False)),
             "inside": (INSIDE, audited_wall(self.step, **within), audited_wall(self.step, slab=False, **within)),
         }
+        if self.balance:
+            walls = {side: (replace(stated, film=Film()), *meshes) for side, (stated, *meshes) in walls.items()}
+            walls["night"] = (NIGHT, *walls["outside"][1:])
         false_bridges: Counter[str] = Counter()
         for seed, (side, (stated, slab, plain_mesh)) in product(range(self.seeds), walls.items()):
             draws = true_draws(stated, seed)

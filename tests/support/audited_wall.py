@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.audit.conditions import (
+    BALANCE,
     Calibrate,
     Camera,
     Conditions,
@@ -21,8 +22,9 @@ from thermoxels_ns.audit.conditions import (
     Surroundings,
     Unknown,
 )
-from thermoxels_ns.audit.draws import Draws, Interval, draw, emissivity_name
+from thermoxels_ns.audit.draws import FORMULA, Draws, Interval, draw, emissivity_name
 from thermoxels_ns.audit.exchange import radiant_k4
+from thermoxels_ns.audit.heat_flow import CONVECTION
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
@@ -60,6 +62,15 @@ INSIDE = replace(
     film=Film("iso-6946", Measured(1.0, 0.2)),
     camera=Camera(offset=Measured(0.0, 0.5), repeatability=Measured(0.0, 0.2)),
 )
+
+NIGHT = replace(
+    STATED,
+    outside=OutsideAir(Measured(0.0, 0.5), wind=Measured(0.5, 0.4)),
+    surroundings=Surroundings(sky=SkyModel(Measured(0.05, 0.05), Measured(-10.0, 1.0)), ground=Measured(-3.0, 1.0)),
+    film=Film(),
+    camera=Camera(offset=Measured(0.0, 0.3), repeatability=Measured(0.0, 0.1)),
+)
+"""A calm and clear night, whose sky cools a wall below the air."""
 
 
 def audited_wall(step: float = 0.1, slab: bool = True, window: bool = True, side: Side = "outside") -> TetMesh:
@@ -135,7 +146,10 @@ def radiant_c(conditions: Conditions, draws: Draws, normals: npt.NDArray[np.floa
 
 
 def solve_wall(mesh: TetMesh, conditions: Conditions, draws: Draws) -> Truth:
-    """Let heat flow through the wall under the true conditions, by iso-6946 on the side that was photographed."""
+    """Let heat flow through the wall under the true conditions, by iso-6946 on the side that was photographed.
+
+    For the model `BALANCE`, convection is by the formula that was drawn, at the mean temperature of each patch.
+    """
     value = {name: float(values[0]) for name, values in draws.values.items()}
     used = (mesh.boundary.patch_names[number] for number in np.unique(mesh.boundary.patch))
     patches = tuple(name for name in used if name not in ("room", "cut"))
@@ -144,16 +158,28 @@ def solve_wall(mesh: TetMesh, conditions: Conditions, draws: Draws) -> Truth:
         return radiant_c(conditions, draws, places.normals)
 
     inside = conditions.side == "inside"
-    coefficient = value["film factor"] * (2.5 if inside else 4.0 + 4.0 * value["wind"])
     seen = ("room",) if inside else patches
-    effects = (
-        Convection(("room",), coefficient if inside else 1.0 / R_INSIDE, value["inside air"]),
-        Convection(patches, 25.0 if inside else coefficient, value["outside air"]),
-        Radiation(seen, value[emissivity_name(conditions, 0)], Varying(around_c, in_time=False)),
-    )
+    balance = conditions.film.model == BALANCE
+    formulas = list(CONVECTION[conditions.side].values()) if balance else []
+    names, airs = mesh.boundary.patch_names, (value["inside air"], value["outside air"])
+    air, other_air = airs if inside else airs[::-1]
     materials = {name: Material(name, k, 1000.0, 1000.0) for name, k in CONDUCTIVITY.items()}
-    problem = HeatProblem(mesh, {n: materials[n] for n in mesh.region_names}, effects=effects, up=UP)
-    solution = solve_steady(problem)
+    warmer_k = {one: -1.0 if inside else 1.0 for one in seen}
+    for _ in range(5 if balance else 1):
+        coefficient = {one: value["film factor"] * (2.5 if inside else 4.0 + 4.0 * value["wind"]) for one in seen}
+        if balance:
+            drawn = formulas[int(value[FORMULA])].w_m2k
+            coefficient = {one: np.ravel(drawn(value["wind"], warmer_k[one], np.zeros(1))).item() for one in seen}
+        effects = (
+            Convection(patches if inside else ("room",), 25.0 if inside else 1.0 / R_INSIDE, other_air),
+            *[Convection((one,), coefficient[one], air) for one in seen],
+            Radiation(seen, value[emissivity_name(conditions, 0)], Varying(around_c, in_time=False)),
+        )
+        problem = HeatProblem(mesh, {n: materials[n] for n in mesh.region_names}, effects=effects, up=UP)
+        solution = solve_steady(problem)
+        for one in seen:
+            facets = mesh.facets[mesh.boundary.patch == names.index(one)]
+            warmer_k[one] = float(solution.temperature_c[facets].mean()) - air
     results = heat_results(problem, solution)
     outwards = 1.0 if inside else -1.0
     flow = {one.patch: outwards * one.heat_w for one in results.patches if one.patch in seen}

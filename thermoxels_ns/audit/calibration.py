@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermoxels_ns.audit.conditions import Calibrate, Conditions, Film
-from thermoxels_ns.audit.draws import Draws, Interval, emissivity_name, interval_of
+from thermoxels_ns.audit.draws import FORMULA, Draws, Interval, emissivity_name, interval_of
 from thermoxels_ns.audit.exchange import HALF_STEP_K, film_flow_w_m2, radiant_k4, triangle_exchange
 from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface, chosen_names
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
@@ -305,13 +305,19 @@ class _Fit:
         """Return the logarithms of the properties in every draw, (m, k), and which quantity moves each property most.
 
         For each quantity that acts on all readings, the fit is repeated at both ends of its range; a parabola stands
-        for the values in between. Effects of several quantities add up.
+        for the values in between; of formulas each is tried. Effects of several quantities add up.
         """
         gain = np.linalg.solve(self.slope.T @ (self.weight[:, None] * self.slope), self.slope.T * self.weight)
         off, count = self.wall.conditions.camera.repeatability.off_by, self.draws.count
         drawn = np.repeat(self.logarithm[:, None], count, axis=1)
         moved: dict[str, FloatArray] = {}
         for name, values in self._uncertain().items():
+            if name == FORMULA:
+                which, place = np.unique(values[1:], return_inverse=True)
+                each = np.stack([self._follow(gain, name, value) for value in which], axis=1) - self.logarithm[:, None]
+                drawn[:, 1:] += each[:, place]
+                moved[name] = np.ptp(each, axis=1)
+                continue
             at = values - values[0]
             low, high = at.min(), at.max()
             below, above = (self._follow(gain, name, values[0] + end) - self.logarithm for end in (low, high))

@@ -9,8 +9,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
+import numpy as np
 from pydantic import Field
 
+from thermoxels_ns.audit.heat_flow import CONVECTION
+from thermoxels_ns.audit.weather import with_weather
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured, Unit
@@ -26,14 +30,20 @@ Hours: TypeAlias = Annotated[Measured, Unit("h")]
 Conductivity: TypeAlias = Annotated[Measured, Unit("W/(m K)", 0.0, above=True)]
 
 Side = Literal["outside", "inside"]
-FilmModel = Literal["iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo", "madding", "given"]
-"""Names of the models of heat exchange at a surface; their formulas stand in `thermoxels_ns.audit.heat_flow`."""
+FilmModel: TypeAlias = str
+"""Name of a model of heat exchange at a surface; the formulas stand in `thermoxels_ns.audit.heat_flow`."""
 
-FILM_MODELS: Mapping[Side, tuple[FilmModel, ...]] = {
-    "outside": ("iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo", "given"),
-    "inside": ("madding", "iso-6946", "iso-6946-combined", "given"),
+BALANCE: FilmModel = "balance"  # Radiation to what each triangle sees, and convection by formulas that are drawn
+SIMPLE: Mapping[Side, tuple[FilmModel, ...]] = {
+    "outside": ("iso-6946-combined", "albatici-tonelli", "dallo"),
+    "inside": ("iso-6946-combined",),
 }
-WINDY: tuple[FilmModel, ...] = ("iso-6946", "albatici-tonelli", "dallo")  # Need the wind speed for an outer surface
+"""Models that take all that a surface sees to be as warm as the air."""
+FILM_MODELS: Mapping[Side, tuple[FilmModel, ...]] = {
+    "outside": (BALANCE, *CONVECTION["outside"], *SIMPLE["outside"], "given"),
+    "inside": (BALANCE, *CONVECTION["inside"], "madding", *SIMPLE["inside"], "given"),
+}
+WINDLESS: tuple[FilmModel, ...] = ("iso-6946-combined", "given")  # Need no wind speed for an outer surface
 
 EXAMPLE = "conditions-example.yaml"
 MOST_UNKNOWN = 4  # Largest number of properties that one calibration may search for
@@ -113,9 +123,12 @@ class Surroundings:
 class Film:
     """The model of heat exchange between surface and surroundings, with its uncertainty."""
 
-    model: FilmModel
-    factor: Annotated[Measured, Unit("1", 0.0)]  # Multiplies convection; all heat for dallo and iso-6946-combined
+    model: FilmModel = BALANCE
+    factor: Annotated[Measured, Unit("1", 0.0)] = Measured(1.0)
+    """Multiplies convection; all heat for dallo and iso-6946-combined."""
     coefficient: Annotated[Measured, Unit("W/(m2 K)", 0.0)] | None = None  # Convection coefficient; model "given" only
+    weights: dict[str, Annotated[float, Field(ge=0.0)]] = field(default_factory=dict)
+    """Model balance only: how often each formula of convection is drawn, by name; the others are not drawn."""
 
     def __post_init__(self) -> None:
         if (self.model == "given") != (self.coefficient is not None):
@@ -123,6 +136,10 @@ class Film:
             remedy = "Add coefficient: 8 +- 1 W/(m2 K) and model: given, or remove both."
             got = "none" if self.coefficient is None else f"one beside {self.model}"
             raise AuditError("coefficient", expected=expected, got=got, remedy=remedy)
+        if self.weights and (self.model != BALANCE or not 0.0 < sum(self.weights.values()) < math.inf):
+            got = f"weights beside {self.model}" if self.model != BALANCE else "none above 0"
+            remedy = f"Write model: {BALANCE} and weights: {{iso-6946: 1, watmuff: 2}}, or remove the weights."
+            raise AuditError("weights", expected=f"weights above 0 beside {BALANCE}", got=got, remedy=remedy)
 
 
 @record(AuditError)
@@ -239,15 +256,25 @@ class Calibrate:
 
 
 @record(AuditError)
+class Weather:
+    """A file of the weather before the survey; entries that say "weather" instead of a number take theirs from it."""
+
+    file: str  # Csv file beside the conditions; its first line names hours (0: the survey) and columns of `COLUMNS`
+    time_constant: Annotated[Measured, Unit("h", 0.0, above=True)] | None = None
+    """Time in which a change of the air fades in the walls, [h]; the audit then says what they still remember."""
+    absorptance: Annotated[Measured, Unit("1", 0.0, 1.0)] = Measured(0.6, 0.2)  # Of the walls for sunlight
+
+
+@record(AuditError)
 class Conditions:
     """All that the user states beside the photographs."""
 
     side: Side  # Side from which the surface was photographed
     inside: InsideAir
     surroundings: Surroundings
-    film: Film
     camera: Camera
     surfaces: Annotated[tuple[Surface, ...], Field(min_length=1)]
+    film: Film = field(default_factory=Film)
     outside: OutsideAir = field(default_factory=OutsideAir)  # May be left out if the surface was seen from inside
     leave_out: tuple[str, ...] = ()  # Names or patterns of patches that do not count, such as glass or metal
     references: tuple[Reference, ...] = ()  # If there are none, `Camera.offset` is used as stated
@@ -257,6 +284,7 @@ class Conditions:
     limits: Limits = field(default_factory=Limits)
     year: Year | None = None
     calibrate: Calibrate | None = None
+    weather: Weather | None = None
     title: str = ""
 
     def __post_init__(self) -> None:
@@ -264,7 +292,11 @@ class Conditions:
         if model not in known:
             name, remedy = f"film: model of surfaces seen from {self.side}", f"Write model: {known[0]}, for example."
             raise AuditError(name, expected=f"one of {', '.join(known)}", got=model, remedy=remedy)
-        if self.side == "outside" and model in WINDY and self.outside.wind is None:
+        strange = sorted(set(self.film.weights) - set(CONVECTION[self.side]))
+        if strange:
+            remedy = f"Choose from {', '.join(CONVECTION[self.side])}."
+            raise AuditError("film: weights", expected=f"formulas for {self.side}", got=strange[0], remedy=remedy)
+        if self.side == "outside" and model not in WINDLESS and self.outside.wind is None:
             expected, remedy = f"a speed, because {model} needs it", "Add wind: 1.5 +- 0.5 m/s, for example."
             raise AuditError("outside: wind", expected=expected, got="none", remedy=remedy)
         needed = {"calibrate": self.calibrate is not None, "year": self.year is not None}
@@ -287,6 +319,13 @@ class Conditions:
         return math.isfinite(self.outside.air.value)
 
     @property
+    def film_shares(self) -> FloatArray:
+        """How often each formula of `CONVECTION` is drawn, in its order; the shares add up to 1."""
+        weights = self.film.weights or {name: one.weight for name, one in CONVECTION[self.side].items()}
+        shares = np.array([weights.get(name, 0.0) for name in CONVECTION[self.side]])
+        return shares / shares.sum()
+
+    @property
     def difference_k(self) -> float:
         """Stated inside minus outside air temperature, [K]; NaN if `outside_known` is False."""
         return self.inside.air.value - self.outside.air.value
@@ -296,7 +335,7 @@ class Conditions:
 def load_conditions(path: Path | str) -> Conditions:
     """Read conditions from a yaml file; raises `AuditError` if the file is missing or wrong."""
     path = Path(path)
-    return as_record(path.name, read_yaml(path), Conditions)
+    return as_record(path.name, with_weather(read_yaml(path), path.parent), Conditions)
 
 
 def write_example(path: Path) -> None:

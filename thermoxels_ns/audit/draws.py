@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermoxels_ns.audit.conditions import Conditions
+from thermoxels_ns.audit.conditions import BALANCE, Conditions
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.measured import Measured
 
-COUNT, SEED = 1000, 20260115
-"""Number of draws behind each interval, and the seed that makes draws the same for the same conditions."""
+COUNT, SEED = 10_000, 20260115
+"""Number of draws behind each interval (JCGM 101, 7.2), and the seed that makes them repeat for the same conditions."""
+FORMULA, REPEATABILITY = "film formula", "camera repeatability"  # Causes of uncertainty that have no `Measured`
 
 CONFIDENCE = 0.90  # Share of the draws that lie in an interval; as many draws lie below the interval as above
+ENDS = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE)
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,13 @@ def interval_of(values: FloatArray) -> Interval:
     >>> round(found.low, 9), found.value, round(found.high, 9)
     (2.0, 20.0, 38.0)
     """
-    low, high = np.quantile(values[1:], (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE))
+    low, high = np.quantile(values[1:], ENDS)
     return Interval(float(values[0]), float(low), float(high))
+
+
+def width_of(values: FloatArray) -> FloatArray:
+    """Return the widths of intervals, shape (n,), of draws of shape (n, 1 + k)."""
+    return np.asarray(np.ptp(np.quantile(values[:, 1:], ENDS, axis=1), axis=0))
 
 
 @dataclass(frozen=True)
@@ -73,6 +80,16 @@ class Draws:
     def __getitem__(self, name: str) -> FloatArray:
         return self.values[name]
 
+    def first(self, count: int) -> Draws:
+        """Return the stated values and the first `count` draws."""
+        return replace(self, values={name: values[: 1 + count] for name, values in self.values.items()})
+
+    def frozen(self, cause: str) -> Draws:
+        """Return draws in which one cause of uncertainty has its stated value; `REPEATABILITY`: no errors of parts."""
+        if cause == REPEATABILITY:
+            return replace(self, errors_of_parts=False)
+        return replace(self, values={**self.values, cause: np.full(self.count, self[cause][0])})
+
     def local(self, off_by: float, number: int) -> FloatArray:
         """Return random errors within +- `off_by`, (1 + k,), the first 0; each `number`, a seed, has its own errors."""
         if not self.errors_of_parts:
@@ -83,26 +100,31 @@ class Draws:
 
 
 def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:
-    """Draw `count` values of each uncertain quantity, one at random in each of `count` equal parts of its range."""
+    """Draw `count` values of each uncertain quantity, one at random in each of `count` equal parts of its range.
+
+    For the model `BALANCE`, `FORMULA` is the place of a formula in `CONVECTION`, as often as its weight says; -1, the
+    stated value, stands for the mean of all.
+    """
     generator = np.random.default_rng(seed)
-    values = {}
-    for name, what in uncertain(conditions).items():
-        parts = (generator.permutation(count) + generator.uniform(size=count)) / count
-        values[name] = np.concatenate([[what.value], what.low + (what.high - what.low) * parts])
+
+    def spread() -> FloatArray:
+        return np.asarray((generator.permutation(count) + generator.uniform(size=count)) / count)
+
+    values = {
+        name: np.concatenate([[what.value], what.low + (what.high - what.low) * spread()])
+        for name, what in uncertain(conditions).items()
+    }
+    if conditions.film.model == BALANCE:
+        reach = np.cumsum(conditions.film_shares)
+        values[FORMULA] = np.concatenate([[-1.0], np.searchsorted(reach[:-1], spread(), side="right")])
     return Draws(_possible(values), seed)
 
 
-def one_at_a_time(conditions: Conditions) -> Iterator[tuple[str, Draws]]:
-    """Yield the name of each quantity that is not exact, with draws in which that quantity alone changes.
-
-    The three values of the quantity are its stated, its lowest and its highest value.
-    """
-    every = uncertain(conditions)
-    for name, what in every.items():
-        if what.off_by > 0.0:
-            values = {other: np.full(3, it.value) for other, it in every.items()}
-            values[name] = np.array([what.value, what.low, what.high])
-            yield name, Draws(_possible(values), errors_of_parts=False)
+def causes(conditions: Conditions) -> list[str]:
+    """Return the names of all that makes results uncertain: quantities that are not exact, formula, repeatability."""
+    named = [name for name, what in uncertain(conditions).items() if what.off_by > 0.0]
+    named += [FORMULA] * (conditions.film.model == BALANCE and bool(conditions.film_shares.max() < 1.0))
+    return named + [REPEATABILITY] * (conditions.camera.repeatability.off_by > 0.0)
 
 
 def uncertain(conditions: Conditions) -> dict[str, Measured]:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
-from thermoxels_ns.audit.conditions import FILM_MODELS, WINDY, Conditions, Film, FilmModel
-from thermoxels_ns.audit.draws import Draws, emissivity_name
+from thermoxels_ns.audit.conditions import BALANCE, FILM_MODELS, WINDLESS, Conditions, Film, FilmModel
+from thermoxels_ns.audit.draws import FORMULA, Draws, emissivity_name
 from thermoxels_ns.audit.heat_flow import (
+    CONVECTION,
     albatici_tonelli_w_m2,
     dallo_w_m2,
     fourth_power,
     madding_w_m2,
-    radiation_w_m2,
+    net_radiation_w_m2,
     reading_k,
     sky_emissivity,
     surface_temperature_k,
@@ -28,7 +30,7 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.heat.scene_fields import inside_coefficient, outside_coefficient
 
-CHUNK = 2000  # Number of groups whose draws are in memory at the same time
+CHUNK = 400_000  # Values, groups times draws, of one array that are in memory at the same time
 HALF_STEP_K = 0.05  # Half the step of difference quotients with respect to readings, [K]
 _AROUND_M, _FARTHEST_M = 0.15, 0.5
 """Readings within the first distance of a reference are averaged; no reading within the second is an error, [m]."""
@@ -71,18 +73,27 @@ def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
 
 
 def part_totals(
-    conditions: Conditions, groups: AlikeTriangles, draws: Draws, area_m2: sparse.csr_array, warmer_k: float = 0.0
+    conditions: Conditions, groups: AlikeTriangles, draws: Draws, rows: sparse.csr_array, warmer_k: float = 0.0
 ) -> PartTotals:
-    """Return totals of p parts; `area_m2`, (p, g), is each group's area in each part; `warmer_k`: see `exchange`."""
-    columns, count = area_m2.tocsc(), len(groups.reading_c)
-    total = np.asarray(area_m2.sum(axis=1)).reshape(-1, 1)
-    flow_w, temperature = np.zeros((len(total), draws.count)), np.zeros((len(total), draws.count))
-    for start in range(0, count, CHUNK):
-        part = slice(start, start + CHUNK)
+    """Return totals of p parts, whose `AlikeTriangles.rows` are `rows`, (2 p, g); `warmer_k`: see `exchange`."""
+    parts = (len(rows.indptr) - 1) // 2
+    area, off = rows[:parts].tocsc(), rows[parts:]
+    total = np.asarray(area.sum(axis=1)).reshape(-1, 1)
+    low, high = (exchange(conditions, groups, draws.stated, warmer_k + step) for step in (-HALF_STEP_K, HALF_STEP_K))
+    temperature, flow_w = (
+        np.repeat(off @ (above - below) / (2.0 * HALF_STEP_K), draws.count, axis=1) for below, above in zip(low, high)
+    )
+    for part in chunks(len(groups.reading_c), draws):
         some = exchange(conditions, groups.some(part), draws, warmer_k)
-        flow_w += columns[:, part] @ some.flow_w_m2
-        temperature += columns[:, part] @ some.surface_c
+        flow_w += area[:, part] @ some.flow_w_m2
+        temperature += area[:, part] @ some.surface_c
     return PartTotals(total[:, 0], temperature / np.where(total > 0.0, total, 1.0), flow_w)
+
+
+def chunks(count: int, draws: Draws) -> Iterator[slice]:
+    """Yield slices that divide `count` groups so that draws of a slice have about `CHUNK` values."""
+    step = max(1, CHUNK // draws.count)
+    yield from (slice(start, start + step) for start in range(0, count, step))
 
 
 def triangle_exchange(
@@ -94,7 +105,7 @@ def triangle_exchange(
     """
     steps = (-HALF_STEP_K, 0.0, HALF_STEP_K)
     low, mean, high = (exchange(conditions, groups, draws, step) for step in steps)
-    off = (surface.reading_c - groups.reading_c[groups.of_triangle]) / (2.0 * HALF_STEP_K)
+    off = groups.off_k / (2.0 * HALF_STEP_K)
     temperature, flow = (
         np.where(surface.counted, at[groups.of_triangle, 0] + off * (above - below)[groups.of_triangle, 0], np.nan)
         for below, at, above in zip(low, mean, high)
@@ -128,7 +139,6 @@ def film_flow_w_m2(
     `surface_k`, `around_k4` (see `radiant_k4`) and `emissivity` have shape (g, k), `normals` has shape (g, 3).
     """
     model, factor = conditions.film.model, draws["film factor"]
-    around_k = np.sqrt(np.sqrt(around_k4))
     inside = conditions.side == "inside"
     air_k = celsius_to_kelvin(draws["inside air" if inside else "outside air"])
     if model == "albatici-tonelli":
@@ -136,23 +146,38 @@ def film_flow_w_m2(
     if model == "dallo":
         return dallo_w_m2(draws["wind"], surface_k, air_k, factor)
     if model == "madding":
-        return madding_w_m2(emissivity, surface_k, around_k, air_k, factor)
+        return madding_w_m2(emissivity, surface_k, np.sqrt(np.sqrt(around_k4)), air_k, factor)
     outward = -1.0 if inside else 1.0
     combined = model == "iso-6946-combined"
     if model == "given":
         coefficient = draws["film coefficient"]
-    elif inside:
-        name = "iso-6946-combined" if combined else "iso-6946-convection"
+    elif inside and combined:
         here = Places(np.zeros_like(normals), normals, up)
-        coefficient = np.asarray(inside_coefficient(name).function(here, 0.0))[:, None]
+        coefficient = np.asarray(inside_coefficient("iso-6946-combined").function(here, 0.0))[:, None]
     elif combined:
         coefficient = outside_coefficient("iso-6946-combined")
     else:
-        coefficient = 4.0 + 4.0 * draws["wind"]
+        coefficient = _convection_w_m2k(conditions, draws, surface_k - air_k, (normals @ np.array(up))[:, None])
     flow = outward * factor * coefficient * (surface_k - air_k)
     if not combined:
-        flow = flow + outward * radiation_w_m2(emissivity, surface_k, around_k)
+        flow = flow + outward * net_radiation_w_m2(emissivity, surface_k, around_k4)
     return flow
+
+
+def _convection_w_m2k(conditions: Conditions, draws: Draws, warmer_k: FloatArray, upward: FloatArray) -> FloatArray:
+    """Return the coefficient of convection by the formula of each draw, shape (g, k); draws without one take the mean.
+
+    `warmer_k` is surface minus air, shape (g, k), `upward` the upward part of normals, shape (g, 1).
+    """
+    formulas, model = CONVECTION[conditions.side], conditions.film.model
+    drawn = draws.values.get(FORMULA, np.full(draws.count, -1.0))
+    shares = conditions.film_shares if model == BALANCE else [float(name == model) for name in formulas]
+    wind, found = draws.values.get("wind", np.zeros(draws.count)), np.zeros(warmer_k.shape)
+    for number, (one, share) in enumerate(zip(formulas.values(), shares)):
+        for which, part in ((drawn == number, 1.0), (drawn < 0.0, share)):
+            if part > 0.0 and which.any():
+                found[:, which] += part * one.w_m2k(wind[which], warmer_k[:, which], upward)
+    return found
 
 
 def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], ...]:
@@ -162,7 +187,7 @@ def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], 
     others: list[tuple[FilmModel, Conditions]] = [
         (model, replace(conditions, film=Film(model, own.factor)))
         for model in FILM_MODELS[conditions.side]
-        if model not in (own.model, "given") and not (windless and model in WINDY)
+        if model not in (own.model, "given") and (not windless or model in WINDLESS)
     ]
     return ((own.model, conditions), *others)
 

@@ -5,13 +5,15 @@ unless the name ends in `_c`; arguments broadcast."""
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4
+from thermoxels_ns.heat.scene_fields import INSIDE_CONVECTION_W_M2K
 from thermoxels_ns.heat.sky import ground_view, sky_view
 
 Values: TypeAlias = Any  # A number or an array
@@ -26,7 +28,12 @@ def fourth_power(values: Values) -> Values:
 
 def radiation_w_m2(emissivity: Values, surface_k: Values, surroundings_k: Values) -> Values:
     """Return the net radiation that leaves a surface, eps sigma (Ts^4 - Trefl^4) (Fokaides and Kalogirou 2011)."""
-    return emissivity * STEFAN_BOLTZMANN_W_M2K4 * (fourth_power(surface_k) - fourth_power(surroundings_k))
+    return net_radiation_w_m2(emissivity, surface_k, fourth_power(surroundings_k))
+
+
+def net_radiation_w_m2(emissivity: Values, surface_k: Values, surroundings_k4: Values) -> Values:
+    """Return `radiation_w_m2` from the fourth power of the temperature of the surroundings, [K^4]."""
+    return emissivity * STEFAN_BOLTZMANN_W_M2K4 * (fourth_power(surface_k) - surroundings_k4)
 
 
 def albatici_tonelli_w_m2(
@@ -43,6 +50,76 @@ def albatici_tonelli_w_m2(
 def dallo_w_m2(wind_m_s: Values, surface_k: Values, air_k: Values, factor: Values = 1.0) -> Values:
     """Return `factor` (5.8 + 3.8054 v) (Ts - Te), the flow at an outer surface (Dall'O, Sarto and Panza 2013)."""
     return factor * (5.8 + WIND_W_S_M3K * wind_m_s) * (surface_k - air_k)
+
+
+def natural_w_m2k(warmer_k: Values, upward: Values) -> Values:
+    """Return the coefficient of natural convection, [W/(m2 K)], of a surface `warmer_k` warmer than the air.
+
+    9.482 |dT|^(1/3) / (7.238 - |u|) where warm air rises from the surface or cold air sinks from it, and 1.810
+    |dT|^(1/3) / (1.382 + |u|) elsewhere; both are 1.31 |dT|^(1/3) for walls (Walton 1983, TARP; EnergyPlus Engineering
+    Reference, "Outside Convection"). `upward`, u, is the upward part of the outward unit normal.
+
+    >>> np.round(natural_w_m2k(8.0, np.array([0.0, 1.0, -1.0])), 2).tolist()
+    [2.62, 3.04, 1.52]
+    """
+    free, held = 9.482 / (7.238 - np.abs(upward)), 1.810 / (1.382 + np.abs(upward))
+    return np.cbrt(np.abs(warmer_k)) * np.where(np.asarray(warmer_k) * upward > 0.0, free, held)
+
+
+class Convection(NamedTuple):
+    """A published formula for the coefficient of convection, without radiation."""
+
+    weight: float  # How often it is drawn beside the others, if the conditions name no weights
+    w_m2k: Callable[[Values, Values, Values], Values]
+    """The coefficient, from the wind beside the surface [m/s], how much warmer than the air the surface is [K], and the
+    upward part of its outward unit normal."""
+
+
+def _mowitt(factor: float, power: float) -> Convection:
+    return Convection(0.5, lambda v, dt, up: np.hypot(0.84 * np.cbrt(np.abs(dt)), factor * np.power(v, power)))
+
+
+def _mixed(factor: float, power: float) -> Convection:
+    return Convection(0.5, lambda v, dt, up: natural_w_m2k(dt, up) + factor * np.power(v, power))
+
+
+_SPARROW = 2.537 * 1.67 * 0.5**0.5  # For walls of brick with a perimeter over area of 0.5 per metre
+_HCI, _SLANT = INSIDE_CONVECTION_W_M2K, 0.5 + 1e-9
+
+CONVECTION: Mapping[str, Mapping[str, Convection]] = {
+    "outside": {
+        "iso-6946": Convection(1.0, lambda v, dt, up: 4.0 + 4.0 * v),
+        "jurges": Convection(0.5, lambda v, dt, up: 5.8 + 3.94 * v),
+        "mcadams": Convection(0.5, lambda v, dt, up: 5.7 + 3.8 * v),
+        "watmuff": Convection(1.0, lambda v, dt, up: 2.8 + 3.0 * v),
+        "mowitt-windward": _mowitt(3.26, 0.89),
+        "mowitt-leeward": _mowitt(3.55, 0.617),
+        "tarp-windward": _mixed(_SPARROW, 0.5),
+        "tarp-leeward": _mixed(0.5 * _SPARROW, 0.5),
+        "emmel-windward": _mixed(5.15, 0.81),
+        "emmel-leeward": _mixed(3.54, 0.76),
+    },
+    "inside": {
+        "iso-6946": Convection(
+            1.0,
+            lambda v, dt, up: np.select([up < -_SLANT, up > _SLANT], [_HCI["up"], _HCI["down"]], _HCI["horizontal"]),
+        ),
+        "walton": Convection(1.0, lambda v, dt, up: natural_w_m2k(dt, up)),
+        "khalifa": Convection(1.0, lambda v, dt, up: 2.30 * np.power(np.abs(dt), 0.24)),
+    },
+}
+"""Formulas of the full balance by the side of the surface; radiation to what the surface sees is added to each.
+
+Outside: iso-6946, 4 + 4 v (ISO 6946, annex C); jurges, 5.8 + 3.94 v (Nusselt and Juerges 1922) and mcadams, 5.7 + 3.8 v
+(McAdams 1954), of the same wind tunnel and so of one weight; watmuff, 2.8 + 3 v, these without the radiation and free
+convection in them (Watmuff, Charters and Proctor 1977); mowitt, sqrt((0.84 dT^(1/3))^2 + (3.26 v^0.89)^2) windward and
+with 3.55 v^0.617 leeward, measured on windows (Yazdanian and Klems 1994); tarp, `natural_w_m2k` + 2.537 Rf sqrt(v P/A),
+half of the wind's part leeward (Sparrow and others 1979, Walton 1983), Rf 1.67 for brick, P/A 0.5 per metre; emmel,
+`natural_w_m2k` + 5.15 v^0.81 windward, 3.54 v^0.76 leeward (Emmel, Abadie and Mendes 2007, walls; sum as in
+EnergyPlus). Windward and leeward are each drawn half as often, as surveys rarely know. ISO, Juerges, McAdams, Watmuff
+mean the wind beside the surface, the others the wind that comes up to the building.
+Inside: iso-6946, hci by the direction of the heat flow; walton, `natural_w_m2k`; khalifa, 2.30 dT^0.24, walls without a
+heater (Khalifa and Marshall 1990)."""
 
 
 def madding_w_m2(

@@ -9,12 +9,21 @@ from typing import Literal
 import numpy as np
 
 from thermoxels_ns.audit.calibration import Calibration, calibrated
-from thermoxels_ns.audit.conditions import Conditions
+from thermoxels_ns.audit.conditions import BALANCE, SIMPLE, Conditions
 from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
-from thermoxels_ns.audit.draws import CONFIDENCE, Draws, Interval, draw, interval_of, one_at_a_time, uncertain
+from thermoxels_ns.audit.draws import (
+    ENDS,
+    Draws,
+    Interval,
+    causes,
+    draw,
+    interval_of,
+    uncertain,
+    width_of,
+)
 from thermoxels_ns.audit.exchange import (
-    CHUNK,
     HALF_STEP_K,
+    chunks,
     exchange,
     other_models,
     part_totals,
@@ -24,7 +33,9 @@ from thermoxels_ns.audit.exchange import (
 )
 from thermoxels_ns.audit.heat_flow import temperature_factor
 from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
+from thermoxels_ns.audit.weather import read_weather, remembered_share
 from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.fem.selection import matching_names
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -34,6 +45,7 @@ SEVERE_SHARE, MODERATE_SHARE = 0.05, 0.01
 F_RSI_M2K_W = (0.13, 0.25)
 """Inside surface resistances Rsi of the temperature factors, [m2 K / W]; ISO 13788 judges mould by the second."""
 _LEAST_FLOW_W_M2 = 1e-9
+_FEW = 2000  # Number of draws that tell by how much a cause widens an interval, and of those of single triangles
 _OF_A_TRIANGLE, _OF_THE_YEAR = 10**6, 10**6 + 1  # Arguments `number` of `Draws.local`, larger than any part's number
 
 LEAST_DIFFERENCE_K, MOST_WIND_M_S, LEAST_HOURS_WITHOUT_SUN, LEAST_HOURS_DRY = 10.0, 5.0, 2.0, 24.0
@@ -61,6 +73,7 @@ class Limit:
     at_most: bool  # True: `found` must not exceed the limit; False: `found` must not fall below the limit
     found: Interval
     verdict: Verdict
+    missed_share: float  # Chance that the limit is not kept, 0 to 1: the share of draws that do not keep it
 
 
 @dataclass(frozen=True)
@@ -74,6 +87,9 @@ class Element:
     loss_w: Interval  # Heat flow from inside to outside, [W]
     u_w_m2k: Interval
     u_by_model: Mapping[str, float]  # U-value by each film model, from the stated values, [W/(m2 K)]
+    width_shares: Mapping[str, float]
+    """By cause, largest first, the share by which the interval of the U-value (of the loss, where no U-value is known)
+    would be narrower if the cause were known exactly, 0 to 1; shares need not add up to 1."""
     unsupported_share: float  # Share of the area whose position no photograph supports, 0 to 1
 
 
@@ -134,7 +150,11 @@ class Audit:
     year: YearResult | None
     calibration: Calibration | None
     f_rsi: tuple[Interval, ...]  # Temperature factors of the coldest square decimetre, see `Defect.f_rsi`
-    budget: Mapping[str, float]  # By quantity, how much its range changes the heat loss of `whole`, [W]
+    budget: Mapping[str, float]
+    """By cause, largest first, by how much the interval of `whole.loss_w` would be narrower if it were exact, [W]."""
+    draws: int  # Number of draws behind each interval
+    failing_models: tuple[str, ...]  # Of `SIMPLE`, those by which `whole` has a U-value of 0 or less, not the balance
+    remembered: Interval | None  # `remembered_share` over the stated ranges; None if no time constant is stated
     not_counted_m2: Mapping[str, float]  # Area of triangles that do not count, by the texts of `WHY_NOT`
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
@@ -167,18 +187,17 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     work = _Parts(conditions, surface, groups, draws, parts)
 
     # Each patch has a reading error of its own; a storey has the errors of its patches, by the shares that lie in it.
-    own = np.stack([work.slope_w_k[n] * work.own_error_k(n) for n in range(len(patches))])
+    rows = [*range(len(patches) + len(storeys)), len(parts) - 1]
+    of_patches = np.stack([_shares(surface, parts[row], parts[: len(patches)]) for row in rows])
+    own = of_patches @ work.own_w(draws, len(patches))
+    budget, shares = work.narrower(rows, of_patches)
     observed = np.isin(patch, patches)
+    chosen = [(names[n], patch == n) for n in patches] + [(storey_names[n], (storey == n) & observed) for n in storeys]
     elements = [
-        work.element(names[number], row, np.flatnonzero(patch == number), own[row])
-        for row, number in enumerate(patches)
+        work.element(name, row, np.flatnonzero(every), own[n], shares[n])
+        for n, (row, (name, every)) in enumerate(zip(rows, [*chosen, ("all that was observed", observed)]))
     ]
-    of_storeys = []
-    for row, number in enumerate(storeys, start=len(patches)):
-        every = np.flatnonzero((storey == number) & observed)
-        shares = _shares(surface, parts[row], parts[: len(patches)])
-        of_storeys.append(work.element(storey_names[number], row, every, shares @ own))
-    whole = work.element("all that was observed", len(parts) - 1, np.flatnonzero(observed), own.sum(axis=0))
+    whole, failing = elements[-1], _failing_models(conditions, elements)
 
     first = len(patches) + len(storeys)
     defects = [
@@ -189,23 +208,29 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     ]
     order = sorted(range(len(found)), key=lambda n: (bool(defects[n].not_counted), -defects[n].extra_w.value))
     found, defects = [found[n] for n in order], [defects[n] for n in order]
-    last, check = len(parts) - 2, check_survey(conditions)
-    f_rsi = work.temperature_factors(last, work.own_error_k(last))
+    last, check, (remembered, told) = len(parts) - 2, check_survey(conditions), _remembered(conditions)
+    factors = work.temperature_factors(last, work.own_error_k(last))
+    loss = work.totals.flow_w[-1] + own[-1]
+    drawn = [(one.name, work.u(row, own[row])) for row, one in enumerate(elements[: len(patches)])]
+    psi = [(one, work.coefficients[first + 3 * n]) for n, one in zip(order, defects)]
     left = {why: float(surface.area_m2[surface.why_not == n].sum()) for n, why in enumerate(WHY_NOT.values())}
     return Audit(
         conditions=conditions,
         surface=surface,
-        check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, draws))),
-        patches=tuple(elements),
-        storeys=tuple(of_storeys),
+        check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, draws), *told)),
+        patches=tuple(elements[: len(patches)]),
+        storeys=tuple(elements[len(patches) : -1]),
         whole=whole,
         defects=tuple(defects),
         found=tuple(found),
-        limits=_limits(conditions, elements, defects, whole, f_rsi),
-        year=_year(conditions, draws, (work.totals.flow_w[-1] + own.sum(axis=0)) / draws.difference_k),
+        limits=_limits(conditions, drawn, psi, loss, factors),
+        year=_year(conditions, draws, loss / draws.difference_k),
         calibration=calibrated(conditions, surface, groups, draws),
-        f_rsi=f_rsi,
-        budget=work.budget(own),
+        f_rsi=tuple(interval_of(one) for one in factors),
+        budget=budget,
+        draws=draws.count - 1,
+        failing_models=failing,
+        remembered=remembered,
         not_counted_m2={why: area for why, area in left.items() if area > 0.0},
         triangle_surface_c=surface_c,
         triangle_flow_w_m2=flow,
@@ -219,6 +244,10 @@ def _storey_of(surface: AuditedSurface, conditions: Conditions) -> IntArray:
     order = np.argsort(begins, kind="stable")
     place = np.searchsorted(begins[order], surface.height_m + 1e-9, side="right")
     return np.concatenate([[-1], order])[place].astype(np.int64)
+
+
+def _largest_first(amounts: Mapping[str, float]) -> dict[str, float]:
+    return dict(sorted(amounts.items(), key=lambda item: -item[1]))
 
 
 def _shares(surface: AuditedSurface, part: IntArray, patches: Sequence[IntArray]) -> FloatArray:
@@ -247,16 +276,28 @@ class _Parts:
             for step in (-HALF_STEP_K, HALF_STEP_K)
         )
         self.slope_w_k = (high - low) / (2.0 * HALF_STEP_K)  # Change of flow per kelvin of reading, shape (parts,)
+        self.coefficients = dict[int, FloatArray]()  # By the number of its zone: draws of a `Defect.coefficient`
         self.u_by_model = dict[str, FloatArray]()  # U-values by each film model from the stated values, shape (parts,)
         for model, chosen in other_models(conditions):
             flow_w = part_totals(chosen, groups, draws.stated, self.rows).flow_w[:, 0]
             self.u_by_model[model] = flow_w / draws.difference_k[0] / np.maximum(self.totals.area_m2, 1e-12)
 
+    def own_w(self, draws: Draws, patches: int) -> FloatArray:
+        """Draw by how much the flow of each of the first parts, `patches`, is off on its own, (patches, k), [W]."""
+        off = self.conditions.camera.repeatability.off_by
+        return np.stack([self.slope_w_k[n] * draws.local(off, n) for n in range(patches)])
+
+    def u(self, row: int, error_w: FloatArray) -> FloatArray:
+        """Return draws of the U-value of part `row`, (k,), [W/(m2 K)]; `error_w`: see `element`."""
+        return (self.totals.flow_w[row] + error_w) / self.totals.area_m2[row] / self.draws.difference_k
+
     def own_error_k(self, number: int) -> FloatArray:
         """Draw the reading error that part `number` does not share with other parts, shape (k,), [K]."""
         return self.draws.local(self.conditions.camera.repeatability.off_by, number)
 
-    def element(self, name: str, row: int, every: IntArray, error_w: FloatArray) -> Element:
+    def element(
+        self, name: str, row: int, every: IntArray, error_w: FloatArray, width_shares: Mapping[str, float]
+    ) -> Element:
         """Return the results of part `row`; `every` are its triangles, `error_w` draws of its own error, (k,), [W]."""
         surface, counted, area = self.surface, self.parts[row], float(self.totals.area_m2[row])
         uncut = every[surface.why_not[every] != list(WHY_NOT).index("cut")]
@@ -267,36 +308,52 @@ class _Parts:
             unobserved_m2=max(float(surface.area_m2[uncut].sum()) - area, 0.0),
             surface_c=interval_of(self.totals.surface_c[row]),
             loss_w=interval_of(flow_w),
-            u_w_m2k=interval_of(flow_w / area / self.draws.difference_k),
+            u_w_m2k=interval_of(self.u(row, error_w)),
             u_by_model={model: float(u[row]) for model, u in self.u_by_model.items()},
+            width_shares=width_shares,
             unsupported_share=float(surface.area_m2[counted] @ surface.unsupported[counted]) / area,
         )
 
     def triangle_u(self) -> FloatArray:
         """Return the U-value of each triangle and both ends of its interval; see `Audit.triangle_u`."""
-        off = self.own_error_k(_OF_A_TRIANGLE)
-        ends, found = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE), []
-        for start in range(0, len(self.groups.reading_c), CHUNK):
-            some = self.groups.some(slice(start, start + CHUNK))
-            flow = exchange(self.conditions, some, self.draws).flow_w_m2
-            warmer = exchange(self.conditions, some, self.draws.stated, HALF_STEP_K).flow_w_m2
-            u = (flow + (warmer - flow[:, :1]) / HALF_STEP_K * off) / self.draws.difference_k
-            found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ends, axis=1).T], axis=1))
-        of_group = np.concatenate(found)
-        return np.where(self.surface.counted[:, None], of_group[self.groups.of_triangle], np.nan)
+        few, found, slopes = self.draws.first(_FEW), [], []
+        off = few.local(self.conditions.camera.repeatability.off_by, _OF_A_TRIANGLE)
+        for part in chunks(len(self.groups.reading_c), few):
+            some = self.groups.some(part)
+            flow = exchange(self.conditions, some, few).flow_w_m2
+            warmer = exchange(self.conditions, some, few.stated, HALF_STEP_K).flow_w_m2
+            slopes.append((warmer - flow[:, :1]) / HALF_STEP_K)
+            u = (flow + slopes[-1] * off) / few.difference_k
+            found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ENDS, axis=1).T], axis=1))
+        of_group, slope = (np.concatenate(one)[self.groups.of_triangle] for one in (found, slopes))
+        u = of_group + slope * self.groups.off_k[:, None] / few.difference_k[0]
+        return np.where(self.surface.counted[:, None], u, np.nan)
 
-    def budget(self, own: FloatArray) -> dict[str, float]:
-        """Return `Audit.budget`, largest first; `own` are draws of the patches' own errors, shape (patches, k), [W]."""
-        rows, found = self.groups.rows([np.flatnonzero(self.surface.counted)], self.surface.area_m2), {}
-        for name, stated in one_at_a_time(self.conditions):
-            draws = with_references(self.surface, self.conditions, stated)
-            found[name] = float(np.ptp(part_totals(self.conditions, self.groups, draws, rows).flow_w[0][1:]))
-        if self.conditions.camera.repeatability.off_by > 0.0:
-            found["camera repeatability"] = float(np.ptp(own.sum(axis=0)))
-        return dict(sorted(found.items(), key=lambda item: -item[1]))
+    def narrower(self, rows: list[int], of_patches: FloatArray) -> tuple[dict[str, float], list[dict[str, float]]]:
+        """Return `Audit.budget` and the `Element.width_shares` of parts, the last of which is all that was observed.
 
-    def temperature_factors(self, part: int, off_k: FloatArray) -> tuple[Interval, ...]:
-        """Return the temperature factors of a part for `F_RSI_M2K_W`; empty if seen from outside.
+        Each cause is frozen in turn. `of_patches`, (n, patches), is the share of each patch's own error in each part.
+        """
+
+        def widths(draws: Draws) -> tuple[FloatArray, FloatArray]:
+            draws = with_references(self.surface, self.conditions, draws)
+            flow_w = part_totals(self.conditions, self.groups, draws, few_rows).flow_w
+            flow_w = flow_w + of_patches @ self.own_w(draws, of_patches.shape[1])
+            u = flow_w / draws.difference_k if self.conditions.outside_known else flow_w
+            return width_of(flow_w), width_of(u)
+
+        few_rows = self.rows[[*rows, *[len(self.parts) + row for row in rows]]]
+        few, budget, found = self.draws.first(_FEW), dict[str, float](), [dict[str, float]() for _ in rows]
+        every_w, every_u = widths(few)
+        for cause in causes(self.conditions):
+            flow_w, u = widths(few.frozen(cause))
+            budget[cause] = max(float(every_w[-1] - flow_w[-1]), 0.0)
+            for one, share in zip(found, np.maximum(1.0 - u / np.maximum(every_u, 1e-300), 0.0).tolist()):
+                one[cause] = share
+        return _largest_first(budget), [_largest_first(one) for one in found]
+
+    def temperature_factors(self, part: int, off_k: FloatArray) -> tuple[FloatArray, ...]:
+        """Return draws of the temperature factors of a part for `F_RSI_M2K_W`, (k,); empty if seen from outside.
 
         `off_k` are draws of the part's own reading error, shape (k,), [K].
         """
@@ -305,7 +362,7 @@ class _Parts:
         flow = self.totals.flow_w[part] + self.slope_w_k[part] * off_k
         flow = np.maximum(flow / max(self.totals.area_m2[part], 1e-12), _LEAST_FLOW_W_M2)
         above = self.totals.surface_c[part] + off_k - self.draws["outside air"]
-        return tuple(interval_of(np.asarray(temperature_factor(above / flow, one))) for one in F_RSI_M2K_W)
+        return tuple(np.asarray(temperature_factor(above / flow, one)) for one in F_RSI_M2K_W)
 
     def defect(self, one: FoundDefect, zone: int, off_k: FloatArray, storey: str, whole_w: float) -> Defect:
         """Return the results of a defect. Part `zone` is its zone, `zone + 1` its reference, `zone + 2` its spot.
@@ -319,7 +376,8 @@ class _Parts:
         flow_w = totals.flow_w[zone] + self.slope_w_k[zone] * off_k
         extra = flow_w - totals.flow_w[calm] / max(totals.area_m2[calm], 1e-12) * one.base_area_m2
         per_kelvin = extra / self.draws.difference_k / (one.length_m if one.kind == "line" else 1.0)
-        extra_w, f_rsi = interval_of(extra), self.temperature_factors(spot, off_k)
+        self.coefficients[zone] = per_kelvin
+        extra_w, f_rsi = interval_of(extra), tuple(map(interval_of, self.temperature_factors(spot, off_k)))
         air_c = self.draws["inside air" if self.conditions.side == "inside" else "outside air"]
         around_c = float(totals.surface_c[calm, 0])
         area, spot_c = surface.area_m2[one.core], interval_of(totals.surface_c[spot] + off_k)
@@ -378,29 +436,49 @@ def verdict(found: Interval, limit: float, at_most: bool = True) -> Verdict:
 
 def _limits(
     conditions: Conditions,
-    patches: Sequence[Element],
-    defects: Sequence[Defect],
-    whole: Element,
-    f_rsi: tuple[Interval, ...],
+    patches: Sequence[tuple[str, FloatArray]],
+    defects: Sequence[tuple[Defect, FloatArray]],
+    loss_w: FloatArray,
+    f_rsi: tuple[FloatArray, ...],
 ) -> tuple[Limit, ...]:
+    """Judge draws, (k,), of U-values of patches by name, coefficients of defects, heat loss and temperature factors."""
     limits, found = conditions.limits, list[Limit]()
 
-    def judge(name: str, limit: Measured, unit: str, value: Interval, at_most: bool = True) -> None:
-        found.append(Limit(name, limit.value, unit, at_most, value, verdict(value, limit.value, at_most)))
+    def judge(name: str, limit: Measured, unit: str, drawn: FloatArray, at_most: bool = True) -> None:
+        value, edge = interval_of(drawn), limit.value
+        missed = float(np.mean(drawn[1:] > edge if at_most else drawn[1:] < edge))
+        missed = missed if np.isfinite(value.value) else np.nan
+        found.append(Limit(name, edge, unit, at_most, value, verdict(value, edge, at_most), missed))
 
-    for patch in patches:
-        chosen = [limit for pattern, limit in limits.u.items() if matching_names([patch.name], pattern)]
+    for name, u in patches:
+        chosen = [limit for pattern, limit in limits.u.items() if matching_names([name], pattern)]
         if chosen:
-            judge(f"U-value of {patch.name}", chosen[-1], "W/(m2 K)", patch.u_w_m2k)
-    lines = [one for one in defects if one.kind == "line" and not one.not_counted]
+            judge(f"U-value of {name}", chosen[-1], "W/(m2 K)", u)
+    lines = [(one, drawn) for one, drawn in defects if one.kind == "line" and not one.not_counted]
     if limits.psi is not None and lines:
-        worst = max(lines, key=lambda one: one.coefficient.value)
-        judge(f"psi of the worst linear thermal bridge, in {worst.patch}", limits.psi, "W/(m K)", worst.coefficient)
+        worst, drawn = max(lines, key=lambda item: item[0].coefficient.value)
+        judge(f"psi of the worst linear thermal bridge, in {worst.patch}", limits.psi, "W/(m K)", drawn)
     if limits.f_rsi is not None and f_rsi:
         judge("lowest temperature factor for Rsi = 0.25", limits.f_rsi, "", f_rsi[-1], at_most=False)
     if limits.loss is not None:
-        judge("heat loss of what was observed", limits.loss, "W", whole.loss_w)
+        judge("heat loss of what was observed", limits.loss, "W", loss_w)
     return tuple(found)
+
+
+def _failing_models(conditions: Conditions, elements: Sequence[Element]) -> tuple[str, ...]:
+    """Return `Audit.failing_models`; raises `AuditError` if the chosen model fails for one of `elements`.
+
+    The last element is all that was observed. Such nights: Zhang, Lucchi and Garzulino 2026, after EN ISO 6781-1.
+    """
+    chosen, failing = conditions.film.model, tuple[str, ...]()
+    for one in elements:
+        u = {name: one.u_by_model.get(name, np.nan) for name in (*SIMPLE[conditions.side], BALANCE)}
+        failing = tuple(name for name in SIMPLE[conditions.side] if u[name] <= 0.0 < u[BALANCE])
+        if chosen in failing:
+            expected = f"one that knows what the surface sees, which is not as warm as the air {conditions.side}"
+            got = f"{chosen}, by which {one.name} has a U-value of {u[chosen]:.2f}; by the balance, {u[BALANCE]:.2f}"
+            raise AuditError("film: model", expected=expected, got=got, remedy=f"Write model: {BALANCE}.")
+    return failing
 
 
 def _year(conditions: Conditions, draws: Draws, coupling_w_k: FloatArray) -> YearResult | None:
@@ -447,6 +525,7 @@ def check_survey(conditions: Conditions) -> SurveyCheck:
 def _doubts(conditions: Conditions) -> tuple[str, ...]:
     found, difference = [], conditions.difference_k
     not_meant = _MEANT_AS_EXACT if conditions.outside_known else (*_MEANT_AS_EXACT, "outside air")
+    not_meant += ("film factor",) if conditions.film.model == BALANCE else ()
     exact = [name for name, what in uncertain(conditions).items() if not what.off_by and name not in not_meant]
     if exact:
         found.append(f"Taken as exact, because nothing says how far they may be off: {', '.join(exact)}.")
@@ -476,6 +555,39 @@ def _doubts(conditions: Conditions) -> tuple[str, ...]:
     if conditions.side == "inside" and conditions.outside_known:
         found.append("U-values hold where the open air is behind the surface; the mesh does not say where that is.")
     return tuple(found)
+
+
+def _remembered(conditions: Conditions) -> tuple[Interval | None, tuple[str, ...]]:
+    """Return `Audit.remembered` with sentences on it; raises `AuditError` if the weather file is unfit."""
+    weather = conditions.weather
+    if weather is None or weather.time_constant is None:
+        return None, ()
+    series, constant, taken = read_weather(weather.file), weather.time_constant, weather.absorptance
+    if "outside_c" not in series or not conditions.outside_known:
+        remedy = "Add the column outside_c to the weather file, and outside: {air: weather +- 0.5 C}."
+        raise AuditError("weather: time_constant", expected="the air outside", got="none", remedy=remedy)
+
+    def share(hours: float, absorptance: float, *earlier_c: float) -> float:
+        before = {name: np.append([values[0]] * len(earlier_c), values) for name, values in series.items()}
+        for air_c in earlier_c:  # the air before the file begins
+            before["hours"][0], before["outside_c"][0] = series["hours"][0] - 0.1, air_c
+        return remembered_share(before, conditions.difference_k, hours, absorptance, conditions.side == "inside")
+
+    value, air = share(constant.value, taken.value), series["outside_c"]
+    ends = [share(hours, part) for hours in (constant.low, constant.high) for part in (taken.low, taken.high)]
+    open_share = max(abs(share(constant.value, taken.value, float(one)) - value) for one in (air.min(), air.max()))
+    low, high = min(value, *ends), max(value, *ends)
+    sentences = [
+        f"A uniform wall that forgets within {constant.value:g} h stores heat: at the survey the heat flow through its "
+        f"surface is {100.0 * low:+.0f} to {100.0 * high:+.0f} % off the steady one. U-values of such walls are off by "
+        "as much, which their intervals do not hold."
+    ]
+    if open_share >= 0.01:
+        sentences.append(
+            f"The weather file begins {-series['hours'][0]:g} h before the survey, too late for such a wall: what was "
+            f"before may change that by {100.0 * open_share:.0f} %."
+        )
+    return Interval(value, low, high), tuple(sentences)
 
 
 def _missing(conditions: Conditions) -> tuple[str, ...]:

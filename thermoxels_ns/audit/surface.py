@@ -14,7 +14,7 @@ from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
-_STEP_K, _STEP_COSINE = 0.05, 0.05
+_STEP_K, _STEP_COSINE = 0.2, 0.05
 """Widths of the bins within which triangles are alike: of readings, [K], and of the cosine between normal and up."""
 
 SPOT_M2 = 0.01  # Area over which the coldest or hottest spot is averaged
@@ -74,19 +74,27 @@ class AlikeTriangles:
     normal: FloatArray  # Unit normal with the group's mean inclination and an arbitrary azimuth, shape (g, 3)
     surface_entry: IntArray  # Place in `Conditions.surfaces` of the group's emissivity, shape (g,)
     of_triangle: IntArray  # Group of each boundary triangle, shape (f,); -1 where a triangle does not count
+    off_k: FloatArray  # Reading of each triangle minus that of its group, shape (f,), [K]; 0 where it does not count
     up: tuple[float, float, float]  # Unit vector that points up
 
     def some(self, part: slice) -> AlikeTriangles:
-        """Return the groups in the slice `part`, with an empty `of_triangle`."""
+        """Return the groups in the slice `part`, without triangles."""
         none = np.zeros(0, dtype=np.int64)
-        return AlikeTriangles(self.reading_c[part], self.normal[part], self.surface_entry[part], none, self.up)
+        return AlikeTriangles(
+            self.reading_c[part], self.normal[part], self.surface_entry[part], none, none.astype(np.float64), self.up
+        )
 
     def rows(self, parts: list[IntArray], area_m2: FloatArray) -> sparse.csr_array:
-        """Return each group's area in each of `parts`, indices of triangles that count; shape (parts, g), [m2]."""
+        """Return areas of `parts`, indices of triangles that count: shape (2 parts, g).
+
+        The first rows are each group's area in each part, [m2]; the second ones the same areas, each triangle's times
+        its `off_k`, [m2 K]: what is taken to change linearly with readings within a group.
+        """
         row = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         which = np.concatenate([*parts, np.zeros(0, dtype=np.int64)]).astype(np.int64)
-        shape = (len(parts), len(self.reading_c))
-        return sparse.coo_array((area_m2[which], (row, self.of_triangle[which])), shape=shape).tocsr()
+        area, place = area_m2[which], self.of_triangle[which]
+        values, at = np.append(area, area * self.off_k[which]), (np.append(row, row + len(parts)), np.tile(place, 2))
+        return sparse.coo_array((values, at), shape=(2 * len(parts), len(self.reading_c))).tocsr()
 
 
 def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float]) -> AuditedSurface:
@@ -159,11 +167,15 @@ def alike_triangles(surface: AuditedSurface) -> AlikeTriangles:
     across /= np.linalg.norm(across)
     of_triangle = np.full(len(surface.counted), -1)
     of_triangle[which] = group
+    mean_c = np.bincount(group, area * reading) / total
+    off_k = np.zeros(len(surface.counted))
+    off_k[which] = reading - mean_c[group]
     return AlikeTriangles(
-        reading_c=np.bincount(group, area * reading) / total,
+        reading_c=mean_c,
         normal=mean_up[:, None] * up + np.sqrt(1.0 - mean_up**2)[:, None] * across,
         surface_entry=surface.surface_entry[which[first]],
         of_triangle=of_triangle,
+        off_k=off_k,
         up=surface.selection.up,
     )
 

@@ -125,7 +125,8 @@ def answers_of(options: Audit, found: Found) -> dict[str, Any]:
         "forbidden": found.check.forbidden,
         "doubts": found.check.doubts,
         "missing_for_en_13187": found.check.missing,
-        "loss_moved_by_w": found.budget,
+        "loss_narrower_by_w": found.budget,
+        **{name: getattr(found, name) for name in ("draws", "failing_models", "remembered")},
     }
     return to_jsonable_python(told, inf_nan_mode="null")
 
