@@ -151,19 +151,23 @@ def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
         number = surface.selection.patch_names.index(one.name)
         on = every[surface.selection.facet_patch[every] == number]
         most[one.name] = most_u_w_m2k(surface, found.conditions, on)
-    limit = max(most.values())
-    most |= {one.name: limit for one in (*found.storeys, found.whole)}
+    most |= {one.name: max(most.values()) for one in (*found.storeys, found.whole)}
     inputs = " and ".join([name for name in found.budget if name != "camera repeatability"][:2])
     over = [one.name for one in found.patches if one.u_w_m2k.value > most[one.name]]
     ends = [one.name for one in found.patches if one.u_w_m2k.value <= most[one.name] < one.u_w_m2k.high]
-    than = f"more than the {limit:.1f} W/(m² K) that the films of air on both sides allow without a wall (ISO 6946)"
-    said = {
-        f"Impossible: {', '.join(over)} would have a U-value of {than}. What is stated clashes with the readings; look "
-        f"at {inputs} first.": over,
-        f"The U-value of {', '.join(ends)} has an interval that ends at {than}: the part above is impossible, and what "
-        f"is stated of {inputs} reaches too far.": ends,
-    }
-    return most, tuple(words for words, names in said.items() if names)
+
+    def than(names: list[str]) -> str:
+        allowed = " to ".join(dict.fromkeys(f"{end(most[name] for name in names):.1f}" for end in (min, max)))
+        return f"more than the {allowed} W/(m² K) that the films of air on both sides allow without a wall (ISO 6946)"
+
+    said = []
+    if over:
+        clash = f"What is stated clashes with the readings; look at {inputs} first."
+        said.append(f"Impossible: {', '.join(over)} would have a U-value of {than(over)}. {clash}")
+    if ends:
+        clash = f"the part above is impossible, and what is stated of {inputs} reaches too far."
+        said.append(f"The U-value of {', '.join(ends)} has an interval that ends at {than(ends)}: {clash}")
+    return most, tuple(said)
 
 
 def answers_of(options: Audit, found: Found) -> dict[str, Any]:

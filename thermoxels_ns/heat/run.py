@@ -241,7 +241,7 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
         warnings.append(
             f"The scene names air inside, but the body has no rooms: of the {area:.4g} m² that no photograph saw, next "
             "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
-            "and heat losses are those of that. Export again with --interior hollow, which keeps the inside empty, or "
+            "and heat losses are those of that. Export again with --interior hollow --wall-thickness 0.3, or "
             "name the inner surface with --patches."
         )
     return tuple(warnings)

@@ -344,7 +344,7 @@ def _without_units(name: str, content: Any) -> Any:
     for key, value in content.items():
         unit = next((unit for end, unit in _UNIT_OF_KEY.items() if key.endswith(end)), None)
         found[key] = value = _without_units(f"{name}: {key}", value)
-        if unit is not None and isinstance(value, str) and any(map(str.isdigit, value)):
+        if unit is not None and isinstance(value, str) and value.lstrip(" +-.,\N{MINUS SIGN}")[:1].isdigit():
             measured = read_measured(f"{name}: {key}", value, unit, bare=True)
             if measured.off_by:
                 remedy = f"Write {measured.value:g} {'' if unit == '1' else unit}".rstrip() + "."

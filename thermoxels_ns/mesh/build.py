@@ -182,10 +182,12 @@ def _tagged(
         centroids = snapshot.lattice.index_to_world(points_index[mesh.facets].mean(axis=1))
         seen = seen_facets(solid.cells, snapshot.views, snapshot.lattice, centroids, normal @ rotation)
     outside = seen
-    if solid.rooms is not None:  # what faces no room is outside, seen or not, as below the lowest floor
+    if solid.rooms is not None:
         beside = np.floor(points_index[mesh.facets].mean(axis=1) + 0.75 * normal @ rotation).astype(np.int64)
         beside = np.clip(beside, 0, np.array(solid.rooms.shape) - 1)
-        outside = seen | ~grow(solid.rooms, 1)[tuple(beside.T)]
+        inner = ~seen & grow(solid.rooms, 1)[tuple(beside.T)]
+        # In a building with rooms, what faces none is outside, seen or not, as below the lowest floor.
+        outside = ~inner if np.count_nonzero(inner) > 0.5 * np.count_nonzero(~seen) else seen
     patch, names, idle = apply_patches(
         options.rules,
         centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
