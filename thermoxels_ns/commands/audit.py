@@ -21,7 +21,7 @@ from thermoxels_ns.core.errors import AuditError
 
 if TYPE_CHECKING:
     from thermoxels_ns.audit.run import Audit as Found
-    from thermoxels_ns.reports.page import Picture, Report
+    from thermoxels_ns.reports.page import Picture
 
 ANSWERS, PAGE, SURFACE = "answers.json", "audit.html", "surface.vtp"
 """Files that an audit writes."""
@@ -190,15 +190,6 @@ def answers_of(options: Audit, found: Found) -> dict[str, Any]:
     return to_jsonable_python(told, inf_nan_mode="null")
 
 
-def report_of(options: Audit) -> Report:
-    """Return number and input files of the report that an audit's options give."""
-    from thermoxels_ns.reports.page import identify
-
-    assert options.mesh is not None and options.conditions is not None
-    boundary = options.mesh.with_name(f"{options.mesh.stem}-boundary.vtp")
-    return identify((options.mesh, boundary, options.conditions), options.up, options.least_bridge_w)
-
-
 def _write(
     folder: Path,
     options: Audit,
@@ -208,15 +199,16 @@ def _write(
 ) -> None:
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit
-    from thermoxels_ns.reports.page import write_page
+    from thermoxels_ns.reports.page import identify, write_page
 
-    report = report_of(options)
+    assert options.mesh is not None and options.conditions is not None
+    inputs = (options.mesh, options.mesh.with_name(f"{options.mesh.stem}-boundary.vtp"), options.conditions)
+    report = identify(inputs, options.up, options.least_bridge_w)
     answers = answers_of(options, found) | {"report": asdict(report)}
     summary_text(answers)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
     _write_surface(folder / SURFACE, found)
     pictures = draw_audit(found) if options.pictures else None
-    assert options.mesh is not None
     command, files = command_of("audit", options), (PAGE, ANSWERS, SURFACE)
     most, said = impossible_u(found)
     shown = {"range_c": range_c, "most_u": most, "impossible": said, "report": report}

@@ -163,9 +163,7 @@ def resistances_of_audit(path: Path, say: Say = lambda _: None) -> dict[str, flo
         raise HeatError(str(path), expected="an audit from outside that found heat flows", got=got, remedy=remedy)
     unclear = sorted(set(loss) - set(clear))
     if unclear:
-        say(
-            f"Warning: of {', '.join(unclear)} the audit knows no more than that little is lost; no layer is put there."
-        )
+        say(f"Warning: of {', '.join(unclear)} the audit knows no more than an upper bound; they get no layer.")
     return found
 
 

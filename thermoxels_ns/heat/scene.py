@@ -136,12 +136,10 @@ class HeatScene:
         airs = [air.patches for air in (self.inside_air, self.outside_air) if air and air.patches not in DEFAULTS]
         contacts = (*self.convection, *self.ground_contact, *self.fixed_temperature, *self.heat_flux)
 
-        def widened(section: Section, others: Sequence[Sequence[str]]) -> Section:
+        def widened(section: Section, *others: tuple[str, ...]) -> Section:
             if section is None or section.patches not in DEFAULTS:
                 return section
-            taken = {
-                name for pattern in sum(map(tuple, others), ()) for name in matching_names(tags.patch_names, pattern)
-            }
+            taken = {name for one in others for pattern in one for name in matching_names(tags.patch_names, pattern)}
             chosen = [n for n in own if (seen[n] > 0.5 * whole[n]) == (section.patches == OUTSIDE)]
             names = [_as_pattern(tags.patch_names[n]) for n in chosen if tags.patch_names[n] not in taken]
             return replace(section, patches=(*section.patches, *names))  # type: ignore[type-var]
@@ -150,10 +148,10 @@ class HeatScene:
         covers = [surface.patches for surface in self.surfaces if surface.patches not in DEFAULTS]
         return replace(
             self,
-            inside_air=widened(self.inside_air, named),
-            outside_air=widened(self.outside_air, named),
-            surfaces=tuple(widened(surface, covers) for surface in self.surfaces),
-            sun=widened(self.sun, [self.adiabatic]),
+            inside_air=widened(self.inside_air, *named),
+            outside_air=widened(self.outside_air, *named),
+            surfaces=tuple(widened(surface, *covers) for surface in self.surfaces),
+            sun=widened(self.sun, self.adiabatic),
         )
 
     def problem(self, mesh: TetMesh, *, up: Vector | None = None) -> HeatProblem:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -37,9 +36,9 @@ def audit_page(
     files: Sequence[str],
     *,
     report: Report,
-    range_c: tuple[float, float] | None = None,
-    most_u: Mapping[str, float] = MappingProxyType({}),
-    impossible: Sequence[str] = (),
+    range_c: tuple[float, float] | None,
+    most_u: Mapping[str, float],
+    impossible: Sequence[str],
 ) -> str:
     """Return the html text of an audit's page; `command` made the audit, `files` lie beside the page.
 

@@ -57,8 +57,7 @@ def degrees(value_c: float) -> str:
 _PLAIN = {
     r"emissivity of \*, entry \d+": "emissivity of the surfaces",
     r"(emissivity of .+?), entry \d+": r"\1",
-    r"\bfilm factor\b": "heat transfer between surface and air (film: factor)",
-    r"\bfilm coefficient\b": "heat transfer between surface and air (film: coefficient)",
+    r"\bfilm (factor|coefficient)\b": r"heat transfer between surface and air (film: \1)",
     r"\bcamera repeatability\b": "difference of the camera's readings between places (repeatability)",
     r"\bcamera offset\b": "common error of the camera's readings (offset)",
 }

@@ -39,12 +39,10 @@ class Report:
 
 def identify(files: Sequence[Path], *choices: object) -> Report:
     """Return the number of a report that is made of files, those of them that exist, and of choices of its user."""
-    inputs = []
-    for path in (path for path in files if path.is_file()):
-        with plain_os_errors(path, "a file that can be read", "Check its permissions.", ThermoxelsError):
-            inputs.append((path.name, hashlib.sha256(path.read_bytes()).hexdigest()))
+    with plain_os_errors(files[0], "a file that can be read", "Check its permissions.", ThermoxelsError):
+        inputs = tuple((path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files if path.is_file())
     digest = hashlib.sha256(repr((__version__, inputs, choices)).encode()).hexdigest()[:12].upper()
-    return Report("-".join((digest[:4], digest[4:8], digest[8:])), __version__, tuple(inputs))
+    return Report("-".join((digest[:4], digest[4:8], digest[8:])), __version__, inputs)
 
 
 def build_page(template: str, **shown: Any) -> str:
