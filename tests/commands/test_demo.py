@@ -223,7 +223,7 @@ def test_the_demo_of_the_house_ends_with_its_audit(quick_demo, fake_command, tmp
     folder = tmp_path / "demo"
     assert cli.main(["demo", "--output-dir", str(folder)]) == 0
     out = capfd.readouterr().out
-    assert out.index("5/7  Export") < out.index("6/7  Audit the house") < out.index("7/7  Compare")
+    assert out.index("6/9  Audit the house") < out.index("8/9  Let a winter night") < out.index("9/9  Compare")
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert page.index(">Result<") < page.index("Audit: the truth beside the answer") < page.index("What went in")
     assert page.count(">yes<") == 5 + len(true) + 1 and "audit/audit.html" in page
