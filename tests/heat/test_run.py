@@ -8,7 +8,7 @@ from tests.support.heat_meshes import box_mesh, mesh_from, planes
 from tests.support.scene_bodies import Z_UP, room, tagged_body, wall
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
-from thermoxels_ns.heat.effects import Convection, HeatFlux
+from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, HeatFlux
 from thermoxels_ns.heat.run import (
     body_warnings,
     doubtful_temperatures,
@@ -20,7 +20,7 @@ from thermoxels_ns.heat.run import (
     unused_settings,
 )
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import InsideAir, OutsideAir
+from thermoxels_ns.heat.scene_fields import OUTSIDE, InsideAir, OutsideAir
 from thermoxels_ns.heat.solving import Goals
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_normals
 
@@ -116,6 +116,8 @@ def test_airs_act_on_the_named_patches_of_their_side(of) -> None:
     own = replace(scene, convection=(Convection(("front",), 8.0, 0.0),))
     assert "front" not in (*own.on(named).inside_air.patches, *own.on(named).outside_air.patches)
     assert run_scene(own, named, Goals()).warnings == ()
+    shone = replace(scene, absorbed_solar=(AbsorbedSolar(OUTSIDE, 0.6, 100.0),))
+    assert ("front" in shone.on(named).absorbed_solar[0].patches) == of.startswith("exterior")
 
 
 @pytest.mark.parametrize(("u", "met"), [(0.5, True), (4.5, False)])

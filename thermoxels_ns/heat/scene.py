@@ -54,7 +54,8 @@ from thermoxels_ns.mesh.boundary.patches import DEFAULT_PATCHES
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Value = TypeVar("Value")
-Section = TypeVar("Section", InsideAir | None, OutsideAir | None, Surface, Sun | None)
+Section = TypeVar("Section", InsideAir | None, OutsideAir | None, Surface, Sun | None, Radiation, AbsorbedSolar)
+Shining = TypeVar("Shining", Radiation, AbsorbedSolar)
 
 DEFAULTS = (INSIDE, OUTSIDE)  # Patches of sections for which the scene names none
 
@@ -145,12 +146,17 @@ class HeatScene:
             return replace(section, patches=(*section.patches, *names))  # type: ignore[type-var]
 
         named = [*airs, *(effect.patches for effect in contacts), self.adiabatic]
-        covers = [surface.patches for surface in self.surfaces if surface.patches not in DEFAULTS]
+
+        def all_widened(entries: tuple[Shining, ...]) -> tuple[Shining, ...]:
+            return tuple(widened(one, *(other.patches for other in entries if other is not one)) for one in entries)
+
         return replace(
             self,
             inside_air=widened(self.inside_air, *named),
             outside_air=widened(self.outside_air, *named),
-            surfaces=tuple(widened(surface, *covers) for surface in self.surfaces),
+            surfaces=tuple(widened(surface) for surface in self.surfaces),  # the last one holds, property by property
+            radiation=all_widened(self.radiation),
+            absorbed_solar=all_widened(self.absorbed_solar),
             sun=widened(self.sun, self.adiabatic),
         )
 
