@@ -480,6 +480,19 @@ def test_what_departs_less_than_readings_repeat_is_none(plate) -> None:
     assert audit(faint, coarse, UP).defects == ()
 
 
+@pytest.mark.parametrize(("value", "why"), [(3.0, "edge of its element"), (4.5, "")])
+def test_what_a_warmer_element_lends_its_neighbour_is_no_finding(plate, value, why) -> None:
+    """A strip of 0.1 m beside a pane 8 K warmer: an eighth of the step may be blur, a third is not."""
+    tags, names = plate.boundary, (*plate.boundary.patch_names, "pane")
+    pane = plate.points_m[plate.facets].mean(axis=1)[:, 0] > 2.0
+    patch = np.where(pane & (tags.patch == names.index("y0")), len(names) - 1, tags.patch)
+    beside = painted(plate, lambda p: (p[:, 0] > 1.88) & (np.abs(p[:, 2] - 1.5) < 0.3), value)
+    warm = np.where(plate.points_m[:, 0] > 2.02, 10.0, beside.temperature_c)
+    mesh = replace(plate, temperature_c=warm, boundary=replace(tags, patch=patch, patch_names=names))
+    found = [one for one in audit(mesh, STATED, UP).defects if one.patch == "y0"]
+    assert len(found) == 1 and (why in found[0].not_counted) and bool(why) == bool(found[0].not_counted)
+
+
 def test_two_bridges_stay_two_and_lose_nothing_to_each_other(plate) -> None:
     def two(p):
         return spot(p) | (np.hypot(p[:, 0] - 2.2, p[:, 2] - 2.2) < 0.16)

@@ -1,3 +1,4 @@
+import hashlib
 import io
 import json
 import re
@@ -170,3 +171,33 @@ def test_results_of_other_commands_are_not_replaced(export, tmp_path) -> None:
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(OutputError, match=r"^output folder: expected"):
         run_audit(Audit(export / "mesh.vtu", export / "conditions.yaml", tmp_path))
+
+
+def test_a_page_says_what_a_client_asks(export, tmp_path) -> None:
+    """Limits only where there are some, values that no wall could have, words in place of names, and whose report."""
+    text = (export / "conditions.yaml").read_text().replace('u: {"*": 0.50', 'u: {"facade": 0.50')
+    text = text.replace("model: iso-6946\n", "model: iso-6946-combined\n").replace("offset: 0.0", "offset: 6.0")
+    (tmp_path / "c.yaml").write_text(text)
+    options = ("--pictures", "False")
+    answers, page = audited(export / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "out", *options)
+    said = " ".join(answers["impossible"])
+    assert "window" in said and "ISO 6946" in said and "film factor and outside air" in said
+    assert "No limit was set for the U-value of window." in page and "impossible" in page
+    assert "of the 2 limits that were set" in page and "entry 1" not in page and "I_tb" not in page
+    again, _ = audited(export / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "again", *options)
+    other, _ = audited(export / "mesh.vtu", export / "conditions.yaml", tmp_path / "other", *options)
+    assert again["report"] == answers["report"] != other["report"]
+    number, inputs = answers["report"]["number"], dict(answers["report"]["inputs"])
+    assert page.count(number) >= 3 and all(digest in page for digest in inputs.values())
+    assert inputs["c.yaml"] == hashlib.sha256((tmp_path / "c.yaml").read_bytes()).hexdigest()
+
+
+def test_bridges_below_a_bound_are_listed_but_count_for_nothing(export, done, tmp_path) -> None:
+    (bridge,) = json.loads((done / "answers.json").read_text())["defects"]
+    for least, counted in ((0.5 * bridge["extra_w"]["value"], True), (2.0 * bridge["extra_w"]["value"], False)):
+        words = ("--pictures", "False", "--least-bridge-w", str(least))
+        answers, page = audited(export / "mesh.vtu", export / "conditions.yaml", tmp_path / str(counted), *words)
+        assert (answers["defects"][0]["not_counted"] == "") == counted == ("<article" in page)
+        assert any("psi" in one["name"] for one in answers["limits"]) == counted
+    with pytest.raises(AuditError, match=r"^--least-bridge-w: expected"):
+        run_audit(Audit(export / "mesh.vtu", export / "conditions.yaml", tmp_path / "x", least_bridge_w=-1.0))

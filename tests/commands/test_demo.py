@@ -66,7 +66,7 @@ def test_only_the_folder_of_a_demo_is_cleared_and_of_what_the_demo_wrote_only(tm
     assert (outside / "kept").is_file()
 
 
-@pytest.mark.parametrize(("scene", "weather"), [("house-corner", "winter-night"), ("sphere", "original")])
+@pytest.mark.parametrize(("scene", "weather"), [("courtyard", "winter-night"), ("sphere", "original")])
 def test_the_next_steps_lead_to_a_heat_report_by_commands_that_exist(scene, weather):
     """The mesh that heat is to flow in is that of the export before, or of the demo; options are as commands know."""
     steps = [shlex.split(command) for command, _ in demo.next_steps(Path("my demo"), scene)[1:-2]]
@@ -79,10 +79,15 @@ def test_the_next_steps_lead_to_a_heat_report_by_commands_that_exist(scene, weat
     export = tyro.cli(ExportThermoxelsMesh, args=steps[0][2:])
     assert (export.interior, export.wall_thickness) == ("hollow", 0.3)
     assert export.output_dir == heat.mesh.parent == Path("my demo/walls")  # the demo's own export stays
-    commands = demo.demo_commands(Path("my demo"), scene)
+    commands = demo.demo_commands(Path("my demo"), "house-corner")
     assert ["--load-config", str(export.load_config)] == commands[2][1:3]
-    assert tyro.cli(ExportThermoxelsMesh, args=commands[-2][2:]).patches == Path("my demo/survey/patches.yaml")
-    audit = tyro.cli(cli.Commands, args=commands[-1][1:])
+    *_, solid, audit, walls, night = (
+        tyro.cli(cli.Commands, args=one[1:]) if one[0] == "thermoxels" else tyro.cli(ExportThermoxelsMesh, args=one[2:])
+        for one in commands[4:]
+    )
+    assert solid.patches == walls.patches == Path("my demo/survey/patches.yaml") and walls.interior == "hollow"
+    assert isinstance(night, Heat) and night.mesh == walls.output_dir / "mesh.vtu"
+    assert (night.scene, night.from_audit) == ("winter-night", audit.output_dir / "answers.json")
     assert isinstance(audit, Audit) and audit.mesh == Path("my demo/export/mesh.vtu")
     assert (audit.conditions, audit.scene) == (Path("my demo/survey/conditions.yaml"), Path("my demo/scene"))
 
@@ -218,7 +223,7 @@ def test_the_demo_of_the_house_ends_with_its_audit(quick_demo, fake_command, tmp
     folder = tmp_path / "demo"
     assert cli.main(["demo", "--output-dir", str(folder)]) == 0
     out = capfd.readouterr().out
-    assert out.index("5/7  Export") < out.index("6/7  Audit the house") < out.index("7/7  Compare")
+    assert out.index("6/9  Audit the house") < out.index("8/9  Let a winter night") < out.index("9/9  Compare")
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert page.index(">Result<") < page.index("Audit: the truth beside the answer") < page.index("What went in")
     assert page.count(">yes<") == 5 + len(true) + 1 and "audit/audit.html" in page

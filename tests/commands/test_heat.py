@@ -11,10 +11,10 @@ import pytest
 import pyvista as pv
 import tyro
 
-from tests.support.scene_bodies import room, wall
+from tests.support.scene_bodies import room, tagged_body, wall
 from tests.support.unreadable import files_end_after
 from thermoxels_ns import cli
-from thermoxels_ns.commands.heat import Heat, compute_heat, run_heat
+from thermoxels_ns.commands.heat import Heat, compute_heat, resistances_of_audit, run_heat
 from thermoxels_ns.commands.installed_commands import command_of
 from thermoxels_ns.core.errors import HeatError, OutputError, ThermoxelsError
 from thermoxels_ns.fem.refine_mesh import refine_mesh
@@ -84,7 +84,7 @@ def test_the_u_value_of_an_exported_wall(folder, capsys) -> None:
         *("answers.json", "heat.vtu", "report.html", "series.csv")
     ]
     page = (folder / "u" / "report.html").read_text()
-    assert f"{u:.3f} W/(m" in page and "Nothing was left out" in page
+    assert f"{u:.2f} W/(m" in page and "Nothing was left out" in page
     # What the reader asked stands first, how it was solved last.
     assert page.index("W, all by convection on exterior-") < page.index("The inner surface is coldest at")
     assert re.findall(r"<h2>(.*?)</h2>", page) == [
@@ -343,3 +343,43 @@ def test_a_cut_body_is_half_of_it() -> None:
     # Back 16, cut 16 - 4, sides 4 x 8; of the room inside: back 4, sides 4 x 2.
     assert area == pytest.approx(16.0 + 12.0 + 32.0 + 4.0 + 8.0, rel=1e-5)
     assert np.ptp(points, axis=0).min() == pytest.approx(2.0) and view[2] < 0.0
+
+
+def test_the_page_says_what_it_rests_on_and_has_no_headline_on_an_unfit_mesh(folder, hour, tmp_path) -> None:
+    """A solid block has no rooms: what it would lose stands in no card, and the first lines say why."""
+    solid = tagged_body(np.ones((3, 3, 3), dtype=bool), 1.0, np.pad(np.ones((5, 5, 4), bool), ((0, 0), (0, 0), (1, 0))))
+    write_mesh(tmp_path / "mesh.vtu", solid)
+    for mesh, fit in ((folder / "room" / "mesh.vtu", True), (tmp_path / "mesh.vtu", False)):
+        run = run_heat(Heat(mesh, str(folder / "steady.yaml"), tmp_path / str(fit), pictures=False))
+        page = (tmp_path / str(fit) / "report.html").read_text()
+        assert (run.unfit == ()) == fit == ("class=cards" in page) == ("As a wall" in page)
+        assert page.index("No measured temperature enters") < page.index("</header>") < page.index("Answers")
+        assert fit or page.index("no rooms") < page.index("Answers")
+    assert "No measured temperature" in (hour / "report.html").read_text()  # initial: {temperature_c: 15}
+
+
+def test_an_example_of_a_scene_is_written_and_read(folder, tmp_path, capsys) -> None:
+    words = ["heat", "--write-scene", str(tmp_path / "mine.yaml")]
+    assert cli.main(words) == 0 and "pass it with --scene" in capsys.readouterr().out
+    assert load_heat_scene(tmp_path / "mine.yaml") == load_heat_scene("all-effects")
+    assert cli.main(words) == 1 and "a name that is free" in capsys.readouterr().err
+
+
+def test_an_audits_resistances_become_layers(folder, tmp_path) -> None:
+    """(20 - 5) K / 30 W/m2 = 0.5 m2 K/W behind the outer surface; a bound gives none, an inside audit is refused."""
+    loss = {"value": 300.0, "low": 200.0, "high": 400.0}
+    patch = {"name": "exterior-side", "area_m2": 10.0, "surface_c": {"value": 5.0}, "loss_w": loss}
+    bound = {**patch, "name": "exterior-up", "loss_w": {**loss, "low": -1.0}}
+    audit = {"conditions": {"side": "outside", "inside": {"air": {"value": 20.0}}}, "patches": [patch, bound]}
+    path = tmp_path / "answers.json"
+    path.write_text(json.dumps(audit))
+    assert resistances_of_audit(path) == {"exterior-side": pytest.approx(0.5)}
+    options = Heat(folder / "wall" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path / "out", from_audit=path)
+    run = run_heat(replace(options, pictures=False))
+    assert run.wall is not None and run.wall.u_value_w_m2k == pytest.approx(1.0 / (0.5 + 1.0 / 25.0), rel=1e-9)
+    (layer,) = answers(tmp_path / "out")["layers"]
+    assert layer["layer_m2k_w"] == pytest.approx(0.5 - 1.0 / 7.7 - 0.2 / 0.8)
+    for wrong in ({**audit, "conditions": {**audit["conditions"], "side": "inside"}}, {"patches": []}):
+        path.write_text(json.dumps(wrong))
+        with pytest.raises(HeatError, match=r"answers\.json: expected"):
+            resistances_of_audit(path)

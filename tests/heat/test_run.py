@@ -8,7 +8,7 @@ from tests.support.heat_meshes import box_mesh, mesh_from, planes
 from tests.support.scene_bodies import Z_UP, room, tagged_body, wall
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
-from thermoxels_ns.heat.effects import Convection
+from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, HeatFlux
 from thermoxels_ns.heat.run import (
     body_warnings,
     doubtful_temperatures,
@@ -20,7 +20,7 @@ from thermoxels_ns.heat.run import (
     unused_settings,
 )
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import InsideAir, OutsideAir
+from thermoxels_ns.heat.scene_fields import OUTSIDE, InsideAir, OutsideAir
 from thermoxels_ns.heat.solving import Goals
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_normals
 
@@ -81,12 +81,12 @@ def test_the_rim_of_a_hole_is_no_spot_of_the_inner_surface() -> None:
     assert run.wall is not None and run.wall.coldest.point_m[1] == 0.25
     assert run.wall.temperature_factor > run.solution.temperature_c[edge].max() / 20.0 + 0.1
     apart = replace(scene, outside_air=replace(airs["outside_air"], patches=("x1",)), adiabatic=("y*", "z*"))
-    assert inner_surface_warnings(apart, mesh, Z_UP) == ()
+    assert inner_surface_warnings(apart, mesh, Z_UP) == ((), ())
 
 
 def test_a_room_without_a_floor_is_named() -> None:
     scene = HeatScene(CONCRETE, **AIRS)
-    assert inner_surface_warnings(scene, room(), Z_UP) == ()
+    assert inner_surface_warnings(scene, room(), Z_UP) == ((), ())
     mesh = room()
     assert mesh.boundary is not None
     floor = (facet_normals(mesh.points_m, mesh.facets)[:, 2] > 0.5) & np.char.startswith(
@@ -95,8 +95,49 @@ def test_a_room_without_a_floor_is_named() -> None:
     names = (*mesh.boundary.patch_names, "floor")
     patch = np.where(floor, len(names) - 1, mesh.boundary.patch)
     missing = replace(mesh, boundary=replace(mesh.boundary, patch=patch, patch_names=names))
-    (warning,) = inner_surface_warnings(scene, missing, Z_UP)
+    ((warning,), ()) = inner_surface_warnings(scene, missing, Z_UP)
     assert "a floor of 0 m²: most of the floor is missing" in warning
+
+
+def with_named_patch(mesh: TetMesh, of: str, name: str) -> TetMesh:
+    """The mesh with a patch of another name, as a user's rules give it; photographs show what is exterior."""
+    tags, patterns = mesh.boundary, np.array(mesh.boundary.patch_names)
+    patch = np.where(patterns[tags.patch] == of, len(patterns), tags.patch)
+    seen = np.char.startswith(patterns[tags.patch], "exterior")
+    return replace(mesh, boundary=replace(tags, patch=patch, patch_names=(*patterns, name), seen=seen))
+
+
+@pytest.mark.parametrize("of", ["exterior-side", "interior-side"])
+def test_airs_act_on_the_named_patches_of_their_side(of) -> None:
+    """A named patch changes nothing, but where another entry of the scene names it."""
+    scene, named = HeatScene(CONCRETE, **AIRS), with_named_patch(room(), of, "front")
+    plain, found = (run_scene(scene, mesh, Goals()).wall for mesh in (room(), named))
+    assert plain is not None and found is not None and found.heat_w == pytest.approx(plain.heat_w, rel=1e-12)
+    own = replace(scene, convection=(Convection(("front",), 8.0, 0.0),))
+    assert "front" not in (*own.on(named).inside_air.patches, *own.on(named).outside_air.patches)
+    assert run_scene(own, named, Goals()).warnings == ()
+    shone = replace(scene, absorbed_solar=(AbsorbedSolar(OUTSIDE, 0.6, 100.0),))
+    assert ("front" in shone.on(named).absorbed_solar[0].patches) == of.startswith("exterior")
+
+
+@pytest.mark.parametrize(("u", "met"), [(0.5, True), (4.5, False)])
+def test_a_layer_makes_up_for_what_an_audit_found(u, met) -> None:
+    """A wall of 0.2 m: 1 / U = Rsi + 0.2 / 1.7 + layer + Rse, but no layer takes resistance away."""
+    mesh, scene = wall(), HeatScene(CONCRETE, **AIRS)
+    run = run_scene(scene, mesh, Goals(), behind_m2k_w={"exterior-side": 1.0 / u - 0.04})
+    (layer,), least = run.layers, 0.13 + 0.2 / CONCRETE["*"].conductivity_w_mk
+    assert layer.body_m2k_w == pytest.approx(least, rel=1e-9) and run.wall is not None
+    assert run.wall.u_value_w_m2k == pytest.approx(u if met else 1.0 / (least + 0.04), rel=1e-6)
+    assert any("exterior-side" in one for one in run.warnings) == (not met)
+
+
+def test_a_layer_needs_rooms_and_nothing_but_air() -> None:
+    for scene, mesh in (
+        (HeatScene(CONCRETE, **AIRS), filled()),
+        (HeatScene(CONCRETE, **AIRS, heat_flux=(HeatFlux(("cut",), 1.0),)), room()),
+    ):
+        with pytest.raises(HeatError, match=r"^--from-audit: expected"):
+            run_scene(scene, mesh, Goals(), behind_m2k_w={"roof": 1.0})
 
 
 @pytest.mark.parametrize(("volume", "said"), [(30.0, False), (60.0, True)])

@@ -123,7 +123,9 @@ STEPS = SMALL.replace("steady: true", "time: {}")
         (SMALL + "outside: {air_c: 0}\n", r"got outside. Did you mean outside_air\?"),
         (AIR.replace("air_c", "air_k"), r"outside_air: .* got air_k. Did you mean air_c\?"),
         (AIR.replace("air_c: 0", f"air_c: 1{'0' * 400}"), "outside_air: air_c"),
-        (AIR.replace("air_c: 0", "air_c: 1e1"), "outside_air: air_c: .* Write 10, without"),
+        (AIR.replace("air_c: 0", "air_c: 0 +- 1 C"), "outside_air: air_c: .*without a range.* Write 0 C"),
+        (AIR.replace("air_c: 0", "air_c: 0,5 C"), "got 5 C. Within braces"),
+        (AIR.replace("air_c: 0", "air_c: 0 W"), "outside_air: air_c: .*with its unit, C"),
         (AIR.replace("air_c: 0", "air_c: true"), "outside_air: air_c"),
         (AIR.replace("iso-6946-combined", "windy"), "outside_air: coefficient"),
         (SMALL + "heat_flux: [{patches: [cut], flux_w_m2: 1}, {patches: [cut]}]\n", "heat_flux entry 2: .*flux_w_m2"),
@@ -213,3 +215,29 @@ def test_a_series_needs_a_file_and_time(tmp_path) -> None:
     (tmp_path / "outside.csv").unlink()
     with pytest.raises(HeatError, match="air_series: expected a csv file"):
         found.effects(room())
+
+
+def test_numbers_may_have_units_as_in_the_conditions_of_an_audit(tmp_path) -> None:
+    """And a comma, or the form 1e1, which yaml takes for a text."""
+    found = scene(
+        tmp_path,
+        """
+materials:
+  "*":
+    conductivity_w_mk: 0,8 W/(m K)
+    density_kg_m3: 1500 kg/m3
+    specific_heat_j_kgk: 0.9 kJ/(kg K)
+time: {duration_s: 24 h}
+initial: {temperature_c: 288.15 K}
+outside_air: {air_c: "-5,5 °C", coefficient: iso-6946-convection, wind_m_s: 3.6 km/h}
+ground: {surface_c: 1e1, reflectance: 20 %}
+surfaces: [{emissivity: 90 %, absorptivity: 0.6}]
+sun: {towards: [0, -1, 1], direct_w_m2: 500 W/m2}
+""",
+    )
+    assert found.outside_air is not None and found.ground is not None and found.time is not None
+    assert (found.outside_air.air_c, found.outside_air.wind_m_s) == (-5.5, pytest.approx(1.0))
+    assert (found.time.duration_s, found.initial_c) == (86400.0, pytest.approx(15.0))
+    assert (found.ground.surface_c, found.ground.reflectance, found.surfaces[0].emissivity) == (10.0, 0.2, 0.9)
+    made = found.materials["*"]
+    assert (made.conductivity_w_mk, made.density_kg_m3, made.specific_heat_j_kgk) == (0.8, 1500.0, 900.0)

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh import temperature
+from thermoxels_ns.mesh.boundary.patches import DEFAULT_PATCHES
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
@@ -219,3 +221,20 @@ def test_corners_that_know_nothing_have_no_influence():
     found, weight = interpolate_corners(np.array([[1.0, 1.0, 1.5], [0.5, 1.0, 1.0], [3.0, 4.0, 0.0]]), values, weights)
     assert found.tolist() == [21.0, 20.0, 0.0]
     assert weight.tolist() == [2.0, 1.5, 0.0]
+
+
+def test_a_hollow_body_that_no_camera_sees_from_below_gets_a_floor(snapshot_of):
+    """A cup upside down, photographed from above all around: floor and ceiling alike, and the underside is outside."""
+    density = np.zeros((25, 25, 25))
+    density[5:20, 5:20, 5:20] = 20.0
+    density[8:17, 8:17, :17] = 0.0
+    angle = 2.0 * np.pi * np.arange(12) / 12
+    eyes = np.column_stack((12 + 60 * np.cos(angle), 12 + 60 * np.sin(angle), np.full(12, 30.0)))
+    field = replace(snapshot_of(density), views=looking_at((12.0, 12.0, 12.0), eyes))
+    selection = replace(DENSE, interior="hollow", wall_thickness=2.0)
+    mesh = build_mesh(field, selection, np.eye(4), VOXEL).mesh
+    area = dict.fromkeys(DEFAULT_PATCHES, 0.0)
+    for patch, of in zip(mesh.boundary.patch, facet_areas(mesh.points_m, mesh.facets)):
+        area[mesh.boundary.patch_names[patch]] += of
+    assert area["interior-up"] == pytest.approx(area["interior-down"], rel=0.1) and area["interior-up"] > 10.0
+    assert area["exterior-down"] == pytest.approx(area["exterior-up"], rel=0.1)

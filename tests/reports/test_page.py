@@ -121,6 +121,7 @@ def shown() -> dict[str, Any]:
         "gradient": ["#000004", "#fcffa4"],
         "ends_c": [10.0, 30.0],
         "heat": [picture(colour) for colour in ("grey", "orange", "pink")],
+        "night": b"",
         "mesh": picture("brown"),
         "measured": picture("purple"),
         "seconds": [("Train", 30.0), ("Export", 10.0)],

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 # Only light imports at the top, so that --help answers at once.
+import math
 import time as clock
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +50,9 @@ class Audit:
     scene: Path | None = None
     """Folder of the photographs that the mesh was made from, the --data of the training: the page then shows each
     defect in the photograph and the thermal image in which the defect is largest."""
+    least_bridge_w: float = 0.0
+    """Bridges and defects that lose less than this extra are listed as seen, but not counted, [W]. What lies within the
+    error of the reconstruction is never counted."""
     pictures: bool = True
     """Draw pictures for the page."""
 
@@ -66,9 +70,9 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     """Audit a mesh, write all files, return the result; with `options.write_conditions`, only write an example."""
     from thermoxels_ns.audit.conditions import load_conditions, write_example
     from thermoxels_ns.audit.run import audit
-    from thermoxels_ns.commands.audit_photographs import photographs_of_defects
+    from thermoxels_ns.commands.audit_photographs import photographs_of_defects, shown_range_c
     from thermoxels_ns.mesh.files.vtu import read_mesh
-    from thermoxels_ns.reports.numbers import interval_text
+    from thermoxels_ns.reports.numbers import interval_text, plain_names
 
     if options.write_conditions is not None:
         write_example(options.write_conditions)
@@ -78,7 +82,10 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         missing = "mesh" if options.mesh is None else "conditions"
         remedy = "Pass the mesh.vtu of an export, and --conditions; --write-conditions writes an example of these."
         raise AuditError(missing, expected="a file", got="none", remedy=remedy)
-    begin = clock.perf_counter()
+    begin, least_w = clock.perf_counter(), options.least_bridge_w
+    if not 0.0 <= least_w < math.inf:
+        remedy = "Pass --least-bridge-w 0 to count all."
+        raise AuditError("--least-bridge-w", expected="a number of watts, at least 0", got=least_w, remedy=remedy)
     others = ("summary.json", "quality.json", "series.csv")
     folder = result_folder(options.output_dir, (ANSWERS, PAGE, SURFACE), (SURFACE, ANSWERS), others)
     conditions = load_conditions(options.conditions)
@@ -88,9 +95,9 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     direction = check_direction("up", up or (0.0, 0.0, 1.0), "Pass --up 0 0 1.", AuditError)
     x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.facets):,} boundary triangles.")
-    found = audit(mesh, conditions, (x, y, z))
-    for words in (*found.check.forbidden, *found.check.doubts):
-        say(f"Warning: {words}")
+    found = without_slight(audit(mesh, conditions, (x, y, z)), least_w)
+    for words in (*found.check.forbidden, *found.check.doubts, *impossible_u(found)[1]):
+        say(f"Warning: {plain_names(words)}")
     if found.check.missing:
         say(f"Missing for a report after EN 13187: {', '.join(found.check.missing)}.")
     whole = found.whole
@@ -100,15 +107,67 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     if calibration is not None:
         told = [f"{name} {interval_text(one, calibration.units[name])}" for name, one in calibration.found.items()]
         say(f"Calibration: {'; '.join(told) or f'refused. {calibration.refused}'}")
-    photographs = {}
+    photographs, range_c = {}, None
     if options.scene is not None:
         scale = (export.get("scale") or {}).get("metres_per_unit", 1.0)
         scale = check_positive("summary.json: metres_per_unit", scale, "Export the mesh again.", AuditError)
-        photographs = photographs_of_defects(options.scene, scale, found)
+        range_c = shown_range_c(found)
+        photographs = photographs_of_defects(options.scene, scale, found, range_c)
         say(f"Photographs show {sum(not found.defects[number].not_counted for number in photographs)} of them.")
-    _write(folder, options, found, photographs)
+    _write(folder, options, found, photographs, range_c)
     say(f"Written to {folder}: {PAGE}, {ANSWERS}, {SURFACE} ({clock.perf_counter() - begin:.1f} s)")
     return found
+
+
+def without_slight(found: Found, least_w: float) -> Found:
+    """Return an audit in which bridges that lose less than `least_w` extra, [W], are not counted and not judged."""
+    from thermoxels_ns.audit.run import verdict
+
+    why = f"It loses less than {least_w:g} W extra (--least-bridge-w)."
+    pairs = [
+        (replace(one, not_counted=why) if not one.not_counted and one.extra_w.value < least_w else one, triangles)
+        for one, triangles in zip(found.defects, found.found)
+    ]
+    pairs.sort(key=lambda pair: bool(pair[0].not_counted))  # those that count stay first
+    lines = [one for one, _ in pairs if one.kind == "line" and not one.not_counted]
+    limits = [one for one in found.limits if one.unit != "W/(m K)"]
+    for one in [one for one in found.limits if one.unit == "W/(m K)" and lines]:
+        worst = max(lines, key=lambda line: line.coefficient.value)
+        psi, name = worst.coefficient, f"{one.name.partition(', in ')[0]}, in {worst.patch}"
+        limits.append(replace(one, name=name, found=psi, verdict=verdict(psi, one.limit)))
+    defects, triangles = zip(*pairs) if pairs else ((), ())
+    return replace(found, defects=defects, found=triangles, limits=tuple(limits))
+
+
+def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Return the U-value that no element exceeds, [W/(m2 K)] by name, and sentences on values and ends beyond it.
+
+    A sentence names the two inputs that move the heat loss most: one of these clashes with the readings.
+    """
+    from thermoxels_ns.audit.exchange import most_u_w_m2k
+
+    surface, every, most = found.surface, np.flatnonzero(found.surface.counted), dict[str, float]()
+    for one in found.patches:
+        number = surface.selection.patch_names.index(one.name)
+        on = every[surface.selection.facet_patch[every] == number]
+        most[one.name] = most_u_w_m2k(surface, found.conditions, on)
+    most |= {one.name: max(most.values()) for one in (*found.storeys, found.whole)}
+    inputs = " and ".join([name for name in found.budget if name != "camera repeatability"][:2])
+    over = [one.name for one in found.patches if one.u_w_m2k.value > most[one.name]]
+    ends = [one.name for one in found.patches if one.u_w_m2k.value <= most[one.name] < one.u_w_m2k.high]
+
+    def than(names: list[str]) -> str:
+        allowed = " to ".join(dict.fromkeys(f"{end(most[name] for name in names):.1f}" for end in (min, max)))
+        return f"more than the {allowed} W/(m² K) that the films of air on both sides allow without a wall (ISO 6946)"
+
+    said = []
+    if over:
+        clash = f"What is stated clashes with the readings; look at {inputs} first."
+        said.append(f"Impossible: {', '.join(over)} would have a U-value of {than(over)}. {clash}")
+    if ends:
+        clash = f"the part above is impossible, and what is stated of {inputs} reaches too far."
+        said.append(f"The U-value of {', '.join(ends)} has an interval that ends at {than(ends)}: {clash}")
+    return most, tuple(said)
 
 
 def answers_of(options: Audit, found: Found) -> dict[str, Any]:
@@ -124,6 +183,7 @@ def answers_of(options: Audit, found: Found) -> dict[str, Any]:
         "calibration": None if calibration is None else {name: getattr(calibration, name) for name in named},
         "forbidden": found.check.forbidden,
         "doubts": found.check.doubts,
+        "impossible": impossible_u(found)[1],
         "missing_for_en_13187": found.check.missing,
         "loss_narrower_by_w": found.budget,
         **{name: getattr(found, name) for name in ("draws", "failing_models", "remembered")},
@@ -131,19 +191,29 @@ def answers_of(options: Audit, found: Found) -> dict[str, Any]:
     return to_jsonable_python(told, inf_nan_mode="null")
 
 
-def _write(folder: Path, options: Audit, found: Found, photographs: Mapping[int, tuple[Picture, ...]]) -> None:
+def _write(
+    folder: Path,
+    options: Audit,
+    found: Found,
+    photographs: Mapping[int, tuple[Picture, ...]],
+    range_c: tuple[float, float] | None,
+) -> None:
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit
-    from thermoxels_ns.reports.page import write_page
+    from thermoxels_ns.reports.page import identify, write_page
 
-    answers = answers_of(options, found)
+    assert options.mesh is not None and options.conditions is not None
+    inputs = (options.mesh, options.mesh.with_name(f"{options.mesh.stem}-boundary.vtp"), options.conditions)
+    report = identify(inputs, options.up, options.least_bridge_w)
+    answers = answers_of(options, found) | {"report": asdict(report)}
     summary_text(answers)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
     _write_surface(folder / SURFACE, found)
     pictures = draw_audit(found) if options.pictures else None
-    assert options.mesh is not None
     command, files = command_of("audit", options), (PAGE, ANSWERS, SURFACE)
-    write_page(folder / PAGE, audit_page(found, pictures, photographs, options.mesh.name, command, files))
+    most, said = impossible_u(found)
+    shown = {"range_c": range_c, "most_u": most, "impossible": said, "report": report}
+    write_page(folder / PAGE, audit_page(found, pictures, photographs, options.mesh.name, command, files, **shown))
     write_summary(folder / ANSWERS, answers)
 
 

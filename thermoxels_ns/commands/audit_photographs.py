@@ -9,6 +9,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from thermoxels_ns.audit.run import Audit
+from thermoxels_ns.audit.surface import WHY_NOT
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
@@ -23,13 +24,25 @@ _CELLS = 64  # Cells across and along a photograph; in each cell the nearest tri
 _HIDDEN = 1.05  # A triangle is hidden if it is this many times as far as the nearest triangle of its cell
 _MARGIN, _LEAST_SHARE = 0.6, 0.3
 """Margin around a defect, as a share of its size, and least width of the cut-out, as a share of the image's width."""
+_BELOW_K, _COLDER = 0.5, 200  # Pixels colder than the range by this are grey, [K], and the grey, 0 to 255
 _WIDTH = 480  # Width of a cut-out, [pixels]
 
 
-def photographs_of_defects(folder: Path, metres_per_unit: float, found: Audit) -> dict[int, tuple[Picture, Picture]]:
+def shown_range_c(found: Audit) -> tuple[float, float]:
+    """Return lowest and highest reading on all surface that thermal images measured, without stray ones, [C]."""
+    surface = found.surface
+    read = surface.counted | (surface.why_not == list(WHY_NOT).index("left out"))
+    low, high = np.quantile(surface.reading_c[read], (0.005, 0.995)).tolist()
+    return low, max(high, low + 0.1)
+
+
+def photographs_of_defects(
+    folder: Path, metres_per_unit: float, found: Audit, range_c: tuple[float, float]
+) -> dict[int, tuple[Picture, Picture]]:
     """Cut each defect out of photograph and thermal image that show it largest; return both by place in `found.found`.
 
-    `metres_per_unit` is the length of one unit of the scene's poses, [m]. Defects that no photograph shows are left
+    `metres_per_unit` is the length of one unit of the scene's poses, [m]; the colours of thermal images span `range_c`,
+    [degrees Celsius]; what is colder is grey, as sky is. Defects that no photograph shows are left
     out, and so are defects beyond `MOST_DEFECTS`. Raises `SceneError` if `folder` is no scene.
     """
     scene = read_scene_file(folder, "skip")
@@ -37,8 +50,6 @@ def photographs_of_defects(folder: Path, metres_per_unit: float, found: Audit) -
     surface = found.surface
     every = surface.centroid_m / metres_per_unit
     hidden_behind = [_nearest(frame, every) for frame in frames]
-    readings = surface.reading_c[surface.counted]
-    low, high = np.quantile(readings, (0.005, 0.995)).tolist()
     pictures = dict[int, tuple[Picture, Picture]]()
     for number, one in enumerate(found.found[:MOST_DEFECTS]):
         some = one.core[:: max(1, len(one.core) // _MOST_POINTS)]
@@ -47,10 +58,9 @@ def photographs_of_defects(folder: Path, metres_per_unit: float, found: Audit) -
         if not scores or max(scores) <= 0.0:
             continue
         frame = frames[int(np.argmax(scores))]
-        shown = _cut_out(scene, frame, points, (low, high))
+        shown = _cut_out(scene, frame, points, range_c)
         if shown is not None:
-            caption = f"Thermal image, as read: {low:.1f} °C and less black, {high:.1f} °C and more bright"
-            pictures[number] = ((shown[0], frame.image.name), (shown[1], caption))
+            pictures[number] = ((shown[0], frame.image.name), (shown[1], "Thermal image, as the camera read it"))
     return pictures
 
 
@@ -98,11 +108,9 @@ def _cut_out(
     thermal_pose = frame.pose if frame.thermal_pose is None else frame.thermal_pose
     photograph = np.asarray(open_photograph(frame.image).convert("RGB"))
     visible = frame.intrinsics.resized(photograph.shape[1], photograph.shape[0])
-    cut = []
-    for picture, camera, pose in (
-        (photograph, visible, frame.pose),
-        (colours(temperature_c, limits), thermal, thermal_pose),
-    ):
+    cut, seen = [], colours(temperature_c, limits)
+    seen[temperature_c < limits[0] - _BELOW_K] = _COLDER
+    for picture, camera, pose in ((photograph, visible, frame.pose), (seen, thermal, thermal_pose)):
         pixels = camera.project_world(pose, points)
         pixels = pixels[camera.contains(pixels)]
         if not len(pixels):

@@ -25,10 +25,14 @@ SceneName = Literal["hot-object", "house-corner", "sphere", "courtyard", "pipes"
 """Names of the synthetic scenes."""
 
 _MARKER = ".thermoxels-demo"
-_WRITTEN = ("index.html", "scene", "outputs", "eval.json", "eval", "renders", "export", "survey", "audit", "logs")
+_WRITTEN = (
+    *("index.html", "scene", "outputs", "eval.json", "eval", "renders", "export", "survey", "audit", "walls", "heat"),
+    "logs",
+)
 _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT = 42, 6, 320, 240
 _BUILDINGS: tuple[SceneName, ...] = ("house-corner", "courtyard")
 _AUDITED: SceneName = "house-corner"  # The scene whose U-values are known
+_WALLS = ("--metres-per-unit", "1", "--interior", "hollow", "--wall-thickness", "0.3")  # Options that make rooms
 
 
 @dataclass
@@ -80,10 +84,15 @@ def run_demo(demo: Demo, console: Console) -> None:
         write_scene(make_scene(demo.scene), folder / "scene", _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT)
         for name in ("patches.yaml", "conditions.yaml") if demo.scene == _AUDITED else ():
             shutil.copyfile(configs_folder() / f"{_AUDITED}-{name}", writable_folder(patches.parent) / name)
-    names = ("Train", "Evaluate", "Render", "Export the mesh and let heat flow", "Audit the house")
+    names = (
+        *("Train", "Evaluate", "Render", "Export the mesh and let heat flow", "Audit the house"),
+        *("Export the house with rooms", "Let a winter night act on the house"),
+    )
     for name, command in zip(names, commands[1:]):
         with step(name):
-            run_command(command, logs / f"{command[0].replace('thermoxels', 'audit')}.log", console)
+            log = command[1] if command[0] == "thermoxels" else command[0]
+            log += "-walls" * (logs / f"{log}.log").exists()
+            run_command(command, logs / f"{log}.log", console)
     with step("Compare with the truth"):
         targets, others = read_results(folder / "eval.json", folder / "export" / "summary.json")
         compared = compare(folder / "audit" / "answers.json", patches) if demo.scene == _AUDITED else ()
@@ -125,7 +134,7 @@ def prepare_folder(path: Path) -> Path:
 
 
 def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> list[list[str]]:
-    """Return the commands of the demo in order: synthetic, train, eval, render, export and, for house-corner, audit."""
+    """Return the commands of the demo in order; house-corner's go on with an audit, an export with rooms, and heat."""
     config = str(folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml")
     survey = folder / "survey"
     patches = ["--patches", str(survey / "patches.yaml")] if scene == _AUDITED else []
@@ -133,6 +142,9 @@ def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> li
         *("thermoxels", "audit", str(folder / "export" / "mesh.vtu"), "--conditions", str(survey / "conditions.yaml")),
         *("--scene", str(folder / "scene"), "--output-dir", str(folder / "audit")),
     ]
+    walls, night = folder / "walls", ["--scene", "winter-night", "--from-audit", str(folder / "audit" / "answers.json")]
+    export = ["ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", str(walls), *_WALLS]
+    heat = ["thermoxels", "heat", str(walls / "mesh.vtu"), *night, "--output-dir", str(folder / "heat")]
     steps = [] if iterations is None else ["--max-num-iterations", str(iterations)]
     return [
         ["thermoxels", "synthetic", scene, "--output-dir", str(folder / "scene")],
@@ -154,7 +166,7 @@ def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> li
             *("ns-export", "thermoxels-mesh", "--load-config", config),
             *("--output-dir", str(folder / "export"), "--metres-per-unit", "1", *patches),
         ],
-        *([audit] if scene == _AUDITED else []),
+        *([audit, [*export, "--steps", "1", *patches], heat] if scene == _AUDITED else []),
     ]
 
 
@@ -175,17 +187,22 @@ def next_steps(folder: Path, scene: str) -> list[tuple[str, str]]:
     steps: list[tuple[list[str | Path], str]] = [
         (["ns-viewer", "--load-config", config], "Walk around the trained model in a browser:")
     ]
-    mesh, weather, said = folder / "export" / "mesh.vtu", "original", "ten windy, sunny minutes"
-    if scene in _BUILDINGS:
-        mesh, weather, said = folder / "walls" / "mesh.vtu", "winter-night", "a winter night"
-        walls = ["--metres-per-unit", "1", "--interior", "hollow", "--wall-thickness", "0.3"]
+    mesh, name, said = folder / "export" / "mesh.vtu", "original", "ten windy, sunny minutes"
+    if scene in _BUILDINGS and scene != _AUDITED:
+        mesh, name, said = folder / "walls" / "mesh.vtu", "winter-night", "a winter night"
         what = "Export the building with rooms; photographs do not show how thick its walls are, so say it:"
-        export = ["ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", mesh.parent, *walls]
+        export = ["ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", mesh.parent, *_WALLS]
         steps.append((export, what))
-    heat = ["thermoxels", "heat", mesh, "--scene", weather, "--output-dir", folder / "heat"]
+    heat = ["thermoxels", "heat", mesh, "--scene", name, "--output-dir", folder / "heat"]
     capture = ["thermoxels", "capture", "PHOTOGRAPHS", "--output", "SCENE"]
+    weather = (heat, f"Let {said} act on it; report.html says how much heat goes where:")
+    if scene == _AUDITED:  # the demo did that
+        weather = (
+            ["thermoxels", "heat", "--write-scene", "scene.yaml"],
+            "Write a heat scene to change, every key explained:",
+        )
     steps += [
-        (heat, f"Let {said} act on it; report.html says how much heat goes where:"),
+        weather,
         (capture, "Make a scene of your own from a folder of photographs and thermal images:"),
         (["ns-train", "thermoxels", "--data", "SCENE"], "Train on it, and then go on with ns-export as above:"),
     ]

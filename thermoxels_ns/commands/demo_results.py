@@ -16,7 +16,7 @@ from thermoxels_ns.core.checks import is_number, plain_os_errors
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json, read_json_object
 from thermoxels_ns.mesh.boundary.patches import apply_patches, load_patch_rules
-from thermoxels_ns.reports.charts import colours
+from thermoxels_ns.reports.charts import colours, gradient
 from thermoxels_ns.reports.page import build_page, image_file
 from thermoxels_ns.synthetic.drawn_scenes import BRIDGE_PSI_W_MK, house_corner, true_u_w_m2k
 
@@ -182,9 +182,7 @@ def demo_page(
 
     `others`: names and texts of figures; `seconds`: names and durations of steps; `next_steps`: commands and sentences.
     """
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
-
+    night = folder / "heat" / "surface-end.png"
     export, renders, drawn = folder / "export", folder / "renders" / "test", folder / "scene"
     photographs = sorted((drawn / "images").glob("frame_train_*"))
     held_out = sorted(path.stem for path in (drawn / "images").glob("frame_eval_*"))
@@ -206,8 +204,9 @@ def demo_page(
             compared=compared,
             inputs=inputs,
             views=[(name, [(renders / of / f"{name}.png").read_bytes() for of in kinds]) for name in held_out],
-            gradient=[to_hex(colour) for colour in colormaps["inferno"](np.linspace(0.0, 1.0, 17))],
+            gradient=gradient(),
             ends_c=[float(bounds[f"absolute_{end}_temperature"]) for end in ("min", "max")],
+            night=night.read_bytes() if compared and night.is_file() else b"",
             heat=_panels(export / "heat.png", 3),
             mesh=(export / "mesh.png").read_bytes(),
             measured=(export / "mesh-measured.png").read_bytes(),

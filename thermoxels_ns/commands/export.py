@@ -91,7 +91,7 @@ class ExportOptions:
     interior: Literal["solid", "hollow"] = "solid"
     """Treatment of the inside of a body if photographs show only its shell. solid: the inside is filled, but a cavity
     that holds a camera is a room and stays empty. hollow: only the shell is exported, with the thickness that training
-    happened to give the shell."""
+    happened to give the shell; with --wall-thickness it is closed, as by a floor, where no camera looks."""
     seal_openings: int = 2
     """In the search for the inside, openings in the shell up to twice this many voxels wide count as closed."""
     wall_thickness: float | None = None

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "report.html", "heat.pvd", "heat.vtu"
 """Files that a run writes beside its pictures."""
+EXAMPLE = "scene-all-effects.yaml"
 
 Say = Callable[[str], None]
 
@@ -36,9 +37,9 @@ class Heat:
     Writes report.html (open it first), answers.json, series.csv, temperatures for ParaView (heat.pvd through time,
     heat.vtu of a steady state) and pictures."""
 
-    mesh: tyro.conf.Positional[Path]
+    mesh: tyro.conf.Positional[Path | None] = None
     """The mesh.vtu of an export with a known scale; its mesh-boundary.vtp must lie in the same folder."""
-    scene: str
+    scene: str | None = None
     """Heat scene: the path of a yaml file, or the NAME of a configs/scene-NAME.yaml, such as winter-night."""
     output_dir: Path = Path("heat")
     """Folder for the results; made if it does not exist. Results of an earlier run in the folder are replaced."""
@@ -67,12 +68,24 @@ class Heat:
     summary.json beside the mesh, or else z."""
     pictures: bool = True
     """Draw pictures of the surface."""
+    write_scene: Path | None = None
+    """Write an example of a scene that explains every key to this file, and do nothing else."""
+    from_audit: Path | None = None
+    """The answers.json of ``thermoxels audit`` on a mesh with the same patches: a layer outside each patch then makes
+    up for what the wall of the mesh lacks of the resistance that the audit found. The mesh needs rooms (--interior
+    hollow), and the scene no more than the two airs, as in winter-night."""
 
     def main(self) -> None:
         """Run; raises `ThermoxelsError` if the mesh, the scene or an option cannot be used, or the solver fails."""
         from rich.console import Console
 
+        from thermoxels_ns.core.yaml_records import write_example
+
         console = Console(highlight=False)
+        if self.write_scene is not None:
+            write_example(self.write_scene, EXAMPLE, HeatError)
+            console.print(f"Written to {self.write_scene}: keep what your scene has, and pass it with --scene.")
+            return
         # With more BLAS threads, the last bits of results would depend on the number of threads.
         with threadpool_limits(1, "blas"):
             run_heat(self, lambda line: console.print(line, markup=False, soft_wrap=True))
@@ -99,7 +112,9 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     from thermoxels_ns.mesh.files.vtu import read_mesh
 
     begin = clock.perf_counter()
-    scene = load_heat_scene(options.scene)
+    mesh_file, scene_file = _given(options)
+    behind = None if options.from_audit is None else resistances_of_audit(options.from_audit, say)
+    scene = load_heat_scene(scene_file)
     goals = Goals(
         tolerance_k=options.tolerance,
         flow_tolerance=options.flow_tolerance,
@@ -108,14 +123,48 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
         allow_unmet=options.allow_unmet,
     )
     goals.check_fits(scene.time)
-    mesh = read_mesh(options.mesh)
-    export = read_export_summary(options.mesh, say)
+    mesh = read_mesh(mesh_file)
+    export = read_export_summary(mesh_file, say)
     up = export.get("up") if options.up is None else options.up
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes.")
     say(f"Scene: {scene.description or options.scene}.")
     read_s = clock.perf_counter() - begin
-    run = run_scene(scene, mesh, goals, up=up, probes_m=options.probes, export=export, say=say)
+    run = run_scene(scene, mesh, goals, up=up, probes_m=options.probes, export=export, behind_m2k_w=behind, say=say)
     return replace(run, seconds={"read": read_s, **run.seconds})
+
+
+def _given(options: Heat) -> tuple[Path, str]:
+    """Return mesh and scene; raises `HeatError` if one is missing."""
+    if options.mesh is None or options.scene is None:
+        missing = "mesh" if options.mesh is None else "scene"
+        remedy = "Pass the mesh.vtu of an export, and --scene winter-night; --write-scene writes one to change."
+        raise HeatError(missing, expected="a file", got="none", remedy=remedy)
+    return options.mesh, options.scene
+
+
+def resistances_of_audit(path: Path, say: Say = lambda _: None) -> dict[str, float]:
+    """Return the resistance from the air inside to the outer surface by patch, [m2 K / W], from an answers.json.
+
+    R = (Ti - Ts) A / Q with the temperatures Ti of the air inside and Ts of the surface, the area A and the heat flow Q
+    that the audit found: the air outside is left out, because the scene has its own. Patches whose heat flow is no more
+    than a bound are named in a line and left out. Raises `HeatError` for other files and for audits from inside.
+    """
+    content, remedy = read_json_object(path, "Pass the answers.json of thermoxels audit.", HeatError), "Audit again."
+    try:
+        side, inside_c = content["conditions"]["side"], float(content["conditions"]["inside"]["air"]["value"])
+        loss = {one["name"]: (one["area_m2"], one["surface_c"]["value"], one["loss_w"]) for one in content["patches"]}
+        clear = {name: one for name, one in loss.items() if one[2]["low"] > 0.0}
+        found = {name: (inside_c - c) * area / float(w["value"]) for name, (area, c, w) in clear.items()}
+    except (KeyError, TypeError, ValueError) as problem:
+        raise HeatError(str(path), expected="the answers of an audit", got=f"no {problem}", remedy=remedy) from problem
+    if side != "outside" or not clear:
+        got = f"one from {side}" if clear else "no heat flow that is more than a bound"
+        remedy = "Give the scene's materials yourself."
+        raise HeatError(str(path), expected="an audit from outside that found heat flows", got=got, remedy=remedy)
+    unclear = sorted(set(loss) - set(clear))
+    if unclear:
+        say(f"Warning: of {', '.join(unclear)} the audit knows no more than an upper bound; they get no layer.")
+    return found
 
 
 def read_export_summary(mesh: Path, say: Say) -> dict[str, Any]:
@@ -173,6 +222,8 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
         **asdict(run.results),
         "wall": None if run.wall is None else asdict(run.wall),
         "no_wall": run.no_wall,
+        "unfit": list(run.unfit),
+        "layers": [asdict(one) for one in run.layers],
         "probes": [
             {"point_m": point, "temperature_c": values} for point, values in zip(run.probes.points_m, run.probes_c.T)
         ],
@@ -194,7 +245,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtu
     from thermoxels_ns.reports.heat_page import heat_page
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES, draw_surface
-    from thermoxels_ns.reports.page import write_page
+    from thermoxels_ns.reports.page import identify, write_page
 
     answers = answers_of(options, run)
     summary_text(answers)  # raises if json cannot hold the answers
@@ -213,7 +264,10 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     drawn = {name: (folder / name).read_bytes() for name in pictures}
     shown_in = STEADY if isinstance(run.solution, SteadySolution) else THROUGH_TIME
     files = [PAGE, ANSWERS, SERIES, shown_in, *pictures]
-    write_page(folder / PAGE, heat_page(run, drawn, options.mesh.name, command_of("heat", options), files))
+    mesh, scene = _given(options)
+    inputs = [mesh, mesh.with_name(f"{mesh.stem}-boundary.vtp"), Path(scene), *filter(None, [options.from_audit])]
+    report = identify(inputs, scene, options.probes, options.up, options.tolerance, options.flow_tolerance)
+    write_page(folder / PAGE, heat_page(run, drawn, mesh.name, command_of("heat", options), files, report))
     write_summary(folder / ANSWERS, answers)
     say(f"Written to {folder}: {', '.join(files)}")
 

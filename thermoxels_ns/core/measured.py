@@ -9,27 +9,36 @@ from typing import Any
 
 from thermoxels_ns.core.errors import ThermoxelsError
 
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_NUMBER = r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?"
 _WRITTEN = re.compile(rf"\s*({_NUMBER})\s*(?:(?:\+-|\+/-|±)\s*({_NUMBER})\s*)?(\S.*)?", re.DOTALL)
 
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "1": {"": (1.0, 0.0), "%": (0.01, 0.0)},
-    "C": {"C": (1.0, 0.0), "°C": (1.0, 0.0), "K": (1.0, -273.15)},
-    "K": {"K": (1.0, 0.0), "C": (1.0, 0.0), "°C": (1.0, 0.0)},
+    "C": {"C": (1.0, 0.0), "K": (1.0, -273.15)},
+    "K": {"K": (1.0, 0.0), "C": (1.0, 0.0)},
     "m": {"m": (1.0, 0.0), "cm": (0.01, 0.0), "mm": (1e-3, 0.0)},
     "m/s": {"m/s": (1.0, 0.0), "km/h": (1.0 / 3.6, 0.0)},
     "h": {"h": (1.0, 0.0), "d": (24.0, 0.0)},
+    "s": {"s": (1.0, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0), "d": (86400.0, 0.0)},
     "Pa": {"Pa": (1.0, 0.0)},
     "W": {"W": (1.0, 0.0), "kW": (1e3, 0.0)},
     "W/K": {"W/K": (1.0, 0.0)},
     "W/(m K)": {"W/mK": (1.0, 0.0)},
     "W/(m2 K)": {"W/m2K": (1.0, 0.0)},
+    "m2 K/W": {"m2K/W": (1.0, 0.0)},
+    "W/m2": {"W/m2": (1.0, 0.0)},
+    "W/m3": {"W/m3": (1.0, 0.0)},
+    "kg/m3": {"kg/m3": (1.0, 0.0)},
+    "J/(kg K)": {"J/kgK": (1.0, 0.0), "kJ/kgK": (1e3, 0.0)},
+    "degrees": {"degrees": (1.0, 0.0), "deg": (1.0, 0.0), "°": (1.0, 0.0)},
     "K d": {"Kd": (1.0, 0.0), "Kh": (1.0 / 24.0, 0.0)},
     "/kWh": {"/kWh": (1.0, 0.0), "/MWh": (1e-3, 0.0)},
     "kg/kWh": {"kg/kWh": (1.0, 0.0), "g/kWh": (1e-3, 0.0)},
 }
 """For each unit in which values are kept: the units that people may write, with factor and summand to convert a value.
 Spaces, brackets and ^ in a written unit are ignored."""
+_SIGNS = str.maketrans({"\N{MINUS SIGN}": "-", "²": "2", "³": "3", "\N{MASCULINE ORDINAL INDICATOR}": "°", "℃": "°C"})
+_THOUSANDS = re.compile(r"(?<![\d.,])([1-9]\d{0,2}),(\d{3})(?!\d)")  # A comma of thousands or of decimals
 _EXAMPLES = {"1": "0.93 +- 0.02", "C": "20.0 +- 0.5 C", "K": "0 +- 1 K"}
 
 
@@ -83,23 +92,30 @@ class Unit:
         return core_schema.no_info_plain_validator_function(self.read)
 
 
-def read_measured(name: str, content: object, unit: str) -> Measured:
+def read_measured(name: str, content: object, unit: str, bare: bool = False) -> Measured:
     """Read a value as people write it, such as ``20.0 +- 0.5 C`` or ``0.93``; return it in `unit`, "1" for no unit.
 
+    A comma counts as a decimal point, unless three digits follow. With `bare` a number without a unit is in `unit`.
     Raises `ThermoxelsError`, which starts with `name`, if the text is no number or its unit is wrong or missing.
 
-    >>> read_measured("wind", "3.6 +- 1.8 km/h", "m/s")
+    >>> read_measured("wind", "3,6 +- 1.8 km/h", "m/s")
     Measured(value=1.0, off_by=0.5)
     """
     example = _EXAMPLES.get(unit, f"1.5 +- 0.5 {unit}")
     plain = isinstance(content, (int, float)) and not isinstance(content, bool)
-    written = _WRITTEN.fullmatch(content if isinstance(content, str) else str(content) if plain else "")
-    got = "nothing" if content is None else repr(content)
+    text = content.translate(_SIGNS) if isinstance(content, str) else str(content) if plain else ""
+    written, got = _WRITTEN.fullmatch(text), "nothing" if content is None else repr(content)
+    if either := _THOUSANDS.search(text):
+        remedy = f"Write {either[1]}{either[2]} or {either[1]}.{either[2]}, whichever is meant."
+        raise _wrong(name, "a comma that cannot be one of thousands", got, remedy)
     if written is None:
         raise _wrong(name, "a number" if unit == "1" else f"a number in {unit}", got, f"Write {example}, for example.")
     number, off_by, ending = written.groups()
-    known = _UNITS[unit]
-    short = re.sub(r"[\s()^]", "", ending or "").replace("²", "2")
+    number, off_by = number.replace(",", "."), off_by and off_by.replace(",", ".")
+    known = _UNITS[unit] | ({"": (1.0, 0.0)} if bare else {})
+    short = re.sub(r"[\s()^]", "", ending or "")
+    if unit in ("C", "K"):
+        short = re.sub(r"^(°|deg|degrees)(C|Celsius)?$", "C", short)
     if short not in known:
         says = "without a unit, or in %" if unit == "1" else f"with its unit, {unit}"
         if short:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_h
 import yaml
 from typing_extensions import dataclass_transform
 
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import RecordError, ThermoxelsError, explain, printable
 
 if TYPE_CHECKING:  # pydantic is slow to import, and presets do not need it
@@ -47,6 +48,16 @@ def configs_folder() -> Path:
     """Return the folder of our yaml files: inside the package if installed, beside the package in a source tree."""
     inside = _PACKAGE / "configs"
     return inside if inside.is_dir() else _PACKAGE.parent / "configs"
+
+
+def write_example(path: Path, example: str, error: type[ThermoxelsError]) -> None:
+    """Copy a file of `configs_folder` to `path`; raises `error` if there is something already."""
+    if path.exists():
+        remedy = "Choose another name."
+        raise error(str(path), expected="a name that is free", got="a file", remedy=remedy)
+    writable_folder(path.parent)
+    with replace_when_done(path) as temporary:
+        temporary.write_text((configs_folder() / example).read_text(encoding="utf-8"), encoding="utf-8")
 
 
 @contextmanager
@@ -174,6 +185,8 @@ def _mistake(name: str, path: list[str | int], value: object, one: dict[str, Any
         known = tuple(key for key in _keys_at(target, path[:-1]) if key != path[-1])
         meant = _meant(str(path[-1]), known)
         remedy = f"Did you mean {meant}?" if meant else "Correct or remove that key."
+        if str(path[-1])[:1].isdigit():
+            remedy = "Within braces a comma ends an entry: write decimals with a point."
         return explain(above, expected=f"keys out of {', '.join(known)}", got=path[-1], remedy=remedy)
     if kind == "literal_error":
         expected = f"one of {one['ctx']['expected'].replace(chr(39), '').replace(' or ', ', ')}"

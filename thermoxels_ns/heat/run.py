@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import kelvin_to_celsius
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
 from thermoxels_ns.fem.tolerance import ToleratedSolution
 from thermoxels_ns.heat.results import (
@@ -23,6 +25,7 @@ from thermoxels_ns.heat.results import (
     WallResult,
     heat_results,
     matching_facets,
+    region_behind_facets,
     volume_shares,
     wall_of_scene,
 )
@@ -110,6 +113,8 @@ class HeatRun:
     left_out: tuple[LeftOut, ...]  # Effects that were left out because they bring too little heat
     accuracy: ToleratedSolution | None  # Solution with estimated errors; None if no tolerance was given
     warnings: tuple[str, ...]  # Sentences on what looks wrong about the scene on this mesh
+    unfit: tuple[str, ...]  # Those of `warnings` that make heat losses and U-values worthless: the mesh has no rooms
+    layers: tuple[Layer, ...]  # Layers that `behind_m2k_w` asked for
     solution: Solution  # Temperatures and heat flows
     results: HeatResults  # Heat by patch, effect and region, the heat balance, and the coldest and hottest spot
     wall: WallResult | None
@@ -129,21 +134,29 @@ def run_scene(
     up: Direction | None = None,
     probes_m: npt.ArrayLike = (),
     export: Mapping[str, Any] | None = None,
+    behind_m2k_w: Mapping[str, float] | None = None,
     say: Say = lambda _: None,
 ) -> HeatRun:
     """Put a scene on a mesh, solve the problem, and return the solution with results and warnings.
 
     If the scene has no `up`, the argument `up` counts, or z if it is None. Temperatures are followed at `probes_m`,
     shape (p, 3), [m]. `export`, the summary of the export that wrote the mesh, adds warnings; `say` gets lines of
-    progress. Raises `HeatError` if the scene does not fit the mesh, a probe lies outside it, or the solver fails.
+    progress. `behind_m2k_w` is the argument of `with_layers`. Raises `HeatError` if the scene does not fit the mesh, a
+    probe lies outside it, or the solver fails.
     """
-    start = clock.perf_counter()
+    start, scene = clock.perf_counter(), scene.on(mesh)
+    scene, layers = (scene, ()) if behind_m2k_w is None else with_layers(scene, mesh, behind_m2k_w)
     problem = scene.problem(mesh, up=up)
     probes = place_probes(mesh, np.array(probes_m, dtype=np.float64).reshape(-1, 3))
     about_patches = patch_warnings(scene, mesh, problem.up)
-    inner = () if about_patches else inner_surface_warnings(scene, mesh, problem.up)
+    inner, harmless = ((), ()) if about_patches else inner_surface_warnings(scene, mesh, problem.up)
     about_scene = (*unused_settings(scene), *doubtful_temperatures(scene))
-    warnings = (*about_patches, *inner, *about_scene, *body_warnings(mesh), *shell_warnings(scene, export or {}))
+    over = [one.patch for one in layers if one.body_m2k_w > 1.05 * one.asked_m2k_w]
+    if over:
+        what = f"The body alone resists more than the audit found: {', '.join(over)}. There the heat loss is too low"
+        about_scene += (f"{what}; give the scene a material that conducts more, or export thinner walls.",)
+    unfit = (*about_patches, *inner)
+    warnings = (*unfit, *harmless, *about_scene, *body_warnings(mesh), *shell_warnings(scene, export or {}))
     for warning in warnings:
         say(f"Warning: {warning}")
     found = solve_problem(problem, scene.time, goals, say)
@@ -170,6 +183,8 @@ def run_scene(
         left_out=found.left_out,
         accuracy=found.accuracy,
         warnings=warnings,
+        unfit=unfit,
+        layers=layers,
         solution=solution,
         results=results,
         wall=None if isinstance(wall, str) else wall,
@@ -194,6 +209,7 @@ _COS_45 = float(np.sqrt(0.5))
 _LEAST_OF_A_ROOM = 0.1
 """Least share of a room's inner surface that walls and floor make up; in a cube they make up five sixths."""
 _LEAST_FLOOR = 0.5  # Least area of a room's floor over that of its ceiling
+_MOST_SHARED = 0.02  # Share of the inner surface's nodes that may lie on the outer one, as the rim of a hole does
 _THICKNESS_OFF = 0.2  # Relative difference from the asked thickness of walls above which there is a warning
 _INWARDS = -0.2
 """Value of `_outwards` below which a surface faces inwards, as that of a room does. Typical values: 0.8 to 1 for a body
@@ -209,8 +225,9 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
     """
     selection = Selection(mesh, up)
     inside, outside = matching_facets(selection, INSIDE), matching_facets(selection, OUTSIDE)
-    inside_air = scene.inside_air is not None and scene.inside_air.patches == INSIDE
-    outside_air = scene.outside_air is not None and scene.outside_air.patches == OUTSIDE
+    inside_air = scene.inside_air is not None and scene.inside_air.patches[:1] == INSIDE
+    outside_air = scene.outside_air is not None and scene.outside_air.patches[:1] == OUTSIDE
+    inside = matching_facets(selection, scene.inside_air.patches) if scene.inside_air and inside_air else inside
     warnings = []
     if (inside_air or outside_air) and _outwards(selection, outside) < _INWARDS:
         warnings.append(
@@ -224,24 +241,27 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
         warnings.append(
             f"The scene names air inside, but the body has no rooms: of the {area:.4g} m² that no photograph saw, next "
             "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
-            "and heat losses are those of that. Export again with --interior hollow, which keeps the inside empty, or "
+            "and heat losses are those of that. Export again with --interior hollow --wall-thickness 0.3, or "
             "name the inner surface with --patches."
         )
     return tuple(warnings)
 
 
-def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str, ...]:
-    """Return warnings on rims of holes, where the inner surface touches the outer one, and on missing floors."""
+def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return warnings on a missing floor and on nodes that the inner surface shares with the outer one.
+
+    The first ones make heat losses worthless; the second ones, on a few nodes at rims of holes, do not.
+    """
     if scene.inside_air is None or scene.outside_air is None:
-        return ()
+        return (), ()
     selection = Selection(mesh, up)
     inside, outside = (matching_facets(selection, air.patches) for air in (scene.inside_air, scene.outside_air))
     inner = np.unique(mesh.facets[inside])
     shared = np.intersect1d(inner, mesh.facets[outside & ~inside])
-    warnings = []
+    warnings, harmless = [], []
     if len(shared):
         x, y, z = mesh.points_m[shared[0]]
-        warnings.append(
+        (warnings if len(shared) > _MOST_SHARED * len(inner) else harmless).append(
             f"{len(shared)} of the {len(inner)} nodes of the inner surface lie on the outer one as well, one at "
             f"({x:.4g}, {y:.4g}, {z:.4g}) m: rims of holes, or walls that end. There both airs touch the body; "
             "temperature factors leave these nodes out, heat losses do not."
@@ -254,7 +274,64 @@ def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tu
             f"The inner surface has a ceiling of {ceiling:.3g} m² and a floor of {floor:.3g} m²: most of the floor is "
             "missing, and so is the heat that it loses."
         )
-    return tuple(warnings)
+    return tuple(warnings), tuple(harmless)
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer on the outside of a patch, with which heat meets the resistance that an audit found."""
+
+    patch: str
+    asked_m2k_w: float  # Resistance from the air inside to the outer surface, [m2 K / W]
+    body_m2k_w: float  # That of the body and of the air inside, without a layer, [m2 K / W]
+    layer_m2k_w: float  # What the layer adds, at least 0, [m2 K / W]
+
+
+def with_layers(
+    scene: HeatScene, mesh: TetMesh, behind_m2k_w: Mapping[str, float]
+) -> tuple[HeatScene, tuple[Layer, ...]]:
+    """Return a scene with a layer on the outside of each patch, so that a wall has a given resistance.
+
+    `behind_m2k_w` is the resistance from the air inside to the outer surface, [m2 K / W], by patch. The body's own is
+    its thickness, the distance across the wall between an outer and the nearest inner triangle, by its conductivity.
+    Raises `HeatError` if the body has no rooms, or if more than air acts, because no layer lies below sunlight or sky.
+    """
+    inside, outside, selection = scene.inside_air, scene.outside_air, Selection(mesh, scene.up or (0.0, 0.0, 1.0))
+    more = [key for key in ("sky", "ground", "sun", "radiation", "absorbed_solar", "heat_flux") if getattr(scene, key)]
+    if inside is None or outside is None or more:
+        got, remedy = ", ".join(more) or "no two airs", "Pass --scene winter-night, or a scene like it."
+        raise HeatError("--from-audit", expected="a scene of the airs inside and outside alone", got=got, remedy=remedy)
+    names, patch = selection.patch_names, selection.facet_patch
+    inner, outer = (np.flatnonzero(matching_facets(selection, air.patches)) for air in (inside, outside))
+    both = [names[n] for n in np.unique(patch[outer]) if names[n] in behind_m2k_w]
+    if not len(inner) or not both:
+        expected, got = f"rooms, and outer patches out of {', '.join(behind_m2k_w)}", ", ".join(names)
+        remedy = "Export with --interior hollow --wall-thickness 0.3 and the --patches of the audit."
+        raise HeatError("--from-audit", expected=expected, got=got, remedy=remedy)
+    places, here, area = selection.facet_places(inner), selection.facet_places(outer), selection.facet_area_m2[outer]
+    _, nearest = KDTree(places.points_m).query(here.points_m)
+    thickness_m = np.abs(np.einsum("fi,fi->f", here.points_m - places.points_m[nearest], here.normals))
+    film = inside.convection().coefficient_w_m2k
+    film = np.broadcast_to(film.function(places, 0.0) if isinstance(film, Varying) else film, len(inner))
+    made_of = scene.material(mesh)
+    by_name = made_of if isinstance(made_of, dict) else dict.fromkeys(mesh.region_names, made_of)
+    conductivity = np.array([by_name[n].conductivity_w_mk if n in by_name else np.nan for n in mesh.region_names])
+    conducts = 1.0 / (1.0 / film[nearest] + thickness_m / conductivity[region_behind_facets(mesh)[outer]])
+    air, layers, effects = outside.convection(), [], []
+    assert isinstance(air.coefficient_w_m2k, float), "outside, films are numbers"
+    for name in both:
+        on = patch[outer] == names.index(name)
+        asked, own = behind_m2k_w[name], 1.0 / float(np.average(conducts[on], weights=area[on]))
+        layers.append(Layer(name, asked, own, max(asked - own, 0.0)))
+        through = 1.0 / (1.0 / max(air.coefficient_w_m2k, 1e-9) + layers[-1].layer_m2k_w)
+        effects.append(replace(air, patches=(name,), coefficient_w_m2k=through))
+    every = {name for pattern in outside.patches for name in matching_names(names, pattern)}
+    rest = tuple(sorted(every - {*behind_m2k_w}))
+    outside = replace(outside, patches=rest or effects[-1].patches)
+    if not rest:  # the last patch keeps the open air, by which the page names the temperature outside
+        own = {"coefficient": None, "wind_m_s": None, "emissivity": None}
+        outside = replace(outside, **own, coefficient_w_m2k=effects.pop().coefficient_w_m2k)
+    return replace(scene, outside_air=outside, convection=(*scene.convection, *effects)), tuple(layers)
 
 
 def unused_settings(scene: HeatScene) -> tuple[str, ...]:

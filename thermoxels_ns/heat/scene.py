@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, make_dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cache
@@ -18,6 +19,7 @@ import yaml
 from pydantic import Discriminator, Field, Tag
 
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.measured import read_measured
 from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml, record, wrong
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Quantity, Varying
@@ -34,6 +36,8 @@ from thermoxels_ns.heat.effects import (
 )
 from thermoxels_ns.heat.materials import Material, material, with_names
 from thermoxels_ns.heat.scene_fields import (
+    INSIDE,
+    OUTSIDE,
     WITH_RADIATION,
     Celsius,
     Direction,
@@ -46,9 +50,14 @@ from thermoxels_ns.heat.scene_fields import (
     unclear,
 )
 from thermoxels_ns.heat.sky import Sunlight, Vector, fixed_sun, moving_sun, outdoor_radiation, swinbank_sky_c
+from thermoxels_ns.mesh.boundary.patches import DEFAULT_PATCHES
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Value = TypeVar("Value")
+Section = TypeVar("Section", InsideAir | None, OutsideAir | None, Surface, Sun | None, Radiation, AbsorbedSolar)
+Shining = TypeVar("Shining", Radiation, AbsorbedSolar)
+
+DEFAULTS = (INSIDE, OUTSIDE)  # Patches of sections for which the scene names none
 
 _Z_UP: Vector = (0.0, 0.0, 1.0)
 _ANY_START_C = 10.0  # where the iterations to a steady state start on a mesh without temperatures, [degrees Celsius]
@@ -110,13 +119,55 @@ class HeatScene:
         """True if the steady state is asked for, `time` being None."""
         return self.time is None
 
+    @property
+    def uses_photographs(self) -> bool:
+        """True if the result depends on a temperature that photographs measured."""
+        return self.time is not None and self.initial_c is None
+
+    def on(self, mesh: TetMesh) -> HeatScene:
+        """Return the scene whose default patches include the mesh's named ones: what photographs show is outside.
+
+        A named patch is outside (``exterior-*``) if photographs show most of its area, else inside. Patches that
+        another entry of the scene names are left to that entry.
+        """
+        if mesh.boundary is None:
+            return self
+        area, tags = Selection(mesh).facet_area_m2, mesh.boundary
+        whole, seen = (np.bincount(tags.patch, area * part, len(tags.patch_names)) for part in (1.0, tags.seen))
+        own = [n for n, name in enumerate(tags.patch_names) if name not in DEFAULT_PATCHES and whole[n] > 0.0]
+        airs = [air.patches for air in (self.inside_air, self.outside_air) if air and air.patches not in DEFAULTS]
+        contacts = (*self.convection, *self.ground_contact, *self.fixed_temperature, *self.heat_flux)
+
+        def widened(section: Section, *others: tuple[str, ...]) -> Section:
+            if section is None or section.patches not in DEFAULTS:
+                return section
+            taken = {name for one in others for pattern in one for name in matching_names(tags.patch_names, pattern)}
+            chosen = [n for n in own if (seen[n] > 0.5 * whole[n]) == (section.patches == OUTSIDE)]
+            names = [_as_pattern(tags.patch_names[n]) for n in chosen if tags.patch_names[n] not in taken]
+            return replace(section, patches=(*section.patches, *names))  # type: ignore[type-var]
+
+        named = [*airs, *(effect.patches for effect in contacts), self.adiabatic]
+
+        def all_widened(entries: tuple[Shining, ...]) -> tuple[Shining, ...]:
+            return tuple(widened(one, *(other.patches for other in entries if other is not one)) for one in entries)
+
+        return replace(
+            self,
+            inside_air=widened(self.inside_air, *named),
+            outside_air=widened(self.outside_air, *named),
+            surfaces=tuple(widened(surface) for surface in self.surfaces),  # the last one holds, property by property
+            radiation=all_widened(self.radiation),
+            absorbed_solar=all_widened(self.absorbed_solar),
+            sun=widened(self.sun, self.adiabatic),
+        )
+
     def problem(self, mesh: TetMesh, *, up: Vector | None = None) -> HeatProblem:
         """Return the problem on a mesh. If the scene has no `up`, the argument counts, or z. Raises as `effects`."""
         start_c = self.initial_c
         if start_c is None and self.steady and not mesh.has_temperatures:
             start_c = _ANY_START_C
         initial = None if start_c is None else np.full(len(mesh.points_m), start_c)
-        return HeatProblem(mesh, self._material(mesh), initial, self.effects(mesh), self.up or up or _Z_UP)
+        return HeatProblem(mesh, self.material(mesh), initial, self.effects(mesh), self.up or up or _Z_UP)
 
     def effects(self, mesh: TetMesh) -> tuple[Effect, ...]:
         """Return the effects that the scene names.
@@ -125,7 +176,7 @@ class HeatScene:
         adiabatic, or two entries count the same exchange of heat.
         """
         patches = ScenePatches(mesh)
-        named = self._named_effects(patches)
+        named = self.on(mesh)._named_effects(patches)
         where = [(name, patches.matching(name, effect.where)) for name, effect in named]
         self._check_counted_once(where)
         patches.check_all_named(set().union(*(chosen for _, chosen in where)), self.adiabatic)
@@ -147,7 +198,8 @@ class HeatScene:
                 named += [(entry_name, entry) for entry_name, entry in listed if isinstance(entry, Effect)]
         return named
 
-    def _material(self, mesh: TetMesh) -> Material | dict[str, Material]:
+    def material(self, mesh: TetMesh) -> Material | dict[str, Material]:
+        """Return the material of a mesh, by region if regions differ; `HeatError` if a region has none."""
         chosen: dict[str, Material] = {}
         for pattern, made_of in self.materials.items():
             matching = [name for name in mesh.region_names if fnmatchcase(name, pattern)]
@@ -261,6 +313,8 @@ def load_heat_scene(name: Path | str) -> HeatScene:
             expected = f"one of {', '.join(heat_scene_names())}, or the path of a yaml file"
             raise wrong("heat scene", expected, repr(str(name)), "Correct the name.")
     content = read_yaml(path)
+    with suppress(RecursionError):  # an entry that contains itself, which the check below names
+        content = _without_units(path.name, content)
     for air in (content.get("inside_air"), content.get("outside_air")):
         if isinstance(air, dict) and isinstance(air.get("air_series"), str):
             air["air_series"] = str(path.parent / air["air_series"])
@@ -278,6 +332,33 @@ def load_heat_scene(name: Path | str) -> HeatScene:
             region: material(one) if isinstance(one, str) else one for region, one in found["materials"].items()
         }
         return HeatScene(**found)
+
+
+_UNIT_OF_KEY = {
+    **{"_w_m2k": "W/(m2 K)", "_m2k_w": "m2 K/W", "_w_mk": "W/(m K)", "_w_m2": "W/m2", "_w_m3": "W/m3", "_m_s": "m/s"},
+    **{"_kg_m3": "kg/m3", "_j_kgk": "J/(kg K)", "_seconds": "s", "_s": "s", "_c": "C", "_k": "K", "_deg": "degrees"},
+    **dict.fromkeys(("emissivity", "absorptivity", "reflectance"), "1"),
+}
+"""Unit of a number by the end of its key; the first end that fits counts."""
+
+
+def _without_units(name: str, content: Any) -> Any:
+    """Return the content of a file with texts such as ``20.5 C`` or ``24 h`` as numbers in the units of their keys."""
+    if isinstance(content, list):
+        return [_without_units(f"{name} entry {number}", one) for number, one in enumerate(content, start=1)]
+    if not isinstance(content, dict):
+        return content
+    found = {}
+    for key, value in content.items():
+        unit = next((unit for end, unit in _UNIT_OF_KEY.items() if key.endswith(end)), None)
+        found[key] = value = _without_units(f"{name}: {key}", value)
+        if unit is not None and isinstance(value, str) and value.lstrip(" +-.,\N{MINUS SIGN}")[:1].isdigit():
+            measured = read_measured(f"{name}: {key}", value, unit, bare=True)
+            if measured.off_by:
+                remedy = f"Write {measured.value:g} {'' if unit == '1' else unit}".rstrip() + "."
+                raise wrong(f"{name}: {key}", "a number without a range", repr(value), remedy)
+            found[key] = measured.value
+    return found
 
 
 def _irradiance(sun: Sun, reflectance: float) -> Varying:

@@ -15,7 +15,7 @@ from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_patches, apply
 from thermoxels_ns.mesh.boundary.visibility import seen_facets
 from thermoxels_ns.mesh.quality.checks import component_of
 from thermoxels_ns.mesh.quality.report import BoundaryMode
-from thermoxels_ns.mesh.solid.morphology import face_connected
+from thermoxels_ns.mesh.solid.morphology import face_connected, grow
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.stuffing.sharp_edges import sharpen
@@ -186,12 +186,19 @@ def _tagged(
     if snapshot.views is not None:
         centroids = snapshot.lattice.index_to_world(points_index[mesh.facets].mean(axis=1))
         seen = seen_facets(solid.cells, snapshot.views, snapshot.lattice, centroids, normal @ rotation)
+    outside = seen
+    if solid.rooms is not None:
+        beside = np.floor(points_index[mesh.facets].mean(axis=1) + 0.75 * normal @ rotation).astype(np.int64)
+        beside = np.clip(beside, 0, np.array(solid.rooms.shape) - 1)
+        inner = ~seen & grow(solid.rooms, 1)[tuple(beside.T)]
+        # In a building with rooms, what faces none is outside, seen or not, as below the lowest floor.
+        outside = ~inner if np.count_nonzero(inner) > 0.5 * np.count_nonzero(~seen) else seen
     patch, names, idle = apply_patches(
         options.rules,
         centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
         normals=normal,
         up=options.up,
-        seen=seen,
+        seen=outside,
         on_box=mesh.facet_tags == FACET_BOX,
         colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),
     )

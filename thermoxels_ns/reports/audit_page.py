@@ -14,8 +14,9 @@ from thermoxels_ns.audit.draws import CONFIDENCE
 from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit
 from thermoxels_ns.audit.surface import WHY_NOT
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.reports.charts import gradient
 from thermoxels_ns.reports.numbers import number_text, stated_text
-from thermoxels_ns.reports.page import Picture, build_page, image_file
+from thermoxels_ns.reports.page import Picture, Report, build_page, image_file
 
 AuditPictures: TypeAlias = dict[str, list[bytes]]
 """PNG files by name, one for each view: "temperature" with the numbers of defects, "u_value" (heat flow if no outside
@@ -33,10 +34,17 @@ def audit_page(
     mesh_name: str,
     command: str,
     files: Sequence[str],
+    *,
+    report: Report,
+    range_c: tuple[float, float] | None,
+    most_u: Mapping[str, float],
+    impossible: Sequence[str],
 ) -> str:
     """Return the html text of an audit's page; `command` made the audit, `files` lie beside the page.
 
-    `photographs` are pictures of defects by place in `audit.defects`; without `pictures` the page has no drawings.
+    `photographs` are pictures of defects by place in `audit.defects`, whose colours span `range_c`; without `pictures`
+    the page has no drawings. `most_u` is the U-value by name of an element from which on a value is marked impossible,
+    `impossible` are sentences on such values.
     """
     numbered, asked = list(enumerate(audit.defects, start=1)), audit.conditions.calibrate
     counted = [(number, one) for number, one in numbered if not one.not_counted]
@@ -59,6 +67,11 @@ def audit_page(
         known={name: value for name, value in start.items() if name not in unknown},
         survey_rows=_survey(audit.conditions.survey),
         pictures=pictures,
+        report=report,
+        gradient=gradient(),
+        range_c=range_c,
+        most_u=most_u,
+        impossible=impossible,
         photographs=defaultdict(tuple, photographs),
         confidence=100.0 * CONFIDENCE,
         severe_share=SEVERE_SHARE,

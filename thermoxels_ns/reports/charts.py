@@ -102,6 +102,12 @@ def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatAr
         return svg_text(figure)
 
 
+def gradient() -> str:
+    """Return the colours of `colours`, from dark to bright, as a list for a style sheet."""
+    shown = colours(np.linspace(0.0, 1.0, 17)[None], (0.0, 1.0))[0]
+    return ", ".join(f"rgb({red} {green} {blue})" for red, green, blue in shown.tolist())
+
+
 def colours(temperature_c: npt.NDArray, limits: tuple[float, float] | None = None) -> npt.NDArray[np.uint8]:
     """Return colours, (h, w, 3), of temperatures, (h, w), from `limits` (default: `PERCENTILES`); black where NaN."""
     import cv2

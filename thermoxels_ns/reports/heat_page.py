@@ -17,7 +17,7 @@ from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.run import HeatRun, mesh_error_in_words
 from thermoxels_ns.reports.charts import plot_over_time
 from thermoxels_ns.reports.numbers import duration_text, flow_text, least_flow, unit_signs
-from thermoxels_ns.reports.page import build_page
+from thermoxels_ns.reports.page import Report, build_page
 
 _CAPTIONS = {
     "surface-start.png": "The surface at the start.",
@@ -27,7 +27,9 @@ _CAPTIONS = {
 }
 
 
-def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, command: str, files: Sequence[str]) -> str:
+def heat_page(
+    run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, command: str, files: Sequence[str], report: Report
+) -> str:
     """Return a heat run's page as html; `pictures` are PNG contents by file name, `files` names of files beside it."""
     results, solution, accuracy = run.results, run.solution, run.accuracy
     flows = [flow for effect in results.effects for flow in (effect.heat_w, effect.last_heat_w)]
@@ -54,6 +56,7 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, comma
         effects=[(label, _values(effect, selection)) for label, effect in zip(labels, run.problem.effects)],
         residual=0.0 if abs(residual) < least_w * duration_s else residual,
         effort=_effort(run),
+        report=report,
         command=command,
         files=files,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from datetime import datetime
 
@@ -11,24 +12,24 @@ from thermoxels_ns.core.measured import Measured
 
 
 def figure(value: float) -> str:
-    """Return a number with at least four significant digits; with a power of ten below 0.001 and from a million on.
+    """Return a number with three significant digits; with a power of ten below 0.001 and from a million on.
 
     >>> figure(1234.56), figure(0.0123456), figure(0.0)
-    ('1,235', '0.01235', '0')
+    ('1,230', '0.0123', '0')
     """
     if value == 0.0:
         return "0"
     if 1e-3 <= abs(value) < 1e6:
-        digits = max(0, 3 - math.floor(math.log10(abs(value))))
-        return f"{value:,.{digits}f}"
-    return f"{value:.3e}"
+        digits = 2 - math.floor(math.log10(abs(value)))
+        return f"{round(value, digits):,.{max(digits, 0)}f}"
+    return f"{value:.2e}"
 
 
 def flow_text(heat_w: float, least_w: float, per_area: float | None = None) -> str:
     """Return `per_area`, [W/m^2], or without it `heat_w`, as text; "0" if the size of `heat_w` is below `least_w`, [W].
 
     >>> flow_text(6e-10, 1e-6), flow_text(6e-10, 1e-6, 1e5), flow_text(-12.5, 1e-6), flow_text(1e-2, 1e-6, 1e-3)
-    ('0', '0', '-12.50', '0.001000')
+    ('0', '0', '-12.5', '0.00100')
     """
     return "0" if abs(heat_w) < least_w else figure(heat_w if per_area is None else per_area)
 
@@ -45,12 +46,32 @@ def least_flow(flows_w: Sequence[float], area_m2: float) -> float:
 
 
 def degrees(value_c: float) -> str:
-    """Return a temperature with two decimals; values that round to 0 have no sign.
+    """Return a temperature with one decimal; values that round to 0 have no sign.
 
-    >>> degrees(-0.001), degrees(-0.006)
-    ('0.00', '-0.01')
+    >>> degrees(-0.01), degrees(-0.06)
+    ('0.0', '-0.1')
     """
-    return f"{round(float(value_c), 2) + 0.0:.2f}"
+    return f"{round(float(value_c), 1) + 0.0:.1f}"
+
+
+_PLAIN = {
+    r"emissivity of \*, entry \d+": "emissivity of the surfaces",
+    r"(emissivity of .+?), entry \d+": r"\1",
+    r"\bfilm (factor|coefficient)\b": r"heat transfer between surface and air (film: \1)",
+    r"\bcamera repeatability\b": "difference of the camera's readings between places (repeatability)",
+    r"\bcamera offset\b": "common error of the camera's readings (offset)",
+}
+
+
+def plain_names(text: str) -> str:
+    """Return a text in which the names of uncertain quantities are words that a client of an audit knows.
+
+    >>> plain_names("wind, emissivity of *, entry 1"), plain_names("emissivity of door, sill, entry 2")
+    ('wind, emissivity of the surfaces', 'emissivity of door, sill')
+    """
+    for pattern, words in _PLAIN.items():
+        text = re.sub(pattern, words, text)
+    return text
 
 
 def point_text(point_m: Sequence[float]) -> str:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -14,7 +17,8 @@ import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns import __version__
+from thermoxels_ns.core.checks import plain_os_errors, replace_when_done
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.reports import numbers
 
@@ -22,6 +26,23 @@ Picture: TypeAlias = tuple[bytes, str]
 """Content of a PNG or JPEG file, and its caption."""
 
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a report was made of: the same inputs, choices and version give the same number."""
+
+    number: str  # Such as 0F3A-99C2-71B0
+    version: str  # Version of Thermoxels
+    inputs: tuple[tuple[str, str], ...]  # Name and SHA-256 of each file
+
+
+def identify(files: Sequence[Path], *choices: object) -> Report:
+    """Return the number of a report that is made of files, those of them that exist, and of choices of its user."""
+    with plain_os_errors(files[0], "a file that can be read", "Check its permissions.", ThermoxelsError):
+        inputs = tuple((path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files if path.is_file())
+    digest = hashlib.sha256(repr((__version__, inputs, choices)).encode()).hexdigest()[:12].upper()
+    return Report("-".join((digest[:4], digest[4:8], digest[8:])), __version__, inputs)
 
 
 def build_page(template: str, **shown: Any) -> str:
@@ -73,6 +94,7 @@ def _environment() -> Environment:
         "finite": math.isfinite,
         "interval": numbers.interval_text,
         "lines": numbers.interval_lines,
+        "plain": numbers.plain_names,
         "point": numbers.point_text,
         "stated": numbers.stated_text,
         "unit": numbers.unit_signs,

@@ -118,6 +118,7 @@ class SolidCells:
     component_sizes: IntArray  # number of voxels of each body in the region after gaps were closed, largest first
     within: BoolArray  # True for voxels, solid or not, in the region; the solid is cut at its border
     left_out: BoolArray  # True for dense voxels and closed gaps outside the region or in bodies that were too small
+    rooms: BoolArray | None  # True for empty voxels inside hollow walls of given thickness; None for other solids
 
 
 def select_solid(
@@ -167,7 +168,7 @@ def select_solid(
     cells = step("region", np.append(False, ~small)[labels], remark)
     left_out = everything & ~cells
     # Solid outside the region still blocks the view of cameras into the region; floaters block nothing.
-    opaque = cells | (everything & ~within)
+    opaque, rooms = cells | (everything & ~within), None
     if thickness is not None:
         assert snapshot.views is not None
         wall = cells | (wall_behind(opaque, snapshot.lattice, snapshot.views, thickness) & within)
@@ -176,6 +177,13 @@ def select_solid(
         if thickness < THINNEST_GROWN:
             remark = f"A wall {asked} is thinner than one and a half voxels; the seen surface stays as thick as it is."
         cells = step("wall", wall, remark)
+        if selection.interior == "hollow":
+            inside = interior(opaque | cells, snapshot.lattice, snapshot.views, selection.seal_openings, within)
+            rooms = (inside.enclosed | inside.hidden) & ~cells
+            depth = np.asarray(ndimage.distance_transform_edt(cells | rooms | ~within))
+            remark = "Where no camera looks, as below the lowest floor, the rooms are closed by a wall as thick."
+            cells = step("close rooms", cells | (rooms & (depth <= thickness)), remark)
+            rooms &= ~cells
     elif selection.interior == "solid":
         inside = interior(opaque, snapshot.lattice, snapshot.views, selection.seal_openings, within)
         remark = f"{int(inside.enclosed.sum())} voxels of enclosed cavities are filled"
@@ -196,6 +204,7 @@ def select_solid(
         component_sizes=np.sort(sizes)[::-1].astype(np.int64),
         within=within,
         left_out=left_out,
+        rooms=rooms,
     )
 
 
