@@ -1,0 +1,424 @@
+"""The flat elements of a building: planes of a mesh's boundary, closed where planes meet, with windows and doors."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.path import Path as Outline
+from scipy import ndimage
+from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree
+
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.core.checks import check_direction
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.boundary.patches import Box, PatchRule, PatchRules, Plane, Vector
+from thermoxels_ns.mesh.quality.checks import component_of
+from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_area_vectors
+
+LEAST_PLANE_M2 = 2.0  # Smallest area of a plane that bounds the body
+_MOST_TRIED = 48  # Directions in which planes are looked for
+_CUBE_M = 0.25  # Edge of cubes over which normals are averaged: single triangles are up to 20 degrees off
+_WRINKLE_M = 0.15  # Distance from a plane within which triangles belong to it
+_COVER_M = 0.25  # Least thickness of what stands out from a wall and covers it
+_RECESS_M = 0.6  # Largest depth of a pane behind its wall; least width of a plane
+_FACES = 0.7  # Least cosine between the normals of a triangle and of its element
+_SAME_M = 1e-5  # Points nearer to each other are one
+_COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
+
+_PIXEL_M = 0.025  # Of the pictures of walls in which windows are looked for
+_RECESSED_M, _OTHER_COLOUR, _OTHER_K = 0.12, 0.15, 1.0
+"""Least differences between an opening and its wall: depth; distance of colours in [0, 1], or three times the wall's
+own median; temperature, or three standard deviations of the wall's own."""
+_LEAST_SIDE_M, _LEAST_FILL = 0.4, 0.65  # Of an opening: shortest side, and share of its rectangle that it fills
+_DOOR_M, _THRESHOLD_M = 1.7, 0.35  # Least height of a door, and largest height of its foot above that of the wall
+
+
+@dataclass(frozen=True)
+class FlatElement:
+    """A wall, roof, floor, window or door."""
+
+    name: str
+    kind: Literal["wall", "roof", "floor", "window", "door"]
+    outline_m: FloatArray  # Corners, shape (k, 3), counter-clockwise as seen from outside
+    normal: FloatArray  # Unit vector out of the building, shape (3,)
+    azimuth_deg: float  # Direction that it faces, clockwise from north
+    tilt_deg: float  # Angle between normal and up: 0 a flat roof, 90 a wall, 180 a floor
+    behind: Literal["air", "ground", "cover"]  # What touches it outside; cover: what stands out, such as an overhang
+    facets: IntArray  # Boundary triangles on the element, without those of its openings; none if air does not touch it
+    openings: tuple[FlatElement, ...] = ()  # Windows and doors, drawn in the plane of their wall
+    depth_m: float = 0.0  # How far the triangles of an opening lie behind its outline
+
+    @property
+    def net_area_m2(self) -> float:
+        """Area without openings, [m2]."""
+        return float(np.linalg.norm(area_vector(self.outline_m))) - sum(one.net_area_m2 for one in self.openings)
+
+
+@dataclass(frozen=True)
+class Building:
+    """The closed body that the planes of a mesh bound."""
+
+    elements: tuple[FlatElement, ...]
+    volume_m3: float
+    left_out: float  # Share of the mesh's volume above the ground that lies outside the body, such as a balcony
+    ground_m: FloatArray | None  # A point of the ground, shape (3,); None: no ground was found
+    east_north_up: FloatArray  # Unit vectors as columns, shape (3, 3)
+
+    def every(self) -> list[FlatElement]:
+        """Return all elements and their openings."""
+        return [*self.elements, *(opening for one in self.elements for opening in one.openings)]
+
+
+class _Plane(NamedTuple):
+    normal: FloatArray  # Unit vector out of the body, shape (3,)
+    middle_m: FloatArray  # Mean position of the triangles on the plane, shape (3,)
+    area_m2: float
+
+    def above(self, points_m: FloatArray) -> FloatArray:
+        """Return the distances (n,) of points (n, 3) from the plane, [m], positive on the side of the normal."""
+        return (points_m - self.middle_m) @ self.normal
+
+
+class _Surface(NamedTuple):
+    """Boundary triangles of a mesh, one entry each."""
+
+    corners_m: FloatArray  # Shape (f, 3, 3)
+    middle_m: FloatArray
+    normal: FloatArray
+    area_m2: FloatArray
+    temperature_c: FloatArray
+    colour: npt.NDArray | None
+
+
+def find_building(mesh: TetMesh, up: npt.ArrayLike, north: npt.ArrayLike) -> Building:
+    """Find the planes of a mesh's boundary and the closed body between them, the faces of which are the elements.
+
+    The planes cut space into convex cells. A cell belongs to the body if the mesh fills more than half of it; elements
+    are where such a cell touches one that does not, so they close exactly where planes meet. What no plane bounds, and
+    what stands out from walls, such as a balcony, is left out.
+
+    Args:
+        mesh: Mesh in metres of a building seen from outside, with the ground around it or without.
+        up: Direction that points up, shape (3,).
+        north: Direction that points north, shape (3,); its part along `up` does not count.
+
+    Raises:
+        MeshError: A direction is none, or the planes do not enclose a body.
+    """
+    upwards = _unit(check_direction("up", up, "Pass --up 0 0 1.", MeshError))
+    east = np.cross(_unit(check_direction("north", north, "Pass --north 0 1 0.", MeshError)), upwards)
+    if np.linalg.norm(east) < 0.02:
+        remedy = "Pass --north 0 1 0, or another level direction in the coordinates of the mesh."
+        raise MeshError("north", expected="a direction that is not up or down", got=north, remedy=remedy)
+    frame = np.stack([_unit(east), _unit(np.cross(upwards, east)), upwards], axis=1)
+    vectors, corners = facet_area_vectors(mesh.points_m, mesh.facets), mesh.points_m[mesh.facets]
+    area = np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)
+    colour = None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1)
+    warm = mesh.temperature_c[mesh.facets].mean(axis=1)
+    surface = _Surface(corners, corners.mean(axis=1), vectors / area[:, None], area, warm, colour)
+    tets = mesh.points_m[mesh.tets]
+    volume, middle = np.abs(np.linalg.det(tets[:, 1:] - tets[:, :1])) / 6.0, tets.mean(axis=1)
+
+    planes = _planes(surface)
+    half = 0.5 * volume.sum()
+    under = [one for one in planes if one.normal @ upwards > 0.95 and volume[one.above(middle) > 0.0].sum() > half]
+    ground = max(under, key=lambda one: one.area_m2, default=None)
+    if ground is not None:  # the sides of the ground are no walls
+        over = ground.above(middle) > 0.0
+        middle, volume = middle[over], volume[over]
+        planes = [one for one in planes if one is not ground and ground.above(one.middle_m) > _WRINKLE_M]
+    planes = [one for one in planes if not any(_is_detail(one, other) for other in planes)]
+    faces, body_m3, mesh_m3 = _closed_body(planes, ground, middle, volume)
+    if not faces:
+        got, remedy = (
+            f"{len(planes)} planes of {LEAST_PLANE_M2:g} m2 or more that do not",
+            "Export all of the building.",
+        )
+        raise MeshError("mesh", expected="flat walls and roofs that enclose a body", got=got, remedy=remedy)
+    ground_m = None if ground is None else ground.middle_m
+    return Building(_named(surface, faces, frame), body_m3, 1.0 - mesh_m3 / float(volume.sum()), ground_m, frame)
+
+
+def _planes(surface: _Surface) -> list[_Plane]:
+    """Find planes: in the direction that most area faces, then in the opposite one, then in what is left."""
+    at, normal, area = surface[1:4]
+    cells = np.floor((at - at.min(axis=0)) / _CUBE_M).astype(np.int64)
+    cube = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_inverse=True)[1]
+    found, left, opposite = list[_Plane](), np.arange(len(at)), None
+    for _ in range(_MOST_TRIED):
+        if area[left].sum() < LEAST_PLANE_M2:
+            break
+        best = opposite
+        if best is None:
+            total = np.stack([np.bincount(cube[left], area[left] * axis) for axis in normal[left].T], axis=1)
+            votes = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+            alike = np.unique(np.rint(votes / 0.1), axis=0, return_inverse=True)[1].ravel()
+            total = np.stack([np.bincount(alike, axis) for axis in total.T], axis=1)
+            weight = np.linalg.norm(total, axis=1)
+            near = KDTree(total / np.maximum(weight, 1e-12)[:, None])
+            around = near.query_ball_point(near.data, 0.2)
+            best = _unit(total[around[int(np.argmax([weight[one].sum() for one in around]))]].sum(axis=0))
+        plane, on = _fitted(surface, left, best, found)
+        if plane is not None or opposite is None:
+            left = np.setdiff1d(left, on)
+        opposite = None
+        if plane is not None:
+            found.append(plane)
+            opposite = -plane.normal
+    return found
+
+
+def _fitted(
+    surface: _Surface, left: IntArray, best: FloatArray, found: Sequence[_Plane]
+) -> tuple[_Plane | None, IntArray]:
+    """Return the plane on which most area of the triangles `left` lies that face `best`, and the triangles on it.
+
+    There is no plane if it is too small, or if its direction is uncertain: narrow, or scattered and parallel to none of
+    those `found`, as two distant ledges are.
+    """
+    corners, at, normal, area = surface[:4]
+    faces = left[normal[left] @ best > 0.87]
+    if not len(faces):
+        return None, faces
+    along = at[faces] @ best
+    edges = np.arange(along.min() - 0.3, along.max() + 0.3, 0.02)
+    counts = np.histogram(along, edges, weights=area[faces])[0]
+    middle, on = best * (edges[np.argmax(ndimage.gaussian_filter1d(counts, 2.5, mode="constant"))] + 0.01), faces
+    for _ in range(4):  # least squares through the triangles near by
+        on = faces[np.abs((at[faces] - middle) @ best) < _WRINKLE_M]
+        middle = np.average(at[on], axis=0, weights=area[on])
+        apart = corners[on] - middle
+        spread, axes = np.linalg.eigh(np.einsum("f,fij,fik->jk", area[on], apart, apart) / (3.0 * area[on].sum()))
+        turned = axes[:, 0] * np.sign(axes[:, 0] @ best)
+        if np.sqrt(12.0 * spread[1]) < _RECESS_M or turned @ best < 0.98:
+            return None, on
+        best = turned
+    size, parallel = float(area[on] @ (normal[on] @ best)), any(abs(one.normal @ best) > 0.999 for one in found)
+    good = size >= LEAST_PLANE_M2 and (parallel or size > 0.25 * 12.0 * np.sqrt(spread[1] * spread[2]))
+    return (_Plane(best, middle, size) if good else None), on
+
+
+def _is_detail(one: _Plane, other: _Plane) -> bool:
+    """Return whether a plane is a recess or a ledge of a larger one, such as the panes of all windows of a wall."""
+    beside = abs(float(other.above(one.middle_m)))
+    return one.area_m2 < other.area_m2 and one.normal @ other.normal > 0.95 and beside < _RECESS_M
+
+
+class _Face(NamedTuple):
+    outline_m: FloatArray
+    normal: FloatArray
+    behind: Literal["air", "ground", "cover"]
+
+
+def _closed_body(
+    planes: Sequence[_Plane], ground: _Plane | None, middle: FloatArray, volume: FloatArray
+) -> tuple[list[_Face], float, float]:
+    """Return the faces of the body between planes, its volume, and the volume of the mesh in it, [m3].
+
+    `middle` (t, 3) and `volume` (t,) are those of the mesh's tetrahedra above the ground.
+    """
+    every = [*planes, *([] if ground is None else [ground])]
+    side = sum((one.above(middle) > 0.0).astype(np.int64) << n for n, one in enumerate(every))
+    keys, first, place = np.unique(side, return_index=True, return_inverse=True)
+    far = float(np.ptp(middle, axis=0).max())  # cells that no plane bounds get so large that the mesh hardly fills them
+    walls = np.concatenate([np.eye(3), -np.eye(3)])
+    reach = np.concatenate([middle.max(axis=0), -middle.min(axis=0)]) + far
+    body = dict[int, tuple[float, float, dict[int, FloatArray]]]()  # Volumes of cell and mesh in it, and polygons
+    for key, inside, filled in zip(keys.tolist(), middle[first], np.bincount(place.ravel(), volume).tolist()):
+        signs = [1.0 if key >> n & 1 else -1.0 for n in range(len(every))]
+        bounds = [np.append(-sign * one.normal, sign * one.normal @ one.middle_m) for sign, one in zip(signs, every)]
+        bounds = np.concatenate([np.column_stack([walls, -reach]), *[bound[None] for bound in bounds]])
+        if (bounds[:, :3] @ inside + bounds[:, 3]).max() > -1e-9:
+            continue
+        corners = HalfspaceIntersection(bounds, inside).intersections
+        corners = corners[np.unique(np.rint(corners / _SAME_M), axis=0, return_index=True)[1]]
+        size = ConvexHull(corners, qhull_options="QJ").volume
+        if filled > 0.5 * size:
+            on = {n: corners[np.abs(one.above(corners)) < _SAME_M] for n, one in enumerate(every)}
+            body[key] = size, filled, {n: polygon for n, polygon in on.items() if len(polygon) > 2}
+    cells = sorted(body)
+    pairs = [
+        (n, cells.index(key ^ 1 << i)) for n, key in enumerate(cells) for i in body[key][2] if key ^ 1 << i in body
+    ]
+    part = component_of(len(cells), *np.array([*pairs, *zip(range(len(cells)), range(len(cells)))]).reshape(-1, 2).T)
+    sizes = np.bincount(part, [body[key][0] for key in cells]) if cells else np.zeros(1)
+    body = {key: body[key] for n, key in enumerate(cells) if part[n] == np.argmax(sizes)}
+
+    groups = defaultdict[tuple[int, int, bool], list[FloatArray]](list)
+    for key, (_, _, polygons) in body.items():
+        for n, polygon in polygons.items():
+            across, outward = key ^ 1 << n, every[n].normal * (-1.0 if key >> n & 1 else 1.0)
+            if across not in body:
+                ring = _around(polygon, outward)
+                behind = np.flatnonzero(side == across)
+                close = behind[np.abs(every[n].above(middle[behind])) < _COVER_M]
+                covered = volume[close].sum() > 0.6 * _COVER_M * np.linalg.norm(area_vector(ring))
+                groups[n, key >> n & 1, bool(covered)].append(ring)
+    faces = []
+    for (n, flipped, covered), outlines in zip(groups, _merged([*groups.values()])):
+        behind_it = "ground" if n == len(planes) else "cover" if covered else "air"
+        normal = every[n].normal * (-1.0 if flipped else 1.0)
+        faces += [_Face(outline, normal, behind_it) for outline in outlines]
+    return faces, sum(one[0] for one in body.values()), sum(one[1] for one in body.values())
+
+
+def _around(points: FloatArray, normal: FloatArray) -> FloatArray:
+    """Return the corners of a convex polygon, (k, 3), in their order around its normal."""
+    flat = (points - points.mean(axis=0)) @ plane_axes(normal)
+    return points[np.argsort(np.arctan2(flat[:, 1], flat[:, 0]))]
+
+
+def area_vector(polygon: FloatArray) -> FloatArray:
+    """Return the unit normal of a flat polygon (k, 3), by the right-hand rule, times its area, shape (3,)."""
+    apart = polygon - polygon[0]
+    return 0.5 * np.cross(apart, np.roll(apart, -1, axis=0)).sum(axis=0)
+
+
+def _merged(groups: list[list[FloatArray]]) -> list[list[FloatArray]]:
+    """Unite the polygons of each group, which lie in one plane; a vertex stays where any outline has a corner.
+
+    A group whose union has a hole stays as it is, because gbXML knows no holes.
+    """
+    points = np.concatenate([polygon for polygons in groups for polygon in polygons] or [np.zeros((0, 3))])
+    number = component_of(len(points), *KDTree(points).query_pairs(_SAME_M * 10.0, output_type="ndarray").T)
+    points[number] = points.copy()
+    numbers, loops = iter(number.tolist()), list[list[list[int]]]()
+    for polygons in groups:
+        single = [list(dict.fromkeys(next(numbers) for _ in polygon)) for polygon in polygons]
+        united = _united(single)
+        outward = area_vector(points[single[0]])
+        loops.append(united if all(area_vector(points[loop]) @ outward > 0.0 for loop in united) else single)
+    corners = set[int]()
+    for loop in (loop for group in loops for loop in group):
+        ring = points[loop]
+        bend = np.cross(ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring)
+        corners |= {v for v, turn in zip(loop, np.linalg.norm(bend, axis=1)) if turn > _SAME_M}
+    return [[points[[v for v in loop if v in corners]] for loop in group] for group in loops]
+
+
+def _united(loops: list[list[int]]) -> list[list[int]]:
+    """Return the outlines of a union of polygons, given as loops of vertices; edges that two of them share go."""
+    edges = {edge for loop in loops for edge in zip(loop, loop[1:] + loop[:1])}
+    after = defaultdict[int, list[int]](list)
+    for start, end in sorted(edges):
+        if (end, start) not in edges:
+            after[start].append(end)
+    found = list[list[int]]()
+    while any(after.values()):
+        loop = [next(start for start, ends in after.items() if ends)]
+        while (step := after[loop[-1]].pop()) != loop[0]:
+            loop.append(step)
+        found.append(loop)
+    return found
+
+
+def _named(surface: _Surface, faces: list[_Face], frame: FloatArray) -> tuple[FlatElement, ...]:
+    """Return faces as elements with names, the largest first, with triangles and openings."""
+    elements, taken = list[FlatElement](), defaultdict[str, int](int)
+    for face in sorted(faces, key=lambda one: -float(np.linalg.norm(area_vector(one.outline_m)))):
+        east, north, upward = face.normal @ frame
+        tilt, azimuth = np.degrees(np.arccos(np.clip(upward, -1.0, 1.0))), np.degrees(np.arctan2(east, north)) % 360.0
+        kind = "roof" if tilt < 60.0 else "floor" if tilt > 120.0 else "wall"
+        name = kind if not 10.0 < tilt < 170.0 else f"{kind}-{_COMPASS[round(azimuth / 45.0) % 8]}"
+        name += "-covered" if face.behind == "cover" else ""
+        taken[name] += 1
+        name += f"-{taken[name]}" if taken[name] > 1 else ""
+        facets = np.zeros(0, dtype=np.int64)
+        if face.behind == "air":
+            beside = np.flatnonzero(surface.normal @ face.normal > _FACES)
+            beside = beside[np.abs((surface.middle_m[beside] - face.outline_m[0]) @ face.normal) < _WRINKLE_M]
+            axes = plane_axes(face.normal, frame[:, 2])
+            facets = beside[Outline(face.outline_m @ axes).contains_points(surface.middle_m[beside] @ axes)]
+        place = face.outline_m, face.normal, float(azimuth), float(tilt), face.behind
+        element = FlatElement(name, kind, *place, facets)
+        elements.append(_with_openings(surface, element, frame[:, 2]) if kind == "wall" and len(facets) else element)
+    return tuple(elements)
+
+
+def _with_openings(surface: _Surface, wall: FlatElement, up: FloatArray) -> FlatElement:
+    """Return a wall with windows and doors: rectangles that lie deeper, or have another colour, than most of the wall
+    and have another temperature. In a mesh without colours the temperature alone decides."""
+    axes = plane_axes(wall.normal, up)
+    outline, foot = wall.outline_m @ axes, float(wall.outline_m[0] @ wall.normal)
+    at, deep = surface.middle_m @ axes, foot - surface.middle_m @ wall.normal
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    near = (surface.normal @ wall.normal > _FACES) & (deep < _RECESS_M) & (deep > -_WRINKLE_M)
+    near = np.flatnonzero(near & ((at > low) & (at < high)).all(axis=1))
+    u, v = (np.arange(start + 0.5 * _PIXEL_M, end, _PIXEL_M) for start, end in zip(low, high))
+    pixels = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+    distance, nearest = KDTree(at[near]).query(pixels)
+    shown = near[nearest]
+    coarse = 2.0 * float(np.sqrt(np.median(surface.area_m2[near])))
+    known = Outline(outline).contains_points(pixels) & (distance < max(_WRINKLE_M, coarse))
+    if not known.any():
+        return wall
+    warmer = np.abs(surface.temperature_c[shown] - np.median(surface.temperature_c[shown[known]]))
+    chosen = known & (warmer > max(_OTHER_K, 3.0 * 1.4826 * float(np.median(warmer[known]))))
+    if surface.colour is not None:
+        off = np.linalg.norm(surface.colour[shown] - np.median(surface.colour[shown[known]], axis=0), axis=1)
+        chosen &= (deep[shown] > _RECESSED_M) | (off > max(_OTHER_COLOUR, 3.0 * float(np.median(off[known]))))
+    picture = chosen.reshape(len(u), len(v))
+    labels = ndimage.label(ndimage.binary_opening(ndimage.binary_closing(picture, iterations=2), iterations=3))[0]
+    openings, inside = list[FlatElement](), np.zeros(len(deep), dtype=bool)
+    for number, window in enumerate(ndimage.find_objects(labels), start=1):
+        mask = labels[window] == number
+        left, right = low[0] + (window[0].start + _ends(mask)) * _PIXEL_M
+        bottom, top = low[1] + (window[1].start + _ends(mask.T)) * _PIXEL_M
+        if min(right - left, top - bottom) < _LEAST_SIDE_M or mask.mean() < _LEAST_FILL:
+            continue
+        kind = "door" if bottom - low[1] < _THRESHOLD_M and top - bottom > _DOOR_M else "window"
+        bottom = low[1] if kind == "door" else bottom
+        corners = np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
+        depth = float(np.median(deep[shown].reshape(picture.shape)[window][mask]))
+        within = near[Outline(corners).contains_points(at[near])]
+        inside[within] = True
+        facets = within[np.abs(deep[within] - depth) < _WRINKLE_M]
+        drawn = corners @ axes.T + foot * wall.normal
+        openings.append(replace(wall, kind=kind, outline_m=drawn, facets=facets, depth_m=depth))
+    taken = defaultdict[str, int](int)
+    for n, one in enumerate(openings):
+        taken[one.kind] += 1
+        openings[n] = replace(one, name=f"{one.kind}{wall.name.removeprefix('wall')}-{taken[one.kind]}")
+    return replace(wall, openings=tuple(openings), facets=wall.facets[~inside[wall.facets]])
+
+
+def _ends(mask: BoolArray) -> FloatArray:
+    """Return the median over the columns of a mask of their first pixel and of the one after their last, shape (2,)."""
+    columns = mask[:, mask.any(axis=0)]
+    return np.array([np.median(columns.argmax(axis=0)), len(mask) - np.median(columns[::-1].argmax(axis=0))])
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    return vector / np.linalg.norm(vector)
+
+
+def plane_axes(normal: FloatArray, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
+    """Return two unit axes in the plane of a normal, shape (3, 2): level to the right as seen from outside, and up."""
+    level = np.cross(up, normal)
+    level = np.cross(np.eye(3)[np.argmin(np.abs(normal))], normal) if np.linalg.norm(level) < 1e-3 else level
+    return np.stack([_unit(level), np.cross(normal, _unit(level))], axis=1)
+
+
+def proposed_rules(building: Building) -> PatchRules:
+    """Return rules that make a patch of each element that air touches, by its name, and of the ground."""
+    rules, up = list[PatchRule](), building.east_north_up[:, 2]
+    if building.ground_m is not None:
+        slab = Plane(_vector(building.ground_m - 0.2 * up), _vector(up), 0.4)
+        rules.append(PatchRule("ground", plane=slab, only="exterior", facing="up"))
+    for one in (one for one in building.every() if len(one.facets)):
+        on, reach = one.outline_m - one.depth_m * one.normal, _WRINKLE_M * np.abs(one.normal)
+        box = Box(_vector(on.min(axis=0) - reach), _vector(on.max(axis=0) + reach))
+        slab = Plane(_vector(on[0] - _WRINKLE_M * one.normal), _vector(one.normal), 2.0 * _WRINKLE_M)
+        oblique = np.abs(one.normal).max() < 0.999  # then the box alone holds more than the element
+        rules.append(PatchRule(one.name, box, slab if oblique else None, None, "exterior", _vector(one.normal)))
+    return PatchRules(tuple(rules))
+
+
+def _vector(values: FloatArray) -> Vector:
+    x, y, z = (round(float(value), 3) + 0.0 for value in values)
+    return x, y, z
