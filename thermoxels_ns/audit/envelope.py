@@ -15,7 +15,7 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.mesh.boundary.planes import Building, FlatElement, find_building, plane_axes
 
 SHGC = 0.6
-"""Share of the sun's heat that windows are assumed to let in: HBJSON demands a number, and no thermal image tells it."""
+"""Share of the sun's heat that windows are assumed to let in: HBJSON demands a number that no thermal image tells."""
 _LEAST_R_M2K_W, _MOST_WINDOW_U = 0.001, 12.0  # Limits of HBJSON for a layer and for a window
 _R_M2K_W = {"roof": 0.14, "wall": 0.17, "door": 0.17, "floor": 0.21}
 """Surface resistances of ISO 6946, both sides, [m2 K / W]: programs add such to those of layers."""
@@ -87,7 +87,7 @@ def hbjson(envelope: Envelope, title: str) -> dict[str, Any]:
         return {
             "type": kind,
             "identifier": one.name,
-            "geometry": {"type": "Face3D", "boundary": np.round(one.outline_m @ building.east_north_up, 5).tolist()},
+            "geometry": {"type": "Face3D", "boundary": np.round(one.outline_m, 5).tolist()},
             "boundary_condition": {"type": boundary},
             "properties": {"type": f"{kind}PropertiesAbridged", "energy": energy},
             "user_data": figures[one.name],
@@ -132,16 +132,15 @@ def gbxml(envelope: Envelope, title: str) -> bytes:
             add(made, "Coordinate", value)
 
     def shape(parent: ElementTree.Element, one: FlatElement) -> None:
-        outline, normal = one.outline_m @ building.east_north_up, one.normal @ building.east_north_up
-        axes = plane_axes(normal)
-        low, size = (outline @ axes).min(axis=0), np.ptp(outline @ axes, axis=0)
+        axes = plane_axes(one.normal)
+        low, high = np.array(one.flat().bounds).reshape(2, 2)
         rectangle = add(parent, "RectangularGeometry")
         add(rectangle, "Azimuth", one.azimuth_deg)
-        point(rectangle, axes @ low + (outline[0] @ normal) * normal)
-        for tag, value in {"Tilt": one.tilt_deg, "Height": size[1], "Width": size[0]}.items():
+        point(rectangle, axes @ low + (one.outline_m[0] @ one.normal) * one.normal)
+        for tag, value in {"Tilt": one.tilt_deg, "Height": high[1] - low[1], "Width": high[0] - low[0]}.items():
             add(rectangle, tag, float(value))
         loop = add(add(parent, "PlanarGeometry"), "PolyLoop")
-        for corner in outline:
+        for corner in one.outline_m:
             point(loop, corner)
 
     campus = add(root, "Campus", id="campus")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import writable_folder
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.mesh.boundary.patches import Vector, with_patches, write_patch_rules
@@ -35,18 +36,19 @@ def propose_patches(path: Path, mesh: TetMesh, up: Vector, north: Vector, say: C
     areas = ", ".join(f"{one.name} {one.net_area_m2:.1f}" for one in building.every() if len(one.facets))
     say(f"Found, [m2]: {areas}. {100 * building.left_out:.0f} % of the volume stands out from walls or is not flat.")
     writable_folder(path.parent)
-    frame, views = building.east_north_up, []
-    at, normal = tagged.points_m[tagged.facets].mean(axis=1), {one.name: one.normal for one in building.every()}
+    at, views = tagged.points_m[tagged.facets].mean(axis=1), []
+    normals = {one.name: one.normal for one in building.every()}
+    kinds = np.array([name.split("-")[0] for name in names])[patch]
+    painted = [(kind, colour, kinds == kind) for kind, colour in _COLOURS.items()]
+    painted.append(("no patch", "lightgrey", ~np.isin(kinds, [*_COLOURS])))
     for title, towards in (("south and east", (-0.7, 0.9, -0.55)), ("north and west", (0.7, -0.9, -0.55))):
-        direction = frame @ np.array(towards)
-        labels = [
-            (name, at[patch == names.index(name)].mean(axis=0))
-            for name in dict.fromkeys(rule.name for rule in rules.patches)
-            if (patch == names.index(name)).any() and normal.get(name, frame[:, 2]) @ direction < 0.0
-        ]
-        kinds = np.array([name.split("-")[0] for name in names])[patch]
-        painted = [(kind, colour, kinds == kind) for kind, colour in _COLOURS.items()]
-        painted.append(("no patch", "lightgrey", ~np.isin(kinds, [*_COLOURS])))
+        direction, labels = building.axes @ towards, list[tuple[str, FloatArray]]()
+        for number in np.unique(patch).tolist():
+            on, normal = at[patch == number], normals.get(names[number])
+            if normal is not None and normal @ towards < 0.0:
+                labels.append((names[number], on.mean(axis=0)))
+            elif names[number] == "ground":  # its middle may be under the house
+                labels.append(("ground", on[np.argsort(on @ direction)[len(on) // 50]]))
         look = {"up": up, "view_direction": direction, "painted": painted, "labels": labels}
         shape = mesh.points_m, mesh.facets, mesh.temperature_c
         views.append(image_of_surface(*shape, title=f"Proposed patches, from {title}", **look))

@@ -9,9 +9,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.path import Path as Outline
+import shapely
 from scipy import ndimage
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree
+from shapely.geometry import MultiPoint, Polygon, polygon
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction
@@ -33,14 +34,14 @@ _COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", 
 _PIXEL_M = 0.025  # Of the pictures of walls in which windows are looked for
 _RECESSED_M, _OTHER_COLOUR, _OTHER_K = 0.12, 0.15, 1.0
 """Least differences between an opening and its wall: depth; distance of colours in [0, 1], or three times the wall's
-own median; temperature, or three standard deviations of the wall's own."""
-_LEAST_SIDE_M, _LEAST_FILL = 0.4, 0.65  # Of an opening: shortest side, and share of its rectangle that it fills
+own median; temperature, or two standard deviations of the wall's own."""
+_LEAST_SIDE_M, _LEAST_FILL = 0.4, 0.75  # Of an opening: shortest side, and share of its rectangle that it fills
 _DOOR_M, _THRESHOLD_M = 1.7, 0.35  # Least height of a door, and largest height of its foot above that of the wall
 
 
 @dataclass(frozen=True)
 class FlatElement:
-    """A wall, roof, floor, window or door."""
+    """A wall, roof, floor, window or door; x points east, y north and z up."""
 
     name: str
     kind: Literal["wall", "roof", "floor", "window", "door"]
@@ -56,7 +57,11 @@ class FlatElement:
     @property
     def net_area_m2(self) -> float:
         """Area without openings, [m2]."""
-        return float(np.linalg.norm(area_vector(self.outline_m))) - sum(one.net_area_m2 for one in self.openings)
+        return self.flat().area - sum(one.net_area_m2 for one in self.openings)
+
+    def flat(self) -> Polygon:
+        """Return the outline in the axes of `plane_axes`."""
+        return Polygon(self.outline_m @ plane_axes(self.normal))
 
 
 @dataclass(frozen=True)
@@ -66,8 +71,9 @@ class Building:
     elements: tuple[FlatElement, ...]
     volume_m3: float
     left_out: float  # Share of the mesh's volume above the ground that lies outside the body, such as a balcony
-    ground_m: FloatArray | None  # A point of the ground, shape (3,); None: no ground was found
-    east_north_up: FloatArray  # Unit vectors as columns, shape (3, 3)
+    ground_m: float | None  # Height of the ground; None: no ground was found
+    axes: FloatArray  # East, north and up in the mesh's coordinates, unit vectors as columns, shape (3, 3)
+    origin_m: FloatArray  # Origin of the elements' coordinates in those of the mesh, shape (3,)
 
     def every(self) -> list[FlatElement]:
         """Return all elements and their openings."""
@@ -116,17 +122,17 @@ def find_building(mesh: TetMesh, up: npt.ArrayLike, north: npt.ArrayLike) -> Bui
         remedy = "Pass --north 0 1 0, or another level direction in the coordinates of the mesh."
         raise MeshError("north", expected="a direction that is not up or down", got=north, remedy=remedy)
     frame = np.stack([_unit(east), _unit(np.cross(upwards, east)), upwards], axis=1)
-    vectors, corners = facet_area_vectors(mesh.points_m, mesh.facets), mesh.points_m[mesh.facets]
+    origin = np.where(np.abs(mesh.points_m).max(axis=0) > 1e4, np.rint(mesh.points_m.mean(axis=0)), 0.0)
+    points = (mesh.points_m - origin) @ frame
+    vectors, corners, tets = facet_area_vectors(points, mesh.facets), points[mesh.facets], points[mesh.tets]
     area = np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)
     colour = None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1)
     warm = mesh.temperature_c[mesh.facets].mean(axis=1)
     surface = _Surface(corners, corners.mean(axis=1), vectors / area[:, None], area, warm, colour)
-    tets = mesh.points_m[mesh.tets]
     volume, middle = np.abs(np.linalg.det(tets[:, 1:] - tets[:, :1])) / 6.0, tets.mean(axis=1)
-
     planes = _planes(surface)
     half = 0.5 * volume.sum()
-    under = [one for one in planes if one.normal @ upwards > 0.95 and volume[one.above(middle) > 0.0].sum() > half]
+    under = [one for one in planes if one.normal[2] > 0.95 and volume[one.above(middle) > 0.0].sum() > half]
     ground = max(under, key=lambda one: one.area_m2, default=None)
     if ground is not None:  # the sides of the ground are no walls
         over = ground.above(middle) > 0.0
@@ -140,8 +146,8 @@ def find_building(mesh: TetMesh, up: npt.ArrayLike, north: npt.ArrayLike) -> Bui
             "Export all of the building.",
         )
         raise MeshError("mesh", expected="flat walls and roofs that enclose a body", got=got, remedy=remedy)
-    ground_m = None if ground is None else ground.middle_m
-    return Building(_named(surface, faces, frame), body_m3, 1.0 - mesh_m3 / float(volume.sum()), ground_m, frame)
+    height = None if ground is None else float(ground.middle_m[2])
+    return Building(_named(surface, faces), body_m3, 1.0 - mesh_m3 / float(volume.sum()), height, frame, origin)
 
 
 def _planes(surface: _Surface) -> list[_Plane]:
@@ -209,181 +215,120 @@ def _is_detail(one: _Plane, other: _Plane) -> bool:
     return one.area_m2 < other.area_m2 and one.normal @ other.normal > 0.95 and beside < _RECESS_M
 
 
-class _Face(NamedTuple):
-    outline_m: FloatArray
-    normal: FloatArray
-    behind: Literal["air", "ground", "cover"]
-
-
 def _closed_body(
     planes: Sequence[_Plane], ground: _Plane | None, middle: FloatArray, volume: FloatArray
-) -> tuple[list[_Face], float, float]:
-    """Return the faces of the body between planes, its volume, and the volume of the mesh in it, [m3].
+) -> tuple[list[FlatElement], float, float]:
+    """Return the faces of the body between planes, without names, its volume, and the mesh's volume in it, [m3].
 
     `middle` (t, 3) and `volume` (t,) are those of the mesh's tetrahedra above the ground.
     """
     every = [*planes, *([] if ground is None else [ground])]
+    normals, offsets = np.array([one.normal for one in every]), np.array([one.normal @ one.middle_m for one in every])
     side = sum((one.above(middle) > 0.0).astype(np.int64) << n for n, one in enumerate(every))
     keys, first, place = np.unique(side, return_index=True, return_inverse=True)
     far = float(np.ptp(middle, axis=0).max())  # cells that no plane bounds get so large that the mesh hardly fills them
-    walls = np.concatenate([np.eye(3), -np.eye(3)])
-    reach = np.concatenate([middle.max(axis=0), -middle.min(axis=0)]) + far
-    body = dict[int, tuple[float, float, dict[int, FloatArray]]]()  # Volumes of cell and mesh in it, and polygons
+    box = np.column_stack([np.concatenate([np.eye(3), -np.eye(3)]), np.zeros(6)])
+    box[:, 3] = -far - np.concatenate([middle.max(axis=0), -middle.min(axis=0)])
+    cells = dict[int, tuple[float, float, FloatArray]]()  # Volumes of a cell and of the mesh in it, and its corners
     for key, inside, filled in zip(keys.tolist(), middle[first], np.bincount(place.ravel(), volume).tolist()):
-        signs = [1.0 if key >> n & 1 else -1.0 for n in range(len(every))]
-        bounds = [np.append(-sign * one.normal, sign * one.normal @ one.middle_m) for sign, one in zip(signs, every)]
-        bounds = np.concatenate([np.column_stack([walls, -reach]), *[bound[None] for bound in bounds]])
-        if (bounds[:, :3] @ inside + bounds[:, 3]).max() > -1e-9:
-            continue
-        corners = HalfspaceIntersection(bounds, inside).intersections
-        corners = corners[np.unique(np.rint(corners / _SAME_M), axis=0, return_index=True)[1]]
-        size = ConvexHull(corners, qhull_options="QJ").volume
-        if filled > 0.5 * size:
-            on = {n: corners[np.abs(one.above(corners)) < _SAME_M] for n, one in enumerate(every)}
-            body[key] = size, filled, {n: polygon for n, polygon in on.items() if len(polygon) > 2}
-    cells = sorted(body)
-    pairs = [
-        (n, cells.index(key ^ 1 << i)) for n, key in enumerate(cells) for i in body[key][2] if key ^ 1 << i in body
-    ]
-    part = component_of(len(cells), *np.array([*pairs, *zip(range(len(cells)), range(len(cells)))]).reshape(-1, 2).T)
-    sizes = np.bincount(part, [body[key][0] for key in cells]) if cells else np.zeros(1)
-    body = {key: body[key] for n, key in enumerate(cells) if part[n] == np.argmax(sizes)}
-
-    groups = defaultdict[tuple[int, int, bool], list[FloatArray]](list)
-    for key, (_, _, polygons) in body.items():
-        for n, polygon in polygons.items():
-            across, outward = key ^ 1 << n, every[n].normal * (-1.0 if key >> n & 1 else 1.0)
-            if across not in body:
-                ring = _around(polygon, outward)
-                behind = np.flatnonzero(side == across)
-                close = behind[np.abs(every[n].above(middle[behind])) < _COVER_M]
-                covered = volume[close].sum() > 0.6 * _COVER_M * np.linalg.norm(area_vector(ring))
-                groups[n, key >> n & 1, bool(covered)].append(ring)
-    faces = []
-    for (n, flipped, covered), outlines in zip(groups, _merged([*groups.values()])):
-        behind_it = "ground" if n == len(planes) else "cover" if covered else "air"
+        sign = np.where(key >> np.arange(len(every)) & 1, -1.0, 1.0)
+        bounds = np.concatenate([box, np.column_stack([sign[:, None] * normals, -sign * offsets])])
+        if (bounds[:, :3] @ inside + bounds[:, 3]).max() < -1e-9:
+            corners = HalfspaceIntersection(bounds, inside).intersections
+            size = ConvexHull(corners, qhull_options="QJ").volume
+            if filled > 0.5 * size:
+                cells[key] = size, filled, corners
+    order = [*cells]
+    beside = [(a, b) for a, one in enumerate(order) for b, other in enumerate(order) if (one ^ other).bit_count() < 2]
+    part = component_of(len(order), *np.array(beside, dtype=np.int64).reshape(-1, 2).T)
+    sizes = np.bincount(part, [cells[key][0] for key in order]) if order else np.zeros(1)
+    body = {key: cells[key] for n, key in enumerate(order) if part[n] == np.argmax(sizes)}
+    rings = defaultdict[tuple[int, int, str], list[Polygon]](list)
+    for key, (_, _, corners) in body.items():
+        for n, plane in enumerate(every):
+            ring = MultiPoint(corners[np.abs(plane.above(corners)) < _SAME_M] @ plane_axes(plane.normal)).convex_hull
+            across = key ^ 1 << n
+            if isinstance(ring, Polygon) and across not in body:
+                close = np.flatnonzero(side == across)
+                close = close[np.abs(plane.above(middle[close])) < _COVER_M]
+                covered = volume[close].sum() > 0.6 * _COVER_M * ring.area
+                rings[n, key >> n & 1, "ground" if plane is ground else "cover" if covered else "air"].append(ring)
+    faces = list[FlatElement]()
+    for (n, flipped, behind), flat in rings.items():
         normal = every[n].normal * (-1.0 if flipped else 1.0)
-        faces += [_Face(outline, normal, behind_it) for outline in outlines]
+        tilt = float(np.degrees(np.arccos(np.clip(normal[2], -1.0, 1.0))))
+        azimuth = float(np.degrees(np.arctan2(normal[0], normal[1])) % 360.0)
+        kind = "roof" if tilt < 60.0 else "floor" if tilt > 120.0 else "wall"
+        where = normal, azimuth if 10.0 < tilt < 170.0 else 0.0, tilt, behind
+        union = shapely.union_all(flat, grid_size=0.1 * _SAME_M).normalize().simplify(_SAME_M)
+        parts = shapely.get_parts(union)
+        for one in flat if any(len(one.interiors) for one in parts) else parts:  # gbXML knows no holes
+            around = np.array(polygon.orient(one, -1.0 if flipped else 1.0).exterior.coords)[:-1]
+            outline = around @ plane_axes(every[n].normal).T + offsets[n] * every[n].normal
+            faces.append(FlatElement("", kind, outline, *where, np.zeros(0, dtype=np.int64)))
     return faces, sum(one[0] for one in body.values()), sum(one[1] for one in body.values())
 
 
-def _around(points: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return the corners of a convex polygon, (k, 3), in their order around its normal."""
-    flat = (points - points.mean(axis=0)) @ plane_axes(normal)
-    return points[np.argsort(np.arctan2(flat[:, 1], flat[:, 0]))]
-
-
-def area_vector(polygon: FloatArray) -> FloatArray:
-    """Return the unit normal of a flat polygon (k, 3), by the right-hand rule, times its area, shape (3,)."""
-    apart = polygon - polygon[0]
-    return 0.5 * np.cross(apart, np.roll(apart, -1, axis=0)).sum(axis=0)
-
-
-def _merged(groups: list[list[FloatArray]]) -> list[list[FloatArray]]:
-    """Unite the polygons of each group, which lie in one plane; a vertex stays where any outline has a corner.
-
-    A group whose union has a hole stays as it is, because gbXML knows no holes.
-    """
-    points = np.concatenate([polygon for polygons in groups for polygon in polygons] or [np.zeros((0, 3))])
-    number = component_of(len(points), *KDTree(points).query_pairs(_SAME_M * 10.0, output_type="ndarray").T)
-    points[number] = points.copy()
-    numbers, loops = iter(number.tolist()), list[list[list[int]]]()
-    for polygons in groups:
-        single = [list(dict.fromkeys(next(numbers) for _ in polygon)) for polygon in polygons]
-        united = _united(single)
-        outward = area_vector(points[single[0]])
-        loops.append(united if all(area_vector(points[loop]) @ outward > 0.0 for loop in united) else single)
-    corners = set[int]()
-    for loop in (loop for group in loops for loop in group):
-        ring = points[loop]
-        bend = np.cross(ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring)
-        corners |= {v for v, turn in zip(loop, np.linalg.norm(bend, axis=1)) if turn > _SAME_M}
-    return [[points[[v for v in loop if v in corners]] for loop in group] for group in loops]
-
-
-def _united(loops: list[list[int]]) -> list[list[int]]:
-    """Return the outlines of a union of polygons, given as loops of vertices; edges that two of them share go."""
-    edges = {edge for loop in loops for edge in zip(loop, loop[1:] + loop[:1])}
-    after = defaultdict[int, list[int]](list)
-    for start, end in sorted(edges):
-        if (end, start) not in edges:
-            after[start].append(end)
-    found = list[list[int]]()
-    while any(after.values()):
-        loop = [next(start for start, ends in after.items() if ends)]
-        while (step := after[loop[-1]].pop()) != loop[0]:
-            loop.append(step)
-        found.append(loop)
-    return found
-
-
-def _named(surface: _Surface, faces: list[_Face], frame: FloatArray) -> tuple[FlatElement, ...]:
-    """Return faces as elements with names, the largest first, with triangles and openings."""
+def _named(surface: _Surface, faces: list[FlatElement]) -> tuple[FlatElement, ...]:
+    """Return faces with names, the largest first, with triangles and openings."""
     elements, taken = list[FlatElement](), defaultdict[str, int](int)
-    for face in sorted(faces, key=lambda one: -float(np.linalg.norm(area_vector(one.outline_m)))):
-        east, north, upward = face.normal @ frame
-        tilt, azimuth = np.degrees(np.arccos(np.clip(upward, -1.0, 1.0))), np.degrees(np.arctan2(east, north)) % 360.0
-        kind = "roof" if tilt < 60.0 else "floor" if tilt > 120.0 else "wall"
-        name = kind if not 10.0 < tilt < 170.0 else f"{kind}-{_COMPASS[round(azimuth / 45.0) % 8]}"
+    for face in sorted(faces, key=lambda one: -one.net_area_m2):
+        level = not 10.0 < face.tilt_deg < 170.0
+        name = face.kind if level else f"{face.kind}-{_COMPASS[round(face.azimuth_deg / 45.0) % 8]}"
         name += "-covered" if face.behind == "cover" else ""
         taken[name] += 1
-        name += f"-{taken[name]}" if taken[name] > 1 else ""
-        facets = np.zeros(0, dtype=np.int64)
+        face = replace(face, name=name if taken[name] == 1 else f"{name}-{taken[name]}")
         if face.behind == "air":
             beside = np.flatnonzero(surface.normal @ face.normal > _FACES)
             beside = beside[np.abs((surface.middle_m[beside] - face.outline_m[0]) @ face.normal) < _WRINKLE_M]
-            axes = plane_axes(face.normal, frame[:, 2])
-            facets = beside[Outline(face.outline_m @ axes).contains_points(surface.middle_m[beside] @ axes)]
-        place = face.outline_m, face.normal, float(azimuth), float(tilt), face.behind
-        element = FlatElement(name, kind, *place, facets)
-        elements.append(_with_openings(surface, element, frame[:, 2]) if kind == "wall" and len(facets) else element)
+            inside = shapely.contains_xy(face.flat(), surface.middle_m[beside] @ plane_axes(face.normal))
+            face = replace(face, facets=beside[inside])
+        elements.append(_with_openings(surface, face) if face.kind == "wall" and len(face.facets) else face)
     return tuple(elements)
 
 
-def _with_openings(surface: _Surface, wall: FlatElement, up: FloatArray) -> FlatElement:
-    """Return a wall with windows and doors: rectangles that lie deeper, or have another colour, than most of the wall
-    and have another temperature. In a mesh without colours the temperature alone decides."""
-    axes = plane_axes(wall.normal, up)
-    outline, foot = wall.outline_m @ axes, float(wall.outline_m[0] @ wall.normal)
+def _with_openings(surface: _Surface, wall: FlatElement) -> FlatElement:
+    """Return a wall with windows and doors: rectangles that are warmer or colder than most of the wall, and lie deeper
+    or have another colour; in a mesh without colours the temperature differs at least half as much as anywhere."""
+    axes, flat, foot = plane_axes(wall.normal), wall.flat(), float(wall.outline_m[0] @ wall.normal)
     at, deep = surface.middle_m @ axes, foot - surface.middle_m @ wall.normal
-    low, high = outline.min(axis=0), outline.max(axis=0)
+    low, high = np.array(flat.bounds).reshape(2, 2)
     near = (surface.normal @ wall.normal > _FACES) & (deep < _RECESS_M) & (deep > -_WRINKLE_M)
     near = np.flatnonzero(near & ((at > low) & (at < high)).all(axis=1))
     u, v = (np.arange(start + 0.5 * _PIXEL_M, end, _PIXEL_M) for start, end in zip(low, high))
-    pixels = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+    pixels = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1)
     distance, nearest = KDTree(at[near]).query(pixels)
     shown = near[nearest]
     coarse = 2.0 * float(np.sqrt(np.median(surface.area_m2[near])))
-    known = Outline(outline).contains_points(pixels) & (distance < max(_WRINKLE_M, coarse))
+    known = shapely.contains_xy(flat, pixels[..., 0], pixels[..., 1]) & (distance < max(_WRINKLE_M, coarse))
     if not known.any():
         return wall
     warmer = np.abs(surface.temperature_c[shown] - np.median(surface.temperature_c[shown[known]]))
-    chosen = known & (warmer > max(_OTHER_K, 3.0 * 1.4826 * float(np.median(warmer[known]))))
+    chosen = known & (warmer > max(_OTHER_K, 2.0 * 1.4826 * float(np.median(warmer[known]))))
+    off, least = warmer, 0.5 * float(np.quantile(warmer[known], 0.99))
     if surface.colour is not None:
-        off = np.linalg.norm(surface.colour[shown] - np.median(surface.colour[shown[known]], axis=0), axis=1)
-        chosen &= (deep[shown] > _RECESSED_M) | (off > max(_OTHER_COLOUR, 3.0 * float(np.median(off[known]))))
-    picture = chosen.reshape(len(u), len(v))
-    labels = ndimage.label(ndimage.binary_opening(ndimage.binary_closing(picture, iterations=2), iterations=3))[0]
-    openings, inside = list[FlatElement](), np.zeros(len(deep), dtype=bool)
+        off = np.linalg.norm(surface.colour[shown] - np.median(surface.colour[shown[known]], axis=0), axis=-1)
+        least = max(_OTHER_COLOUR, 3.0 * float(np.median(off[known])))
+    chosen &= (deep[shown] > _RECESSED_M) | (off > least)
+    labels = ndimage.label(ndimage.binary_opening(ndimage.binary_closing(chosen, iterations=2), iterations=3))[0]
+    openings, inside, taken = list[FlatElement](), np.zeros(len(deep), dtype=bool), defaultdict[str, int](int)
     for number, window in enumerate(ndimage.find_objects(labels), start=1):
         mask = labels[window] == number
         left, right = low[0] + (window[0].start + _ends(mask)) * _PIXEL_M
         bottom, top = low[1] + (window[1].start + _ends(mask.T)) * _PIXEL_M
-        if min(right - left, top - bottom) < _LEAST_SIDE_M or mask.mean() < _LEAST_FILL:
+        across = surface.colour is None and right - left > 0.8 * (high[0] - low[0])  # as the edge of a floor slab shows
+        if across or min(right - left, top - bottom) < _LEAST_SIDE_M or mask.mean() < _LEAST_FILL:
             continue
         kind = "door" if bottom - low[1] < _THRESHOLD_M and top - bottom > _DOOR_M else "window"
         bottom = low[1] if kind == "door" else bottom
-        corners = np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
-        depth = float(np.median(deep[shown].reshape(picture.shape)[window][mask]))
-        within = near[Outline(corners).contains_points(at[near])]
+        taken[kind] += 1
+        name = f"{kind}{wall.name.removeprefix('wall')}-{taken[kind]}"
+        outline = np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
+        depth = float(np.median(deep[shown[window][mask]]))
+        within = near[shapely.contains_xy(Polygon(outline), at[near])]
         inside[within] = True
-        facets = within[np.abs(deep[within] - depth) < _WRINKLE_M]
-        drawn = corners @ axes.T + foot * wall.normal
-        openings.append(replace(wall, kind=kind, outline_m=drawn, facets=facets, depth_m=depth))
-    taken = defaultdict[str, int](int)
-    for n, one in enumerate(openings):
-        taken[one.kind] += 1
-        openings[n] = replace(one, name=f"{one.kind}{wall.name.removeprefix('wall')}-{taken[one.kind]}")
+        facets, drawn = within[np.abs(deep[within] - depth) < _WRINKLE_M], outline @ axes.T + foot * wall.normal
+        openings.append(replace(wall, name=name, kind=kind, outline_m=drawn, facets=facets, depth_m=depth))
     return replace(wall, openings=tuple(openings), facets=wall.facets[~inside[wall.facets]])
 
 
@@ -397,25 +342,26 @@ def _unit(vector: FloatArray) -> FloatArray:
     return vector / np.linalg.norm(vector)
 
 
-def plane_axes(normal: FloatArray, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
+def plane_axes(normal: FloatArray) -> FloatArray:
     """Return two unit axes in the plane of a normal, shape (3, 2): level to the right as seen from outside, and up."""
-    level = np.cross(up, normal)
+    level = np.cross((0.0, 0.0, 1.0), normal)
     level = np.cross(np.eye(3)[np.argmin(np.abs(normal))], normal) if np.linalg.norm(level) < 1e-3 else level
     return np.stack([_unit(level), np.cross(normal, _unit(level))], axis=1)
 
 
 def proposed_rules(building: Building) -> PatchRules:
     """Return rules that make a patch of each element that air touches, by its name, and of the ground."""
-    rules, up = list[PatchRule](), building.east_north_up[:, 2]
+    rules, axes, origin = list[PatchRule](), building.axes, building.origin_m
     if building.ground_m is not None:
-        slab = Plane(_vector(building.ground_m - 0.2 * up), _vector(up), 0.4)
-        rules.append(PatchRule("ground", plane=slab, only="exterior", facing="up"))
+        foot = _vector(origin + (building.ground_m - 0.2) * axes[:, 2])
+        rules.append(PatchRule("ground", plane=Plane(foot, _vector(axes[:, 2]), 0.4), only="exterior", facing="up"))
     for one in (one for one in building.every() if len(one.facets)):
-        on, reach = one.outline_m - one.depth_m * one.normal, _WRINKLE_M * np.abs(one.normal)
+        on, normal = (one.outline_m - one.depth_m * one.normal) @ axes.T + origin, axes @ one.normal
+        reach, oblique = _WRINKLE_M * np.abs(normal), np.abs(normal).max() < 0.999
         box = Box(_vector(on.min(axis=0) - reach), _vector(on.max(axis=0) + reach))
-        slab = Plane(_vector(on[0] - _WRINKLE_M * one.normal), _vector(one.normal), 2.0 * _WRINKLE_M)
-        oblique = np.abs(one.normal).max() < 0.999  # then the box alone holds more than the element
-        rules.append(PatchRule(one.name, box, slab if oblique else None, None, "exterior", _vector(one.normal)))
+        slab = Plane(_vector(on[0] - _WRINKLE_M * normal), _vector(normal), 2.0 * _WRINKLE_M)
+        # The box around an oblique element holds more than the element; the slab cuts that off.
+        rules.append(PatchRule(one.name, box, slab if oblique else None, None, "exterior", _vector(normal)))
     return PatchRules(tuple(rules))
 
 
