@@ -55,9 +55,10 @@ def house_corner(voxels: int = 64) -> TetMesh:
     for corner in mesh.facets.T:
         np.add.at(normals, corner, facet_area_vectors(mesh.points_m, mesh.facets))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    inside = mesh.points_m - (scene.solid.signed_distance(mesh.points_m) + 1e-4)[:, None] * normals
     return replace(
         mesh,
-        temperature_c=np.asarray(scene.surface_temperature_c(mesh.points_m)),
+        temperature_c=np.asarray(scene.surface_temperature_c(inside)),
         observed=np.ones(len(mesh.points_m), dtype=bool),
         colour=np.asarray(scene.colour(mesh.points_m, normals), dtype=np.float32),
     )

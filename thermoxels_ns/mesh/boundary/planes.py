@@ -34,7 +34,7 @@ _COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", 
 _PIXEL_M = 0.025  # Of the pictures of walls in which windows are looked for
 _RECESSED_M, _OTHER_COLOUR, _OTHER_K = 0.12, 0.15, 1.0
 """Least differences between an opening and its wall: depth; distance of colours in [0, 1], or three times the wall's
-own median; temperature, or two standard deviations of the wall's own."""
+own median; temperature, or three standard deviations of the wall's own."""
 _LEAST_SIDE_M, _LEAST_FILL = 0.4, 0.75  # Of an opening: shortest side, and share of its rectangle that it fills
 _DOOR_M, _THRESHOLD_M = 1.7, 0.35  # Least height of a door, and largest height of its foot above that of the wall
 
@@ -139,7 +139,7 @@ def find_building(mesh: TetMesh, up: npt.ArrayLike, north: npt.ArrayLike) -> Bui
         middle, volume = middle[over], volume[over]
         planes = [one for one in planes if one is not ground and ground.above(one.middle_m) > _WRINKLE_M]
     planes = [one for one in planes if not any(_is_detail(one, other) for other in planes)]
-    faces, body_m3, mesh_m3 = _closed_body(planes, ground, middle, volume)
+    faces, body_m3, mesh_m3 = _closed_body(planes, ground, middle, volume) if len(planes) > 2 else ([], 0.0, 0.0)
     if not faces:
         got, remedy = (
             f"{len(planes)} planes of {LEAST_PLANE_M2:g} m2 or more that do not",
@@ -303,8 +303,12 @@ def _with_openings(surface: _Surface, wall: FlatElement) -> FlatElement:
     known = shapely.contains_xy(flat, pixels[..., 0], pixels[..., 1]) & (distance < max(_WRINKLE_M, coarse))
     if not known.any():
         return wall
-    warmer = np.abs(surface.temperature_c[shown] - np.median(surface.temperature_c[shown[known]]))
-    chosen = known & (warmer > max(_OTHER_K, 2.0 * 1.4826 * float(np.median(warmer[known]))))
+    # The wall's own temperature is that of the narrowest range that holds half of it (Rousseeuw and Leroy 1988).
+    values = np.sort(surface.temperature_c[shown[known]])
+    ranges = values[len(values) // 2 :] - values[: len(values) - len(values) // 2]
+    narrow = int(np.argmin(ranges))
+    warmer = np.abs(surface.temperature_c[shown] - values[narrow] - 0.5 * ranges[narrow])
+    chosen = known & (warmer > max(_OTHER_K, 3.0 * float(ranges[narrow]) / 1.349))
     off, least = warmer, 0.5 * float(np.quantile(warmer[known], 0.99))
     if surface.colour is not None:
         off = np.linalg.norm(surface.colour[shown] - np.median(surface.colour[shown[known]], axis=0), axis=-1)
@@ -323,10 +327,11 @@ def _with_openings(surface: _Surface, wall: FlatElement) -> FlatElement:
         bottom = low[1] if kind == "door" else bottom
         taken[kind] += 1
         name = f"{kind}{wall.name.removeprefix('wall')}-{taken[kind]}"
-        outline = np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
+        rectangle = shapely.box(left, bottom, right, top).intersection(flat)
         depth = float(np.median(deep[shown[window][mask]]))
-        within = near[shapely.contains_xy(Polygon(outline), at[near])]
+        within = near[shapely.contains_xy(rectangle, at[near])]
         inside[within] = True
+        outline = np.array(polygon.orient(rectangle).exterior.coords)[:-1]
         facets, drawn = within[np.abs(deep[within] - depth) < _WRINKLE_M], outline @ axes.T + foot * wall.normal
         openings.append(replace(wall, name=name, kind=kind, outline_m=drawn, facets=facets, depth_m=depth))
     return replace(wall, openings=tuple(openings), facets=wall.facets[~inside[wall.facets]])
