@@ -123,7 +123,7 @@ def gbxml(envelope: Envelope, title: str) -> bytes:
         parent: ElementTree.Element, tag: str, text: str | float | None = None, **given: str
     ) -> ElementTree.Element:
         made = ElementTree.SubElement(parent, tag, given)
-        made.text = f"{text:.4f}" if isinstance(text, float) else text
+        made.text = text if text is None or isinstance(text, str) else f"{text:.4f}"
         return made
 
     def point(parent: ElementTree.Element, at_m: FloatArray) -> None:
@@ -172,6 +172,7 @@ def gbxml(envelope: Envelope, title: str) -> bytes:
         else:
             ends = f"{interval.low:.2f} to {interval.high:.2f} W/(m2 K), {100 * CONFIDENCE:.0f} %"
             add(made, "Description", f"U-value measured by thermography: {ends}")
-            add(made, "U-value", float(interval.value), unit="WPerSquareMeterK")
+            if interval.value > 0.0:
+                add(made, "U-value", float(interval.value), unit="WPerSquareMeterK")
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)

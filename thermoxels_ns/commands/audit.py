@@ -198,7 +198,7 @@ def _write(
     assert options.mesh is not None
     command, files = (
         command_of("audit", options),
-        (PAGE, ANSWERS, SURFACE, *(ENVELOPES[one] for one in options.envelope)),
+        (PAGE, ANSWERS, SURFACE, *map(ENVELOPES.__getitem__, options.envelope)),
     )
     write_page(folder / PAGE, audit_page(found, pictures, photographs, options.mesh.name, command, files))
     write_summary(folder / ANSWERS, answers)

@@ -25,9 +25,10 @@ def propose_patches(path: Path, mesh: TetMesh, up: Vector, north: Vector, say: C
     """
     picture = path.with_suffix(".png")
     for one in (path, picture):
-        if one.exists():
-            remedy = "Choose another name with --write-patches, or move it away."
-            raise AuditError("write_patches", expected="a name that is free", got=str(one), remedy=remedy)
+        if one.exists() or path == picture:
+            remedy = "Choose another name with --write-patches, such as patches.yaml."
+            got = f"{one}, which is there" if one.exists() else f"{one}, the name of the picture"
+            raise AuditError("write_patches", expected="a name of a yaml file that is free", got=got, remedy=remedy)
     building = find_building(mesh, up, north)
     rules = proposed_rules(building)
     tagged, _ = with_patches(mesh, rules, up)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -44,12 +44,12 @@ class FlatElement:
     """A wall, roof, floor, window or door; x points east, y north and z up."""
 
     name: str
-    kind: Literal["wall", "roof", "floor", "window", "door"]
+    kind: str  # wall, roof, floor, window or door
     outline_m: FloatArray  # Corners, shape (k, 3), counter-clockwise as seen from outside
     normal: FloatArray  # Unit vector out of the building, shape (3,)
     azimuth_deg: float  # Direction that it faces, clockwise from north
     tilt_deg: float  # Angle between normal and up: 0 a flat roof, 90 a wall, 180 a floor
-    behind: Literal["air", "ground", "cover"]  # What touches it outside; cover: what stands out, such as an overhang
+    behind: str  # What touches it outside: air, ground, or cover, which is what stands out, such as an overhang
     facets: IntArray  # Boundary triangles on the element, without those of its openings; none if air does not touch it
     openings: tuple[FlatElement, ...] = ()  # Windows and doors, drawn in the plane of their wall
     depth_m: float = 0.0  # How far the triangles of an opening lie behind its outline
@@ -143,7 +143,7 @@ def find_building(mesh: TetMesh, up: npt.ArrayLike, north: npt.ArrayLike) -> Bui
     if not faces:
         got, remedy = (
             f"{len(planes)} planes of {LEAST_PLANE_M2:g} m2 or more that do not",
-            "Export all of the building.",
+            "Export all of the building, with --interior solid.",
         )
         raise MeshError("mesh", expected="flat walls and roofs that enclose a body", got=got, remedy=remedy)
     height = None if ground is None else float(ground.middle_m[2])
@@ -200,7 +200,7 @@ def _fitted(
         middle = np.average(at[on], axis=0, weights=area[on])
         apart = corners[on] - middle
         spread, axes = np.linalg.eigh(np.einsum("f,fij,fik->jk", area[on], apart, apart) / (3.0 * area[on].sum()))
-        turned = axes[:, 0] * np.sign(axes[:, 0] @ best)
+        turned: FloatArray = axes[:, 0] * float(np.sign(axes[:, 0] @ best))
         if np.sqrt(12.0 * spread[1]) < _RECESS_M or turned @ best < 0.98:
             return None, on
         best = turned
@@ -211,8 +211,8 @@ def _fitted(
 
 def _is_detail(one: _Plane, other: _Plane) -> bool:
     """Return whether a plane is a recess or a ledge of a larger one, such as the panes of all windows of a wall."""
-    beside = abs(float(other.above(one.middle_m)))
-    return one.area_m2 < other.area_m2 and one.normal @ other.normal > 0.95 and beside < _RECESS_M
+    alike = float(one.normal @ other.normal) > 0.95 and abs(float(other.above(one.middle_m))) < _RECESS_M
+    return alike and one.area_m2 < other.area_m2
 
 
 def _closed_body(
@@ -225,24 +225,28 @@ def _closed_body(
     every = [*planes, *([] if ground is None else [ground])]
     normals, offsets = np.array([one.normal for one in every]), np.array([one.normal @ one.middle_m for one in every])
     side = sum((one.above(middle) > 0.0).astype(np.int64) << n for n, one in enumerate(every))
-    keys, first, place = np.unique(side, return_index=True, return_inverse=True)
+    keys, place = np.unique(side, return_inverse=True)
+    inside = np.stack([np.bincount(place.ravel(), volume * axis) for axis in middle.T], axis=1)
+    fill = np.bincount(place.ravel(), volume)
     far = float(np.ptp(middle, axis=0).max())  # cells that no plane bounds get so large that the mesh hardly fills them
     box = np.column_stack([np.concatenate([np.eye(3), -np.eye(3)]), np.zeros(6)])
     box[:, 3] = -far - np.concatenate([middle.max(axis=0), -middle.min(axis=0)])
     cells = dict[int, tuple[float, float, FloatArray]]()  # Volumes of a cell and of the mesh in it, and its corners
-    for key, inside, filled in zip(keys.tolist(), middle[first], np.bincount(place.ravel(), volume).tolist()):
+    for key, filled, point in zip(keys.tolist(), fill.tolist(), inside / fill[:, None]):
         sign = np.where(key >> np.arange(len(every)) & 1, -1.0, 1.0)
         bounds = np.concatenate([box, np.column_stack([sign[:, None] * normals, -sign * offsets])])
-        if (bounds[:, :3] @ inside + bounds[:, 3]).max() < -1e-9:
-            corners = HalfspaceIntersection(bounds, inside).intersections
-            size = ConvexHull(corners, qhull_options="QJ").volume
+        if (bounds[:, :3] @ point + bounds[:, 3]).max() < -1e-9:
+            corners = HalfspaceIntersection(bounds, point).intersections
+            size = ConvexHull(corners).volume
             if filled > 0.5 * size:
                 cells[key] = size, filled, corners
-    order = [*cells]
-    beside = [(a, b) for a, one in enumerate(order) for b, other in enumerate(order) if (one ^ other).bit_count() < 2]
-    part = component_of(len(order), *np.array(beside, dtype=np.int64).reshape(-1, 2).T)
-    sizes = np.bincount(part, [cells[key][0] for key in order]) if order else np.zeros(1)
-    body = {key: cells[key] for n, key in enumerate(order) if part[n] == np.argmax(sizes)}
+    number = {key: n for n, key in enumerate(cells)}
+    beside = [
+        (n, number[key ^ 1 << i]) for key, n in number.items() for i in range(len(every)) if key ^ 1 << i in number
+    ]
+    part = component_of(len(cells), *np.array(beside, dtype=np.int64).reshape(-1, 2).T)
+    largest = np.argmax(np.bincount(part, [cell[0] for cell in cells.values()])) if cells else 0
+    body = {key: cells[key] for key, n in number.items() if part[n] == largest}
     rings = defaultdict[tuple[int, int, str], list[Polygon]](list)
     for key, (_, _, corners) in body.items():
         for n, plane in enumerate(every):
@@ -314,7 +318,7 @@ def _with_openings(surface: _Surface, wall: FlatElement) -> FlatElement:
         off = np.linalg.norm(surface.colour[shown] - np.median(surface.colour[shown[known]], axis=0), axis=-1)
         least = max(_OTHER_COLOUR, 3.0 * float(np.median(off[known])))
     chosen &= (deep[shown] > _RECESSED_M) | (off > least)
-    labels = ndimage.label(ndimage.binary_opening(ndimage.binary_closing(chosen, iterations=2), iterations=3))[0]
+    labels, _ = ndimage.label(ndimage.binary_opening(ndimage.binary_closing(chosen, iterations=2), iterations=3))  # type: ignore[misc]
     openings, inside, taken = list[FlatElement](), np.zeros(len(deep), dtype=bool), defaultdict[str, int](int)
     for number, window in enumerate(ndimage.find_objects(labels), start=1):
         mask = labels[window] == number
