@@ -207,7 +207,7 @@ def test_an_envelope_from_inside_is_refused(export, tmp_path, capsys) -> None:
 side: inside
 inside: {air: 20 C}
 surroundings: {reflected: 19.5 C}
-film: {model: iso-6946}
+film: {model: iso-6946, factor: 1.0}
 camera: {offset: 0 K, repeatability: 0 K}
 surfaces: [{emissivity: 0.93}]
 """)

@@ -12,7 +12,7 @@ import numpy as np
 from thermoxels_ns.audit.draws import CONFIDENCE, Interval
 from thermoxels_ns.audit.run import Audit
 from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.mesh.boundary.planes import Building, FlatElement, find_building, plane_axes
+from thermoxels_ns.mesh.boundary.planes import Building, FlatElement, plane_axes
 
 SHGC = 0.6
 """Share of the sun's heat that windows are assumed to let in: HBJSON demands a number that no thermal image tells."""
@@ -43,9 +43,8 @@ class Envelope:
         }
 
 
-def envelope_of(found: Audit, north: tuple[float, float, float]) -> Envelope:
-    """Return the envelope of an audited building; raises `MeshError` if no planes enclose one."""
-    building = find_building(found.surface.mesh, found.surface.selection.up, north)
+def envelope_of(found: Audit, building: Building) -> Envelope:
+    """Return the envelope of the building that `find_building` found on the audited mesh."""
     area, known = found.surface.area_m2, np.isfinite(found.triangle_u).all(axis=1)
     u, share = dict[str, Interval | None](), dict[str, float]()
     for one in building.every():

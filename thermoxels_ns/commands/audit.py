@@ -84,6 +84,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     from thermoxels_ns.audit.run import audit
     from thermoxels_ns.commands.audit_photographs import photographs_of_defects
     from thermoxels_ns.commands.proposed_patches import propose_patches
+    from thermoxels_ns.mesh.boundary.planes import find_building
     from thermoxels_ns.reports.numbers import interval_text
 
     if options.write_conditions is not None:
@@ -107,8 +108,9 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         remedy = "Leave --envelope out; rooms are not written."
         raise AuditError("envelope", expected="a survey from outside", got="one from inside", remedy=remedy)
     mesh, up, export = _read(options.mesh, options, say)
+    building = find_building(mesh, up, options.north) if options.envelope else None  # raises before anything slow
     found = audit(mesh, conditions, up)
-    envelope = envelope_of(found, options.north) if options.envelope else None
+    envelope = None if building is None else envelope_of(found, building)
     for words in (*found.check.forbidden, *found.check.doubts):
         say(f"Warning: {words}")
     if found.check.missing:

@@ -41,7 +41,7 @@ _DOOR_M, _THRESHOLD_M = 1.7, 0.35  # Least height of a door, and largest height 
 
 @dataclass(frozen=True)
 class FlatElement:
-    """A wall, roof, floor, window or door; x points east, y north and z up."""
+    """A wall, roof, floor, window or door; x points east, y north and z up, see `Building.origin_m`."""
 
     name: str
     kind: str  # wall, roof, floor, window or door
@@ -73,7 +73,8 @@ class Building:
     left_out: float  # Share of the mesh's volume above the ground that lies outside the body, such as a balcony
     ground_m: float | None  # Height of the ground; None: no ground was found
     axes: FloatArray  # East, north and up in the mesh's coordinates, unit vectors as columns, shape (3, 3)
-    origin_m: FloatArray  # Origin of the elements' coordinates in those of the mesh, shape (3,)
+    origin_m: FloatArray
+    """Origin of the elements' coordinates in those of the mesh, shape (3,): 0, unless those exceed 10 km."""
 
     def every(self) -> list[FlatElement]:
         """Return all elements and their openings."""
@@ -329,9 +330,11 @@ def _with_openings(surface: _Surface, wall: FlatElement) -> FlatElement:
             continue
         kind = "door" if bottom - low[1] < _THRESHOLD_M and top - bottom > _DOOR_M else "window"
         bottom = low[1] if kind == "door" else bottom
+        rectangle = shapely.box(left, bottom, right, top).intersection(flat)
+        if not isinstance(rectangle, Polygon):  # around a corner of the wall's outline
+            continue
         taken[kind] += 1
         name = f"{kind}{wall.name.removeprefix('wall')}-{taken[kind]}"
-        rectangle = shapely.box(left, bottom, right, top).intersection(flat)
         depth = float(np.median(deep[shown[window][mask]]))
         within = near[shapely.contains_xy(rectangle, at[near])]
         inside[within] = True
