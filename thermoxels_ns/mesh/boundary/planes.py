@@ -236,7 +236,7 @@ def _closed_body(
     for key, filled, point in zip(keys.tolist(), fill.tolist(), inside / fill[:, None]):
         sign = np.where(key >> np.arange(len(every)) & 1, -1.0, 1.0)
         bounds = np.concatenate([box, np.column_stack([sign[:, None] * normals, -sign * offsets])])
-        if (bounds[:, :3] @ point + bounds[:, 3]).max() < -1e-9:
+        if (bounds[:, :3] @ point + bounds[:, 3]).max() < -1e-6:
             corners = HalfspaceIntersection(bounds, point).intersections
             size = ConvexHull(corners).volume
             if filled > 0.5 * size:
