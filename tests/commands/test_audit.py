@@ -11,6 +11,7 @@ import pyvista as pv
 from PIL import Image
 
 from tests.support.audited_wall import INSIDE, STATED, audited_wall, photographed, solve_wall, true_draws
+from tests.support.flat_houses import house_corner
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns import cli
 from thermoxels_ns.audit.run import audit
@@ -201,3 +202,46 @@ def test_bridges_below_a_bound_are_listed_but_count_for_nothing(export, done, tm
         assert any("psi" in one["name"] for one in answers["limits"]) == counted
     with pytest.raises(AuditError, match=r"^--least-bridge-w: expected"):
         run_audit(Audit(export / "mesh.vtu", export / "conditions.yaml", tmp_path / "x", least_bridge_w=-1.0))
+
+
+def test_patches_are_proposed_taken_and_written_as_an_envelope(tmp_path, capsys) -> None:
+    write_mesh(tmp_path / "mesh.vtu", house_corner())
+    patches, picture = tmp_path / "new" / "patches.yaml", tmp_path / "new" / "patches.png"
+    propose = ["audit", str(tmp_path / "mesh.vtu"), "--write-patches", str(patches), "--north", "1", "0", "0"]
+    assert cli.main(propose) == 0
+    assert "window-east-4" in capsys.readouterr().out and np.ptp(np.asarray(Image.open(picture))) > 100
+    assert cli.main(propose) == 1 and "write_patches" in capsys.readouterr().err
+    text = (configs_folder() / "house-corner-conditions.yaml").read_text()
+    (tmp_path / "c.yaml").write_text(text.replace(", reveals]", "]").replace('"*-wall"', '"wall-*"'))
+    words = [
+        "--patches",
+        str(patches),
+        "--envelope",
+        "hbjson",
+        "gbxml",
+        "--north",
+        "1",
+        "0",
+        "0",
+        "--pictures",
+        "False",
+    ]
+    answers, _ = audited(tmp_path / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "out", *words)
+    assert {"wall-east", "roof", "ground", "door-north-1"} <= {one["name"] for one in answers["patches"]}
+    assert answers["envelope"]["wall-east"]["azimuth_deg"] == pytest.approx(90.0, abs=2.0)
+    assert json.loads((tmp_path / "out" / "envelope.hbjson").read_text())["type"] == "Model"
+    assert (tmp_path / "out" / "envelope-gbxml.xml").read_bytes().startswith(b"<?xml")
+
+
+def test_an_envelope_from_inside_is_refused(export, tmp_path, capsys) -> None:
+    (tmp_path / "c.yaml").write_text("""
+side: inside
+inside: {air: 20 C}
+surroundings: {reflected: 19.5 C}
+film: {model: iso-6946, factor: 1.0}
+camera: {offset: 0 K, repeatability: 0 K}
+surfaces: [{emissivity: 0.93}]
+""")
+    given = ["audit", str(export / "mesh.vtu"), "--conditions", str(tmp_path / "c.yaml"), "--envelope", "gbxml"]
+    assert cli.main([*given, "--output-dir", str(tmp_path / "out")]) == 1
+    assert "envelope: expected" in capsys.readouterr().err and not [*(tmp_path / "out").iterdir()]

@@ -8,7 +8,7 @@ import time as clock
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
@@ -20,11 +20,16 @@ from thermoxels_ns.core.checks import check_direction, check_positive, remove_fi
 from thermoxels_ns.core.errors import AuditError
 
 if TYPE_CHECKING:
+    from thermoxels_ns.audit.envelope import Envelope
     from thermoxels_ns.audit.run import Audit as Found
+    from thermoxels_ns.mesh.boundary.patches import Vector
+    from thermoxels_ns.mesh.tetrahedra import TetMesh
     from thermoxels_ns.reports.page import Picture
 
 ANSWERS, PAGE, SURFACE = "answers.json", "audit.html", "surface.vtp"
 """Files that an audit writes."""
+ENVELOPES = {"hbjson": "envelope.hbjson", "gbxml": "envelope-gbxml.xml"}
+"""Files that an audit writes if `Audit.envelope` asks for them."""
 
 Say = Callable[[str], None]
 
@@ -55,6 +60,16 @@ class Audit:
     error of the reconstruction is never counted."""
     pictures: bool = True
     """Draw pictures for the page."""
+    write_patches: Path | None = None
+    """Propose patches: find walls, roofs, windows, doors and the ground on the mesh, write them to this yaml file with
+    a picture of their names beside it, and do nothing else. Needs no conditions."""
+    patches: Path | None = None
+    """A yaml file of patches that replace those of the mesh, such as --write-patches wrote; what --patches of ns-export
+    thermoxels-mesh reads."""
+    envelope: tuple[Literal["hbjson", "gbxml"], ...] = ()
+    """Write the building as flat elements with U-values for energy programs: hbjson (Ladybug Tools), gbxml or both."""
+    north: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    """Direction that points north in the coordinates of the mesh, for names of walls and for --envelope."""
 
     def main(self) -> None:
         """Run the audit; raises `ThermoxelsError` if the mesh, the conditions or an option cannot be used."""
@@ -69,14 +84,20 @@ class Audit:
 def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     """Audit a mesh, write all files, return the result; with `options.write_conditions`, only write an example."""
     from thermoxels_ns.audit.conditions import load_conditions, write_example
+    from thermoxels_ns.audit.envelope import envelope_of
     from thermoxels_ns.audit.run import audit
     from thermoxels_ns.commands.audit_photographs import photographs_of_defects, shown_range_c
-    from thermoxels_ns.mesh.files.vtu import read_mesh
+    from thermoxels_ns.commands.proposed_patches import propose_patches
+    from thermoxels_ns.mesh.boundary.planes import find_building
     from thermoxels_ns.reports.numbers import interval_text, plain_names
 
     if options.write_conditions is not None:
         write_example(options.write_conditions)
         say(f"Written to {options.write_conditions}: put in what you measured, and pass it with --conditions.")
+        return None
+    if options.mesh is not None and options.write_patches is not None:
+        mesh, up, _ = _read(options.mesh, options, say)
+        propose_patches(options.write_patches, mesh, up, options.north, say)
         return None
     if options.mesh is None or options.conditions is None:
         missing = "mesh" if options.mesh is None else "conditions"
@@ -87,15 +108,16 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         remedy = "Pass --least-bridge-w 0 to count all."
         raise AuditError("--least-bridge-w", expected="a number of watts, at least 0", got=least_w, remedy=remedy)
     others = ("summary.json", "quality.json", "series.csv")
-    folder = result_folder(options.output_dir, (ANSWERS, PAGE, SURFACE), (SURFACE, ANSWERS), others)
+    written = (ANSWERS, PAGE, SURFACE, *ENVELOPES.values())
+    folder = result_folder(options.output_dir, written, (SURFACE, ANSWERS), others)
     conditions = load_conditions(options.conditions)
-    mesh = read_mesh(options.mesh)
-    export = read_export_summary(options.mesh, say)
-    up = export.get("up") if options.up is None else options.up
-    direction = check_direction("up", up or (0.0, 0.0, 1.0), "Pass --up 0 0 1.", AuditError)
-    x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
-    say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.facets):,} boundary triangles.")
-    found = without_slight(audit(mesh, conditions, (x, y, z)), least_w)
+    if options.envelope and conditions.side != "outside":
+        remedy = "Leave --envelope out; rooms are not written."
+        raise AuditError("envelope", expected="a survey from outside", got="one from inside", remedy=remedy)
+    mesh, up, export = _read(options.mesh, options, say)
+    building = find_building(mesh, up, options.north) if options.envelope else None  # raises before anything slow
+    found = without_slight(audit(mesh, conditions, up), least_w)
+    envelope = None if building is None else envelope_of(found, building)
     for words in (*found.check.forbidden, *found.check.doubts, *impossible_u(found)[1]):
         say(f"Warning: {plain_names(words)}")
     if found.check.missing:
@@ -114,9 +136,27 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         range_c = shown_range_c(found)
         photographs = photographs_of_defects(options.scene, scale, found, range_c)
         say(f"Photographs show {sum(not found.defects[number].not_counted for number in photographs)} of them.")
-    _write(folder, options, found, photographs, range_c)
-    say(f"Written to {folder}: {PAGE}, {ANSWERS}, {SURFACE} ({clock.perf_counter() - begin:.1f} s)")
+    _write(folder, options, found, photographs, range_c, envelope)
+    names = (PAGE, ANSWERS, SURFACE, *(ENVELOPES[one] for one in options.envelope))
+    say(f"Written to {folder}: {', '.join(names)} ({clock.perf_counter() - begin:.1f} s)")
     return found
+
+
+def _read(path: Path, options: Audit, say: Say) -> tuple[TetMesh, Vector, dict[str, Any]]:
+    """Return the mesh with the patches asked for, the unit vector that points up, and the summary of the export."""
+    from thermoxels_ns.mesh.boundary.patches import load_patch_rules, with_patches
+    from thermoxels_ns.mesh.files.vtu import read_mesh
+
+    rules = None if options.patches is None else load_patch_rules(options.patches)
+    mesh, export = read_mesh(path), read_export_summary(path, say)
+    up = export.get("up") if options.up is None else options.up
+    direction = check_direction("up", up or (0.0, 0.0, 1.0), "Pass --up 0 0 1.", AuditError)
+    x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
+    say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.facets):,} boundary triangles.")
+    if rules is not None:
+        mesh, idle = with_patches(mesh, rules, (x, y, z))
+        say(f"Rules that no triangle follows: {', '.join(idle)}." if idle else f"Patches of {options.patches}.")
+    return mesh, (x, y, z), export
 
 
 def without_slight(found: Found, least_w: float) -> Found:
@@ -170,7 +210,7 @@ def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
     return most, tuple(said)
 
 
-def answers_of(options: Audit, found: Found) -> dict[str, Any]:
+def answers_of(options: Audit, found: Found, envelope: Envelope | None = None) -> dict[str, Any]:
     """Return the content of answers.json; numbers and ends of intervals that are NaN or infinite become null."""
     from pydantic_core import to_jsonable_python
 
@@ -187,6 +227,7 @@ def answers_of(options: Audit, found: Found) -> dict[str, Any]:
         "missing_for_en_13187": found.check.missing,
         "loss_narrower_by_w": found.budget,
         **{name: getattr(found, name) for name in ("draws", "failing_models", "remembered")},
+        **({} if envelope is None else {"envelope": envelope.figures()}),
     }
     return to_jsonable_python(told, inf_nan_mode="null")
 
@@ -197,7 +238,10 @@ def _write(
     found: Found,
     photographs: Mapping[int, tuple[Picture, ...]],
     range_c: tuple[float, float] | None,
+    envelope: Envelope | None,
 ) -> None:
+    from thermoxels_ns.audit.envelope import gbxml, hbjson
+    from thermoxels_ns.mesh.files.content import write_bytes
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit
     from thermoxels_ns.reports.page import identify, write_page
@@ -205,12 +249,21 @@ def _write(
     assert options.mesh is not None and options.conditions is not None
     inputs = (options.mesh, options.mesh.with_name(f"{options.mesh.stem}-boundary.vtp"), options.conditions)
     report = identify(inputs, options.up, options.least_bridge_w)
-    answers = answers_of(options, found) | {"report": asdict(report)}
+    answers = answers_of(options, found, envelope) | {"report": asdict(report)}
     summary_text(answers)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
     _write_surface(folder / SURFACE, found)
+    title = found.conditions.title
+    for kind, name in ENVELOPES.items():
+        if envelope is None or kind not in options.envelope:
+            remove_file(folder / name)
+        elif kind == "hbjson":
+            write_summary(folder / name, hbjson(envelope, title))
+        else:
+            write_bytes(folder / name, [gbxml(envelope, title)])
     pictures = draw_audit(found) if options.pictures else None
-    command, files = command_of("audit", options), (PAGE, ANSWERS, SURFACE)
+    command = command_of("audit", options)
+    files = (PAGE, ANSWERS, SURFACE, *map(ENVELOPES.__getitem__, options.envelope))
     most, said = impossible_u(found)
     shown = {"range_c": range_c, "most_u": most, "impossible": said, "report": report}
     write_page(folder / PAGE, audit_page(found, pictures, photographs, options.mesh.name, command, files, **shown))

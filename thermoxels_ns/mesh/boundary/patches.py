@@ -8,17 +8,19 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import yaml
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_direction, check_finite, check_shape
+from thermoxels_ns.core.checks import check_direction, check_finite, check_shape, replace_when_done
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, wrong
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_normals
 
 FACINGS = ("up", "side", "down")  # The directions that `facing` tells apart
 DEFAULT_PATCHES = (*(f"{where}-{facing}" for where in ("exterior", "interior") for facing in FACINGS), "cut")
@@ -51,8 +53,11 @@ class Plane:
 
     point: Vector  # Any point of the plane, [m]
     normal: Vector  # Direction across the plane, of any length above 0
+    depth: float = math.inf  # Largest distance from the plane, [m]
 
     def __post_init__(self) -> None:
+        if not self.depth > 0.0:
+            raise wrong("depth", "a number above 0, [m]", self.depth)
         if not (all(map(math.isfinite, self.point)) and 0.0 < math.hypot(*self.normal) < math.inf):
             got = f"{[*self.point]} and {[*self.normal]}"
             raise wrong("point and normal", "finite numbers, and a normal that is not 0", got, "Correct them.")
@@ -111,7 +116,13 @@ class PatchRule(RegionRule):
     """A user's rule for a patch of boundary triangles, with two more conditions than a rule for a region."""
 
     only: Literal["exterior", "interior", "cut", "all"] | None = None  # Part of the boundary that the rule applies to
-    facing: Literal["up", "side", "down", "any"] | None = None  # Where the normal points, see `facing`; None: any
+    facing: Literal["up", "side", "down", "any"] | Vector | None = None
+    """Where the normal points, see `facing`, or a direction that it is at most 45 degrees from; None: any."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.facing, tuple) and not 0.0 < math.hypot(*self.facing) < math.inf:
+            raise wrong("facing", "up, side, down, any, or a direction that is not 0", [*self.facing])
 
 
 @dataclass(frozen=True)
@@ -212,11 +223,46 @@ def apply_patches(
     everywhere = np.ones(len(patch), dtype=bool)
     parts = {"exterior": ~on_box & seen, "interior": ~on_box & ~seen, "cut": on_box}
     facings = {name: direction == number for number, name in enumerate(FACINGS)}
-    allowed = [
-        parts.get(rule.only or "all", everywhere) & facings.get(rule.facing or "any", everywhere)
-        for rule in rules.patches
-    ]
+
+    def faces(rule: PatchRule) -> BoolArray:
+        if isinstance(rule.facing, tuple):
+            return normals @ (np.array(rule.facing) / math.hypot(*rule.facing)) > _COS_45
+        return facings.get(rule.facing or "any", everywhere)
+
+    allowed = [parts.get(rule.only or "all", everywhere) & faces(rule) for rule in rules.patches]
     return _applied(rules.patches, "patch", allowed, patch, names, centroids_m, colours)
+
+
+def with_patches(mesh: TetMesh, rules: PatchRules, up: npt.ArrayLike) -> tuple[TetMesh, tuple[str, ...]]:
+    """Return a tagged mesh with patches by a user's rules in place of its own, and the idle rules."""
+    if mesh.boundary is None:
+        remedy = "Export it with ns-export thermoxels-mesh."
+        raise MeshError("mesh", expected="one whose boundary has tags", got="one without", remedy=remedy)
+    patch, names, idle = apply_patches(
+        rules,
+        centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
+        normals=facet_normals(mesh.points_m, mesh.facets),
+        up=up,
+        seen=mesh.boundary.seen,
+        on_box=mesh.facet_tags == FACET_BOX,
+        colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),
+    )
+    return replace(mesh, boundary=replace(mesh.boundary, patch=patch, patch_names=names)), idle
+
+
+def write_patch_rules(path: Path, rules: PatchRules, heading: str) -> None:
+    """Write rules for patches as a yaml file that `load_patch_rules` reads, below a comment of one line."""
+    plain = [_plain(rule) for rule in rules.patches]
+    lines = (yaml.safe_dump(one, default_flow_style=True, sort_keys=False, width=10_000) for one in plain)
+    with replace_when_done(path) as temporary:
+        temporary.write_text(f"# {heading}\npatches:\n" + "".join(f"  - {line}" for line in lines), encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """Return a rule as lists and mappings, without what it leaves open."""
+    if is_dataclass(value):
+        return {name: _plain(one) for name, one in vars(value).items() if one is not None and one != math.inf}
+    return [*value] if isinstance(value, tuple) else value
 
 
 def apply_regions(rules: PatchRules, tet_centroids: FloatArray, tet_colours: npt.NDArray | None = None) -> Applied:
@@ -250,7 +296,8 @@ def _applied(
         if rule.box is not None:
             inside &= np.all((centroids >= rule.box.lower) & (centroids <= rule.box.upper), axis=1)
         if rule.plane is not None:
-            inside &= (centroids - rule.plane.point) @ np.array(rule.plane.normal) >= 0.0
+            distance = (centroids - rule.plane.point) @ np.array(rule.plane.normal)
+            inside &= (distance >= 0.0) & (distance <= rule.plane.depth * math.hypot(*rule.plane.normal))
         if rule.nearest_colour is not None:
             if colours is None:
                 expected = "a mesh with colours, because its rule is by nearest_colour"
