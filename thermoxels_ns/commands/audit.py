@@ -13,7 +13,6 @@ import numpy as np
 import tyro
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.commands.heat import read_export_summary
 from thermoxels_ns.commands.installed_commands import command_of
 from thermoxels_ns.core.checks import check_direction, check_positive, remove_file, result_folder
 from thermoxels_ns.core.errors import AuditError
@@ -67,7 +66,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     from thermoxels_ns.audit.conditions import load_conditions, write_example
     from thermoxels_ns.audit.run import audit
     from thermoxels_ns.commands.audit_photographs import photographs_of_defects
-    from thermoxels_ns.mesh.files.vtu import read_mesh
+    from thermoxels_ns.mesh.files.vtu import read_export_summary, read_mesh
     from thermoxels_ns.reports.numbers import interval_text
 
     if options.write_conditions is not None:
@@ -131,42 +130,18 @@ def answers_of(options: Audit, found: Found) -> dict[str, Any]:
 
 
 def _write(folder: Path, options: Audit, found: Found, photographs: Mapping[int, tuple[Picture, ...]]) -> None:
-    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtk
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit
     from thermoxels_ns.reports.page import write_page
 
     answers = answers_of(options, found)
     summary_text(answers)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
-    _write_surface(folder / SURFACE, found)
+    write_vtk(vtkXMLPolyDataWriter(), folder / SURFACE, found.to_pyvista())
     pictures = draw_audit(found) if options.pictures else None
     assert options.mesh is not None
     command, files = command_of("audit", options), (PAGE, ANSWERS, SURFACE)
     write_page(folder / PAGE, audit_page(found, pictures, photographs, options.mesh.name, command, files))
     write_summary(folder / ANSWERS, answers)
-
-
-def _write_surface(path: Path, found: Found) -> None:
-    """Write the results of each boundary triangle, NaN where it does not count, and its defect's number, from 1."""
-    import pyvista as pv
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
-
-    from thermoxels_ns.mesh.files.content import surface_of
-    from thermoxels_ns.mesh.files.vtu import write_vtk
-
-    mesh, calibration = found.surface.mesh, found.calibration
-    surface = surface_of(mesh.points_m, mesh.facets)
-    data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
-    numbers = np.zeros(len(mesh.facets), dtype=np.int32)
-    for number, one in enumerate(found.found, start=1):
-        numbers[one.core] = number
-    for name, values in {
-        "surface_temperature_c": found.triangle_surface_c,
-        "heat_flow_w_m2": found.triangle_flow_w_m2,
-        **dict(zip(("u_w_m2k", "u_low_w_m2k", "u_high_w_m2k"), found.triangle_u.T)),
-        "counted": found.surface.counted.astype(np.uint8),
-        "defect": numbers,
-        **({} if calibration is None else {"measured_minus_computed_k": calibration.difference_k}),
-    }.items():
-        data.cell_data[name] = values
-    write_vtk(vtkXMLPolyDataWriter(), path, data)

@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import remove_file, result_folder
+from thermoxels_ns.core.config_loader import check_run
 from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.core.lattice import Lattice, input_from_world
@@ -314,6 +315,24 @@ def prepare_folder(output_dir: Path | str) -> Path:
     return result_folder(output_dir, names, (_QUALITY, _SUMMARY), others, f"{Path(_HEAT).stem}/{STEP_PATTERN}")
 
 
+def built_mesh(
+    snapshot: GridSnapshot,
+    options: ExportOptions,
+    checked: CheckedOptions,
+    to_mesh: FloatArray,
+    metres: float,
+    up: tuple[float, float, float],
+    depths: Depths | None,
+    tracks: FeatureRays | None,
+) -> BuiltMesh:
+    """Return the mesh of a trained field, with its support by photographs if their depths are given."""
+    from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+
+    mesh_options = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
+    built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options, metres)
+    return built if depths is None else _with_support(built, depths, tracks, snapshot.lattice, to_mesh)
+
+
 def export_snapshot(
     snapshot: GridSnapshot,
     world_to_input: FloatArray,
@@ -352,7 +371,7 @@ def export_snapshot(
     from thermoxels_ns.fem.solution import HeatSolution
     from thermoxels_ns.heat.solving import Goals, solve_problem
     from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, write_heat_series
-    from thermoxels_ns.mesh.build import MeshOptions, apply_transform, build_mesh
+    from thermoxels_ns.mesh.build import apply_transform
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
     from thermoxels_ns.mesh.files.solvers import HeatStep
     from thermoxels_ns.mesh.files.surface import check_stl
@@ -368,10 +387,7 @@ def export_snapshot(
     up, up_source = up_of(options, scene_file, viewpoint)
     folder = prepare_folder(output_dir)
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ world_to_input
-    mesh_options = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
-    built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options, metres)
-    if depths is not None:
-        built = _with_support(built, depths, tracks, snapshot.lattice, to_mesh)
+    built = built_mesh(snapshot, options, checked, to_mesh, metres, up, depths, tracks)
     mesh = built.mesh
     suffixes = [f".{name}" for name in options.formats]
     if ".stl" in suffixes:
@@ -532,14 +548,15 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
 
     `check_scene` is called with the path of the scene before anything slow; an error that it raises is passed on.
     """
-    if not load_config.is_file():
-        remedy = "Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml."
-        got = f"no file at {load_config}"
-        raise CheckpointError("load_config", expected="the config.yml of a training run", got=got, remedy=remedy)
+    check_run(load_config)
     import yaml
     from nerfstudio.utils.eval_utils import eval_setup
 
+    from thermoxels_ns.training.trainer import ThermoxelsTrainerConfig
+
     def check(config: TrainerConfig) -> TrainerConfig:
+        if isinstance(config, ThermoxelsTrainerConfig):
+            config.moved_to(load_config.parent)
         _check_config(config)
         manager: Any = config.pipeline.datamanager
         told = getattr(manager, "data", None)  # with --data of ns-train, else with the dataparser's own --data

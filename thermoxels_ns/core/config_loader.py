@@ -9,8 +9,9 @@ import os
 import sys
 from collections.abc import Iterator
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
@@ -32,6 +33,9 @@ class ConfigLoader(yaml.Loader):
     packages installed as its plugins. The whole file is checked before any object is made.
     """
 
+    run_folder: ClassVar[Path | None] = None
+    """Folder of the config.yml that is loaded next, to which the run may have been moved; None: not known."""
+
     def get_single_data(self) -> Any:
         """Return the content of the file, or raise `CheckpointError` with a forbidden name and its line."""
         expected = "a config.yml that names only configuration classes of nerfstudio and its installed plugins"
@@ -46,7 +50,61 @@ class ConfigLoader(yaml.Loader):
             if place.tag != tag and not _harmless(tag):
                 got = f"{tag} in line {place.start_mark.line + 1}"
                 raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
-        return None if node is None else self.construct_document(node)
+        found = None if node is None else self.construct_document(node)
+        folder, ConfigLoader.run_folder = ConfigLoader.run_folder, None
+        if folder is not None and found is not None and hasattr(found, "moved_to"):
+            found.moved_to(folder)
+        return found
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Loader that imports nothing: objects become mappings of their fields, paths lists of their parts, names None."""
+
+
+def _plain(loader: _PlainLoader, _: str, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    return loader.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else None
+
+
+_PlainLoader.add_multi_constructor(_PYTHON_TAG, _plain)
+
+
+def check_run(config: Path) -> None:
+    """Raise `CheckpointError` if a run lacks its config.yml, checkpoint or photographs, without importing nerfstudio.
+
+    A file in another layout than `ThermoxelsTrainerConfig` writes is left to whoever loads it.
+    """
+    if not config.is_file():
+        remedy = "Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml."
+        got = f"no file at {config}"
+        raise CheckpointError("load_config", expected="the config.yml of a training run", got=got, remedy=remedy)
+    try:
+        content = yaml.load(config.read_text(encoding="utf-8"), Loader=_PlainLoader)
+        models = config.parent.joinpath(*content["relative_model_dir"])
+        manager = content["pipeline"]["datamanager"]
+        told = Path(*(manager["data"] or manager["dataparser"]["data"]))
+        from_run = content.get("scene_from_run", "")
+    except (yaml.YAMLError, OSError, UnicodeDecodeError, KeyError, TypeError, RecursionError):
+        return
+    if not any(models.glob("step-*.ckpt")):
+        remedy = "Copy the whole folder of the run, or train to the first checkpoint."
+        raise CheckpointError("checkpoint", expected=f"a file step-*.ckpt in {models}", got="none", remedy=remedy)
+    if not (scene := scene_of_run(config.parent, told, from_run)).exists():
+        expected, remedy = f"photographs at {scene}, where the run was trained on them", "Put the scene folder there"
+        if from_run:
+            remedy += f" or, for a run that was moved, at {scene_of_run(config.parent, Path(), from_run, False)}"
+        raise CheckpointError("scene of the run", expected=expected, got="none", remedy=f"{remedy}.")
+
+
+def scene_of_run(folder: Path, told: Path, from_run: str, needed: bool = True) -> Path:
+    """Return the path of a run's scene: where it lies seen from the run's folder, if it is there, else as `told`.
+
+    >>> scene_of_run(Path("outputs/house/thermoxels/run"), Path("house"), "../../../../scenes/house", False).as_posix()
+    'scenes/house'
+    """
+    beside = Path(os.path.normpath(folder / from_run))
+    return beside if from_run and (beside.exists() or not needed) else told
 
 
 def _nodes(root: yaml.Node | None) -> Iterator[yaml.Node]:

@@ -7,26 +7,33 @@ import binascii
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import MeshError, OutputError
-from thermoxels_ns.core.json_values import plain_values
-from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays, surface_of, write_bytes
-from thermoxels_ns.mesh.quality.checks import count_wrong_facets, group_faces
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh, facet_areas, facet_normals
+from thermoxels_ns.core.checks import plain_os_errors, replace_when_done, writable_folder
+from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
+from thermoxels_ns.core.json_values import plain_values, read_json_object
+from thermoxels_ns.mesh.files.content import write_bytes
+from thermoxels_ns.mesh.files.pyvista_objects import (
+    BODY,
+    BOUNDARY,
+    body_grid,
+    boundary_surface,
+    mesh_of,
+    mesh_of_grid,
+    wrong_mesh,
+)
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+if TYPE_CHECKING:
+    import pyvista as pv
 
 _DISK_IS_FULL = 20007  # VTK's error code
-_REMEDY = "Export the mesh again with ns-export thermoxels-mesh."
-_REGION = "region:"
-_TETRAHEDRON = 10  # VTK's number for tetrahedra
 _MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and a margin
 
 
@@ -35,26 +42,16 @@ def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
 
     Point arrays are `temperature_c` [degrees Celsius], `temperature_k` [K], `observed` (1: measured, 0: extended) and,
     if the mesh has colours, `colour` (red, green, blue as bytes). The cell array is `region`; field arrays
-    `region:NAME` hold the number of each region. The argument `temperature_c`, if given, replaces the mesh's own.
+    `region:NAME` hold the number of each region, from 1 as in every format. The argument `temperature_c`, if given,
+    replaces the mesh's own.
 
     Raises:
         MeshError: An array does not fit the mesh or is not finite.
         OutputError: The file cannot be written.
     """
-    import pyvista as pv
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-    path = Path(path)
-    mesh, _ = checked_mesh(mesh, temperature_c)
-    grid = pv.UnstructuredGrid({pv.CellType.TETRA: mesh.tets}, mesh.points_m)
-    for name, values in node_arrays(mesh).items():
-        grid.point_data[name] = values
-    grid.cell_data["region"] = mesh.region
-    # Regions are field arrays of numbers, because meshio refuses a file that holds text.
-    for number, name in enumerate(mesh.region_names):
-        grid.field_data[f"region:{name}"] = [number]
-    grid.set_active_scalars("temperature_c")
-    write_vtk(vtkXMLUnstructuredGridWriter(), path, grid)
+    write_vtk(vtkXMLUnstructuredGridWriter(), Path(path), body_grid(mesh, temperature_c))
 
 
 def write_vtk(writer: Any, path: Path, data: Any) -> None:
@@ -115,44 +112,16 @@ def boundary_path(path: Path | str) -> Path:
 def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
     """Write the boundary triangles and their tags as VTK polygons (.vtp, read by ParaView and pyvista).
 
-    Cell arrays: `normal` (outward), `area_m2`, `seen` (1: a camera sees the triangle), `patch` (an index into the field
-    array `patch_names`), `on_box` (1: the scene box or the region cuts the solid there) and, if photographs were
-    compared, `photographs_seen` and `photographs_supporting`, see `Boundary.photographs`. Point arrays:
-    `temperature_c`, `observed`, `node` (number in the mesh, from 0) and, if the mesh has colours, `colour` as bytes.
+    Cell arrays: `normal` (outward), `area_m2`, `seen` (1: a camera sees the triangle), `patch` (number of the patch in
+    the field array `patch_names`, from 1 as in every format), `on_box` (1: the scene box or the region cuts the solid
+    there) and, if photographs were compared, `photographs_seen` and `photographs_supporting`, see
+    `Boundary.photographs`. Point arrays: `temperature_c`, `observed`, `node` (number in the mesh, from 0) and, if the
+    mesh has colours, `colour` as bytes.
     A mesh without boundary tags is written with one patch, "boundary", and without `seen`, which is unknown.
     """
-    import pyvista as pv
-    from vtkmodules.vtkCommonCore import vtkStringArray
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    path = Path(path)
-    mesh, tags = checked_mesh(mesh)
-    surface = surface_of(mesh.points_m, mesh.facets)
-    arrays: dict[str, npt.NDArray] = {
-        "area_m2": facet_areas(mesh.points_m, mesh.facets),
-        "normal": facet_normals(mesh.points_m, mesh.facets),
-        "on_box": (mesh.facet_tags == FACET_BOX).astype(np.uint8),
-        "patch": tags.patch,
-    }
-    if mesh.boundary is not None:
-        arrays["seen"] = tags.seen.astype(np.uint8)
-    if tags.photographs is not None:
-        arrays["photographs_seen"], arrays["photographs_supporting"] = tags.photographs.T.astype(np.int32)
-
-    data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
-    data.point_data["node"] = surface.nodes
-    for name, values in node_arrays(mesh).items():
-        if name != "temperature_k":
-            data.point_data[name] = values[surface.nodes]
-    for name, values in arrays.items():
-        data.cell_data[name] = values
-    names = vtkStringArray()  # pyvista's own way takes ASCII names only
-    names.SetName("patch_names")
-    for name in tags.patch_names:
-        names.InsertNextValue(name)
-    data.GetFieldData().AddArray(names)
-    data.set_active_scalars("temperature_c")
-    write_vtk(vtkXMLPolyDataWriter(), path, data)
+    write_vtk(vtkXMLPolyDataWriter(), Path(path), boundary_surface(mesh))
 
 
 def read_mesh(path: Path | str) -> TetMesh:
@@ -166,41 +135,70 @@ def read_mesh(path: Path | str) -> TetMesh:
     """
     path = Path(path)
     if path.suffix != ".vtu":
-        raise _wrong("mesh file", "a name that ends in .vtu", path.name, "Pass the mesh.vtu of an export.")
+        raise wrong_mesh("mesh file", "a name that ends in .vtu", path.name, "Pass the mesh.vtu of an export.")
     beside = boundary_path(path)
-    body, surface = _read(path), _read(beside)
-    others = np.count_nonzero(body.celltypes != _TETRAHEDRON)
-    if others:
-        raise _wrong(path.name, "tetrahedra only", f"{others} cells of other kinds")
-    points = np.array(body.points, dtype=np.float64)
-    colour = body.point_data.get("colour")
-    facets, tags = _boundary(surface, points, beside.name)
-    on_box = _array(surface.cell_data, "on_box", beside.name) != 0
-    mesh = TetMesh(
-        points_m=points,
-        tets=np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4),
-        temperature_c=_array(body.point_data, "temperature_c", path.name).astype(np.float64),
-        observed=_array(body.point_data, "observed", path.name) != 0,
-        facets=facets,
-        facet_tags=np.where(on_box, FACET_BOX, FACET_SURFACE).astype(np.int64),
-        region=_array(body.cell_data, "region", path.name).astype(np.int64),
-        region_names=_region_names(body, path.name),
-        boundary=tags,
-        colour=None if colour is None else (np.asarray(colour) / 255.0).astype(np.float32),
-    )
-    mesh.check(f"{path.name} with {beside.name}", _REMEDY)
-    faces = group_faces(mesh.tets)
-    wrong = count_wrong_facets(mesh, faces)
-    crowded = faces.sizes.max() > 2
-    if (wrong or crowded) and (doubled := len(mesh.tets) - len(np.unique(np.sort(mesh.tets, axis=1), axis=0))):
-        raise _wrong(path.name, "every tetrahedron once", f"{doubled} of {len(mesh.tets)} listed again")
-    if wrong:
-        expected, got = "every face of one tetrahedron alone, and no other", f"{wrong} missing, inside or turned over"
-        raise _wrong(beside.name, expected, got)
-    if crowded:
-        remedy = "Remove tetrahedra that lie in each other, or export the mesh again."
-        raise _wrong(path.name, "faces of one or two tetrahedra each", "faces of more", remedy)
-    return mesh
+    return mesh_of(_read(path), _read(beside), path.name, beside.name)
+
+
+AnyMesh: TypeAlias = "pv.MultiBlock | pv.UnstructuredGrid | TetMesh | Path | str"
+"""What `any_mesh` takes."""
+
+
+def any_mesh(data: AnyMesh, up: npt.ArrayLike | None = None) -> tuple[TetMesh, dict[str, Any]]:
+    """Return a mesh, and what is known about it: the content of its summary.json, or the user_dict of its blocks.
+
+    Args:
+        data: A pyvista MultiBlock as `blocks_of` makes it, a pyvista grid of tetrahedra as `mesh_of_grid` takes it, a
+            `TetMesh`, or the path of the mesh.vtu of an export.
+        up: Direction that points up; if given, it takes the place of the one that is known.
+
+    Raises:
+        MeshError: `data` is none of these, or no sound mesh.
+        HeatError: The mesh has no scale.
+    """
+    import pyvista as pv
+
+    about: dict[str, Any] = {}
+    if isinstance(data, TetMesh):
+        data.check()
+        mesh = data
+    elif isinstance(data, (str, Path)):
+        mesh, about = read_mesh(data), read_export_summary(Path(data))
+    elif isinstance(data, pv.MultiBlock) and {BODY, BOUNDARY} <= set(data.keys()):
+        mesh, about = mesh_of(data[BODY], data[BOUNDARY]), json.loads(str(data.user_dict))
+        check_in_metres(about)
+    elif isinstance(data, pv.UnstructuredGrid):
+        mesh = mesh_of_grid(data, (0.0, 0.0, 1.0) if up is None else up)
+    else:
+        expected = f"blocks {BODY} and {BOUNDARY}, a pyvista UnstructuredGrid, a TetMesh or a path"
+        raise wrong_mesh("mesh", expected, type(data).__name__, "Make it with scene.mesh(), or with pyvista.")
+    return mesh, about if up is None else {**about, "up": up}
+
+
+def read_export_summary(mesh: Path, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Read the summary.json beside a mesh; empty if there is none. Raises `HeatError` if the mesh has no scale."""
+    path = mesh.with_name("summary.json")
+    if not path.is_file():
+        say(f"Warning: {path} is missing; the mesh is taken to be in metres.")
+        return {}
+    summary = read_json_object(path, "Export the mesh again, or move the file away.", MeshError)
+    check_in_metres(summary)
+    try:
+        if summary.get("up") is not None:
+            x, y, z = map(float, summary["up"])
+            summary["up"] = (x, y, z)
+    except (TypeError, ValueError) as problem:
+        name, remedy = f"{path}: up", "Pass --up 0 0 1, or export the mesh again."
+        raise MeshError(name, expected="three numbers", got=repr(summary["up"]), remedy=remedy) from problem
+    return summary
+
+
+def check_in_metres(summary: Mapping[str, Any]) -> None:
+    """Raise `HeatError` if the summary of an export says that its mesh is not in metres."""
+    if summary.get("length_unit", "m") != "m":
+        remedy = "Export again with --metres-per-unit or --known-distance."
+        got = f"one in {summary['length_unit']}s"
+        raise HeatError("scale of the mesh", expected="an export in metres", got=got, remedy=remedy)
 
 
 def _read(path: Path) -> Any:
@@ -209,7 +207,7 @@ def _read(path: Path) -> Any:
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
 
     if not path.is_file():
-        raise _wrong(path.name, f"a file at {path}", "none")
+        raise wrong_mesh(path.name, f"a file at {path}", "none")
     reader: Any = vtkXMLPolyDataReader() if path.suffix == ".vtp" else vtkXMLUnstructuredGridReader()
     reader.SetFileName(str(path))
     data = None
@@ -220,7 +218,7 @@ def _read(path: Path) -> Any:
             reader.Update()
             data = pv.wrap(reader.GetOutput())
     if data is None or complaints.events or reader.GetErrorCode() or not data.n_cells:
-        raise _wrong(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one")
+        raise wrong_mesh(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one")
     return data
 
 
@@ -254,56 +252,3 @@ def _numbers(letters: bytes, width: int, count: int) -> list[int]:
         found = b""
     whole = found + b"\xff" * max(0, width * count - len(found))
     return [int.from_bytes(whole[width * k : width * (k + 1)], "little") for k in range(count)]
-
-
-def _region_names(body: Any, name: str) -> tuple[str, ...]:
-    """Return the names of the regions in the order of their numbers, read from field arrays `region:NAME`."""
-    arrays = body.GetFieldData()
-    numbers = {}
-    for place in range(arrays.GetNumberOfArrays()):
-        array = arrays.GetAbstractArray(place)
-        if (array.GetName() or "").startswith(_REGION) and array.GetNumberOfValues() == 1:
-            numbers[int(array.GetVariantValue(0).ToInt())] = array.GetName().removeprefix(_REGION)
-    if sorted(numbers) != list(range(len(numbers))) or not numbers:
-        raise _wrong(name, f"field arrays {_REGION}NAME numbered from 0", sorted(numbers) or "none")
-    return tuple(numbers[number] for number in range(len(numbers)))
-
-
-def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Boundary | None]:
-    """Return the boundary triangles (f, 3) and their tags; the tags are None for a mesh written without tags."""
-
-    def array(of: str) -> npt.NDArray:
-        return _array(surface.cell_data, of, name)
-
-    node = _array(surface.point_data, "node", name).astype(np.int64)
-    if not np.isfinite(points).all():
-        bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
-        raise _wrong(name, "finite positions of nodes", f"{bad} that are not, in the mesh beside it")
-    if node.min() < 0 or node.max() >= len(points) or not np.array_equal(points[node], surface.points):
-        raise _wrong(name, "the boundary of the mesh beside it", "that of another one")
-    if not surface.is_all_triangles:
-        raise _wrong(name, "triangles only", "other polygons")
-    facets = node[np.asarray(surface.regular_faces, dtype=np.int64)]
-    if "seen" not in surface.cell_data:
-        return facets, None
-    names = surface.GetFieldData().GetAbstractArray("patch_names")
-    if names is None:
-        raise _wrong(name, "the field array patch_names", "none")
-    counts = [f"photographs_{what}" for what in ("seen", "supporting")]
-    counted = any(count in surface.cell_data for count in counts)
-    return facets, Boundary(
-        seen=array("seen") != 0,
-        patch=array("patch").astype(np.int64),
-        patch_names=tuple(str(names.GetValue(number)) for number in range(names.GetNumberOfValues())),
-        photographs=np.stack([array(count) for count in counts], axis=1).astype(np.int64) if counted else None,
-    )
-
-
-def _array(data: Any, array: str, name: str) -> npt.NDArray:
-    if array not in data:
-        raise _wrong(name, f"an array {array}", f"{', '.join(sorted(data.keys())) or 'none'}")
-    return check_finite(f"{name}: {array}", np.array(data[array]), _REMEDY, MeshError)
-
-
-def _wrong(name: str, expected: str, got: object, remedy: str = _REMEDY) -> MeshError:
-    return MeshError(name, expected=expected, got=got, remedy=remedy)
