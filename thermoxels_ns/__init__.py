@@ -24,26 +24,19 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from thermoxels_ns.api import Scene as Scene
-    from thermoxels_ns.api import load as load
-    from thermoxels_ns.api import solve as solve
-    from thermoxels_ns.api import to_pyvista as to_pyvista
+    from thermoxels_ns.api import Scene, ThermoxelsError, load, solve, to_pyvista
     from thermoxels_ns.audit.run import audit_mesh as audit
-    from thermoxels_ns.core.errors import ThermoxelsError as ThermoxelsError
 
 __version__ = "0.1.0"
 __all__ = ["Scene", "ThermoxelsError", "__version__", "audit", "load", "solve", "to_pyvista"]
 
-_LIES_IN = {"ThermoxelsError": "core.errors", **dict.fromkeys(("Scene", "load", "solve", "to_pyvista"), "api")}
-"""Module of each public name, which is imported when the name is used first."""
-
 
 def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     if name == "audit":
         return import_module("thermoxels_ns.audit")  # a package that can be called
-    if name not in _LIES_IN:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_LIES_IN[name]}"), name)
+    return getattr(import_module("thermoxels_ns.api"), name)
 
 
 def __dir__() -> list[str]:

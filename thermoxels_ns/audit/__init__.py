@@ -1,7 +1,4 @@
-"""Answers from measured surface temperatures: heat flows, U-values, thermal bridges, with intervals.
-
-Called as a function, ``thermoxels_ns.audit(mesh, conditions)``, this package is `thermoxels_ns.audit.run.audit_mesh`.
-"""
+"""Answers from measured surface temperatures, with intervals; called as a function, it is `run.audit_mesh`."""
 
 import sys
 from types import ModuleType

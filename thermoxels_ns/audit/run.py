@@ -32,12 +32,11 @@ from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.tables import HasTables, lines_of
 from thermoxels_ns.fem.selection import matching_names
-from thermoxels_ns.mesh.files.pyvista_objects import boundary_surface
-from thermoxels_ns.mesh.files.vtu import AnyMesh, any_mesh
+from thermoxels_ns.mesh.files.vtu import AnyMesh, any_mesh, boundary_surface
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 if TYPE_CHECKING:
-    from thermoxels_ns.mesh.files.pyvista_objects import pv
+    from thermoxels_ns.mesh.files.vtu import pv
 
 SEVERE_SHARE, MODERATE_SHARE = 0.05, 0.01
 """Least shares of the observed heat loss at which a defect is severe or moderate; no standard defines these shares."""
@@ -165,15 +164,9 @@ class Audit(HasTables):
         return {"patches": patches, **others}
 
     def to_pyvista(self) -> pv.PolyData:
-        """Return the boundary with the results of each triangle, NaN where it does not count.
-
-        Cell arrays: `surface_temperature_c`, `heat_flow_w_m2`, `u_w_m2k` with both ends of its interval, `counted`,
-        `defect` (its number, from 1) and, after a calibration, `measured_minus_computed_k`."""
-        mesh, calibration = self.surface.mesh, self.calibration
-        data = boundary_surface(mesh)
-        data.cell_data.clear()
-        data.point_data.clear()
-        numbers = np.zeros(len(mesh.facets), dtype=np.int32)
+        """Return the boundary, as `vtu.boundary_surface`, with the results of each triangle; NaN: does not count."""
+        data, calibration = boundary_surface(self.surface.mesh), self.calibration
+        numbers = np.zeros(len(self.surface.mesh.facets), dtype=np.int32)
         for number, one in enumerate(self.found, start=1):
             numbers[one.core] = number
         for name, values in {
@@ -193,25 +186,16 @@ def audit_mesh(
 ) -> Audit:
     """Find heat loss, U-values and thermal bridges, each as an interval, from the temperatures that a mesh holds.
 
-    Args:
-        mesh: What `thermoxels_ns.solve` takes.
-        conditions: Conditions of the survey: a `Conditions`, the path of a yaml file, or its keys as a mapping.
-        up: Direction that points up in the coordinates of the mesh. Default: what the mesh says, or else z.
-
-    Returns:
-        The `Audit`: `whole`, `patches`, `defects` and more; `to_frame()` and `to_pyvista()`.
-
-    Raises:
-        AuditError: The conditions are wrong or do not fit the mesh.
-        ThermoxelsError: The mesh is not sound or has no scale.
+    `mesh` is what `thermoxels_ns.solve` takes, `conditions` a `Conditions`, the path of a yaml file, or its keys as a
+    mapping. `up` points up in the coordinates of the mesh; by default it is what the mesh says, or else z. Raises
+    `AuditError` if the conditions are wrong or do not fit the mesh, `ThermoxelsError` if the mesh is not sound.
     """
     if not isinstance(conditions, Conditions):
         conditions = load_conditions(conditions)
     body, about = any_mesh(mesh, up)
     towards = check_direction("up", about.get("up") or (0.0, 0.0, 1.0), "Pass up=(0, 0, 1).", AuditError)
     x, y, z = (towards / float(np.linalg.norm(towards))).tolist()
-    # With more BLAS threads, the last bits of results would depend on the number of threads.
-    with threadpool_limits(1, "blas"):
+    with threadpool_limits(1, "blas"):  # with more, the last bits would depend on the number of threads
         return audit(body, conditions, (x, y, z))
 
 

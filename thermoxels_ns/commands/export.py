@@ -128,6 +128,9 @@ class ExportOptions:
     """Mass density of the material, [kg / m3]. Left out: as in the heat scene."""
     specific_heat_j_kgk: float | None = None
     """Specific heat capacity, [J / (kg K)]. Left out: as in the heat scene."""
+    vtk_times: Literal["all"] | tuple[float, ...] = ()
+    """Times whose temperatures are written for ParaView beside those of the start and of the end, [s]: for each the
+    nearest time that the scene keeps. all: every kept time; each takes as much space as the mesh."""
     pictures: bool = True
     """Write PNG pictures of the mesh coloured by temperature, and of its quality."""
 
@@ -315,24 +318,6 @@ def prepare_folder(output_dir: Path | str) -> Path:
     return result_folder(output_dir, names, (_QUALITY, _SUMMARY), others, f"{Path(_HEAT).stem}/{STEP_PATTERN}")
 
 
-def built_mesh(
-    snapshot: GridSnapshot,
-    options: ExportOptions,
-    checked: CheckedOptions,
-    to_mesh: FloatArray,
-    metres: float,
-    up: tuple[float, float, float],
-    depths: Depths | None,
-    tracks: FeatureRays | None,
-) -> BuiltMesh:
-    """Return the mesh of a trained field, with its support by photographs if their depths are given."""
-    from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-
-    mesh_options = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
-    built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options, metres)
-    return built if depths is None else _with_support(built, depths, tracks, snapshot.lattice, to_mesh)
-
-
 def export_snapshot(
     snapshot: GridSnapshot,
     world_to_input: FloatArray,
@@ -370,8 +355,8 @@ def export_snapshot(
     from thermoxels_ns.commands import export_summary
     from thermoxels_ns.fem.solution import HeatSolution
     from thermoxels_ns.heat.solving import Goals, solve_problem
-    from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, write_heat_series
-    from thermoxels_ns.mesh.build import apply_transform
+    from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, shown_states, write_heat_series
+    from thermoxels_ns.mesh.build import MeshOptions, apply_transform, build_mesh
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
     from thermoxels_ns.mesh.files.solvers import HeatStep
     from thermoxels_ns.mesh.files.surface import check_stl
@@ -387,7 +372,10 @@ def export_snapshot(
     up, up_source = up_of(options, scene_file, viewpoint)
     folder = prepare_folder(output_dir)
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ world_to_input
-    built = built_mesh(snapshot, options, checked, to_mesh, metres, up, depths, tracks)
+    mesh_options = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
+    built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options, metres)
+    if depths is not None:
+        built = with_support(built, depths, tracks, snapshot.lattice, to_mesh)
     mesh = built.mesh
     suffixes = [f".{name}" for name in options.formats]
     if ".stl" in suffixes:
@@ -406,7 +394,7 @@ def export_snapshot(
 
     scene, material, time = checked.scene, checked.material, checked.time
     solution: HeatSolution | None = None
-    truth = None
+    truth, states = None, list[int]()
     if scale is not None:
         say(f"Heat: {time.steps} steps of {time.step_seconds:g} s through {material.name}")
         everything = Goals(leave_out_below=0.0, memory_gb=None)
@@ -421,7 +409,8 @@ def export_snapshot(
 
     files = [*_mesh_files(suffixes), _QUALITY]
     if solution is not None:
-        files += [p.relative_to(folder).as_posix() for p in heat_series_paths(folder / _HEAT, len(solution.times_s))]
+        states = shown_states(solution.times_s, options.vtk_times)
+        files += [p.relative_to(folder).as_posix() for p in heat_series_paths(folder / _HEAT, len(states))]
     if options.pictures:
         files += [*_MESH_PICTURES, *([] if solution is None else [_HEAT_PICTURE])]
     skipped = {"computed": False, "reason": HEAT_SKIPPED}
@@ -453,7 +442,7 @@ def export_snapshot(
     for suffix in suffixes:
         write_mesh(folder / f"mesh{suffix}", mesh, heat_step=heat_step, up=up)
     if solution is not None:
-        write_heat_series(folder / _HEAT, mesh, solution)
+        write_heat_series(folder / _HEAT, mesh, solution, states)
     if options.pictures:
         look = {"up": up, "view_direction": viewpoint.view_direction}
         mesh_pictures.draw_mesh([folder / name for name in _MESH_PICTURES[:2]], mesh, look, unit)
@@ -483,7 +472,7 @@ def _mesh_files(suffixes: Iterable[str]) -> list[str]:
     return [path.name for suffix in suffixes for path in mesh_file_paths(f"mesh{suffix}")]
 
 
-def _with_support(
+def with_support(
     built: BuiltMesh,
     depths: Depths,
     tracks: FeatureRays | None,

@@ -9,7 +9,7 @@ import time as clock
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
@@ -63,6 +63,9 @@ class Heat:
     up: tuple[float, float, float] | None = None
     """Direction that points up in the coordinates of the mesh, if the scene has none. Default: the direction in the
     summary.json beside the mesh, or else z."""
+    vtk_times: Literal["all"] | tuple[float, ...] = ()
+    """Times whose temperatures are written for ParaView beside those of the start and of the end, [s]: for each the
+    nearest time that the scene keeps. all: every kept time; each takes as much space as the mesh."""
     pictures: bool = True
     """Draw pictures of the surface."""
 
@@ -167,7 +170,7 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
 def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> None:
     """Write all files of a run into an existing folder, answers.json last; raises `OutputError` if writing fails."""
     from thermoxels_ns.fem.solution import SteadySolution
-    from thermoxels_ns.heat.vtk_series import remove_heat_series, write_heat_series
+    from thermoxels_ns.heat.vtk_series import remove_heat_series, shown_states, write_heat_series
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtu
     from thermoxels_ns.reports.heat_page import heat_page
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES, draw_surface
@@ -184,7 +187,8 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
         remove_heat_series(folder / THROUGH_TIME)
         write_vtu(folder / STEADY, shown.mesh, temperature_c=shown.states_c[-1])
     else:
-        write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution)
+        states = shown_states(run.solution.times_s, options.vtk_times)
+        write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution, states)
     if options.pictures:
         pictures = draw_surface(folder, shown.mesh, shown.states_c, shown.times_s, run.problem.up)
     drawn = {name: (folder / name).read_bytes() for name in pictures}

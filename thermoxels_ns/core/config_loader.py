@@ -71,10 +71,7 @@ _PlainLoader.add_multi_constructor(_PYTHON_TAG, _plain)
 
 
 def check_run(config: Path) -> None:
-    """Raise `CheckpointError` if a run lacks its config.yml, checkpoint or photographs, without importing nerfstudio.
-
-    A file in another layout than `ThermoxelsTrainerConfig` writes is left to whoever loads it.
-    """
+    """Raise `CheckpointError` if a run lacks its config.yml, checkpoint or photographs; nerfstudio is not imported."""
     if not config.is_file():
         remedy = "Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml."
         got = f"no file at {config}"
@@ -82,29 +79,23 @@ def check_run(config: Path) -> None:
     try:
         content = yaml.load(config.read_text(encoding="utf-8"), Loader=_PlainLoader)
         models = config.parent.joinpath(*content["relative_model_dir"])
-        manager = content["pipeline"]["datamanager"]
+        manager, from_run = content["pipeline"]["datamanager"], content.get("scene_from_run", "")
         told = Path(*(manager["data"] or manager["dataparser"]["data"]))
-        from_run = content.get("scene_from_run", "")
     except (yaml.YAMLError, OSError, UnicodeDecodeError, KeyError, TypeError, RecursionError):
-        return
+        return  # another layout is left to whoever loads the file
+    remedy = "Copy the whole folder of the run, or train to the first checkpoint."
     if not any(models.glob("step-*.ckpt")):
-        remedy = "Copy the whole folder of the run, or train to the first checkpoint."
         raise CheckpointError("checkpoint", expected=f"a file step-*.ckpt in {models}", got="none", remedy=remedy)
-    if not (scene := scene_of_run(config.parent, told, from_run)).exists():
-        expected, remedy = f"photographs at {scene}, where the run was trained on them", "Put the scene folder there"
-        if from_run:
-            remedy += f" or, for a run that was moved, at {scene_of_run(config.parent, Path(), from_run, False)}"
-        raise CheckpointError("scene of the run", expected=expected, got="none", remedy=f"{remedy}.")
+    if not scene_of_run(config.parent, told, from_run).exists():
+        expected, remedy = "the photographs that it was trained on", f"Put the scene folder at {told}"
+        remedy += f", or at {from_run} as seen from the folder of the run." if from_run else "."
+        raise CheckpointError(f"scene of {config}", expected=expected, got="none", remedy=remedy)
 
 
-def scene_of_run(folder: Path, told: Path, from_run: str, needed: bool = True) -> Path:
-    """Return the path of a run's scene: where it lies seen from the run's folder, if it is there, else as `told`.
-
-    >>> scene_of_run(Path("outputs/house/thermoxels/run"), Path("house"), "../../../../scenes/house", False).as_posix()
-    'scenes/house'
-    """
+def scene_of_run(folder: Path, told: Path, from_run: str) -> Path:
+    """Return the path of a run's scene: `from_run`, as seen from its folder, if something is there, else `told`."""
     beside = Path(os.path.normpath(folder / from_run))
-    return beside if from_run and (beside.exists() or not needed) else told
+    return beside if from_run and beside.exists() else told
 
 
 def _nodes(root: yaml.Node | None) -> Iterator[yaml.Node]:

@@ -19,17 +19,13 @@ class HasTables(ABC):
         """Return all tables by name; a table is a list of lines, a line a dictionary from column to plain value."""
 
     def to_frame(self, table: str = "patches") -> Any:
-        """Return a table as a pandas DataFrame.
-
-        Raises:
-            ThermoxelsError: There is no table of this name, or pandas, which is no dependency, is not installed.
-        """
+        """Return a table as a pandas DataFrame; raise `ThermoxelsError` without such a table, or without pandas."""
         tables = self.tables()
         if table not in tables:
-            remedy = 'Pass "patches", for example.'
-            raise ThermoxelsError("table", expected=f"one of {', '.join(tables)}", got=repr(table), remedy=remedy)
+            expected = f"one of {', '.join(tables)}"
+            raise ThermoxelsError("table", expected=expected, got=repr(table), remedy="Correct the name.")
         try:
-            pandas = import_module("pandas")
+            pandas = import_module("pandas")  # no dependency: it is large, and few need it
         except ImportError as problem:
             remedy = f"Run pip install pandas, or take tables()[{table!r}], the same as a list of dictionaries."
             raise ThermoxelsError("pandas", expected="an installed package", got="none", remedy=remedy) from problem

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,7 +31,7 @@ from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_table
 from thermoxels_ns.heat.sky import Vector as Direction
 from thermoxels_ns.heat.solving import Goals, LeftOut, Say, solve_problem
-from thermoxels_ns.mesh.files.pyvista_objects import blocks_of
+from thermoxels_ns.mesh.files.vtu import blocks_of
 from thermoxels_ns.mesh.quality.checks import count_tets_in_other_bodies, count_twin_nodes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -152,7 +152,8 @@ class HeatRun(HasTables):
 
     def to_pyvista(self) -> pv.MultiBlock:
         """Return the mesh that was solved, with the temperatures at the end, as `thermoxels_ns.to_pyvista` does."""
-        return blocks_of(self.nodes.mesh, self.nodes.states_c[-1], {"up": self.problem.up})
+        end = replace(self.nodes.mesh, temperature_c=self.nodes.states_c[-1])
+        return blocks_of(end, {"up": self.problem.up})
 
 
 def run_scene(

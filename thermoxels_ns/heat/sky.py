@@ -213,24 +213,20 @@ def moving_sun(
     `start` is the moment of the time 0, with a time zone. Latitudes north and longitudes east are positive. `north` is
     the direction north in the coordinates of the mesh. Without `sunlight` the light is that of `meinel_clear_sky`.
     """
-    irradiance = partial(_from_moving_sun, start, latitude_deg, longitude_deg, north, sunlight, ground_reflectance)
-    return Varying(irradiance, resolution_s=_RESOLUTION_S)
+    where = start, latitude_deg, longitude_deg, north
+    return Varying(partial(_from_moving_sun, where, sunlight, ground_reflectance), resolution_s=_RESOLUTION_S)
 
 
 def _from_moving_sun(
-    start: datetime,
-    latitude_deg: float,
-    longitude_deg: float,
-    north: Vector,
-    sunlight: Sunlight | None,
-    reflectance: float,
+    where: tuple[datetime, float, float, Vector],
+    light: Sunlight | None,
+    reflected: float,
     places: Places,
     time_s: float,
 ) -> FloatArray:
-    position = sun_position(_later(start, time_s), latitude_deg, longitude_deg)
-    light = sunlight or meinel_clear_sky(position.elevation_deg, position.distance_au)
-    towards = towards_sun(position, places.up, north)
-    return facet_irradiance(places.normals, places.up, towards, light, reflectance)
+    position = sun_position(_later(where[0], time_s), *where[1:3])
+    light = light or meinel_clear_sky(position.elevation_deg, position.distance_au)
+    return facet_irradiance(places.normals, places.up, towards_sun(position, places.up, where[3]), light, reflected)
 
 
 def _later(start: datetime, time_s: float) -> datetime:
