@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,14 +109,16 @@ def load(run: Path | str, *, metres_per_unit: float | None = None) -> Scene:
     config = Path(run) if Path(run).suffix == ".yml" else Path(run) / "config.yml"
     given = None if metres_per_unit is None else scale_from_option(metres_per_unit).metres_per_unit
     check_run(config)  # before nerfstudio is imported, which takes many seconds
-    from nerfstudio.utils.rich_utils import CONSOLE
+    hook = sys.excepthook  # our plugin makes nerfstudio's commands print errors without a traceback, which Python keeps
+    with threadpool_limits(1, "blas"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # of torch about nerfstudio, on which no user can act
+        from nerfstudio.utils.rich_utils import CONSOLE
 
-    loud, CONSOLE.quiet = CONSOLE.quiet, True
-    try:
-        with threadpool_limits(1, "blas"):
+        loud, CONSOLE.quiet = CONSOLE.quiet, True
+        try:
             trained = load_trained_scene(config)
-    finally:
-        CONSOLE.quiet = loud
+        finally:
+            CONSOLE.quiet, sys.excepthook = loud, hook
     scale, field = choose_scale(given, None, scene_json(trained.scene_folder)), trained.snapshot
     metres = None if scale is None else scale.metres_per_unit
     units = (metres or 1.0) * float(np.cbrt(abs(np.linalg.det(trained.world_to_input[:3, :3]))))

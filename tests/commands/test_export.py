@@ -484,7 +484,7 @@ def test_scale_and_up_from_the_scene_file(small, tmp_path) -> None:
     assert mesh["area_standard_error"] == pytest.approx(2 * 0.02 * mesh["area"])
     boundary = pyvista.read(tmp_path / "mesh-boundary.vtp")
     up = [str(name) for name in boundary.field_data["patch_names"]].index("exterior-up")
-    assert boundary.cell_data["normal"][boundary.cell_data["patch"] == up].mean(axis=0).argmax() == 1
+    assert boundary.cell_data["normal"][boundary.cell_data["patch"] == up + 1].mean(axis=0).argmax() == 1
 
 
 def test_patches_of_the_user_reach_mesh_and_summary(small, tmp_path_factory) -> None:
