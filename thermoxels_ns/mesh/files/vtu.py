@@ -198,7 +198,8 @@ def read_export_summary(mesh: Path, say: Callable[[str], None] = lambda _: None)
 
 def _check_in_metres(summary: Mapping[str, Any]) -> None:
     if summary.get("length_unit", "m") != "m":
-        got, remedy = f"one in {summary['length_unit']}s", "Export again with --metres-per-unit or --known-distance."
+        got = f"one in {summary['length_unit']}s"
+        remedy = "Export again with --metres-per-unit or --known-distance; in Python, load(run, metres_per_unit=1.0)."
         raise HeatError("scale of the mesh", expected="an export in metres", got=got, remedy=remedy)
 
 
