@@ -32,7 +32,7 @@ def test_the_five_lines_of_the_docs_on_a_run_that_was_moved(trained: Trained, tm
     assert scene.trained.scene_folder.samefile(run / from_run) and scene.metres_per_unit == 1.0
     assert scene.points.shape == (*scene.temperature_c.shape, 3) == (*scene.density.shape, 3)
     assert np.linalg.norm(scene.points[1, 1, 1] - scene.points[0, 1, 1]) == pytest.approx(scene.spacing)
-    assert heat.wall.u_value_w_m2k > 0.0 and found.whole.loss_w.low < found.whole.loss_w.high
+    assert heat.results.balance.into_body > 0.0 and found.whole.loss_w.low < found.whole.loss_w.high
     assert len(repr(scene)) + len(repr(heat)) + len(repr(found)) < 400
 
     options = ("--density-percentile", "90", "--interior", "hollow", "--pictures", "False", "--steps", "1")

@@ -73,7 +73,7 @@ _PlainLoader.add_multi_constructor(_PYTHON_TAG, _plain)
 def check_run(config: Path) -> None:
     """Raise `CheckpointError` if a run lacks its config.yml, checkpoint or photographs; nerfstudio is not imported."""
     if not config.is_file():
-        remedy = "Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml."
+        remedy = "Pass that of a run, outputs/<scene>/thermoxels/<time>/config.yml."
         got = f"no file at {config}"
         raise CheckpointError("load_config", expected="the config.yml of a training run", got=got, remedy=remedy)
     try:

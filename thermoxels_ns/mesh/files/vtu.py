@@ -143,7 +143,7 @@ def read_mesh(path: Path | str) -> TetMesh:
     """
     path = Path(path)
     if path.suffix != ".vtu":
-        raise wrong_mesh("mesh file", "a name that ends in .vtu", path.name, "Pass the mesh.vtu of an export.")
+        raise _wrong("mesh file", "a name that ends in .vtu", path.name, "Pass the mesh.vtu of an export.")
     beside = boundary_path(path)
     return mesh_of(_read(path), _read(beside), path.name, beside.name)
 
@@ -174,7 +174,7 @@ def any_mesh(data: AnyMesh, up: Sequence[float] | None = None) -> tuple[TetMesh,
         mesh = data
     else:
         expected = f"a path, a TetMesh, a pyvista UnstructuredGrid, or a MultiBlock of {BODY} and {BOUNDARY}"
-        raise wrong_mesh("mesh", expected, type(data).__name__, "Make it with scene.mesh() or with pyvista.")
+        raise _wrong("mesh", expected, type(data).__name__, "Make it with scene.mesh() or with pyvista.")
     return mesh, about if up is None else {**about, "up": tuple(up)}
 
 
@@ -209,7 +209,7 @@ def _read(path: Path) -> Any:
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
 
     if not path.is_file():
-        raise wrong_mesh(path.name, f"a file at {path}", "none")
+        raise _wrong(path.name, f"a file at {path}", "none")
     reader: Any = vtkXMLPolyDataReader() if path.suffix == ".vtp" else vtkXMLUnstructuredGridReader()
     reader.SetFileName(str(path))
     data = None
@@ -220,7 +220,7 @@ def _read(path: Path) -> Any:
             reader.Update()
             data = pv.wrap(reader.GetOutput())
     if data is None or complaints.events or reader.GetErrorCode() or not data.n_cells:
-        raise wrong_mesh(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one")
+        raise _wrong(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one")
     return data
 
 
@@ -355,7 +355,7 @@ def mesh_of_grid(grid: pv.UnstructuredGrid, up: npt.ArrayLike = (0.0, 0.0, 1.0))
     if "temperature_c" not in grid.point_data:
         remedy = 'Set grid.point_data["temperature_c"] = 20.0, or to what was measured.'
         got = ", ".join(grid.point_data.keys()) or "none"
-        raise wrong_mesh(name, "a point array temperature_c [degrees Celsius]", got, remedy)
+        raise _wrong(name, "a point array temperature_c [degrees Celsius]", got, remedy)
     points, tets = np.array(grid.points, np.float64), np.array(grid.cell_connectivity, np.int64).reshape(-1, 4)
     turned = signed_volumes(points, tets) < 0.0
     tets[turned] = tets[turned][:, [0, 2, 1, 3]]
@@ -387,7 +387,7 @@ def _check_tetrahedra(grid: Any, name: str) -> None:
     others = np.count_nonzero(grid.celltypes != _TETRAHEDRON)
     if others or not grid.n_cells:
         remedy = "Keep grid.extract_cells_by_type(10), the tetrahedra, or make some with grid.triangulate()."
-        raise wrong_mesh(name, "tetrahedra only", f"{others} cells of other kinds" if others else "none", remedy)
+        raise _wrong(name, "tetrahedra only", f"{others} cells of other kinds" if others else "none", remedy)
 
 
 def _checked(mesh: TetMesh, name: str, beside: str) -> TetMesh:
@@ -396,13 +396,13 @@ def _checked(mesh: TetMesh, name: str, beside: str) -> TetMesh:
     wrong = count_wrong_facets(mesh, faces)
     crowded = faces.sizes.max() > 2
     if (wrong or crowded) and (doubled := len(mesh.tets) - len(np.unique(np.sort(mesh.tets, axis=1), axis=0))):
-        raise wrong_mesh(name, "every tetrahedron once", f"{doubled} of {len(mesh.tets)} listed again")
+        raise _wrong(name, "every tetrahedron once", f"{doubled} of {len(mesh.tets)} listed again")
     if wrong:
         expected, got = "every face of one tetrahedron alone, and no other", f"{wrong} missing, inside or turned over"
-        raise wrong_mesh(beside, expected, got)
+        raise _wrong(beside, expected, got)
     if crowded:
         remedy = "Remove tetrahedra that lie in each other, or export the mesh again."
-        raise wrong_mesh(name, "faces of one or two tetrahedra each", "faces of more", remedy)
+        raise _wrong(name, "faces of one or two tetrahedra each", "faces of more", remedy)
     return mesh
 
 
@@ -427,7 +427,7 @@ def _names(body: Any, name: str) -> tuple[str, ...]:
         if (array.GetName() or "").startswith(_REGION) and array.GetNumberOfValues() == 1:
             numbers[int(array.GetVariantValue(0).ToInt())] = array.GetName().removeprefix(_REGION)
     if sorted(numbers) != list(range(1, len(numbers) + 1)) or not numbers:
-        raise wrong_mesh(name, f"field arrays {_REGION}NAME numbered from 1", sorted(numbers) or "none")
+        raise _wrong(name, f"field arrays {_REGION}NAME numbered from 1", sorted(numbers) or "none")
     return tuple(numbers[number] for number in range(1, len(numbers) + 1))
 
 
@@ -440,17 +440,17 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Bo
     node = _array(surface.point_data, "node", name).astype(np.int64)
     if not np.isfinite(points).all():
         bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
-        raise wrong_mesh(name, "finite positions of nodes", f"{bad} that are not, in the mesh beside it")
+        raise _wrong(name, "finite positions of nodes", f"{bad} that are not, in the mesh beside it")
     if node.min() < 0 or node.max() >= len(points) or not np.array_equal(points[node], surface.points):
-        raise wrong_mesh(name, "the boundary of the mesh beside it", "that of another one")
+        raise _wrong(name, "the boundary of the mesh beside it", "that of another one")
     if not surface.is_all_triangles:
-        raise wrong_mesh(name, "triangles only", "other polygons")
+        raise _wrong(name, "triangles only", "other polygons")
     facets = node[np.asarray(surface.regular_faces, dtype=np.int64)]
     if "seen" not in surface.cell_data and array("patch").dtype.kind != "U":
         return facets, None
     names = surface.GetFieldData().GetAbstractArray("patch_names")
     if names is None:
-        raise wrong_mesh(name, "the field array patch_names", "none")
+        raise _wrong(name, "the field array patch_names", "none")
     every = tuple(str(names.GetValue(number)) for number in range(names.GetNumberOfValues()))
     patch, patch_names = _numbered(array("patch"), every)
     counts = [f"photographs_{what}" for what in ("seen", "supporting")]
@@ -465,11 +465,10 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Bo
 
 def _array(data: Any, array: str, name: str) -> npt.NDArray:
     if array not in data:
-        raise wrong_mesh(name, f"an array {array}", f"{', '.join(sorted(data.keys())) or 'none'}")
+        raise _wrong(name, f"an array {array}", f"{', '.join(sorted(data.keys())) or 'none'}")
     values = np.array(data[array])
     return values if values.dtype.kind == "U" else check_finite(f"{name}: {array}", values, _REMEDY, MeshError)
 
 
-def wrong_mesh(name: str, expected: str, got: object, remedy: str = _REMEDY) -> MeshError:
-    """Return an error about the mesh `name`; the remedy is to export it again, if no other is given."""
+def _wrong(name: str, expected: str, got: object, remedy: str = _REMEDY) -> MeshError:
     return MeshError(name, expected=expected, got=got, remedy=remedy)
