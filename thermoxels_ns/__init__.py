@@ -31,12 +31,14 @@ __version__ = "0.1.0"
 __all__ = ["Scene", "ThermoxelsError", "__version__", "audit", "load", "solve", "to_pyvista"]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name == "audit":
-        return import_module("thermoxels_ns.audit")  # a package that can be called
-    return getattr(import_module("thermoxels_ns.api"), name)
+if not TYPE_CHECKING:  # a type checker that saw it would take every name for one of ours
+
+    def __getattr__(name: str) -> Any:
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        if name == "audit":
+            return import_module("thermoxels_ns.audit")  # a package that can be called
+        return getattr(import_module("thermoxels_ns.api"), name)
 
 
 def __dir__() -> list[str]:
