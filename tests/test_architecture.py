@@ -63,27 +63,27 @@ NEVER = {
 """Other packages that a room does not import, not even inside a function."""
 
 MOST_LINES = {
-    "audit": 2230,
+    "audit": 2950,
     "capture": 4700,
-    "commands": 2590,
-    "core": 1690,
-    "data": 2620,
+    "commands": 2880,
+    "core": 1855,
+    "data": 2895,
     "evaluation": 515,
     "fem": 3575,
     "field": 890,
-    "heat": 2370,
-    "mesh": 5190,
+    "heat": 2610,
+    "mesh": 5875,
     "multiview": 1850,
     "radiometry": 1440,
     "render": 1670,
-    "reports": 1270,
+    "reports": 1335,
     "synthetic": 2810,
-    "training": 2480,
-    "root": 470,
+    "training": 2685,
+    "root": 710,
 }
 """Budget of lines of each room, comments and docstrings included: what it had when that was written down and 5 % more.
 Raising one is said in the message of the commit."""
-MOST_TEST_LINES = 27300
+MOST_TEST_LINES = 29300
 
 
 def room_of(module: str) -> str:

@@ -115,7 +115,7 @@ def hooked(monkeypatch):
     return hook
 
 
-def test_hook_keeps_members_and_markers(hooked) -> None:
+def test_hook_keeps_members_and_markers(hooked, tmp_path) -> None:
     exporter = hooked("nerfstudio.scripts.exporter", EXPORTER)
     first = exporter.tyro
     nerfstudio_bridge.extend_commands()
@@ -123,8 +123,10 @@ def test_hook_keeps_members_and_markers(hooked) -> None:
     assert exporter.entrypoint(["two", "--size", "5"]) == exporter.Two(5)
     # FlagConversionOff: booleans take a value, for the stock subcommands and for ours.
     assert exporter.entrypoint(["one", "--deep", "True"]) == exporter.One(True)
-    ours = exporter.entrypoint(["thermoxels-mesh", "--load-config", "c", "--output-dir", "o", "--pictures", "False"])
-    assert ours == ExportThermoxelsMesh(load_config=Path("c"), output_dir=Path("o"), pictures=False)
+    config = tmp_path / "config.yml"
+    config.touch()
+    words = ["thermoxels-mesh", "--load-config", str(config), "--output-dir", "o", "--pictures", "False"]
+    assert exporter.entrypoint(words) == ExportThermoxelsMesh(load_config=config, output_dir=Path("o"), pictures=False)
     # Everything else is tyro's.
     assert first.conf is tyro.conf and first.cli(exporter.Two, args=[]) == exporter.Two()
 

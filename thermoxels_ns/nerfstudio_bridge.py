@@ -17,7 +17,7 @@ import tyro
 import yaml
 
 from thermoxels_ns.core.checks import refuse_what_is_in_the_way, writable_folder
-from thermoxels_ns.core.config_loader import ConfigLoader, ModuleWith
+from thermoxels_ns.core.config_loader import ConfigLoader, ModuleWith, check_run
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from thermoxels_ns.training.pipeline import ThermoxelsPipeline
 
 _EXPORTER, _TRAIN = "nerfstudio.scripts.exporter", "nerfstudio.scripts.train"
-_EVALUATIONS = ("nerfstudio.scripts.eval", "nerfstudio.scripts.render")
+_EVALUATIONS = ("nerfstudio.scripts.eval", "nerfstudio.scripts.render", "nerfstudio.scripts.viewer.run_viewer")
 _SUBCOMMAND, _DATAPARSER = "thermoxels-mesh", "thermal-data"
 METHODS = ("thermoxels", "thermoxels-paper", "thermoxels-arco", "plenoxels-t")  # Names of the methods in `config`
 
@@ -72,9 +72,9 @@ def allow_checkpoint_globals() -> None:
 def extend_commands() -> None:
     """Add ``thermoxels-mesh`` to ``ns-export``, and make ``ns-*`` commands check their output paths at the start.
 
-    nerfstudio's scripts call ``tyro.cli`` when they start. Where the script of export, train, eval or render is loaded,
-    as a module or as ``__main__``, its name `tyro` is bound to a copy whose `cli`, our `_cli`, does this. Scripts that
-    are loaded later are not changed.
+    nerfstudio's scripts call ``tyro.cli`` when they start. Where the script of export, train, eval, render or viewer is
+    loaded, as a module or as ``__main__``, its name `tyro` is bound to a copy whose `cli`, our `_cli`, does this.
+    Scripts that are loaded later are not changed.
     """
     main = sys.modules.get("__main__")
     for name in (_EXPORTER, _TRAIN, *_EVALUATIONS):
@@ -104,6 +104,9 @@ def _cli(script: ModuleType, name: str, f: Any, *, args: Sequence[str] | None = 
             raise SystemExit(0)
         words = _with_dataparser_last(["--help" if word == "--help-all" else word for word in words])
     command = tyro.cli(_with_mesh_export(f) if stock else f, args=words, **kwargs)
+    if name != _TRAIN and isinstance(config := getattr(command, "load_config", None), Path):
+        check_run(config)
+        ConfigLoader.run_folder = config.parent
     for name in ("output_path", "output_dir", "render_output_path"):
         path = getattr(command, name, None)
         if isinstance(path, Path) and callable(getattr(command, "main", None)):

@@ -107,8 +107,8 @@ def test_answers_series_and_temperatures_agree(hour) -> None:
         assert np.mean(flows) == pytest.approx(effect["heat_w"], rel=1e-12)
     assert [float(row[5]) for row in table] == found["probes"][1]["temperature_c"]
     index = (hour / "heat.pvd").read_text()
-    assert re.findall(r'timestep="([^"]*)"', index) == ["0.0", "1200.0", "2400.0", "3600.0"]
-    last = pv.read(hour / "heat" / "step-0003.vtu")
+    assert re.findall(r'timestep="([^"]*)"', index) == ["0.0", "3600.0"]
+    last = pv.read(hour / "heat" / "step-0001.vtu")
     assert last.point_data["temperature_c"].min() == float(table[-1][1])
     assert found["coldest"]["temperature_c"] <= float(table[-1][1]) < 15.0
     balance = found["balance"]

@@ -1,7 +1,10 @@
 import numpy as np
 import pytest
 
+import thermoxels_ns
+from tests.support.docs_code import code_in
 from tests.support.heat_matrices import assemble, backward_euler
+from tests.support.scene_bodies import tagged_body
 from thermoxels_ns.mesh.files.solvers import write_xdmf
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import facet_areas
@@ -96,3 +99,20 @@ def test_ten_steps_agree_with_ours(fenicsx, heat_problem, ten_steps):
     span = np.ptp(heat_problem.start_c)
     assert np.abs(ours[-1] - heat_problem.start_c).max() > 0.1 * span
     assert np.abs(theirs - ours).max() < 1e-9 * span
+
+
+def test_the_script_of_the_docs_finds_our_heat_loss(tmp_path, fenicsx_python, run_in):
+    """Between the two: its convection is integrated with nodes that share, ours node by node."""
+    cells = np.ones((12, 12, 12), dtype=bool)
+    cells[4:8, 4:8, 4:8] = False
+    outside = np.ones((14, 14, 14), dtype=bool)
+    outside[5:9, 5:9, 5:9] = False
+    mesh = tagged_body(cells, 0.25, outside)
+    write_xdmf(tmp_path / "mesh.xdmf", mesh)
+    (tmp_path / "loss.py").write_text(code_in("export.md")[0])
+    said = run_in(tmp_path, [fenicsx_python, "loss.py"])
+    air = [{"air_c": air_c, "coefficient_w_m2k": w_m2k} for air_c, w_m2k in ((20.0, 7.7), (0.0, 25.0))]
+    stone = {"conductivity_w_mk": 2.0, "density_kg_m3": 2000.0, "specific_heat_j_kgk": 1000.0}
+    scene = {"materials": {"*": stone}, "inside_air": air[0], "outside_air": air[1], "steady": True}
+    ours = thermoxels_ns.solve(mesh, scene)
+    assert float(said.split("loss [W]")[1].split()[0]) == pytest.approx(ours.wall.heat_w, rel=0.01)

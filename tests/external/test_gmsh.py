@@ -4,6 +4,7 @@ import meshio
 import numpy as np
 import pytest
 
+from tests.support.docs_code import code_in
 from thermoxels_ns.mesh.files.solvers import write_msh
 
 pytestmark = pytest.mark.external
@@ -39,6 +40,15 @@ def test_gmsh_finds_no_fault(tmp_path, solid_mesh, program, run_in):
     assert f"{len(solid_mesh.tets) + len(solid_mesh.facets)} elements" in said
     assert "Done checking mesh coherence" in said
     assert "Error" not in said and "Warning" not in said, said
+
+
+def test_the_script_of_the_docs_runs(tmp_path, solid_mesh, program, run_in):
+    write_msh(tmp_path / "mesh.msh", solid_mesh)
+    (tmp_path / "look.geo").write_text(code_in("export.md", "geo")[0])
+    said = run_in(tmp_path, [program("gmsh", "gmsh"), "-parse_and_exit", "look.geo"])
+    used = np.unique(solid_mesh.boundary.patch) + 1
+    counts = f"{len(solid_mesh.points_m)} nodes, {len(solid_mesh.tets)} tetrahedra"
+    assert f"{counts}, patches {used[0]} to {used[-1]}" in said and "rror" not in said, said
 
 
 def test_gmsh_keeps_the_physical_groups_when_it_saves_what_it_read(tmp_path, solid_mesh, program, run_in):

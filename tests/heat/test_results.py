@@ -157,15 +157,15 @@ def test_an_insulated_body_has_results() -> None:
 
 def test_a_series_reads_back_and_only_it_is_removed(tmp_path, random_body, concrete) -> None:
     solution = solve_heat(HeatProblem(random_body, concrete), TimeSteps(3, 20.0))
-    paths = write_heat_series(tmp_path / "heat.pvd", random_body, solution)
+    paths = write_heat_series(tmp_path / "heat.pvd", random_body, solution, [0, 1, 3])
     assert [path.relative_to(tmp_path).as_posix() for path in paths] == [
         "heat.pvd",
-        *(f"heat/step-{number:04d}.vtu" for number in range(4)),
+        *(f"heat/step-{number:04d}.vtu" for number in range(3)),
     ]
     reader = pyvista.PVDReader(tmp_path / "heat.pvd")
-    assert reader.time_values == [0.0, 20.0, 40.0, 60.0]
-    for number, time_s in enumerate(solution.times_s):
-        reader.set_active_time_value(time_s)
+    assert reader.time_values == [0.0, 20.0, 60.0]
+    for number in (0, 1, 3):
+        reader.set_active_time_value(solution.times_s[number])
         grid = reader.read()[0]
         np.testing.assert_array_equal(grid.point_data["temperature_c"], solution.temperature_c[number])
         np.testing.assert_allclose(grid.point_data["temperature_k"], solution.temperature_c[number] + 273.15)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import field
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -332,8 +332,10 @@ class Conditions:
 
 
 @raising(AuditError)
-def load_conditions(path: Path | str) -> Conditions:
-    """Read conditions from a yaml file; raises `AuditError` if the file is missing or wrong."""
+def load_conditions(path: Path | str | Mapping[str, Any]) -> Conditions:
+    """Read conditions from a yaml file, or a mapping of its keys; raises `AuditError` if it is missing or wrong."""
+    if isinstance(path, Mapping):
+        return as_record("conditions", path, Conditions)
     path = Path(path)
     return as_record(path.name, with_weather(read_yaml(path), path.parent), Conditions)
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.audit.calibration import Calibration, calibrated
-from thermoxels_ns.audit.conditions import BALANCE, SIMPLE, Conditions
+from thermoxels_ns.audit.conditions import BALANCE, SIMPLE, Conditions, load_conditions
 from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
 from thermoxels_ns.audit.draws import (
     ENDS,
@@ -35,10 +37,16 @@ from thermoxels_ns.audit.heat_flow import temperature_factor
 from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
 from thermoxels_ns.audit.weather import read_weather, remembered_share
 from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
+from thermoxels_ns.core.tables import HasTables, lines_of
 from thermoxels_ns.fem.selection import matching_names
+from thermoxels_ns.mesh.files.vtu import AnyMesh, any_mesh, boundary_surface
 from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+if TYPE_CHECKING:
+    from thermoxels_ns.mesh.files.vtu import pv
 
 SEVERE_SHARE, MODERATE_SHARE = 0.05, 0.01
 """Least shares of the observed heat loss at which a defect is severe or moderate; no standard defines these shares."""
@@ -135,8 +143,10 @@ class SurveyCheck:
 
 
 @dataclass(frozen=True)
-class Audit:
-    """All results of one audit, with the conditions and the surface that the results follow from."""
+class Audit(HasTables):
+    """All results of one audit, with the conditions and the surface that the results follow from.
+
+    It has the tables "patches", "storeys", "defects" and "limits"."""
 
     conditions: Conditions
     surface: AuditedSurface
@@ -159,6 +169,53 @@ class Audit:
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
     triangle_u: FloatArray  # U-value and both ends of its interval, shape (f, 3), [W/(m2 K)]; NaN: does not count
+
+    def __repr__(self) -> str:
+        loss, u = self.whole.loss_w, self.whole.u_w_m2k
+        defects = sum(not one.not_counted for one in self.defects)
+        told = f"loss {loss.value:.4g} W ({loss.low:.4g} to {loss.high:.4g})"
+        return f"Audit({told}, U {u.value:.3g} W/(m2 K) ({u.low:.3g} to {u.high:.3g}), {defects} defects)"
+
+    def tables(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the results by patch, storey, defect and limit; an interval has columns of its own for both ends."""
+        patches = lines_of((*self.patches, self.whole))
+        others = {name: lines_of(getattr(self, name)) for name in ("storeys", "defects", "limits")}
+        return {"patches": patches, **others}
+
+    def to_pyvista(self) -> pv.PolyData:
+        """Return the boundary, as `vtu.boundary_surface`, with the results of each triangle; NaN: does not count."""
+        data, calibration = boundary_surface(self.surface.mesh), self.calibration
+        numbers = np.zeros(len(self.surface.mesh.facets), dtype=np.int32)
+        for number, one in enumerate(self.found, start=1):
+            numbers[one.core] = number
+        for name, values in {
+            "surface_temperature_c": self.triangle_surface_c,
+            "heat_flow_w_m2": self.triangle_flow_w_m2,
+            **dict(zip(("u_w_m2k", "u_low_w_m2k", "u_high_w_m2k"), self.triangle_u.T)),
+            "counted": self.surface.counted.astype(np.uint8),
+            "defect": numbers,
+            **({} if calibration is None else {"measured_minus_computed_k": calibration.difference_k}),
+        }.items():
+            data.cell_data[name] = values
+        return data
+
+
+def audit_mesh(
+    mesh: AnyMesh, conditions: Conditions | Mapping[str, Any] | Path | str, *, up: Sequence[float] | None = None
+) -> Audit:
+    """Find heat loss, U-values and thermal bridges, each as an interval, from the temperatures that a mesh holds.
+
+    `mesh` is what `thermoxels_ns.solve` takes, `conditions` a `Conditions`, the path of a yaml file, or its keys as a
+    mapping. `up` points up in the coordinates of the mesh; by default it is what the mesh says, or else z. Raises
+    `AuditError` if the conditions are wrong or do not fit the mesh, `ThermoxelsError` if the mesh is not sound.
+    """
+    if not isinstance(conditions, Conditions):
+        conditions = load_conditions(conditions)
+    body, about = any_mesh(mesh, up)
+    towards = check_direction("up", about.get("up") or (0.0, 0.0, 1.0), "Pass up=(0, 0, 1).", AuditError)
+    x, y, z = (towards / float(np.linalg.norm(towards))).tolist()
+    with threadpool_limits(1, "blas"):  # with more, the last bits would depend on the number of threads
+        return audit(body, conditions, (x, y, z))
 
 
 def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Audit:

@@ -14,7 +14,6 @@ import numpy as np
 import tyro
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.commands.heat import read_export_summary
 from thermoxels_ns.commands.installed_commands import command_of
 from thermoxels_ns.core.checks import check_direction, check_positive, remove_file, result_folder
 from thermoxels_ns.core.errors import AuditError
@@ -145,7 +144,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
 def _read(path: Path, options: Audit, say: Say) -> tuple[TetMesh, Vector, dict[str, Any]]:
     """Return the mesh with the patches asked for, the unit vector that points up, and the summary of the export."""
     from thermoxels_ns.mesh.boundary.patches import load_patch_rules, with_patches
-    from thermoxels_ns.mesh.files.vtu import read_mesh
+    from thermoxels_ns.mesh.files.vtu import read_export_summary, read_mesh
 
     rules = None if options.patches is None else load_patch_rules(options.patches)
     mesh, export = read_mesh(path), read_export_summary(path, say)
@@ -174,7 +173,8 @@ def without_slight(found: Found, least_w: float) -> Found:
     for one in [one for one in found.limits if one.unit == "W/(m K)" and lines]:
         worst = max(lines, key=lambda line: line.coefficient.value)
         psi, name = worst.coefficient, f"{one.name.partition(', in ')[0]}, in {worst.patch}"
-        limits.append(replace(one, name=name, found=psi, verdict=verdict(psi, one.limit)))
+        judged = verdict(psi, one.limit)
+        limits.append(replace(one, name=name, found=psi, verdict=judged, missed_share=math.nan))  # of its own draws
     defects, triangles = zip(*pairs) if pairs else ((), ())
     return replace(found, defects=defects, found=triangles, limits=tuple(limits))
 
@@ -240,9 +240,11 @@ def _write(
     range_c: tuple[float, float] | None,
     envelope: Envelope | None,
 ) -> None:
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
     from thermoxels_ns.audit.envelope import gbxml, hbjson
     from thermoxels_ns.mesh.files.content import write_bytes
-    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
+    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtk
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit
     from thermoxels_ns.reports.page import identify, write_page
 
@@ -252,7 +254,7 @@ def _write(
     answers = answers_of(options, found, envelope) | {"report": asdict(report)}
     summary_text(answers)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
-    _write_surface(folder / SURFACE, found)
+    write_vtk(vtkXMLPolyDataWriter(), folder / SURFACE, found.to_pyvista())
     title = found.conditions.title
     for kind, name in ENVELOPES.items():
         if envelope is None or kind not in options.envelope:
@@ -268,29 +270,3 @@ def _write(
     shown = {"range_c": range_c, "most_u": most, "impossible": said, "report": report}
     write_page(folder / PAGE, audit_page(found, pictures, photographs, options.mesh.name, command, files, **shown))
     write_summary(folder / ANSWERS, answers)
-
-
-def _write_surface(path: Path, found: Found) -> None:
-    """Write the results of each boundary triangle, NaN where it does not count, and its defect's number, from 1."""
-    import pyvista as pv
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
-
-    from thermoxels_ns.mesh.files.content import surface_of
-    from thermoxels_ns.mesh.files.vtu import write_vtk
-
-    mesh, calibration = found.surface.mesh, found.calibration
-    surface = surface_of(mesh.points_m, mesh.facets)
-    data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
-    numbers = np.zeros(len(mesh.facets), dtype=np.int32)
-    for number, one in enumerate(found.found, start=1):
-        numbers[one.core] = number
-    for name, values in {
-        "surface_temperature_c": found.triangle_surface_c,
-        "heat_flow_w_m2": found.triangle_flow_w_m2,
-        **dict(zip(("u_w_m2k", "u_low_w_m2k", "u_high_w_m2k"), found.triangle_u.T)),
-        "counted": found.surface.counted.astype(np.uint8),
-        "defect": numbers,
-        **({} if calibration is None else {"measured_minus_computed_k": calibration.difference_k}),
-    }.items():
-        data.cell_data[name] = values
-    write_vtk(vtkXMLPolyDataWriter(), path, data)

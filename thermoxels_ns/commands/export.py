@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import remove_file, result_folder
+from thermoxels_ns.core.config_loader import check_run
 from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.core.lattice import Lattice, input_from_world
@@ -131,6 +132,9 @@ class ExportOptions:
     """Mass density of the material, [kg / m3]. Left out: as in the heat scene."""
     specific_heat_j_kgk: float | None = None
     """Specific heat capacity, [J / (kg K)]. Left out: as in the heat scene."""
+    vtk_times: Literal["all"] | tuple[float, ...] = ()
+    """Times whose temperatures are written for ParaView beside those of the start and of the end, [s]: for each the
+    nearest time that the scene keeps. all: every kept time; each takes as much space as the mesh."""
     pictures: bool = True
     """Write PNG pictures of the mesh coloured by temperature, and of its quality."""
 
@@ -355,7 +359,7 @@ def export_snapshot(
     from thermoxels_ns.commands import export_summary
     from thermoxels_ns.fem.solution import HeatSolution
     from thermoxels_ns.heat.solving import Goals, solve_problem
-    from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, write_heat_series
+    from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, shown_states, write_heat_series
     from thermoxels_ns.mesh.build import MeshOptions, apply_transform, build_mesh
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
     from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
@@ -375,7 +379,7 @@ def export_snapshot(
     mesh_options = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
     built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options, metres)
     if depths is not None:
-        built = _with_support(built, depths, tracks, snapshot.lattice, to_mesh)
+        built = with_support(built, depths, tracks, snapshot.lattice, to_mesh)
     mesh = built.mesh
     suffixes = [f".{name}" for name in options.formats]
     if ".stl" in suffixes:
@@ -399,7 +403,7 @@ def export_snapshot(
 
     scene, material, time = checked.scene, checked.material, checked.time
     solution: HeatSolution | None = None
-    truth, skipped = None, HEAT_SKIPPED if scale is None else None
+    truth, skipped, states = None, HEAT_SKIPPED if scale is None else None, list[int]()
     if not starting.has_temperatures:
         skipped = skipped or NO_START
     if skipped is None:
@@ -417,7 +421,8 @@ def export_snapshot(
 
     files = [*_mesh_files(suffixes), _QUALITY]
     if solution is not None:
-        files += [p.relative_to(folder).as_posix() for p in heat_series_paths(folder / _HEAT, len(solution.times_s))]
+        states = shown_states(solution.times_s, options.vtk_times)
+        files += [p.relative_to(folder).as_posix() for p in heat_series_paths(folder / _HEAT, len(states))]
     if options.pictures:
         files += [*_MESH_PICTURES, *([] if solution is None else [_HEAT_PICTURE])]
     summary = {
@@ -450,7 +455,7 @@ def export_snapshot(
     for suffix in suffixes:
         write_mesh(folder / f"mesh{suffix}", starting if suffix == ".inp" else mesh, heat_step=heat_step, up=up)
     if solution is not None:
-        write_heat_series(folder / _HEAT, mesh, solution)
+        write_heat_series(folder / _HEAT, mesh, solution, states)
     if options.pictures:
         look = {"up": up, "view_direction": viewpoint.view_direction}
         mesh_pictures.draw_mesh([folder / name for name in _MESH_PICTURES[:2]], mesh, look, unit)
@@ -480,7 +485,7 @@ def _mesh_files(suffixes: Iterable[str]) -> list[str]:
     return [path.name for suffix in suffixes for path in mesh_file_paths(f"mesh{suffix}")]
 
 
-def _with_support(
+def with_support(
     built: BuiltMesh,
     depths: Depths,
     tracks: FeatureRays | None,
@@ -545,14 +550,15 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
 
     `check_scene` is called with the path of the scene before anything slow; an error that it raises is passed on.
     """
-    if not load_config.is_file():
-        remedy = "Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml."
-        got = f"no file at {load_config}"
-        raise CheckpointError("load_config", expected="the config.yml of a training run", got=got, remedy=remedy)
+    check_run(load_config)
     import yaml
     from nerfstudio.utils.eval_utils import eval_setup
 
+    from thermoxels_ns.training.trainer import ThermoxelsTrainerConfig
+
     def check(config: TrainerConfig) -> TrainerConfig:
+        if isinstance(config, ThermoxelsTrainerConfig):
+            config.moved_to(load_config.parent)
         _check_config(config)
         manager: Any = config.pipeline.datamanager
         told = getattr(manager, "data", None)  # with --data of ns-train, else with the dataparser's own --data

@@ -9,7 +9,7 @@ import time as clock
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.commands.installed_commands import command_of
 from thermoxels_ns.core.checks import remove_file, replace_when_done, result_folder
-from thermoxels_ns.core.errors import HeatError, MeshError
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.json_values import read_json_object
 
 if TYPE_CHECKING:
@@ -66,6 +66,9 @@ class Heat:
     up: tuple[float, float, float] | None = None
     """Direction that points up in the coordinates of the mesh, if the scene has none. Default: the direction in the
     summary.json beside the mesh, or else z."""
+    vtk_times: Literal["all"] | tuple[float, ...] = ()
+    """Times whose temperatures are written for ParaView beside those of the start and of the end, [s]: for each the
+    nearest time that the scene keeps. all: every kept time; each takes as much space as the mesh."""
     pictures: bool = True
     """Draw pictures of the surface."""
     write_scene: Path | None = None
@@ -109,7 +112,7 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     from thermoxels_ns.heat.run import run_scene
     from thermoxels_ns.heat.scene import load_heat_scene
     from thermoxels_ns.heat.solving import Goals
-    from thermoxels_ns.mesh.files.vtu import read_mesh
+    from thermoxels_ns.mesh.files.vtu import read_export_summary, read_mesh
 
     begin = clock.perf_counter()
     mesh_file, scene_file = _given(options)
@@ -167,27 +170,6 @@ def resistances_of_audit(path: Path, say: Say = lambda _: None) -> dict[str, flo
     return found
 
 
-def read_export_summary(mesh: Path, say: Say) -> dict[str, Any]:
-    """Read the summary.json beside a mesh; empty if there is none. Raises `HeatError` if the mesh has no scale."""
-    path = mesh.with_name("summary.json")
-    if not path.is_file():
-        say(f"Warning: {path} is missing; the mesh is taken to be in metres.")
-        return {}
-    summary = read_json_object(path, "Export the mesh again, or move the file away.", MeshError)
-    if summary.get("length_unit", "m") != "m":
-        remedy = "Export again with --metres-per-unit or --known-distance."
-        got = f"one in {summary['length_unit']}s"
-        raise HeatError("scale of the mesh", expected="an export in metres", got=got, remedy=remedy)
-    try:
-        if summary.get("up") is not None:
-            x, y, z = map(float, summary["up"])
-            summary["up"] = (x, y, z)
-    except (TypeError, ValueError) as problem:
-        name, remedy = f"{path}: up", "Pass --up 0 0 1, or export the mesh again."
-        raise MeshError(name, expected="three numbers", got=repr(summary["up"]), remedy=remedy) from problem
-    return summary
-
-
 def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
     """Return the content of answers.json for a heat run."""
     solution, accuracy = run.solution, run.accuracy
@@ -241,7 +223,7 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
 def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> None:
     """Write all files of a run into an existing folder, answers.json last; raises `OutputError` if writing fails."""
     from thermoxels_ns.fem.solution import SteadySolution
-    from thermoxels_ns.heat.vtk_series import remove_heat_series, write_heat_series
+    from thermoxels_ns.heat.vtk_series import remove_heat_series, shown_states, write_heat_series
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtu
     from thermoxels_ns.reports.heat_page import heat_page
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES, draw_surface
@@ -258,7 +240,8 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
         remove_heat_series(folder / THROUGH_TIME)
         write_vtu(folder / STEADY, shown.mesh, temperature_c=shown.states_c[-1])
     else:
-        write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution)
+        states = shown_states(run.solution.times_s, options.vtk_times)
+        write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution, states)
     if options.pictures:
         pictures = draw_surface(folder, shown.mesh, shown.states_c, shown.times_s, run.problem.up)
     drawn = {name: (folder / name).read_bytes() for name in pictures}
@@ -274,17 +257,8 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
 
 def _write_series(path: Path, run: HeatRun) -> None:
     """Write a csv line for each time: temperatures, and mean heat flows since the time before."""
-    times, states = run.nodes.times_s, run.nodes.states_c
-    effects = run.solution.effects
-    head = ["time_s", "min_c", "mean_c", "max_c"]
-    head += [f"probe {number + 1} [C]" for number in range(run.probes_c.shape[1])]
-    head += [f"{heat.effect} [W]" for heat in effects]
-    heat_w = np.stack([heat.heat_w for heat in effects], axis=1) if effects else np.zeros((max(len(times) - 1, 1), 0))
+    lines = run.tables()["times"]
     with replace_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(head)
-        for number, time_s in enumerate(times):
-            temperatures = [states[number].min(), run.mean_c[number], states[number].max(), *run.probes_c[number]]
-            interval = number if len(times) == 1 else number - 1
-            flows = ["" for _ in effects] if interval < 0 else [repr(float(flow)) for flow in heat_w[interval]]
-            writer.writerow([repr(float(time_s)), *(repr(float(value)) for value in temperatures), *flows])
+        writer.writerow(lines[0])
+        writer.writerows(["" if value is None else repr(value) for value in line.values()] for line in lines)

@@ -9,8 +9,9 @@ import os
 import sys
 from collections.abc import Iterator
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
@@ -32,6 +33,9 @@ class ConfigLoader(yaml.Loader):
     packages installed as its plugins. The whole file is checked before any object is made.
     """
 
+    run_folder: ClassVar[Path | None] = None
+    """Folder of the config.yml that is loaded next, to which the run may have been moved; None: not known."""
+
     def get_single_data(self) -> Any:
         """Return the content of the file, or raise `CheckpointError` with a forbidden name and its line."""
         expected = "a config.yml that names only configuration classes of nerfstudio and its installed plugins"
@@ -46,7 +50,52 @@ class ConfigLoader(yaml.Loader):
             if place.tag != tag and not _harmless(tag):
                 got = f"{tag} in line {place.start_mark.line + 1}"
                 raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
-        return None if node is None else self.construct_document(node)
+        found = None if node is None else self.construct_document(node)
+        folder, ConfigLoader.run_folder = ConfigLoader.run_folder, None
+        if folder is not None and found is not None and hasattr(found, "moved_to"):
+            found.moved_to(folder)
+        return found
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Loader that imports nothing: objects become mappings of their fields, paths lists of their parts, names None."""
+
+
+def _plain(loader: _PlainLoader, _: str, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    return loader.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else None
+
+
+_PlainLoader.add_multi_constructor(_PYTHON_TAG, _plain)
+
+
+def check_run(config: Path) -> None:
+    """Raise `CheckpointError` if a run lacks its config.yml, checkpoint or photographs; nerfstudio is not imported."""
+    if not config.is_file():
+        remedy = "Pass that of a run, outputs/<scene>/thermoxels/<time>/config.yml."
+        got = f"no file at {config}"
+        raise CheckpointError("load_config", expected="the config.yml of a training run", got=got, remedy=remedy)
+    try:
+        content = yaml.load(config.read_text(encoding="utf-8"), Loader=_PlainLoader)
+        models = config.parent.joinpath(*content["relative_model_dir"])
+        manager, from_run = content["pipeline"]["datamanager"], content.get("scene_from_run", "")
+        told = Path(*(manager["data"] or manager["dataparser"]["data"]))
+    except (yaml.YAMLError, OSError, UnicodeDecodeError, KeyError, TypeError, RecursionError):
+        return  # another layout is left to whoever loads the file
+    remedy = "Copy the whole folder of the run, or train to the first checkpoint."
+    if not any(models.glob("step-*.ckpt")):
+        raise CheckpointError("checkpoint", expected=f"a file step-*.ckpt in {models}", got="none", remedy=remedy)
+    if not scene_of_run(config.parent, told, from_run).exists():
+        expected, remedy = "the photographs that it was trained on", f"Put the scene folder at {told}"
+        remedy += f", or at {from_run} as seen from the folder of the run." if from_run else "."
+        raise CheckpointError(f"scene of {config}", expected=expected, got="none", remedy=remedy)
+
+
+def scene_of_run(folder: Path, told: Path, from_run: str) -> Path:
+    """Return the path of a run's scene: `from_run`, as seen from its folder, if something is there, else `told`."""
+    beside = Path(os.path.normpath(folder / from_run))
+    return beside if from_run and beside.exists() else told
 
 
 def _nodes(root: yaml.Node | None) -> Iterator[yaml.Node]:

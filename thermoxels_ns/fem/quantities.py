@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -69,9 +70,11 @@ def tabulated(times_s: npt.ArrayLike, values: npt.ArrayLike) -> Varying:
         expected = "at least two times, ascending, and as many values, all finite"
         got = f"times of shape {times.shape} and values of shape {entries.shape}"
         raise HeatError("table", expected=expected, got=got, remedy="Sort it by time and remove repetitions.")
-    return Varying(
-        lambda _, time_s: float(np.interp(time_s, times, entries)), resolution_s=float(np.min(np.diff(times)))
-    )
+    return Varying(partial(_interpolated, times, entries), resolution_s=float(np.min(np.diff(times))))
+
+
+def _interpolated(times_s: FloatArray, values: FloatArray, _: Places, time_s: float) -> float:
+    return float(np.interp(time_s, times_s, values))
 
 
 Quantity: TypeAlias = float | Varying  # One number for all places and times, or a function

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.tables import HasTables, lines_of
 from thermoxels_ns.core.units import kelvin_to_celsius
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
@@ -33,8 +34,12 @@ from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_table
 from thermoxels_ns.heat.sky import Vector as Direction
 from thermoxels_ns.heat.solving import Goals, LeftOut, Say, solve_problem
+from thermoxels_ns.mesh.files.vtu import blocks_of
 from thermoxels_ns.mesh.quality.checks import count_tets_in_other_bodies, count_twin_nodes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+if TYPE_CHECKING:
+    import pyvista as pv
 
 Vector = FloatArray
 
@@ -103,8 +108,10 @@ def _outside(mesh: TetMesh, number: int, point: Vector) -> HeatError:
 
 
 @dataclass(frozen=True)
-class HeatRun:
-    """The outcome of `run_scene`: the problems, the solution, its results and the warnings."""
+class HeatRun(HasTables):
+    """The outcome of `run_scene`: the problems, the solution, its results and the warnings.
+
+    It has the tables "patches", "effects", "regions" and "times"."""
 
     scene: HeatScene  # The scene that was run
     problem: HeatProblem  # The problem with all effects of the scene, on the given mesh
@@ -124,6 +131,34 @@ class HeatRun:
     probes: Probes  # Points where temperatures are followed, in the mesh of `nodes`
     probes_c: Vector  # Temperatures at `probes`, shape (s, p), [degrees Celsius]
     seconds: Mapping[str, float]  # Time to solve, "solve", and then to work out the results, "answers", [s]
+
+    def __repr__(self) -> str:
+        states, last_s = self.nodes.states_c, self.nodes.times_s[-1]
+        wall = "" if self.wall is None else f", U {self.wall.u_value_w_m2k:.3g} W/(m2 K)"
+        what = f"{'steady' if self.scene.steady else f'{last_s:g} s'}, {len(self.solved.mesh.tets):,} tetrahedra"
+        return f"HeatRun({what}, {states[-1].min():.4g} to {states[-1].max():.4g} °C at the end{wall})"
+
+    def tables(self) -> dict[str, list[dict[str, Any]]]:
+        """Return heat and temperatures by patch, effect and region, and through time, see `HeatResults`.
+
+        "times" has a line for each kept time: the least, mean and largest temperature, those at probes, and the mean
+        heat flow into the body by each effect since the time before, which the start has none of."""
+        states, effects = self.nodes.states_c, self.solution.effects
+        times = list[dict[str, Any]]()
+        for number, time_s in enumerate(self.nodes.times_s.tolist()):
+            line = {"time_s": time_s, "min_c": float(states[number].min()), "mean_c": float(self.mean_c[number])}
+            line |= {"max_c": float(states[number].max())}
+            line |= {f"probe {n + 1} [C]": value for n, value in enumerate(self.probes_c[number].tolist())}
+            interval = number if len(states) == 1 else number - 1
+            line |= {f"{heat.effect} [W]": float(heat.heat_w[interval]) if interval >= 0 else None for heat in effects}
+            times.append(line)
+        of_results = {name: lines_of(getattr(self.results, name)) for name in ("patches", "effects", "regions")}
+        return {**of_results, "times": times}
+
+    def to_pyvista(self) -> pv.MultiBlock:
+        """Return the mesh that was solved, with the temperatures at the end, as `thermoxels_ns.to_pyvista` does."""
+        end = replace(self.nodes.mesh, temperature_c=self.nodes.states_c[-1])
+        return blocks_of(end, {"up": self.problem.up})
 
 
 def run_scene(

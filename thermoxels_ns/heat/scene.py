@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import fields, make_dataclass, replace
 from fnmatch import fnmatchcase
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
@@ -22,7 +23,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.measured import read_measured
 from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml, record, wrong
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Quantity, Varying
+from thermoxels_ns.fem.quantities import Places, Quantity, Varying
 from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
@@ -239,13 +240,9 @@ class HeatScene:
             return sky.temperature_c
         assert self.outside_air is not None, "checked when the scene was made"
         air, below_k = self.outside_air.temperature, sky.below_air_k
-
-        def above(air_c: float) -> float:
-            return swinbank_sky_c(air_c) if below_k is None else air_c - below_k
-
         if not isinstance(air, Varying):
-            return above(air)
-        return replace(air, function=lambda places, time_s: above(float(np.max(air.function(places, time_s)))))
+            return _above(air, below_k)
+        return replace(air, function=partial(_sky_above, air, below_k))
 
     def _check_counted_once(self, where: list[tuple[str, set[str]]]) -> None:
         """Raise `HeatError` for two contacts with air or ground, or radiation counted twice, on one patch."""
@@ -298,21 +295,21 @@ def heat_scene_names() -> list[str]:
 
 
 @raising(HeatError)
-def load_heat_scene(name: Path | str) -> HeatScene:
-    """Read a heat scene from a yaml file, or from the package by a name such as ``winter-night``.
+def load_heat_scene(name: Path | str | Mapping[str, Any]) -> HeatScene:
+    """Read a heat scene from a yaml file, from the package by a name such as ``winter-night``, or from a mapping.
 
     The keys of a file are the fields of `HeatScene`, with three differences: a material is a name of the table or
     three figures, the start is ``initial: photographs`` or ``initial: {temperature_c: 15}``, and a scene has either
     ``steady: true`` or ``time:`` with the fields of `TimeSteps` or of `AdaptiveSteps`. Raises `HeatError` if the name
     is not known or the content is wrong.
     """
-    path = Path(name)
-    if path.suffix not in (".yaml", ".yml"):
+    path = Path("scene" if isinstance(name, Mapping) else name)
+    if path.suffix not in (".yaml", ".yml") and not isinstance(name, Mapping):
         path = configs_folder() / f"scene-{name}.yaml"
         if not path.is_file():
             expected = f"one of {', '.join(heat_scene_names())}, or the path of a yaml file"
             raise wrong("heat scene", expected, repr(str(name)), "Correct the name.")
-    content = read_yaml(path)
+    content = deepcopy(dict(name)) if isinstance(name, Mapping) else read_yaml(path)
     with suppress(RecursionError):  # an entry that contains itself, which the check below names
         content = _without_units(path.name, content)
     for air in (content.get("inside_air"), content.get("outside_air")):
@@ -359,6 +356,14 @@ def _without_units(name: str, content: Any) -> Any:
                 raise wrong(f"{name}: {key}", "a number without a range", repr(value), remedy)
             found[key] = measured.value
     return found
+
+
+def _above(air_c: float, below_k: float | None) -> float:
+    return swinbank_sky_c(air_c) if below_k is None else air_c - below_k
+
+
+def _sky_above(air: Varying, below_k: float | None, places: Places, time_s: float) -> float:
+    return _above(float(np.max(air.function(places, time_s))), below_k)
 
 
 def _irradiance(sun: Sun, reflectance: float) -> Varying:

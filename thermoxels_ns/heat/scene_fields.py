@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import field
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Literal, TypeAlias
@@ -54,13 +55,12 @@ def inside_coefficient(
     else:
         radiative = radiative_coefficient(mean_c, emissivity) if name == "iso-6946-separate" else 0.0
         table = np.array([INSIDE_CONVECTION_W_M2K[direction] + radiative for direction in directions])
+    return Varying(partial(_by_orientation, table, -1.0 if heat_flow == "into-body" else 1.0), in_time=False)
 
-    def by_orientation(places: Places, _: float) -> FloatArray:
-        outward = places.normals @ np.array(places.up)
-        upward = -outward if heat_flow == "into-body" else outward
-        return table[np.where(upward > _HORIZONTAL, 0, np.where(upward < -_HORIZONTAL, 2, 1))]
 
-    return Varying(by_orientation, in_time=False)
+def _by_orientation(table: FloatArray, sign: float, places: Places, _: float) -> FloatArray:
+    upward = sign * (places.normals @ np.array(places.up))
+    return table[np.where(upward > _HORIZONTAL, 0, np.where(upward < -_HORIZONTAL, 2, 1))]
 
 
 def outside_coefficient(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
+from functools import partial
 
 import numpy as np
 
@@ -57,19 +59,24 @@ def outdoor_radiation(
     ground alone, the emissivity is multiplied by its view factor F; the rest of the view exchanges nothing.
     """
     if sky_c is not None and ground_c is not None:
-        varying = sky_c if isinstance(sky_c, Varying) else Varying(lambda *_: sky_c, in_time=False)
-        ground = celsius_to_kelvin(ground_c) ** 4
-
-        def mean(places: Places, time_s: float) -> FloatArray:
-            seen = sky_view(places.normals, places.up)
-            sky = celsius_to_kelvin(np.asarray(varying.function(places, time_s), dtype=np.float64)) ** 4
-            return kelvin_to_celsius((seen * sky + (1.0 - seen) * ground) ** 0.25)
-
-        return emissivity, replace(varying, function=mean)
+        mean = partial(_surroundings_c, sky_c, ground_c)
+        return emissivity, replace(sky_c, function=mean) if isinstance(sky_c, Varying) else Varying(mean, in_time=False)
     if sky_c is not None:
-        return Varying(lambda places, _: emissivity * sky_view(places.normals, places.up), in_time=False), sky_c
+        return Varying(partial(_seen, emissivity, sky_view), in_time=False), sky_c
     assert ground_c is not None, "one of the two is given"
-    return Varying(lambda places, _: emissivity * ground_view(places.normals, places.up), in_time=False), ground_c
+    return Varying(partial(_seen, emissivity, ground_view), in_time=False), ground_c
+
+
+# Functions of places and time are partial calls of these: a heat run that holds them can be pickled.
+def _surroundings_c(sky_c: Quantity, ground_c: float, places: Places, time_s: float) -> FloatArray:
+    seen = sky_view(places.normals, places.up)
+    there_c = np.asarray(sky_c.function(places, time_s) if isinstance(sky_c, Varying) else sky_c, dtype=np.float64)
+    fourth = seen * celsius_to_kelvin(there_c) ** 4 + (1.0 - seen) * celsius_to_kelvin(ground_c) ** 4
+    return kelvin_to_celsius(fourth**0.25)
+
+
+def _seen(emissivity: float, view: Callable[[FloatArray, Vector], FloatArray], places: Places, _: float) -> FloatArray:
+    return emissivity * view(places.normals, places.up)
 
 
 @dataclass(frozen=True)
@@ -186,10 +193,11 @@ def facet_irradiance(
 def fixed_sun(towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0) -> Varying:
     """Return the sunlight on facets from a sun fixed in direction `towards`; for `AbsorbedSolar.irradiance_w_m2`."""
     x, y, z = _unit(towards).tolist()
-    return Varying(
-        lambda places, _: facet_irradiance(places.normals, places.up, (x, y, z), sunlight, ground_reflectance),
-        in_time=False,
-    )
+    return Varying(partial(_from_fixed_sun, (x, y, z), sunlight, ground_reflectance), in_time=False)
+
+
+def _from_fixed_sun(towards: Vector, light: Sunlight, reflectance: float, places: Places, _: float) -> FloatArray:
+    return facet_irradiance(places.normals, places.up, towards, light, reflectance)
 
 
 def moving_sun(
@@ -205,14 +213,20 @@ def moving_sun(
     `start` is the moment of the time 0, with a time zone. Latitudes north and longitudes east are positive. `north` is
     the direction north in the coordinates of the mesh. Without `sunlight` the light is that of `meinel_clear_sky`.
     """
+    where = start, latitude_deg, longitude_deg, north
+    return Varying(partial(_from_moving_sun, where, sunlight, ground_reflectance), resolution_s=_RESOLUTION_S)
 
-    def irradiance(places: Places, time_s: float) -> FloatArray:
-        position = sun_position(_later(start, time_s), latitude_deg, longitude_deg)
-        light = sunlight or meinel_clear_sky(position.elevation_deg, position.distance_au)
-        towards = towards_sun(position, places.up, north)
-        return facet_irradiance(places.normals, places.up, towards, light, ground_reflectance)
 
-    return Varying(irradiance, resolution_s=_RESOLUTION_S)
+def _from_moving_sun(
+    where: tuple[datetime, float, float, Vector],
+    light: Sunlight | None,
+    reflected: float,
+    places: Places,
+    time_s: float,
+) -> FloatArray:
+    position = sun_position(_later(where[0], time_s), *where[1:3])
+    light = light or meinel_clear_sky(position.elevation_deg, position.distance_au)
+    return facet_irradiance(places.normals, places.up, towards_sun(position, places.up, where[3]), light, reflected)
 
 
 def _later(start: datetime, time_s: float) -> datetime:

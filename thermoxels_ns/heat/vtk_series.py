@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 from xml.etree import ElementTree
 
+import numpy as np
+
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.fem.solution import HeatSolution
@@ -14,21 +18,32 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 STEP_PATTERN = "step-*.vtu"  # Names of the files of a series
 
 
-def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution) -> list[Path]:
+def shown_states(times_s: FloatArray, wanted_s: Literal["all"] | tuple[float, ...]) -> list[int]:
+    """Return which kept times go into a series: the first, the last, and the nearest to each of `wanted_s`; or all.
+
+    >>> shown_states(np.array([0.0, 60.0, 120.0, 180.0]), (70.0,))
+    [0, 1, 3]
+    """
+    near = times_s if wanted_s == "all" else (times_s[0], *wanted_s, times_s[-1])
+    return np.unique([np.abs(times_s - time_s).argmin() for time_s in near]).tolist()
+
+
+def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution, states: list[int]) -> list[Path]:
     """Write ``NAME.pvd`` and ``NAME/step-0000.vtu`` and so on, which ParaView and pyvista open as one series.
 
-    `pvd` is the path of ``NAME.pvd``, which is written last, so that all files it lists exist. Files left over from a
-    longer earlier series are removed. Returns all paths, the .pvd first; raises `OutputError` if writing fails.
+    `pvd` is the path of ``NAME.pvd``, which is written last, so that all files it lists exist; `states` are numbers of
+    kept times. Files left over from a longer earlier series are removed. Returns all paths, the .pvd first; raises
+    `OutputError` if writing fails.
     """
     pvd = Path(pvd)
     writable_folder(pvd.parent)
     folder = writable_folder(pvd.with_suffix(""))
-    steps = heat_series_paths(pvd, len(solution.times_s))[1:]
-    for path, temperature_c in zip(steps, solution.temperature_c):
-        write_vtu(path, mesh, temperature_c=temperature_c)
+    steps = heat_series_paths(pvd, len(states))[1:]
+    for path, state in zip(steps, states):
+        write_vtu(path, mesh, temperature_c=solution.temperature_c[state])
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
     collection = ElementTree.SubElement(root, "Collection")
-    for path, time_s in zip(steps, solution.times_s):
+    for path, time_s in zip(steps, solution.times_s[states]):
         name = path.relative_to(pvd.parent).as_posix()
         ElementTree.SubElement(collection, "DataSet", timestep=repr(float(time_s)), part="0", file=name)
     ElementTree.indent(root)

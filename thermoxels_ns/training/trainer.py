@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from thermoxels_ns.core.checks import check_ranges, hold_folder, plain_os_errors, replace_when_done, writable_folder
-from thermoxels_ns.core.config_loader import ConfigLoader, typed, typed_value
+from thermoxels_ns.core.config_loader import ConfigLoader, scene_of_run, typed, typed_value
 from thermoxels_ns.core.errors import CheckpointError, OutputError, ThermoxelsError
 from thermoxels_ns.training.schedule import QUALITIES, Quality, Schedule, schedule_for
 
@@ -45,6 +46,8 @@ class ThermoxelsTrainerConfig(TrainerConfig):
     """Print all settings before training begins; config.yml in the folder of the run has them, too."""
     replaced: tyro.conf.Suppress[str] = ""
     """Voxels and steps that the quality replaced, as text for the log."""
+    scene_from_run: tyro.conf.Suppress[str] = ""
+    """Path of the scene seen from the folder of the run, so that both may be moved together."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set a field; the viewer gets `LOCAL_HOST` as its host unless another host was typed on the command line."""
@@ -76,12 +79,22 @@ class ThermoxelsTrainerConfig(TrainerConfig):
             self.experiment_name = Path(os.path.abspath(data.parent if data.is_file() else data)).stem
         super().set_experiment_name()
 
+    def moved_to(self, folder: Path) -> None:
+        """Take `folder` as that of the run, and as its scene the one that lies to it as it did when it was trained."""
+        manager: Any = self.pipeline.datamanager
+        scene = scene_of_run(folder, manager.data or manager.dataparser.data, self.scene_from_run)
+        manager.dataparser.data = scene
+        manager.data = scene if manager.data is not None else None
+        self.__dict__["_folder"] = folder  # no field: it is not written to config.yml
+
     def get_base_dir(self) -> Path:
-        """Return the folder of the run, which always lies inside `output_dir`.
+        """Return the folder of the run: that of `moved_to`, or else one that always lies inside `output_dir`.
 
         Raises:
             OutputError: The name of a folder in the path contains a separator, or is ``.`` or ``..``.
         """
+        if "_folder" in vars(self):
+            return vars(self)["_folder"]
         self.set_experiment_name()
         names = {name: str(getattr(self, name)) for name in ("experiment_name", "method_name", "timestamp")}
         names |= {"relative_model_dir": Path(self.relative_model_dir).as_posix()}
@@ -113,6 +126,9 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         with plain_os_errors(self.output_dir):
             # Room for two checkpoints, each with values and two moments of the first lattice.
             folder = writable_folder(self.get_base_dir(), min(6 * first, 1e9 * model.memory_budget_gb))
+            manager: Any = self.pipeline.datamanager
+            with suppress(ValueError):  # on another drive
+                self.scene_from_run = Path(os.path.relpath(manager.data or manager.dataparser.data, folder)).as_posix()
             _HELD.append(hold_folder(folder / ".lock", "Wait until it ends, or pass another --timestamp.", CONSOLE.log))
             super().save_config()
 

@@ -1,4 +1,4 @@
-"""VTK files of meshes, written and read: the body (.vtu) and its tagged boundary (.vtp)."""
+"""Meshes as pyvista objects and as VTK files, made and read: the body (.vtu) and its tagged boundary (.vtp)."""
 
 from __future__ import annotations
 
@@ -7,26 +7,41 @@ import binascii
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import MeshError, OutputError
-from thermoxels_ns.core.json_values import plain_values
+from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
+from thermoxels_ns.core.json_values import plain_values, read_json_object
+from thermoxels_ns.mesh.boundary.patches import DEFAULT_REGION, default_patches
 from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays, surface_of, write_bytes
-from thermoxels_ns.mesh.quality.checks import count_wrong_facets, group_faces
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh, facet_areas, facet_normals
+from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of, count_wrong_facets, group_faces
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.tetrahedra import (
+    FACET_BOX,
+    FACET_SURFACE,
+    Boundary,
+    TetMesh,
+    facet_area_vectors,
+    facet_areas,
+    facet_normals,
+)
 
-_DISK_IS_FULL = 20007  # VTK's error code
-_REMEDY = "Export the mesh again with ns-export thermoxels-mesh."
+if TYPE_CHECKING:
+    import pyvista as pv
+
+BODY, BOUNDARY = "body", "boundary"  # Names of the two blocks of a mesh
+_REMEDY = "Export the mesh again with ns-export thermoxels-mesh, or correct the grid."
 _REGION = "region:"
 _TETRAHEDRON = 10  # VTK's number for tetrahedra
+_DISK_IS_FULL = 20007  # VTK's error code
 _MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and a margin
 
 
@@ -35,28 +50,17 @@ def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
 
     Point arrays are `temperature_c` [degrees Celsius], `temperature_k` [K] and `observed` (1: measured, 0: extended)
     where temperatures are known, and `colour` (red, green, blue as bytes) where colours are. The cell array is
-    `region`; field arrays `region:NAME` hold the number of each region. The argument `temperature_c`, if given,
+    `region`; field arrays `region:NAME` hold the number of each region, from 1 as in every format. The argument
+    `temperature_c`, if given,
     replaces the mesh's own.
 
     Raises:
         MeshError: An array does not fit the mesh or is not finite.
         OutputError: The file cannot be written.
     """
-    import pyvista as pv
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-    path = Path(path)
-    mesh, _ = checked_mesh(mesh, temperature_c)
-    grid = pv.UnstructuredGrid({pv.CellType.TETRA: mesh.tets}, mesh.points_m)
-    for name, values in node_arrays(mesh).items():
-        grid.point_data[name] = values
-    grid.cell_data["region"] = mesh.region
-    # Regions are field arrays of numbers, because meshio refuses a file that holds text.
-    for number, name in enumerate(mesh.region_names):
-        grid.field_data[f"region:{name}"] = [number]
-    if mesh.has_temperatures:
-        grid.set_active_scalars("temperature_c")
-    write_vtk(vtkXMLUnstructuredGridWriter(), path, grid)
+    write_vtk(vtkXMLUnstructuredGridWriter(), Path(path), body_grid(mesh, temperature_c))
 
 
 def write_vtk(writer: Any, path: Path, data: Any) -> None:
@@ -117,45 +121,16 @@ def boundary_path(path: Path | str) -> Path:
 def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
     """Write the boundary triangles and their tags as VTK polygons (.vtp, read by ParaView and pyvista).
 
-    Cell arrays: `normal` (outward), `area_m2`, `seen` (1: a camera sees the triangle), `patch` (an index into the field
-    array `patch_names`), `on_box` (1: the scene box or the region cuts the solid there) and, if photographs were
-    compared, `photographs_seen` and `photographs_supporting`, see `Boundary.photographs`. Point arrays:
-    `temperature_c`, `observed`, `node` (number in the mesh, from 0) and, if the mesh has colours, `colour` as bytes.
+    Cell arrays: `normal` (outward), `area_m2`, `seen` (1: a camera sees the triangle), `patch` (number of the patch in
+    the field array `patch_names`, from 1 as in every format), `on_box` (1: the scene box or the region cuts the solid
+    there) and, if photographs were compared, `photographs_seen` and `photographs_supporting`, see
+    `Boundary.photographs`. Point arrays: `temperature_c`, `observed`, `node` (number in the mesh, from 0) and, if the
+    mesh has colours, `colour` as bytes.
     A mesh without boundary tags is written with one patch, "boundary", and without `seen`, which is unknown.
     """
-    import pyvista as pv
-    from vtkmodules.vtkCommonCore import vtkStringArray
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    path = Path(path)
-    mesh, tags = checked_mesh(mesh)
-    surface = surface_of(mesh.points_m, mesh.facets)
-    arrays: dict[str, npt.NDArray] = {
-        "area_m2": facet_areas(mesh.points_m, mesh.facets),
-        "normal": facet_normals(mesh.points_m, mesh.facets),
-        "on_box": (mesh.facet_tags == FACET_BOX).astype(np.uint8),
-        "patch": tags.patch,
-    }
-    if mesh.boundary is not None:
-        arrays["seen"] = tags.seen.astype(np.uint8)
-    if tags.photographs is not None:
-        arrays["photographs_seen"], arrays["photographs_supporting"] = tags.photographs.T.astype(np.int32)
-
-    data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
-    data.point_data["node"] = surface.nodes
-    for name, values in node_arrays(mesh).items():
-        if name != "temperature_k":
-            data.point_data[name] = values[surface.nodes]
-    for name, values in arrays.items():
-        data.cell_data[name] = values
-    names = vtkStringArray()  # pyvista's own way takes ASCII names only
-    names.SetName("patch_names")
-    for name in tags.patch_names:
-        names.InsertNextValue(name)
-    data.GetFieldData().AddArray(names)
-    if mesh.has_temperatures:
-        data.set_active_scalars("temperature_c")
-    write_vtk(vtkXMLPolyDataWriter(), path, data)
+    write_vtk(vtkXMLPolyDataWriter(), Path(path), boundary_surface(mesh))
 
 
 def read_mesh(path: Path | str) -> TetMesh:
@@ -171,44 +146,62 @@ def read_mesh(path: Path | str) -> TetMesh:
     if path.suffix != ".vtu":
         raise _wrong("mesh file", "a name that ends in .vtu", path.name, "Pass the mesh.vtu of an export.")
     beside = boundary_path(path)
-    body, surface = _read(path), _read(beside)
-    others = np.count_nonzero(body.celltypes != _TETRAHEDRON)
-    if others:
-        raise _wrong(path.name, "tetrahedra only", f"{others} cells of other kinds")
-    points = np.array(body.points, dtype=np.float64)
-    colour = body.point_data.get("colour")
-    facets, tags = _boundary(surface, points, beside.name)
-    on_box = _array(surface.cell_data, "on_box", beside.name) != 0
-    alone = not {"temperature_c", "observed"} & set(body.point_data.keys())  # photographs alone trained
-    temperature_c, observed = np.full(len(points), np.nan), np.zeros(len(points), dtype=bool)
-    if not alone:
-        temperature_c = _array(body.point_data, "temperature_c", path.name).astype(np.float64)
-        observed = _array(body.point_data, "observed", path.name) != 0
-    mesh = TetMesh(
-        points_m=points,
-        tets=np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4),
-        temperature_c=temperature_c,
-        observed=observed,
-        facets=facets,
-        facet_tags=np.where(on_box, FACET_BOX, FACET_SURFACE).astype(np.int64),
-        region=_array(body.cell_data, "region", path.name).astype(np.int64),
-        region_names=_region_names(body, path.name),
-        boundary=tags,
-        colour=None if colour is None else (np.asarray(colour) / 255.0).astype(np.float32),
-    )
-    mesh.check(f"{path.name} with {beside.name}", _REMEDY)
-    faces = group_faces(mesh.tets)
-    wrong = count_wrong_facets(mesh, faces)
-    crowded = faces.sizes.max() > 2
-    if (wrong or crowded) and (doubled := len(mesh.tets) - len(np.unique(np.sort(mesh.tets, axis=1), axis=0))):
-        raise _wrong(path.name, "every tetrahedron once", f"{doubled} of {len(mesh.tets)} listed again")
-    if wrong:
-        expected, got = "every face of one tetrahedron alone, and no other", f"{wrong} missing, inside or turned over"
-        raise _wrong(beside.name, expected, got)
-    if crowded:
-        remedy = "Remove tetrahedra that lie in each other, or export the mesh again."
-        raise _wrong(path.name, "faces of one or two tetrahedra each", "faces of more", remedy)
-    return mesh
+    return mesh_of(_read(path), _read(beside), path.name, beside.name)
+
+
+AnyMesh: TypeAlias = "pv.MultiBlock | pv.UnstructuredGrid | TetMesh | Path | str"
+"""What `any_mesh` takes."""
+
+
+def any_mesh(data: AnyMesh, up: Sequence[float] | None = None) -> tuple[TetMesh, dict[str, Any]]:
+    """Return a mesh and what is known about it: the content of its summary.json, or the user_dict of its blocks.
+
+    Blocks are those of `blocks_of`, a grid is what `mesh_of_grid` takes, a path that of the mesh.vtu of an export. If
+    given, `up` replaces the direction that is known. Raises `MeshError` for a mesh that is not sound, `HeatError` for
+    one that has no scale.
+    """
+    import pyvista as pv
+
+    about: dict[str, Any] = {}
+    if isinstance(data, (str, Path)):
+        mesh, about = read_mesh(data), read_export_summary(Path(data))
+    elif isinstance(data, pv.MultiBlock) and {BODY, BOUNDARY} <= set(data.keys()):
+        mesh, about = mesh_of(data[BODY], data[BOUNDARY]), json.loads(str(data.user_dict))
+        _check_in_metres(about)
+    elif isinstance(data, pv.UnstructuredGrid):
+        mesh = mesh_of_grid(data, (0.0, 0.0, 1.0) if up is None else up)
+    elif isinstance(data, TetMesh):
+        data.check()
+        mesh = data
+    else:
+        expected = f"a path, a TetMesh, a pyvista UnstructuredGrid, or a MultiBlock of {BODY} and {BOUNDARY}"
+        raise _wrong("mesh", expected, type(data).__name__, "Make it with scene.mesh() or with pyvista.")
+    return mesh, about if up is None else {**about, "up": tuple(up)}
+
+
+def read_export_summary(mesh: Path, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Read the summary.json beside a mesh; empty if there is none. Raises `HeatError` if the mesh has no scale."""
+    path = mesh.with_name("summary.json")
+    if not path.is_file():
+        say(f"Warning: {path} is missing; the mesh is taken to be in metres.")
+        return {}
+    summary = read_json_object(path, "Export the mesh again, or move the file away.", MeshError)
+    _check_in_metres(summary)
+    try:
+        if summary.get("up") is not None:
+            x, y, z = map(float, summary["up"])
+            summary["up"] = (x, y, z)
+    except (TypeError, ValueError) as problem:
+        name, remedy = f"{path}: up", "Pass --up 0 0 1, or export the mesh again."
+        raise MeshError(name, expected="three numbers", got=repr(summary["up"]), remedy=remedy) from problem
+    return summary
+
+
+def _check_in_metres(summary: Mapping[str, Any]) -> None:
+    if summary.get("length_unit", "m") != "m":
+        got = f"one in {summary['length_unit']}s"
+        remedy = "Export again with --metres-per-unit or --known-distance; in Python, load(run, metres_per_unit=1.0)."
+        raise HeatError("scale of the mesh", expected="an export in metres", got=got, remedy=remedy)
 
 
 def _read(path: Path) -> Any:
@@ -264,7 +257,176 @@ def _numbers(letters: bytes, width: int, count: int) -> list[int]:
     return [int.from_bytes(whole[width * k : width * (k + 1)], "little") for k in range(count)]
 
 
-def _region_names(body: Any, name: str) -> tuple[str, ...]:
+def blocks_of(mesh: TetMesh, about: Mapping[str, Any]) -> pv.MultiBlock:
+    """Return the blocks "body", see `body_grid`, and "boundary", see `boundary_surface`; `about` is their user_dict."""
+    import pyvista as pv
+
+    blocks = pv.MultiBlock({BODY: body_grid(mesh), BOUNDARY: boundary_surface(mesh)})
+    blocks.user_dict = plain_values(about, "about", MeshError)
+    return blocks
+
+
+def body_grid(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None = None) -> pv.UnstructuredGrid:
+    """Return the tetrahedra with the arrays that `vtu.write_vtu` names."""
+    import pyvista as pv
+
+    mesh, _ = checked_mesh(mesh, temperature_c)
+    grid = pv.UnstructuredGrid({pv.CellType.TETRA: mesh.tets}, mesh.points_m)
+    for name, values in node_arrays(mesh).items():
+        grid.point_data[name] = values
+    grid.cell_data["region"] = mesh.region + 1
+    # Regions are field arrays of numbers, because meshio refuses a file that holds text.
+    for number, name in enumerate(mesh.region_names, start=1):
+        grid.field_data[f"{_REGION}{name}"] = [number]
+    if mesh.has_temperatures:
+        grid.set_active_scalars("temperature_c")
+    return grid
+
+
+def boundary_surface(mesh: TetMesh) -> pv.PolyData:
+    """Return the boundary triangles with the arrays that `vtu.write_boundary_vtp` names."""
+    import pyvista as pv
+    from vtkmodules.vtkCommonCore import vtkStringArray
+
+    mesh, tags = checked_mesh(mesh)
+    surface = surface_of(mesh.points_m, mesh.facets)
+    arrays: dict[str, npt.NDArray] = {
+        "area_m2": facet_areas(mesh.points_m, mesh.facets),
+        "normal": facet_normals(mesh.points_m, mesh.facets),
+        "on_box": (mesh.facet_tags == FACET_BOX).astype(np.uint8),
+        "patch": tags.patch + 1,
+    }
+    if mesh.boundary is not None:
+        arrays["seen"] = tags.seen.astype(np.uint8)
+    if tags.photographs is not None:
+        arrays["photographs_seen"], arrays["photographs_supporting"] = tags.photographs.T.astype(np.int32)
+
+    data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
+    data.point_data["node"] = surface.nodes
+    for name, values in node_arrays(mesh).items():
+        if name != "temperature_k":
+            data.point_data[name] = values[surface.nodes]
+    for name, values in arrays.items():
+        data.cell_data[name] = values
+    names = vtkStringArray()  # pyvista's own way takes ASCII names only
+    names.SetName("patch_names")
+    for name in tags.patch_names:
+        names.InsertNextValue(name)
+    data.GetFieldData().AddArray(names)
+    if mesh.has_temperatures:
+        data.set_active_scalars("temperature_c")
+    return data
+
+
+def mesh_of(body: Any, surface: Any, name: str = BODY, beside: str = BOUNDARY) -> TetMesh:
+    """Return the mesh that `body_grid` and `boundary_surface` made; `name` and `beside` name the two in messages.
+
+    The cell arrays `region` and `patch` may hold names in place of numbers. Raises `MeshError` as `vtu.read_mesh`.
+    """
+    _check_tetrahedra(body, name)
+    points = np.array(body.points, dtype=np.float64)
+    colour = body.point_data.get("colour")
+    facets, tags = _boundary(surface, points, beside)
+    on_box = _array(surface.cell_data, "on_box", beside) != 0
+    region, region_names = _numbered(_array(body.cell_data, "region", name), _names(body, name))
+    alone = not {"temperature_c", "observed"} & set(body.point_data.keys())  # photographs alone trained
+    temperature_c, observed = np.full(len(points), np.nan), np.zeros(len(points), dtype=bool)
+    if not alone:
+        temperature_c = _array(body.point_data, "temperature_c", name).astype(np.float64)
+        observed = _array(body.point_data, "observed", name) != 0
+    mesh = TetMesh(
+        points_m=points,
+        tets=np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4),
+        temperature_c=temperature_c,
+        observed=observed,
+        facets=facets,
+        facet_tags=np.where(on_box, FACET_BOX, FACET_SURFACE).astype(np.int64),
+        region=region,
+        region_names=region_names,
+        boundary=tags,
+        colour=None if colour is None else (np.asarray(colour) / 255.0).astype(np.float32),
+    )
+    return _checked(mesh, name, beside)
+
+
+def mesh_of_grid(grid: pv.UnstructuredGrid, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> TetMesh:
+    """Return a mesh of any grid of tetrahedra with a point array `temperature_c`, lengths in metres.
+
+    The cell array `region`, if there is one, holds the region's name or number of each tetrahedron. The boundary gets
+    the patches exterior-up, -side and -down and, around closed cavities, interior-up, -side and -down; `up` decides.
+
+    Raises:
+        MeshError: The grid has other cells or none, no temperatures, or faces that three tetrahedra share.
+    """
+    name = "grid"
+    _check_tetrahedra(grid, name)
+    if "temperature_c" not in grid.point_data:
+        remedy = 'Set grid.point_data["temperature_c"] = 20.0, or to what was measured.'
+        got = ", ".join(grid.point_data.keys()) or "none"
+        raise _wrong(name, "a point array temperature_c [degrees Celsius]", got, remedy)
+    points, tets = np.array(grid.points, np.float64), np.array(grid.cell_connectivity, np.int64).reshape(-1, 4)
+    turned = signed_volumes(points, tets) < 0.0
+    tets[turned] = tets[turned][:, [0, 2, 1, 3]]
+    facets = boundary_facets(tets)
+    # Normals point out of the body: those around a cavity point into it, so that its volume comes out negative.
+    part = component_of(len(points), facets[:, :2].ravel(), facets[:, 1:].ravel())[facets[:, 0]]
+    middle = points[facets].mean(axis=1) - points.mean(axis=0)
+    volume = np.einsum("fi,fi->f", middle, facet_area_vectors(points, facets))
+    seen, on_box = np.bincount(part, volume)[part] > 0.0, np.zeros(len(facets), dtype=bool)
+    patch, names = default_patches(facet_normals(points, facets), up, seen, on_box)
+    region, region_names = np.zeros(len(tets), np.int64), (DEFAULT_REGION,)
+    if "region" in grid.cell_data:
+        found = _names(grid, name) if any(key.startswith(_REGION) for key in grid.field_data) else ()
+        region, region_names = _numbered(grid.cell_data["region"], found)
+    mesh = TetMesh(
+        points_m=points,
+        tets=tets,
+        temperature_c=_array(grid.point_data, "temperature_c", name).astype(np.float64),
+        observed=np.asarray(grid.point_data.get("observed", np.ones(len(points)))) != 0,
+        facets=facets,
+        facet_tags=np.full(len(facets), FACET_SURFACE, np.int64),
+        region=region,
+        region_names=region_names,
+    )
+    return _checked(replace(mesh, boundary=Boundary(seen, patch, names)), name, name)
+
+
+def _check_tetrahedra(grid: Any, name: str) -> None:
+    others = np.count_nonzero(grid.celltypes != _TETRAHEDRON)
+    if others or not grid.n_cells:
+        remedy = "Keep grid.extract_cells_by_type(10), the tetrahedra, or make some with grid.triangulate()."
+        raise _wrong(name, "tetrahedra only", f"{others} cells of other kinds" if others else "none", remedy)
+
+
+def _checked(mesh: TetMesh, name: str, beside: str) -> TetMesh:
+    mesh.check(name if name == beside else f"{name} with {beside}", _REMEDY)
+    faces = group_faces(mesh.tets)
+    wrong = count_wrong_facets(mesh, faces)
+    crowded = faces.sizes.max() > 2
+    if (wrong or crowded) and (doubled := len(mesh.tets) - len(np.unique(np.sort(mesh.tets, axis=1), axis=0))):
+        raise _wrong(name, "every tetrahedron once", f"{doubled} of {len(mesh.tets)} listed again")
+    if wrong:
+        expected, got = "every face of one tetrahedron alone, and no other", f"{wrong} missing, inside or turned over"
+        raise _wrong(beside, expected, got)
+    if crowded:
+        remedy = "Remove tetrahedra that lie in each other, or export the mesh again."
+        raise _wrong(name, "faces of one or two tetrahedra each", "faces of more", remedy)
+    return mesh
+
+
+def _numbered(values: npt.NDArray, names: tuple[str, ...]) -> tuple[IntArray, tuple[str, ...]]:
+    """Return numbers from 0 and their names, from `values` that are names, or numbers from 1 of `names`.
+
+    Without `names`, numbers become names.
+    """
+    values = np.asarray(values)
+    if values.dtype.kind == "U" or not names:
+        found, number = np.unique(values.astype(str), return_inverse=True)
+        return number.reshape(-1).astype(np.int64), tuple(found.tolist())
+    return values.astype(np.int64) - 1, names
+
+
+def _names(body: Any, name: str) -> tuple[str, ...]:
     """Return the names of the regions in the order of their numbers, read from field arrays `region:NAME`."""
     arrays = body.GetFieldData()
     numbers = {}
@@ -272,9 +434,9 @@ def _region_names(body: Any, name: str) -> tuple[str, ...]:
         array = arrays.GetAbstractArray(place)
         if (array.GetName() or "").startswith(_REGION) and array.GetNumberOfValues() == 1:
             numbers[int(array.GetVariantValue(0).ToInt())] = array.GetName().removeprefix(_REGION)
-    if sorted(numbers) != list(range(len(numbers))) or not numbers:
-        raise _wrong(name, f"field arrays {_REGION}NAME numbered from 0", sorted(numbers) or "none")
-    return tuple(numbers[number] for number in range(len(numbers)))
+    if sorted(numbers) != list(range(1, len(numbers) + 1)) or not numbers:
+        raise _wrong(name, f"field arrays {_REGION}NAME numbered from 1", sorted(numbers) or "none")
+    return tuple(numbers[number] for number in range(1, len(numbers) + 1))
 
 
 def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Boundary | None]:
@@ -292,17 +454,19 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Bo
     if not surface.is_all_triangles:
         raise _wrong(name, "triangles only", "other polygons")
     facets = node[np.asarray(surface.regular_faces, dtype=np.int64)]
-    if "seen" not in surface.cell_data:
+    if "seen" not in surface.cell_data and array("patch").dtype.kind != "U":
         return facets, None
     names = surface.GetFieldData().GetAbstractArray("patch_names")
     if names is None:
         raise _wrong(name, "the field array patch_names", "none")
+    every = tuple(str(names.GetValue(number)) for number in range(names.GetNumberOfValues()))
+    patch, patch_names = _numbered(array("patch"), every)
     counts = [f"photographs_{what}" for what in ("seen", "supporting")]
     counted = any(count in surface.cell_data for count in counts)
     return facets, Boundary(
-        seen=array("seen") != 0,
-        patch=array("patch").astype(np.int64),
-        patch_names=tuple(str(names.GetValue(number)) for number in range(names.GetNumberOfValues())),
+        seen=array("seen") != 0 if "seen" in surface.cell_data else np.ones(len(facets), dtype=bool),
+        patch=patch,
+        patch_names=patch_names,
         photographs=np.stack([array(count) for count in counts], axis=1).astype(np.int64) if counted else None,
     )
 
@@ -310,7 +474,8 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Bo
 def _array(data: Any, array: str, name: str) -> npt.NDArray:
     if array not in data:
         raise _wrong(name, f"an array {array}", f"{', '.join(sorted(data.keys())) or 'none'}")
-    return check_finite(f"{name}: {array}", np.array(data[array]), _REMEDY, MeshError)
+    values = np.array(data[array])
+    return values if values.dtype.kind == "U" else check_finite(f"{name}: {array}", values, _REMEDY, MeshError)
 
 
 def _wrong(name: str, expected: str, got: object, remedy: str = _REMEDY) -> MeshError:
