@@ -4,11 +4,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from thermoxels_ns.audit.conditions import EXAMPLE, load_conditions, write_example
+from thermoxels_ns.audit.conditions import EXAMPLE, load_conditions
 from thermoxels_ns.audit.run import check_survey
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
-from thermoxels_ns.core.yaml_records import configs_folder
+from thermoxels_ns.core.yaml_records import configs_folder, write_example
 
 PLAIN = """
 side: outside
@@ -41,14 +41,14 @@ def changed(tmp_path: Path):
 
 
 def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) -> None:
-    write_example(tmp_path / "new" / "mine.yaml")
+    write_example(tmp_path / "new" / "mine.yaml", EXAMPLE, AuditError)
     conditions = load_conditions(tmp_path / "new" / "mine.yaml")
     assert conditions == load_conditions(configs_folder() / EXAMPLE)
     found = check_survey(conditions)
     assert (found.forbidden, found.missing) == ((), ())
     assert conditions.film.model == "balance" and conditions.survey.date.hour == 6
     with pytest.raises(AuditError, match=r"expected a name that is free"):
-        write_example(tmp_path / "new" / "mine.yaml")
+        write_example(tmp_path / "new" / "mine.yaml", EXAMPLE, AuditError)
 
 
 @pytest.mark.parametrize(

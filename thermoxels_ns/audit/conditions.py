@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import field
 from datetime import datetime
 from pathlib import Path
@@ -15,11 +16,10 @@ from pydantic import Field
 from thermoxels_ns.audit.heat_flow import CONVECTION
 from thermoxels_ns.audit.weather import with_weather
 from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured, Unit
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml, record
+from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, record
 
 Share: TypeAlias = Annotated[Measured, Unit("1")]
 Emissivity: TypeAlias = Annotated[Measured, Unit("1", 0.0, 1.0, above=True)]
@@ -335,16 +335,6 @@ class Conditions:
 def load_conditions(path: Path | str | Mapping[str, Any]) -> Conditions:
     """Read conditions from a yaml file, or a mapping of its keys; raises `AuditError` if it is missing or wrong."""
     if isinstance(path, Mapping):
-        return as_record("conditions", path, Conditions)
+        return as_record("conditions", with_weather(deepcopy(dict(path)), Path()), Conditions)
     path = Path(path)
     return as_record(path.name, with_weather(read_yaml(path), path.parent), Conditions)
-
-
-def write_example(path: Path) -> None:
-    """Write an example of conditions that explains every key; raises `AuditError` if `path` exists already."""
-    if path.exists():
-        remedy = "Choose another name."
-        raise AuditError("conditions file", expected="a name that is free", got=str(path), remedy=remedy)
-    writable_folder(path.parent)
-    with replace_when_done(path) as temporary:
-        temporary.write_text((configs_folder() / EXAMPLE).read_text(encoding="utf-8"), encoding="utf-8")

@@ -82,16 +82,17 @@ class Audit:
 
 def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     """Audit a mesh, write all files, return the result; with `options.write_conditions`, only write an example."""
-    from thermoxels_ns.audit.conditions import load_conditions, write_example
+    from thermoxels_ns.audit.conditions import EXAMPLE, load_conditions
     from thermoxels_ns.audit.envelope import envelope_of
     from thermoxels_ns.audit.run import audit
     from thermoxels_ns.commands.audit_photographs import photographs_of_defects, shown_range_c
     from thermoxels_ns.commands.proposed_patches import propose_patches
+    from thermoxels_ns.core.yaml_records import write_example
     from thermoxels_ns.mesh.boundary.planes import find_building
     from thermoxels_ns.reports.numbers import interval_text, plain_names
 
     if options.write_conditions is not None:
-        write_example(options.write_conditions)
+        write_example(options.write_conditions, EXAMPLE, AuditError)
         say(f"Written to {options.write_conditions}: put in what you measured, and pass it with --conditions.")
         return None
     if options.mesh is not None and options.write_patches is not None:

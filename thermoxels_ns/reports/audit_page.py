@@ -57,7 +57,7 @@ def audit_page(
         counted=counted,
         doubted=[(number, one) for number, one in numbered if one.not_counted],
         worst=max(counted, key=lambda item: item[1].extra_w.value, default=None),
-        worth_measuring=[name for name, width in audit.budget.items() if width > 0.2 * loss][:3],
+        worth_measuring=[name for name, width in audit.budget.items() if width > 0.05 * loss][:3],
         budget=[
             (name, number_text(width, width), "" if bound else f"{100.0 * width / (loss or 1.0):.0f} %")
             for name, width in audit.budget.items()
