@@ -37,8 +37,9 @@ class Scene:
 
     def __repr__(self) -> str:
         shape, unit = " x ".join(map(str, self.density.shape)), "input units" if self.metres_per_unit is None else "m"
-        low, high = np.nanmin(self.temperature_c), np.nanmax(self.temperature_c)
-        return f"Scene({shape} corners, {self.spacing:.3g} {unit} apart, {low:.1f} to {high:.1f} °C)"
+        known = self.temperature_c[np.isfinite(self.temperature_c)]
+        degrees = f"{known.min():.1f} to {known.max():.1f} °C" if len(known) else "no temperatures"
+        return f"Scene({shape} corners, {self.spacing:.3g} {unit} apart, {degrees})"
 
     @property
     def points(self) -> FloatArray:

@@ -139,7 +139,7 @@ def twice(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("layout", "change", "named", "helps"),
     [
-        ("rgbt-scenes", no_raw, "false-colour.*raw_images/.*--layout rgb", {"layout": "rgb"}),
+        ("rgbt-scenes", no_raw, "false-colour.*R-JPEG.*--layout rgb", {"layout": "rgb"}),
         ("rgbt-scenes", jpeg_ls, r"frame_train_00002\.jpg.*JPEG-LS.*--missing-thermal skip", None),
         ("thermoscenes", lose("thermal/*"), "none with one.*--layout rgb", {"layout": "rgb"}),
         ("thermalmix", lose("warped_thermal/*00001.npy"), "--missing-thermal", {"missing_thermal": "skip"}),
@@ -191,3 +191,61 @@ def test_a_writer_refuses_what_its_layout_cannot_say(tmp_path, written):
     (folder / "truth.json").unlink()
     with pytest.raises(SceneError, match="other photographs"):
         scene_folder.write_scene(scene, folder, 3, 1, 40, 30, layout="colmap")
+
+
+def test_a_held_out_thermal_image_holds_its_pair_out(copied):
+    folder = copied("thermalnerf")
+    content = json.loads((folder / "transforms.json").read_text())
+    warm = [frame["file_path"] for frame in content["frames"] if frame.get("is_thermal")]
+    cold = [frame["file_path"] for frame in content["frames"] if not frame.get("is_thermal")]
+    (folder / "transforms.json").write_text(json.dumps(content | {"test_filenames": [cold[0], f"./{warm[2]}"]}))
+    named = {path.name for path in parsed(folder, "test", eval_mode="lists").image_filenames}
+    assert named == {Path(cold[0]).name, Path(cold[2]).name}
+    assert named.isdisjoint(path.name for path in parsed(folder, eval_mode="lists").image_filenames)
+
+
+def test_a_json_without_frames_says_what_a_colmap_model_cannot(copied):
+    folder = copied("colmap")
+    (folder / "transforms.json").write_text(json.dumps({"metres_per_unit": 2.0, "scene_box": [[-2.0] * 3, [2.0] * 3]}))
+    found = read_scene_file(folder)
+    assert found.layout.startswith("colmap: ") and found.meta["metres_per_unit"] == 2.0 and len(found.frames) == 7
+
+
+def test_thermal_images_that_no_layout_reads_are_not_passed_over(copied):
+    folder = copied("rgb")
+    (folder / "images_thermal").mkdir()
+    with pytest.raises(SceneError, match="beside images_thermal/"):
+        read_scene_file(folder)
+    assert read_scene_file(folder, layout="rgb").layout.startswith("rgb: ")
+
+
+@pytest.mark.parametrize(
+    ("first", "then"), [("thermoscenes", "rgb"), ("rgbt-scenes", "colmap"), ("thermalmix", "colmap")]
+)
+def test_a_scene_may_be_written_again_in_another_layout(tmp_path, first, then):
+    for layout in (first, then):
+        scene_folder.write_scene(
+            scene_folder.make_scene("hot-object"), tmp_path, 2, 1, 40, 30, layout=layout, progress=False
+        )
+    assert read_scene_file(tmp_path).layout.startswith(f"{then}: ")
+
+
+def test_another_cameras_thermal_image_is_no_partner(copied):
+    folder = copied("thermoscenes")
+    names = sorted(path.name for path in (folder / "thermal").iterdir())
+    (folder / "thermal" / "preview").mkdir()
+    shutil.copy(folder / "thermal" / names[0], folder / "thermal" / "preview" / names[0])
+    assert read_scene_file(folder).frames[0].thermal.parent.name == "thermal"
+    content = json.loads((folder / "transforms.json").read_text())
+    (folder / "thermal" / "right").mkdir()
+    (folder / "images" / "right").mkdir()
+    first, last = content["frames"][0], content["frames"][-1]
+    image = folder / "images" / "right" / Path(last["file_path"]).name
+    shutil.move(folder / last["file_path"], image)
+    last |= {"file_path": f"images/right/{image.name}"}
+    last.pop("thermal_file_path", None), first.pop("thermal_file_path", None)
+    name = Path(first["file_path"]).stem + ".png"
+    shutil.rmtree(folder / "thermal" / "preview")
+    shutil.move(folder / "thermal" / name, folder / "thermal" / "right" / name)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    assert first["file_path"] in read_scene_file(folder, missing_thermal="skip").left_out

@@ -138,7 +138,7 @@ class Film:
             raise AuditError("coefficient", expected=expected, got=got, remedy=remedy)
         if self.weights and (self.model != BALANCE or not 0.0 < sum(self.weights.values()) < math.inf):
             got = f"weights beside {self.model}" if self.model != BALANCE else "none above 0"
-            remedy = f"Write model: {BALANCE} and weights: {{iso-6946: 1, watmuff: 2}}, or remove the weights."
+            remedy = f"Write model: {BALANCE} and weights: {{iso-6946: 1}}, or remove the weights."
             raise AuditError("weights", expected=f"weights above 0 beside {BALANCE}", got=got, remedy=remedy)
 
 

@@ -195,14 +195,14 @@ def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], 
 def most_u_w_m2k(surface: AuditedSurface, conditions: Conditions, which: IntArray) -> float:
     """Return the U-value that the films of air on both sides allow without any wall, [W/(m2 K)].
 
-    1 / (Rsi + Rse) of ISO 6946, by the direction in which heat flows through the triangles `which` on the whole. A
-    larger U-value is impossible: an input clashes with the readings.
+    1 / (Rsi + Rse) of ISO 6946, by the direction in which heat flows through each of the triangles `which`; the mean by
+    area. A larger U-value is impossible: an input clashes with the readings.
     """
-    normal = surface.area_m2[which] @ surface.selection.facet_normal[which]
-    normal *= (-1.0 if conditions.side == "outside" else 1.0) / max(float(np.linalg.norm(normal)), 1e-300)
-    inner = Places(np.zeros((1, 3)), normal[None], surface.selection.up)
-    inside = float(np.ravel(inside_coefficient("iso-6946-combined").function(inner, 0.0))[0])
-    return 1.0 / (1.0 / inside + 1.0 / outside_coefficient("iso-6946-combined"))
+    normal = surface.selection.facet_normal[which] * (-1.0 if conditions.side == "outside" else 1.0)
+    inner = Places(np.zeros_like(normal), normal, surface.selection.up)
+    inside = np.asarray(inside_coefficient("iso-6946-combined").function(inner, 0.0))
+    allowed = 1.0 / (1.0 / inside + 1.0 / outside_coefficient("iso-6946-combined"))
+    return float(np.average(allowed, weights=surface.area_m2[which]))
 
 
 def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draws) -> Draws:

@@ -164,6 +164,8 @@ def without_slight(found: Found, least_w: float) -> Found:
     from thermoxels_ns.audit.run import verdict
 
     why = f"It loses less than {least_w:g} W extra (--least-bridge-w)."
+    if least_w == 0.0:
+        return found
     pairs = [
         (replace(one, not_counted=why) if not one.not_counted and one.extra_w.value < least_w else one, triangles)
         for one, triangles in zip(found.defects, found.found)
@@ -174,8 +176,9 @@ def without_slight(found: Found, least_w: float) -> Found:
     for one in [one for one in found.limits if one.unit == "W/(m K)" and lines]:
         worst = max(lines, key=lambda line: line.coefficient.value)
         psi, name = worst.coefficient, f"{one.name.partition(', in ')[0]}, in {worst.patch}"
-        judged = verdict(psi, one.limit)
-        limits.append(replace(one, name=name, found=psi, verdict=judged, missed_share=math.nan))  # of its own draws
+        if psi != one.found:  # the chance was of the draws of the line that does not count
+            one = replace(one, name=name, found=psi, verdict=verdict(psi, one.limit), missed_share=math.nan)
+        limits.append(one)
     defects, triangles = zip(*pairs) if pairs else ((), ())
     return replace(found, defects=defects, found=triangles, limits=tuple(limits))
 
@@ -183,8 +186,9 @@ def without_slight(found: Found, least_w: float) -> Found:
 def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return the U-value that no element exceeds, [W/(m2 K)] by name, and sentences on values and ends beyond it.
 
-    A sentence names the two inputs that move the heat loss most: one of these clashes with the readings.
+    A sentence names the two inputs that widen the U-value's interval most: one of these clashes with the readings.
     """
+    from thermoxels_ns.audit.draws import REPEATABILITY
     from thermoxels_ns.audit.exchange import most_u_w_m2k
 
     surface, every, most = found.surface, np.flatnonzero(found.surface.counted), dict[str, float]()
@@ -193,7 +197,8 @@ def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
         on = every[surface.selection.facet_patch[every] == number]
         most[one.name] = most_u_w_m2k(surface, found.conditions, on)
     most |= {one.name: max(most.values()) for one in (*found.storeys, found.whole)}
-    inputs = " and ".join([name for name in found.budget if name != "camera repeatability"][:2])
+    widest = [name for name, share in found.whole.width_shares.items() if share > 0.0 and name != REPEATABILITY]
+    inputs = " and ".join(widest[:2]) or "the airs and the camera"
     over = [one.name for one in found.patches if one.u_w_m2k.value > most[one.name]]
     ends = [one.name for one in found.patches if one.u_w_m2k.value <= most[one.name] < one.u_w_m2k.high]
 
@@ -251,7 +256,10 @@ def _write(
 
     assert options.mesh is not None and options.conditions is not None
     inputs = (options.mesh, options.mesh.with_name(f"{options.mesh.stem}-boundary.vtp"), options.conditions)
-    report = identify(inputs, options.up, options.least_bridge_w)
+    weather = found.conditions.weather
+    more = [options.patches, None if weather is None else Path(weather.file)]
+    north = options.north if options.envelope else None
+    report = identify((*inputs, *filter(None, more)), options.up, options.least_bridge_w, north)
     answers = answers_of(options, found, envelope) | {"report": asdict(report)}
     summary_text(answers)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)

@@ -8,12 +8,14 @@ from rich.table import Table
 TASKS: dict[str, dict[str, str]] = {
     "What most people need": {
         "--data SCENE": "folder of the scene",
-        "--quality draft|standard|fine": "half a minute for a first look, minutes (default), many minutes",
+        "--quality draft|standard|fine": "a minute or two for a first look, minutes (default), many minutes",
         "--output-dir FOLDER": "where the run goes: FOLDER/scene/method/time (default: outputs)",
         "--vis viewer|tensorboard": "watch in a browser while it trains (default), or not",
-        "--load-dir RUN/nerfstudio_models": "go on with a run that was interrupted",
+        "--load-dir RUN/nerfstudio_models": "go on with a run that was interrupted; repeat its --quality",
     },
     "The scene": {
+        "--layout NAME": "how the folder is read (docs/data.md); rgb: photographs alone",
+        "--thermal-bounds LOW HIGH": "degrees of black and white in grey thermal pictures",
         "--missing-thermal skip": "leave out photographs without a thermal image",
         "--scene-box XMIN YMIN ZMIN XMAX YMAX ZMAX": "the box to reconstruct; by default where photographs agree",
         "--downscale-factor 2": "photographs of half the width, which is faster",

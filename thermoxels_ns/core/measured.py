@@ -102,6 +102,7 @@ def read_measured(name: str, content: object, unit: str, bare: bool = False) -> 
     Measured(value=1.0, off_by=0.5)
     """
     example = _EXAMPLES.get(unit, f"1.5 +- 0.5 {unit}")
+    example = re.sub(r" \+- \S+", "", example) if bare else example
     plain = isinstance(content, (int, float)) and not isinstance(content, bool)
     text = content.translate(_SIGNS) if isinstance(content, str) else str(content) if plain else ""
     written, got = _WRITTEN.fullmatch(text), "nothing" if content is None else repr(content)

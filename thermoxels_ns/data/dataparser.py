@@ -191,7 +191,8 @@ class ThermalDataParser(DataParser):
         side = math.ceil(math.sqrt(need_gb / self.config.photographs_gb))
         CONSOLE.print(
             f"{len(lenses)} photographs need {need_gb:.2g} GB: for training they are averaged over {side} x {side} "
-            f"pixels, {need_gb / side**2:.2g} GB (--photographs-gb {math.ceil(need_gb)} keeps all pixels)."
+            f"pixels, {need_gb / side**2:.2g} GB, and voxels get no finer than these pixels allow (--photographs-gb "
+            f"{math.ceil(need_gb)} keeps all pixels)."
         )
         return side
 
@@ -307,9 +308,11 @@ def _refuse_beyond_bounds(middles_c: dict[Path, float], bounds_c: tuple[float, f
     least, most = bounds_c[0] - max(width, _COLDEST_SKY_K), bounds_c[1] + max(width, _SAME_PLACE_K)
     for path, middle in middles_c.items():
         if not least <= middle <= most:
-            expected = f"temperatures near {bounds_c[0]:g} to {bounds_c[1]:g} C, as {BOUNDS_NAME} says"
+            expected = (
+                f"temperatures near {bounds_c[0]:g} to {bounds_c[1]:g} C, as {BOUNDS_NAME} or --thermal-bounds says"
+            )
             got = f"{middle:.2f} C in the middle"
-            remedy = f"Subtract 273.15 if the file holds kelvins; else correct {BOUNDS_NAME}, or remove it."
+            remedy = "Subtract 273.15 if the file holds kelvins; else correct the bounds."
             raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 

@@ -76,17 +76,22 @@ def find_source(data: Path, wanted: LayoutName | None = None) -> SceneSource:
         return mark.removeprefix(_FRAMES) in keys if mark.startswith(_FRAMES) else (folder / mark).exists()
 
     for layout in LAYOUTS:
-        origin = model if layout.photographs else json_path
+        # A json without frames beside a COLMAP model says what the model cannot: scale, up, box, thermal unit.
+        origin = model if layout.photographs else json_path if "frames" in content or model is None else None
         root = next((name for name in layout.photographs if (folder / name).is_dir()), "")
         fits = wanted in (None, layout.name) and (not layout.marks or any(map(there, layout.marks)))
         if not fits or origin is None or bool(root) != bool(layout.photographs):
             continue
         left_out: list[str] = []
         if layout.photographs:
-            content, left_out = _content_of_model(folder, origin, root)
+            posed, left_out = _content_of_model(folder, origin, root)
+            content = content | posed if "frames" not in content else posed
         elif "is_thermal" in keys:
             content = _paired(content, origin.name, alone=not layout.thermal)
         thermal = next((folder / name for name in layout.thermal if (folder / name).is_dir()), None)
+        if not layout.thermal and wanted is None and (found := _signs_of_thermal(folder, content)):
+            remedy = "Put thermal images into thermal/, named as their photographs, or pass --layout rgb."
+            raise SceneError(f"scene folder {folder}", expected="thermal images", got=found, remedy=remedy)
         return SceneSource(layout, folder, origin, content, thermal, left_out)
     expected = f"{' or '.join(JSON_NAMES)}, or a COLMAP model in {COLMAP_FOLDERS[-2]} beside images/ or rgb/"
     got = "none of them" if data.is_dir() else "no such folder"
@@ -101,6 +106,14 @@ def find_source(data: Path, wanted: LayoutName | None = None) -> SceneSource:
     raise SceneError(f"scene folder {data}", expected=expected, got=got, remedy=remedy)
 
 
+def _signs_of_thermal(folder: Path, content: dict[str, Any]) -> str:
+    """Return in words what tells of thermal images in a scene that looks like photographs alone; empty: nothing."""
+    keys = [key for key in ("thermal_camera", "thermal_unit") if key in content]
+    folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
+    named = [f"{name}/" for name in folders if "therm" in name.lower() or name == "raw_images"]
+    return f"photographs alone, beside {', '.join(keys + named)}" if keys or named else ""
+
+
 def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, Any], list[str]]:
     """Return what a transforms.json would say of a COLMAP model's photographs in ``folder / root``, found by name, else
     by stem, and the names of those that are not there. Subfolders train, val and test become split lists."""
@@ -109,16 +122,20 @@ def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, A
     except SceneError as problem:
         remedy = "Copy the model again, or run COLMAP again."
         raise SceneError(str(place), expected="a readable COLMAP model", got=problem, remedy=remedy) from problem
-    files = defaultdict[str, list[str]](list)
+    exact, files = dict[str, list[str]](), defaultdict[str, list[str]](list)
     for path in sorted((folder / root).rglob("*")):
         within = path.relative_to(folder / root)
         if path.is_file():
-            for key in {within.as_posix(), within.name, f"{within.stem}.*"}:
+            exact[within.as_posix()] = [path.relative_to(folder).as_posix()]
+            for key in {within.name, f"{within.stem}.*"}:
                 files[key].append(path.relative_to(folder).as_posix())
     frames, left_out = [], []
+    taken = {exact[image.name][0] for image in model.images.values() if image.name in exact}
     for image in sorted(model.images.values(), key=lambda image: image.name):
         name = PurePosixPath(image.name)
-        found = next((files[key] for key in (str(name), name.name, f"{name.stem}.*") if key in files), [])
+        found = exact.get(image.name) or next((files[key] for key in (name.name, f"{name.stem}.*") if key in files), [])
+        if image.name not in exact:
+            found = [one for one in found if one not in taken]  # such as thermal images that COLMAP saw too
         if len(found) > 1:
             got, remedy = ", ".join(found), "Rename them in the folder and in COLMAP, and run COLMAP again."
             raise SceneError(f"{place}: {name}", expected="one photograph of this name", got=got, remedy=remedy)
@@ -154,15 +171,21 @@ def _paired(content: dict[str, Any], name: str, alone: bool) -> dict[str, Any]:
         remedy = "Remove the frames without a partner, or pass --layout rgb to train on photographs alone."
         raise SceneError(f"{name}: is_thermal", expected="as many of both kinds", got=got, remedy=remedy)
     by_stem = {PurePosixPath(frame["file_path"]).stem: frame for frame in thermal}
-    pairs = photographs if alone else []
+    pairs, partner = photographs if alone else [], dict[str, str]()
     for photograph, warm in zip([] if alone else photographs, thermal):
         warm = by_stem.get(PurePosixPath(photograph["file_path"]).stem, warm)
         pair = {**photograph, "thermal_file_path": warm["file_path"]}
+        partner[PurePosixPath(warm["file_path"]).as_posix()] = photograph["file_path"]
         if "fl_x" in warm:
             pair["thermal_camera"] = {key: both[key] for key in _THERMAL_CAMERA if key in (both := {**content, **warm})}
         if warm.get("transform_matrix") != photograph.get("transform_matrix"):
             pair["thermal_transform_matrix"] = warm.get("transform_matrix")
         pairs.append(pair)
     lists = {key: names for key, names in content.items() if key.endswith("_filenames") and isinstance(names, list)}
-    left = [frame["file_path"] for frame in thermal]
-    return content | {"frames": pairs} | {key: [n for n in names if n not in left] for key, names in lists.items()}
+    left = {PurePosixPath(frame["file_path"]).as_posix() for frame in thermal}
+    for key, names in lists.items():  # a thermal image that a list names stands for its pair
+        written = [PurePosixPath(name).as_posix() if isinstance(name, str) else name for name in names]
+        lists[key] = list(
+            dict.fromkeys(partner.get(name, name) for name in written if name in partner or name not in left)
+        )
+    return content | {"frames": pairs} | lists

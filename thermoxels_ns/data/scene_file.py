@@ -105,6 +105,8 @@ def read_scene_file(
         if path.suffix.lower() in THERMAL_SUFFIXES and not path.name.startswith("."):
             by_stem.setdefault(path.stem, []).append(path)
     there = sum(map(len, by_stem.values()))
+    named = [entry["file_path"] for entry in entries if isinstance(entry, dict) and "file_path" in entry]
+    folders = {Path(str(name)).parent.name for name in named}  # a thermal image in one of these is of its photographs
     frames, left_out, by_name_alone, place = [], [], True, f"{thermal_folder.name}/"
     for index, entry in enumerate(entries):
         where = f"{json_path.name}: frame {index}"
@@ -119,9 +121,10 @@ def read_scene_file(
         if "thermal_file_path" in entry:
             partners = [path] if (path := folder / str(entry["thermal_file_path"])).is_file() else []
         else:
-            partners, by_name_alone = by_stem.get(image.stem, []), False
-        beside = [path for path in partners if path.parent.name == image.parent.name]  # as in rgb/train, thermal/train
-        partners = beside if len(partners) > 1 and beside else partners
+            every, by_name_alone = by_stem.get(image.stem, []), False
+            beside = [path for path in every if path.parent.name == image.parent.name]  # as in rgb/train, thermal/train
+            here = [path for path in every if path.parent == thermal_folder]
+            partners = beside or here or [path for path in every if path.parent.name not in folders]
         if len(partners) > 1:
             remedy = "Keep one of them, or name it with 'thermal_file_path' in the frame."
             got = ", ".join(path.name for path in partners)

@@ -180,7 +180,7 @@ def run_scene(
     probe lies outside it, or the solver fails.
     """
     start, scene = clock.perf_counter(), scene.on(mesh)
-    scene, layers = (scene, ()) if behind_m2k_w is None else with_layers(scene, mesh, behind_m2k_w)
+    scene, layers = (scene, ()) if behind_m2k_w is None else with_layers(scene, mesh, behind_m2k_w, up)
     problem = scene.problem(mesh, up=up)
     probes = place_probes(mesh, np.array(probes_m, dtype=np.float64).reshape(-1, 3))
     about_patches = patch_warnings(scene, mesh, problem.up)
@@ -301,9 +301,11 @@ def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tu
             f"({x:.4g}, {y:.4g}, {z:.4g}) m: rims of holes, or walls that end. There both airs touch the body; "
             "temperature factors leave these nodes out, heat losses do not."
         )
-    area = selection.facet_area_m2[inside]
-    level = selection.facet_normal[inside] @ np.array(selection.up) / np.linalg.norm(selection.up)
-    floor, ceiling = (float(area[where].sum()) for where in (level > _COS_45, level < -_COS_45))
+    area = selection.facet_area_m2
+    level = selection.facet_normal @ np.array(selection.up) / np.linalg.norm(selection.up)
+    # A floor may be adiabatic, or touch a cellar: all that faces up and is not outside is one.
+    floor = float(area[(level > _COS_45) & ~outside].sum())
+    ceiling = float(area[inside & (level < -_COS_45)].sum())
     if floor < _LEAST_FLOOR * ceiling:
         warnings.append(
             f"The inner surface has a ceiling of {ceiling:.3g} m² and a floor of {floor:.3g} m²: most of the floor is "
@@ -323,15 +325,18 @@ class Layer:
 
 
 def with_layers(
-    scene: HeatScene, mesh: TetMesh, behind_m2k_w: Mapping[str, float]
+    scene: HeatScene, mesh: TetMesh, behind_m2k_w: Mapping[str, float], up: Direction | None = None
 ) -> tuple[HeatScene, tuple[Layer, ...]]:
     """Return a scene with a layer on the outside of each patch, so that a wall has a given resistance.
 
-    `behind_m2k_w` is the resistance from the air inside to the outer surface, [m2 K / W], by patch. The body's own is
-    its thickness, the distance across the wall between an outer and the nearest inner triangle, by its conductivity.
+    If the scene has no `up`, the argument counts, or z. `behind_m2k_w` is the resistance from the air inside to the
+    outer surface, [m2 K / W], by patch. The body's own is its thickness, the distance across the wall between an outer
+    and the nearest inner triangle, by its conductivity.
     Raises `HeatError` if the body has no rooms, or if more than air acts, because no layer lies below sunlight or sky.
     """
-    inside, outside, selection = scene.inside_air, scene.outside_air, Selection(mesh, scene.up or (0.0, 0.0, 1.0))
+    top = np.array(scene.up or up or (0.0, 0.0, 1.0), dtype=np.float64)
+    x, y, z = (top / np.linalg.norm(top)).tolist()
+    inside, outside, selection = scene.inside_air, scene.outside_air, Selection(mesh, (x, y, z))
     more = [key for key in ("sky", "ground", "sun", "radiation", "absorbed_solar", "heat_flux") if getattr(scene, key)]
     if inside is None or outside is None or more:
         got, remedy = ", ".join(more) or "no two airs", "Pass --scene winter-night, or a scene like it."

@@ -270,7 +270,7 @@ def _read_image(path: Path) -> tuple[npt.NDArray[Any], BoolArray | None]:
     if not (colours == colours[..., :1]).all():
         remedy = (
             "Export the radiometric data (16-bit PNG or TIFF, .npy, .csv), or a grey palette: pass --thermal-bounds; "
-            "or put the camera's own R-JPEG files into raw_images/ beside rgb/; or pass --layout rgb to train without."
+            "or put the camera's own R-JPEG files in its place; or pass --layout rgb to train without."
         )
         got = "a false-colour picture: its palette cannot be turned back into temperatures"
         raise ThermalFileError(str(path), expected="a grey image (all channels equal)", got=got, remedy=remedy)

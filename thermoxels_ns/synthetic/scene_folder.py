@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -272,6 +273,9 @@ def _prepared_folder(folder: Path | str, layout: LayoutName) -> Path:
             *(p for g in pictures for p in target.glob(g)),
         ):
             remove_file(path)  # truth.json stays until it is replaced: it marks the folder as synthetic
+        for one in sorted((path for path in target.rglob("*") if path.is_dir()), reverse=True):
+            with suppress(OSError):  # an empty folder would tell of another layout
+                one.rmdir()
     elif any((target / name).exists() for name in (_JSON, *models)):
         expected = "an empty folder or one with an earlier synthetic scene"
         got = f"{target}, which holds a scene of other photographs"

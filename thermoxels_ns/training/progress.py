@@ -37,12 +37,14 @@ class ProgressLines(writer.LocalWriter):
         super().__init__(config)
         for line in banner_messages or ():  # where the viewer is
             CONSOLE.print(line)
-        self.said_s, self.said_part = time.monotonic(), 0  # the first steps say nothing about the pace
+        self.said_s, self.said_part = time.monotonic(), -1
 
     def write_stats_log(self, step: int) -> None:
         """Print a line if one is due after step `step`, counted from 0."""
         steps, done = writer.GLOBAL_BUFFER["max_iter"], step + 1
         part, now = done * _LINES // steps, time.monotonic()
+        if self.said_part < 0:  # the first step, of a resumed run too, says nothing about the pace
+            self.said_s, self.said_part = now, part
         timings = writer.GLOBAL_BUFFER["events"].get(writer.EventName.ITER_TRAIN_TIME.value)
         if timings is None or done > steps or (part == self.said_part and now - self.said_s < _LONGEST_SILENCE_S):
             return
