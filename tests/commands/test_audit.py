@@ -177,12 +177,12 @@ def test_results_of_other_commands_are_not_replaced(export, tmp_path) -> None:
 def test_a_page_says_what_a_client_asks(export, tmp_path) -> None:
     """Limits only where there are some, values that no wall could have, words in place of names, and whose report."""
     text = (export / "conditions.yaml").read_text().replace('u: {"*": 0.50', 'u: {"facade": 0.50')
-    text = text.replace("model: iso-6946\n", "model: iso-6946-combined\n").replace("offset: 0.0", "offset: 6.0")
+    text = text.replace("model: balance\n", "model: iso-6946-combined\n").replace("offset: 0.0", "offset: 6.0")
     (tmp_path / "c.yaml").write_text(text)
     options = ("--pictures", "False")
     answers, page = audited(export / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "out", *options)
     said = " ".join(answers["impossible"])
-    assert "window" in said and "ISO 6946" in said and "film factor and outside air" in said
+    assert "window" in said and "ISO 6946" in said and "outside air and camera offset" in said
     assert "No limit was set for the U-value of window." in page and "impossible" in page
     assert "of the 2 limits that were set" in page and "entry 1" not in page and "I_tb" not in page
     again, _ = audited(export / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "again", *options)

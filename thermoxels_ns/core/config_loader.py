@@ -79,7 +79,7 @@ def check_run(config: Path) -> None:
     try:
         content = yaml.load(config.read_text(encoding="utf-8"), Loader=_PlainLoader)
         models = config.parent.joinpath(*content["relative_model_dir"])
-        manager, from_run = content["pipeline"]["datamanager"], content.get("scene_from_run", "")
+        manager, from_run = content["pipeline"]["datamanager"], content["scene_from_run"]  # other methods lack it
         told = Path(*(manager["data"] or manager["dataparser"]["data"]))
     except (yaml.YAMLError, OSError, UnicodeDecodeError, KeyError, TypeError, RecursionError):
         return  # another layout is left to whoever loads the file
