@@ -23,7 +23,7 @@ from thermoxels_ns.heat.materials import Material
 
 TAKEN = """
 side: outside
-inside: {air: weather +- 0.5 C}
+inside: {air: "weather ± 0,5 °C"}
 outside: {air: weather +- 0.4 C, wind: weather +- 0.5 m/s}
 surroundings: {sky: {cloud: weather, dew_point: weather +- 1 C}}
 camera: {offset: 0 +- 1 K, repeatability: 0 +- 0.2 K}

@@ -63,7 +63,7 @@ def with_weather(content: dict[str, Any], folder: Path) -> dict[str, Any]:
         text = str(at.get(key, "")) if isinstance(at, dict) else ""
         if not text.startswith("weather"):
             continue
-        if column not in series or not re.fullmatch(rf"weather(\s*(\+-|±)\s*[\d.]+\s*{unit})?\s*", text):
+        if column not in series or not re.fullmatch(rf"weather(\s*(\+/?-|±)\s*[\d.,]+\s*°?\s*{unit})?\s*", text):
             got, remedy = f"{text!r}, of the columns {', '.join(series)}", "Correct it, or write the value."
             expected = f"weather +- 0.5 {unit}".strip() + f", and a column {column}"
             raise AuditError(": ".join((*path, key)), expected=expected, got=got, remedy=remedy)
