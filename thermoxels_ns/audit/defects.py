@@ -225,7 +225,8 @@ class _Zones:
         """Return whether a core departs by no more than a reconstruction errs beside a patch of another temperature.
 
         The core lies on average within `_BLURRED_EDGES` of the other patch, and its spot departs from the reference by
-        at most `_OWN_SHARE` of the step, in the same direction, from the reference to what that patch reads next to it.
+        at most `_OWN_SHARE` of the step from the reference to what that patch reads next to it, or half of that share
+        where that patch departs the other way.
         """
         surface, reach = self.surface, _BLURRED_EDGES * edge_m
         others = np.flatnonzero(self.read & (self.patch != self.patch[core[0]]))
@@ -237,8 +238,9 @@ class _Zones:
             return False
         near = others[np.unique(np.concatenate(beside.query_ball_point(self.at[core], 2.0 * reach)).astype(np.int64))]
         calm, top = (float(np.average(surface.reading_c[n], weights=surface.area_m2[n])) for n in (reference, spot))
-        step = np.sign(top - calm) * (surface.reading_c[near] - calm)  # a colder patch cannot lend warmth
-        return abs(top - calm) <= _OWN_SHARE * max(float(np.quantile(step, 0.9)) if len(near) else 0.0, 0.0)
+        step = np.sign(top - calm) * (surface.reading_c[near] - calm)
+        # Half for a patch that departs the other way: on the drawn house what is an error there stays below a tenth.
+        return abs(top - calm) <= _OWN_SHARE * float(np.maximum(step, -0.5 * step).max(initial=0.0))
 
     def _nearest(self, core: IntArray, same: IntArray, distance: FloatArray, near: BoolArray) -> BoolArray:
         """Return `near`, with the core itself, but without triangles of `same` that are nearer to another core."""
