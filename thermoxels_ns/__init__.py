@@ -23,11 +23,12 @@ inside to outside). The command line has the same steps: ``ns-export thermoxels-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from thermoxels_ns.core.version import __version__
+
 if TYPE_CHECKING:
     from thermoxels_ns.api import Scene, ThermoxelsError, load, solve, to_pyvista
     from thermoxels_ns.audit.run import audit_mesh as audit
 
-__version__ = "0.1.0"
 __all__ = ["Scene", "ThermoxelsError", "__version__", "audit", "load", "solve", "to_pyvista"]
 
 

@@ -19,6 +19,7 @@ from thermoxels_ns.commands.demo import Demo
 from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.core import quiet_warnings
 from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.data.layouts import LayoutName
 from thermoxels_ns.synthetic.catalogue import SceneWord
 from thermoxels_ns.synthetic.imperfections import Imperfections
 
@@ -35,9 +36,7 @@ class Synthetic:
     random-3+street."""
     output_dir: Path
     """Folder for the scene; made if it does not exist. An earlier synthetic scene in it is replaced."""
-    layout: Literal["thermoscenes", "nerfstudio", "thermalnerf", "rgbt-scenes", "thermalmix", "colmap", "rgb"] = (
-        "thermoscenes"
-    )
+    layout: LayoutName = "thermoscenes"
     """Layout of the folder, see docs/data.md; rgb: photographs alone."""
     num_train: int = 42
     """Number of training views."""

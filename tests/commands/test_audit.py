@@ -245,3 +245,11 @@ surfaces: [{emissivity: 0.93}]
     given = ["audit", str(export / "mesh.vtu"), "--conditions", str(tmp_path / "c.yaml"), "--envelope", "gbxml"]
     assert cli.main([*given, "--output-dir", str(tmp_path / "out")]) == 1
     assert "envelope: expected" in capsys.readouterr().err and not [*(tmp_path / "out").iterdir()]
+
+
+def test_a_scene_that_cannot_be_read_is_refused_before_the_audit(export, tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("thermoxels_ns.audit.run.audit", lambda *_: pytest.fail("too late"))
+    given = ["audit", str(export / "mesh.vtu"), "--conditions", str(export / "conditions.yaml")]
+    given += ["--output-dir", str(tmp_path / "out"), "--scene", str(tmp_path)]
+    assert cli.main(given) == 1 and "expected transforms.json" in capsys.readouterr().err
+    assert cli.main([*given, "--layout", "colmap"]) == 1

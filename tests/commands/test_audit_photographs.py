@@ -12,7 +12,7 @@ from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.audit.run import Audit, audit
 from thermoxels_ns.commands.audit_photographs import photographs_of_defects, shown_range_c
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.scene_file import read_scene_file
 
 SCALE = 2.0  # Metres in a unit of the poses
 CAMERA = Camera(160, 120, 100.0, 100.0, 80.0, 60.0)
@@ -61,7 +61,7 @@ def scene(tmp_path_factory) -> Path:
 
 
 def pictures_of(scene: Path, found: Audit) -> dict:
-    return photographs_of_defects(scene, SCALE, found, shown_range_c(found))
+    return photographs_of_defects(read_scene_file(scene), SCALE, found, shown_range_c(found))
 
 
 def shown(image: bytes) -> np.ndarray:
@@ -88,8 +88,3 @@ def test_what_stands_before_a_defect_hides_it(found, scene) -> None:
     screen[np.flatnonzero(~surface.counted)[:count]] = surface.centroid_m[surface.counted] * (1, 0, 1) - (0, 1.0, 0)
     hidden = replace(found, surface=replace(surface, centroid_m=screen))
     assert pictures_of(scene, hidden) == {}
-
-
-def test_a_folder_that_is_no_scene_is_refused(found, tmp_path) -> None:
-    with pytest.raises(SceneError, match=r"expected transforms\.json"):
-        photographs_of_defects(tmp_path, 1.0, found, (0.0, 9.0))

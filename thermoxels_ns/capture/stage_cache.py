@@ -14,12 +14,12 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
-from thermoxels_ns import __version__
 from thermoxels_ns.capture.settings import StageName
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.version import __version__
 
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"

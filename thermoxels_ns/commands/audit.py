@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.commands.installed_commands import command_of
 from thermoxels_ns.core.checks import check_direction, check_positive, remove_file, result_folder
 from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.data.layouts import LayoutName
 
 if TYPE_CHECKING:
     from thermoxels_ns.audit.envelope import Envelope
@@ -54,6 +55,10 @@ class Audit:
     scene: Path | None = None
     """Folder of the photographs that the mesh was made from, the --data of the training: the page then shows each
     defect in the photograph and the thermal image in which the defect is largest."""
+    layout: LayoutName | None = None
+    """Layout of the folder of --scene, if the training had --layout."""
+    thermal_bounds: tuple[float, float] | None = None
+    """Degrees Celsius of black and of white in the thermal images of --scene, if the training had --thermal-bounds."""
     least_bridge_w: float = 0.0
     """Bridges and defects that lose less than this extra are listed as seen, but not counted, [W]. What lies within the
     error of the reconstruction is never counted."""
@@ -81,13 +86,14 @@ class Audit:
 
 
 def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
-    """Audit a mesh, write all files, return the result; with `options.write_conditions`, only write an example."""
+    """Audit a mesh, write all files, return the result; None if conditions or patches were written instead."""
     from thermoxels_ns.audit.conditions import EXAMPLE, load_conditions
     from thermoxels_ns.audit.envelope import envelope_of
     from thermoxels_ns.audit.run import audit
     from thermoxels_ns.commands.audit_photographs import photographs_of_defects, shown_range_c
     from thermoxels_ns.commands.proposed_patches import propose_patches
     from thermoxels_ns.core.yaml_records import write_example
+    from thermoxels_ns.data.scene_file import read_scene_file
     from thermoxels_ns.mesh.boundary.planes import find_building
     from thermoxels_ns.reports.numbers import interval_text, plain_names
 
@@ -114,11 +120,15 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     if options.envelope and conditions.side != "outside":
         remedy = "Leave --envelope out; rooms are not written."
         raise AuditError("envelope", expected="a survey from outside", got="one from inside", remedy=remedy)
+    scene = None  # is read before anything slow
+    if options.scene is not None:
+        scene = read_scene_file(options.scene, "skip", options.layout, options.thermal_bounds)
     mesh, up, export = _read(options.mesh, options, say)
     building = find_building(mesh, up, options.north) if options.envelope else None  # raises before anything slow
     found = without_slight(audit(mesh, conditions, up), least_w)
     envelope = None if building is None else envelope_of(found, building)
-    for words in (*found.check.forbidden, *found.check.doubts, *impossible_u(found)[1]):
+    most_u, impossible = impossible_u(found)
+    for words in (*found.check.forbidden, *found.check.doubts, *impossible):
         say(f"Warning: {plain_names(words)}")
     if found.check.missing:
         say(f"Missing for a report after EN 13187: {', '.join(found.check.missing)}.")
@@ -130,13 +140,15 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         told = [f"{name} {interval_text(one, calibration.units[name])}" for name, one in calibration.found.items()]
         say(f"Calibration: {'; '.join(told) or f'refused. {calibration.refused}'}")
     photographs, range_c = {}, None
-    if options.scene is not None:
+    if scene is not None:
         scale = (export.get("scale") or {}).get("metres_per_unit", 1.0)
         scale = check_positive("summary.json: metres_per_unit", scale, "Export the mesh again.", AuditError)
         range_c = shown_range_c(found)
-        photographs = photographs_of_defects(options.scene, scale, found, range_c)
+        photographs = photographs_of_defects(scene, scale, found, range_c)
         say(f"Photographs show {sum(not found.defects[number].not_counted for number in photographs)} of them.")
-    _write(folder, options, found, photographs, range_c, envelope)
+    _write(
+        folder, options, found, photographs, {"range_c": range_c, "most_u": most_u, "impossible": impossible}, envelope
+    )
     names = (PAGE, ANSWERS, SURFACE, *(ENVELOPES[one] for one in options.envelope))
     say(f"Written to {folder}: {', '.join(names)} ({clock.perf_counter() - begin:.1f} s)")
     return found
@@ -163,9 +175,9 @@ def without_slight(found: Found, least_w: float) -> Found:
     """Return an audit in which bridges that lose less than `least_w` extra, [W], are not counted and not judged."""
     from thermoxels_ns.audit.run import verdict
 
-    why = f"It loses less than {least_w:g} W extra (--least-bridge-w)."
     if least_w == 0.0:
         return found
+    why = f"It loses less than {least_w:g} W extra (--least-bridge-w)."
     pairs = [
         (replace(one, not_counted=why) if not one.not_counted and one.extra_w.value < least_w else one, triangles)
         for one, triangles in zip(found.defects, found.found)
@@ -229,7 +241,6 @@ def answers_of(options: Audit, found: Found, envelope: Envelope | None = None) -
         "calibration": None if calibration is None else {name: getattr(calibration, name) for name in named},
         "forbidden": found.check.forbidden,
         "doubts": found.check.doubts,
-        "impossible": impossible_u(found)[1],
         "missing_for_en_13187": found.check.missing,
         "loss_narrower_by_w": found.budget,
         **{name: getattr(found, name) for name in ("draws", "failing_models", "remembered")},
@@ -243,7 +254,7 @@ def _write(
     options: Audit,
     found: Found,
     photographs: Mapping[int, tuple[Picture, ...]],
-    range_c: tuple[float, float] | None,
+    shown: Mapping[str, Any],
     envelope: Envelope | None,
 ) -> None:
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
@@ -260,7 +271,7 @@ def _write(
     more = [options.patches, None if weather is None else Path(weather.file)]
     north = options.north if options.envelope else None
     report = identify((*inputs, *filter(None, more)), options.up, options.least_bridge_w, north)
-    answers = answers_of(options, found, envelope) | {"report": asdict(report)}
+    answers = answers_of(options, found, envelope) | {"report": asdict(report), "impossible": shown["impossible"]}
     summary_text(answers)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
     write_vtk(vtkXMLPolyDataWriter(), folder / SURFACE, found.to_pyvista())
@@ -275,7 +286,6 @@ def _write(
     pictures = draw_audit(found) if options.pictures else None
     command = command_of("audit", options)
     files = (PAGE, ANSWERS, SURFACE, *map(ENVELOPES.__getitem__, options.envelope))
-    most, said = impossible_u(found)
-    shown = {"range_c": range_c, "most_u": most, "impossible": said, "report": report}
-    write_page(folder / PAGE, audit_page(found, pictures, photographs, options.mesh.name, command, files, **shown))
+    page = audit_page(found, pictures, photographs, options.mesh.name, command, files, report=report, **shown)
+    write_page(folder / PAGE, page)
     write_summary(folder / ANSWERS, answers)

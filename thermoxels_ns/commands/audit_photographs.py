@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
@@ -13,7 +11,7 @@ from thermoxels_ns.audit.surface import WHY_NOT
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
+from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
 from thermoxels_ns.reports.audit_page import MOST_DEFECTS
 from thermoxels_ns.reports.charts import colours
@@ -37,15 +35,14 @@ def shown_range_c(found: Audit) -> tuple[float, float]:
 
 
 def photographs_of_defects(
-    folder: Path, metres_per_unit: float, found: Audit, range_c: tuple[float, float]
+    scene: SceneFile, metres_per_unit: float, found: Audit, range_c: tuple[float, float]
 ) -> dict[int, tuple[Picture, Picture]]:
     """Cut each defect out of photograph and thermal image that show it largest; return both by place in `found.found`.
 
     `metres_per_unit` is the length of one unit of the scene's poses, [m]; the colours of thermal images span `range_c`,
     [degrees Celsius]; what is colder is grey, as sky is. Defects that no photograph shows are left
-    out, and so are defects beyond `MOST_DEFECTS`. Raises `SceneError` if `folder` is no scene.
+    out, and so are defects beyond `MOST_DEFECTS`.
     """
-    scene = read_scene_file(folder, "skip")
     frames = [frame for frame in scene.frames if frame.intrinsics.lens == "perspective"]
     surface = found.surface
     every = surface.centroid_m / metres_per_unit
@@ -99,7 +96,7 @@ def _size_in_view(
 def _cut_out(
     scene: SceneFile, frame: Frame, points: FloatArray, limits: tuple[float, float]
 ) -> tuple[bytes, bytes] | None:
-    """Cut photograph and thermal image around some points, as JPEG files; None if either shows no point, or is none."""
+    """Cut photograph and thermal image around some points, as JPEG files; None if either shows no point, or is missing."""
     if frame.thermal is None:
         return None
     temperature_c = read_thermal_file(frame.thermal, scene.unit).temperature_c

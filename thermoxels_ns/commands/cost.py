@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import tyro
 
-from thermoxels_ns import __version__
 from thermoxels_ns.commands.installed_commands import PLAIN_TRAINING, run_command
 from thermoxels_ns.core.checks import check_positive, remedy_of, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.version import __version__
 
 if TYPE_CHECKING:
     from rich.console import Console

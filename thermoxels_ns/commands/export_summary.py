@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns import __version__
 from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.version import __version__
 from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.fem.solution import HeatSolution

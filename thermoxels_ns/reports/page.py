@@ -17,9 +17,9 @@ import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from thermoxels_ns import __version__
 from thermoxels_ns.core.checks import plain_os_errors, replace_when_done
 from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.version import __version__
 from thermoxels_ns.reports import numbers
 
 Picture: TypeAlias = tuple[bytes, str]
