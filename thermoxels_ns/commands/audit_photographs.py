@@ -96,7 +96,7 @@ def _size_in_view(
 def _cut_out(
     scene: SceneFile, frame: Frame, points: FloatArray, limits: tuple[float, float]
 ) -> tuple[bytes, bytes] | None:
-    """Cut photograph and thermal image around some points, as JPEG files; None if either shows no point, or is missing."""
+    """Cut photograph and thermal image around some points, as JPEG files; None if one is missing or shows no point."""
     if frame.thermal is None:
         return None
     temperature_c = read_thermal_file(frame.thermal, scene.unit).temperature_c
