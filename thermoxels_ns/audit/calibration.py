@@ -321,10 +321,9 @@ class _Fit:
             at = values - values[0]
             low, high = at.min(), at.max()
             below, above = (self._follow(gain, name, values[0] + end) - self.logarithm for end in (low, high))
-            # The parabola through (low, below), (0, 0) and (high, above).
             if low == 0.0 or high == 0.0:  # stated at an end of what is possible, such as no wind: a line
                 rise, bend = (above / high if high > 0.0 else below / low), np.zeros(len(below))
-            else:
+            else:  # the parabola through (low, below), (0, 0) and (high, above)
                 bend = (above / high - below / low) / (high - low)
                 rise = above / high - bend * high
             drawn += rise[:, None] * at + bend[:, None] * at**2
