@@ -1,5 +1,5 @@
 #!/bin/sh
-# Install the programs that the tests marked external run: Gmsh, CalculiX and FEniCSx, from Debian's or Ubuntu's packages.
+# Install the programs that the tests marked external run: Gmsh, CalculiX and FEniCSx, and pango, from Debian's or Ubuntu's packages.
 # Where one cannot be had this says so and ends well: its tests are skipped with a reason.
 set -u
 
@@ -8,6 +8,8 @@ say() {
 }
 
 missing=
+# The system library of the extra pdf.
+ldconfig -p 2>/dev/null | grep -q libpangoft2 || missing="$missing libpango-1.0-0 libpangoft2-1.0-0"
 command -v gmsh >/dev/null 2>&1 || missing="$missing gmsh"
 command -v ccx >/dev/null 2>&1 || missing="$missing calculix-ccx"
 "${THERMOXELS_FENICSX_PYTHON:-/usr/bin/python3}" -c 'import dolfinx' >/dev/null 2>&1 || missing="$missing python3-dolfinx"
