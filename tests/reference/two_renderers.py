@@ -16,7 +16,7 @@ from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
 
 Renderer = Callable[[VoxelGrid, RayRequest, RenderOptions], RayRender]
 RENDERERS: dict[str, Renderer] = {"reference": reference.render, "fused": fused.render}
-PER_RAY = ("rgb", "thermal", "transmittance", "accumulation", "distortion", "sparsity")
+PER_RAY = ("rgb", "thermal", "transmittance", "accumulation", "depth", "distortion", "sparsity")
 EVERYTHING = RenderOptions(distortion_scale=2.0, sparsity=True)
 
 
@@ -105,14 +105,13 @@ def see(renderer: str, grid: VoxelGrid, request: RayRequest, options: RenderOpti
     loss = torch.zeros((), dtype=dtype)
     for name, value in values.items():
         push = torch.rand(value.shape, generator=generator) * scale.get(name, 1.0)
-        loss = loss + (value * push.to(dtype)).sum()
+        loss = loss + (torch.where(torch.isfinite(value), value, 0.0) * push.to(dtype)).sum()
     if loss.requires_grad:
         loss.backward()
     gradients = {}
     for name, parameter in grid.row_parameters().items():
         gradient = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
         gradients[name] = gradient.to_dense().double()
-    values["depth"] = render.depth
     return Seen({name: value.detach().double() for name, value in values.items()}, gradients)
 
 

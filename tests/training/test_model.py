@@ -64,6 +64,7 @@ def test_only_terms_of_non_zero_weight_are_computed(recipe):
     model = make(LINES, recipe=recipe, distortion_ramp=(0, 1)).train()
     model.update_to_step(10)
     model.backdrop_ray_sampler = model.feature_ray_sampler
+    model.plain_areas = plain_areas()
     terms = set(model.get_loss_dict(model(rays()), targets()))
     weights = LOSS_RECIPES[recipe]
     assert terms == {f"{name}_loss" for name in vars(weights) if getattr(weights, name)}

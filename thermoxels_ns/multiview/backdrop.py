@@ -38,7 +38,7 @@ def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolA
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         along = np.column_stack((columns.ravel(), rows.ravel(), np.ones(width * height))) @ inverse.T
         directions[pixels] = along / np.linalg.norm(along, axis=1, keepdims=True)
-        even = _even_pixels(photographs.colours[pixels].reshape(*shape, 3)) & np.isnan(depth[pixels]).reshape(shape)
+        even = even_pixels(photographs.colours[pixels].reshape(*shape, 3)) & np.isnan(depth[pixels]).reshape(shape)
         plain[pixels] = even.ravel()
         turns = _turns(inverse, up)
         if turns is not None:
@@ -88,7 +88,7 @@ def _turns(inverse: FloatArray, up: FloatArray) -> int | None:
     return 1 if right > 0 else 3
 
 
-def _even_pixels(picture: Float32Array) -> BoolArray:
+def even_pixels(picture: Float32Array) -> BoolArray:
     """Return which pixels of a picture (h, w, 3) differ by at most `PLAIN` from the four around; none beside a mask."""
     even = np.ones(picture.shape[:2], dtype=bool)
     for axis in (0, 1):

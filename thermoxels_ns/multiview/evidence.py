@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.multiview.differences import matters, photograph_differences
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs, thermal_at
@@ -33,6 +33,7 @@ class PhotographEvidence:
     """Evidence from training photographs before there is a model."""
 
     photographs: Photographs  # Small photographs, with gains and offsets corrected where `log_gain` or `offset` is set
+    depth: Float32Array  # Depth of each pixel where it is sure, else NaN, shape (pixels,), [world units]
     backdrop: BoolArray  # True for pixels that show a plain backdrop, shape (pixels,)
     feature_rays: FeatureRays | None
     """Rays to the depths on which several photographs agree; None if there are too few such depths (`LEAST_SHARE`)."""
@@ -88,7 +89,7 @@ def evidence_of_photographs(
         f"a plain backdrop fills {backdrop.mean():.1%}; {time.perf_counter() - began:.1f} s"
     )
     rays = None if few else feature_rays_to_depths(depths)
-    return PhotographEvidence(photographs, backdrop, rays, log_gain, offset)
+    return PhotographEvidence(photographs, depths.depth, backdrop, rays, log_gain, offset)
 
 
 def rays_through_backdrop(photographs: Photographs, backdrop: BoolArray, beyond: float) -> FeatureRays | None:

@@ -167,7 +167,6 @@ class _Render(torch.autograd.Function):
         ctx.recorded, ctx.options = recorded, options
         ctx.set_materialize_grads(False)
         sums = [torch.from_numpy(values) for values in recorded.sums]
-        ctx.mark_non_differentiable(sums[4])
         return (*sums, *(torch.tensor(value, dtype=density.dtype) for value in variation))
 
     @staticmethod
@@ -175,7 +174,7 @@ class _Render(torch.autograd.Function):
         if ctx.recorded is None:
             raise RuntimeError("a fused render can be differentiated once: its records hold the gradients afterwards")
         recorded, ctx.recorded = ctx.recorded, None
-        rgb, thermal, transmittance, accumulation, _, distortion, sparsity, *pushes = grad_outputs
+        rgb, thermal, transmittance, accumulation, depth, distortion, sparsity, *pushes = grad_outputs
         sums, records = recorded.sums, recorded.records
         left = _gradient(transmittance, sums.transmittance)
         if accumulation is not None:
@@ -184,6 +183,7 @@ class _Render(torch.autograd.Function):
             _gradient(rgb, sums.rgb),
             _gradient(thermal, sums.thermal),
             left,
+            _gradient(depth, sums.depth) * (sums.accumulation > 0.0) / np.maximum(sums.accumulation, 1e-30),
             _gradient(distortion, sums.distortion),
             _gradient(sparsity, sums.sparsity),
         )
@@ -192,7 +192,7 @@ class _Render(torch.autograd.Function):
             *(records.density, records.transmittance, records.rgb, np.empty(len(records.number), np.uint8)),
         )
         if any(gradient is not None for gradient in grad_outputs[:7]):
-            inputs = recorded.rays, recorded.volume, recorded.settings, records, grads, of_samples
+            inputs = recorded.rays, recorded.volume, recorded.settings, records, grads, sums.depth, of_samples
             run_ranges(lambda a, b: kernels_backward.find_sample_gradients(a, b, *inputs), len(records.used))
         else:
             records.used.fill(0)

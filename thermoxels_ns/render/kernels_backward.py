@@ -41,6 +41,7 @@ class RayGradients(NamedTuple):
     rgb: Floats
     thermal: Floats
     transmittance: Floats  # Gradient for the transmittance minus that for the accumulation, 1 - transmittance
+    depth: Floats  # Gradient for the depth, divided by the accumulation; 0 where this is 0
     distortion: Floats
     sparsity: Floats
 
@@ -54,12 +55,14 @@ def find_sample_gradients(
     settings: Settings,
     records: Records,
     grads: RayGradients,
+    depth: Floats,
     samples: SampleGradients,
 ):
     """Write the gradients of the samples of rays `first` to before `last` into `samples`, which overwrites `records`.
 
     With w_i = T_i (1 - exp(-x_i)), T_{i+1} = T_i exp(-x_i) and x_i the optical depth of step i,
-    dL/dx_i = g_i T_{i+1} - sum_{j>i} g_j w_j - g_T T_end, where g_i = dL/dw_i and g_T = dL/dT_end.
+    dL/dx_i = g_i T_{i+1} - sum_{j>i} g_j w_j - g_T T_end, where g_i = dL/dw_i and g_T = dL/dT_end. The `depth` (rays,)
+    of a ray is d = sum_i w_i t_i / sum_i w_i, so that it adds dL/dd (t_i - d) / sum_j w_j to g_i.
     """
     channels = volume.sh.shape[1]
     for r in range(first, last):
@@ -83,6 +86,7 @@ def find_sample_gradients(
                 t = enter + i * settings.step + 0.5 * min(settings.step, length - i * settings.step)
                 weight_sum += records.weight[n]
                 moment_sum += records.weight[n] * t
+        pull = grads.depth[r]
         weight_after, moment_after = 0.0, 0.0
         end_term = grads.transmittance[r] * records.transmittance[end - 1]
         behind = 0.0
@@ -111,6 +115,8 @@ def find_sample_gradients(
                 )
                 weight_after += weight
                 moment_after += weight * t
+            if pull != 0.0:
+                gain += pull * (enter + i * settings.step + 0.5 * delta - depth[r])
             slope = gain * left - behind - end_term
             behind += gain * weight
             slope = slope * delta if density * delta < OPAQUE else 0.0

@@ -59,7 +59,7 @@ class RayRender:
     thermal: Float[Tensor, "rays 1"]  # Sum of weight times normalised temperature
     transmittance: Float[Tensor, " rays"]  # Share of the light from behind the grid that passes the grid
     accumulation: Float[Tensor, " rays"]  # Opacity, 1 - transmittance, with all digits when it is small
-    depth: Float[Tensor, " rays"]  # Weighted mean distance, world units; infinite at opacity 0. Carries no gradient
+    depth: Float[Tensor, " rays"]  # Weighted mean distance, world units; infinite at opacity 0
     distortion: Float[Tensor, " rays"] | None = None  # See `reference.ray_distortion`; None where not requested
     sparsity: Float[Tensor, " rays"] | None = None  # Sum of log(1 + 2 density^2) over the samples of each ray
     variation: dict[str, Float[Tensor, ""]] = field(default_factory=dict)  # Total variation by parameter name

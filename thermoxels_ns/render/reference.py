@@ -195,7 +195,7 @@ def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayR
         summed(grid.thermal_at, request.thermal_rays, thermal_weight, 1),
         along.transmittance,
         along.accumulation,
-        depth.detach(),
+        depth,
         distortion,
         sparsity,
         variation,

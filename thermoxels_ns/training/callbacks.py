@@ -24,6 +24,7 @@ from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_pho
 from thermoxels_ns.multiview.votes import air_voxels, around_cameras
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
+from thermoxels_ns.training.plain_areas import PlainAreas
 from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 
 FEWEST_OPEN_RAYS = 0.002  # A background stays if at least this share of rays leaves the box with half of its light
@@ -192,6 +193,8 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
         model.feature_ray_sampler = FeatureRaySampler(tracks.joined_with(depths), box, far)
     open_rays = rays_through_backdrop(found.photographs, found.backdrop, 1e3 * float(np.linalg.norm(box[1] - box[0])))
     model.backdrop_ray_sampler = None if open_rays is None else FeatureRaySampler(open_rays, box)
+    areas = PlainAreas(found.photographs, np.isfinite(found.depth), found.backdrop)
+    model.plain_areas = areas if len(areas) else None
     if trainer is None or trainer._start_step == 0:
         points = model.grid.voxels.corner_index() * lattice.voxel_size + np.asarray(lattice.lo)
         model.grid.paint(torch.from_numpy(mean_colours(found.photographs, found.backdrop, points)))

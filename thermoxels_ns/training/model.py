@@ -31,7 +31,7 @@ from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, Surrou
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.reference import intersect_box
-from thermoxels_ns.render.renderers import GridSamples, Scene, SceneRender, render_scene, sample_rays
+from thermoxels_ns.render.renderers import GridSamples, Scene, SceneRender, render_rays, render_scene, sample_rays
 from thermoxels_ns.training import losses
 from thermoxels_ns.training.degrees_view import DegreesView
 from thermoxels_ns.training.image_metrics import (
@@ -45,6 +45,7 @@ from thermoxels_ns.training.image_metrics import (
     thermal_metrics,
 )
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
+from thermoxels_ns.training.plain_areas import PlainAreas, bend_loss
 from thermoxels_ns.training.ray_statistics import field_evidence
 
 SURROUNDINGS = (48, 12)
@@ -126,6 +127,7 @@ class ThermoxelsModel(Model):
             self.feature_ray_sampler = losses.FeatureRaySampler(rays, box, self.surroundings is not None)
         # Rays through pixels that show a plain backdrop; `callbacks.follow_depths` finds them.
         self.backdrop_ray_sampler: losses.FeatureRaySampler | None = None
+        self.plain_areas: PlainAreas | None = None  # Found by `callbacks.follow_depths` too
 
     @property
     def seen_surroundings(self) -> Surroundings | None:
@@ -324,7 +326,17 @@ class ThermoxelsModel(Model):
         ):
             if weight and sampler is not None:
                 terms[f"{name}_loss"] = weight * self._feature_ray_loss(sampler)
+        if weights.bend and self.plain_areas is not None:
+            terms["bend_loss"] = weights.bend * self._bend_loss(self.plain_areas)
         return terms
+
+    def _bend_loss(self, areas: PlainAreas) -> Tensor:
+        """Return `bend_loss` of random pixels of plain areas."""
+        generator = torch.Generator().manual_seed((self.config.seed + 1) * 5_000_011 + self.step)
+        near, most = self.config.near_plane * self.unit, self.config.track_rays // 4
+        request, length = areas.request(most, near, generator, self.device)
+        seen = render_rays(self.grid, request, self._options(), self.config.backend)
+        return bend_loss(seen.depth, seen.accumulation, length, self.grid.lattice.voxel_size)
 
     def _feature_ray_loss(self, rays: losses.FeatureRaySampler) -> Tensor:
         """Return `losses.feature_ray_loss` of random rays of a sampler; a coarse lattice may let light pass points."""

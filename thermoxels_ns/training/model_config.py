@@ -45,6 +45,7 @@ class LossWeights:
     tracks: float = 0.05
     """Make feature rays end at their points: tracks of structure from motion, depths on which photographs agree."""
     backdrop: float = 0.02  # Let rays through a plain backdrop (sky, a wall far behind) meet nothing in the box
+    bend: float = 0.003  # Keep surfaces flat in plain areas of photographs, where no depth is known
     surroundings: float = 1e-3  # Keep the surroundings transparent where colour at infinity explains the photographs
 
 
@@ -61,6 +62,7 @@ LOSS_RECIPES: Mapping[str, LossWeights] = {
         distortion=0.0,
         tracks=0.0,
         backdrop=0.0,
+        bend=0.0,
     ),
 }
 
@@ -153,7 +155,7 @@ class ThermoxelsModelConfig(ModelConfig):
     """Set of loss weights; paper: the published weights."""
     loss_overrides: dict[str, float] = field(default_factory=dict)
     """Loss weights by name that replace weights of the recipe: rgb, thermal, tv_density, tv_sh, tv_temperature,
-    sparsity, beta, distortion, tracks, backdrop, surroundings."""
+    sparsity, beta, distortion, tracks, backdrop, bend, surroundings."""
     thermal_l2_share: float = 0.5
     """lambda of the paper's eq. 4."""
     distortion_ramp: tuple[int, int] = _STANDARD.distortion_ramp
