@@ -80,6 +80,7 @@ MECHANISMS: Mapping[str, Without] = {
     "thinning": Without((f"{_MODEL}thin-threshold", "0")),
     "box-distant-points": Without(replaced=((_BOX, "_worth_keeping", lambda points, *_: np.ones(len(points), bool)),)),
     "surroundings": Without((f"{_MODEL}surroundings", "off")),
+    "bend": Without((_LOSS, "bend", "0")),
     "distortion": Without((_LOSS, "distortion", "0")),
     "mean-colours": Without(
         replaced=((_CALLBACKS, "mean_colours", lambda *three: np.full((len(three[2]), 3), 0.5, np.float32)),)

@@ -9,12 +9,22 @@ from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM, FeatureR
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.refine import prune
+from thermoxels_ns.multiview.photographs import gathered
 from thermoxels_ns.training import pipeline
 from thermoxels_ns.training.image_metrics import fitted_gain
 from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.model_config import LOSS_RECIPES, ThermoxelsModelConfig
+from thermoxels_ns.training.plain_areas import PlainAreas
 
 BOX = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]]))
+
+
+def plain_areas() -> PlainAreas:
+    """The upper side of the box, grey all over, as a photograph from above shows it."""
+    matrix = np.array([[8.0, 0.0, -8.0, 24.0], [0.0, -8.0, -8.0, 24.0], [0.0, 0.0, -1.0, 3.0]])
+    pinhole = np.full((16, 16, 3), 0.5, np.float32), np.full((16, 16), np.nan, np.float32), matrix
+    nothing = np.zeros(16 * 16, dtype=bool)
+    return PlainAreas(gathered([pinhole], [(0.0, 0.0, 3.0)]), nothing, nothing)
 
 
 LINES = FeatureRays(np.array([[0.0, 0.0, 3.0]]), np.array([0]), np.array([[0.1, 0.2, 0.0]]), np.array([0.01]))

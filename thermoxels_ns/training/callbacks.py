@@ -126,9 +126,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             except MemoryBudgetError as problem:
                 if not model.config.voxel_pixels:  # the user gave this resolution
                     raise
-                CONSOLE.log(
-                    f"step {step}: the lattice stays as it is, where photographs ask for a finer one: {problem}"
-                )
+                CONSOLE.log(f"step {step}: the lattice stays, where photographs ask for a finer one: {problem}")
                 finest = model.config.resolutions.index(max(model.grid.lattice.cell_shape))
                 known = model.config.resolutions[: finest + 1], model.config.refine_at[:finest]
                 model.config = replace(model.config, resolutions=known[0], refine_at=known[1])
@@ -193,8 +191,7 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
         model.feature_ray_sampler = FeatureRaySampler(tracks.joined_with(depths), box, far)
     open_rays = rays_through_backdrop(found.photographs, found.backdrop, 1e3 * float(np.linalg.norm(box[1] - box[0])))
     model.backdrop_ray_sampler = None if open_rays is None else FeatureRaySampler(open_rays, box)
-    areas = PlainAreas(found.photographs, np.isfinite(found.depth), found.backdrop)
-    model.plain_areas = areas if len(areas) else None
+    model.plain_areas = PlainAreas(found.photographs, np.isfinite(found.depth), found.backdrop)
     if trainer is None or trainer._start_step == 0:
         points = model.grid.voxels.corner_index() * lattice.voxel_size + np.asarray(lattice.lo)
         model.grid.paint(torch.from_numpy(mean_colours(found.photographs, found.backdrop, points)))

@@ -326,7 +326,7 @@ class ThermoxelsModel(Model):
         ):
             if weight and sampler is not None:
                 terms[f"{name}_loss"] = weight * self._feature_ray_loss(sampler)
-        if weights.bend and self.plain_areas is not None:
+        if weights.bend and self.plain_areas:  # None, or without any, in a scene without plain areas
             terms["bend_loss"] = weights.bend * self._bend_loss(self.plain_areas)
         return terms
 
