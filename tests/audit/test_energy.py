@@ -123,12 +123,10 @@ def test_what_is_wrong_with_an_energy_section_is_one_line(content, named) -> Non
         (["hours,outside_c", *(f"{h},1" for h in range(4000))], "energy: climate: .*outside_c of one or more"),
         (["hours,outside_c", "0,1", "8759,2"], "energy: climate: .*without gaps"),
         (["time,outside_c"], "energy: climate: .*a first line of hours"),
-        (None, "energy: climate: .*a first line"),
     ],
 )
 def test_a_climate_that_is_no_year_is_one_line(tmp_path, lines, named) -> None:
-    if lines is not None:
-        (tmp_path / "place.csv").write_text("\n".join(lines))
+    (tmp_path / "place.csv").write_text("\n".join(lines))
     airs = {"inside": Measured(20.0), "heating_limit": Measured(15.0)}
     with pytest.raises(AuditError, match=rf"^{named}[^\n]*$"):
         year(Energy(climate=str(tmp_path / "place.csv"), **airs))

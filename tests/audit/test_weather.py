@@ -95,7 +95,6 @@ def test_an_epw_file_of_the_year_of_the_survey_gives_its_weather(conditions, tmp
         ("2025-01-10T12:00:00", 480, False),
         ("2026-03-10T12:00:00", 480, False),
         (None, 480, False),
-        ("x", 480, False),
         ("2026-02-10T12:00:00", 1440, True),
         ("2026-01-10T12:00:00", 0, False),
     ],

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -255,6 +256,7 @@ CAPACITY_KJ_M3K = 980.0
 _BEFORE_H = 120.0  # How long before the survey the true weather begins
 
 
+@cache
 def after_a_warm_day(
     side: Side, seed: int, folder: Path, history_h: float = 48.0, step: float = 1.0
 ) -> tuple[Truth, Conditions]:
@@ -303,7 +305,7 @@ def after_a_warm_day(
     problem = HeatProblem(column, material, np.full(len(column.points_m), 10.0), effects, UP)
     start_c = solve_steady(problem).temperature_c
     problem = replace(problem, initial_temperature_c=start_c)
-    end_c = solve_heat(problem, TimeSteps(240, _BEFORE_H * 15.0), scheme=SDIRK2).temperature_c[-1]
+    end_c = solve_heat(problem, TimeSteps(160, 2700.0), scheme=SDIRK2).temperature_c[-1]
     depth, first = np.unique(column.points_m[:, 0], return_index=True)
     mesh = audited_wall(step, slab=False, window=False, side=side)
     mesh = replace(mesh, temperature_c=np.interp(mesh.points_m[:, 1], depth, end_c[first]))

@@ -35,7 +35,7 @@ from thermoxels_ns.heat.scene_fields import OUTSIDE_RESISTANCE_M2K_W, inside_coe
 
 _UNITS = {"conductivity": "W/(m K)", "thickness": "m", "film": "W/(m2 K)", "capacity": "kJ/(m3 K)"}
 _BEFORE, _ABSORPTANCE = "air before the weather file", "absorptance of the walls"  # Uncertain with a history alone
-_LEAST_STEP_H, _STEPS_OF_AN_AGE = 0.125, 8.0  # Shortest time step; longer ones are an eighth of the time to the survey
+_LEAST_STEP_H, _STEPS_OF_AN_AGE = 0.125, 4.0  # Shortest time step; longer ones are a quarter of the time to the survey
 _LINEAR = 1e-9  # Relative tolerance of the linear equations of a time step
 _TOLD_SHARE = 0.05  # Least share by which the air before the file may move a property without a sentence
 _STEP = 1e-4  # Step of difference quotients with respect to the logarithm of a property
