@@ -25,6 +25,8 @@ from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.audit.conditions import (
     SIMPLE,
     Camera,
+    Energy,
+    Energy,
     Film,
     Limits,
     OutsideAir,

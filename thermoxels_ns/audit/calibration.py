@@ -36,6 +36,7 @@ from thermoxels_ns.heat.scene_fields import OUTSIDE_RESISTANCE_M2K_W, inside_coe
 _UNITS = {"conductivity": "W/(m K)", "thickness": "m", "film": "W/(m2 K)", "capacity": "kJ/(m3 K)"}
 _BEFORE, _ABSORPTANCE = "air before the weather file", "absorptance of the walls"  # Uncertain with a history alone
 _LEAST_STEP_H, _STEPS_OF_AN_AGE = 0.125, 4.0  # Shortest time step; longer ones are a quarter of the time to the survey
+_UNSEEN_DAY_K = 10.0  # How far air and sun before a file of less than a day may be off what its first hours say
 _LINEAR = 1e-9  # Relative tolerance of the linear equations of a time step
 _TOLD_SHARE = 0.05  # Least share by which the air before the file may move a property without a sentence
 _STEP = 1e-4  # Step of difference quotients with respect to the logarithm of a property
@@ -139,7 +140,8 @@ class _Wall:
         self.stated = asked.stated()
         if self.history is not None:
             change_k, weather = self.history["outside_c"], conditions.weather
-            self.stated[_BEFORE] = Measured(0.0, 0.5 * float(np.ptp(change_k)))
+            unseen_k = _UNSEEN_DAY_K if self.history_h < 24.0 else 0.0
+            self.stated[_BEFORE] = Measured(0.0, max(0.5 * float(np.ptp(change_k)), unseen_k))
             if self.history["sun_w_m2"].any() and weather is not None:
                 self.stated[_ABSORPTANCE] = weather.absorptance
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import datetime
+from importlib import import_module
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +23,7 @@ _EPW = {
     "cloud": ("total_sky_cover", 0.1, 10.0),
 }
 """Columns that an .epw file has: name in pvlib, factor, and largest number that does not stand for a missing value."""
+_YEAR_H = 8760
 _LEAST_KNOWN, _MOST_SUN_W_M2 = 0.9, 2000.0  # Least share of known values of a column; larger sunlight is missing
 
 
@@ -35,7 +38,7 @@ def read_weather(
         start: Hour 0 of an .epw file, in the standard time of its place if no time zone is stated; None: its beginning.
         facing_deg: Directions that walls face, clockwise from north, [degrees]; sun_w_m2 of an .epw file is the mean of
             the sunlight on them (ground of albedo 0.2); empty: no such column.
-        any_year: Take an .epw file for a typical year, which goes on before and after it; else it has to hold `start`.
+        any_year: Take an .epw file for a typical year, which begins again at its end; else it has to hold `start`.
 
     Raises:
         RecordError: The file cannot be read or is not in order, or pvlib is not installed.
@@ -59,14 +62,14 @@ def read_weather(
 
 def _read_epw(path: Path, start: datetime | None, facing_deg: Sequence[float], any_year: bool) -> dict[str, FloatArray]:
     try:
-        import pvlib
+        pvlib: Any = import_module("pvlib")  # optional: it brings pandas
     except ImportError as problem:
         remedy = "Run pip install 'thermoxels-ns[weather]'."
         raise wrong(str(path), "the package pvlib, which reads .epw files", "none", remedy) from problem
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
         year = start.year if start is not None and any_year else None
-        data, place = pvlib.iotools.read_epw(StringIO(text), coerce_year=year)
+        data, place = pvlib.iotools.read_epw(StringIO(text), coerce_year=year)  # a path it might take for an address
         begins, zone = data.index, data.index.tz
         if len(begins) < 2:
             raise ValueError("no hours")
@@ -98,8 +101,8 @@ def _read_epw(path: Path, start: datetime | None, facing_deg: Sequence[float], a
             for one in facing_deg
         ]
         found["sun_w_m2"] = np.interp(hours, hours - 0.5, np.nan_to_num(np.mean(walls, axis=0)))
-    if any_year:
-        year_h = 24.0 * (365 + (found["hours"][-1] - found["hours"][0] > 8770.0))
+    if any_year and len(hours) >= _YEAR_H:
+        year_h = _YEAR_H + 24.0 * (hours[-1] - hours[0] > _YEAR_H)
         found = {name: np.concatenate([values] * 3) for name, values in found.items()}
         found["hours"] = found["hours"] + np.repeat([-year_h, 0.0, year_h], len(hours))
     return found
