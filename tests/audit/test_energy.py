@@ -25,13 +25,12 @@ def year(asked: Energy, u: np.ndarray | None = None) -> EnergyResult:
     return year_of(replace(STATED, energy=asked), draws, elements)
 
 
+def outside_c(hour: float) -> float:
+    return 17.0 if hour % 4 == 0 else 4.0
+
+
 @pytest.fixture
 def climate(tmp_path):
-    """A year of 4 C outside, but of 17 C in every fourth hour."""
-
-    def outside_c(hour: float) -> float:
-        return 17.0 if hour % 4 == 0 else 4.0
-
     lines = [f"{hour},{outside_c(hour)}" for hour in range(8760)]
     (tmp_path / "place.csv").write_text("\n".join(["hours,outside_c", *lines]))
     return {"csv": str(tmp_path / "place.csv"), "epw": str(write_epw(tmp_path / "place.epw", outside_c))}
@@ -99,7 +98,6 @@ AIRS = {"inside": "20 C", "heating_limit": "15 C"}
         ({"degree_hours": "80000 K h", "inside": "20 C"}, "energy: inside: expected one beside climate"),
         ({"climate": "a.epw", **AIRS, "heating_limit": "21 C"}, "energy: heating_limit: expected surely"),
         ({"degree_hours": "80000"}, "energy: degree_hours: expected"),
-        ({"degree_hours": "-3 K d"}, "energy: degree_hours: expected"),
         ({"degree_hours": "3000 K d", "price": "12 EUR"}, "energy: price: expected"),
         (
             {"degree_hours": "3000 K d", "measures": {"x": {"patches": ["*"]}}},

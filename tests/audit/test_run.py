@@ -26,7 +26,6 @@ from thermoxels_ns.audit.conditions import (
     SIMPLE,
     Camera,
     Energy,
-    Energy,
     Film,
     Limits,
     OutsideAir,

@@ -251,8 +251,7 @@ def calibrated(side: Side, seed: int, step: float = 0.1) -> Iterator[tuple[str, 
         yield f"conductivity of {name}", CONDUCTIVITY[name], found.found[f"conductivity of {name}"]
 
 
-CAPACITY_KJ_M3K = 980.0
-"""With films of 12.5 and 7.7 W/(m2 K) the slowest mode of the wall then decays within 12 h."""
+CAPACITY_KJ_M3K = 980.0  # The slowest mode of the wall, with films of 12.5 and 7.7 W/(m2 K), decays within 12 h
 _BEFORE_H = 120.0  # How long before the survey the true weather begins
 
 
@@ -309,10 +308,9 @@ def after_a_warm_day(
     depth, first = np.unique(column.points_m[:, 0], return_index=True)
     mesh = audited_wall(step, slab=False, window=False, side=side)
     mesh = replace(mesh, temperature_c=np.interp(mesh.points_m[:, 1], depth, end_c[first]))
-    known = hours >= -history_h
     table = np.stack([hours, stated.outside.air.value + outside, stated.inside.air.value + room, sun], axis=1)
     file = folder / f"{side}-{seed}.csv"
-    np.savetxt(file, table[known], "%.6g", ",", header="hours,outside_c,inside_c,sun_w_m2", comments="")
+    np.savetxt(file, table[hours >= -history_h], "%.6g", ",", header="hours,outside_c,inside_c,sun_w_m2", comments="")
     conditions = replace(stated, weather=Weather(str(file), absorptance=Measured(0.6, 0.2)))
     return Truth(mesh, 0.0, {}, {}, {}, draws), conditions
 
