@@ -211,17 +211,12 @@ class _Wall:
         if self.history is None:
             state = solve_steady(scene(Varying(partial(_always, air_c), in_time=False), far_air_c).problem(mesh, up=up))
             return state.temperature_c[facets].mean(axis=1)
-        ends_s, outside, room = (
-            3600.0 * self.history["hours"],
-            self.history["outside_c"].copy(),
-            self.history["inside_c"],
-        )
+        ends_s, room = 3600.0 * self.history["hours"], self.history["inside_c"]
+        outside = self.history["outside_c"].copy()
         outside[0] += values[_BEFORE]
         sun = values.get(_ABSORPTANCE, 0.0) * self.history["sun_w_m2"]
-        resistance = OUTSIDE_RESISTANCE_M2K_W if inside else 1.0 / coefficient[:, None]
-        open_air = (
-            outside + resistance * sun
-        )  # warmer by what the sun adds (sol-air temperature, Mackey and Wright 1944)
+        # The sun acts like warmer air (sol-air temperature, Mackey and Wright 1944).
+        open_air = outside + (OUTSIDE_RESISTANCE_M2K_W if inside else 1.0 / coefficient[:, None]) * sun
         near, beyond = (room, open_air) if inside else (open_air, room)
         airs = partial(_at, ends_s, air_c[:, None] + near), partial(_at, ends_s, far_air_c + beyond)
         problem = scene(*map(Varying, airs)).problem(mesh, up=up)

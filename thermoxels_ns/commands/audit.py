@@ -140,7 +140,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     calibration = found.calibration
     if calibration is not None:
         told = [f"{name} {interval_text(one, calibration.units[name])}" for name, one in calibration.found.items()]
-        say(f"Calibration: {'; '.join(told) or f'refused. {calibration.refused}'}")
+        say(f"Calibration: {'; '.join(told) or f'refused. {calibration.refused}'} {calibration.doubt}".rstrip())
     photographs, range_c = {}, None
     if scene is not None:
         scale = (export.get("scale") or {}).get("metres_per_unit", 1.0)
