@@ -8,10 +8,7 @@ BEGIN = datetime(2026, 1, 1)
 
 
 def write_epw(path: Path, outside_c: Callable[[float], float], *, hours: int = 8760, mixed_years: bool = False) -> Path:
-    """An .epw file of Geneva (UTC+1) whose air at `h` hours after New Year is `outside_c(h)`; wind 2 m/s, half clouds.
-
-    The sun gives 500 W/m2 of direct light from 10 to 14 o'clock. With `mixed_years` every month has a year of its own.
-    """
+    """An .epw file of Geneva (UTC+1), with air of `outside_c(hours after New Year)`, and direct light at noon."""
     lines = ["LOCATION,Geneva,-,CHE,made up,067000,46.25,6.13,1.0,416.0", *(f"HEADER {n}" for n in range(7))]
     for hour in range(hours):
         begin = BEGIN + timedelta(hours=hour)
