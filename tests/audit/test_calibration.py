@@ -13,12 +13,13 @@ from tests.support.audited_wall import (
     Truth,
     audited_wall,
     calibrated,
+    calibrated_after,
     photographed,
     solve_wall,
     true_draws,
 )
 from thermoxels_ns.audit.calibration import Calibration
-from thermoxels_ns.audit.conditions import Calibrate, Camera, Film, Layer, Unknown
+from thermoxels_ns.audit.conditions import Calibrate, Camera, Film, Layer, Unknown, Weather
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
@@ -148,6 +149,35 @@ def test_intervals_hold_the_truth_though_all_is_off(side) -> None:
     """A small version of ``tests/benchmarks/audit_truth.py --calibrate``."""
     held = [low.low <= true <= low.high for seed in (2, 5, 8) for _, true, low in calibrated(side, seed, STEP_M)]
     assert sum(held) >= len(held) - 1
+
+
+def test_with_the_history_of_the_air_a_wall_after_a_warm_day_comes_out_right(tmp_path) -> None:
+    """One seed of ``tests/benchmarks/audit_truth.py --calibrate --history-h 48``."""
+    true = CONDUCTIVITY["wall"]
+    found, calibration = calibrated_after("outside", 0, tmp_path)
+    steady, _ = calibrated_after("outside", 0, tmp_path, steady=True)
+    assert found.low <= true <= found.high and calibration.history_h == 48.0 and calibration.doubt == ""
+    assert abs(np.log(found.value / true)) < abs(np.log(steady.value / true))
+
+
+def test_a_history_shorter_than_what_the_wall_remembers_leaves_a_doubt_with_its_size(tmp_path) -> None:
+    found, calibration = calibrated_after("outside", 0, tmp_path, 6.0)
+    assert calibration.history_h == 6.0 and found.low < CONDUCTIVITY["wall"] < found.high
+    assert re.search(r"begins 6 h before .*conductivity of wall by \d+ %", calibration.doubt)
+
+
+CAPACITY = {"heat_capacity": {"wall": Measured(1600.0)}}
+
+
+def test_what_a_history_needs_is_said(walls, tmp_path) -> None:
+    with pytest.raises(AuditError, match=r"^heat_capacity: expected one for each of wall, got brick[^\n]*$"):
+        replace(WALL, heat_capacity={"brick": Measured(1600.0)})
+    with pytest.raises(AuditError, match=r"^calibrate: heat_capacity: expected weather beside it[^\n]*$"):
+        calibrate(walls["plain"], replace(WALL, **CAPACITY))
+    (tmp_path / "weather.csv").write_text("hours,wind_m_s\n-5,1\n0,1\n")
+    conditions = replace(OFFSET_ALONE, weather=Weather(str(tmp_path / "weather.csv")))
+    with pytest.raises(AuditError, match=r"^weather: file: expected a column outside_c[^\n]*$"):
+        calibrate(walls["plain"], replace(WALL, **CAPACITY), conditions)
 
 
 @pytest.mark.parametrize(

@@ -25,13 +25,13 @@ from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.audit.conditions import (
     SIMPLE,
     Camera,
+    Energy,
     Film,
     Limits,
     OutsideAir,
     Reference,
     Surface,
     Surroundings,
-    Year,
 )
 from thermoxels_ns.audit.defects import find_defects, undisturbed_temperature
 from thermoxels_ns.audit.draws import COUNT, FORMULA, Interval, draw, interval_of
@@ -162,19 +162,18 @@ def test_what_freezing_takes_from_an_interval_is_what_stating_it_exactly_takes(w
         assert "camera offset" not in narrow.width_shares
 
 
-def test_storeys_divide_the_whole_and_a_heating_season_is_coupling_times_degree_days(walls) -> None:
+def test_storeys_divide_the_whole_and_a_year_is_coupling_times_degree_hours(walls) -> None:
     storeys = {"upper": Measured(1.5), "lower": Measured(0.0)}
-    year = Year(Measured(3000.0), price=Measured(0.1), currency="EUR", co2=Measured(0.2))
-    stated, mesh = replace(STATED, storeys=storeys, year=year), photographed(walls["plain"], STATED)
+    year = Energy(Measured(3000.0), price=Measured(0.1), currency="EUR", co2=Measured(0.2))
+    stated, mesh = replace(STATED, storeys=storeys, energy=year), photographed(walls["plain"], STATED)
     found = audit(mesh, stated, UP)
     assert {one.name for one in found.storeys} == {"lower", "upper"}
     assert sum(one.area_m2 for one in found.storeys) == pytest.approx(found.whole.area_m2)
     assert sum(one.loss_w.value for one in found.storeys) == pytest.approx(found.whole.loss_w.value)
     assert sum(one.loss_w.high for one in found.storeys) == pytest.approx(found.whole.loss_w.high, rel=0.01)
     heat = found.whole.loss_w.value / 20.0 * 3000.0 * 0.024
-    assert found.year is not None and found.year.cost is not None and found.year.co2_kg is not None
-    assert found.year.heat_kwh.value == pytest.approx(heat)
-    assert (found.year.cost.value, found.year.co2_kg.value) == pytest.approx((0.1 * heat, 0.2 * heat))
+    year = found.energy.whole
+    assert (year.heat_kwh.value, year.cost.value, year.co2_kg.value) == pytest.approx((heat, 0.1 * heat, 0.2 * heat))
     again = audit(mesh, stated, UP)  # draws are the same each time
     assert again.whole == found.whole and np.array_equal(again.triangle_u, found.triangle_u, equal_nan=True)
 
@@ -403,8 +402,8 @@ def test_without_the_air_outside_heat_flow_is_told_and_nothing_that_needs_it() -
     assert any("air outside is not known" in one for one in found.check.doubts)
     assert not any("Taken as exact" in one and "outside air" in one for one in found.check.doubts)
     assert "air temperature outside" in found.check.missing
-    with pytest.raises(AuditError, match=r"outside: air: expected a temperature beside year"):
-        replace(unknown, year=Year(Measured(3000.0)))
+    with pytest.raises(AuditError, match=r"outside: air: expected a temperature beside energy"):
+        replace(unknown, energy=Energy(Measured(3000.0)))
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
-"""The weather before a survey, from a csv file, and what a wall still remembers of it."""
+"""The weather before a survey, from csv and .epw files, and what a wall still remembers of it."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import yaml
 from scipy.optimize import brentq
 
 from tests.support.audited_wall import UP, audited_wall
+from tests.support.epw_file import write_epw
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.audit.conditions import load_conditions
 from thermoxels_ns.audit.run import audit
@@ -68,6 +70,46 @@ def test_an_audit_says_what_walls_remember_and_what_the_file_is_too_short_for(co
     assert found.remembered is not None and 0.1 < found.remembered.low < found.remembered.value < found.remembered.high
     told = [one for one in found.check.doubts if "stores heat" in one or "too late" in one]
     assert len(told) == 1 + too_late and f"{100 * found.remembered.high:+.0f} %" in told[0]
+
+
+def test_an_epw_file_of_the_year_of_the_survey_gives_its_weather(conditions, tmp_path) -> None:
+    """Survey at noon of 10 January in Geneva, 228 hours after New Year; south walls get the most sun."""
+    write_epw(tmp_path / "geneva.epw", lambda h: 0.05 * h - 10.0, hours=480)
+    stated = {"survey": {"date": "2026-01-10T12:00:00+01:00"}, "inside": {"air": "20 C"}}
+    found = conditions(weather={"file": "geneva.epw"}, **stated)
+    assert found.outside.air.value == pytest.approx(0.05 * 228.0 - 10.0) and found.outside.wind.value == 2.0
+    assert found.surroundings.sky.cloud.value == 0.5 and found.outside.lowest_24h.value == pytest.approx(0.2)
+    suns = {
+        facing: conditions(weather={"file": "geneva.epw", "facing": f"{facing} deg"}, **stated).history()["sun_w_m2"]
+        for facing in (0, 180)
+    }
+    assert len(suns[0]) == 228 and suns[180].max() > 400.0 > 120.0 > suns[0].max() > 40.0
+    assert found.history()["sun_w_m2"].max() < suns[180].max()
+    night = found.history()["hours"] % 24.0 == 12.0  # midnight
+    assert night.any() and not suns[180][night].any()
+
+
+@pytest.mark.parametrize(
+    ("date", "hours", "mixed"),
+    [
+        ("2025-01-10T12:00:00", 480, False),
+        ("2026-03-10T12:00:00", 480, False),
+        (None, 480, False),
+        ("2026-02-10T12:00:00", 1440, True),
+        ("2026-01-10T12:00:00", 0, False),
+    ],
+)
+def test_an_epw_file_that_does_not_know_the_survey_is_one_clear_error(conditions, tmp_path, date, hours, mixed) -> None:
+    write_epw(tmp_path / "geneva.epw", lambda h: 0.0, hours=hours, mixed_years=mixed)
+    with pytest.raises(AuditError, match=r"^weather: file: .*geneva\.epw: expected [^\n]*$"):
+        conditions(weather={"file": "geneva.epw"}, survey={"date": date} if date else {})
+
+
+def test_without_pvlib_an_epw_file_asks_for_it(conditions, tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "pvlib", None)
+    write_epw(tmp_path / "geneva.epw", lambda h: 0.0, hours=480)
+    with pytest.raises(AuditError, match=r"pip install 'thermoxels-ns\[weather\]'"):
+        conditions(weather={"file": "geneva.epw"}, survey={"date": "2026-01-10T12:00:00"})
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,9 @@ the solved mesh itself ("no training"), so that what reconstruction adds shows. 
 ``audit_truth.csv`` in the output folder, written as they come; seeds that are there are not run again.
 
 With --calibrate conductivities are estimated instead, from starts that are off by factors of two: of wall and glazing
-from outside with a contact temperature, of the wall from inside. With --balance the formula of convection is drawn,
+from outside with a contact temperature, of the wall from inside. With --calibrate --history-h 48 the wall (of a time
+constant of 12 h) is photographed after a warm day, and its conductivity is found with that many hours of the air before
+the survey, and as if heat flow were steady. With --balance the formula of convection is drawn,
 too, for the truth as for the audits, and a calm, clear night is added, whose sky cools the wall below the air.
 """
 
@@ -29,6 +31,7 @@ from dataclasses import astuple, dataclass, replace
 from io import StringIO
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
@@ -45,6 +48,7 @@ from tests.support.audited_house import (
     patches_yaml,
 )
 from tests.support.audited_wall import (
+    CONDUCTIVITY,
     INSIDE,
     LENGTH_M,
     NIGHT,
@@ -53,6 +57,7 @@ from tests.support.audited_wall import (
     Truth,
     audited_wall,
     calibrated,
+    calibrated_after,
     photographed,
     solve_wall,
     true_draws,
@@ -206,6 +211,8 @@ class AuditTruth:
     """Size of the cells, [m]."""
     calibrate: bool = False
     """Estimate conductivities instead."""
+    history_h: float = 0.0
+    """Of --calibrate: photograph after a warm day, of which the weather file knows so many hours; 0: steady, [h]."""
     balance: bool = False
     """Draw the formula of convection."""
     trained: Literal["draft", "standard"] | None = None
@@ -217,6 +224,14 @@ class AuditTruth:
         rows: Rows = {}
         if self.trained:
             return run_trained(self.output, self.trained, self.seeds)
+        if self.calibrate and self.history_h > 0.0:
+            with TemporaryDirectory() as folder:
+                for seed, side, steady in product(range(self.seeds), ("outside", "inside"), (False, True)):
+                    how = f"{side}, {'as if steady' if steady else f'{self.history_h:g} h of air'}"
+                    found, _ = calibrated_after(side, seed, Path(folder), self.history_h, steady)
+                    rows.setdefault((how, "conductivity of wall"), []).append((CONDUCTIVITY["wall"], found))
+            report(rows)
+            return
         if self.calibrate:
             for seed, side in product(range(self.seeds), ("outside", "inside")):
                 for name, true, found in calibrated(side, seed, self.step):

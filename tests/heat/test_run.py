@@ -155,7 +155,7 @@ def test_walls_that_came_out_thicker_than_asked_are_named(volume, said) -> None:
 @pytest.mark.parametrize("time", [TimeSteps(2, 3600.0), AdaptiveSteps(7200.0)])
 def test_a_series_that_ends_before_the_run_is_named(tmp_path, time) -> None:
     path = tmp_path / "air.csv"
-    path.write_text("hours,air_c\n0,10\n1,12\n")
+    path.write_text("hours,outside_c\n0,10\n1,12\n")
     airs = {"outside_air": OutsideAir(10.0, "iso-6946-combined", air_series=str(path))}
     (warning,) = unused_settings(HeatScene(CONCRETE, time, **airs))
     scene = HeatScene(CONCRETE, time, adiabatic=("interior*", "cut"), **airs)

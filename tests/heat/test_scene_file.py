@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.support.epw_file import write_epw
 from tests.support.scene_bodies import room
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.quantities import Places, Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
@@ -163,14 +164,16 @@ def test_unknown_names_and_paths(tmp_path) -> None:
             load_heat_scene(name)
 
 
-def with_series(tmp_path: Path, series: str, time: str = "time: {duration_s: 36000.0}") -> HeatScene:
-    (tmp_path / "outside.csv").write_text(series, encoding="utf-8")
+def with_series(
+    tmp_path: Path, content: str, time: str = "time: {duration_s: 36000.0}", series: str = "outside.csv"
+) -> HeatScene:
+    (tmp_path / "outside.csv").write_text(content, encoding="utf-8")
     text = f"""
 materials: {{"*": concrete}}
 {time}
 initial: {{temperature_c: 10.0}}
 inside_air: {{air_c: 20.0, coefficient_w_m2k: 8.0}}
-outside_air: {{air_c: 0.0, air_series: outside.csv, coefficient_w_m2k: 25.0, patches: [exterior-side, exterior-down]}}
+outside_air: {{air_c: 0.0, air_series: {series}, coefficient_w_m2k: 25.0, patches: [exterior-side, exterior-down]}}
 surfaces: [{{patches: [exterior-up], emissivity: 0.9}}]
 sky: {{below_air_k: 20.0}}
 """
@@ -179,7 +182,7 @@ sky: {{below_air_k: 20.0}}
 
 def test_air_follows_the_file_beside_the_scene_and_the_sky_follows_the_air(tmp_path) -> None:
     mesh = room()
-    found = with_series(tmp_path, "hours,air_c\n0,-4\n2,6.0\n\n10, 6\n")
+    found = with_series(tmp_path, "hours,outside_c\n0,-4\n2,6.0\n\n10, 6\n")
     inside, outside, sky = found.effects(mesh)
     assert isinstance(inside, Convection) and inside.air_c == 20.0
     assert isinstance(outside, Convection) and isinstance(sky, Radiation)
@@ -192,15 +195,29 @@ def test_air_follows_the_file_beside_the_scene_and_the_sky_follows_the_air(tmp_p
     assert varying.in_time and varying.resolution_s == 7200.0  # no step is longer than the file's shortest interval
 
 
+def test_air_follows_an_epw_file_over_the_end_of_its_year(tmp_path) -> None:
+    """The scene starts at noon of 31 December 2031; the file, of 2026, begins again at New Year."""
+    write_epw(tmp_path / "outside.epw", lambda h: 0.001 * h)
+    series = "outside.epw, air_start: 2031-12-31T12:00:00+01:00"
+    outside = with_series(tmp_path, "", series=series).effects(room())[1]
+    for hours, air_c in ((0.0, 8.748), (6.5, 8.7545), (15.0, 0.003)):
+        places = Places(np.zeros((1, 3)), np.zeros((1, 3)))
+        assert outside.bounded("air_c").at(places, 3600.0 * hours) == pytest.approx(air_c, abs=1e-3)
+    for wrong in ("outside.epw", "outside.csv, air_start: 2031-12-31T12:00:00+01:00"):
+        with pytest.raises(HeatError, match="outside_air: air_start: expected a date"):
+            with_series(tmp_path, "hours,outside_c\n0,1\n1,2\n", series=wrong)
+
+
 @pytest.mark.parametrize(
     ("series", "named"),
     [
+        ("hours,inside_c\n0,1\n1,2\n", "outside_air: air_series: .*expected a column outside_c"),
         ("time,air\n0,1\n", "air_series: .*outside.csv"),
         ("", "air_series"),
-        ("hours,air_c\n0,cold\n1,2\n", "air_series"),
-        ("hours,air_c\n0,1,2\n1,2,3\n", "air_series"),
-        ("hours,air_c\n0,1\n", "table: expected at least two times"),
-        ("hours,air_c\n0,1\n1,-300\n", "air_c"),
+        ("hours,outside_c\n0,cold\n1,2\n", "air_series"),
+        ("hours,outside_c\n0,1,2\n1,2,3\n", "air_series"),
+        ("hours,outside_c\n0,1\n", "air_series: .*outside.csv"),
+        ("hours,outside_c\n0,1\n1,-300\n", "air_c"),
     ],
 )
 def test_a_series_that_cannot_be_used_is_refused(tmp_path, series, named) -> None:
@@ -210,10 +227,10 @@ def test_a_series_that_cannot_be_used_is_refused(tmp_path, series, named) -> Non
 
 def test_a_series_needs_a_file_and_time(tmp_path) -> None:
     with pytest.raises(HeatError, match="outside_air: air_series: expected time"):
-        with_series(tmp_path, "hours,air_c\n0,1\n1,2\n", time="steady: true")
-    found = with_series(tmp_path, "hours,air_c\n0,1\n1,2\n")
+        with_series(tmp_path, "hours,outside_c\n0,1\n1,2\n", time="steady: true")
+    found = with_series(tmp_path, "hours,outside_c\n0,1\n1,2\n")
     (tmp_path / "outside.csv").unlink()
-    with pytest.raises(HeatError, match="air_series: expected a csv file"):
+    with pytest.raises(HeatError, match=r"air_series: .*outside\.csv: expected"):
         found.effects(room())
 
 

@@ -2,11 +2,14 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from tests.support.heat_meshes import box_mesh, planes
+from thermoxels_ns.audit.calibration import Calibration
 from thermoxels_ns.audit.conditions import (
     BALANCE,
     Calibrate,
@@ -21,6 +24,7 @@ from thermoxels_ns.audit.conditions import (
     Surface,
     Surroundings,
     Unknown,
+    Weather,
 )
 from thermoxels_ns.audit.draws import FORMULA, Draws, Interval, draw, emissivity_name
 from thermoxels_ns.audit.exchange import radiant_k4
@@ -28,10 +32,12 @@ from thermoxels_ns.audit.heat_flow import CONVECTION
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
-from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Places, Varying, tabulated
+from thermoxels_ns.fem.runge_kutta import SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.heat.effects import Convection, Radiation
+from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Radiation
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.results import heat_results
 from thermoxels_ns.heat.scene_fields import INSIDE_RESISTANCE_M2K_W
@@ -243,3 +249,85 @@ def calibrated(side: Side, seed: int, step: float = 0.1) -> Iterator[tuple[str, 
     assert found is not None and not found.refused, found
     for name in names:
         yield f"conductivity of {name}", CONDUCTIVITY[name], found.found[f"conductivity of {name}"]
+
+
+CAPACITY_KJ_M3K = 980.0  # The slowest mode of the wall, with films of 12.5 and 7.7 W/(m2 K), decays within 12 h
+_BEFORE_H = 120.0  # How long before the survey the true weather begins
+
+
+@cache
+def after_a_warm_day(
+    side: Side, seed: int, folder: Path, history_h: float = 48.0, step: float = 1.0
+) -> tuple[Truth, Conditions]:
+    """A wall that is followed through 120 h of weather of its own; the conditions know the last `history_h` of it.
+
+    The air outside has a daily wave of 4 to 8 K, a trend and weather of its own; the sun shines on the wall by day, the
+    room is 2 K colder at night. The survey is at five in the morning. The truth is solved on cells of 12.5 mm.
+    """
+    stated = STATED if side == "outside" else INSIDE
+    draws, own = true_draws(stated, seed), np.random.default_rng((seed, 13))
+    value = {name: float(values[0]) for name, values in draws.values.items()}
+    hours = np.arange(-_BEFORE_H, 1.0)
+    clock = (hours + 5.0) % 24.0
+    outside = own.uniform(4.0, 8.0) * np.cos(2.0 * np.pi * (clock - 15.0) / 24.0) + own.uniform(-0.05, 0.05) * hours
+    outside += np.convolve(own.normal(0.0, 1.0, len(hours) + 11), np.ones(12) / 6.0, "valid")
+    outside -= outside[-1]
+    room = np.where((clock >= 6.0) & (clock < 22.0), 2.0, 0.0)
+    sun = (
+        own.uniform(0.0, 300.0) * np.maximum(np.sin(np.pi * (clock - 8.0) / 9.0), 0.0) * (clock > 8.0) * (clock < 17.0)
+    )
+    absorptance, capacity = own.uniform(0.4, 0.8), CAPACITY_KJ_M3K * own.uniform(0.9, 1.1)
+
+    def changes(values: npt.NDArray[np.float64], time_s: float) -> float:
+        return float(np.interp(time_s / 3600.0 - _BEFORE_H, hours, values))
+
+    def around_c(places: Places, time_s: float) -> npt.NDArray[np.float64]:
+        if side == "inside":
+            return np.full(len(places), value["reflected temperature"] + changes(room, time_s))
+        moved = {name: draws[name] + changes(outside, time_s) for name in ("outside air", "dew point")}
+        return radiant_c(stated, Draws({**draws.values, **moved}), places.normals)
+
+    def air(name: str, values: npt.NDArray[np.float64]) -> Varying:
+        return tabulated(3600.0 * (hours + _BEFORE_H), value[name] + values)
+
+    near, far = ("x1", "x0") if side == "inside" else ("x0", "x1")
+    film = value["film factor"] * (2.5 if side == "inside" else 4.0 + 4.0 * value["wind"])
+    airs = {"x0": air("outside air", outside), "x1": air("inside air", room)}
+    effects = (
+        Convection((near,), film, airs[near]),
+        Convection((far,), 25.0 if side == "inside" else 1.0 / R_INSIDE, airs[far]),
+        Radiation((near,), value[emissivity_name(stated, 0)], Varying(around_c)),
+        AbsorbedSolar(("x0",), absorptance, tabulated(3600.0 * (hours + _BEFORE_H), sun)),
+    )
+    column = box_mesh(planes(0.0, WALL_M, step=0.0125), [0.0, 1.0], [0.0, 1.0])
+    material = Material("wall", CONDUCTIVITY["wall"], 1000.0, capacity)
+    problem = HeatProblem(column, material, np.full(len(column.points_m), 10.0), effects, UP)
+    start_c = solve_steady(problem).temperature_c
+    problem = replace(problem, initial_temperature_c=start_c)
+    end_c = solve_heat(problem, TimeSteps(160, 2700.0), scheme=SDIRK2).temperature_c[-1]
+    depth, first = np.unique(column.points_m[:, 0], return_index=True)
+    mesh = audited_wall(step, slab=False, window=False, side=side)
+    mesh = replace(mesh, temperature_c=np.interp(mesh.points_m[:, 1], depth, end_c[first]))
+    table = np.stack([hours, stated.outside.air.value + outside, stated.inside.air.value + room, sun], axis=1)
+    file = folder / f"{side}-{seed}.csv"
+    np.savetxt(file, table[hours >= -history_h], "%.6g", ",", header="hours,outside_c,inside_c,sun_w_m2", comments="")
+    conditions = replace(stated, weather=Weather(str(file), absorptance=Measured(0.6, 0.2)))
+    return Truth(mesh, 0.0, {}, {}, {}, draws), conditions
+
+
+def calibrated_after(
+    side: Side, seed: int, folder: Path, history_h: float = 48.0, steady: bool = False
+) -> tuple[Interval, Calibration]:
+    """Calibrate the conductivity of a wall `after_a_warm_day`, with its history or as if heat flow were steady."""
+    truth, conditions = after_a_warm_day(side, seed, folder, history_h)
+    conditions = with_contact(conditions, truth, seed) if side == "outside" else conditions
+    capacity = {} if steady else {"wall": Measured(CAPACITY_KJ_M3K, 0.1 * CAPACITY_KJ_M3K)}
+    asked = Calibrate(
+        {"wall": Measured(2.0 * CONDUCTIVITY["wall"])},
+        (Unknown("conductivity", "wall"),),
+        behind=("room",) if side == "outside" else ("facade",),
+        heat_capacity=capacity,
+    )
+    found = audit(photographed(truth, conditions, seed), replace(conditions, calibrate=asked), UP).calibration
+    assert found is not None and not found.refused, found
+    return found.found["conductivity of wall"], found

@@ -1,14 +1,16 @@
 """Calibration: find the properties of walls for which computed surface temperatures agree with measured ones.
 
-The package `heat` computes steady heat flow through the mesh, with the conditions' film model on the photographed side
-and ISO 6946 on the other side. Gauss-Newton's method finds the logarithms of the unknown properties with the least sum
-of squared differences, weighted by area (Beck and Arnold 1977, Parameter Estimation in Engineering and Science).
+The package `heat` computes heat flow through the mesh, with the conditions' film model on the photographed side and ISO
+6946 on the other side: steady, or with heat capacities from the beginning of the weather file on. Gauss-Newton's method
+finds the logarithms of the unknown properties with the least sum of squared differences, weighted by area (Beck and
+Arnold 1977, Parameter Estimation in Engineering and Science).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -20,15 +22,23 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin
+from thermoxels_ns.fem.problem import GivenSteps
 from thermoxels_ns.fem.quantities import Places, Varying
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER
 from thermoxels_ns.fem.selection import matching_names
 from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import inside_coefficient, outside_coefficient
+from thermoxels_ns.heat.scene_fields import OUTSIDE_RESISTANCE_M2K_W, inside_coefficient, outside_coefficient
 
-_UNITS = {"conductivity": "W/(m K)", "thickness": "m", "film": "W/(m2 K)"}
+_UNITS = {"conductivity": "W/(m K)", "thickness": "m", "film": "W/(m2 K)", "capacity": "kJ/(m3 K)"}
+_BEFORE, _ABSORPTANCE = "air before the weather file", "absorptance of the walls"  # Uncertain with a history alone
+_LEAST_STEP_H, _STEPS_OF_AN_AGE = 0.125, 4.0  # Shortest time step; longer ones are a quarter of the time to the survey
+_UNSEEN_DAY_K = 10.0  # How far air and sun before a file of less than a day may be off what its first hours say
+_LINEAR = 1e-9  # Relative tolerance of the linear equations of a time step
+_TOLD_SHARE = 0.05  # Least share by which the air before the file may move a property without a sentence
 _STEP = 1e-4  # Step of difference quotients with respect to the logarithm of a property
 _MOST_STEP, _ENOUGH, _MOST_STEPS = 1.0, 1e-3, 30  # Largest step and stopping step of logarithms; most steps
 _FAR = 4.0  # A property whose logarithm moves farther than this from the start is not determined
@@ -49,6 +59,8 @@ class Calibration:
     misfit_k: float  # Root mean square of measured minus computed surface temperature, weighted by area, [K]
     difference_k: FloatArray
     """Measured minus computed surface temperature, shape (f,), [K]; NaN for triangles outside the fit."""
+    history_h: float = 0.0  # How long before the survey the computed history of the airs begins, [h]; 0: steady
+    doubt: str = ""  # Sentence on a history that is too short; empty if it is long enough
 
 
 def calibrated(
@@ -68,9 +80,10 @@ def calibrated(
     difference = np.full(len(surface.counted), np.nan)
     difference[fit.wall.counted] = fit.residual_k
     misfit = float(np.sqrt(fit.weight @ fit.residual_k**2))
+    history_h = fit.wall.history_h
     if refused:
-        return Calibration({}, units, refused, {}, misfit, difference)
-    logarithms, most = fit.spread()
+        return Calibration({}, units, refused, {}, misfit, difference, history_h)
+    logarithms, most, before = fit.spread()
     found = {}
     for name, drawn in zip(names, logarithms):
         one = interval_of(np.exp(np.clip(drawn, -20.0, 20.0)) * fit.start[name])
@@ -78,7 +91,14 @@ def calibrated(
         found[name] = Interval(
             one.value, one.low if one.low > least else 0.0, one.high if one.high < largest else np.inf
         )
-    return Calibration(found, units, "", dict(zip(names, most)), misfit, difference)
+    doubt = ""
+    if np.expm1(before).max() >= _TOLD_SHARE:
+        moved = ", ".join(f"{name} by {100.0 * share:.0f} %" for name, share in zip(names, np.expm1(before)))
+        doubt = (
+            f"The weather file begins {history_h:g} h before the survey, too late for what this wall remembers: from "
+            f"the warmest to the coldest air that may have been before, {moved}; that is in the intervals."
+        )
+    return Calibration(found, units, "", dict(zip(names, most)), misfit, difference, history_h, doubt)
 
 
 class _Wall:
@@ -116,15 +136,57 @@ class _Wall:
             expected = "one for every region of the mesh"
             raise AuditError("calibrate: conductivity", expected=expected, got=f"none for {unknown[0]}", remedy=remedy)
         self._film = {name: self._on("film", self.seen, (name,)) for name in asked.film}
+        self.history = self._history() if asked.heat_capacity else None
+        self.stated = asked.stated()
+        if self.history is not None:
+            change_k, weather = self.history["outside_c"], conditions.weather
+            unseen_k = _UNSEEN_DAY_K if self.history_h < 24.0 else 0.0
+            self.stated[_BEFORE] = Measured(0.0, max(0.5 * float(np.ptp(change_k)), unseen_k))
+            if self.history["sun_w_m2"].any() and weather is not None:
+                self.stated[_ABSORPTANCE] = weather.absorptance
+
+    @property
+    def history_h(self) -> float:
+        """How long before the survey the history begins, [h]; 0 without one."""
+        return 0.0 if self.history is None else float(self.history["hours"][-1])
+
+    def _history(self) -> dict[str, FloatArray]:
+        """Return hours since the beginning of the weather file, the ends of time steps, and means over each step.
+
+        Airs are minus those at the survey, [K]. The first value is that before: the mean of the first day. The last is
+        that at the survey. Steps are the longer the earlier they are, as walls forget details first.
+        """
+        series = self.conditions.history()
+        if "outside_c" not in series:
+            remedy = "Add it, or remove heat_capacity from calibrate for steady heat flow."
+            raise AuditError("weather: file", expected="a column outside_c", got=", ".join(series), remedy=remedy)
+        hours, ages = series["hours"] - series["hours"][0], [0.0]
+        while ages[-1] < hours[-1]:
+            step = max(_LEAST_STEP_H, 2.0 ** np.floor(np.log2(max(ages[-1], _LEAST_STEP_H) / _STEPS_OF_AN_AGE)))
+            ages.append(min(ages[-1] + step, hours[-1]))
+        ends = hours[-1] - np.array(ages[::-1])
+        grid = np.union1d(hours, ends)
+        found = {"hours": ends}
+        for name in ("outside_c", "inside_c", "sun_w_m2"):
+            values = series.get(name, np.zeros(len(hours)))
+            values = np.interp(grid, hours, values - (0.0 if name == "sun_w_m2" else values[-1]))
+            total = np.append(0.0, np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(grid)))
+            day = min(24.0, hours[-1])
+            before = np.interp(day, grid, total) / day
+            means = np.diff(np.interp(ends, grid, total)) / np.diff(ends)
+            found[name] = np.concatenate([[before], means[:-1], values[-1:]])
+        return found
 
     def measured_c(self, draws: Draws) -> FloatArray:
         """Return the corrected temperature of every triangle in `counted`, shape (c,), [degrees Celsius]."""
         return triangle_exchange(self.conditions, self.surface, self.groups, draws)[0][self.counted]
 
     def computed_c(self, values: Mapping[str, float], draws: Draws, measured_c: FloatArray) -> FloatArray:
-        """Return the steady temperature of every triangle in `counted`, shape (c,), for `values` of all properties.
+        """Return the temperature of every triangle in `counted`, shape (c,), for `values` of all properties.
 
-        The film on the photographed side is replaced by its tangent at the measured temperature.
+        The film on the photographed side is replaced by its tangent at the measured temperature. With a history, the
+        body begins in the steady state of the first day and is followed to the survey by backward Euler; what the
+        surface radiates to is then as much warmer or colder than at the survey as the air.
         """
         mesh, names = self.surface.mesh, np.array(self.surface.selection.patch_names)
         start_c = np.full(len(self.surface.counted), float(measured_c.mean()))
@@ -133,19 +195,36 @@ class _Wall:
         inside = self.conditions.side == "inside"
         far_air_c = float(draws["outside air" if inside else "inside air"][0])
         far = self._far_side(values)
-
-        def acting(facets: IntArray, coefficient: FloatArray, air_c: Varying | float) -> Convection:
-            patches = tuple(names[np.unique(self.surface.selection.facet_patch[facets])].tolist())
-            return Convection(patches, Varying(lambda *_: coefficient, in_time=False), air_c)
-
         materials = {
-            name: Material(name, values[f"conductivity of {name}"], 1000.0, 1000.0) for name in self.asked.conductivity
+            name: Material(name, values[f"conductivity of {name}"], 1000.0, values.get(f"capacity of {name}", 1000.0))
+            for name in self.asked.conductivity
         }
-        near = acting(self.seen, coefficient, Varying(lambda *_: air_c, in_time=False))
-        films = near, acting(self.behind, far, far_air_c)
-        scene = HeatScene(materials, convection=films, adiabatic=self.asked.adiabatic, initial_c=far_air_c)
-        state = solve_steady(scene.problem(mesh, up=self.surface.selection.up))
-        return state.temperature_c[mesh.facets[self.counted]].mean(axis=1)
+
+        def scene(near_c: Varying | float, far_c: Varying | float) -> HeatScene:
+            films = []
+            for facets, film, air in ((self.seen, coefficient, near_c), (self.behind, far, far_c)):
+                patches = tuple(names[np.unique(self.surface.selection.facet_patch[facets])].tolist())
+                films.append(Convection(patches, Varying(partial(_always, film), in_time=False), air))
+            return HeatScene(materials, convection=tuple(films), adiabatic=self.asked.adiabatic, initial_c=far_air_c)
+
+        up, facets = self.surface.selection.up, mesh.facets[self.counted]
+        if self.history is None:
+            state = solve_steady(scene(Varying(partial(_always, air_c), in_time=False), far_air_c).problem(mesh, up=up))
+            return state.temperature_c[facets].mean(axis=1)
+        ends_s, room = 3600.0 * self.history["hours"], self.history["inside_c"]
+        outside = self.history["outside_c"].copy()
+        outside[0] += values[_BEFORE]
+        sun = values.get(_ABSORPTANCE, 0.0) * self.history["sun_w_m2"]
+        # The sun acts like warmer air (sol-air temperature, Mackey and Wright 1944).
+        open_air = outside + (OUTSIDE_RESISTANCE_M2K_W if inside else 1.0 / coefficient[:, None]) * sun
+        near, beyond = (room, open_air) if inside else (open_air, room)
+        airs = partial(_at, ends_s, air_c[:, None] + near), partial(_at, ends_s, far_air_c + beyond)
+        problem = scene(*map(Varying, airs)).problem(mesh, up=up)
+        start_c = solve_steady(problem).temperature_c
+        steps = GivenSteps(float(ends_s[-1]), (np.diff(ends_s),))
+        problem = replace(problem, initial_temperature_c=start_c)
+        found = solve_heat(problem, steps, scheme=BACKWARD_EULER, relative_tolerance=_LINEAR)
+        return found.temperature_c[-1][facets].mean(axis=1)
 
     def _photographed_side(
         self, values: Mapping[str, float], draws: Draws, at_c: FloatArray
@@ -196,13 +275,23 @@ class _Wall:
         return np.isin(patch, [names.index(name) for name in chosen_names(f"calibrate: {entry}", there, patterns)])
 
 
+# Functions of places and time for `Varying`.
+def _always(value: FloatArray, *_: object) -> FloatArray:
+    return value
+
+
+def _at(times_s: FloatArray, values: FloatArray, _: object, time_s: float) -> FloatArray:
+    """Return the column of `values`, (k, t) or (t,), at the entry of `times_s` nearest to a time."""
+    return values[..., int(np.argmin(np.abs(times_s - time_s)))]
+
+
 class _Fit:
     """The least-squares fit for the stated values, and its change with every uncertain quantity."""
 
     def __init__(self, wall: _Wall, draws: Draws) -> None:
         self.wall, self.draws = wall, draws
         self.names = [one.name() for one in wall.asked.unknown]
-        self.stated = wall.asked.stated()
+        self.stated = wall.stated
         self.start = {name: self.stated[name].value for name in self.names}
         area = wall.surface.area_m2[wall.counted]
         self.weight = area / area.sum()
@@ -301,8 +390,9 @@ class _Fit:
             variance += off**2 / 3.0 * moved**2
         return np.sqrt(variance)
 
-    def spread(self) -> tuple[FloatArray, list[str]]:
-        """Return the logarithms of the properties in every draw, (m, k), and which quantity moves each property most.
+    def spread(self) -> tuple[FloatArray, list[str], FloatArray]:
+        """Return the logarithms of the properties in every draw, (m, k), which quantity moves each property most, and
+        by how much the air before the weather file moves each, (m,).
 
         For each quantity that acts on all readings, the fit is repeated at both ends of its range; a parabola stands
         for the values in between; of formulas each is tried. Effects of several quantities add up.
@@ -334,7 +424,7 @@ class _Fit:
         noise[:, 0] = 0.0
         drawn += np.linalg.cholesky(self._noise(gain) + 1e-18 * np.eye(len(drawn))) @ noise
         most = [max(moved, key=lambda name: moved[name][n]) if moved else "" for n in range(len(self.names))]
-        return drawn, most
+        return drawn, most, moved.get(_BEFORE, np.zeros(len(self.names)))
 
     def _uncertain(self) -> dict[str, FloatArray]:
         """Return the draws of uncertain quantities that act on all readings: conditions and known properties."""

@@ -14,12 +14,13 @@ import numpy as np
 from pydantic import Field
 
 from thermoxels_ns.audit.heat_flow import CONVECTION
-from thermoxels_ns.audit.weather import with_weather
+from thermoxels_ns.audit.weather import survey_weather, with_weather
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured, Unit
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, record
+from thermoxels_ns.heat.weather_file import ALL_AROUND_DEG
 
 Share: TypeAlias = Annotated[Measured, Unit("1")]
 Emissivity: TypeAlias = Annotated[Measured, Unit("1", 0.0, 1.0, above=True)]
@@ -189,13 +190,42 @@ class Limits:
 
 
 @record(AuditError)
-class Year:
-    """A heating season, with the price and the carbon dioxide of heat."""
+class Measure:
+    """Something to be done to patches, which then have another U-value."""
 
-    degree_days: Annotated[Measured, Unit("K d")]  # Inside minus outside air, summed over the season
+    patches: Annotated[tuple[str, ...], Field(min_length=1)]  # Names or patterns of patches that were observed
+    u: Annotated[Measured, Unit("W/(m2 K)", 0.0)]  # U-value afterwards
+
+
+@record(AuditError)
+class Energy:
+    """A climate, with the price and the carbon dioxide of heat, for the heat that a year takes."""
+
+    degree_hours: Annotated[Measured, Unit("K d", 0.0, above=True)] | None = None
+    """Inside minus outside air, summed over the hours of a year with heating, in K h or K d; in place of `climate`."""
+    climate: str | None = None
+    """Weather file of a year beside the conditions, .epw or csv with outside_c; in place of `degree_hours`."""
+    inside: Air | None = None  # Temperature inside while it is heated, [degrees Celsius]; beside `climate`
+    heating_limit: Air | None = None  # Hours with a warmer outside air do not count, [degrees Celsius]; as `inside`
     price: Annotated[Measured, Unit("/kWh")] | None = None  # Price of heat, in `currency`
     currency: str = ""
     co2: Annotated[Measured, Unit("kg/kWh")] | None = None  # Carbon dioxide per heat
+    measures: dict[str, Measure] = field(default_factory=dict)  # By name; each alone, on the envelope as it is
+
+    def __post_init__(self) -> None:
+        if (self.degree_hours is None) == (self.climate is None):
+            got = "neither" if self.climate is None else "both"
+            remedy = "Write climate: place.epw, or degree_hours: 80000 +- 5000 K h."
+            raise AuditError("", expected="either climate or degree_hours", got=got, remedy=remedy)
+        for name, value in (("inside", self.inside), ("heating_limit", self.heating_limit)):
+            if (value is None) != (self.climate is None):
+                expected, got = "one beside climate, and none beside degree_hours", "none" if value is None else "one"
+                remedy = f"Add {name}: {20 if name == 'inside' else 15} +- 1 C." if value is None else f"Remove {name}."
+                raise AuditError(name, expected=expected, got=got, remedy=remedy)
+        if self.inside is not None and self.heating_limit is not None and self.heating_limit.high > self.inside.low:
+            expected, got = "surely at most the air inside", f"{self.heating_limit.high:g} above {self.inside.low:g} C"
+            remedy = "Write the outside air above which nobody heats, such as 15 C."
+            raise AuditError("heating_limit", expected=expected, got=got, remedy=remedy)
 
 
 @record(AuditError)
@@ -231,8 +261,15 @@ class Calibrate:
     """Convection coefficient, beside radiation, by name or pattern of photographed patches; replaces the film model."""
     behind: tuple[str, ...] = ("interior-*",)  # Patches in contact with the air on the side not photographed
     adiabatic: tuple[str, ...] = ("cut",)  # Patches that no heat crosses
+    heat_capacity: dict[str, Annotated[Measured, Unit("kJ/(m3 K)", 0.0, above=True)]] = field(default_factory=dict)
+    """Heat capacity by the names of `conductivity`, [kJ/(m3 K)]: with it, walls store heat from the beginning of the
+    weather file on; empty: heat flow is steady."""
 
     def __post_init__(self) -> None:
+        if self.heat_capacity and set(self.heat_capacity) != set(self.conductivity):
+            expected, got = f"one for each of {', '.join(self.conductivity)}", ", ".join(self.heat_capacity)
+            remedy = "Write 1600 +- 300 kJ/(m3 K) for masonry, for example."
+            raise AuditError("heat_capacity", expected=expected, got=got, remedy=remedy)
         both = sorted(set(self.conductivity) & set(self.layers))
         if both:
             remedy = "Give the layer another name."
@@ -252,6 +289,7 @@ class Calibrate:
         every = {f"conductivity of {name}": value for name, value in self.conductivity.items()}
         every |= {f"conductivity of {name}": layer.conductivity for name, layer in self.layers.items()}
         every |= {f"thickness of {name}": layer.thickness for name, layer in self.layers.items()}
+        every |= {f"capacity of {name}": value for name, value in self.heat_capacity.items()}
         return every | {f"film of {name}": value for name, value in self.film.items()}
 
 
@@ -259,10 +297,14 @@ class Calibrate:
 class Weather:
     """A file of the weather before the survey; entries that say "weather" instead of a number take theirs from it."""
 
-    file: str  # Csv file beside the conditions; its first line names hours (0: the survey) and columns of `COLUMNS`
+    file: str
+    """File beside the conditions: csv, whose first line names hours (0: the survey) and columns of `COLUMNS`, or .epw
+    of the year of the survey, whose date has to be stated."""
     time_constant: Annotated[Measured, Unit("h", 0.0, above=True)] | None = None
     """Time in which a change of the air fades in the walls, [h]; the audit then says what they still remember."""
     absorptance: Annotated[Measured, Unit("1", 0.0, 1.0)] = Measured(0.6, 0.2)  # Of the walls for sunlight
+    facing: Annotated[Measured, Unit("degrees")] | None = None
+    """Direction that the walls face, clockwise from north, for the sunlight of an .epw file; None: all around."""
 
 
 @record(AuditError)
@@ -282,7 +324,7 @@ class Conditions:
     """Height of the floor of each storey above the lowest point of the mesh, [m], by name of the storey."""
     survey: Survey = field(default_factory=Survey)
     limits: Limits = field(default_factory=Limits)
-    year: Year | None = None
+    energy: Energy | None = None
     calibrate: Calibrate | None = None
     weather: Weather | None = None
     title: str = ""
@@ -299,11 +341,14 @@ class Conditions:
         if self.side == "outside" and model not in WINDLESS and self.outside.wind is None:
             expected, remedy = f"a speed, because {model} needs it", "Add wind: 1.5 +- 0.5 m/s, for example."
             raise AuditError("outside: wind", expected=expected, got="none", remedy=remedy)
-        needed = {"calibrate": self.calibrate is not None, "year": self.year is not None}
+        needed = {"calibrate": self.calibrate is not None, "energy": self.energy is not None}
         for name, there in {"seen from outside": self.side == "outside", **needed}.items():
             if there and not self.outside_known:
                 remedy = "Add air: 0.0 +- 0.5 C, as measured or from a weather station."
                 raise AuditError("outside: air", expected=f"a temperature beside {name}", got="none", remedy=remedy)
+        if self.calibrate is not None and self.calibrate.heat_capacity and self.weather is None:
+            remedy = "Add weather: {file: weather.csv}, or remove heat_capacity for steady heat flow."
+            raise AuditError("calibrate: heat_capacity", expected="weather beside it", got="none", remedy=remedy)
         if inside.low <= outside.high:
             expected = "air that is warmer than outside by more than both may be off"
             got = f"{inside.value:g} +- {inside.off_by:g} C inside, {outside.value:g} +- {outside.off_by:g} C outside"
@@ -317,6 +362,12 @@ class Conditions:
     def outside_known(self) -> bool:
         """True if the conditions state an air temperature outside."""
         return math.isfinite(self.outside.air.value)
+
+    def history(self) -> dict[str, FloatArray]:
+        """Return `survey_weather` of `weather`, which must not be None; raises `AuditError` if the file is unfit."""
+        assert self.weather is not None
+        facing = ALL_AROUND_DEG if self.weather.facing is None else (self.weather.facing.value,)
+        return survey_weather(self.weather.file, self.survey.date, facing)
 
     @property
     def film_shares(self) -> FloatArray:

@@ -23,6 +23,7 @@ from thermoxels_ns.audit.draws import (
     uncertain,
     width_of,
 )
+from thermoxels_ns.audit.energy import EnergyResult, year_of
 from thermoxels_ns.audit.exchange import (
     HALF_STEP_K,
     chunks,
@@ -35,7 +36,7 @@ from thermoxels_ns.audit.exchange import (
 )
 from thermoxels_ns.audit.heat_flow import temperature_factor
 from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
-from thermoxels_ns.audit.weather import read_weather, remembered_share
+from thermoxels_ns.audit.weather import remembered_share
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import AuditError
@@ -54,7 +55,7 @@ F_RSI_M2K_W = (0.13, 0.25)
 """Inside surface resistances Rsi of the temperature factors, [m2 K / W]; ISO 13788 judges mould by the second."""
 _LEAST_FLOW_W_M2 = 1e-9
 _FEW = 2000  # Number of draws that tell by how much a cause widens an interval, and of those of single triangles
-_OF_A_TRIANGLE, _OF_THE_YEAR = 10**6, 10**6 + 1  # Arguments `number` of `Draws.local`, larger than any part's number
+_OF_A_TRIANGLE = 10**6  # Argument `number` of `Draws.local`, larger than any part's number
 
 LEAST_DIFFERENCE_K, MOST_WIND_M_S, LEAST_HOURS_WITHOUT_SUN, LEAST_HOURS_DRY = 10.0, 5.0, 2.0, 24.0
 """Limits of EN 13187: least difference of the airs, most wind, least hours since the sun and since wetness."""
@@ -125,15 +126,6 @@ class Defect:
 
 
 @dataclass(frozen=True)
-class YearResult:
-    """Heat that the observed surface loses in one heating season, with its cost and carbon dioxide."""
-
-    heat_kwh: Interval
-    cost: Interval | None  # In the user's currency
-    co2_kg: Interval | None
-
-
-@dataclass(frozen=True)
 class SurveyCheck:
     """Shortcomings of a survey, in words for the report."""
 
@@ -146,7 +138,7 @@ class SurveyCheck:
 class Audit(HasTables):
     """All results of one audit, with the conditions and the surface that the results follow from.
 
-    It has the tables "patches", "storeys", "defects" and "limits"."""
+    It has the tables "patches", "storeys", "defects", "limits", "energy" and "savings"."""
 
     conditions: Conditions
     surface: AuditedSurface
@@ -157,7 +149,7 @@ class Audit(HasTables):
     defects: tuple[Defect, ...]  # By falling extra heat flow; defects that do not count come last
     found: tuple[FoundDefect, ...]  # Triangles of each defect, in the order of `defects`
     limits: tuple[Limit, ...]
-    year: YearResult | None
+    energy: EnergyResult | None
     calibration: Calibration | None
     f_rsi: tuple[Interval, ...]  # Temperature factors of the coldest square decimetre, see `Defect.f_rsi`
     budget: Mapping[str, float]
@@ -180,7 +172,14 @@ class Audit(HasTables):
         """Return the results by patch, storey, defect and limit; an interval has columns of its own for both ends."""
         patches = lines_of((*self.patches, self.whole))
         others = {name: lines_of(getattr(self, name)) for name in ("storeys", "defects", "limits")}
-        return {"patches": patches, **others}
+        year = self.energy
+        energy = [] if year is None else lines_of((*year.elements, year.whole))
+        return {
+            "patches": patches,
+            **others,
+            "energy": energy,
+            "savings": [] if year is None else lines_of(year.savings),
+        }
 
     def to_pyvista(self) -> pv.PolyData:
         """Return the boundary, as `vtu.boundary_surface`, with the results of each triangle; NaN: does not count."""
@@ -269,6 +268,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     factors = work.temperature_factors(last, work.own_error_k(last))
     loss = work.totals.flow_w[-1] + own[-1]
     drawn = [(one.name, work.u(row, own[row])) for row, one in enumerate(elements[: len(patches)])]
+    energy = year_of(conditions, draws, [(name, elements[n].area_m2, u) for n, (name, u) in enumerate(drawn)])
     psi = [(one, work.coefficients[first + 3 * n]) for n, one in zip(order, defects)]
     left = {why: float(surface.area_m2[surface.why_not == n].sum()) for n, why in enumerate(WHY_NOT.values())}
     return Audit(
@@ -281,7 +281,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
         defects=tuple(defects),
         found=tuple(found),
         limits=_limits(conditions, drawn, psi, loss, factors),
-        year=_year(conditions, draws, loss / draws.difference_k),
+        energy=energy,
         calibration=calibrated(conditions, surface, groups, draws),
         f_rsi=tuple(interval_of(one) for one in factors),
         budget=budget,
@@ -538,21 +538,6 @@ def _failing_models(conditions: Conditions, elements: Sequence[Element]) -> tupl
     return failing
 
 
-def _year(conditions: Conditions, draws: Draws, coupling_w_k: FloatArray) -> YearResult | None:
-    """Return heat, cost and carbon dioxide of a season from draws of the heat loss per kelvin, shape (k,), [W/K]."""
-    year = conditions.year
-    if year is None:
-        return None
-
-    def drawn(what: Measured, number: int) -> FloatArray:
-        return what.value + draws.local(what.off_by, _OF_THE_YEAR + number)
-
-    heat = 0.024 * coupling_w_k * drawn(year.degree_days, 0)
-    cost = None if year.price is None else interval_of(heat * drawn(year.price, 1))
-    co2 = None if year.co2 is None else interval_of(heat * drawn(year.co2, 2))
-    return YearResult(interval_of(heat), cost, co2)
-
-
 def check_survey(conditions: Conditions) -> SurveyCheck:
     """Return what EN 13187 forbids and misses in the conditions of a survey, and what makes results doubtful."""
     survey, wind, difference = conditions.survey, conditions.outside.wind, conditions.difference_k
@@ -619,7 +604,7 @@ def _remembered(conditions: Conditions) -> tuple[Interval | None, tuple[str, ...
     weather = conditions.weather
     if weather is None or weather.time_constant is None:
         return None, ()
-    series, constant, taken = read_weather(weather.file), weather.time_constant, weather.absorptance
+    series, constant, taken = conditions.history(), weather.time_constant, weather.absorptance
     if "outside_c" not in series or not conditions.outside_known:
         remedy = "Add the column outside_c to the weather file, and outside: {air: weather +- 0.5 C}."
         raise AuditError("weather: time_constant", expected="the air outside", got="none", remedy=remedy)

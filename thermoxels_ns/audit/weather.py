@@ -1,8 +1,11 @@
-"""The weather before a survey, read from a csv file, and what a wall still remembers of it."""
+"""The weather before a survey, and what a wall still remembers of it."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +13,9 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.core.yaml_records import raising, wrong
+from thermoxels_ns.heat.weather_file import ALL_AROUND_DEG, read_weather
 
-COLUMNS = ("outside_c", "inside_c", "wind_m_s", "cloud", "dew_point_c", "sun_w_m2")
 _TAKEN = {
     ("inside", "air"): ("inside_c", "C"),
     ("outside", "air"): ("outside_c", "C"),
@@ -23,39 +27,44 @@ _TAKEN = {
 _OUTER, _WALL, _INNER, _CELLS = 0.04, 1.0, 0.13, 60  # Resistances of films and wall, [m2 K / W]; layers of the wall
 
 
-def read_weather(path: Path | str) -> dict[str, FloatArray]:
-    """Return hours, 0 at the survey and negative before, and each column of `COLUMNS` that a csv file has, (k,) each.
+def survey_weather(
+    file: str, date: datetime | None = None, facing_deg: Sequence[float] = ALL_AROUND_DEG
+) -> dict[str, FloatArray]:
+    """Return hours, 0 at the survey and negative before, and each column of `COLUMNS` that the file has, (k,) each.
 
-    The first line names the columns. Raises `AuditError` if the file cannot be read or does not reach the survey.
+    `date` is that of the survey, which an .epw file needs; `facing_deg`: see `read_weather`. Raises `AuditError` if the
+    file cannot be read or does not reach the survey.
     """
-    try:
-        lines = [line for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip(" ,")]
-        head = [part.strip() for part in lines[0].split(",")] if lines else []
-        fits = head[:1] == ["hours"] and set(head[1:]) <= set(COLUMNS) and len(set(head)) == len(head)
-        table = np.loadtxt(lines[1:], delimiter=",", ndmin=2) if fits and len(lines) > 2 else np.zeros((1, 0))
-        fits = table.shape[1] == len(head) > 1 and bool(np.isfinite(table).all() and (np.diff(table[:, 0]) > 0.0).all())
-        got = f"{', '.join(head)} and {len(lines) - 1} lines of numbers"
-    except (OSError, ValueError) as problem:
-        fits, got, table = False, str(problem), np.zeros((1, 1))
-    hours = table.T[0] if fits else np.zeros(1)
-    if not hours[0] < 0.0 <= hours[-1]:
-        expected = f"a first line of hours and some of {', '.join(COLUMNS)}, and hours that grow from below 0 to 0"
-        remedy = "Count hours from the survey, and write hours,outside_c, for example."
-        raise AuditError(f"weather: file: {path}", expected=expected, got=got, remedy=remedy)
+    with raising(AuditError, "weather: file: "):
+        if date is None and file.lower().endswith(".epw"):
+            remedy = "Add survey: {date: 2026-01-15T06:30:00+01:00}."
+            raise wrong(file, "the date of the survey beside an .epw file", "none", remedy)
+        found = read_weather(file, date, facing_deg=facing_deg)
+        hours = found["hours"]
+        if not hours[0] < 0.0 <= hours[-1]:
+            expected, got = "hours that grow from below 0, the survey, to 0", f"{hours[0]:g} to {hours[-1]:g}"
+            raise wrong(file, expected, got, "Count hours from the survey.")
     times = np.append(hours[hours < 0.0], 0.0)
-    return {one: np.interp(times, hours, column) for one, column in zip(head, table.T)}
+    return {one: np.interp(times, hours, column) for one, column in found.items()}
 
 
 def with_weather(content: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return conditions in which each "weather" of `_TAKEN` is the value of the weather file at the survey.
 
     A file of 24 hours and more also tells extremes of the airs, and how long ago the sun shone, if nothing else does.
+    Names of files are taken from `folder` on.
     """
-    weather = content.get("weather")
+    weather, energy = content.get("weather"), content.get("energy")
+    if isinstance(energy, dict) and isinstance(energy.get("climate"), str):
+        energy["climate"] = str(folder / energy["climate"])
     if not isinstance(weather, dict) or not isinstance(weather.get("file"), str):
         return content
     weather["file"] = str(folder / weather["file"])
-    series = read_weather(weather["file"])
+    survey = content.get("survey")
+    date = survey.get("date") if isinstance(survey, dict) else None
+    with suppress(ValueError):  # the check of the conditions says what is wrong with a date
+        date = datetime.fromisoformat(date.replace("Z", "+00:00")) if isinstance(date, str) else date
+    series = survey_weather(weather["file"], date if isinstance(date, datetime) else None)
     for (*path, key), (column, unit) in _TAKEN.items():
         at: Any = content
         for part in path:

@@ -135,10 +135,12 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     whole = found.whole
     say(f"Heat loss: {interval_text(whole.loss_w, 'W')}; U-value: {interval_text(whole.u_w_m2k, 'W/(m2 K)')}.")
     say(f"{sum(not one.not_counted for one in found.defects)} thermal bridges or defects.")
+    if found.energy is not None:
+        say(f"A year: {interval_text(found.energy.whole.heat_kwh, 'kWh')} through what was observed.")
     calibration = found.calibration
     if calibration is not None:
         told = [f"{name} {interval_text(one, calibration.units[name])}" for name, one in calibration.found.items()]
-        say(f"Calibration: {'; '.join(told) or f'refused. {calibration.refused}'}")
+        say(f"Calibration: {'; '.join(told) or f'refused. {calibration.refused}'} {calibration.doubt}".rstrip())
     photographs, range_c = {}, None
     if scene is not None:
         scale = (export.get("scale") or {}).get("metres_per_unit", 1.0)
@@ -233,8 +235,8 @@ def answers_of(options: Audit, found: Found, envelope: Envelope | None = None) -
     from pydantic_core import to_jsonable_python
 
     calibration = found.calibration
-    same = ("conditions", "whole", "patches", "storeys", "defects", "limits", "f_rsi", "year", "not_counted_m2")
-    named = ("found", "units", "refused", "moved_most_by", "misfit_k")
+    same = ("conditions", "whole", "patches", "storeys", "defects", "limits", "f_rsi", "energy", "not_counted_m2")
+    named = ("found", "units", "refused", "moved_most_by", "misfit_k", "history_h", "doubt")
     told = {
         "mesh": options.mesh,
         **{name: getattr(found, name) for name in same},
@@ -267,8 +269,9 @@ def _write(
 
     assert options.mesh is not None and options.conditions is not None
     inputs = (options.mesh, options.mesh.with_name(f"{options.mesh.stem}-boundary.vtp"), options.conditions)
-    weather = found.conditions.weather
-    more = [options.patches, None if weather is None else Path(weather.file)]
+    weather, energy = found.conditions.weather, found.conditions.energy
+    series = weather and weather.file, energy and energy.climate
+    more = [options.patches, *(Path(one) for one in series if one)]
     north = options.north if options.envelope else None
     report = identify((*inputs, *filter(None, more)), options.up, options.least_bridge_w, north)
     answers = answers_of(options, found, envelope) | {"report": asdict(report), "impossible": shown["impossible"]}

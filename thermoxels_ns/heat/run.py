@@ -31,7 +31,7 @@ from thermoxels_ns.heat.results import (
     wall_of_scene,
 )
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE, air_series_table
+from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE
 from thermoxels_ns.heat.sky import Vector as Direction
 from thermoxels_ns.heat.solving import Goals, LeftOut, Say, solve_problem
 from thermoxels_ns.mesh.files.vtu import blocks_of
@@ -388,7 +388,7 @@ def unused_settings(scene: HeatScene) -> tuple[str, ...]:
     for name, air in (("inside_air", scene.inside_air), ("outside_air", scene.outside_air)):
         if air is None or air.air_series is None:
             continue
-        begin, end = air_series_table(air.air_series)[[0, -1], 0].tolist()
+        begin, end = air.series()[0][[0, -1]].tolist()
         if begin > 0.0 or end < hours * (1.0 - 1e-9):
             warnings.append(
                 f"The air_series of {name} is from {begin:g} to {end:g} hours, but the body is followed from 0 to "

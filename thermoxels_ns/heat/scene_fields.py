@@ -6,9 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import field
 from functools import partial
-from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from pydantic import AfterValidator, AwareDatetime, Field
@@ -16,10 +15,11 @@ from pydantic import AfterValidator, AwareDatetime, Field
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
-from thermoxels_ns.core.yaml_records import record
+from thermoxels_ns.core.yaml_records import raising, record
 from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying, tabulated
 from thermoxels_ns.heat.effects import HOTTEST_C, STEFAN_BOLTZMANN_W_M2K4, Convection
 from thermoxels_ns.heat.sky import Vector
+from thermoxels_ns.heat.weather_file import read_weather
 
 HeatDirection: TypeAlias = Literal["up", "horizontal", "down"]  # Direction in which heat flows
 HeatFlow: TypeAlias = Literal["into-body", "out-of-body"]
@@ -117,23 +117,49 @@ class _Air:
 
     air_c: Celsius  # Temperature of the air, [degrees Celsius], at least -273.15
     air_series: str | None = field(default=None, kw_only=True)
-    """A csv file beside the scene with the columns hours (since the start) and air_c. The temperature is interpolated
-    linearly, and constant before the first and after the last line; named coefficients still use the field `air_c`. A
-    sky whose temperature follows the air follows this series, too."""
+    """A weather file beside the scene: csv with hours (since the start) and outside_c or inside_c among its columns, or
+    .epw. The temperature is interpolated linearly, and constant before the first and after the last line; named
+    coefficients still use the field `air_c`. A sky whose temperature follows the air follows this series, too."""
+    air_start: AwareDatetime | None = field(default=None, kw_only=True)
+    """Date and time of the scene's start, with a time zone, for an .epw file, whose year does not matter."""
+
+    column: ClassVar[str] = "outside_c"  # What the air takes from a weather file
 
     def __post_init__(self) -> None:
+        epw = self.air_series is not None and self.air_series.lower().endswith(".epw")
+        if epw != (self.air_start is not None):
+            remedy = (
+                "Write air_start: 2026-01-15T06:00:00+01:00." if epw else "Remove it; hours of csv files count from 0."
+            )
+            got = "none" if epw else "a date"
+            raise unclear("air_start", "a date beside an .epw file, and none beside others", got, remedy)
         _ = self.temperature  # raises `HeatError` for a file that cannot be read
 
     @property
     def temperature(self) -> Quantity:
         """Temperature of the air, constant or changing with time, [degrees Celsius]."""
-        return self.air_c if self.air_series is None else read_air_series(self.air_series)
+        if self.air_series is None:
+            return self.air_c
+        hours, air_c = self.series()
+        Bounds("air_c", "degrees Celsius", -ZERO_CELSIUS_K, HOTTEST_C).check(air_c)
+        return tabulated(3600.0 * hours, air_c)
+
+    def series(self) -> tuple[FloatArray, FloatArray]:
+        """Return hours since the start and temperatures, (k,) each, of `air_series`; `HeatError` if it is unfit."""
+        assert self.air_series is not None
+        with raising(HeatError, "air_series: "):
+            found = read_weather(self.air_series, self.air_start, any_year=True)
+        if self.column not in found:
+            expected, got = f"a column {self.column}", ", ".join(found)
+            raise unclear(f"air_series: {self.air_series}", expected, got, "Add it to the file.")
+        return found["hours"], found[self.column]
 
 
 @record(HeatError)
 class InsideAir(_Air):
     """The air of a room."""
 
+    column: ClassVar[str] = "inside_c"
     coefficient: InsideCoefficient | None = None
     """Heat transfer coefficient by the orientation of each surface, after ISO 6946: iso-6946-combined (1 / Rsi,
     convection and radiation together), iso-6946-separate (hci + 4 eps sigma T^3 at the temperature of the air), or
@@ -274,32 +300,6 @@ class Sun:
         if self.clear_sky is not None and self.diffuse_w_m2 > 0.0:
             got = f"{self.diffuse_w_m2:g}"
             raise unclear("diffuse_w_m2", "none beside clear_sky", got, "Remove one of the two.")
-
-
-def read_air_series(path: str) -> Varying:
-    """Read the temperature of air over time from a csv file; `HeatError` if the file or the order of times is wrong."""
-    table = air_series_table(path)
-    Bounds("air_c", "degrees Celsius", -ZERO_CELSIUS_K, HOTTEST_C).check(table[:, 1])
-    return tabulated(3600.0 * table[:, 0], table[:, 1])
-
-
-def air_series_table(path: str) -> FloatArray:
-    """Read hours and air_c, shape (k, 2), from a csv file, without a check of order or range; `HeatError` if unfit."""
-    try:
-        lines = [line for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip(" ,")]
-    except (OSError, UnicodeDecodeError) as problem:
-        got = problem.strerror if isinstance(problem, OSError) else str(problem)
-        raise unclear("air_series", "a csv file beside the scene", f"{path}: {got}", "Correct the name.") from problem
-    if not lines or [name.strip() for name in lines[0].split(",")] != ["hours", "air_c"]:
-        got = lines[0] if lines else "nothing"
-        raise unclear(f"air_series: {path}", "the first line hours,air_c", got, "Write it so.")
-    try:
-        return np.array(
-            [[float(hours), float(air_c)] for hours, air_c in (line.split(",") for line in lines[1:])]
-        ).reshape(-1, 2)
-    except ValueError as problem:
-        remedy = "Write 1.5,-3.2, for example."
-        raise unclear(f"air_series: {path}", "two numbers in each line", str(problem), remedy) from problem
 
 
 def _check_coefficient(named: str | None, number: float | None, emissivity: float | None) -> None:
