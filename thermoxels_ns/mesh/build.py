@@ -13,7 +13,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_patches, apply_regions
 from thermoxels_ns.mesh.boundary.visibility import seen_facets
-from thermoxels_ns.mesh.quality.checks import component_of
+from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of
 from thermoxels_ns.mesh.quality.report import BoundaryMode
 from thermoxels_ns.mesh.solid.morphology import face_connected, grow
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
@@ -26,7 +26,7 @@ from thermoxels_ns.mesh.temperature import (
     tet_conductances,
 )
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh, facet_normals
-from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
+from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ def build_mesh(
     scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
     solid = select_solid(snapshot, selection, scale, transform[:3] / metres_per_unit, makes_up_volume=not voxel)
     if voxel:
-        (corners, tets), facets = kuhn_tets(solid.cells), voxel_facets(solid.cells)
-        points = corners.astype(np.float64)
+        corners, tets = kuhn_tets(solid.cells)
+        points, facets = corners.astype(np.float64), boundary_facets(tets)
     else:
         stuffed = sharpen(stuff(solid.level, options.coarsest_cell), solid.level.shape)
         points, tets, facets = stuffed.points, stuffed.tets, stuffed.facets
@@ -115,7 +115,7 @@ def build_mesh(
         number = np.cumsum(stays) - 1
         tets, facets = number[tets[stays[tets[:, 0]]]], number[facets[stays[facets[:, 0]]]]
         points, temperature_c, observed = points[stays], temperature_c[stays], observed[stays]
-    edges, conductance = lattice_edges(solid.cells) if voxel else tet_conductances(points, tets)
+    edges, conductance = tet_conductances(points, tets)
     if known is not None:
         temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
         measured_c = known[snapshot.observed_weight >= MIN_OBSERVED_WEIGHT]
