@@ -69,7 +69,7 @@ STEPS: Refused = [
     ),
 ]
 MESHES: Refused = [
-    ("mesh points", lambda: body(points_m=moved(BOX.points_m, (3, 1), NAN))),
+    ("mesh points_m", lambda: body(points_m=moved(BOX.points_m, (3, 1), NAN))),
     ("mesh tets", lambda: body(tets=np.concatenate([BOX.tets[:1, [1, 0, 2, 3]], BOX.tets[1:]]))),
     ("mesh tets", lambda: body(points_m=BOX.points_m * [1.0, 1.0, 0.0])),
     ("mesh tets", lambda: body(tets=moved(BOX.tets, (0, 0), len(BOX.points_m)))),
@@ -80,8 +80,8 @@ MESHES: Refused = [
     ),
     *(("mesh temperature_c", lambda t=t: body(temperature_c=moved(BOX.temperature_c, 5, t))) for t in (NAN, -274.0)),
     ("mesh temperature_c", lambda: body(temperature_c=BOX.temperature_c[:-1])),
-    ("boundary patch", lambda: tagged(patch=np.full(len(BOX.facets), 7))),
-    ("boundary patch", lambda: tagged(patch=np.zeros(3, np.int64))),
+    ("mesh boundary.patch", lambda: tagged(patch=np.full(len(BOX.facets), 7))),
+    ("mesh boundary.patch", lambda: tagged(patch=np.zeros(3, np.int64))),
 ]
 PROBLEMS: Refused = [
     *(

@@ -201,7 +201,11 @@ def depths() -> Depths:
 
 def support(cells: np.ndarray, tracks: FeatureRays | None = None) -> tuple[FacetViews, np.ndarray]:
     """Views of the surface of voxels, and how many photographs support it."""
-    points, facets, photos = GRID.index_to_world(kuhn_tets(cells)[0]), boundary_facets(kuhn_tets(cells)[1]), drawn_photographs()
+    points, facets, photos = (
+        GRID.index_to_world(kuhn_tets(cells)[0]),
+        boundary_facets(kuhn_tets(cells)[1]),
+        drawn_photographs(),
+    )
     middle, normals = points[facets].mean(axis=1), facet_normals(points, facets)
     views = facet_views(cells, GRID, photos.matrices, photos.centres, photos.sizes, middle, normals)
     found = supporting_photographs(depths(), views.middle, views.seen, VOXEL, tracks)

@@ -10,14 +10,12 @@ import numpy.typing as npt
 from scipy import sparse
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.kernel_cache import kernel
 
 Vector = FloatArray
 Numbers = IntArray
 
-_REMEDY = "Build the mesh with thermoxels_ns.mesh."
 FLATTEST = 1e-6
 """Least height of a tetrahedron over its size. In a flatter one, conduction along its plane is lost to round-off beside
 conduction through its thickness, which is 1 / `FLATTEST`^2 times as large."""
@@ -61,17 +59,16 @@ class MeshEdges:
 
 
 def mesh_edges(tets: IntArray, num_nodes: int) -> MeshEdges:
-    """Return the edges of a mesh in ascending order, in time and memory proportional to the number of tetrahedra.
+    """Return the edges of a mesh of n nodes in ascending order; `tets` has shape (t, 4).
 
     >>> edges = mesh_edges(np.array([[3, 0, 2, 1], [1, 2, 4, 3]]), 5)
     >>> np.column_stack([edges.smaller_nodes(), edges.other]).tolist()
     [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]
     """
-    tets = np.ascontiguousarray(tets, np.int64)
-    end, other = np.zeros(num_nodes + 1, np.int64), np.empty(6 * len(tets), np.int32)
-    first, mark = np.zeros(num_nodes + 1, np.int64), np.full(num_nodes, -1, np.int32)
-    kept = _unique_edges(tets, end, other, first, mark)
-    return MeshEdges(first, other[:kept].copy())
+    ends = tets.astype(np.int32)[:, TET_EDGES].reshape(-1, 2).T
+    pairs = np.minimum(*ends), np.maximum(*ends)
+    links = sparse.csr_matrix((np.ones(len(pairs[0]), bool), pairs), shape=(num_nodes, num_nodes))
+    return MeshEdges(links.indptr.astype(np.int64), links.indices)
 
 
 def stiffness_matrix(
@@ -117,19 +114,13 @@ def lumped_mass(points_m: Vector, tets: Numbers, heat_capacity_j_m3k: Vector) ->
 
 
 def refuse_flat_tets(points_m: Vector, tets: Numbers) -> None:
-    """Raise `HeatError` if arrays have wrong shapes, numbers are out of range, or tetrahedra are inverted or flat."""
-    check_shape("mesh points", points_m, (None, 3), _REMEDY, HeatError)
-    check_finite("mesh points", points_m, _REMEDY, HeatError)
-    check_shape("mesh tets", tets, (None, 4), _REMEDY, HeatError)
-    if len(tets) and (tets.min() < 0 or tets.max() >= len(points_m)):
-        expected, got = f"node numbers from 0 to {len(points_m) - 1}", f"{tets.min()} to {tets.max()}"
-        raise HeatError("mesh tets", expected=expected, got=got, remedy=_REMEDY)
+    """Raise `HeatError` if tetrahedra of a mesh that `TetMesh.check` accepts are inverted or flat."""
     points_m, tets, unit_m = _prepared(points_m, tets)
     num_flat = _count_flat(points_m, tets, 1.0 / unit_m)
     if num_flat:
         expected = f"volumes above 0 and heights of at least {FLATTEST:g} of the longest side"
         got = f"{num_flat} of {len(tets)} flat or inverted"
-        raise HeatError("mesh tets", expected=expected, got=got, remedy=_REMEDY)
+        raise HeatError("mesh tets", expected=expected, got=got, remedy="Build the mesh with thermoxels_ns.mesh.")
 
 
 def _prepared(points_m: Vector, tets: Numbers) -> tuple[Vector, Numbers, float]:
@@ -231,39 +222,3 @@ def _add_capacities(points, tets, capacity, scale, nodal):
         a, b, c = _sides(points, tet, scale)
         for i in range(4):
             nodal[tet[i]] += capacity[t] * _dot(a, _cross(b, c)) / 24.0
-
-
-@kernel
-def _unique_edges(tets, end, other, first, mark):
-    """Fill `first` and the beginning of `other` as in `MeshEdges`, and return the number of edges."""
-    num_nodes = len(mark)
-    for t in range(len(tets)):
-        for a in range(3):
-            for b in range(a + 1, 4):
-                end[min(tets[t, a], tets[t, b]) + 1] += 1
-    for node in range(num_nodes):
-        end[node + 1] += end[node]
-    # end[i], where the edges of node i begin, moves with each edge stored and at last is where those of i + 1 begin.
-    for t in range(len(tets)):
-        for a in range(3):
-            for b in range(a + 1, 4):
-                low, high = min(tets[t, a], tets[t, b]), max(tets[t, a], tets[t, b])
-                other[end[low]] = high
-                end[low] += 1
-    begin = kept = np.int64(0)
-    for node in range(num_nodes):
-        for k in range(begin, end[node]):
-            if mark[other[k]] != node:
-                mark[other[k]] = node
-                other[kept] = other[k]
-                kept += 1
-        # Insertion sort, because the few edges of a node are almost in order.
-        for k in range(first[node] + 1, kept):
-            high, place = other[k], k
-            while place > first[node] and other[place - 1] > high:
-                other[place] = other[place - 1]
-                place -= 1
-            other[place] = high
-        begin = end[node]
-        first[node + 1] = kept
-    return kept
