@@ -19,7 +19,7 @@ Numbers = IntArray
 FLATTEST = 1e-6
 """Least height of a tetrahedron over its size. In a flatter one, conduction along its plane is lost to round-off beside
 conduction through its thickness, which is 1 / `FLATTEST`^2 times as large."""
-_ANGLE_ROUND_OFF = 16.0 * np.finfo(np.float64).eps
+_ANGLE_ROUND_OFF = 32.0 * np.finfo(np.float64).eps
 """Upper estimate of the round-off of the cosine of an angle, for a tetrahedron as large as its largest coordinate."""
 TET_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
 """Local numbers of the two ends of each edge of a tetrahedron, in scikit-fem's order."""
@@ -86,11 +86,10 @@ def stiffness_matrix(
     >>> (6 * stiffness_matrix(corner, np.array([[0, 1, 2, 3]]), np.ones(1))).toarray().round(12).tolist()
     [[3.0, -1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 1.0]]
     """
-    points_m, tets, unit_m = _prepared(points_m, tets)
+    points_m, tets = _prepared(points_m, tets)
     edges = mesh_edges(tets, len(points_m)) if edges is None else edges
-    coupling = np.zeros(len(edges.other))
-    _add_couplings(points_m, tets, conductivity_w_mk, 1.0 / unit_m, edges.first, edges.other, coupling)
-    coupling *= unit_m
+    coupling, reach_m = np.zeros(len(edges.other)), float(np.max(np.abs(points_m), initial=0.0))
+    _add_couplings(points_m, tets, conductivity_w_mk, reach_m, edges.first, edges.other, coupling)
     # A constant temperature has no gradient, so each row sums to 0.
     diagonal = np.zeros(edges.num_nodes)
     diagonal -= np.bincount(edges.smaller_nodes(), coupling, edges.num_nodes)
@@ -107,38 +106,35 @@ def lumped_mass(points_m: Vector, tets: Numbers, heat_capacity_j_m3k: Vector) ->
     With non-obtuse tetrahedra, such as those of a lattice, backward Euler with this mass keeps every temperature within
     the initial range for any step length (Li and Huang, arXiv 1209.5657). The capacity, (t,), is in [J / (m3 K)].
     """
-    points_m, tets, unit_m = _prepared(points_m, tets)
+    points_m, tets = _prepared(points_m, tets)
     nodal = np.zeros(len(points_m))
-    _add_capacities(points_m, tets, heat_capacity_j_m3k, 1.0 / unit_m, nodal)
-    return nodal * unit_m**3
+    _add_capacities(points_m, tets, heat_capacity_j_m3k, nodal)
+    return nodal
 
 
 def refuse_flat_tets(points_m: Vector, tets: Numbers) -> None:
     """Raise `HeatError` if tetrahedra of a mesh that `TetMesh.check` accepts are inverted or flat."""
-    points_m, tets, unit_m = _prepared(points_m, tets)
-    num_flat = _count_flat(points_m, tets, 1.0 / unit_m)
+    num_flat = _count_flat(*_prepared(points_m, tets))
     if num_flat:
         expected = f"volumes above 0 and heights of at least {FLATTEST:g} of the longest side"
         got = f"{num_flat} of {len(tets)} flat or inverted"
         raise HeatError("mesh tets", expected=expected, got=got, remedy="Build the mesh with thermoxels_ns.mesh.")
 
 
-def _prepared(points_m: Vector, tets: Numbers) -> tuple[Vector, Numbers, float]:
-    """Return arrays for the kernels, and the power of 2 above all coordinates, a unit in which nothing overflows."""
-    reach = float(np.max(np.abs(points_m), initial=0.0))
-    unit_m = float(np.exp2(np.frexp(reach)[1])) if reach else 1.0
-    return np.ascontiguousarray(points_m, np.float64), np.ascontiguousarray(tets, np.int64), unit_m
+def _prepared(points_m: Vector, tets: Numbers) -> tuple[Vector, Numbers]:
+    """Return the arrays as the kernels take them."""
+    return np.ascontiguousarray(points_m, np.float64), np.ascontiguousarray(tets, np.int64)
 
 
 @kernel
-def _sides(points, tet, scale):
+def _sides(points, tet):
     # Node numbers are unsigned, here and below, which saves a test for negative indices.
     o, a = points[np.uint64(tet[0])], points[np.uint64(tet[1])]
     b, c = points[np.uint64(tet[2])], points[np.uint64(tet[3])]
     return (
-        ((a[0] - o[0]) * scale, (a[1] - o[1]) * scale, (a[2] - o[2]) * scale),
-        ((b[0] - o[0]) * scale, (b[1] - o[1]) * scale, (b[2] - o[2]) * scale),
-        ((c[0] - o[0]) * scale, (c[1] - o[1]) * scale, (c[2] - o[2]) * scale),
+        (a[0] - o[0], a[1] - o[1], a[2] - o[2]),
+        (b[0] - o[0], b[1] - o[1], b[2] - o[2]),
+        (c[0] - o[0], c[1] - o[1], c[2] - o[2]),
     )
 
 
@@ -188,24 +184,24 @@ def _edge_numbers(first, other, elements, ends, numbers):
 
 
 @kernel
-def _count_flat(points, tets, scale):
+def _count_flat(points, tets):
     flat = 0
     for t in range(len(tets)):
-        a, b, c = _sides(points, tets[t], scale)
+        a, b, c = _sides(points, tets[t])
         flat += _is_flat(a, b, c)
     return flat
 
 
 @kernel
-def _add_couplings(points, tets, conductivity, scale, first, other, coupling):
+def _add_couplings(points, tets, conductivity, reach, first, other, coupling):
     for t in range(len(tets)):
         tet = tets[t]
-        a, b, c = _sides(points, tet, scale)
+        a, b, c = _sides(points, tet)
         # Inward normals of the face opposite each node, of twice this face's area in length.
         n1, n2, n3 = _cross(b, c), _cross(c, a), _cross(a, b)
         n0 = (-n1[0] - n2[0] - n3[0], -n1[1] - n2[1] - n3[1], -n1[2] - n2[2] - n3[2])
         normals = (n0, n1, n2, n3)
-        right = _ANGLE_ROUND_OFF / _size(a, b, c)
+        right = _ANGLE_ROUND_OFF * reach / _size(a, b, c)
         squares = (_dot(n0, n0), _dot(n1, n1), _dot(n2, n2), _dot(n3, n3))
         factor = conductivity[t] / (6.0 * _dot(a, n1))
         for i in range(3):
@@ -216,9 +212,9 @@ def _add_couplings(points, tets, conductivity, scale, first, other, coupling):
 
 
 @kernel
-def _add_capacities(points, tets, capacity, scale, nodal):
+def _add_capacities(points, tets, capacity, nodal):
     for t in range(len(tets)):
         tet = tets[t]
-        a, b, c = _sides(points, tet, scale)
+        a, b, c = _sides(points, tet)
         for i in range(4):
             nodal[tet[i]] += capacity[t] * _dot(a, _cross(b, c)) / 24.0

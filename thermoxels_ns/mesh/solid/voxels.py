@@ -18,7 +18,6 @@ from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.core.yaml_records import record, wrong
 from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, first_solid
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
-from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
 
 RegionKind = Literal["auto", "all"]
@@ -97,7 +96,7 @@ class SolidCells:
     """The solid voxels of a field, their surface level, and the steps that found them."""
 
     cells: BoolArray  # True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is
-    level: Float32Array  # `level_of` at voxel centres; the surface is where the trilinear level is 0
+    dense: BoolArray  # True for voxels that the threshold chose
     threshold: float  # least density at the centre of a voxel that counts as dense, [1 / world unit]
     explanation: str  # which rule chose the threshold, and why
     steps: tuple[SolidStep, ...]  # all steps in order; the first is the threshold
@@ -112,13 +111,11 @@ def select_solid(
     selection: SolidSelection,
     metres_per_world_unit: float | None = None,
     world_to_input: FloatArray | None = None,
-    *,
-    makes_up_volume: bool = True,
 ) -> SolidCells:
     """Return the solid voxels of a trained field, chosen by their density and then changed by up to three more steps.
 
     `metres_per_world_unit` is needed for a wall thickness only. `world_to_input`, shape (3, 4), maps world coordinates
-    to those of the region's box or point; None is the identity. `makes_up_volume` is passed to `level_of`.
+    to those of the region's box or point; None is the identity.
 
     Raises:
         MeshError: No voxel is dense enough; none lies in the box or ball asked for; a percentile is asked for and all
@@ -183,7 +180,7 @@ def select_solid(
         cells = step("interior", cells | inside.enclosed | inside.hidden, remark)
     return SolidCells(
         cells=cells,
-        level=level_of(density, chosen.density, chosen.cells, cells, makes_up_volume=makes_up_volume),
+        dense=chosen.cells,
         threshold=chosen.density,
         explanation=chosen.explanation,
         steps=tuple(steps),
