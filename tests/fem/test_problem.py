@@ -76,7 +76,11 @@ MESHES: Refused = [
     ("mesh tets", lambda: body(tets=BOX.tets[:0])),
     (
         "mesh points",
-        lambda: body(points_m=np.vstack([BOX.points_m, [[9, 9, 9]]]), temperature_c=np.append(BOX.temperature_c, 0)),
+        lambda: body(
+            points_m=np.vstack([BOX.points_m, [[9, 9, 9]]]),
+            temperature_c=np.append(BOX.temperature_c, 0),
+            observed=np.append(BOX.observed, True),
+        ),
     ),
     *(("mesh temperature_c", lambda t=t: body(temperature_c=moved(BOX.temperature_c, 5, t))) for t in (NAN, -274.0)),
     ("mesh temperature_c", lambda: body(temperature_c=BOX.temperature_c[:-1])),
