@@ -72,9 +72,10 @@ class SolidSelection:
     def __post_init__(self) -> None:
         box, near = self.region_box, self.region_near
         if box is not None and not np.less(box[:3], box[3:]).all():
-            raise wrong("region_box", "xmin ymin zmin xmax ymax zmax, minima below maxima", box, "Pass 0 0 0 4 3 2.")
+            expected, remedy = "xmin ymin zmin xmax ymax zmax, minima below maxima", "Pass --region-box 0 0 0 4 3 2."
+            raise wrong("region_box", expected, box, remedy)
         if near is not None and not near[3] > 0:
-            raise wrong("region_near", "x y z radius, above 0", near, "Pass 0 0 1 2.5.")
+            raise wrong("region_near", "x y z radius, above 0", near, "Pass --region-near 0 0 1 2.5.")
         asked = [f"--region {self.region}"] * (self.region != "auto")
         asked += ["--region-box"] * (box is not None) + ["--region-near"] * (near is not None)
         if len(asked) > 1:
