@@ -68,7 +68,7 @@ def mesh_edges(tets: IntArray, num_nodes: int) -> MeshEdges:
     ends = tets.astype(np.int32)[:, TET_EDGES].reshape(-1, 2).T
     pairs = np.minimum(*ends), np.maximum(*ends)
     links = sparse.csr_matrix((np.ones(len(pairs[0]), bool), pairs), shape=(num_nodes, num_nodes))
-    return MeshEdges(links.indptr.astype(np.int64), links.indices)
+    return MeshEdges(links.indptr.astype(np.int64), links.indices.astype(np.int32, copy=False))
 
 
 def stiffness_matrix(
