@@ -202,7 +202,7 @@ def test_impossible_dataparser_transforms_are_refused(transform, scale) -> None:
         ({"metres_per_unit": 1.0, "known_distance_error": 0.1}, "known_distance_error"),
         ({"coarsest_cell": 3}, "coarsest_cell"),
         ({"region": "some"}, "region"),
-        ({"region_box": (0.0, 0.0, 0.0, 1.0, float("nan"), 1.0)}, "region_box"),
+        ({"region_box": (0.0, 0.0, 0.0, 1.0, float("nan"), 1.0)}, "region_box entry 5"),
         ({"region_near": (0.0, 0.0, 0.0, -1.0)}, "region_near"),
         ({"formats": ("vtu", "vtu")}, "formats"),
         ({"formats": ("inp",)}, "scale"),

@@ -69,19 +69,23 @@ STEPS: Refused = [
     ),
 ]
 MESHES: Refused = [
-    ("mesh points", lambda: body(points_m=moved(BOX.points_m, (3, 1), NAN))),
+    ("mesh points_m", lambda: body(points_m=moved(BOX.points_m, (3, 1), NAN))),
     ("mesh tets", lambda: body(tets=np.concatenate([BOX.tets[:1, [1, 0, 2, 3]], BOX.tets[1:]]))),
     ("mesh tets", lambda: body(points_m=BOX.points_m * [1.0, 1.0, 0.0])),
     ("mesh tets", lambda: body(tets=moved(BOX.tets, (0, 0), len(BOX.points_m)))),
     ("mesh tets", lambda: body(tets=BOX.tets[:0])),
     (
         "mesh points",
-        lambda: body(points_m=np.vstack([BOX.points_m, [[9, 9, 9]]]), temperature_c=np.append(BOX.temperature_c, 0)),
+        lambda: body(
+            points_m=np.vstack([BOX.points_m, [[9, 9, 9]]]),
+            temperature_c=np.append(BOX.temperature_c, 0),
+            observed=np.append(BOX.observed, True),
+        ),
     ),
     *(("mesh temperature_c", lambda t=t: body(temperature_c=moved(BOX.temperature_c, 5, t))) for t in (NAN, -274.0)),
     ("mesh temperature_c", lambda: body(temperature_c=BOX.temperature_c[:-1])),
-    ("boundary patch", lambda: tagged(patch=np.full(len(BOX.facets), 7))),
-    ("boundary patch", lambda: tagged(patch=np.zeros(3, np.int64))),
+    ("mesh boundary.patch", lambda: tagged(patch=np.full(len(BOX.facets), 7))),
+    ("mesh boundary.patch", lambda: tagged(patch=np.zeros(3, np.int64))),
 ]
 PROBLEMS: Refused = [
     *(

@@ -56,7 +56,7 @@ def iso() -> tuple[HeatProblem, SteadySolution]:
     return problem, solve_steady(finer(problem), order=2, relative_tolerance=1e-8)
 
 
-@pytest.mark.parametrize("tolerance", [Tolerance(0.2), Tolerance(None, 0.005), Tolerance(0.2, 0.01)])
+@pytest.mark.parametrize("tolerance", [Tolerance(0.2), Tolerance(None, 0.005)])
 def test_iso_10211_case_3(iso, tolerance) -> None:
     problem, exact = iso
     found = solve_to_tolerance(problem, tolerance, log=silent)
@@ -70,11 +70,15 @@ def test_iso_10211_case_3(iso, tolerance) -> None:
     assert 1 / WITHIN < settings.error.heat_flow / true.heat_flow < MOST_FLOW, (settings.error, true)
 
 
-@pytest.mark.parametrize(("tolerance_k", "refinements"), [(0.2, 0), (0.02, 1)])
-def test_spherical_shell(tolerance_k, refinements) -> None:
+@pytest.fixture(scope="module")
+def exact_shell() -> SteadySolution:
     """The body is the one between the facets: the exact answer is that of much finer tetrahedra in it."""
-    problem = shell()
-    exact = solve_steady(finer(problem, 3), order=2)
+    return solve_steady(finer(shell(), 3), order=2)
+
+
+@pytest.mark.parametrize(("tolerance_k", "refinements"), [(0.2, 0), (0.02, 1)])
+def test_spherical_shell(exact_shell, tolerance_k, refinements) -> None:
+    problem, exact = shell(), exact_shell
     found = solve_to_tolerance(problem, Tolerance(tolerance_k), log=silent)
     assert (found.settings.order, found.settings.refinements) == (2, refinements), found.levels
     true, estimate = true_error(found, problem, exact), found.settings.error
@@ -83,10 +87,14 @@ def test_spherical_shell(tolerance_k, refinements) -> None:
     assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < MOST_FLOW, (found.settings, true)
 
 
+@pytest.fixture(scope="module")
+def exact_t3() -> HeatSolution:
+    return solve_heat(nafems_t3(160), AdaptiveSteps(32.0, 0.01))
+
+
 @pytest.mark.parametrize(("tolerance_k", "refinements"), [(2.0, 0), (0.5, 1), (0.2, 2)])
-def test_nafems_t3(tolerance_k, refinements) -> None:
-    problem = nafems_t3()
-    exact = solve_heat(nafems_t3(160), AdaptiveSteps(32.0, 0.01))
+def test_nafems_t3(exact_t3, tolerance_k, refinements) -> None:
+    problem, exact = nafems_t3(), exact_t3
     found = solve_to_tolerance(problem, Tolerance(tolerance_k), duration_s=32.0, log=silent)
     assert found.met and found.settings.refinements == refinements and found.settings.order == 1
     assert isinstance(found.solution, HeatSolution) and found.settings.step_tolerance_k is not None
@@ -148,7 +156,6 @@ BODIES = {
     "fin": fin,
     "radiating sphere": stove,
     "side by side, 1e-8": lambda: side_by_side(1e-8),
-    "side by side, 0.035": lambda: side_by_side(0.035),
     "side by side, 1e8": lambda: side_by_side(1e8),
 }
 

@@ -1,10 +1,8 @@
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.quality.checks import boundary_facets
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, facet_areas
-from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
 
 
 def exposed_faces(cells: np.ndarray) -> int:
@@ -45,19 +43,6 @@ def test_volume_area_and_validity(mesh_of_cells, name):
     assert quality.area_m2 == pytest.approx(exposed_faces(cells) * 0.5**2, rel=1e-14)
     assert quality.criteria[0].figure == pytest.approx(0.5**3 / 6, rel=1e-14)
     assert (quality.dihedral_range_deg[0], quality.dihedral_range_deg[1]) == pytest.approx((45.0, 90.0))
-
-
-def turned(facets: np.ndarray) -> list:
-    """Triangles with their smallest node first, orientation kept, in one order."""
-    rows = [tuple(np.roll(row, -int(np.argmin(row)))) for row in facets]
-    assert len(set(rows)) == len(rows)
-    return sorted(rows)
-
-
-@pytest.mark.parametrize("name", PATTERNS)
-def test_voxel_faces_give_the_boundary_of_the_tetrahedra(name):
-    cells = PATTERNS[name]
-    assert turned(voxel_facets(cells)) == turned(boundary_facets(kuhn_tets(cells)[1]))
 
 
 def test_box_facets_are_those_on_the_lattice_border(mesh_of_cells):

@@ -8,8 +8,9 @@ from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.boundary.visibility import FacetViews, facet_views
+from thermoxels_ns.mesh.quality.checks import boundary_facets
 from thermoxels_ns.mesh.tetrahedra import facet_normals
-from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import Depths, depths_of
 from thermoxels_ns.multiview.votes import (
@@ -200,7 +201,11 @@ def depths() -> Depths:
 
 def support(cells: np.ndarray, tracks: FeatureRays | None = None) -> tuple[FacetViews, np.ndarray]:
     """Views of the surface of voxels, and how many photographs support it."""
-    points, facets, photos = GRID.index_to_world(kuhn_tets(cells)[0]), voxel_facets(cells), drawn_photographs()
+    points, facets, photos = (
+        GRID.index_to_world(kuhn_tets(cells)[0]),
+        boundary_facets(kuhn_tets(cells)[1]),
+        drawn_photographs(),
+    )
     middle, normals = points[facets].mean(axis=1), facet_normals(points, facets)
     views = facet_views(cells, GRID, photos.matrices, photos.centres, photos.sizes, middle, normals)
     found = supporting_photographs(depths(), views.middle, views.seen, VOXEL, tracks)

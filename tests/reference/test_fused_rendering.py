@@ -43,7 +43,6 @@ def test_everything_at_once(sh_degree, temperature_degree, activation, kept):
     assert all(float(g.norm()) > 0 for g in reference.gradients.values())
 
 
-@pytest.mark.parametrize("kept", [1.0, 0.4], ids=["dense", "sparse"])
 @pytest.mark.parametrize("moves", [False, True])
 @pytest.mark.parametrize(
     "options",
@@ -58,8 +57,8 @@ def test_everything_at_once(sh_degree, temperature_degree, activation, kept):
     ],
     ids=["plain", "distortion", "sparsity", "one variation", "two variations", "coarse steps", "fine steps"],
 )
-def test_each_term_alone(options, moves, kept):
-    grid = random_grid(1, 1, "softplus", kept)
+def test_each_term_alone(options, moves):
+    grid = random_grid(1, 1, "softplus", 0.4)
     options = replace(options, thermal_moves_density=moves)
     reference = assert_twins_agree(grid, random_request(grid), options)
     assert ("distortion" in reference.values) is (options.distortion_scale is not None)
@@ -207,7 +206,7 @@ def cases(draw):
 
 
 @given(cases())
-@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@settings(max_examples=30, deadline=None, derandomize=True, database=None)
 def test_both_backends_list_the_same_samples(case):
     grid, request, options = case
     grid, request = as_double(grid), in_double(request)
@@ -225,7 +224,7 @@ def test_both_backends_list_the_same_samples(case):
 
 
 @given(cases())
-@settings(max_examples=40, deadline=None, derandomize=True, database=None)
+@settings(max_examples=20, deadline=None, derandomize=True, database=None)
 def test_any_pattern_has_the_reference_s_values_and_gradients(case):
     grid, request, options = case
     assert_twins_agree(grid, request, replace(EVERYTHING, steps_per_voxel=options.steps_per_voxel))

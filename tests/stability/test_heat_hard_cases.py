@@ -49,7 +49,7 @@ def test_a_disconnected_piece(flux_w_m2) -> None:
 
 
 @pytest.mark.parametrize("shape", [*BLOCKS, "sphere", "slab at 30 degrees", AT_THE_BOUNDS])
-@pytest.mark.parametrize("fourier", [1e-3, 1e-1, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("fourier", [1e-3, 1.0, 1e6])
 @pytest.mark.parametrize(("strength", "sky"), [(0.0, False), (1e-9, False), (1e-9, True), (1e6, True)])
 def test_range_and_balance_at_any_step_and_any_cooling(shape, fourier, strength, sky) -> None:
     effects: tuple[Effect, ...] = (Convection(("*",), strength, -40.0),) if strength else ()

@@ -75,8 +75,7 @@ SCHEDULE = {
 }
 
 
-@pytest.mark.parametrize("rate", [100.0, 1e6])
-@pytest.mark.parametrize("recipe", ["default", "paper"])
+@pytest.mark.parametrize(("recipe", "rate"), [("default", 1e6), ("paper", 100.0)])
 def test_learning_rates_far_too_large_end_in_a_finite_model_or_a_clear_error(tmp_path, recipe, rate):
     scene = sphere(tmp_path / "scene")
     activation = "exp" if recipe == "default" else "relu"

@@ -1,4 +1,5 @@
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,13 +50,19 @@ def test_a_model_has_the_voxels_that_its_photographs_ask_for(pixel_size, expecte
     assert max(model.grid.lattice.cell_shape) == expected[0]
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return write_scene(
+        make_scene("sphere"), tmp_path_factory.mktemp("pixels"), 12, 2, width=160, height=120, progress=False
+    )
+
+
 @pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("factor", [None, 2])
-def test_a_pixel_is_as_wide_as_it_is_where_the_body_stands(tmp_path, factor, given):
+def test_a_pixel_is_as_wide_as_it_is_where_the_body_stands(folder, factor, given):
     scene = make_scene("sphere")
-    write_scene(scene, tmp_path, 12, 2, width=160, height=120, progress=False)
     box = tuple(tuple(corner) for corner in np.asarray(scene.scene_box).tolist()) if given else None
-    config = ThermalDataParserConfig(data=tmp_path, scene_box=box, downscale_factor=factor)
+    config = ThermalDataParserConfig(data=folder, scene_box=box, downscale_factor=factor)
     outputs = config.setup().get_dataparser_outputs()
     away = np.linalg.norm(np.concatenate(scene.poses(12, 2))[:, :3, 3], axis=1)
     focal = float(outputs.cameras.fx[0])

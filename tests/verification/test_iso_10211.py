@@ -41,7 +41,7 @@ CASE_1 = """9.7 13.4 14.7 15.1
 0.3 0.6 0.8 0.9"""
 
 
-@pytest.mark.parametrize("seed", [None, 0, 1])
+@pytest.mark.parametrize("seed", [None, 0])
 def test_case_1_half_a_square_column(seed) -> None:
     """Half of a unit square, its top at 20 C, the other sides at 0 C: 28 points at a spacing of 1/8.
 
@@ -150,10 +150,9 @@ def test_case_3_with_quadratic_tetrahedra() -> None:
     assert flows == pytest.approx([46.133, 13.912, -60.045], abs=6e-4)
 
 
-@pytest.mark.parametrize("finest", [0.0125, 0.00625])
-def test_case_4_an_iron_bar_through_insulation(finest) -> None:
+def test_case_4_an_iron_bar_through_insulation() -> None:
     """1 m x 1 m of insulation, 0.2 m thick; the bar, 0.1 m x 0.05 m x 0.6 m, ends at its cold face. A quarter of it."""
-    grading = {"finest": finest, "growth": 1.3, "coarsest": 0.1}
+    grading = {"finest": 0.0125, "growth": 1.3, "coarsest": 0.1}
     x, y, z = (graded(*knots, **grading) for knots in ((0, 0.05, 0.5), (0, 0.025, 0.5), (0, 0.2, 0.6)))
 
     def insulation(p):

@@ -365,9 +365,10 @@ def export_snapshot(
     from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
     from thermoxels_ns.mesh.files.surface import check_stl
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
+    from thermoxels_ns.mesh.quality.checks import boundary_facets
     from thermoxels_ns.mesh.quality.report import check_mesh, picture_of_quality
     from thermoxels_ns.mesh.tetrahedra import support_of_facets
-    from thermoxels_ns.mesh.voxel_tets import used_corners, voxel_facets
+    from thermoxels_ns.mesh.voxel_tets import kuhn_tets
     from thermoxels_ns.reports import mesh_pictures
 
     checked = check_options(options)
@@ -463,11 +464,8 @@ def export_snapshot(
         if support_of_facets(mesh) is not None:
             mesh_pictures.add_support(folder / _MESH_PICTURES[2], mesh, look)
         # Faces of the voxels that are not exported are drawn in grey.
-        left_out = built.solid.left_out
-        ghost = (
-            apply_transform(to_mesh, snapshot.lattice.index_to_world(used_corners(left_out))),
-            voxel_facets(left_out),
-        )
+        corners, tets = kuhn_tets(built.solid.left_out)
+        ghost = apply_transform(to_mesh, snapshot.lattice.index_to_world(corners)), boundary_facets(tets)
         note = "grey: left out of the region" if len(ghost[0]) else "nothing is left out"
         beside: Any = {"title": "Region", "length_unit": unit, "ghost": ghost, "note": note, **look}
         mesh_pictures.write_picture(folder / _MESH_PICTURES[3], mesh_pictures.image_of_mesh(mesh, **beside))

@@ -364,7 +364,7 @@ def geometry_metrics(
     """
     known.points_seen  # noqa: B018 - raises before anything slow
     try:
-        solid = select_solid(snapshot, SolidSelection(), makes_up_volume=False)
+        solid = select_solid(snapshot, SolidSelection())
     except MeshError as problem:
         say(f"The geometry scores 0: {problem}")
         return dict.fromkeys(("fscore", "precision", "recall", "fscore_128"), 0.0)

@@ -49,7 +49,6 @@ LAST_ITERATIONS = 20_000
 """Most iterations with the diagonal after multigrid failed: on quadratic tetrahedra 100 times as long as high multigrid
 stalls and the diagonal does not."""
 _PER_UNKNOWN = 10  # Most of these last iterations per unknown: without round-off one would be enough
-_BLOCK = 1 << 16  # Entries of the matrix that are scaled at a time, to save memory
 
 
 @dataclass(frozen=True)
@@ -78,11 +77,8 @@ class LinearSolver:
             remedy = "Check the units of the mesh, the material and the time step."
             raise HeatError("matrix of the heat problem", expected=expected, got=got, remedy=remedy)
         self._scale = 1.0 / np.sqrt(diagonal)
-        scaled = np.repeat(self._scale, np.diff(matrix.indptr))
-        scaled *= matrix.data
-        for begin in range(0, len(scaled), _BLOCK):
-            block = slice(begin, begin + _BLOCK)
-            scaled[block] *= self._scale[matrix.indices[block]]
+        scaled = matrix.data * np.repeat(self._scale, np.diff(matrix.indptr))
+        scaled *= self._scale[matrix.indices]
         self._scaled = sparse.csr_matrix((scaled, matrix.indices, matrix.indptr), shape=matrix.shape)
         self._relative_tolerance = relative_tolerance
         self._slow = False

@@ -10,18 +10,16 @@ import numpy.typing as npt
 from scipy import sparse
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.kernel_cache import kernel
 
 Vector = FloatArray
 Numbers = IntArray
 
-_REMEDY = "Build the mesh with thermoxels_ns.mesh."
 FLATTEST = 1e-6
 """Least height of a tetrahedron over its size. In a flatter one, conduction along its plane is lost to round-off beside
 conduction through its thickness, which is 1 / `FLATTEST`^2 times as large."""
-_ANGLE_ROUND_OFF = 16.0 * np.finfo(np.float64).eps
+_ANGLE_ROUND_OFF = 32.0 * np.finfo(np.float64).eps
 """Upper estimate of the round-off of the cosine of an angle, for a tetrahedron as large as its largest coordinate."""
 TET_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
 """Local numbers of the two ends of each edge of a tetrahedron, in scikit-fem's order."""
@@ -61,17 +59,16 @@ class MeshEdges:
 
 
 def mesh_edges(tets: IntArray, num_nodes: int) -> MeshEdges:
-    """Return the edges of a mesh in ascending order, in time and memory proportional to the number of tetrahedra.
+    """Return the edges of a mesh of n nodes in ascending order; `tets` has shape (t, 4).
 
     >>> edges = mesh_edges(np.array([[3, 0, 2, 1], [1, 2, 4, 3]]), 5)
     >>> np.column_stack([edges.smaller_nodes(), edges.other]).tolist()
     [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]
     """
-    tets = np.ascontiguousarray(tets, np.int64)
-    end, other = np.zeros(num_nodes + 1, np.int64), np.empty(6 * len(tets), np.int32)
-    first, mark = np.zeros(num_nodes + 1, np.int64), np.full(num_nodes, -1, np.int32)
-    kept = _unique_edges(tets, end, other, first, mark)
-    return MeshEdges(first, other[:kept].copy())
+    ends = tets.astype(np.int32)[:, TET_EDGES].reshape(-1, 2).T
+    pairs = np.minimum(*ends), np.maximum(*ends)
+    links = sparse.csr_matrix((np.ones(len(pairs[0]), bool), pairs), shape=(num_nodes, num_nodes))
+    return MeshEdges(links.indptr.astype(np.int64), links.indices.astype(np.int32, copy=False))
 
 
 def stiffness_matrix(
@@ -89,11 +86,10 @@ def stiffness_matrix(
     >>> (6 * stiffness_matrix(corner, np.array([[0, 1, 2, 3]]), np.ones(1))).toarray().round(12).tolist()
     [[3.0, -1.0, -1.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 1.0]]
     """
-    points_m, tets, unit_m = _prepared(points_m, tets)
+    points_m, tets = _prepared(points_m, tets)
     edges = mesh_edges(tets, len(points_m)) if edges is None else edges
-    coupling = np.zeros(len(edges.other))
-    _add_couplings(points_m, tets, conductivity_w_mk, 1.0 / unit_m, edges.first, edges.other, coupling)
-    coupling *= unit_m
+    coupling, reach_m = np.zeros(len(edges.other)), float(np.max(np.abs(points_m), initial=0.0))
+    _add_couplings(points_m, tets, conductivity_w_mk, reach_m, edges.first, edges.other, coupling)
     # A constant temperature has no gradient, so each row sums to 0.
     diagonal = np.zeros(edges.num_nodes)
     diagonal -= np.bincount(edges.smaller_nodes(), coupling, edges.num_nodes)
@@ -110,44 +106,35 @@ def lumped_mass(points_m: Vector, tets: Numbers, heat_capacity_j_m3k: Vector) ->
     With non-obtuse tetrahedra, such as those of a lattice, backward Euler with this mass keeps every temperature within
     the initial range for any step length (Li and Huang, arXiv 1209.5657). The capacity, (t,), is in [J / (m3 K)].
     """
-    points_m, tets, unit_m = _prepared(points_m, tets)
+    points_m, tets = _prepared(points_m, tets)
     nodal = np.zeros(len(points_m))
-    _add_capacities(points_m, tets, heat_capacity_j_m3k, 1.0 / unit_m, nodal)
-    return nodal * unit_m**3
+    _add_capacities(points_m, tets, heat_capacity_j_m3k, nodal)
+    return nodal
 
 
 def refuse_flat_tets(points_m: Vector, tets: Numbers) -> None:
-    """Raise `HeatError` if arrays have wrong shapes, numbers are out of range, or tetrahedra are inverted or flat."""
-    check_shape("mesh points", points_m, (None, 3), _REMEDY, HeatError)
-    check_finite("mesh points", points_m, _REMEDY, HeatError)
-    check_shape("mesh tets", tets, (None, 4), _REMEDY, HeatError)
-    if len(tets) and (tets.min() < 0 or tets.max() >= len(points_m)):
-        expected, got = f"node numbers from 0 to {len(points_m) - 1}", f"{tets.min()} to {tets.max()}"
-        raise HeatError("mesh tets", expected=expected, got=got, remedy=_REMEDY)
-    points_m, tets, unit_m = _prepared(points_m, tets)
-    num_flat = _count_flat(points_m, tets, 1.0 / unit_m)
+    """Raise `HeatError` if tetrahedra of a mesh that `TetMesh.check` accepts are inverted or flat."""
+    num_flat = _count_flat(*_prepared(points_m, tets))
     if num_flat:
         expected = f"volumes above 0 and heights of at least {FLATTEST:g} of the longest side"
         got = f"{num_flat} of {len(tets)} flat or inverted"
-        raise HeatError("mesh tets", expected=expected, got=got, remedy=_REMEDY)
+        raise HeatError("mesh tets", expected=expected, got=got, remedy="Build the mesh with thermoxels_ns.mesh.")
 
 
-def _prepared(points_m: Vector, tets: Numbers) -> tuple[Vector, Numbers, float]:
-    """Return arrays for the kernels, and the power of 2 above all coordinates, a unit in which nothing overflows."""
-    reach = float(np.max(np.abs(points_m), initial=0.0))
-    unit_m = float(np.exp2(np.frexp(reach)[1])) if reach else 1.0
-    return np.ascontiguousarray(points_m, np.float64), np.ascontiguousarray(tets, np.int64), unit_m
+def _prepared(points_m: Vector, tets: Numbers) -> tuple[Vector, Numbers]:
+    """Return the arrays as the kernels take them."""
+    return np.ascontiguousarray(points_m, np.float64), np.ascontiguousarray(tets, np.int64)
 
 
 @kernel
-def _sides(points, tet, scale):
+def _sides(points, tet):
     # Node numbers are unsigned, here and below, which saves a test for negative indices.
     o, a = points[np.uint64(tet[0])], points[np.uint64(tet[1])]
     b, c = points[np.uint64(tet[2])], points[np.uint64(tet[3])]
     return (
-        ((a[0] - o[0]) * scale, (a[1] - o[1]) * scale, (a[2] - o[2]) * scale),
-        ((b[0] - o[0]) * scale, (b[1] - o[1]) * scale, (b[2] - o[2]) * scale),
-        ((c[0] - o[0]) * scale, (c[1] - o[1]) * scale, (c[2] - o[2]) * scale),
+        (a[0] - o[0], a[1] - o[1], a[2] - o[2]),
+        (b[0] - o[0], b[1] - o[1], b[2] - o[2]),
+        (c[0] - o[0], c[1] - o[1], c[2] - o[2]),
     )
 
 
@@ -197,24 +184,24 @@ def _edge_numbers(first, other, elements, ends, numbers):
 
 
 @kernel
-def _count_flat(points, tets, scale):
+def _count_flat(points, tets):
     flat = 0
     for t in range(len(tets)):
-        a, b, c = _sides(points, tets[t], scale)
+        a, b, c = _sides(points, tets[t])
         flat += _is_flat(a, b, c)
     return flat
 
 
 @kernel
-def _add_couplings(points, tets, conductivity, scale, first, other, coupling):
+def _add_couplings(points, tets, conductivity, reach, first, other, coupling):
     for t in range(len(tets)):
         tet = tets[t]
-        a, b, c = _sides(points, tet, scale)
+        a, b, c = _sides(points, tet)
         # Inward normals of the face opposite each node, of twice this face's area in length.
         n1, n2, n3 = _cross(b, c), _cross(c, a), _cross(a, b)
         n0 = (-n1[0] - n2[0] - n3[0], -n1[1] - n2[1] - n3[1], -n1[2] - n2[2] - n3[2])
         normals = (n0, n1, n2, n3)
-        right = _ANGLE_ROUND_OFF / _size(a, b, c)
+        right = _ANGLE_ROUND_OFF * reach / _size(a, b, c)
         squares = (_dot(n0, n0), _dot(n1, n1), _dot(n2, n2), _dot(n3, n3))
         factor = conductivity[t] / (6.0 * _dot(a, n1))
         for i in range(3):
@@ -225,45 +212,9 @@ def _add_couplings(points, tets, conductivity, scale, first, other, coupling):
 
 
 @kernel
-def _add_capacities(points, tets, capacity, scale, nodal):
+def _add_capacities(points, tets, capacity, nodal):
     for t in range(len(tets)):
         tet = tets[t]
-        a, b, c = _sides(points, tet, scale)
+        a, b, c = _sides(points, tet)
         for i in range(4):
             nodal[tet[i]] += capacity[t] * _dot(a, _cross(b, c)) / 24.0
-
-
-@kernel
-def _unique_edges(tets, end, other, first, mark):
-    """Fill `first` and the beginning of `other` as in `MeshEdges`, and return the number of edges."""
-    num_nodes = len(mark)
-    for t in range(len(tets)):
-        for a in range(3):
-            for b in range(a + 1, 4):
-                end[min(tets[t, a], tets[t, b]) + 1] += 1
-    for node in range(num_nodes):
-        end[node + 1] += end[node]
-    # end[i], where the edges of node i begin, moves with each edge stored and at last is where those of i + 1 begin.
-    for t in range(len(tets)):
-        for a in range(3):
-            for b in range(a + 1, 4):
-                low, high = min(tets[t, a], tets[t, b]), max(tets[t, a], tets[t, b])
-                other[end[low]] = high
-                end[low] += 1
-    begin = kept = np.int64(0)
-    for node in range(num_nodes):
-        for k in range(begin, end[node]):
-            if mark[other[k]] != node:
-                mark[other[k]] = node
-                other[kept] = other[k]
-                kept += 1
-        # Insertion sort, because the few edges of a node are almost in order.
-        for k in range(first[node] + 1, kept):
-            high, place = other[k], k
-            while place > first[node] and other[place - 1] > high:
-                other[place] = other[place - 1]
-                place -= 1
-            other[place] = high
-        begin = end[node]
-        first[node + 1] = kept
-    return kept

@@ -16,6 +16,7 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.core.yaml_records import raising
 from thermoxels_ns.fem.p1_kernels import refuse_flat_tets
 from thermoxels_ns.fem.quantities import Bounded, Bounds
 from thermoxels_ns.fem.selection import Selection
@@ -205,9 +206,8 @@ class HeatProblem:
 
     def __post_init__(self) -> None:
         points, tets = self.mesh.points_m, self.mesh.tets
-        if len(tets) == 0:
-            remedy = "Build the mesh with thermoxels_ns.mesh."
-            raise HeatError("mesh tets", expected="at least one tetrahedron", got="none", remedy=remedy)
+        with raising(HeatError):
+            self.mesh.check()
         refuse_flat_tets(points, tets)
         unused = len(points) - np.count_nonzero(np.bincount(tets.ravel(), minlength=len(points)))
         if unused:
@@ -216,7 +216,6 @@ class HeatProblem:
             raise HeatError("mesh points", expected=expected, got=got, remedy=remedy)
         self._check_temperatures()
         self._check_effects()
-        _ = self.selection  # refuses tags that do not fit the mesh
         self._check_materials()
 
     @cached_property

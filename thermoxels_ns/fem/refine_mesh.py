@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.p1_kernels import FACET_EDGES, TET_EDGES, mesh_edges
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -27,14 +26,12 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
     num_nodes, low, high = len(mesh.points_m), edges.smaller_nodes(), edges.other
     points = np.concatenate([mesh.points_m, edges.midpoints(mesh.points_m)])
     local = np.concatenate([mesh.tets, num_nodes + edges.numbers(mesh.tets, TET_EDGES)], axis=1)
-    chosen = np.empty(len(mesh.tets), np.int64)
-    _choose_diagonals(points, local, _CHILDREN, chosen)
     facets = np.concatenate([mesh.facets, num_nodes + edges.numbers(mesh.facets, FACET_EDGES)], axis=1)
     tags, colour = mesh.boundary, mesh.colour
     return replace(
         mesh,
         points_m=points,
-        tets=np.take_along_axis(local[:, None], _CHILDREN[chosen], axis=2).reshape(-1, 4),
+        tets=np.take_along_axis(local[:, None], _CHILDREN[_diagonals(points, local)], axis=2).reshape(-1, 4),
         temperature_c=np.concatenate([mesh.temperature_c, edges.midpoints(mesh.temperature_c)]),
         observed=np.concatenate([mesh.observed, mesh.observed[low] & mesh.observed[high]]),
         facets=facets[:, _FACET_CHILDREN].reshape(-1, 3),
@@ -82,36 +79,19 @@ _FACET_CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 _TIE = 1e-9  # Cosines that differ by at most this count as equal
 
 
-@kernel
-def _choose_diagonals(points, local, children, chosen):
-    """Set `chosen` of each tetrahedron to the diagonal for which the largest angle between faces is smallest."""
-    normal = np.empty((4, 3))
-    side = np.empty((3, 3))
-    for t in range(len(local)):
-        best = -2.0
-        for option in range(3):
-            worst = 2.0
-            for child in range(4, 8):
-                o = local[t, children[option, child, 0]]
-                for i in range(3):
-                    for x in range(3):
-                        side[i, x] = points[local[t, children[option, child, i + 1]], x] - points[o, x]
-                for i in range(3):
-                    u, v = side[(i + 1) % 3], side[(i + 2) % 3]
-                    normal[i + 1, 0] = u[1] * v[2] - u[2] * v[1]
-                    normal[i + 1, 1] = u[2] * v[0] - u[0] * v[2]
-                    normal[i + 1, 2] = u[0] * v[1] - u[1] * v[0]
-                for x in range(3):
-                    normal[0, x] = -normal[1, x] - normal[2, x] - normal[3, x]
-                for i in range(4):
-                    length = np.sqrt(normal[i, 0] ** 2 + normal[i, 1] ** 2 + normal[i, 2] ** 2)
-                    for x in range(3):
-                        normal[i, x] /= length
-                    for j in range(i):
-                        # The angle between two faces is 180 degrees less the angle between their inward normals.
-                        cosine = 0.0
-                        for x in range(3):
-                            cosine -= normal[i, x] * normal[j, x]
-                        worst = min(worst, cosine)
-            if worst > best + _TIE:
-                best, chosen[t] = worst, option
+def _diagonals(points: FloatArray, local: IntArray) -> IntArray:
+    """Return for each tetrahedron the diagonal for which the largest angle between faces is smallest, shape (t,)."""
+    best, chosen = np.full(len(local), -2.0), np.zeros(len(local), np.int64)
+    one, other = np.triu_indices(4, 1)
+    for option in range(3):
+        corner = points[local[:, _CHILDREN[option, 4:]]]  # the four tetrahedra around the diagonal, (t, 4, 4, 3)
+        a, b, c = (corner[:, :, n] - corner[:, :, 0] for n in (1, 2, 3))
+        inward = [np.cross(b, c), np.cross(c, a), np.cross(a, b)]
+        inward = np.stack([-sum(inward), *inward], axis=2)
+        inward /= np.linalg.norm(inward, axis=3, keepdims=True)
+        # The angle between two faces is 180 degrees less the angle between their inward normals.
+        cosines = -(inward @ np.swapaxes(inward, 2, 3))[:, :, one, other]
+        worst = cosines.min(axis=(1, 2))
+        better = worst > best + _TIE
+        best[better], chosen[better] = worst[better], option
+    return chosen

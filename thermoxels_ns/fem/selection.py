@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas, facet_normals
@@ -19,10 +18,8 @@ class Selection:
     """A mesh's patches and regions, which effects name, and the geometry of its f boundary triangles."""
 
     def __init__(self, mesh: TetMesh, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> None:
-        """Check the tags of a mesh (`HeatError` if they do not fit); `up` is the unit vector for `Places.up`."""
-        self.mesh, self.up = mesh, up
-        self._check()
-        tags = mesh.boundary
+        """Take a mesh that `TetMesh.check` accepts; `up` is the unit vector for `Places.up`."""
+        self.mesh, self.up, tags = mesh, up, mesh.boundary
         self.patch_names: tuple[str, ...] = ("boundary",) if tags is None else tags.patch_names
         """Names of the patches; a mesh without tags has one, "boundary"."""
         self.facet_patch: IntArray = np.zeros(len(mesh.facets), np.int64) if tags is None else tags.patch
@@ -55,23 +52,6 @@ class Selection:
         """Return the centroids of tetrahedra as places without normals."""
         centroids = self.mesh.points_m[self.mesh.tets[tets]].mean(axis=1)
         return Places(centroids, np.zeros_like(centroids), self.up)
-
-    def _check(self) -> None:
-        mesh, remedy = self.mesh, "Build the mesh with thermoxels_ns.mesh."
-        tags = mesh.boundary
-        check_shape("mesh facets", mesh.facets, (None, 3), remedy, HeatError)
-        _check_indices("mesh facets", mesh.facets, len(mesh.points_m), remedy)
-        check_shape("mesh region", mesh.region, (len(mesh.tets),), remedy, HeatError)
-        _check_indices("mesh region", mesh.region, len(mesh.region_names), remedy)
-        if tags is not None:
-            check_shape("boundary patch", tags.patch, (len(mesh.facets),), remedy, HeatError)
-            _check_indices("boundary patch", tags.patch, len(tags.patch_names), remedy)
-
-
-def _check_indices(name: str, indices: IntArray, count: int, remedy: str) -> None:
-    if indices.size and (indices.min() < 0 or indices.max() >= count):
-        got = f"{indices.min()} to {indices.max()}"
-        raise HeatError(name, expected=f"numbers from 0 to {count - 1}", got=got, remedy=remedy)
 
 
 def matching_names(names: Collection[str], pattern: str) -> list[str]:

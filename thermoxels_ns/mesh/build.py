@@ -13,8 +13,9 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_patches, apply_regions
 from thermoxels_ns.mesh.boundary.visibility import seen_facets
-from thermoxels_ns.mesh.quality.checks import component_of
+from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of
 from thermoxels_ns.mesh.quality.report import BoundaryMode
+from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.solid.morphology import face_connected, grow
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
@@ -26,7 +27,7 @@ from thermoxels_ns.mesh.temperature import (
     tet_conductances,
 )
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh, facet_normals
-from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
+from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
 
 
 @dataclass(frozen=True)
@@ -89,12 +90,13 @@ def build_mesh(
     """
     transform = check_similarity("world_to_metres", world_to_metres)
     scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
-    solid = select_solid(snapshot, selection, scale, transform[:3] / metres_per_unit, makes_up_volume=not voxel)
+    solid = select_solid(snapshot, selection, scale, transform[:3] / metres_per_unit)
     if voxel:
-        (corners, tets), facets = kuhn_tets(solid.cells), voxel_facets(solid.cells)
-        points = corners.astype(np.float64)
+        corners, tets = kuhn_tets(solid.cells)
+        points, facets = corners.astype(np.float64), boundary_facets(tets)
     else:
-        stuffed = sharpen(stuff(solid.level, options.coarsest_cell), solid.level.shape)
+        level = level_of(snapshot.centre_density(), solid.threshold, solid.dense, solid.cells)
+        stuffed = sharpen(stuff(level, options.coarsest_cell), level.shape)
         points, tets, facets = stuffed.points, stuffed.tets, stuffed.facets
     known, observed_range_c = snapshot.temperature_c, None
     temperature_c, observed = np.full(len(points), np.nan), np.zeros(len(points), dtype=bool)
@@ -111,11 +113,11 @@ def build_mesh(
         stays = ~unseen[body]
         goes = _voxels_of(solid.cells, points, tets, ~stays, voxel)
         num_voxels = int(np.count_nonzero(goes))
-        solid = replace(solid, cells=solid.cells & ~goes, level=np.where(goes, -np.abs(solid.level), solid.level))
+        solid = replace(solid, cells=solid.cells & ~goes)
         number = np.cumsum(stays) - 1
         tets, facets = number[tets[stays[tets[:, 0]]]], number[facets[stays[facets[:, 0]]]]
         points, temperature_c, observed = points[stays], temperature_c[stays], observed[stays]
-    edges, conductance = lattice_edges(solid.cells) if voxel else tet_conductances(points, tets)
+    edges, conductance = tet_conductances(points, tets)
     if known is not None:
         temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
         measured_c = known[snapshot.observed_weight >= MIN_OBSERVED_WEIGHT]

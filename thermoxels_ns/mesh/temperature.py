@@ -72,8 +72,7 @@ def extend_harmonically(
         edges: Node pairs, shape (e, 2); if a pair is listed several times, its weights add up.
         temperature_c: Nodal temperatures, shape (n,), [degrees Celsius]; read at observed nodes only.
         observed: True where a node's temperature is a measurement, shape (n,).
-        edge_weights: Conductance w of each edge, shape (e,), as from `voxel_tets.lattice_edges` or `tet_conductances`;
-            all are 1 if left out.
+        edge_weights: Conductance w of each edge, shape (e,), as from `tet_conductances`; all are 1 if left out.
 
     Raises:
         MeshError: A connected component has no observed node, a value is not finite, or the solver did not converge.

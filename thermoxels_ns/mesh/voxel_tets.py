@@ -1,4 +1,4 @@
-"""Meshes along voxel faces: six conforming tetrahedra per voxel, their boundary and their edges."""
+"""Meshes along voxel faces: six conforming tetrahedra per voxel."""
 
 from __future__ import annotations
 
@@ -33,60 +33,16 @@ def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
     >>> corners.shape, tets.shape
     ((8, 3), (6, 4))
     """
-    cells, number, first = _node_numbers(cells)
-    strides = np.array([number.shape[1] * number.shape[2], number.shape[2], 1], dtype=np.int64)
+    box = bounding_box(cells)
+    cells, first = cells[box], np.array([part.start for part in box], dtype=np.int64)
+    nx, ny, nz = cells.shape
+    used = np.zeros((nx + 1, ny + 1, nz + 1), dtype=bool)
+    for dx, dy, dz in CORNER_OFFSETS:
+        used[dx : dx + nx, dy : dy + ny, dz : dz + nz] |= cells
+    number = np.cumsum(used.ravel(), dtype=np.int64) - 1
+    strides = np.array([used.shape[1] * used.shape[2], used.shape[2], 1], dtype=np.int64)
     corners = (np.argwhere(cells) @ strides)[:, None] + CORNER_OFFSETS @ strides
-    tets = number.ravel()[corners][:, KUHN_PATTERN].reshape(-1, 4)
-    return np.argwhere(number >= 0) + first, tets
-
-
-def used_corners(cells: BoolArray) -> IntArray:
-    """Return the lattice indices (n, 3) of the corners of solid voxels in C order: the nodes of `kuhn_tets`."""
-    number, first = _node_numbers(cells)[1:]
-    return np.argwhere(number >= 0) + first
-
-
-def lattice_edges(cells: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return the edges of solid voxels, (e, 2) nodes of `kuhn_tets`, and how many solid voxels have each edge, (e,).
-
-    Two neighbouring corners with only empty voxels around their connection are not joined by an edge.
-    """
-    cells, number, _ = _node_numbers(cells)
-    flat_number = number.ravel()
-    strides = (number.shape[1] * number.shape[2], number.shape[2], 1)
-    edges, counts = [], []
-    for axis in range(3):
-        # This is the number of solid voxels around the edge that starts in each corner.
-        around = np.zeros(number.shape, dtype=np.uint8)
-        for offset in CORNER_OFFSETS[CORNER_OFFSETS[:, axis] == 0]:
-            around[tuple(slice(o, o + n) for o, n in zip(offset, cells.shape))] += cells
-        start = np.flatnonzero(around)
-        edges.append(np.stack([flat_number[start], flat_number[start + strides[axis]]], axis=-1))
-        counts.append(around.ravel()[start].astype(np.int64))
-    return np.concatenate(edges), np.concatenate(counts)
-
-
-def voxel_facets(cells: BoolArray) -> IntArray:
-    """Return the boundary triangles of `kuhn_tets`, (f, 3), normals outwards: two per face between solid and empty.
-
-    Each face is cut along the diagonal from its lowest to its highest corner, as `kuhn_tets` does.
-
-    >>> voxel_facets(np.ones((1, 1, 1), dtype=bool)).shape
-    (12, 3)
-    """
-    cells, number, _ = _node_numbers(cells)
-    facets = []
-    for axis in range(3):
-        u, v = np.eye(3, dtype=np.int64)[(axis + 1) % 3], np.eye(3, dtype=np.int64)[(axis + 2) % 3]
-        width = [(0, 0)] * 3
-        width[axis] = (1, 1)
-        steps = np.diff(np.pad(cells, width).astype(np.int8), axis=axis)
-        for turned in (True, False):  # turned: the solid is above the face and the normal points down the axis
-            low = np.argwhere(steps == (1 if turned else -1))
-            a, b, c, d = (number[tuple((low + offset).T)] for offset in (0, u, u + v, v))
-            pair = [(a, c, b), (a, d, c)] if turned else [(a, b, c), (a, c, d)]
-            facets.append(np.stack([np.stack(triangle, axis=-1) for triangle in pair], axis=1).reshape(-1, 3))
-    return np.concatenate(facets)
+    return np.argwhere(used) + first, number[corners][:, KUHN_PATTERN].reshape(-1, 4)
 
 
 def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tuple[int, ...]) -> IntArray:
@@ -98,19 +54,3 @@ def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tu
         sides |= (points_index[:, axis] == count - 1).astype(np.uint8) << (2 * axis + 1)
     common = sides[facets[:, 0]] & sides[facets[:, 1]] & sides[facets[:, 2]]
     return np.where(common > 0, FACET_BOX, FACET_SURFACE).astype(np.int64)
-
-
-def _node_numbers(cells: BoolArray) -> tuple[BoolArray, IntArray, IntArray]:
-    """Return the cells of the solid's bounding box, the node numbers of their corners, and the box's first index.
-
-    Nodes are numbered in C order; corners of no solid voxel have -1. Corners are one more than cells along each axis.
-    """
-    box = bounding_box(cells)
-    cells, first = np.ascontiguousarray(cells[box]), np.array([part.start for part in box], dtype=np.int64)
-    nx, ny, nz = cells.shape
-    used = np.zeros((nx + 1, ny + 1, nz + 1), dtype=bool)
-    for dx, dy, dz in CORNER_OFFSETS:
-        used[dx : dx + nx, dy : dy + ny, dz : dz + nz] |= cells
-    number = np.cumsum(used.ravel(), dtype=np.int64).reshape(used.shape) - 1
-    number[~used] = -1
-    return cells, number, first

@@ -7,8 +7,9 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.boundary.visibility import facet_views, seen_facets
+from thermoxels_ns.mesh.quality.checks import boundary_facets
 from thermoxels_ns.mesh.tetrahedra import facet_normals
-from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 LATTICE = Lattice((2.0, -1.0, 0.5), 0.25, (33, 33, 33))
 H = LATTICE.voxel_size
@@ -27,7 +28,7 @@ def views(*centres: np.ndarray, target: np.ndarray = MIDDLE, focal: float = 100.
 def voxel_surface(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centroids and outward normals of a voxel body's triangles, those of the faces themselves, in world units."""
     points = LATTICE.index_to_world(kuhn_tets(cells)[0])
-    facets = voxel_facets(cells)
+    facets = boundary_facets(kuhn_tets(cells)[1])
     return points[facets].mean(axis=1), facet_normals(points, facets)
 
 
@@ -47,7 +48,7 @@ def test_a_sphere_is_seen_up_to_its_horizon() -> None:
     distance = np.linalg.norm((LATTICE.cell_centres() - MIDDLE) / H, axis=-1) - radius
     cells, camera = distance < 0.0, MIDDLE + np.array([12.0, 3.0, -2.0])
     points = kuhn_tets(cells)[0]
-    facets = voxel_facets(cells)
+    facets = boundary_facets(kuhn_tets(cells)[1])
     centroids = LATTICE.index_to_world(points[facets].mean(axis=1))
     normals = (centroids - MIDDLE) / np.linalg.norm(centroids - MIDDLE, axis=1, keepdims=True)
     seen = seen_facets(cells, views(camera), LATTICE, centroids, normals)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numbers
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_positive, remove_file, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays
 from thermoxels_ns.mesh.quality.checks import facet_owners
@@ -264,15 +263,6 @@ class HeatStep:
     specific_heat_j_kgk: float  # Specific heat capacity, [J / (kg K)], above 0
     steps: int  # Number of steps, at least 1
     step_seconds: float  # Length of a step, [s], above 0
-
-    def __post_init__(self) -> None:
-        for field in ("conductivity_w_mk", "density_kg_m3", "specific_heat_j_kgk", "step_seconds"):
-            remedy = "Give it in the unit that its name ends in."
-            object.__setattr__(self, field, check_positive(field, getattr(self, field), remedy, HeatError))
-        whole = isinstance(self.steps, numbers.Integral) and not isinstance(self.steps, bool)
-        if not whole or self.steps < 1:
-            expected = "a whole number of at least 1"
-            raise HeatError("steps", expected=expected, got=repr(self.steps), remedy="Pass 10, for example.")
 
 
 def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> None:

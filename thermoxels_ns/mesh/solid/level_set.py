@@ -37,8 +37,6 @@ def level_of(
     threshold: float,
     dense: BoolArray,
     cells: BoolArray,
-    *,
-    makes_up_volume: bool = True,
 ) -> Float32Array:
     """Return a level in [-1, 1] for every voxel: above 0 in solid voxels, below 0 in empty voxels, 0 on the surface.
 
@@ -54,8 +52,6 @@ def level_of(
         dense: True for voxels that the threshold chose.
         cells: True for solid voxels. Solid voxels that are not dense were added by a later step and get level 1 before
             smoothing; dense voxels that are not solid were removed by a later step and get level -1.
-        makes_up_volume: True if the level is shifted so that thin and small bodies keep their volume; False for meshes
-            along voxel faces, which keep it anyway.
     """
     result = np.full(cells.shape, -1.0, dtype=np.float32)
     near, threshold = bounding_box(cells, MARGIN), max(threshold, float(np.finfo(np.float64).tiny))
@@ -79,7 +75,7 @@ def level_of(
     least = np.abs(level)
     least *= np.where(_thin(cells) | _thin(~cells), np.float32(LEAST_SHARE_THIN), np.float32(LEAST_SHARE))
     smooth = np.clip(_signed(smooth, least, cells), np.float32(-1.0), np.float32(1.0))
-    result[near] = _keep_volume(smooth, level, least, cells) if makes_up_volume else smooth
+    result[near] = _keep_volume(smooth, level, least, cells)
     return result
 
 

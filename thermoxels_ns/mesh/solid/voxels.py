@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 from scipy import ndimage
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_positive, is_number
+from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
+from thermoxels_ns.core.yaml_records import record, wrong
 from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, first_solid
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
-from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
 
 RegionKind = Literal["auto", "all"]
@@ -47,53 +48,38 @@ FEWEST_CAMERAS = 0.1  # quantile of the visibility of what cameras are pointed a
 MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` interpolates between blocks of voxels
 
 
-@dataclass(frozen=True)
+@record(MeshError)
 class SolidSelection:
     """The rules that tell solid voxels from empty ones; the fields are the export's options of the same names."""
 
-    voxel_optical_depth: float | None = None  # least density times edge; rays choose if the first three are None
-    density_percentile: float | None = None
-    """Percentile, 0 to 100, of the density of all voxels, as in the Thermoxels paper; overrides the optical depth."""
-    density_threshold: float | None = None  # least density, [1 / world unit]; overrides both rules above
-    close_gaps: int = 1  # gaps up to twice this many voxels wide are filled (a morphological closing)
+    voxel_optical_depth: Annotated[float, Field(gt=0)] | None = None
+    """Least density times edge; rays choose if the first three are None."""
+    density_percentile: Annotated[float, Field(ge=0, le=100)] | None = None
+    """Percentile of the density of all voxels, as in the Thermoxels paper; overrides the optical depth."""
+    density_threshold: Annotated[float, Field(ge=0)] | None = None
+    """Least density, [1 / world unit]; overrides both rules above."""
+    close_gaps: Annotated[int, Field(ge=0, le=100)] = 1
+    """Gaps up to twice this many voxels wide are filled (a morphological closing)."""
     region: RegionKind = "auto"  # auto: the voxels of `where_cameras_look`; all: all voxels
     region_box: Box | None = None  # xmin ymin zmin xmax ymax zmax, in coordinates of the input poses; replaces `region`
     region_near: Ball | None = None  # x y z radius in the same coordinates; replaces `region`
     interior: InteriorKind = "solid"  # solid: the voxels of `interior` are filled; hollow: they stay empty
-    seal_openings: int = 2  # to find the interior, openings up to twice this many voxels wide count as closed
-    wall_thickness: float | None = None  # thickness that walls get instead of a filled interior, [m]
+    seal_openings: Annotated[int, Field(ge=0, le=100)] = 2
+    """To find the interior, openings up to twice this many voxels wide count as closed."""
+    wall_thickness: Annotated[float, Field(gt=0)] | None = None
+    """Thickness that walls get instead of a filled interior, [m]."""
 
     def __post_init__(self) -> None:
-        def good(value: object, most: float = math.inf) -> bool:
-            return is_number(value) and 0 <= value <= most and value < math.inf
-
-        def whole(value: object) -> bool:
-            return isinstance(value, int) and good(value, 100)
-
-        depth, wall, box, near = self.voxel_optical_depth, self.wall_thickness, self.region_box, self.region_near
-        percentile, threshold = self.density_percentile, self.density_threshold
-        box_is_good = box is None or (np.isfinite(box).all() and np.less(box[:3], box[3:]).all())
-        for name, allowed, expected, instead in (
-            ("voxel_optical_depth", depth is None or (good(depth) and depth > 0), "a finite number above 0", None),
-            ("density_percentile", percentile is None or good(percentile, 100), "a finite number from 0 to 100", None),
-            ("density_threshold", threshold is None or good(threshold), "a finite number of at least 0", None),
-            ("close_gaps", whole(self.close_gaps), "a whole number from 0 to 100", "1"),
-            ("seal_openings", whole(self.seal_openings), "a whole number from 0 to 100", "2"),
-            ("wall_thickness", wall is None or (good(wall) and wall > 0), "a finite number above 0", None),
-            ("region", self.region in get_args(RegionKind), "auto or all", "auto"),
-            ("region_box", box_is_good, "finite xmin ymin zmin xmax ymax zmax, minima below maxima", "0 0 0 4 3 2"),
-            ("region_near", near is None or (np.isfinite(near).all() and near[3] > 0), "x y z radius > 0", "0 0 1 2.5"),
-            ("interior", self.interior in get_args(InteriorKind), "solid or hollow", "solid"),
-        ):
-            if not allowed:
-                option = f"--{name.replace('_', '-')}"
-                remedy = f"Leave {option} out." if instead is None else f"Pass {option} {instead}, or leave it out."
-                raise MeshError(name, expected=expected, got=repr(getattr(self, name)), remedy=remedy)
+        box, near = self.region_box, self.region_near
+        if box is not None and not np.less(box[:3], box[3:]).all():
+            expected, remedy = "xmin ymin zmin xmax ymax zmax, minima below maxima", "Pass --region-box 0 0 0 4 3 2."
+            raise wrong("region_box", expected, box, remedy)
+        if near is not None and not near[3] > 0:
+            raise wrong("region_near", "x y z radius, above 0", near, "Pass --region-near 0 0 1 2.5.")
         asked = [f"--region {self.region}"] * (self.region != "auto")
         asked += ["--region-box"] * (box is not None) + ["--region-near"] * (near is not None)
         if len(asked) > 1:
-            remedy = "Leave all but one of these options out."
-            raise MeshError("region", expected="one of them", got=" and ".join(asked), remedy=remedy)
+            raise wrong("region", "one of them", " and ".join(asked), "Leave all but one of these options out.")
 
 
 @dataclass(frozen=True)
@@ -111,7 +97,7 @@ class SolidCells:
     """The solid voxels of a field, their surface level, and the steps that found them."""
 
     cells: BoolArray  # True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is
-    level: Float32Array  # `level_of` at voxel centres; the surface is where the trilinear level is 0
+    dense: BoolArray  # True for voxels that the threshold chose
     threshold: float  # least density at the centre of a voxel that counts as dense, [1 / world unit]
     explanation: str  # which rule chose the threshold, and why
     steps: tuple[SolidStep, ...]  # all steps in order; the first is the threshold
@@ -126,13 +112,11 @@ def select_solid(
     selection: SolidSelection,
     metres_per_world_unit: float | None = None,
     world_to_input: FloatArray | None = None,
-    *,
-    makes_up_volume: bool = True,
 ) -> SolidCells:
     """Return the solid voxels of a trained field, chosen by their density and then changed by up to three more steps.
 
     `metres_per_world_unit` is needed for a wall thickness only. `world_to_input`, shape (3, 4), maps world coordinates
-    to those of the region's box or point; None is the identity. `makes_up_volume` is passed to `level_of`.
+    to those of the region's box or point; None is the identity.
 
     Raises:
         MeshError: No voxel is dense enough; none lies in the box or ball asked for; a percentile is asked for and all
@@ -197,7 +181,7 @@ def select_solid(
         cells = step("interior", cells | inside.enclosed | inside.hidden, remark)
     return SolidCells(
         cells=cells,
-        level=level_of(density, chosen.density, chosen.cells, cells, makes_up_volume=makes_up_volume),
+        dense=chosen.cells,
         threshold=chosen.density,
         explanation=chosen.explanation,
         steps=tuple(steps),
