@@ -16,12 +16,13 @@ from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig_types import DriftEstimate, FloatArray, RigEstimate
-from thermoxels_ns.capture.sfm.scale_and_up import MetricScale, Up
+from thermoxels_ns.capture.sfm.scale_and_up import Up
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import CACHE_FOLDER
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.json_values import write_json
+from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, write_tracks
 
 JSON_NAME = "transforms.json"
@@ -44,7 +45,7 @@ class Scene:
     model: SfmModel
     rig: RigEstimate
     drift: DriftEstimate
-    scale: MetricScale | None
+    scale: SceneScale | None
     up: Up
     masks: PhotographMasks
 

@@ -25,7 +25,6 @@ from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions
 from thermoxels_ns.capture.sfm.poses import add_points, find_poses, fitted_to_photographs, read_given_poses
 from thermoxels_ns.capture.sfm.scale_and_up import (
-    MetricScale,
     Up,
     find_up,
     level_rotation,
@@ -48,6 +47,7 @@ from thermoxels_ns.capture.stage_cache import (
 from thermoxels_ns.core.checks import hold_folder, remove_stale_temporaries
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError, printable
 from thermoxels_ns.core.json_values import write_json
+from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 PAGE_NAME = "capture.html"  # file name of the report, in the output folder
@@ -256,7 +256,7 @@ class _Capture:
         self.dropped |= load_json(folder / "dropped.json")
         return load(folder / "model.npz", SfmModel)
 
-    def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, MetricScale | None, str, Up]:
+    def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, SceneScale | None, str, Up]:
         """Return the model (turned upright unless its poses are given), scale or None, reason for None, and up."""
         settings = self.settings
         depends = {
@@ -284,10 +284,10 @@ class _Capture:
         content = load_json(folder / "scale.json")
         scale, up = content["scale"], content["up"]
         up["direction"] = np.array(up["direction"], dtype=np.float64)
-        scale = None if scale is None else MetricScale(**scale)
+        scale = None if scale is None else SceneScale(**scale)
         return load(folder / "model.npz", SfmModel), scale, content["missing"], Up(**up)
 
-    def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[MetricScale | None, str]:
+    def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
         """Return metres per unit from a known distance, else markers, else GPS; or None and the reason for None."""
         settings = self.settings
         if settings.known_distance is not None:
@@ -320,7 +320,7 @@ class _Capture:
         model: SfmModel,
         frames: list[CaptureFrame],
         read: CaptureFrames,
-        scale: MetricScale | None,
+        scale: SceneScale | None,
         scale_missing: str,
         board: RigEstimate | None,
     ) -> tuple[RigEstimate, RigEstimate]:

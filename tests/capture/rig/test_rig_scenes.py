@@ -19,8 +19,8 @@ from thermoxels_ns.capture.rig.search import estimate_rig
 from thermoxels_ns.capture.rig.start import read_rig
 from thermoxels_ns.capture.rig_types import PARAMETERS, RigEstimate, RigFrame, RigStart
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.scale_and_up import MetricScale
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 
@@ -231,7 +231,7 @@ def test_files_give_focal_length_turn_and_place_in_metres_and_then_in_units(fold
     ]
     assert np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)) < 0.15
     assert 0.0 < rig.projection_sigma_px < 0.3
-    units = in_scene_units(rig, MetricScale(0.5, None, "a ruler"), "")
+    units = in_scene_units(rig, SceneScale(0.5, None, "a ruler"), "")
     assert np.allclose(units.visible_to_thermal[:3, 3], 2.0 * rig.visible_to_thermal[:3, 3])
     assert np.array_equal(units.visible_to_thermal[:3, :3], rig.visible_to_thermal[:3, :3])
     assert units.standard_errors["tx"] == pytest.approx(2.0 * rig.standard_errors["tx"])
