@@ -12,7 +12,7 @@ import numpy.typing as npt
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import SceneError
 
-Lens = Literal["perspective", "fisheye", "equirectangular"]
+Lens = Literal["perspective", "fisheye"]
 
 _UNDISTORT_STEPS = 20  # Fixed-point steps that remove distortion
 _MOST_PIXELS = 1_000_000  # Most pixels along a side
