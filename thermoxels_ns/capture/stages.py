@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -22,7 +21,6 @@ from thermoxels_ns.capture.rig.start import kept_start, read_rig, rig_frames, ri
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.scene_writer import SCENE_CONTENT, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.feature_matching import PoseOptions
 from thermoxels_ns.capture.sfm.poses import add_points, find_poses, fitted_to_photographs, read_given_poses
 from thermoxels_ns.capture.sfm.scale_and_up import (
     Up,
@@ -54,8 +52,6 @@ PAGE_NAME = "capture.html"  # file name of the report, in the output folder
 _MOST_NAMED = 10  # how many of the files left out are named while the command runs; the page names all
 _LEAST_SIGHTINGS = 50  # with fewer sightings of scene points, thermal images and photographs cannot be compared
 _OVERLAY_FILE = "overlay.npy"
-
-_Options = TypeVar("_Options")
 
 
 @dataclass(frozen=True)
@@ -124,7 +120,7 @@ def run_capture(
 
 @dataclass
 class _Capture:
-    """One capture while it runs; each public method runs one stage, except `run` and `options`."""
+    """One capture while it runs; each public method runs one stage, except `run`."""
 
     source: Path
     output: Path
@@ -163,10 +159,11 @@ class _Capture:
         self.cache.run("page", {}, lambda _: write_page(result), [result.page])
         return result
 
-    def options(self, kind: type[_Options]) -> _Options:
-        """Return an instance of `kind`, a dataclass of options, filled with the user's settings of the same names."""
-        settings = vars(self.settings)
-        return kind(**{each.name: settings[each.name] for each in fields(kind) if each.name in settings})  # type: ignore[arg-type]
+    @property
+    def radiometry(self) -> RadiometryOptions:
+        """The user's settings of the same names."""
+        given = vars(self.settings)
+        return RadiometryOptions(**{each.name: given[each.name] for each in fields(RadiometryOptions)})
 
     def pairs(self) -> tuple[Pair, ...]:
         """Return the pairs of photograph and thermal image, found in the folder or listed by the user."""
@@ -204,7 +201,7 @@ class _Capture:
 
     def temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
         """Return the frames: thermal images in degrees C, and photographs, extracted where one file holds both."""
-        settings, options = self.settings, self.options(RadiometryOptions)
+        settings, options = self.settings, self.radiometry
         library = settings.dji_library if settings.dji_library and settings.dji_library.is_file() else None
         depends = {
             "options": options,
@@ -224,9 +221,10 @@ class _Capture:
 
     def poses(self, read: CaptureFrames) -> SfmModel:
         """Return camera, poses and scene points; they are found from the photographs or given by the user."""
-        settings, options = self.settings, self.options(PoseOptions)
+        settings = self.settings
+        names = ("image_size", "max_features", "matching", "lens", "seed", "threads")
         depends = {
-            "options": options,
+            "options": {name: getattr(settings, name) for name in names},
             "poses": given_fingerprints([] if settings.poses is None else files_of(settings.poses)),
             "masks": given_fingerprints([] if settings.masks is None else list(mask_files(settings.masks).values())),
             "overlays": settings.find_overlays,
@@ -241,13 +239,13 @@ class _Capture:
             if settings.poses is None:
                 focal = [frame.focal_px for frame in read.frames if frame.focal_px]
                 middle = float(np.median(focal)) if focal else None
-                poses = find_poses(photographs, folder, middle, masks, options, self.say)
+                poses = find_poses(photographs, folder, settings, middle, masks, self.say)
             else:
                 given = read_given_poses(settings.poses, {f.name: f.photograph_source for f in read.frames})
                 poses = fitted_to_photographs(given, photographs)
             model = poses.model
             if not len(model.points):
-                model = add_points(model, photographs, folder, masks, options, self.say)
+                model = add_points(model, photographs, folder, settings, masks, self.say)
             save(folder / "model.npz", model)
             write_json(folder / "dropped.json", dict(poses.dropped))
             self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
@@ -309,7 +307,7 @@ class _Capture:
         depends = {"board": board, "files": fingerprint(files_of(pictures), pictures), "angle": angle}
 
         def work(folder: Path) -> None:
-            radiometry, size = self.options(RadiometryOptions), read.thermal_size
+            radiometry, size = self.radiometry, read.thermal_size
             rig = rig_from_board_photos(pictures, board, model.camera, size, folder, settings, radiometry, self.say)
             save(folder / "rig.npz", rig)
 

@@ -10,13 +10,20 @@ from tests.support.colmap_model import write_colmap_model
 from tests.support.posed_model import CAMERA, ring_model
 from tests.support.textured_room import VISIBLE, write_card
 from thermoxels_ns.capture.masks import PhotographMasks
+from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.colmap import model_of_colmap, read_colmap
-from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, image_pairs
-from thermoxels_ns.capture.sfm.poses import Poses, add_points, find_poses, fitted_to_photographs, read_given_poses
+from thermoxels_ns.capture.sfm.poses import (
+    Poses,
+    add_points,
+    find_poses,
+    fitted_to_photographs,
+    image_pairs,
+    read_given_poses,
+)
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel, SparseDepth
 from thermoxels_ns.core.errors import SceneError
 
-OPTIONS = PoseOptions(max_features=500)
+SETTINGS = CaptureSettings(max_features=500)
 COUNT = 6
 
 
@@ -36,7 +43,7 @@ def test_points_for_poses_that_are_given(card, tmp_path):
         *(names, VISIBLE, truth[::-1], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), none, none),
         np.zeros((0, 2)),
     )
-    model = add_points(given, photographs, tmp_path, options=OPTIONS)
+    model = add_points(given, photographs, tmp_path, SETTINGS)
     assert np.array_equal(model.camera_to_world, truth[::-1])
     assert model.camera == VISIBLE
     assert len(model.points) > 200
@@ -51,7 +58,7 @@ def test_masked_parts_have_no_features(card, tmp_path):
     use[:, :200] = False
     masks = PhotographMasks((VISIBLE.width, VISIBLE.height), use)
     some = {name: photographs[name] for name in ("shot0", "shot1", "shot2", "shot3")}
-    model = find_poses(some, tmp_path, 430.0, masks, OPTIONS).model
+    model = find_poses(some, tmp_path, SETTINGS, 430.0, masks).model
     assert model.sighting_pixel[:, 0].min() > 195
 
 
