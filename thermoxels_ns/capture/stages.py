@@ -42,8 +42,8 @@ from thermoxels_ns.capture.stage_cache import (
     prepare_output,
     save,
 )
-from thermoxels_ns.core.checks import hold_folder, remove_stale_temporaries
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError, printable
+from thermoxels_ns.core.checks import hold_folder, plain_os_errors, remove_stale_temporaries
+from thermoxels_ns.core.errors import SceneError, printable
 from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
@@ -105,15 +105,10 @@ def run_capture(
     try:
         remove_stale_temporaries(folder, [PAGE_NAME])
         # Results of BLAS depend on its number of threads in the last bits; one thread is no slower here.
-        with threadpool_limits(1, "blas"):
+        remedy = "Check free space and permissions, and run the command again: finished stages are kept."
+        with threadpool_limits(1, "blas"), plain_os_errors(folder, remedy=remedy):
             cache = StageCache(folder, settings.from_stage, say)
             return _Capture(source, folder, settings, cache, say, board).run(write_page)
-    except ThermoxelsError:
-        raise
-    except OSError as problem:
-        what, got = str(problem.filename2 or problem.filename or folder), problem.strerror or str(problem)
-        remedy = "Check free space and permissions, and run the command again: finished stages are kept."
-        raise OutputError(what, expected="a file that can be read or written", got=got, remedy=remedy) from problem
     finally:
         lock.release()
 
