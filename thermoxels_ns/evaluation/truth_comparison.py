@@ -342,23 +342,14 @@ def geometry_metrics(
     except MeshError as problem:
         say(f"The geometry scores 0: {problem}")
         return dict.fromkeys(("fscore", "precision", "recall", "fscore_128"), 0.0)
-    lattice, transform = snapshot.lattice, check_similarity("world_to_input", world_to_input)
-    voxel_m = lattice.voxel_size * _scale_of(transform)
-    (own, own_seen), (common, common_seen) = (
-        known.score(solid.cells, lattice, transform, TOLERANCE_VOXELS * size_m, solid.within)
-        for size_m in (voxel_m, known.scene.size / COMMON_RESOLUTION)
-    )
-    result = {
-        "fscore": own.fscore,
-        "precision": own.precision,
-        "recall": own.recall,
-        f"fscore_{COMMON_RESOLUTION}": common.fscore,
-        "fscore_seen": own_seen.fscore,
-        f"fscore_{COMMON_RESOLUTION}_seen": common_seen.fscore,
-    }
-    if own.mean_distance is not None:
-        result["surface_distance_voxels"] = own.mean_distance / voxel_m
-        result["surface_distance_m"] = own.mean_distance
+    own = compare_with_truth(solid.cells, snapshot.lattice, world_to_input, known, within=solid.within)
+    assert own is not None  # the truth is known
+    tolerance_m = TOLERANCE_VOXELS * known.scene.size / COMMON_RESOLUTION
+    common, of_seen = known.score(solid.cells, snapshot.lattice, world_to_input, tolerance_m, solid.within)
+    result = {name: own[name] for name in ("fscore", "precision", "recall", "fscore_seen")}
+    result |= {f"fscore_{COMMON_RESOLUTION}": common.fscore, f"fscore_{COMMON_RESOLUTION}_seen": of_seen.fscore}
+    if own["mean_distance_m"] is not None:
+        result |= {f"surface_distance_{unit}": own[f"mean_distance_{unit}"] for unit in ("voxels", "m")}
     return result
 
 
