@@ -11,7 +11,7 @@ from tests.support.posed_model import CAMERA, ring_model
 from tests.support.textured_room import VISIBLE, write_card
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.colmap import model_of_colmap, read_colmap
+from thermoxels_ns.capture.sfm.colmap import model_of_colmap
 from thermoxels_ns.capture.sfm.poses import (
     Poses,
     add_points,
@@ -22,6 +22,7 @@ from thermoxels_ns.capture.sfm.poses import (
 )
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel, SparseDepth
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.colmap_model import read_model
 
 SETTINGS = CaptureSettings(max_features=500)
 COUNT = 6
@@ -173,7 +174,7 @@ def test_a_colmap_model_comes_in_with_its_points(tmp_path):
     assert found.sighting_error_px().max() < 1e-6
     assert len(found.sighting_frame) == len(MODEL.frames) * len(MODEL.points)
     assert found.point_error_px == pytest.approx(0.5)
-    large = model_of_colmap(read_colmap(tmp_path), files, (1280, 960))
+    large = model_of_colmap(read_model(tmp_path), files, (1280, 960))
     assert (large.camera.fl_x, large.camera.cx, large.camera.k1) == (1000.0, 640.0, 0.02)
     assert large.sighting_error_px().max() < 1e-6
     assert large.point_error_px == pytest.approx(1.0)

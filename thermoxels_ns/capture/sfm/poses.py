@@ -15,13 +15,14 @@ from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.capture.settings import CaptureSettings, LensModel, Matching
-from thermoxels_ns.capture.sfm.colmap import model_of_colmap, read_colmap, run_in_process
+from thermoxels_ns.capture.sfm.colmap import model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.data.colmap_model import read_model
 from thermoxels_ns.data.transforms_json import path_inside, read_intrinsics, read_pose
 
 MIN_FRAMES = 3  # smallest number of photographs that are reconstructed
@@ -125,7 +126,7 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
     none of the photographs, has several cameras, or has a name that leads out of its folder.
     """
     if path.is_dir():
-        reconstruction = read_colmap(path)
+        reconstruction = read_model(path)
         names = [image.name for image in reconstruction.images.values()]
         model = model_of_colmap(reconstruction, _frames_of(names, photographs, path))
     elif path.is_file():
