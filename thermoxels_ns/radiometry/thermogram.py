@@ -148,7 +148,7 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
         ThermoxelsError: The options contradict the file's conditions, e.g. an emissivity below 1 without reflected_c.
     """
     options = options or RadiometryOptions()
-    with errors_name(path, "a whole thermal file, as the camera wrote it", error=ThermalFileError):
+    with errors_name(path, "a whole and readable thermal file", error=ThermalFileError):
         found = detect_format(path)
         if found == "FLIR R-JPEG":
             flir = read_flir_jpeg(path)
