@@ -17,14 +17,14 @@ from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.rig_types import PARAMETERS, RigEstimate, RigFrame
 from thermoxels_ns.capture.scene_writer import TRACKS_NAME, scene_names, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.scale_and_up import MetricScale, Up
+from thermoxels_ns.capture.sfm.scale_and_up import Up
 from thermoxels_ns.capture.stage_cache import prepare_output
 from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
-from thermoxels_ns.data.scene_scale import scale_from_scene_file, up_from_scene_file
+from thermoxels_ns.data.scene_scale import SceneScale, scale_from_scene_file, up_from_scene_file
 from thermoxels_ns.data.tracks import read_tracks
 from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
 from thermoxels_ns.reports.capture_page import capture_page, thermal_in_photograph
@@ -140,7 +140,7 @@ def test_numbers_on_the_page_have_their_errors(capture):
     assert "turned by 0.00 ± 0.74 degrees" in said
     assert "41.0, 29.0 41.0, 29.0 " in words(result, rig=replace(rig, parameters=(), covariance=np.zeros((0, 0))))
     assert f"unknown ({result.scale_missing}); give a length when you export the mesh" in said
-    known = words(result, scale=MetricScale(0.5, 0.01, "GPS."))
+    known = words(result, scale=SceneScale(0.5, 0.01, "GPS."))
     assert "0.5 ± 0.01 (2.0 %) m per unit" in known and "unknown" not in known
 
 
@@ -190,7 +190,7 @@ def written(capture, tmp_path):
         scene,
         frames=[replace(scene.frames[0], thermal=tmp_path / "holed.npy"), *scene.frames[1:]],
         drift=replace(scene.drift, radial=(0.5,)),
-        scale=MetricScale(0.5, 0.01, "GPS."),
+        scale=SceneScale(0.5, 0.01, "GPS."),
         up=Up(np.array([0.0, 0.6, 0.8]), "Measured.", 0.1),
     )
     folder = prepare_output(tmp_path / "scene")

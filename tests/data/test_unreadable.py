@@ -11,7 +11,6 @@ from thermoxels_ns.capture.pairs import read_pair_list
 from thermoxels_ns.capture.photograph import open_photograph, read_mask
 from thermoxels_ns.capture.rig.images import read_photograph
 from thermoxels_ns.capture.rig_types import RigFrame
-from thermoxels_ns.capture.sfm.colmap import read_colmap
 from thermoxels_ns.commands.cost import read_runs
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import ThermoxelsError
@@ -48,7 +47,7 @@ READERS = {
     "rig.jpg": read_rig_photograph,
     "mask.png": lambda path: read_mask(path, 4, 3),
     "points3D.bin": lambda path: read_model(path.parent),
-    "images.txt": lambda path: read_colmap(path.parent),
+    "images.txt": lambda path: read_model(path.parent),
     "step.ckpt": load_checkpoint,
 }
 

@@ -65,20 +65,6 @@ def exact_mesh(
     return build_mesh(snapshot, selection, world_to_metres, MeshOptions("voxel")).mesh, cells, lattice
 
 
-def test_volume_and_area_of_a_ball_are_those_of_its_voxels(sphere):
-    cells, lattice = exact_cells(sphere)
-    result = compare_with_truth(cells, lattice, IDENTITY, sphere)
-    assert result["volume_m3"] == pytest.approx(np.count_nonzero(cells) * lattice.voxel_size**3)
-    assert result["volume_m3"] == pytest.approx(result["true_volume_m3"], rel=0.02)
-    hollow = cells.copy()
-    hollow[tuple(slice(n // 2 - 3, n // 2 + 3) for n in cells.shape)] = False
-    of_hollow = compare_with_truth(hollow, lattice, IDENTITY, sphere)
-    assert of_hollow["filled_volume_m3"] == result["volume_m3"] > of_hollow["volume_m3"]
-    assert of_hollow["area_m2"] == pytest.approx(result["area_m2"] + 6 * 36 * lattice.voxel_size**2)
-    # The faces of a digitised convex body cover each of its three shadows twice: 6 pi r^2 for a ball of area 4 pi r^2.
-    assert result["area_m2"] == pytest.approx(1.5 * result["true_area_m2"], rel=0.05)
-
-
 def test_cameras_are_found_in_a_mirrored_turned_and_scaled_world(hot_object):
     cells, lattice = exact_cells(hot_object, 24)
     plain = compare_with_truth(cells, lattice, IDENTITY, hot_object)
@@ -96,50 +82,17 @@ def test_cameras_are_found_in_a_mirrored_turned_and_scaled_world(hot_object):
         compare_with_truth(turned, other, np.zeros((4, 4)), hot_object)
 
 
-def test_only_measured_boundary_nodes_near_the_surface_count(hot_object):
-    mesh, cells, lattice = exact_mesh(hot_object)
-    boundary = np.unique(mesh.facets)
-    inner = np.setdiff1d(np.arange(len(mesh.points_m)), boundary)
-    far = boundary[: len(boundary) // 2]
-    temperature_c, observed, points_m = mesh.temperature_c.copy(), mesh.observed.copy(), mesh.points_m.copy()
-    temperature_c[inner] += 100.0
-    temperature_c[far[::2]] += 100.0
-    observed[far[::2]] = False
-    temperature_c[far[1::2]] += 100.0
-    points_m[far[1::2]] += 10.0
-    changed = replace(mesh, temperature_c=temperature_c, observed=observed, points_m=points_m)
-    result = compare_with_truth(cells, lattice, IDENTITY, hot_object, changed)
-    kept = mesh.points_m[boundary[len(boundary) // 2 :]]
-    near = np.abs(hot_object.scene.solid.signed_distance(kept)) <= 1.5 * lattice.voxel_size
-    assert result["temperature_nodes"] == np.count_nonzero(near) > 500
-    assert result["temperature_mae_c"] == pytest.approx(0.0, abs=1e-5)
-    warmer = replace(mesh, temperature_c=mesh.temperature_c - 2.5)
-    assert compare_with_truth(cells, lattice, IDENTITY, hot_object, warmer)["temperature_mae_c"] == pytest.approx(2.5)
-    unseen = replace(mesh, observed=np.zeros_like(mesh.observed))
-    result = compare_with_truth(cells, lattice, IDENTITY, hot_object, unseen)
-    assert (result["temperature_nodes"], result["temperature_mae_c"]) == (0, None)
-
-
-def test_the_comparison_is_in_the_units_of_the_mesh(hot_object):
+def test_a_mesh_in_metres_is_compared_in_those_of_the_scene(hot_object):
     mesh, cells, lattice = exact_mesh(hot_object)
     scaled = replace(mesh, points_m=3.0 * mesh.points_m)
     result = compare_with_truth(cells, lattice, IDENTITY, hot_object, scaled, metres_per_unit=3.0)
     plain = compare_with_truth(cells, lattice, IDENTITY, hot_object, mesh)
-    for names, factor in (
-        (("voxel_size_m", "mean_distance_m", "chamfer_m", "hausdorff_m"), 3.0),
-        (("area_m2", "true_area_m2", "mesh_area_m2"), 9.0),
-        (("volume_m3", "filled_volume_m3", "true_volume_m3", "mesh_volume_m3"), 27.0),
-    ):
-        for name in names:
-            assert result.pop(name) == pytest.approx(factor * plain.pop(name)), name
-    # Shares, voxels and temperatures have nothing to do with it.
-    assert result == pytest.approx(plain) and not [name for name in plain if name.endswith(("_m", "_m2", "_m3"))]
-    volume = float(signed_volumes(scaled.points_m, scaled.tets).sum())
-    assert compare_with_truth(cells, lattice, IDENTITY, hot_object, scaled, metres_per_unit=3.0)["mesh_volume_m3"] == (
-        pytest.approx(volume)
-    )
-    with pytest.raises(MeshError, match="metres_per_unit"):
-        compare_with_truth(cells, lattice, IDENTITY, hot_object, mesh, metres_per_unit=0.0)
+    assert result == pytest.approx(plain)
+    volume = float(signed_volumes(mesh.points_m, mesh.tets).sum())
+    assert plain["mesh_volume_m3"] == pytest.approx(volume)
+    warmer = replace(mesh, temperature_c=mesh.temperature_c + 50.0)
+    off_k = compare_with_truth(cells, lattice, IDENTITY, hot_object, warmer)["temperature_seen_mae_c"]
+    assert off_k == pytest.approx(50.0, abs=plain["temperature_seen_mae_c"] + 1e-6)
 
 
 def test_surfaces_that_few_training_cameras_see_are_not_asked_for(hot_object):
@@ -182,12 +135,10 @@ def test_mesh_of_the_exact_voxels_is_near_the_truth_in_shape_and_temperature(sph
     assert result["mean_distance_voxels"] < 0.5 and result["voxel_size_m"] == lattice.voxel_size
     assert 0.1 < result["chamfer_voxels"] < 0.5
     assert result["chamfer_m"] == pytest.approx(result["chamfer_voxels"] * lattice.voxel_size)
-    assert result["chamfer_m"] < result["hausdorff_m"] < 1.5 * lattice.voxel_size
     assert result["share_of_seen_reached"] == 1.0 and result["temperature_seen_mae_c"] < 0.5
-    assert result["mesh_volume_m3"] == pytest.approx(result["volume_m3"])
-    # The staircase has 1.5 times the sphere's area; what its triangles stand for is the sphere's.
-    assert result["area_m2"] > 1.4 * result["true_area_m2"]
-    assert result["mesh_area_m2"] == pytest.approx(result["area_m2"])
+    assert result["mesh_volume_m3"] == pytest.approx(result["true_volume_m3"], rel=0.02)
+    # The faces of a digitised convex body cover each of its three shadows twice: 6 pi r^2 for a ball of area 4 pi r^2.
+    assert result["mesh_area_m2"] == pytest.approx(1.5 * result["true_area_m2"], rel=0.05)
 
 
 def shell_that_cameras_see(truth: KnownTruth, resolution: int) -> GridSnapshot:
@@ -221,7 +172,8 @@ def test_the_solid_of_a_perfectly_trained_scene_is_the_scene(name, resolution, l
     result = compare_with_truth(cells, snapshot.lattice, IDENTITY, truth)
     assert result["fscore"] > least_fscore and result["fscore_seen"] > least_fscore
     # The wall is 7 voxels thick, the table 5: half a voxel to either side.
-    assert result["volume_m3"] == pytest.approx(result["true_volume_m3"], rel=0.13)
+    volume_m3 = np.count_nonzero(cells) * snapshot.lattice.voxel_size**3
+    assert volume_m3 == pytest.approx(result["true_volume_m3"], rel=0.13)
     assert np.count_nonzero(cells) > 3 * np.count_nonzero(shell)
 
 

@@ -18,7 +18,7 @@ OF_THE_RUN = {"capture.html", "lock", "seconds.txt", "key.txt", "features.db"}
 """They hold times, a process number, the options, and rows in the order in which threads ended."""
 
 
-STOPS = ("features:", "matches:", "4/9 scale", "rig: Comparing", "9/9 page")
+STOPS = ("matches:", "rig: Comparing", "9/9 page")
 """What the command says last before it is killed, one after the other."""
 
 

@@ -14,7 +14,7 @@ import websockets
 from PIL import Image
 
 from tests.integration.commands import Trained
-from thermoxels_ns.synthetic.camera_rings import look_at
+from thermoxels_ns.synthetic.scene_truth import look_at
 
 LONGEST_S = 280.0
 

@@ -12,10 +12,10 @@ from thermoxels_ns.multiview.bundle_adjustment import (
     features_of,
     find_tracks,
 )
-from thermoxels_ns.synthetic.camera_rings import look_at
 from thermoxels_ns.synthetic.imperfections import DrawnFlaws, Imperfections
 from thermoxels_ns.synthetic.raycast import render_view
 from thermoxels_ns.synthetic.scene_folder import make_scene
+from thermoxels_ns.synthetic.scene_truth import look_at
 
 FOCAL, VIEWS = 300.0, 12
 

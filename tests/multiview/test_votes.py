@@ -21,7 +21,7 @@ from thermoxels_ns.multiview.votes import (
     supporting_photographs,
     votes,
 )
-from thermoxels_ns.synthetic.camera_rings import look_at
+from thermoxels_ns.synthetic.scene_truth import look_at
 from thermoxels_ns.synthetic.solids import BoxSolid
 
 

@@ -13,10 +13,9 @@ from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.synthetic.appearance import Paint, SunLight, sky_rgb, sky_temperature_c
-from thermoxels_ns.synthetic.camera_rings import rings_around
 from thermoxels_ns.synthetic.random_plan import Plan, distance_to
 from thermoxels_ns.synthetic.random_scene import painted_scene
-from thermoxels_ns.synthetic.scene_truth import SyntheticScene
+from thermoxels_ns.synthetic.scene_truth import SyntheticScene, rings_around
 from thermoxels_ns.synthetic.solids import Box
 
 HOUSE: Box = ((0.0, 0.0, 0.0), (5.0, 4.0, 3.4))

@@ -4,7 +4,7 @@ import numpy as np
 
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.synthetic.camera_rings import look_at
+from thermoxels_ns.synthetic.scene_truth import look_at
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, k1=0.02)
 

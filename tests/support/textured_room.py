@@ -9,7 +9,7 @@ from PIL import Image
 from tests.support.camera_card import counts
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.synthetic.camera_rings import look_at
+from thermoxels_ns.synthetic.scene_truth import look_at
 
 VISIBLE = Camera(480, 360, 420.0, 420.0, 240.0, 180.0)
 THERMAL = Camera(160, 128, 150.0, 150.0, 81.0, 63.0)

@@ -154,8 +154,6 @@ def test_nothing_stale_stays_of_an_older_scene_not_even_of_an_interrupted_write(
     ("options", "field"),
     [
         ({"thermal_width": 7}, "thermal_width"),
-        ({"thermal_format": "jpeg"}, "thermal_format"),
-        ({"photo_format": "npy"}, "photo_format"),
         ({"imperfections": Imperfections(noise_k=-1.0)}, "noise_k"),
         ({"num_train": 0}, "number of views"),
         ({"width": 0}, "^width: "),

@@ -10,11 +10,11 @@ import tyro
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.camera_rings import look_at
 from thermoxels_ns.synthetic.catalogue import DEVELOPMENT_NAMES, SCENE_NAMES, SceneWord, make_scene
 from thermoxels_ns.synthetic.random_plan import SMALLEST, Plan
 from thermoxels_ns.synthetic.random_scene import FAMILIES
 from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
+from thermoxels_ns.synthetic.scene_truth import look_at
 from thermoxels_ns.synthetic.solids import BoxSolid, SolidUnion, distance_to_box
 
 RANDOM = tuple(f"random-{seed}" for seed in range(15))

@@ -16,7 +16,7 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.multiview.votes import air_voxels
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
-from thermoxels_ns.synthetic.camera_rings import look_at
+from thermoxels_ns.synthetic.scene_truth import look_at
 from thermoxels_ns.training.callbacks import coarse_to_fine_callbacks, prune_by_rays
 from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig

@@ -16,12 +16,12 @@ from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig_types import DriftEstimate, FloatArray, RigEstimate
-from thermoxels_ns.capture.sfm.scale_and_up import MetricScale, Up
+from thermoxels_ns.capture.sfm.scale_and_up import Up
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import CACHE_FOLDER
-from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.json_values import write_json
+from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, write_tracks
 
 JSON_NAME = "transforms.json"
@@ -44,7 +44,7 @@ class Scene:
     model: SfmModel
     rig: RigEstimate
     drift: DriftEstimate
-    scale: MetricScale | None
+    scale: SceneScale | None
     up: Up
     masks: PhotographMasks
 
@@ -102,13 +102,6 @@ def write_points(path: Path, points: FloatArray, colours: npt.NDArray[np.uint8])
         temporary.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + rows.tobytes())
 
 
-def camera_entries(camera: Camera) -> dict[str, Any]:
-    """Return a camera's intrinsics under their names in transforms.json; lengths in pixels."""
-    names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
-    values = {name: getattr(camera, name) for name in names}
-    return {"camera_model": "OPENCV", "w": camera.width, "h": camera.height, **values}
-
-
 def _write_frame(scene: Scene, number: int, frame: CaptureFrame, name: str, folder: Path) -> dict[str, Any]:
     with Image.open(frame.photograph) as image:
         suffix = _COPIED.get(image.format or "") if image.mode == "RGB" else None
@@ -139,8 +132,8 @@ def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:
     rig, drift = scene.rig, scene.drift
     disagreement = {"before": drift.before_k, "after": drift.after_k}
     content: dict[str, Any] = {
-        **camera_entries(scene.model.camera),
-        "thermal_camera": camera_entries(rig.thermal_camera),
+        **scene.model.camera.entries(),
+        "thermal_camera": rig.thermal_camera.entries(),
         "pixel_convention": "the centre of the top left pixel is at (0.5, 0.5)",
         "up": scene.up.direction.tolist(),
         "rig": rig.visible_to_thermal.tolist(),

@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -22,10 +21,8 @@ from thermoxels_ns.capture.rig.start import kept_start, read_rig, rig_frames, ri
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.scene_writer import SCENE_CONTENT, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.feature_matching import PoseOptions
 from thermoxels_ns.capture.sfm.poses import add_points, find_poses, fitted_to_photographs, read_given_poses
 from thermoxels_ns.capture.sfm.scale_and_up import (
-    MetricScale,
     Up,
     find_up,
     level_rotation,
@@ -45,17 +42,16 @@ from thermoxels_ns.capture.stage_cache import (
     prepare_output,
     save,
 )
-from thermoxels_ns.core.checks import hold_folder, remove_stale_temporaries
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError, printable
+from thermoxels_ns.core.checks import hold_folder, plain_os_errors, remove_stale_temporaries
+from thermoxels_ns.core.errors import SceneError, printable
 from thermoxels_ns.core.json_values import write_json
+from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 PAGE_NAME = "capture.html"  # file name of the report, in the output folder
 _MOST_NAMED = 10  # how many of the files left out are named while the command runs; the page names all
 _LEAST_SIGHTINGS = 50  # with fewer sightings of scene points, thermal images and photographs cannot be compared
 _OVERLAY_FILE = "overlay.npy"
-
-_Options = TypeVar("_Options")
 
 
 @dataclass(frozen=True)
@@ -109,22 +105,17 @@ def run_capture(
     try:
         remove_stale_temporaries(folder, [PAGE_NAME])
         # Results of BLAS depend on its number of threads in the last bits; one thread is no slower here.
-        with threadpool_limits(1, "blas"):
+        remedy = "Check free space and permissions, and run the command again: finished stages are kept."
+        with threadpool_limits(1, "blas"), plain_os_errors(folder, remedy=remedy):
             cache = StageCache(folder, settings.from_stage, say)
             return _Capture(source, folder, settings, cache, say, board).run(write_page)
-    except ThermoxelsError:
-        raise
-    except OSError as problem:
-        what, got = str(problem.filename2 or problem.filename or folder), problem.strerror or str(problem)
-        remedy = "Check free space and permissions, and run the command again: finished stages are kept."
-        raise OutputError(what, expected="a file that can be read or written", got=got, remedy=remedy) from problem
     finally:
         lock.release()
 
 
 @dataclass
 class _Capture:
-    """One capture while it runs; each public method runs one stage, except `run` and `options`."""
+    """One capture while it runs; each public method runs one stage, except `run`."""
 
     source: Path
     output: Path
@@ -163,10 +154,11 @@ class _Capture:
         self.cache.run("page", {}, lambda _: write_page(result), [result.page])
         return result
 
-    def options(self, kind: type[_Options]) -> _Options:
-        """Return an instance of `kind`, a dataclass of options, filled with the user's settings of the same names."""
-        settings = vars(self.settings)
-        return kind(**{each.name: settings[each.name] for each in fields(kind) if each.name in settings})  # type: ignore[arg-type]
+    @property
+    def radiometry(self) -> RadiometryOptions:
+        """The user's settings of the same names."""
+        given = vars(self.settings)
+        return RadiometryOptions(**{each.name: given[each.name] for each in fields(RadiometryOptions)})
 
     def pairs(self) -> tuple[Pair, ...]:
         """Return the pairs of photograph and thermal image, found in the folder or listed by the user."""
@@ -204,7 +196,7 @@ class _Capture:
 
     def temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
         """Return the frames: thermal images in degrees C, and photographs, extracted where one file holds both."""
-        settings, options = self.settings, self.options(RadiometryOptions)
+        settings, options = self.settings, self.radiometry
         library = settings.dji_library if settings.dji_library and settings.dji_library.is_file() else None
         depends = {
             "options": options,
@@ -224,9 +216,10 @@ class _Capture:
 
     def poses(self, read: CaptureFrames) -> SfmModel:
         """Return camera, poses and scene points; they are found from the photographs or given by the user."""
-        settings, options = self.settings, self.options(PoseOptions)
+        settings = self.settings
+        names = ("image_size", "max_features", "matching", "lens", "seed", "threads")
         depends = {
-            "options": options,
+            "options": {name: getattr(settings, name) for name in names},
             "poses": given_fingerprints([] if settings.poses is None else files_of(settings.poses)),
             "masks": given_fingerprints([] if settings.masks is None else list(mask_files(settings.masks).values())),
             "overlays": settings.find_overlays,
@@ -241,13 +234,13 @@ class _Capture:
             if settings.poses is None:
                 focal = [frame.focal_px for frame in read.frames if frame.focal_px]
                 middle = float(np.median(focal)) if focal else None
-                poses = find_poses(photographs, folder, middle, masks, options, self.say)
+                poses = find_poses(photographs, folder, settings, middle, masks, self.say)
             else:
                 given = read_given_poses(settings.poses, {f.name: f.photograph_source for f in read.frames})
                 poses = fitted_to_photographs(given, photographs)
             model = poses.model
             if not len(model.points):
-                model = add_points(model, photographs, folder, masks, options, self.say)
+                model = add_points(model, photographs, folder, settings, masks, self.say)
             save(folder / "model.npz", model)
             write_json(folder / "dropped.json", dict(poses.dropped))
             self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
@@ -256,7 +249,7 @@ class _Capture:
         self.dropped |= load_json(folder / "dropped.json")
         return load(folder / "model.npz", SfmModel)
 
-    def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, MetricScale | None, str, Up]:
+    def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, SceneScale | None, str, Up]:
         """Return the model (turned upright unless its poses are given), scale or None, reason for None, and up."""
         settings = self.settings
         depends = {
@@ -284,10 +277,10 @@ class _Capture:
         content = load_json(folder / "scale.json")
         scale, up = content["scale"], content["up"]
         up["direction"] = np.array(up["direction"], dtype=np.float64)
-        scale = None if scale is None else MetricScale(**scale)
+        scale = None if scale is None else SceneScale(**scale)
         return load(folder / "model.npz", SfmModel), scale, content["missing"], Up(**up)
 
-    def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[MetricScale | None, str]:
+    def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
         """Return metres per unit from a known distance, else markers, else GPS; or None and the reason for None."""
         settings = self.settings
         if settings.known_distance is not None:
@@ -309,7 +302,7 @@ class _Capture:
         depends = {"board": board, "files": fingerprint(files_of(pictures), pictures), "angle": angle}
 
         def work(folder: Path) -> None:
-            radiometry, size = self.options(RadiometryOptions), read.thermal_size
+            radiometry, size = self.radiometry, read.thermal_size
             rig = rig_from_board_photos(pictures, board, model.camera, size, folder, settings, radiometry, self.say)
             save(folder / "rig.npz", rig)
 
@@ -320,7 +313,7 @@ class _Capture:
         model: SfmModel,
         frames: list[CaptureFrame],
         read: CaptureFrames,
-        scale: MetricScale | None,
+        scale: SceneScale | None,
         scale_missing: str,
         board: RigEstimate | None,
     ) -> tuple[RigEstimate, RigEstimate]:

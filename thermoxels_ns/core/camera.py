@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import SceneError
 
-Lens = Literal["perspective", "fisheye", "equirectangular"]
+Lens = Literal["perspective", "fisheye"]
 
 _UNDISTORT_STEPS = 20  # Fixed-point steps that remove distortion
 _MOST_PIXELS = 1_000_000  # Most pixels along a side
@@ -68,6 +68,12 @@ class Camera:
     def distortion(self) -> tuple[float, float, float, float, float, float]:
         """Distortion k1, k2, k3, k4, p1, p2, in nerfstudio's order."""
         return self.k1, self.k2, self.k3, self.k4, self.p1, self.p2
+
+    def entries(self) -> dict[str, Any]:
+        """Return size and lens by their names in transforms.json; k3 and k4 are left out."""
+        names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+        lens = {name: getattr(self, name) for name in names}
+        return {"camera_model": "OPENCV", "w": self.width, "h": self.height, **lens}
 
     def resized(self, width: int, height: int) -> Camera:
         """Return the same camera for its image resampled to `width` x `height` pixels; distortion does not change."""

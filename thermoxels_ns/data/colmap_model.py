@@ -30,11 +30,15 @@ def read_model(folder: Path) -> Any:
     """Read the COLMAP model in a folder as a `pycolmap.Reconstruction`, or raise `SceneError` if it cannot be read."""
     import pycolmap  # slow to import and only needed here
 
-    check_complete(folder)
-    try:
-        return pycolmap.Reconstruction(str(folder))
-    except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
-        raise SceneError(f"it cannot be read, {(str(problem).strip() or repr(problem)).splitlines()[-1]}") from problem
+    said = _incomplete(folder)
+    if not said:
+        try:
+            return pycolmap.Reconstruction(str(folder))
+        except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
+            said = (str(problem).strip() or repr(problem)).splitlines()[-1]
+    expected, got = "a COLMAP model (cameras, images, points3D as .bin or .txt)", f"one that cannot be read: {said}"
+    remedy = "Copy it again, or run COLMAP again; it lies in a folder such as sparse/0."
+    raise SceneError(str(folder), expected=expected, got=got, remedy=remedy)
 
 
 def camera_to_world(image: Any) -> FloatArray:
@@ -44,8 +48,8 @@ def camera_to_world(image: Any) -> FloatArray:
     return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def check_complete(folder: Path) -> None:
-    """Raise `SceneError` if a file of a COLMAP model cannot be opened, or ends before the last entry that it announces.
+def _incomplete(folder: Path) -> str:
+    """Return which file of a COLMAP model cannot be opened, or ends before the last entry that it announces; or "".
 
     pycolmap says of an unreadable file that it is no model, and may read a truncated file for ever.
     """
@@ -57,11 +61,10 @@ def check_complete(folder: Path) -> None:
                 with path.open("rb") as file:
                     whole = path.suffix == ".txt" or _complete(name, file.read())
             except OSError as problem:
-                said = f"it cannot be read, {path.name}: {problem.strerror}; check its permissions and the disk"
-                raise SceneError(said) from problem
+                return f"{path.name}: {problem.strerror}; check its permissions and the disk"
             if not whole:
-                said = f"{path.name} ends before its last entry, as after an interrupted copy"
-                raise SceneError(f"it cannot be read, {said}")
+                return f"{path.name} ends before its last entry, as after an interrupted copy"
+    return ""
 
 
 def _complete(name: str, data: bytes) -> bool:

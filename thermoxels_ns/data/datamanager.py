@@ -27,18 +27,6 @@ from thermoxels_ns.data.ray_sampler import RaySampler, draw_generator
 
 _TRAIN, _EVAL, _EVAL_IMAGE = 0, 1, 2
 _WIDEST = np.deg2rad(80.0)  # largest angle from the optical axis in the pinhole view of a fisheye lens
-_CUBE = np.array(
-    [
-        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-        [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],
-        [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
-        [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
-        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-    ],
-    dtype=np.float64,
-)
-"""Rotations of six cameras that look along the half axes, shape (6, 3, 3); columns are x right, y up, z back."""
 
 
 @dataclass
@@ -144,17 +132,14 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         index = int(torch.randint(len(self.eval_dataset), (1,), generator=generator))
         return self.eval_dataloader.get_camera(index)
 
-    def training_rays(
-        self, stream: int, max_rays_per_image: int | None = None, *, stride: int = 1, chunk: int = 16384
-    ) -> Iterator[RayBundle]:
+    def training_rays(self, stream: int, max_rays_per_image: int | None = None) -> Iterator[RayBundle]:
         """Yield training rays through the pixels of a regular grid, always the same, without decoding photographs.
 
         `stream` holds bits of `core.feature_rays`. The thermal bit alone gives rays through valid thermal pixels; both
-        bits together give every ray once. Streams that do not train (option `streams`) give no rays. The grid has every
-        `stride`-th pixel in both directions, or fewer, until at most `max_rays_per_image` remain in an image. A bundle
-        has at most `chunk` rays. Raises ValueError for an unknown stream or a number below 1.
+        bits together give every ray once. Streams that do not train (option `streams`) give no rays. The grid has as
+        many pixels of an image as do not exceed `max_rays_per_image`. Raises ValueError for an unknown stream.
         """
-        return self.train_rays.grid(stream, stride, max_rays_per_image, chunk)
+        return self.train_rays.grid(stream, max_rays_per_image)
 
     def training_views(self) -> Views:
         """Return the cameras of the streams that train: the photographs', and thermal cameras where these differ."""
@@ -183,7 +168,7 @@ def views_of_cameras(cameras: Cameras) -> Views:
 
     Lens distortion is ignored, so a view may end a little inside or outside the border of a distorted photograph. A
     fisheye lens becomes a pinhole with the same focal length whose image spans the same angles along both axes, at most
-    80 degrees to each side. A panorama (equirectangular) becomes six views, the sides of a cube.
+    80 degrees to each side.
     """
     cameras = cameras.to("cpu")
 
@@ -199,15 +184,4 @@ def views_of_cameras(cameras: Cameras) -> Views:
     behind = focal * np.tan(np.clip((size - centre) / focal, -_WIDEST, _WIDEST))
     centre = np.where(fisheye[:, None], before, centre)
     size = np.where(fisheye[:, None], np.ceil(before + behind).astype(np.int64), size)
-
-    panorama = kind == CameraType.EQUIRECTANGULAR.value
-    sides = np.where(panorama, len(_CUBE), 1)
-    of = np.repeat(np.arange(len(pose)), sides)
-    pose, focal, centre, size = pose[of], focal[of], centre[of], size[of]
-    cube = panorama[of]
-    turned = np.einsum("nij,njk->nik", pose[cube][:, :, :3], np.tile(_CUBE, (np.count_nonzero(panorama), 1, 1)))
-    pose[cube, :, :3] = turned
-    # A side spans a quarter of the horizon.
-    side = np.maximum(1, size[cube, :1] // 4)
-    focal[cube], centre[cube], size[cube] = 0.5 * side, 0.5 * side, side
     return Views(pose, focal, centre, size)

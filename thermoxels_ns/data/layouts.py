@@ -117,11 +117,7 @@ def _signs_of_thermal(folder: Path, content: dict[str, Any]) -> str:
 def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, Any], list[str]]:
     """Return what a transforms.json would say of a COLMAP model's photographs in ``folder / root``, found by name, else
     by stem, and the names of those that are not there. Subfolders train, val and test become split lists."""
-    try:
-        model = read_model(place)
-    except SceneError as problem:
-        remedy = "Copy the model again, or run COLMAP again."
-        raise SceneError(str(place), expected="a readable COLMAP model", got=problem, remedy=remedy) from problem
+    model = read_model(place)
     exact, files = dict[str, list[str]](), defaultdict[str, list[str]](list)
     for path in sorted((folder / root).rglob("*")):
         within = path.relative_to(folder / root)

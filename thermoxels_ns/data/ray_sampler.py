@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cached_property
+from itertools import count
 from typing import Literal
 
 import numpy as np
@@ -22,6 +24,7 @@ _BITS = {"both": RGB_STREAM | THERMAL_STREAM, "rgb": RGB_STREAM, "thermal": THER
 TABLE_LIMIT_BYTES = 2 * 1024**3
 """Largest table of ray directions; else they are computed per batch, as where all photographs differ in intrinsics."""
 _CHUNK = 1 << 17
+_GRID_RAYS = 1 << 14  # most rays of a bundle of `grid`
 _BYTES_PER_PIXEL = 16
 _FISHEYE = CameraType.FISHEYE.value
 
@@ -125,24 +128,24 @@ class RaySampler:
         batch = {"image": torch.cat(images), "thermal": torch.cat(temperatures).to(self.device)}
         return self._bundle(rays, torch.cat(bits)), batch
 
-    def grid(self, stream: int, stride: int, max_rays_per_image: int | None, chunk: int) -> Iterator[RayBundle]:
+    def grid(self, stream: int, max_rays_per_image: int | None) -> Iterator[RayBundle]:
         """Yield rays through the usable pixels of a regular grid, see `ThermalDataManager.training_rays`."""
-        if not 0 < stream <= RGB_STREAM | THERMAL_STREAM or min(stride, chunk, max_rays_per_image or 1) < 1:
-            raise ValueError(f"no such grid: {stream=}, {stride=}, {max_rays_per_image=}, {chunk=}")
+        if not 0 < stream <= RGB_STREAM | THERMAL_STREAM:
+            raise ValueError(f"no such stream: {stream}")
         wanted = stream & _BITS[self.streams]
         if wanted & RGB_STREAM:
-            pixels = _regular(self.colour_rays, stride, max_rays_per_image)
+            pixels = self.colour_rays.grid(max_rays_per_image)
             if self._allowed is not None:
                 pixels = pixels[self._allowed.to(pixels.device)[pixels]]
             both = self.shared and bool(wanted & THERMAL_STREAM)
-            for part in pixels.split(chunk):
+            for part in pixels.split(_GRID_RAYS):
                 bits = torch.full((len(part), 1), RGB_STREAM, dtype=torch.uint8, device=part.device)
                 if both:
                     bits += THERMAL_STREAM * self._valid[part][:, None]
                 yield self._bundle(self.colour_rays.columns(part), bits)
         if wanted & THERMAL_STREAM and not (self.shared and wanted & RGB_STREAM):
-            pixels = _regular(self.thermal_rays, stride, max_rays_per_image)
-            for part in pixels[self._valid[pixels]].split(chunk):
+            pixels = self.thermal_rays.grid(max_rays_per_image)
+            for part in pixels[self._valid[pixels]].split(_GRID_RAYS):
                 bits = torch.full((len(part), 1), THERMAL_STREAM, dtype=torch.uint8, device=part.device)
                 yield self._bundle(self.thermal_rays.columns(part), bits)
 
@@ -158,18 +161,6 @@ class RaySampler:
         if numbers is not None:
             drawn = numbers.index_select(0, drawn).to(torch.int64)
         return drawn.to(self.storage)
-
-
-def _regular(rays: CameraRays, stride: int, max_rays_per_image: int | None) -> Int[Tensor, " n"]:
-    """Return the numbers of the pixels on a regular grid in every image, at most `max_rays_per_image` of each."""
-    strides = torch.full_like(rays.widths, stride)
-    if max_rays_per_image is not None:
-        # Rows and columns are rounded up, so the square root alone may give a few pixels too many.
-        enough = (rays.widths * rays.heights / max_rays_per_image).sqrt().to(torch.int64).clamp(min=1)
-        while bool((too_many := rays.grid_sizes(enough) > max_rays_per_image).any()):
-            enough = enough + too_many.to(torch.int64)
-        strides = torch.maximum(strides, enough)
-    return rays.grid(strides)
 
 
 def draw_generator(*key: int) -> torch.Generator:
@@ -248,28 +239,21 @@ class CameraRays:
             directions, origins, area = (part.to(self.device) for part in parts)
         return {"origins": origins, "directions": directions, "pixel_area": area, "camera_indices": image[:, None]}
 
-    def grid(self, stride: Int[Tensor, " images"]) -> Int[Tensor, " n"]:
-        """Return the numbers of every `stride`-th pixel in both directions, in ascending order; one stride per camera.
+    def grid(self, most: int | None) -> Int[Tensor, " n"]:
+        """Return the numbers of every n-th pixel in both directions, in ascending order, at most `most` in an image.
 
-        The grid starts in the middle of its first cell, so that it prefers no border. Along a side shorter than the
-        stride, the grid has the middle pixel alone.
+        Each image has the least such n. The grid starts in the middle of its first cell, so that it prefers no border.
+        Along a side shorter than n, the grid has the middle pixel alone.
         """
         numbers = []
-        for index, step in enumerate(stride.tolist()):
-            width, height = int(self.widths[index]), int(self.heights[index])
-            columns = torch.arange(min(step, width) // 2, width, step)
-            rows = torch.arange(min(step, height) // 2, height, step)
-            numbers.append((self.first_pixel[index] + rows[:, None] * width + columns[None, :]).reshape(-1))
+        for first, width, height in zip(self.first_pixel, self.widths.tolist(), self.heights.tolist()):
+            # Rows and columns are rounded up, so the square root alone may give a few pixels too many.
+            for step in count(max(math.isqrt(width * height // (most or width * height)), 1)):
+                columns, rows = (torch.arange(min(step, side) // 2, side, step) for side in (width, height))
+                if most is None or len(columns) * len(rows) <= most:
+                    break
+            numbers.append((first + rows[:, None] * width + columns[None, :]).reshape(-1))
         return torch.cat(numbers).to(self.device)
-
-    def grid_sizes(self, stride: Int[Tensor, " images"]) -> Int[Tensor, " images"]:
-        """Return how many pixels `grid` returns of every camera."""
-
-        def along(length: Tensor) -> Tensor:
-            start = torch.minimum(stride, length) // 2
-            return (length - start + stride - 1) // stride
-
-        return along(self.widths) * along(self.heights)
 
     def _camera_axes(self, index: int) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 1"]]:
         """Return the ray directions in camera axes, and the areas, of all pixels of one camera."""

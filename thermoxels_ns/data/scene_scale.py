@@ -28,25 +28,17 @@ class SceneScale:
     standard_error: StandardError | None  # Standard error of `metres_per_unit`, [m]; None: not known
     source: str  # Source of the scale, as a sentence
 
-    def area_standard_error(self, area_m2: float) -> float | None:
-        """Return an area's standard error [m^2]: twice the scale's relative error times the area; None: unknown."""
-        return self._share(2, area_m2)
+    def standard_error_of(self, size: float, power: int) -> float | None:
+        """Return the standard error, to first order, of an area (`power` 2) or a volume (3) in metres; None: unknown.
 
-    def volume_standard_error(self, volume_m3: float) -> float | None:
-        """Return a volume's standard error [m^3]: three times the scale's relative error times the volume.
-
-        >>> SceneScale(2.0, 0.02, "").volume_standard_error(10.0)
+        >>> SceneScale(2.0, 0.02, "").standard_error_of(10.0, 3)
         0.3
         """
-        return self._share(3, volume_m3)
+        return None if self.standard_error is None else power * (self.standard_error / self.metres_per_unit) * abs(size)
 
     def as_mapping(self) -> dict[str, Any]:
         """Return the fields by name, as json can hold them."""
         return asdict(self)  # type: ignore[call-overload]
-
-    def _share(self, power: int, size: float) -> float | None:
-        """Return the standard error, to first order, of a quantity `size` that grows with a power of the scale."""
-        return None if self.standard_error is None else power * (self.standard_error / self.metres_per_unit) * abs(size)
 
 
 @record(ThermoxelsError)

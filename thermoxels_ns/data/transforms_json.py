@@ -28,7 +28,6 @@ _LENS_OF_MODEL: dict[str, Lens] = {
     "RADIAL": "perspective",
     "OPENCV": "perspective",
     "OPENCV_FISHEYE": "fisheye",
-    "EQUIRECTANGULAR": "equirectangular",
 }
 """Lens by nerfstudio's camera model, for models whose rays all start in one point."""
 
@@ -73,7 +72,7 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
     model = values.get("camera_model", "OPENCV")
     lens = _LENS_OF_MODEL.get(model) if isinstance(model, str) else None
     if lens is None:
-        expected = "PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR"
+        expected = "PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or OPENCV_FISHEYE"
         undistort = "Undistort the photographs to a pinhole camera."
         raise SceneError(f"{where}: camera_model", expected=expected, got=model, remedy=undistort)
     size, orientation = None, 1
@@ -119,8 +118,6 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
 
 def _refuse_odd(camera: Camera, where: str) -> None:
     """Raise `SceneError` for a principal point, a focal length or a distortion that no lens has."""
-    if camera.lens == "equirectangular":
-        return
     corner = min(0.5 * float(np.hypot(camera.width / camera.fl_x, camera.height / camera.fl_y)), 1e30)
     shifts = {"cx": camera.cx / camera.width, "cy": camera.cy / camera.height}
     odd = [name for name, shift in shifts.items() if not -1.0 <= shift <= 2.0]

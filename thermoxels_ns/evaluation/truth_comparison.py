@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import check_positive, check_shape
+from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import MeshError, SceneError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
@@ -27,6 +27,7 @@ from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_areas
 from thermoxels_ns.synthetic.raycast import first_surface, visible_surface_points
 from thermoxels_ns.synthetic.scene_folder import load_truth
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
+from thermoxels_ns.synthetic.solids import Solid
 
 MIN_VIEWS = 3  # A point of a surface counts as seen if at least this many training cameras see it
 TOLERANCE_VOXELS = 1.5  # Two surfaces agree where their distance is at most this, [voxels]
@@ -36,14 +37,6 @@ COMMON_RESOLUTION = 128  # Voxels in the exact box's longest side, for the toler
 _SURFACE_POINTS = 20_000
 _PER_SIDE = 2  # Sample points along each side of a voxel's face
 _TRAINING_PREFIX = "frame_train_"
-
-
-class TrueShape(Protocol):
-    """A body whose shape is known exactly, in coordinates of its own (truth coordinates, in truth units)."""
-
-    def signed_distance(self, points: FloatArray, /) -> FloatArray:
-        """Return the distance of points (n, 3) to the surface, shape (n,), [truth units], negative inside the body."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -67,12 +60,12 @@ class SurfaceScore:
 def surface_fscore(
     cells: BoolArray,
     lattice: Lattice,
-    truth: TrueShape,
+    truth: Solid,
     true_points_seen: FloatArray,
     tolerance: float,
     world_to_truth: FloatArray,
     views: Views,
-    surroundings: TrueShape | None = None,
+    surroundings: Solid | None = None,
     within: BoolArray | None = None,
 ) -> tuple[SurfaceScore, SurfaceScore]:
     """Return two scores of the boundary of solid voxels against the true surface: of all faces, and of the seen ones.
@@ -141,17 +134,11 @@ def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, 
 class SurfaceDistances:
     """Distances between the surface of a mesh and the true surface, [truth units]."""
 
-    mesh_to_truth: float  # Mean distance of points spread evenly over the mesh's surface to the true surface
-    truth_to_mesh: float  # Mean distance of the given true points to the mesh's surface
-    hausdorff: float  # Largest of all distances both ways
+    chamfer: float
+    """Mean of two mean distances: of points spread evenly over the mesh's surface, and of the true points back."""
     closest_temperature_c: FloatArray
     """Temperature of the mesh at its surface point closest to each true point, shape (m,), [degrees Celsius]."""
     closest_distance: FloatArray  # Distance of each true point to the mesh's surface, shape (m,)
-
-    @property
-    def chamfer(self) -> float:
-        """Mean of `mesh_to_truth` and `truth_to_mesh`, [truth units]."""
-        return 0.5 * (self.mesh_to_truth + self.truth_to_mesh)
 
 
 def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArray:
@@ -164,10 +151,10 @@ def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArra
 
 def surface_distances(
     mesh: TetMesh,
-    truth: TrueShape,
+    truth: Solid,
     true_points: FloatArray,
     metres_per_unit: float = 1.0,
-    surroundings: TrueShape | None = None,
+    surroundings: Solid | None = None,
     tolerance: float = 0.0,
 ) -> SurfaceDistances | None:
     """Return the distances between a mesh's surface and the true one; None if nothing of the surface can be measured.
@@ -195,9 +182,7 @@ def surface_distances(
     triangle = facets[np.asarray(cell)]
     share = np.clip(points_to_barycentric(points[triangle], np.asarray(closest)), 0.0, 1.0)
     return SurfaceDistances(
-        mesh_to_truth=float(outwards.mean()),
-        truth_to_mesh=float(inwards.mean()),
-        hausdorff=float(max(outwards.max(), inwards.max())),
+        chamfer=0.5 * float(outwards.mean() + inwards.mean()),
         closest_temperature_c=np.einsum(
             "ij,ij->i", share / share.sum(axis=1, keepdims=True), mesh.temperature_c[triangle]
         ),
@@ -214,7 +199,7 @@ class KnownTruth:
     camera: Camera  # Intrinsics of all training cameras
 
     @property
-    def surroundings(self) -> TrueShape | None:
+    def surroundings(self) -> Solid | None:
         """Shape of what stands around the scene's solid and is not scored; None if nothing does."""
         return None if self.scene.around is None else self.scene.around.solid
 
@@ -293,32 +278,26 @@ def compare_with_truth(
     F-score is their harmonic mean. `surface_fscore` says which faces are left out. Figures named ``..._seen`` are of
     the part of the boundary that cameras see; they are 0 if cameras see none. `cells` has the shape
     `lattice.cell_shape`. `world_to_truth` (4, 4) is the similarity from the lattice's world to the coordinates of the
-    input poses, in which a synthetic scene is written in metres. Lengths, areas and volumes are scaled by
-    `metres_per_unit`, the scale of the mesh's nodes.
+    input poses, in which a synthetic scene is written in metres; `metres_per_unit` is the scale of the mesh's nodes.
 
     Returns:
-        Figures by name, which json can hold; None if the truth is not known. Scores are 0 to 1. Mean distances go from
-        the boundary to the true surface (None without a boundary). ``volume_m3`` and ``area_m2`` are those of the solid
-        voxels, with steps; ``filled_volume_m3`` includes enclosed cavities. With a mesh also its volume and area;
-        ``chamfer_...`` and ``hausdorff_m`` between its surface and the seen true points; ``share_of_seen_reached``, the
-        share of these points within the tolerance of its surface; and ``temperature_seen_mae_c``, the mean absolute
-        error [K] where its surface is closest to these points. Of its surface nodes within the tolerance of the truth,
-        ``temperature_nodes`` counts those measured by thermal rays, and ``temperature_mae_c`` is their mean absolute
-        error [K]; names with ``unmeasured`` are for the others, ``temperature_p95_all_c`` is the 95 % quantile for all.
+        Figures by name, which json can hold, in metres of the scene; None if the truth is not known. Scores are 0 to 1.
+        Mean distances go from the boundary to the true surface (None without a boundary). With a mesh also its volume
+        and area; ``chamfer_...`` between its surface and the seen true points; ``share_of_seen_reached``, the share of
+        these points within the tolerance of its surface; and ``temperature_seen_mae_c``, the mean absolute error [K]
+        where its surface is closest to these points.
 
     Raises:
         SceneError: The scene folder cannot be used, or no true point is seen by enough training cameras.
-        MeshError: `cells` does not fit the lattice, the 4x4 is no similarity, or `metres_per_unit` is not above 0.
+        MeshError: `cells` does not fit the lattice, or the 4x4 is no similarity.
     """
     known = truth if isinstance(truth, KnownTruth) else load_known_truth(truth)
     if known is None:
         return None
     transform = check_similarity("world_to_truth", world_to_truth)
-    check_positive("metres_per_unit", metres_per_unit, "Pass the scale the mesh was built with.", MeshError)
     voxel_m = lattice.voxel_size * _scale_of(transform)
     tolerance_m = TOLERANCE_VOXELS * voxel_m
     score, of_seen = known.score(cells, lattice, transform, tolerance_m, within)
-    solid = np.asarray(cells, dtype=bool)
     result: dict[str, Any] = {
         "scene": known.scene.name,
         "voxel_size_m": voxel_m,
@@ -333,17 +312,12 @@ def compare_with_truth(
         "fscore_seen": of_seen.fscore,
         "mean_distance_voxels": None if score.mean_distance is None else score.mean_distance / voxel_m,
         "mean_distance_m": score.mean_distance,
-        "volume_m3": int(np.count_nonzero(solid)) * voxel_m**3,
-        "filled_volume_m3": int(np.count_nonzero(fill_enclosed(solid))) * voxel_m**3,
         "true_volume_m3": float(known.scene.solid.volume),
-        "area_m2": _num_faces(solid) * voxel_m**2,
         "true_area_m2": float(known.scene.solid.area),
     }
     if mesh is not None:
         result |= _mesh_errors(known, mesh, voxel_m, metres_per_unit)
-        if mesh.has_temperatures:
-            result |= _temperature_errors(known.scene, mesh, tolerance_m, metres_per_unit)
-    return {name: _scaled(name, value, metres_per_unit) for name, value in result.items()}
+    return result
 
 
 def geometry_metrics(
@@ -368,23 +342,14 @@ def geometry_metrics(
     except MeshError as problem:
         say(f"The geometry scores 0: {problem}")
         return dict.fromkeys(("fscore", "precision", "recall", "fscore_128"), 0.0)
-    lattice, transform = snapshot.lattice, check_similarity("world_to_input", world_to_input)
-    voxel_m = lattice.voxel_size * _scale_of(transform)
-    (own, own_seen), (common, common_seen) = (
-        known.score(solid.cells, lattice, transform, TOLERANCE_VOXELS * size_m, solid.within)
-        for size_m in (voxel_m, known.scene.size / COMMON_RESOLUTION)
-    )
-    result = {
-        "fscore": own.fscore,
-        "precision": own.precision,
-        "recall": own.recall,
-        f"fscore_{COMMON_RESOLUTION}": common.fscore,
-        "fscore_seen": own_seen.fscore,
-        f"fscore_{COMMON_RESOLUTION}_seen": common_seen.fscore,
-    }
-    if own.mean_distance is not None:
-        result["surface_distance_voxels"] = own.mean_distance / voxel_m
-        result["surface_distance_m"] = own.mean_distance
+    own = compare_with_truth(solid.cells, snapshot.lattice, world_to_input, known, within=solid.within)
+    assert own is not None  # the truth is known
+    tolerance_m = TOLERANCE_VOXELS * known.scene.size / COMMON_RESOLUTION
+    common, of_seen = known.score(solid.cells, snapshot.lattice, world_to_input, tolerance_m, solid.within)
+    result = {name: own[name] for name in ("fscore", "precision", "recall", "fscore_seen")}
+    result |= {f"fscore_{COMMON_RESOLUTION}": common.fscore, f"fscore_{COMMON_RESOLUTION}_seen": of_seen.fscore}
+    if own["mean_distance_m"] is not None:
+        result |= {f"surface_distance_{unit}": own[f"mean_distance_{unit}"] for unit in ("voxels", "m")}
     return result
 
 
@@ -432,18 +397,6 @@ def depth_metrics(
     return result | ({"sky_filled": float(sky.mean())} if len(sky) else {})
 
 
-def _scaled(name: str, value: Any, metres_per_unit: float) -> Any:
-    """Return a figure times the scale, its square or its cube if its name ends in _m, _m2 or _m3; else unchanged."""
-    power = next((power for ending, power in (("_m", 1), ("_m2", 2), ("_m3", 3)) if name.endswith(ending)), 0)
-    return value if value is None or power == 0 else value * metres_per_unit**power
-
-
-def _num_faces(cells: BoolArray) -> int:
-    """Return the number of voxel faces between solid and empty; what is outside the lattice counts as empty."""
-    padded = np.pad(cells, 1)
-    return sum(int(np.count_nonzero(np.diff(padded, axis=axis))) for axis in range(3))
-
-
 def _mesh_errors(known: KnownTruth, mesh: TetMesh, voxel_m: float, metres_per_unit: float) -> dict[str, Any]:
     """Return volume and area of the mesh, and distances and temperature errors at the true points seen, by name."""
     area = facet_areas(mesh.points_m, mesh.facets)
@@ -460,30 +413,6 @@ def _mesh_errors(known: KnownTruth, mesh: TetMesh, voxel_m: float, metres_per_un
     return result | {
         "chamfer_voxels": distances.chamfer / voxel_m,
         "chamfer_m": distances.chamfer,
-        "hausdorff_m": distances.hausdorff,
         "temperature_seen_mae_c": float(error_k.mean()) if len(error_k) and mesh.has_temperatures else None,
         "share_of_seen_reached": float(reached.mean()),
-    }
-
-
-def _temperature_errors(
-    scene: SyntheticScene, mesh: TetMesh, tolerance_m: float, metres_per_unit: float
-) -> dict[str, Any]:
-    """Return temperature errors at surface nodes within the tolerance of the truth: measured, unmeasured and all."""
-    nodes = np.unique(mesh.facets)
-    points = mesh.points_m[nodes] / metres_per_unit
-    near = np.abs(scene.solid.signed_distance(points)) <= tolerance_m
-    nodes, points = nodes[near], points[near]
-    error_k = np.abs(mesh.temperature_c[nodes] - scene.surface_temperature_c(points))
-    measured = mesh.observed[nodes]
-
-    def mean(errors: FloatArray) -> float | None:
-        return float(errors.mean()) if len(errors) else None
-
-    return {
-        "temperature_nodes": int(measured.sum()),
-        "temperature_mae_c": mean(error_k[measured]),
-        "temperature_nodes_unmeasured": int((~measured).sum()),
-        "temperature_mae_unmeasured_c": mean(error_k[~measured]),
-        "temperature_p95_all_c": float(np.quantile(error_k, 0.95)) if len(error_k) else None,
     }

@@ -137,10 +137,7 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
     temperature_c = np.full((size.height, size.width), np.nan, dtype=np.float32)
     pointer = temperature_c.ctypes.data_as(ctypes.POINTER(ctypes.c_float))
     call("dirp_measure_ex", handle, pointer, ctypes.c_int32(temperature_c.nbytes))
-    with (
-        errors_name(path, "a JPEG with readable tags", error=ThermalFileError),
-        Image.open(path, formats=("JPEG", "MPO")) as image,
-    ):
+    with Image.open(path, formats=("JPEG", "MPO")) as image:
         return DjiImage(temperature_c, after, read_exif_facts(image))
 
 

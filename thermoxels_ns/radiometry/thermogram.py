@@ -148,7 +148,7 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
         ThermoxelsError: The options contradict the file's conditions, e.g. an emissivity below 1 without reflected_c.
     """
     options = options or RadiometryOptions()
-    try:
+    with errors_name(path, "a whole and readable thermal file", error=ThermalFileError):
         found = detect_format(path)
         if found == "FLIR R-JPEG":
             flir = read_flir_jpeg(path)
@@ -162,9 +162,6 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
             metadata = ThermogramMetadata(found, dji.exif.camera, conditions=dji.conditions)
         else:
             image, metadata = _read_stored(path, found, options)
-    except OSError as problem:
-        got, remedy = problem.strerror or str(problem), "Check its permissions, or copy it again."
-        raise ThermalFileError(str(path), expected="a file that can be read", got=got, remedy=remedy) from problem
     return Thermogram(image.temperature_c, metadata, image.report)
 
 
@@ -186,10 +183,9 @@ def detect_format(path: Path) -> ThermogramFormat:
     if head.startswith(JPEG_START):
         if is_flir_jpeg(path):
             return "FLIR R-JPEG"
-        with errors_name(path, "a whole radiometric JPEG", "Copy the file from the camera again.", ThermalFileError):
-            if is_dji_rjpeg(path):
-                return "DJI R-JPEG"
-            app_segments(path, whole=True)
+        if is_dji_rjpeg(path):
+            return "DJI R-JPEG"
+        app_segments(path, whole=True)
         got = "a plain JPEG: a photograph, or a false-colour picture, whose palette cannot be turned back"
         remedy = "Use the file as the camera wrote it; editing, messengers and cloud albums drop the thermal part."
     raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
@@ -202,13 +198,10 @@ def _read_stored(
     unit, exif = options.given_unit, ExifFacts()
     if found in ("TIFF", "PNG"):
         unit, exif = _unit_of_image(path, options)
-    elif found == "NPY" and unit is None:
-        with errors_name(path, "a readable array of numbers", error=ThermalFileError):
-            array = load_array(path)
-        if array.dtype.kind in "ui":
-            expected = "an array of degrees C (float32 or float64), or whole numbers with a known unit"
-            remedy = "Pass --camera, or --celsius-per-count and --celsius-offset."
-            raise ThermalFileError(str(path), expected=expected, got="whole numbers and no unit", remedy=remedy)
+    elif found == "NPY" and unit is None and load_array(path).dtype.kind in "ui":
+        expected = "an array of degrees C (float32 or float64), or whole numbers with a known unit"
+        remedy = "Pass --camera, or --celsius-per-count and --celsius-offset."
+        raise ThermalFileError(str(path), expected=expected, got="whole numbers and no unit", remedy=remedy)
     unit = ThermalUnit.celsius() if unit is None or found == "CSV" else unit
     image = read_thermal_file(path, unit, suffix=f".{found.lower()}")
     conditions = options.applied_to(Conditions())
@@ -229,12 +222,11 @@ def _unit_of_image(path: Path, options: RadiometryOptions) -> tuple[ThermalUnit,
     Raises `ThermalFileError` for pictures with 8 bits or in colour, and for counts whose unit is unknown.
     """
     unit = options.given_unit
-    with errors_name(path, "a readable TIFF or PNG", error=ThermalFileError):
-        if size_of_double_tiff(path) is not None:
-            return unit or ThermalUnit.celsius(), ExifFacts()
-        with Image.open(path, formats=("TIFF", "PNG")) as image:
-            check_thermal_size(path, *image.size)
-            mode, exif = image.mode, read_exif_facts(image)
+    if size_of_double_tiff(path) is not None:
+        return unit or ThermalUnit.celsius(), ExifFacts()
+    with Image.open(path, formats=("TIFF", "PNG")) as image:
+        check_thermal_size(path, *image.size)
+        mode, exif = image.mode, read_exif_facts(image)
     if mode != "F" and not mode.startswith("I"):
         expected = "one channel of 16-bit counts or of floats, [degrees C]"
         got = f"image mode {mode}: a picture for the eye, whose shades are no temperatures"

@@ -18,10 +18,9 @@ from thermoxels_ns.synthetic.appearance import (
     sky_rgb,
     sky_temperature_c,
 )
-from thermoxels_ns.synthetic.camera_rings import CameraRing, CameraWalk, rings_around
 from thermoxels_ns.synthetic.random_plan import HAIR, Plan, Range, Wall, distance_to
 from thermoxels_ns.synthetic.random_scene import painted_scene, surrounded, warm_scene, with_street
-from thermoxels_ns.synthetic.scene_truth import SyntheticScene
+from thermoxels_ns.synthetic.scene_truth import CameraRing, CameraWalk, SyntheticScene, rings_around
 from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, Vector
 
 HOUSE = "house-corner"

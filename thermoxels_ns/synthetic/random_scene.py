@@ -23,7 +23,6 @@ from thermoxels_ns.synthetic.appearance import (
     sky_rgb,
     sky_temperature_c,
 )
-from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.random_arrangements import (
     detached_house,
     facade,
@@ -33,7 +32,7 @@ from thermoxels_ns.synthetic.random_arrangements import (
     wings,
 )
 from thermoxels_ns.synthetic.random_plan import Plan, bounds_of
-from thermoxels_ns.synthetic.scene_truth import Body, DegreesFunction, RgbFunction, SyntheticScene
+from thermoxels_ns.synthetic.scene_truth import Body, CameraRing, DegreesFunction, RgbFunction, SyntheticScene
 from thermoxels_ns.synthetic.solids import Box, Solid, Sphere, box_beside, box_between, distance_to_box
 
 RANDOM_NAMES = ("random-N", "wild-N")

@@ -17,7 +17,7 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import check_ranges, remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.json_values import read_json_object
+from thermoxels_ns.core.json_values import read_json_object, write_json
 from thermoxels_ns.synthetic.catalogue import make_scene
 from thermoxels_ns.synthetic.imperfections import PERFECT, DrawnFlaws, Imperfections
 from thermoxels_ns.synthetic.raycast import first_surface, render_view
@@ -41,7 +41,6 @@ _FOLDERS: dict[LayoutName, tuple[str, str, str]] = {
 }
 """Folders of photographs ({}: train or test), of thermal images and of the COLMAP model ("": none) in each layout."""
 _BOUNDS, _JSON = "temperature_bounds.json", "transforms.json"
-_OPENCV = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
 _SAME_POINT = 1e-6  # share of the way to a point by which rounding may be off
 _POINTS_PER_VIEW = 50  # points of the COLMAP model that are drawn in each view
 _PHOTO_SUFFIXES: dict[str, str] = {"jpeg": ".jpg", "png": ".png"}
@@ -89,14 +88,6 @@ def write_scene(
         OutputError: The folder cannot be written to.
     """
     thermal_camera, offset = _thermal_camera(scene, width, height, thermal_width, own_thermal_camera)
-    for name, text, known in (
-        ("photo_format", photo_format, _PHOTO_SUFFIXES),
-        ("thermal_format", thermal_format, _SUFFIXES),
-        ("layout", layout, _FOLDERS),
-    ):
-        if text not in known:
-            expected = f"one of {', '.join(known)}"
-            raise SceneError(name, expected=expected, got=repr(text), remedy="Choose one of these.")
     photographs, thermals, model = _FOLDERS[layout]
     if own_thermal_camera and (model or not thermals):
         expected = "one camera for both, which is all that this layout can say"
@@ -146,23 +137,23 @@ def write_scene(
 
     if layout == "thermoscenes" or (thermals and thermal_format == "png16"):
         named = {"absolute_min_temperature": bounds[0], "absolute_max_temperature": bounds[1]}
-        _write_json(target / _BOUNDS, named)
-    transforms: dict[str, Any] = _intrinsics(flaws.given_camera(camera))
+        write_json(target / _BOUNDS, named)
+    transforms: dict[str, Any] = flaws.given_camera(camera).entries()
     if layout == "thermalnerf":
-        frames = _separate_frames(frames, transforms, _intrinsics(thermal_camera))
+        frames = _separate_frames(frames, transforms, thermal_camera.entries())
     elif layout != "thermoscenes":  # thermal images belong to the photographs of the same name
         frames = [{key: value for key, value in frame.items() if key != "thermal_file_path"} for frame in frames]
     if own_thermal_camera and layout != "thermalnerf":
-        transforms["thermal_camera"] = _intrinsics(thermal_camera)
+        transforms["thermal_camera"] = thermal_camera.entries()
     if thermal_format == "tiff":  # counts of a 16-bit PNG span the temperature bounds, which are written above
         transforms["thermal_unit"] = unit
     transforms |= {"metres_per_unit": 1.0, "up": [0, 0, 1], "frames": frames}
     truth = {"synthetic_scene": scene.name, "scene_box": scene.scene_box, "seed": seed}
-    _write_json(target / TRUTH, truth | flaws.truth())
+    write_json(target / TRUTH, truth | flaws.truth())
     if model:
         _write_colmap_model(target / model, scene, poses, frames, camera, flaws.given_camera(camera), seed)
     else:
-        _write_json(target / _JSON, transforms)
+        write_json(target / _JSON, transforms)
     return target
 
 
@@ -204,7 +195,7 @@ def _write_colmap_model(
         placed = " ".join(map(repr, map(float, (w, x, y, z, *world[:3, 3]))))
         images.append(f"{number} {placed} 1 {Path(frame['file_path']).name}")
         images.append(" ".join(f"{u:.3f} {v:.3f} {point + 1}" for (u, v), point in zip(pixels[shown], shown)))
-    lens = " ".join(repr(float(getattr(given, name))) for name in _OPENCV)
+    _, _, _, *lens = given.entries().values()
     seen = [
         f"{number} {x!r} {y!r} {z!r} 128 128 128 0.5 {' '.join(track)}"
         for number, ((x, y, z), track) in enumerate(zip(points.tolist(), tracks), start=1)
@@ -212,7 +203,7 @@ def _write_colmap_model(
     ]
     writable_folder(folder)
     for name, lines in (
-        ("cameras", [f"1 OPENCV {given.width} {given.height} {lens}"]),
+        ("cameras", [f"1 OPENCV {given.width} {given.height} {' '.join(repr(float(value)) for value in lens)}"]),
         ("images", images),
         ("points3D", seen),
     ):
@@ -284,13 +275,3 @@ def _prepared_folder(folder: Path | str, layout: LayoutName) -> Path:
         for side in ("train", "test") if name else ():
             writable_folder(target / name.format(side))
     return target
-
-
-def _intrinsics(camera: Camera) -> dict[str, Any]:
-    lens = {name: getattr(camera, name) for name in _OPENCV}
-    return {"camera_model": "OPENCV", "w": camera.width, "h": camera.height} | lens
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    with replace_when_done(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,13 +11,94 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.synthetic.camera_rings import CameraRing, CameraWalk, ring_poses
-from thermoxels_ns.synthetic.solids import Box, Solid
+from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.synthetic.solids import Box, Solid, Vector
 
 RgbFunction = Callable[..., Float32Array]
 DegreesFunction = Callable[[npt.ArrayLike], FloatArray]
 
 _ASPECT = 4.0 / 3.0
+
+
+def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:
+    """Return the pose (4, 4) of a camera at `position` that looks at `target`, not straight up or down; z is up."""
+    position = np.asarray(position, dtype=np.float64)
+    back = position - np.asarray(target, dtype=np.float64)
+    right = np.cross((0.0, 0.0, 1.0), back)
+    assert np.linalg.norm(right) > 1e-9 * np.linalg.norm(back)
+    right /= np.linalg.norm(right)
+    back /= np.linalg.norm(back)
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(back, right), back, position
+    return pose
+
+
+@dataclass(frozen=True)
+class CameraRing:
+    """A horizontal circle, or an arc of a circle, of cameras that look at one point."""
+
+    target: Vector  # point at which all cameras look, on the axis of the circle [m]
+    radius_m: float  # horizontal distance from the axis [m]
+    height_m: float  # z of the cameras [m]
+    start_deg: float = 0.0  # azimuth where the arc begins, counted from x towards y [degrees]
+    span_deg: float = 360.0  # length of the arc [degrees]; 360 closes the ring
+
+    @property
+    def closed(self) -> bool:
+        """True for a full circle, where the last camera is a neighbour of the first."""
+        return self.span_deg >= 360.0
+
+    def pose(self, share: float) -> FloatArray:
+        """Return the pose (4, 4) at a share of the arc, 0 to 1, camera to world."""
+        azimuth = math.radians(self.start_deg + self.span_deg * share)
+        x = self.target[0] + self.radius_m * math.cos(azimuth)
+        y = self.target[1] + self.radius_m * math.sin(azimuth)
+        return look_at((x, y, self.height_m), self.target)
+
+
+def rings_around(middle: tuple[float, float], *rings: Vector, **arc: float) -> tuple[CameraRing, ...]:
+    """Return a `CameraRing` about `middle` (x, y) for each z of target, radius and z of cameras [m], all with `arc`."""
+    return tuple(CameraRing((*middle, aim), radius, height, **arc) for aim, radius, height in rings)
+
+
+@dataclass(frozen=True)
+class CameraWalk:
+    """A straight line of cameras that look at points of a second line, in step."""
+
+    ends: tuple[Vector, Vector]  # begin and end of the line of cameras [m]
+    aims: tuple[Vector, Vector]  # points at which cameras at begin and end look [m]
+    closed: bool = False  # the last camera is no neighbour of the first
+
+    def pose(self, share: float) -> FloatArray:
+        """Return the pose (4, 4) at a share of the line, 0 to 1, camera to world."""
+        position, aim = (np.add(a, share * np.subtract(b, a)) for a, b in (self.ends, self.aims))
+        return look_at(position, aim)
+
+
+def ring_poses(
+    rings: Sequence[CameraRing | CameraWalk], num_train: int, num_eval: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return training poses (num_train, 4, 4), evenly spread over rings, and evaluation poses (num_eval, 4, 4) between.
+
+    Cameras go to the rings in turn; each ring starts a fraction of a step later than the ring before. The evaluation
+    cameras in a gap between neighbours divide it evenly. Raises `SceneError` for too small a number of cameras.
+    """
+    if num_train < 1 or num_eval < 0:
+        expected, got = "at least 1 for training and at least 0 for evaluation", f"{num_train} and {num_eval}"
+        raise SceneError("number of views", expected=expected, got=got, remedy="Raise num_train or num_eval.")
+    used = rings[: min(len(rings), num_train)]
+    train, held_out = [np.eye(4)] * num_train, [np.eye(4)] * num_eval
+    for number, ring in enumerate(used):
+        slots, wanted = len(range(number, num_train, len(used))), len(range(number, num_eval, len(used)))
+        phase = 0.25 + 0.5 * (number + 0.5) / len(used)
+        gaps = slots if ring.closed else max(slots - 1, 1)
+        for slot in range(slots):
+            train[number + slot * len(used)] = ring.pose((slot + phase) / slots)
+        chosen = [int((q + 0.5) * gaps / wanted) for q in range(wanted)]
+        for q, gap in enumerate(chosen):
+            within = (chosen[:q].count(gap) + 1) / (chosen.count(gap) + 1)
+            held_out[number + q * len(used)] = ring.pose((gap + phase + within) / slots)
+    return np.array(train), np.array(held_out).reshape(-1, 4, 4)
 
 
 @dataclass(frozen=True, eq=False)

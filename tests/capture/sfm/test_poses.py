@@ -10,13 +10,21 @@ from tests.support.colmap_model import write_colmap_model
 from tests.support.posed_model import CAMERA, ring_model
 from tests.support.textured_room import VISIBLE, write_card
 from thermoxels_ns.capture.masks import PhotographMasks
-from thermoxels_ns.capture.sfm.colmap import model_of_colmap, read_colmap
-from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, image_pairs
-from thermoxels_ns.capture.sfm.poses import Poses, add_points, find_poses, fitted_to_photographs, read_given_poses
+from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.capture.sfm.colmap import model_of_colmap
+from thermoxels_ns.capture.sfm.poses import (
+    Poses,
+    add_points,
+    find_poses,
+    fitted_to_photographs,
+    image_pairs,
+    read_given_poses,
+)
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel, SparseDepth
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.colmap_model import read_model
 
-OPTIONS = PoseOptions(max_features=500)
+SETTINGS = CaptureSettings(max_features=500)
 COUNT = 6
 
 
@@ -36,7 +44,7 @@ def test_points_for_poses_that_are_given(card, tmp_path):
         *(names, VISIBLE, truth[::-1], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), none, none),
         np.zeros((0, 2)),
     )
-    model = add_points(given, photographs, tmp_path, options=OPTIONS)
+    model = add_points(given, photographs, tmp_path, SETTINGS)
     assert np.array_equal(model.camera_to_world, truth[::-1])
     assert model.camera == VISIBLE
     assert len(model.points) > 200
@@ -51,7 +59,7 @@ def test_masked_parts_have_no_features(card, tmp_path):
     use[:, :200] = False
     masks = PhotographMasks((VISIBLE.width, VISIBLE.height), use)
     some = {name: photographs[name] for name in ("shot0", "shot1", "shot2", "shot3")}
-    model = find_poses(some, tmp_path, 430.0, masks, OPTIONS).model
+    model = find_poses(some, tmp_path, SETTINGS, 430.0, masks).model
     assert model.sighting_pixel[:, 0].min() > 195
 
 
@@ -166,7 +174,7 @@ def test_a_colmap_model_comes_in_with_its_points(tmp_path):
     assert found.sighting_error_px().max() < 1e-6
     assert len(found.sighting_frame) == len(MODEL.frames) * len(MODEL.points)
     assert found.point_error_px == pytest.approx(0.5)
-    large = model_of_colmap(read_colmap(tmp_path), files, (1280, 960))
+    large = model_of_colmap(read_model(tmp_path), files, (1280, 960))
     assert (large.camera.fl_x, large.camera.cx, large.camera.k1) == (1000.0, 640.0, 0.02)
     assert large.sighting_error_px().max() < 1e-6
     assert large.point_error_px == pytest.approx(1.0)

@@ -19,7 +19,7 @@ from thermoxels_ns.capture.sfm.scale_and_up import (
 )
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.synthetic.camera_rings import look_at
+from thermoxels_ns.synthetic.scene_truth import look_at
 
 UNIT_M = 0.37
 

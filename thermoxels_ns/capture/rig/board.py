@@ -18,9 +18,9 @@ from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig.start import BASELINE_SIGMA_M, kept_start, rig_start
 from thermoxels_ns.capture.rig_types import PARAMETERS, FloatArray, RigEstimate, RigModel, RigStart, prior_sigmas
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.scale_and_up import MetricScale
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 _SIZE = re.compile(r"(\d{1,3})\s*[xX]\s*(\d{1,3})")
@@ -173,7 +173,7 @@ def rig_from_board_photos(
     return estimate
 
 
-def in_scene_units(rig: RigEstimate, scale: MetricScale | None, missing: str) -> RigEstimate:
+def in_scene_units(rig: RigEstimate, scale: SceneScale | None, missing: str) -> RigEstimate:
     """Convert a rig's lengths from metres to scene units; raise `SceneError` (text: `missing`) if `scale` is None."""
     if scale is None:
         expected = "a known scale, because a board gives the distance of the lenses in metres"

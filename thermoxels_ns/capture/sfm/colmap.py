@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
-from thermoxels_ns.data.colmap_model import camera_to_world, read_model
+from thermoxels_ns.data.colmap_model import camera_to_world
 
 Say = Callable[[str], None]
 _Result = TypeVar("_Result")
@@ -171,13 +171,3 @@ def model_of_colmap(
         np.array(seen, dtype=np.int64),
         np.array(pixels, dtype=np.float64).reshape(-1, 2) * factor,
     )
-
-
-def read_colmap(folder: Path) -> Any:
-    """Return the model in a COLMAP folder as pycolmap.Reconstruction; raise `SceneError` if none is readable."""
-    try:
-        return read_model(folder)
-    except SceneError as problem:
-        expected = "a COLMAP model (cameras, images and points3D as .bin or .txt)"
-        remedy = "Pass --poses the folder that holds them, such as sparse/0."
-        raise SceneError(str(folder), expected=expected, got=problem, remedy=remedy) from problem

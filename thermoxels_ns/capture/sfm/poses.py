@@ -14,12 +14,15 @@ from PIL import Image
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
-from thermoxels_ns.capture.sfm.colmap import model_of_colmap, read_colmap, run_in_process
-from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, as_colmap, fill_database
+from thermoxels_ns.capture.settings import CaptureSettings, LensModel, Matching
+from thermoxels_ns.capture.sfm.colmap import model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
+from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.data.colmap_model import read_model
 from thermoxels_ns.data.transforms_json import path_inside, read_intrinsics, read_pose
 
 MIN_FRAMES = 3  # smallest number of photographs that are reconstructed
@@ -27,6 +30,15 @@ _SAID_EVERY = 10
 _GUESSED_FOCAL = 1.0  # focal length as a share of the longest side, if no photograph states one: a 53 degree lens
 _JPEG_QUALITY = 95
 _DATABASE = "features.db"
+EXHAUSTIVE_UP_TO = 80  # auto matching compares all pairs up to this number of photographs; time grows with its square
+_NEIGHBOURS = 8
+"""Sequential matching: each photograph is matched with the next `_NEIGHBOURS`, and with those 2, 4, 8, ... times
+`_NEIGHBOURS` places ahead."""
+_ANCHORS = 40
+"""Sequential matching: so many photographs, spread over the capture, are also matched with each other, so that a path
+that returns to its start is closed."""
+_CHUNK = 8
+_PAIR_CHUNK = 200
 
 
 @dataclass(frozen=True)
@@ -37,12 +49,25 @@ class Poses:
     dropped: Mapping[str, str]  # reason by the frame's name
 
 
+@dataclass(frozen=True)
+class ReducedPhotographs:
+    """Files that COLMAP reads and writes: reduced photographs, their masks, and a database of features and matches."""
+
+    database: Path  # COLMAP's database file, made if it does not exist; COLMAP also writes to its folder
+    images: Path  # folder of the reduced photographs, all of one size
+    frame_of_image: Mapping[str, str]
+    """Frame name by file name in `images`, in the order the photographs were taken."""
+    size: tuple[int, int]
+    """Width and height of the original photographs, [pixels]; the photographs in `images` may be smaller."""
+    masks: Path | None = None  # folder of pictures that are black where features are not used; None: no masks
+
+
 def find_poses(
     photographs: Mapping[str, Path],
     folder: Path,
+    settings: CaptureSettings,
     focal_px: float | None = None,
     masks: PhotographMasks | None = None,
-    options: PoseOptions | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Poses:
     """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
@@ -53,20 +78,17 @@ def find_poses(
     Raises:
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
     """
-    options = options or PoseOptions()
-    if len(photographs) < MIN_FRAMES:
-        raise _too_few(len(photographs), "photographs")
     size, dropped = common_size(photographs)
     names = [name for name in photographs if name not in dropped]
     if len(names) < MIN_FRAMES:
         raise _too_few(len(names), "photographs of one size")
     some = {name: photographs[name] for name in names}
-    reduced, small = _reduced(some, folder, size, options.image_size, masks)
+    reduced, small = _reduced(some, folder, size, settings.image_size, masks)
     # The photographs' own focal length or a usual one, the principal point at the centre.
     focal = focal_px or _GUESSED_FOCAL * max(size)
     start = Camera(*size, focal, focal, size[0] / 2.0, size[1] / 2.0).resized(*small)
-    fill_database(reduced, start, focal_px is not None, options, say)
-    model, elsewhere = run_in_process(_map, (reduced, options.seed), folder, say)
+    run_in_process(_find_and_match, (reduced, start, focal_px is not None, settings), folder, say)
+    model, elsewhere = run_in_process(_map, (reduced, settings.seed), folder, say)
     if model is None or len(model.frames) < MIN_FRAMES:
         raise _too_few(0 if model is None else len(model.frames), "photographs that fit together")
     for name in names:
@@ -81,19 +103,19 @@ def add_points(
     given: SfmModel,
     photographs: Mapping[str, Path],
     folder: Path,
+    settings: CaptureSettings,
     masks: PhotographMasks | None = None,
-    options: PoseOptions | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> SfmModel:
     """Return the model `given` with scene points that at least two photographs show; lens and poses stay unchanged.
 
     The photographs must have the size of `given.camera`. Results of an interrupted run in `folder` are reused.
     """
-    options = options or PoseOptions()
     size, posed = (given.camera.width, given.camera.height), {name: photographs[name] for name in given.frames}
-    reduced, small = _reduced(posed, folder, size, options.image_size, masks)
-    fill_database(reduced, given.camera.resized(*small), True, replace(options, lens="OPENCV"), say)
-    return run_in_process(_triangulate, (reduced, given, options.seed), folder, say)
+    reduced, small = _reduced(posed, folder, size, settings.image_size, masks)
+    to_match = reduced, given.camera.resized(*small), True, replace(settings, lens="OPENCV")
+    run_in_process(_find_and_match, to_match, folder, say)
+    return run_in_process(_triangulate, (reduced, given, settings.seed), folder, say)
 
 
 def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
@@ -104,7 +126,7 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
     none of the photographs, has several cameras, or has a name that leads out of its folder.
     """
     if path.is_dir():
-        reconstruction = read_colmap(path)
+        reconstruction = read_model(path)
         names = [image.name for image in reconstruction.images.values()]
         model = model_of_colmap(reconstruction, _frames_of(names, photographs, path))
     elif path.is_file():
@@ -317,3 +339,93 @@ def _options(seed: int) -> Any:
     options.mapper.num_threads = 1
     options.min_model_size = MIN_FRAMES
     return options
+
+
+def image_pairs(count: int, matching: Matching) -> IntArray:
+    """Return the pairs of photographs to match, sorted, shape (p, 2): indices in order of time, the smaller first.
+
+    "exhaustive" gives every pair, "sequential" neighbours in time and some far pairs; "auto" chooses by `count`.
+
+    >>> image_pairs(3, "exhaustive").tolist()
+    [[0, 1], [0, 2], [1, 2]]
+    """
+    if matching == "exhaustive" or (matching == "auto" and count <= EXHAUSTIVE_UP_TO):
+        return np.stack(np.triu_indices(count, 1), axis=1).astype(np.int64)
+    steps = [*range(1, _NEIGHBOURS), *(_NEIGHBOURS * 2**power for power in range(count.bit_length()))]
+    first, step = (grid.ravel() for grid in np.meshgrid(np.arange(count), steps, indexing="ij"))
+    near = np.stack([first, first + step], axis=1)
+    anchors = np.unique(np.linspace(0, count - 1, min(_ANCHORS, count)).round().astype(np.int64))
+    far = anchors[np.stack(np.triu_indices(len(anchors), 1), axis=1)]
+    return np.unique(np.concatenate([near[near[:, 1] < count], far]).astype(np.int64), axis=0)
+
+
+def _find_and_match(
+    photographs: ReducedPhotographs,
+    camera: Camera,
+    known_focal: bool,
+    settings: CaptureSettings,
+    say: Callable[[str], None],
+) -> None:
+    """Find features in photographs and match them, adding to what an interrupted run left in the database.
+
+    `camera` is the start value of the lens, at the size of the reduced photographs; `known_focal` is True if its focal
+    length is stated by photographs or poses, not guessed.
+    """
+    import pycolmap
+
+    _add_images(photographs, camera, settings.lens, known_focal)
+    database, names = photographs.database, list(photographs.frame_of_image)
+    reader = pycolmap.ImageReaderOptions(camera_model=settings.lens, existing_camera_id=1)
+    if photographs.masks is not None:
+        reader.mask_path = str(photographs.masks)
+    extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=settings.threads)
+    extraction.sift.max_num_features = settings.max_features
+    for start in range(0, len(names), _CHUNK):  # COLMAP skips photographs that already have features
+        some = names[start : start + _CHUNK]
+        given: dict[str, Any] = {"reader_options": reader, "extraction_options": extraction}
+        pycolmap.extract_features(database, photographs.images, some, **given)
+        say(f"features: {start + len(some)} of {len(names)} photographs")
+    pairs = image_pairs(len(names), settings.matching)
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=settings.threads)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = settings.seed
+    listed = database.with_name("pairs.txt")
+    for start in range(0, len(pairs), _PAIR_CHUNK):
+        some = pairs[start : start + _PAIR_CHUNK]
+        listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some), encoding="utf-8")
+        pairing: Any = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = str(listed)
+        pycolmap.match_image_pairs(database, matching, pairing, verification)
+        say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
+
+
+def as_colmap(camera: Camera, lens: LensModel) -> Any:
+    """Return a camera as a pycolmap.Camera with number 1 and the given lens model."""
+    import pycolmap
+
+    numbers = [camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
+    if lens != "OPENCV":
+        numbers = [numbers[0], *numbers[2 : 5 if lens == "SIMPLE_RADIAL" else 6]]
+    return pycolmap.Camera(camera_id=1, model=lens, width=camera.width, height=camera.height, params=numbers)
+
+
+def _add_images(photographs: ReducedPhotographs, camera: Camera, lens: LensModel, known_focal: bool) -> None:
+    """Create the database with photographs numbered in order; the feature threads would number them by chance."""
+    import pycolmap
+
+    if photographs.database.is_file():
+        return
+    names = photographs.frame_of_image
+    with replace_when_done(photographs.database) as temporary, pycolmap.Database.open(temporary) as opened:
+        colmap_camera = as_colmap(camera, lens)
+        colmap_camera.has_prior_focal_length = known_focal
+        opened.write_camera(colmap_camera, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=1)
+        rig.add_ref_sensor(colmap_camera.sensor_id)
+        opened.write_rig(rig, use_rig_id=True)
+        for number, name in enumerate(names, start=1):
+            image = pycolmap.Image(name=name, camera_id=1, image_id=number)
+            opened.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=number, rig_id=1)
+            frame.add_data_id(image.data_id)
+            opened.write_frame(frame, use_frame_id=True)

@@ -16,6 +16,7 @@ from thermoxels_ns.capture.rig_types import FloatArray
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.scene_scale import SceneScale
 
 _EARTH_RADIUS_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563
 _WORST_GPS = 0.3  # largest relative standard error of a scale from GPS that is accepted
@@ -32,16 +33,7 @@ _ROLLED_DEG = 2.0  # standard deviation of how level people hold a picture's sid
 _BELIEVED_DEG = 5.0  # largest accepted standard error of the common normal of the cameras' level axes, [degrees]
 
 
-@dataclass(frozen=True)
-class MetricScale:
-    """How many metres one unit of the model has, and how that was found."""
-
-    metres_per_unit: float
-    standard_error: float | None  # standard error of `metres_per_unit`, [m per unit]; None: unknown
-    source: str  # sentence for the report that says what the scale comes from
-
-
-def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple[MetricScale | None, str]:
+def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple[SceneScale | None, str]:
     """Find the scale by fitting the cameras' places, shape (n, 3), to their GPS fixes; None and the reason if it fails.
 
     The fit is a similarity by closed-form least squares (Umeyama 1991, equation 42) with Huber's weights. The standard
@@ -71,7 +63,7 @@ def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple
         f"From the GPS positions of {len(known)} photographs, which differ from the cameras' path by "
         f"{math.sqrt(float((residual**2).mean())):.2f} m (root mean square)."
     )
-    return MetricScale(scale, error, source), ""
+    return SceneScale(scale, error, source), ""
 
 
 def local_metres(fixes: Sequence[GpsFix]) -> FloatArray:
@@ -97,7 +89,7 @@ def scale_from_distance(
     known: tuple[str, float, float, float, float, float],
     photograph_of: Mapping[str, str],
     standard_error_m: float | None = None,
-) -> MetricScale:
+) -> SceneScale:
     """Find the scale from the measured distance between two points that one photograph shows.
 
     The depth at each of the two pixels is that of a plane through the scene points around the pixel: inverse depth is
@@ -128,12 +120,12 @@ def scale_from_distance(
     along = (second - first) / apart
     relative = math.hypot(error @ along / apart, other_error @ along / apart, (standard_error_m or 0.0) / metres)
     source = f"From {metres:g} m measured between two points in {name}."
-    return MetricScale(metres / apart, metres / apart * relative, source)
+    return SceneScale(metres / apart, metres / apart * relative, source)
 
 
 def scale_from_markers(
     model: SfmModel, photographs: Mapping[str, Path], side_m: float, standard_error_m: float | None = None
-) -> tuple[MetricScale | None, str]:
+) -> tuple[SceneScale | None, str]:
     """Find the scale from printed ArUco markers (4 x 4 cells, numbers 0 to 49) of known side; or None and a reason.
 
     A marker's corners are triangulated from all photographs that show the marker (linear least squares of the rays).
@@ -174,7 +166,7 @@ def scale_from_markers(
         f"From {len(used)} ArUco marker{'s' * (len(used) != 1)} of {side_m:g} m "
         f"({', '.join(map(str, used))}), whose corners miss their rays by {np.mean(offs):.2f} pixels."
     )
-    return MetricScale(scale, scale * relative, source), ""
+    return SceneScale(scale, scale * relative, source), ""
 
 
 def _similarity(model: FloatArray, metres: FloatArray, weight: FloatArray) -> tuple[float, FloatArray]:
