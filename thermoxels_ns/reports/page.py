@@ -1,4 +1,4 @@
-"""Build html pages from templates; a page is one file that loads nothing else and runs no script."""
+"""Build html pages from templates; a page is one file that loads nothing else. Only the audit's runs a script."""
 
 from __future__ import annotations
 
