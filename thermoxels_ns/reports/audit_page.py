@@ -11,9 +11,10 @@ import numpy as np
 
 from thermoxels_ns.audit.conditions import Survey
 from thermoxels_ns.audit.draws import CONFIDENCE
-from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit
+from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit, asked_of_survey
 from thermoxels_ns.audit.surface import WHY_NOT
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.core.version import __version__
 from thermoxels_ns.reports.audit_view import plotly_script, view_data
 from thermoxels_ns.reports.charts import gradient
 from thermoxels_ns.reports.numbers import number_text, stated_text
@@ -97,6 +98,12 @@ def audit_page(
         why = f"A 3-D view is left out: with it, this page would have {size} MB, of {most} at most."
         page = build_page("audit.html.j2", **shown | {"view_left_out": why})
     return page
+
+
+def agreement_page(title: str, survey: Survey) -> str:
+    """Return the html text of what a client signs before a survey: purpose, conditions and limits."""
+    about = {"title": title, "survey": survey, "asked": asked_of_survey(survey)}
+    return build_page("agreement.html.j2", **about, version=__version__, confidence=100.0 * CONFIDENCE)
 
 
 def _survey(survey: Survey) -> list[tuple[str, str]]:

@@ -39,6 +39,8 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
 
     `toward` is the direction, (3,), in which the view looks at first.
     """
+    from plotly.colors import get_colorscale
+
     surface, known = audit.surface, audit.conditions.outside_known
     mesh, selection = surface.mesh, surface.selection
     points, facets, which = thinned(mesh.points_m, mesh.facets, surface.counted, MOST_TRIANGLES)
@@ -52,7 +54,7 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
     quantities = []
     for (name, unit, scale, cut), every in values.items():
         low, high = np.nanquantile(every[surface.counted], (cut, 1.0 - cut)).tolist()
-        told = {"name": name, "unit": unit, "scale": scale, "low": low, "high": max(high, low + 1e-3)}
+        told = {"name": name, "unit": unit, "scale": get_colorscale(scale), "low": low, "high": max(high, low + 1e-3)}
         quantities.append({**told, "values": _rounded(every[shown])})
     return packed(
         json.dumps(

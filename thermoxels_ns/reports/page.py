@@ -36,6 +36,11 @@ class Report:
     version: str  # Version of Thermoxels
     inputs: tuple[tuple[str, str], ...]  # Name and SHA-256 of each file
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the digests of all inputs, written one after the other."""
+        return hashlib.sha256("".join(digest for _, digest in self.inputs).encode()).hexdigest()
+
 
 def identify(files: Sequence[Path], *choices: object) -> Report:
     """Return the number of a report that is made of files, those of them that exist, and of choices of its user."""
