@@ -31,4 +31,4 @@ def write_pdf(path: Path, page: str) -> None:
     from weasyprint import HTML
 
     with replace_when_done(path) as temporary:
-        HTML(string=page).write_pdf(temporary, pdf_tags=True)
+        HTML(string=page).write_pdf(temporary)
