@@ -95,7 +95,7 @@ def test_the_page_is_complete_in_itself_and_escapes_what_users_write(done) -> No
     assert headings == [
         *("What was asked for", "What was seen", "Findings", "The envelope, element by element"),
         *("Thermal bridges and defects", "Conditions", "The survey", "How sure this is", "Method and its limits"),
-        *("For the file", "How it was made"),
+        *("How it was made", "For the file"),
     ]
     answers = json.loads((done / "answers.json").read_text())
     assert page.count("<article") == len(answers["defects"]) and page.count("data:image/png") == 3

@@ -66,7 +66,7 @@
     });
     box.on("plotly_click", event => {
       const one = event.points[0];
-      if (one.curveNumber === 2) location.hash = `bridge-${data.bridges[one.pointNumber].number}`;
+      if (one.curveNumber === 2) part(`bridge-${data.bridges[one.pointNumber].number}`)?.scrollIntoView();
     });
     for (const button of part("view").querySelectorAll("button")) button.addEventListener("click", () => {
       const {turn, nearer} = button.dataset, angle = Number(turn ?? 0), along = dot(data.up, eye) * (1 - Math.cos(angle));
