@@ -125,18 +125,18 @@ def test_a_browser_draws_the_view_and_its_choice_changes_the_colours(found, tmp_
       for (const n of [0, 1, 2]) {
         choice.value = n;
         choice.dispatchEvent(new Event("change"));
-        await new Promise(done => setTimeout(done, 500));
+        await new Promise(done => setTimeout(done, 100));
         const picture = await Plotly.toImage(box, {format: "png", width: 300, height: 300});
         told.push([box.data[0].cmin, box.data[0].colorbar.title.text, picture]);
       }
       document.querySelector("[data-turn]").click();
-      await new Promise(done => setTimeout(done, 500));
+      await new Promise(done => setTimeout(done, 100));
       told.push(box.layout.scene.camera.eye);
       document.body.innerHTML = `<output>${JSON.stringify(told)}</output>`;
-    }, 200);</script>"""
+    }, 100);</script>"""
     (tmp_path / "page.html").write_text(page_of(found).replace("</body>", watch + "</body>"))
     options = ("--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader", "--use-gl=angle", "--dump-dom")
-    more = ("--use-angle=swiftshader", "--virtual-time-budget=30000", f"--user-data-dir={tmp_path / 'profile'}")
+    more = ("--use-angle=swiftshader", "--virtual-time-budget=5000", f"--user-data-dir={tmp_path / 'profile'}")
     command = [str(CHROMIUM), *options, *more, (tmp_path / "page.html").as_uri()]
     shown = subprocess.run(command, capture_output=True, text=True, timeout=400, check=True).stdout
     first, second, third, eye = json.loads(shown.partition("<output>")[2].partition("</output>")[0])
@@ -145,4 +145,4 @@ def test_a_browser_draws_the_view_and_its_choice_changes_the_colours(found, tmp_
         assert drawn[:2] == [one["low"], f"{one['name']} [{one['unit']}]"] and len(drawn[2]) > 2000
     assert len({first[2], second[2], third[2]}) == 3
     before = audit_page._views(found)[0]
-    assert np.linalg.norm([*eye.values()] + 1.9 * before / np.linalg.norm(before)) > 0.3
+    assert np.linalg.norm([*eye.values()] + 1.5 * before / np.linalg.norm(before)) > 0.3

@@ -18,7 +18,7 @@ MOST_TRIANGLES = 100_000
 """Most triangles of a view; on more, nodes are put together, first where nothing counts."""
 
 _COARSER = 4.0  # Nodes at which nothing counts are put together in cells this many times as large
-_BEFORE_SURFACE_M = 0.1  # Distance of the marks of bridges from the surface, [m]
+_BEFORE_SURFACE_M = 0.4  # Distance of the marks of bridges from the surface, [m]; nearer, it hides half of them
 
 
 @cache
@@ -68,7 +68,7 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
                 "u_ends": [_rounded(audit.triangle_u[shown, end]) for end in (1, 2)] if known else None,
                 "bridges": _marks(audit),
                 "up": list(selection.up),
-                "eye": (-1.9 * toward / np.linalg.norm(toward)).tolist(),
+                "eye": (-1.5 * toward / np.linalg.norm(toward)).tolist(),
                 "inside": audit.conditions.side == "inside",
             },
             separators=(",", ":"),

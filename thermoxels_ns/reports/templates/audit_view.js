@@ -38,12 +38,13 @@
           cmin: one.low, cmax: one.high, colorscale: one.scale, hoverinfo: "text", hovertext: which.map(n => told[n]),
           colorbar: {orientation: "h", y: -0.02, yanchor: "top", thickness: 14, len: 0.9,
             title: {text: `${one.name} [${one.unit}]`, side: "top"}}},
-        {...same, ...corners(data.others, facing(data.others)), color: "#c9ccd1", hoverinfo: "text",
+        {...same, ...corners(data.others, facing(data.others)), color: "#d4d7dc",
+          lighting: {...light, ambient: 0.6, diffuse: 0.6}, hoverinfo: "text",
           hovertext: "does not count"},
         {type: "scatter3d", mode: "markers+text", x: data.bridges.map(one => one.at[0] / 1000),
           y: data.bridges.map(one => one.at[1] / 1000), z: data.bridges.map(one => one.at[2] / 1000),
           text: data.bridges.map(one => `<b>${one.number}</b>`), textposition: "middle center", showlegend: false,
-          textfont: {size: 12, color: "#1d2430"}, marker: {size: 13, color: "#fff", line: {color: "#1d2430", width: 2}},
+          textfont: {size: 12, color: "#1d2430"}, marker: {size: 11, color: "#fff", line: {color: "#1d2430", width: 2}},
           hoverinfo: "text", hovertext: data.bridges.map(one => one.text)},
       ];
     };
