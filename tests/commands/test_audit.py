@@ -1,3 +1,5 @@
+import base64
+import gzip
 import hashlib
 import io
 import json
@@ -22,6 +24,7 @@ from thermoxels_ns.core.errors import AuditError, OutputError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.mesh.files.formats import write_mesh
 from thermoxels_ns.reports.audit_page import draw_audit
+from thermoxels_ns.reports.audit_view import view_data
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +113,10 @@ def test_pictures_of_a_room_look_into_it() -> None:
     middle = mesh.points_m[mesh.facets].mean(axis=1)
     seen = ((middle > 0.4) & (middle < 3.6)).all(axis=1)
     room = replace(mesh, boundary=replace(mesh.boundary, seen=seen))
-    pictures = draw_audit(audit(room, INSIDE))
+    found = audit(room, INSIDE)
+    view = json.loads(gzip.decompress(base64.b64decode(view_data(found, np.array([1.0, 0.0, 0.0])))))
+    assert view["inside"] and len(view["counted"][0]) == found.surface.counted.sum() and not view["others"][0]
+    pictures = draw_audit(found)
     assert len(pictures["temperature"]) == 2
     for png in pictures["temperature"]:
         drawn = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)[150:750, 50:900]

@@ -12,10 +12,9 @@ import numpy as np
 from thermoxels_ns.audit.conditions import Survey
 from thermoxels_ns.audit.draws import CONFIDENCE
 from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit, asked_of_survey
-from thermoxels_ns.audit.surface import WHY_NOT
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.version import __version__
-from thermoxels_ns.reports.audit_view import plotly_script, view_data
+from thermoxels_ns.reports.audit_view import drawn_triangles, plotly_script, view_data
 from thermoxels_ns.reports.charts import gradient
 from thermoxels_ns.reports.numbers import number_text, stated_text
 from thermoxels_ns.reports.page import Picture, Report, build_page, image_file
@@ -217,8 +216,6 @@ def _picture(audit: Audit, chosen: BoolArray, values: FloatArray, **look: Any) -
     from thermoxels_ns.reports.mesh_pictures import image_of_surface
 
     mesh = audit.surface.mesh
-    if audit.conditions.side == "inside":
-        kinds = [number for number, name in enumerate(WHY_NOT) if name in ("cut", "unseen")]
-        chosen = chosen & ~np.isin(audit.surface.why_not, kinds)
+    chosen = chosen & drawn_triangles(audit)
     painted = [("does not count", "lightgrey", ~audit.surface.counted[chosen])]
     return image_file(image_of_surface(mesh.points_m, mesh.facets[chosen], values, painted=painted, **look), "PNG")

@@ -11,6 +11,7 @@ from html import escape
 import numpy as np
 
 from thermoxels_ns.audit.run import Audit
+from thermoxels_ns.audit.surface import WHY_NOT
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.reports.numbers import interval_text
 
@@ -43,7 +44,9 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
 
     surface, known = audit.surface, audit.conditions.outside_known
     mesh, selection = surface.mesh, surface.selection
-    points, facets, which = thinned(mesh.points_m, mesh.facets, surface.counted, MOST_TRIANGLES)
+    some = np.flatnonzero(drawn_triangles(audit))
+    points, facets, which = thinned(mesh.points_m, mesh.facets[some], surface.counted[some], MOST_TRIANGLES)
+    which = some[which]
     counted = surface.counted[which]
     shown = which[counted]
     values = {
@@ -74,6 +77,14 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
             separators=(",", ":"),
         )
     )
+
+
+def drawn_triangles(audit: Audit) -> BoolArray:
+    """Return which boundary triangles pictures show, (f,): in a view from inside, none that are cut or unseen."""
+    if audit.conditions.side == "outside":
+        return np.ones(len(audit.surface.why_not), dtype=bool)
+    kinds = [number for number, name in enumerate(WHY_NOT) if name in ("cut", "unseen")]
+    return ~np.isin(audit.surface.why_not, kinds)
 
 
 def _rounded(values: FloatArray) -> list[float | None]:
