@@ -68,11 +68,7 @@ _NAMES = {
 }
 
 Verdict = Literal["met", "not met", "cannot tell"]
-_NOT_OF_EN_13187 = (
-    "purpose",
-    "certificate",
-    "parts_not_observed",
-)  # Facts of a `Survey` that the standard does not ask
+_NOT_OF_EN_13187 = ("purpose", "certificate", "parts_not_observed")  # Facts of a `Survey` that it does not ask for
 Severity = Literal["severe", "moderate", "slight", "uncertain"]
 
 

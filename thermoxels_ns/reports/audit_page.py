@@ -24,7 +24,7 @@ AuditPictures: TypeAlias = dict[str, list[bytes]]
 temperature is stated), "misfit" (measured minus computed temperature). "defects" has one file per defect."""
 
 MOST_DEFECTS = 12  # Number of defects that get a picture
-MOST_PAGE_BYTES = 15_000_000  # A page that would be larger has no 3-D view: mail servers refuse such files
+MOST_PAGE_BYTES = 15_000_000  # A page that would be larger has no 3-D view
 _ALL_AROUND = 0.35  # If the mean horizontal normal is shorter than this, the building was seen from all around
 _AROUND_DEFECT_M = 0.8  # Least margin around a defect in its picture, [m]
 
