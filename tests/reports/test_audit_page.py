@@ -145,4 +145,4 @@ def test_a_browser_draws_the_view_and_its_choice_changes_the_colours(found, tmp_
         assert drawn[:2] == [one["low"], f"{one['name']} [{one['unit']}]"] and len(drawn[2]) > 2000
     assert len({first[2], second[2], third[2]}) == 3
     before = audit_page._views(found)[0]
-    assert np.linalg.norm([*eye.values()] + 1.5 * before / np.linalg.norm(before)) > 0.3
+    assert np.linalg.norm([*eye.values()] + 1.9 * before / np.linalg.norm(before)) > 0.3

@@ -71,7 +71,7 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
                 "u_ends": [_rounded(audit.triangle_u[shown, end]) for end in (1, 2)] if known else None,
                 "bridges": _marks(audit),
                 "up": list(selection.up),
-                "eye": (-1.5 * toward / np.linalg.norm(toward)).tolist(),
+                "eye": (-1.9 * toward / np.linalg.norm(toward)).tolist(),
                 "inside": audit.conditions.side == "inside",
             },
             separators=(",", ":"),

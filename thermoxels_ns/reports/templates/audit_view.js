@@ -21,6 +21,8 @@
     data.quantities.forEach((one, n) => chosen.add(new Option(`${one.name}, ${one.unit}`, n)));
     const quantity = () => data.quantities[chosen.value];
     let eye = data.eye;
+    const [lx, ly, lz] = eye.map((value, n) => 1e5 * (value + 0.8 * data.up[n] + 0.5 * cross(data.up, eye)[n]));
+    const lamp = {x: lx, y: ly, z: lz};
     // From inside, walls between the reader and the room are left out: those whose front the reader does not see.
     const facing = ([i, j, k]) => i.map((a, n) => n).filter(n => {
       if (!data.inside) return true;
@@ -31,15 +33,17 @@
       k: which.map(n => facets[2][n])});
     const meshes = () => {
       const which = facing(data.counted), one = quantity();
-      const light = {ambient: 0.85, diffuse: 0.25, specular: 0, fresnel: 0};
-      const same = {type: "mesh3d", x, y, z, flatshading: true, lighting: light};
+      // Without these two, plotly takes small triangles for flat ones without a side, and shades none of them.
+      const light = {ambient: 0.8, diffuse: 0.3, specular: 0, fresnel: 0, facenormalsepsilon: 0,
+        vertexnormalsepsilon: 0};
+      const same = {type: "mesh3d", x, y, z, flatshading: true, lighting: light, lightposition: lamp};
       return [
         {...same, ...corners(data.counted, which), intensitymode: "cell", intensity: which.map(n => one.values[n]),
           cmin: one.low, cmax: one.high, colorscale: one.scale, hoverinfo: "text", hovertext: which.map(n => told[n]),
           colorbar: {orientation: "h", y: -0.02, yanchor: "top", thickness: 14, len: 0.9,
             title: {text: `${one.name} [${one.unit}]`, side: "top"}}},
         {...same, ...corners(data.others, facing(data.others)), color: "#d4d7dc",
-          lighting: {...light, ambient: 0.6, diffuse: 0.6}, hoverinfo: "text",
+          lighting: {...light, ambient: 0.55, diffuse: 0.55}, hoverinfo: "text",
           hovertext: "does not count"},
         {type: "scatter3d", mode: "markers+text", x: data.bridges.map(one => one.at[0] / 1000),
           y: data.bridges.map(one => one.at[1] / 1000), z: data.bridges.map(one => one.at[2] / 1000),
@@ -70,8 +74,8 @@
       if (one.curveNumber === 2) part(`bridge-${data.bridges[one.pointNumber].number}`)?.scrollIntoView();
     });
     for (const button of part("view").querySelectorAll("button")) button.addEventListener("click", () => {
-      const {turn, nearer} = button.dataset, angle = Number(turn ?? 0), along = dot(data.up, eye) * (1 - Math.cos(angle));
-      const aside = cross(data.up, eye);
+      const {turn, nearer} = button.dataset, angle = Number(turn ?? 0);
+      const aside = cross(data.up, eye), along = dot(data.up, eye) * (1 - Math.cos(angle));
       look(eye.map((value, n) =>
         (value * Math.cos(angle) + aside[n] * Math.sin(angle) + data.up[n] * along) * Number(nearer ?? 1)));
     });
