@@ -1,7 +1,11 @@
+import base64
+import gzip
 import hashlib
 import io
 import json
 import re
+import sys
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +24,7 @@ from thermoxels_ns.core.errors import AuditError, OutputError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.mesh.files.formats import write_mesh
 from thermoxels_ns.reports.audit_page import draw_audit
+from thermoxels_ns.reports.audit_view import view_data
 
 
 @pytest.fixture(scope="module")
@@ -88,11 +93,12 @@ calibrate:
 def test_the_page_is_complete_in_itself_and_escapes_what_users_write(done) -> None:
     page = (done / "audit.html").read_text()
     assert "<h1>A &lt;script&gt;house&lt;/script&gt; &amp; garden</h1>" in page
-    assert not re.search(r'(?:src|href)="(?!data:)', page) and "<script" not in page
+    assert not re.search(r'(?:src|href)="(?!data:|#)', page) and "<script>house" not in page
     headings = re.findall(r"<h2>(.*?)</h2>", page)
     assert headings == [
-        *("What was asked for", "What was seen", "The envelope, element by element", "Thermal bridges and defects"),
-        *("Conditions", "The survey", "How sure this is", "Method and its limits", "How it was made"),
+        *("What was asked for", "What was seen", "Findings", "The envelope, element by element"),
+        *("Thermal bridges and defects", "Conditions", "The survey", "How sure this is", "Method and its limits"),
+        *("How it was made", "For the file"),
     ]
     answers = json.loads((done / "answers.json").read_text())
     assert page.count("<article") == len(answers["defects"]) and page.count("data:image/png") == 3
@@ -107,7 +113,10 @@ def test_pictures_of_a_room_look_into_it() -> None:
     middle = mesh.points_m[mesh.facets].mean(axis=1)
     seen = ((middle > 0.4) & (middle < 3.6)).all(axis=1)
     room = replace(mesh, boundary=replace(mesh.boundary, seen=seen))
-    pictures = draw_audit(audit(room, INSIDE))
+    found = audit(room, INSIDE)
+    view = json.loads(gzip.decompress(base64.b64decode(view_data(found, np.array([1.0, 0.0, 0.0])))))
+    assert view["inside"] and len(view["counted"][0]) == found.surface.counted.sum() and not view["others"][0]
+    pictures = draw_audit(found)
     assert len(pictures["temperature"]) == 2
     for png in pictures["temperature"]:
         drawn = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)[150:750, 50:900]
@@ -140,6 +149,44 @@ def test_what_forbids_a_survey_stands_first(export, tmp_path) -> None:
     _, page = audited(export / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "out", "--pictures", "False")
     assert page.index("Look at this first") < page.index("The wind was 7.0 m/s") < page.index('class="cards')
     assert "this one does not know: client." in page and "data:image/png" not in page
+
+
+def test_the_page_is_printed_as_a_document_where_weasyprint_is(export, tmp_path, capsys, monkeypatch) -> None:
+    words = ("--pictures", "False", "--pdf", "True")
+    audited(export / "mesh.vtu", export / "conditions.yaml", tmp_path / "out", *words)
+    document = (tmp_path / "out" / "audit.pdf").read_bytes()
+    assert document.startswith(b"%PDF-") and document.rstrip().endswith(b"%%EOF")
+    packed = re.findall(rb"/Type /ObjStm.*?stream\r?\n(.*?)endstream", document, flags=re.S)
+    objects = b"".join(zlib.decompressobj().decompress(one) for one in packed)
+    assert len(re.findall(rb"/Type /Page\b", objects)) in range(3, 9)
+    (corners,) = set(re.findall(rb"/MediaBox ?\[([^\]]*)\]", objects))
+    assert np.allclose([float(one) for one in corners.split()], [0, 0, 595.28, 841.89], atol=0.01)  # A4
+    capsys.readouterr()
+    monkeypatch.setitem(sys.modules, "weasyprint", None)
+    _, page = audited(export / "mesh.vtu", export / "conditions.yaml", tmp_path / "out", *words)
+    assert "thermoxels-ns[pdf]" in capsys.readouterr().out and "audit.pdf" not in page.partition("answers.json")[2]
+    assert not (tmp_path / "out" / "audit.pdf").exists()
+
+
+@pytest.mark.parametrize(("name", "begins"), [("a.html", b"<!doctype html>"), ("a.pdf", b"%PDF-")])
+def test_an_agreement_is_written_before_a_survey(tmp_path, name, begins) -> None:
+    (tmp_path / "c.yaml").write_text("title: A <b>house\nsurvey: {client: C. Lient, purpose: to find leaks}\n")
+    words = ["audit", "--write-agreement", str(tmp_path / "new" / name), "--conditions", str(tmp_path / "c.yaml")]
+    assert cli.main(words) == 0
+    written = (tmp_path / "new" / name).read_bytes()
+    assert written.startswith(begins)
+    if name == "a.html":
+        page = written.decode()
+        assert "A &lt;b&gt;house" in page and "<td>C. Lient</td>" in page and "<td>to find leaks</td>" in page
+        assert page.count('class="blank') == 10 and "at least 10 K" in page and "air leakage is not in it" in page
+    with pytest.raises(AuditError, match="--write-agreement"):
+        run_audit(Audit(write_agreement=tmp_path / "new" / name))  # is there
+    with pytest.raises(AuditError, match="--write-agreement"):
+        run_audit(Audit(write_agreement=tmp_path / "a.doc"))
+    (tmp_path / "c.yaml").write_text("survey: {cleint: C}\n")
+    with pytest.raises(AuditError, match="cleint"):
+        run_audit(Audit(write_agreement=tmp_path / "b.html", conditions=tmp_path / "c.yaml"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["c.yaml", "new"]
 
 
 def test_an_example_of_conditions_is_written_and_read(export, tmp_path, capsys) -> None:

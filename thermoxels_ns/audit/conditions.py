@@ -164,12 +164,15 @@ class Survey:
     """Facts that a report after EN 13187 states; the audit computes no figures from them."""
 
     client: str = ""
+    purpose: str = ""  # What the client wants to know
     operator: str = ""
+    certificate: str = ""  # Of the operator, as ISO 6781-3 asks for: number, level, who issued it
     place: str = ""
     construction: str = ""  # Construction of the building, as far as known
     date: datetime | None = None
     camera_positions: str = ""
     parts_observed: str = ""
+    parts_not_observed: str = ""
     hours_since_sun: Hours | None = None  # Hours since the sun last shone on the surface
     sun_last_12h: str = ""
     hours_dry: Hours | None = None  # Hours since the surface was last wet

@@ -11,7 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.audit.calibration import Calibration, calibrated
-from thermoxels_ns.audit.conditions import BALANCE, SIMPLE, Conditions, load_conditions
+from thermoxels_ns.audit.conditions import BALANCE, SIMPLE, Conditions, Survey, load_conditions
 from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
 from thermoxels_ns.audit.draws import (
     ENDS,
@@ -69,6 +69,7 @@ _NAMES = {
 }
 
 Verdict = Literal["met", "not met", "cannot tell"]
+_NOT_OF_EN_13187 = ("purpose", "certificate", "parts_not_observed")  # Facts of a `Survey` that it does not ask for
 Severity = Literal["severe", "moderate", "slight", "uncertain"]
 
 
@@ -126,9 +127,20 @@ class Defect:
 
 
 @dataclass(frozen=True)
+class Asked:
+    """A condition that a standard asks a survey to meet, in words for the report."""
+
+    what: str
+    asked: str
+    stated: str  # Empty if nothing is known
+    verdict: Literal["met", "not met", "not stated"]
+
+
+@dataclass(frozen=True)
 class SurveyCheck:
     """Shortcomings of a survey, in words for the report."""
 
+    asked: tuple[Asked, ...]  # The conditions that EN 13187 and ISO 6781-3 ask for, met or not
     forbidden: tuple[str, ...]  # Sentences on conditions that EN 13187 does not allow
     doubts: tuple[str, ...]  # Sentences on what makes the figures less certain than their intervals say
     missing: tuple[str, ...]  # Names of facts that EN 13187 wants in a report and that the conditions do not state
@@ -538,6 +550,32 @@ def _failing_models(conditions: Conditions, elements: Sequence[Element]) -> tupl
     return failing
 
 
+def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tuple[Asked, ...]:
+    """Return what EN 13187 and ISO 6781-3 (certificate) ask of a survey; without conditions, of one from outside."""
+    found, wind, difference = list[Asked](), None, None
+    if conditions is not None:
+        wind = conditions.outside.wind
+        difference = Measured(conditions.difference_k) if conditions.outside_known else None
+
+    def ask(what: str, stated: Measured | None, limit: float, unit: str, least: bool = True) -> None:
+        asked = f"at {'least' if least else 'most'} {limit:g} {unit}"
+        if stated is None:
+            found.append(Asked(what, asked, "", "not stated"))
+        else:
+            met = stated.value >= limit if least else stated.value <= limit
+            found.append(Asked(what, asked, f"{stated.value:.3g} {unit}", "met" if met else "not met"))
+
+    ask("air inside warmer than outside, during the survey", difference, LEAST_DIFFERENCE_K, "K")
+    ask("the same, all the last 24 hours", survey.least_difference_24h, LEAST_DIFFERENCE_K, "K")
+    ask("wind", wind, MOST_WIND_M_S, "m/s", least=False)
+    if conditions is None or conditions.side == "outside":
+        ask("time since the sun shone on the surface", survey.hours_since_sun, LEAST_HOURS_WITHOUT_SUN, "h")
+        ask("time since the surface was wet", survey.hours_dry, LEAST_HOURS_DRY, "h")
+    certificate = survey.certificate
+    asked = "a certificate of qualification"
+    return (*found, Asked("operator", asked, certificate, "met" if certificate else "not stated"))
+
+
 def check_survey(conditions: Conditions) -> SurveyCheck:
     """Return what EN 13187 forbids and misses in the conditions of a survey, and what makes results doubtful."""
     survey, wind, difference = conditions.survey, conditions.outside.wind, conditions.difference_k
@@ -561,7 +599,8 @@ def check_survey(conditions: Conditions) -> SurveyCheck:
         if dry is not None and dry.value < LEAST_HOURS_DRY:
             asked = f"EN 13187 asks for {LEAST_HOURS_DRY:g} hours."
             forbidden.append(f"The surface was wet {dry.value:g} hours before; {asked}")
-    return SurveyCheck(tuple(forbidden), _doubts(conditions), _missing(conditions))
+    asked = asked_of_survey(survey, conditions)
+    return SurveyCheck(asked, tuple(forbidden), _doubts(conditions), _missing(conditions))
 
 
 def _doubts(conditions: Conditions) -> tuple[str, ...]:
@@ -634,7 +673,8 @@ def _remembered(conditions: Conditions) -> tuple[Interval | None, tuple[str, ...
 
 def _missing(conditions: Conditions) -> tuple[str, ...]:
     survey, camera, outside = conditions.survey, conditions.camera, conditions.outside
-    said = {_NAMES.get(one.name, one.name.replace("_", " ")): getattr(survey, one.name) for one in fields(survey)}
+    of_it = [one.name for one in fields(survey) if one.name not in _NOT_OF_EN_13187]
+    said = {_NAMES.get(name, name.replace("_", " ")): getattr(survey, name) for name in of_it}
     said["air temperature outside"] = outside.air if conditions.outside_known else None
     for name, air in (("inside", conditions.inside), ("outside", outside)):
         both = air.lowest_24h if air.highest_24h is not None else None

@@ -15,7 +15,7 @@ import tyro
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.commands.installed_commands import command_of
-from thermoxels_ns.core.checks import check_direction, check_positive, remove_file, result_folder
+from thermoxels_ns.core.checks import check_direction, check_positive, remove_file, result_folder, writable_folder
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.data.layouts import LayoutName
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from thermoxels_ns.mesh.tetrahedra import TetMesh
     from thermoxels_ns.reports.page import Picture
 
-ANSWERS, PAGE, SURFACE = "answers.json", "audit.html", "surface.vtp"
+ANSWERS, PAGE, DOCUMENT, SURFACE = "answers.json", "audit.html", "audit.pdf", "surface.vtp"
 """Files that an audit writes."""
 ENVELOPES = {"hbjson": "envelope.hbjson", "gbxml": "envelope-gbxml.xml"}
 """Files that an audit writes if `Audit.envelope` asks for them."""
@@ -63,7 +63,13 @@ class Audit:
     """Bridges and defects that lose less than this extra are listed as seen, but not counted, [W]. What lies within the
     error of the reconstruction is never counted."""
     pictures: bool = True
-    """Draw pictures for the page."""
+    """Draw pictures and the 3-D view for the page."""
+    pdf: bool = False
+    """Print the page into audit.pdf as well: a document to sign. It takes some seconds, and needs WeasyPrint (pip
+    install 'thermoxels-ns[pdf]')."""
+    write_agreement: Path | None = None
+    """Write what a client signs before the survey (purpose, conditions, limits) to this .pdf or .html file, and do
+    nothing else. What the section survey of --conditions says is filled in; the rest are lines to fill in by hand."""
     write_patches: Path | None = None
     """Propose patches: find walls, roofs, windows, doors and the ground on the mesh, write them to this yaml file with
     a picture of their names beside it, and do nothing else. Needs no conditions."""
@@ -95,11 +101,16 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     from thermoxels_ns.core.yaml_records import write_example
     from thermoxels_ns.data.scene_file import read_scene_file
     from thermoxels_ns.mesh.boundary.planes import find_building
+    from thermoxels_ns.reports.document import why_no_pdf
     from thermoxels_ns.reports.numbers import interval_text, plain_names
 
     if options.write_conditions is not None:
         write_example(options.write_conditions, EXAMPLE, AuditError)
         say(f"Written to {options.write_conditions}: put in what you measured, and pass it with --conditions.")
+        return None
+    if options.write_agreement is not None:
+        write_agreement(options.write_agreement, options.conditions)
+        say(f"Written to {options.write_agreement}.")
         return None
     if options.mesh is not None and options.write_patches is not None:
         mesh, up, _ = _read(options.mesh, options, say)
@@ -114,8 +125,11 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         remedy = "Pass --least-bridge-w 0 to count all."
         raise AuditError("--least-bridge-w", expected="a number of watts, at least 0", got=least_w, remedy=remedy)
     others = ("summary.json", "quality.json", "series.csv")
-    written = (ANSWERS, PAGE, SURFACE, *ENVELOPES.values())
+    written = (ANSWERS, PAGE, DOCUMENT, SURFACE, *ENVELOPES.values())
     folder = result_folder(options.output_dir, written, (SURFACE, ANSWERS), others)
+    lacking = why_no_pdf() if options.pdf else ""
+    if lacking:
+        say(f"Without audit.pdf: {lacking}")
     conditions = load_conditions(options.conditions)
     if options.envelope and conditions.side != "outside":
         remedy = "Leave --envelope out; rooms are not written."
@@ -148,12 +162,36 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         range_c = shown_range_c(found)
         photographs = photographs_of_defects(scene, scale, found, range_c)
         say(f"Photographs show {sum(not found.defects[number].not_counted for number in photographs)} of them.")
-    _write(
+    names = _write(
         folder, options, found, photographs, {"range_c": range_c, "most_u": most_u, "impossible": impossible}, envelope
     )
-    names = (PAGE, ANSWERS, SURFACE, *(ENVELOPES[one] for one in options.envelope))
     say(f"Written to {folder}: {', '.join(names)} ({clock.perf_counter() - begin:.1f} s)")
     return found
+
+
+def write_agreement(path: Path, conditions: Path | None) -> None:
+    """Write what a client signs before a survey to a .pdf or .html file, filled in from a file of conditions, if any.
+
+    Raises `AuditError` for other endings, or if WeasyPrint is missing or the conditions are wrong.
+    """
+    from thermoxels_ns.audit.conditions import Survey
+    from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml
+    from thermoxels_ns.reports.audit_page import agreement_page
+    from thermoxels_ns.reports.document import write_pdf
+    from thermoxels_ns.reports.page import write_page
+
+    if path.suffix not in (".pdf", ".html") or path.exists():
+        got = "a file that is there" if path.exists() else path.name
+        remedy = "Choose another name, such as agreement.pdf."
+        raise AuditError("--write-agreement", expected="a new .pdf or .html file", got=got, remedy=remedy)
+    title, survey = "", Survey()
+    with raising(AuditError):
+        if conditions is not None:
+            stated = read_yaml(conditions)  # before the survey, the rest of it is not known
+            survey = as_record(f"{conditions.name}: survey", stated.get("survey") or {}, Survey)
+            title = str(stated.get("title") or "")
+        writable_folder(path.parent)
+        (write_page if path.suffix == ".html" else write_pdf)(path, agreement_page(title, survey))
 
 
 def _read(path: Path, options: Audit, say: Say) -> tuple[TetMesh, Vector, dict[str, Any]]:
@@ -244,6 +282,7 @@ def answers_of(options: Audit, found: Found, envelope: Envelope | None = None) -
         "forbidden": found.check.forbidden,
         "doubts": found.check.doubts,
         "missing_for_en_13187": found.check.missing,
+        "asked_of_survey": found.check.asked,
         "loss_narrower_by_w": found.budget,
         **{name: getattr(found, name) for name in ("draws", "failing_models", "remembered")},
         **({} if envelope is None else {"envelope": envelope.figures()}),
@@ -258,13 +297,15 @@ def _write(
     photographs: Mapping[int, tuple[Picture, ...]],
     shown: Mapping[str, Any],
     envelope: Envelope | None,
-) -> None:
+) -> tuple[str, ...]:
+    """Write all files and return their names."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     from thermoxels_ns.audit.envelope import gbxml, hbjson
     from thermoxels_ns.mesh.files.content import write_bytes
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtk
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit
+    from thermoxels_ns.reports.document import why_no_pdf, write_pdf
     from thermoxels_ns.reports.page import identify, write_page
 
     assert options.mesh is not None and options.conditions is not None
@@ -287,8 +328,13 @@ def _write(
         else:
             write_bytes(folder / name, [gbxml(envelope, title)])
     pictures = draw_audit(found) if options.pictures else None
-    command = command_of("audit", options)
-    files = (PAGE, ANSWERS, SURFACE, *map(ENVELOPES.__getitem__, options.envelope))
-    page = audit_page(found, pictures, photographs, options.mesh.name, command, files, report=report, **shown)
-    write_page(folder / PAGE, page)
+    command, document = command_of("audit", options), options.pdf and not why_no_pdf()
+    files = (PAGE, DOCUMENT, ANSWERS, SURFACE) if document else (PAGE, ANSWERS, SURFACE)
+    files += tuple(ENVELOPES[one] for one in options.envelope)
+    about = (found, pictures, photographs, options.mesh.name, command, files)
+    write_page(folder / PAGE, audit_page(*about, report=report, **shown))
+    remove_file(folder / DOCUMENT)
+    if document:
+        write_pdf(folder / DOCUMENT, audit_page(*about, report=report, **shown, paper=True))
     write_summary(folder / ANSWERS, answers)
+    return files

@@ -140,7 +140,7 @@ def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> li
     patches = ["--patches", str(survey / "patches.yaml")] if scene == _AUDITED else []
     audit = [
         *("thermoxels", "audit", str(folder / "export" / "mesh.vtu"), "--conditions", str(survey / "conditions.yaml")),
-        *("--scene", str(folder / "scene"), "--output-dir", str(folder / "audit")),
+        *("--scene", str(folder / "scene"), "--output-dir", str(folder / "audit"), "--pdf", "True"),
     ]
     walls, night = folder / "walls", ["--scene", "winter-night", "--from-audit", str(folder / "audit" / "answers.json")]
     export = ["ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", str(walls), *_WALLS]

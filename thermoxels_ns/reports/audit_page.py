@@ -11,9 +11,10 @@ import numpy as np
 
 from thermoxels_ns.audit.conditions import Survey
 from thermoxels_ns.audit.draws import CONFIDENCE
-from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit
-from thermoxels_ns.audit.surface import WHY_NOT
+from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit, asked_of_survey
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.core.version import __version__
+from thermoxels_ns.reports.audit_view import drawn_triangles, plotly_script, view_data
 from thermoxels_ns.reports.charts import gradient
 from thermoxels_ns.reports.numbers import number_text, stated_text
 from thermoxels_ns.reports.page import Picture, Report, build_page, image_file
@@ -23,6 +24,7 @@ AuditPictures: TypeAlias = dict[str, list[bytes]]
 temperature is stated), "misfit" (measured minus computed temperature). "defects" has one file per defect."""
 
 MOST_DEFECTS = 12  # Number of defects that get a picture
+MOST_PAGE_BYTES = 15_000_000  # A page that would be larger has no 3-D view
 _ALL_AROUND = 0.35  # If the mean horizontal normal is shorter than this, the building was seen from all around
 _AROUND_DEFECT_M = 0.8  # Least margin around a defect in its picture, [m]
 
@@ -39,8 +41,11 @@ def audit_page(
     range_c: tuple[float, float] | None,
     most_u: Mapping[str, float],
     impossible: Sequence[str],
+    paper: bool = False,
 ) -> str:
     """Return the html text of an audit's page; `command` made the audit, `files` lie beside the page.
+
+    It has a 3-D view if it has pictures, is not meant for `paper` and does not exceed `MOST_PAGE_BYTES`.
 
     `photographs` are pictures of defects by place in `audit.defects`, whose colours span `range_c`; without `pictures`
     the page has no drawings. `most_u` is the U-value by name of an element from which on a value is marked impossible,
@@ -51,8 +56,7 @@ def audit_page(
     loss, bound = abs(audit.whole.loss_w.value), audit.whole.loss_w.at_most or audit.whole.loss_w.unknown
     start = {} if asked is None else asked.stated()
     unknown = set() if asked is None else {one.name() for one in asked.unknown}
-    return build_page(
-        "audit.html.j2",
+    shown = dict[str, Any](
         audit=audit,
         counted=counted,
         doubted=[(number, one) for number, one in numbered if one.not_counted],
@@ -81,7 +85,24 @@ def audit_page(
         mesh_name=mesh_name,
         command=command,
         files=files,
+        view=None,
+        view_left_out="",
     )
+    view = None
+    if pictures is not None and not paper:
+        view = {"plotly": plotly_script(), "data": view_data(audit, _views(audit)[0])}
+    page = build_page("audit.html.j2", **shown | {"view": view})
+    if view is not None and len(page) > MOST_PAGE_BYTES:
+        size, most = f"{len(page) / 1e6:.0f}", f"{MOST_PAGE_BYTES / 1e6:.0f}"
+        why = f"A 3-D view is left out: with it, this page would have {size} MB, of {most} at most."
+        page = build_page("audit.html.j2", **shown | {"view_left_out": why})
+    return page
+
+
+def agreement_page(title: str, survey: Survey) -> str:
+    """Return the html text of what a client signs before a survey: purpose, conditions and limits."""
+    about = {"title": title, "survey": survey, "asked": asked_of_survey(survey)}
+    return build_page("agreement.html.j2", **about, version=__version__, confidence=100.0 * CONFIDENCE)
 
 
 def _survey(survey: Survey) -> list[tuple[str, str]]:
@@ -195,8 +216,6 @@ def _picture(audit: Audit, chosen: BoolArray, values: FloatArray, **look: Any) -
     from thermoxels_ns.reports.mesh_pictures import image_of_surface
 
     mesh = audit.surface.mesh
-    if audit.conditions.side == "inside":
-        kinds = [number for number, name in enumerate(WHY_NOT) if name in ("cut", "unseen")]
-        chosen = chosen & ~np.isin(audit.surface.why_not, kinds)
+    chosen = chosen & drawn_triangles(audit)
     painted = [("does not count", "lightgrey", ~audit.surface.counted[chosen])]
     return image_file(image_of_surface(mesh.points_m, mesh.facets[chosen], values, painted=painted, **look), "PNG")

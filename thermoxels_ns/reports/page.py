@@ -1,4 +1,4 @@
-"""Build html pages from templates; a page is one file that loads nothing else and runs no script."""
+"""Build html pages from templates; a page is one file that loads nothing else. Only the audit's runs a script."""
 
 from __future__ import annotations
 
@@ -35,6 +35,11 @@ class Report:
     number: str  # Such as 0F3A-99C2-71B0
     version: str  # Version of Thermoxels
     inputs: tuple[tuple[str, str], ...]  # Name and SHA-256 of each file
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the digests of all inputs, written one after the other."""
+        return hashlib.sha256("".join(digest for _, digest in self.inputs).encode()).hexdigest()
 
 
 def identify(files: Sequence[Path], *choices: object) -> Report:
