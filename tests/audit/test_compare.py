@@ -34,7 +34,7 @@ def changed() -> tuple[Comparison, dict[str, float], float]:
 def test_what_was_insulated_and_mended_is_found_first_and_what_stayed_is_not_significant(changed) -> None:
     found, true, coupling = changed
     assert found.moved and found.residual_m < 0.01 and found.only_before == found.only_after == ()
-    assert [one.name for one in found.elements][0] == "east" and found.elements[0].significant
+    assert next(one.name for one in found.elements) == "east" and found.elements[0].significant
     assert {one.name for one in found.elements} == set(U)
     for one in found.elements:
         assert one.change.low < true[one.name] < one.change.high

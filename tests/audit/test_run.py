@@ -34,7 +34,7 @@ from thermoxels_ns.audit.conditions import (
     Year,
 )
 from thermoxels_ns.audit.defects import find_defects, undisturbed_temperature
-from thermoxels_ns.audit.draws import COUNT, FORMULA, Interval, draw, interval_of
+from thermoxels_ns.audit.draws import COUNT, FORMULA, GEOMETRY, Interval, draw, interval_of
 from thermoxels_ns.audit.heat_flow import CONVECTION, radiation_w_m2
 from thermoxels_ns.audit.run import Audit, audit, incidence_factor
 from thermoxels_ns.audit.surface import audited_surface
@@ -232,6 +232,21 @@ def test_what_no_photograph_supports_is_listed_and_not_counted(walls) -> None:
     photographs[:, 0] = 0
     with pytest.raises(AuditError, match=r"boundary triangles with a reading, got none"):
         audit(replace(mesh, boundary=replace(mesh.boundary, photographs=photographs)), STATED, UP)
+
+
+def test_geometry_widens_areas_and_watts_and_more_where_fewer_photographs_support(walls) -> None:
+    """A flat wall of 12 m2 whose border, 14 m, may lie half a triangle's edge (0.1 m) off, or a whole one."""
+    mesh, found = photographed(walls["plain"], STATED), list[Audit]()
+    for supporting in (None, 5, 1):
+        photographs = None if supporting is None else np.full((len(mesh.facets), 2), supporting)
+        found.append(audit(replace(mesh, boundary=replace(mesh.boundary, photographs=photographs)), STATED, UP))
+    none, good, weak = (one.patches[0] for one in found)
+    assert none.area_range_m2 == Interval(*[none.area_m2] * 3) and GEOMETRY not in none.width_shares
+    half = 0.25 * np.pi * 0.05 * 14.0 * (1.0 - np.sqrt(0.1))  # 90 % of the mean of two even distributions
+    wide = [0.5 * (one.area_range_m2.high - one.area_range_m2.low) for one in (good, weak)]
+    assert wide[1] == pytest.approx(2.0 * wide[0], rel=1e-9) and wide[0] == pytest.approx(half, rel=0.05)
+    assert good.u_w_m2k.high == pytest.approx(none.u_w_m2k.high)
+    assert weak.loss_w.high > good.loss_w.high > none.loss_w.high and found[2].budget[GEOMETRY] > 0.0
 
 
 @pytest.mark.parametrize(

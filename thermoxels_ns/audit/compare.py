@@ -205,7 +205,7 @@ class _Compared:
         both = [np.einsum("p,pk->k", areas, np.stack(one)) / areas.sum() for one in zip(*pairs)]
         at = self._middle(np.concatenate([*elements.values()]))
         whole = _change("all that both saw", "in both", at, "W/(m2 K)", *both, float(areas.sum()) * difference_k)
-        found = [self._bridge(*one, difference_k) for one in bridges]
+        found = [self._bridge(difference_k, *one) for one in bridges]
         return Comparison(
             whole=whole,
             elements=_ranked(changes),
@@ -256,13 +256,13 @@ class _Compared:
 
     def _bridge(
         self,
+        difference_k: float,
         bridge: FoundDefect,
         state: State,
         first: int,
         base: float,
         second: int,
         new_base: float,
-        difference_k: float,
     ) -> Change:
         length, unit = (bridge.length_m, "W/(m K)") if bridge.kind == "line" else (1.0, "W/K")
         draws = (self.old.extra_w_k(first, base) / length, self.new.extra_w_k(second, new_base) / length)
@@ -337,15 +337,12 @@ def _places(points_m: FloatArray, normal: FloatArray) -> FloatArray:
 
 
 def _partners(count: int, which: IntArray, at: FloatArray, others: IntArray, others_at: FloatArray) -> IntArray:
-    """Return for `which` of a survey's triangles the nearest of the `others` that faces the same way, or -1, (count,)."""
-    distance, nearest = KDTree(others_at).query(at, distance_upper_bound=2.0 * _NEAR_M)
-    apart = np.full(len(at), np.inf)
-    met = np.isfinite(distance)
-    apart[met] = np.linalg.norm(at[met, :3] - others_at[nearest[met], :3], axis=1)
-    cosine = np.einsum("ij,ij->i", at[met, 3:], others_at[nearest[met], 3:]) / _NEAR_M**2
-    apart[np.flatnonzero(met)[cosine < _FACES]] = np.inf
+    """Return for `which` triangles of a survey the nearest of the `others` that faces the same way, or -1, (count,)."""
+    nearest = np.asarray(KDTree(others_at).query(at)[1], dtype=np.int64)
+    apart = np.linalg.norm(at[:, :3] - others_at[nearest, :3], axis=1)
+    same = (apart <= _NEAR_M) & (np.einsum("ij,ij->i", at[:, 3:], others_at[nearest, 3:]) >= _FACES * _NEAR_M**2)
     found = np.full(count, -1)
-    found[which[apart <= _NEAR_M]] = others[nearest[apart <= _NEAR_M]]
+    found[which[same]] = others[nearest[same]]
     return found
 
 
@@ -362,7 +359,7 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
 
     def distances(pose: Pose, points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
         moved, turned = pose(points), normals @ pose.turn.T
-        _, nearest = tree.query(_places(moved, turned))
+        nearest = np.asarray(tree.query(_places(moved, turned))[1], dtype=np.int64)
         along = np.einsum("ij,ij->i", target[nearest] - moved, facing[nearest])
         lost = np.linalg.norm(target[nearest] - moved, axis=1) > _UNMATCHED_M
         lost |= np.einsum("ij,ij->i", turned, facing[nearest]) < _FACES

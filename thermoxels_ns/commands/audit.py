@@ -15,7 +15,7 @@ import tyro
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.commands.installed_commands import command_of
-from thermoxels_ns.core.checks import check_direction, check_positive, remove_file, result_folder
+from thermoxels_ns.core.checks import check_direction, check_positive, is_number, remove_file, result_folder
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.data.layouts import LayoutName
 
@@ -66,8 +66,8 @@ class Audit:
     pictures: bool = True
     """Draw pictures for the page."""
     compare: Path | None = None
-    """The answers.json of an earlier audit of the same building, with its surface.vtp beside it: what changed since, with
-    intervals. The two meshes may have different coordinates, both in metres."""
+    """The answers.json of an earlier audit of the same building, with its surface.vtp beside it: what changed since,
+    with intervals. The two meshes may have different coordinates, both in metres."""
     compare_difference: float | None = None
     """Inside minus outside air at which --compare compares heat losses, [K]. Default: that of the later survey."""
     write_patches: Path | None = None
@@ -188,7 +188,7 @@ def _read(path: Path, options: Audit, say: Say) -> tuple[TetMesh, Vector, dict[s
 def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
     """Read an earlier audit from its answers.json and the surface.vtp beside it; return a function that repeats it.
 
-    Raises `AuditError` or `MeshError` if a file is missing, damaged or of another kind, or `difference_k` is not above 0.
+    Raises `AuditError` or `MeshError` if a file is missing or damaged, or `difference_k` is not above 0.
     """
     from thermoxels_ns.audit.compare import earlier_conditions
     from thermoxels_ns.audit.run import audit
@@ -199,7 +199,8 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
         check_positive("--compare-difference", difference_k, "Pass --compare-difference 20.", AuditError)
     again = "Pass the answers.json that thermoxels audit wrote, with its surface.vtp beside it."
     content = read_json_object(path, again, AuditError)
-    missing = [key for key in ("conditions", "up") if not content.get(key)]
+    kinds = {"conditions": dict, "up": list}
+    missing = [key for key, kind in kinds.items() if not isinstance(content.get(key), kind)]
     if missing:
         got = f"one without {' and '.join(missing)}"
         raise AuditError(
@@ -207,8 +208,8 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
         )
     conditions, mesh = earlier_conditions(path.name, content["conditions"]), read_surface(path.with_name(SURFACE))
     x, y, z = check_direction(f"{path}: up", content["up"], again, AuditError).tolist()
-    least_w = float(content.get("least_bridge_w") or 0.0)
-    return lambda: without_slight(audit(mesh, conditions, (x, y, z)), least_w)
+    least_w = content.get("least_bridge_w")
+    return lambda: without_slight(audit(mesh, conditions, (x, y, z)), least_w if is_number(least_w) else 0.0)
 
 
 def without_slight(found: Found, least_w: float) -> Found:
@@ -240,7 +241,7 @@ def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
 
     A sentence names the two inputs that widen the U-value's interval most: one of these clashes with the readings.
     """
-    from thermoxels_ns.audit.draws import REPEATABILITY
+    from thermoxels_ns.audit.draws import GEOMETRY, REPEATABILITY
     from thermoxels_ns.audit.exchange import most_u_w_m2k
 
     surface, every, most = found.surface, np.flatnonzero(found.surface.counted), dict[str, float]()
@@ -249,7 +250,11 @@ def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
         on = every[surface.selection.facet_patch[every] == number]
         most[one.name] = most_u_w_m2k(surface, found.conditions, on)
     most |= {one.name: max(most.values()) for one in (*found.storeys, found.whole)}
-    widest = [name for name, share in found.whole.width_shares.items() if share > 0.0 and name != REPEATABILITY]
+    widest = [
+        name
+        for name, share in found.whole.width_shares.items()
+        if share > 0.0 and name not in (GEOMETRY, REPEATABILITY)
+    ]
     inputs = " and ".join(widest[:2]) or "the airs and the camera"
     over = [one.name for one in found.patches if one.u_w_m2k.value > most[one.name]]
     ends = [one.name for one in found.patches if one.u_w_m2k.value <= most[one.name] < one.u_w_m2k.high]
@@ -315,7 +320,13 @@ def _write(
     weather = found.conditions.weather
     more = [options.patches, None if weather is None else Path(weather.file), options.compare]
     north = options.north if options.envelope else None
-    report = identify((*inputs, *filter(None, more)), options.up, options.least_bridge_w, north)
+    report = identify(
+        (*inputs, *filter(None, more)),
+        options.up,
+        options.least_bridge_w,
+        north,
+        *filter(None, [options.compare_difference]),
+    )
     answers = answers_of(options, found, envelope, shown["compared"])
     answers |= {"report": asdict(report), "impossible": shown["impossible"]}
     summary_text(answers)  # raises if json cannot hold the answers
