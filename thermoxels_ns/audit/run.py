@@ -346,7 +346,8 @@ class _Parts:
         """Draw by how much the flow of each of the first parts, `flow_w`, (p, k), is off on its own, (p, k), [W]."""
         off, area_m2 = self.conditions.camera.repeatability.off_by, self.totals.area_m2[: len(flow_w), None]
         read = np.stack([self.slope_w_k[n] * draws.local(off, n) for n in range(len(flow_w))])
-        return read + flow_w * self.own_m2(draws, len(flow_w)) / area_m2
+        wider = self.own_m2(draws, len(flow_w)) / area_m2
+        return read + (flow_w + read) * wider
 
     def own_m2(self, draws: Draws, patches: int) -> FloatArray:
         """Draw by how much the area of each of the first parts, `patches`, is off, (patches, k), [m2]."""
