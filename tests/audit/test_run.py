@@ -246,6 +246,7 @@ def test_geometry_widens_areas_and_watts_and_more_where_fewer_photographs_suppor
         surfaces=(Surface(Measured(0.93)),),
     )  # nothing else is uncertain
     mesh, found = photographed(walls["plain"], STATED), list[Audit]()
+    mesh = replace(mesh, temperature_c=mesh.temperature_c + 3.0)  # surely warmer than the air
     for supporting in (None, 5, 1):
         photographs = None if supporting is None else np.full((len(mesh.facets), 2), supporting)
         found.append(audit(replace(mesh, boundary=replace(mesh.boundary, photographs=photographs)), stated, UP))
