@@ -300,3 +300,22 @@ def test_a_scene_that_cannot_be_read_is_refused_before_the_audit(export, tmp_pat
     given += ["--output-dir", str(tmp_path / "out"), "--scene", str(tmp_path)]
     assert cli.main(given) == 1 and "expected transforms.json" in capsys.readouterr().err
     assert cli.main([*given, "--layout", "colmap"]) == 1
+
+
+def test_an_earlier_audit_is_compared_on_the_page_and_in_the_answers(export, done, tmp_path, capsys) -> None:
+    """The same wall, of which nothing changed: the mesh keeps its coordinates, and no change is significant."""
+    words = ("--pictures", "False", "--compare", str(done / "answers.json"), "--compare-difference", "10")
+    answers, page = audited(export / "mesh.vtu", export / "conditions.yaml", tmp_path / "out", *words)
+    compared = answers["compared"]
+    assert {one["name"] for one in compared["elements"]} == {"facade", "window"} and not compared["moved"]
+    assert [one["state"] for one in compared["bridges"]] == ["in both"] and compared["difference_k"] == 10.0
+    assert all(abs(one["change"]["value"]) < 1e-9 and not one["significant"] for one in compared["elements"])
+    assert page.index("element by element") < page.index("What changed since") < page.index("Thermal bridges and")
+    assert "same coordinates" in capsys.readouterr().out and "answers.json" in dict(answers["report"]["inputs"])
+    given = ["audit", str(export / "mesh.vtu"), "--conditions", str(export / "conditions.yaml"), "--compare"]
+    before = (done / "answers.json").read_bytes()
+    assert cli.main([*given, str(done / "answers.json"), "--output-dir", str(done)]) == 1
+    assert "output folder: expected" in capsys.readouterr().err and (done / "answers.json").read_bytes() == before
+    (tmp_path / "answers.json").write_text("{}")
+    assert cli.main([*given, str(tmp_path / "answers.json"), "--output-dir", str(tmp_path / "other")]) == 1
+    assert "without conditions and up" in capsys.readouterr().err

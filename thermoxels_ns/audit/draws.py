@@ -13,7 +13,9 @@ from thermoxels_ns.core.measured import Measured
 
 COUNT, SEED = 10_000, 20260115
 """Number of draws behind each interval (JCGM 101, 7.2), and the seed that makes them repeat for the same conditions."""
-FORMULA, REPEATABILITY = "film formula", "camera repeatability"  # Causes of uncertainty that have no `Measured`
+FORMULA, REPEATABILITY, GEOMETRY = "film formula", "camera repeatability", "geometry"
+"""Causes of uncertainty that have no `Measured`; geometry: where borders of the reconstructed surface lie."""
+_COMMON_GEOMETRY = 3 * 10**6  # Argument `number` of `Draws.local` for the part of geometry that all parts share
 
 CONFIDENCE = 0.90  # Share of the draws that lie in an interval; as many draws lie below the interval as above
 ENDS = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE)
@@ -61,6 +63,7 @@ class Draws:
     values: Mapping[str, FloatArray]
     seed: int = SEED
     errors_of_parts: bool = True  # True: `local` draws errors; False: `local` returns zeros
+    errors_of_geometry: bool = True  # The same for `geometry`
 
     @property
     def count(self) -> int:
@@ -85,7 +88,9 @@ class Draws:
         return replace(self, values={name: values[: 1 + count] for name, values in self.values.items()})
 
     def frozen(self, cause: str) -> Draws:
-        """Return draws in which one cause of uncertainty has its stated value; `REPEATABILITY`: no errors of parts."""
+        """Return draws in which one cause has its stated value; `REPEATABILITY`, `GEOMETRY`: no such errors."""
+        if cause == GEOMETRY:
+            return replace(self, errors_of_geometry=False)
         if cause == REPEATABILITY:
             return replace(self, errors_of_parts=False)
         return replace(self, values={**self.values, cause: np.full(self.count, self[cause][0])})
@@ -97,6 +102,16 @@ class Draws:
         drawn = np.random.default_rng((self.seed, number)).uniform(-off_by, off_by, self.count)
         drawn[0] = 0.0
         return drawn
+
+    def geometry(self, number: int) -> FloatArray:
+        """Return errors of where the borders of part `number` lie, in -1 to 1, shape (1 + k,), the first 0.
+
+        Half is common to all parts, as reconstructions round all edges alike; half is the part's own.
+        """
+        if not self.errors_of_geometry:
+            return np.zeros(self.count)
+        whole = replace(self, errors_of_parts=True)
+        return 0.5 * (whole.local(1.0, _COMMON_GEOMETRY) + whole.local(1.0, _COMMON_GEOMETRY + 1 + number))
 
 
 def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:

@@ -15,6 +15,7 @@ from thermoxels_ns.audit.conditions import BALANCE, SIMPLE, Conditions, Survey, 
 from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
 from thermoxels_ns.audit.draws import (
     ENDS,
+    GEOMETRY,
     Draws,
     Interval,
     causes,
@@ -92,6 +93,7 @@ class Element:
 
     name: str
     area_m2: float  # Area of the triangles that count
+    area_range_m2: Interval  # The same with what geometry may be off by
     unobserved_m2: float  # Area of the part's other triangles, without those that the scene box or the region cuts
     surface_c: Interval  # Mean surface temperature, [degrees Celsius]
     loss_w: Interval  # Heat flow from inside to outside, [W]
@@ -257,12 +259,13 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     # Each patch has a reading error of its own; a storey has the errors of its patches, by the shares that lie in it.
     rows = [*range(len(patches) + len(storeys)), len(parts) - 1]
     of_patches = np.stack([_shares(surface, parts[row], parts[: len(patches)]) for row in rows])
-    own = of_patches @ work.own_w(draws, len(patches))
+    own = of_patches @ work.own_w(draws, work.totals.flow_w[: len(patches)])
+    own_m2 = of_patches @ work.own_m2(draws, len(patches))
     budget, shares = work.narrower(rows, of_patches)
     observed = np.isin(patch, patches)
     chosen = [(names[n], patch == n) for n in patches] + [(storey_names[n], (storey == n) & observed) for n in storeys]
     elements = [
-        work.element(name, row, np.flatnonzero(every), own[n], shares[n])
+        work.element(name, row, np.flatnonzero(every), own[n], own_m2[n], shares[n])
         for n, (row, (name, every)) in enumerate(zip(rows, [*chosen, ("all that was observed", observed)]))
     ]
     whole, failing = elements[-1], _failing_models(conditions, elements)
@@ -279,7 +282,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     last, check, (remembered, told) = len(parts) - 2, check_survey(conditions), _remembered(conditions)
     factors = work.temperature_factors(last, work.own_error_k(last))
     loss = work.totals.flow_w[-1] + own[-1]
-    drawn = [(one.name, work.u(row, own[row])) for row, one in enumerate(elements[: len(patches)])]
+    drawn = [(one.name, work.u(row, own[row], own_m2[row])) for row, one in enumerate(elements[: len(patches)])]
     energy = year_of(conditions, draws, [(name, elements[n].area_m2, u) for n, (name, u) in enumerate(drawn)])
     psi = [(one, work.coefficients[first + 3 * n]) for n, one in zip(order, defects)]
     left = {why: float(surface.area_m2[surface.why_not == n].sum()) for n, why in enumerate(WHY_NOT.values())}
@@ -351,33 +354,52 @@ class _Parts:
             flow_w = part_totals(chosen, groups, draws.stated, self.rows).flow_w[:, 0]
             self.u_by_model[model] = flow_w / draws.difference_k[0] / np.maximum(self.totals.area_m2, 1e-12)
 
-    def own_w(self, draws: Draws, patches: int) -> FloatArray:
-        """Draw by how much the flow of each of the first parts, `patches`, is off on its own, (patches, k), [W]."""
-        off = self.conditions.camera.repeatability.off_by
-        return np.stack([self.slope_w_k[n] * draws.local(off, n) for n in range(patches)])
+    def own_w(self, draws: Draws, flow_w: FloatArray) -> FloatArray:
+        """Draw by how much the flow of each of the first parts, `flow_w`, (p, k), is off on its own, (p, k), [W]."""
+        off, area_m2 = self.conditions.camera.repeatability.off_by, self.totals.area_m2[: len(flow_w), None]
+        read = np.stack([self.slope_w_k[n] * draws.local(off, n) for n in range(len(flow_w))])
+        wider = self.own_m2(draws, len(flow_w)) / area_m2
+        return read + (flow_w + read) * wider
 
-    def u(self, row: int, error_w: FloatArray) -> FloatArray:
-        """Return draws of the U-value of part `row`, (k,), [W/(m2 K)]; `error_w`: see `element`."""
-        return (self.totals.flow_w[row] + error_w) / self.totals.area_m2[row] / self.draws.difference_k
+    def own_m2(self, draws: Draws, patches: int) -> FloatArray:
+        """Draw by how much the area of each of the first parts, `patches`, is off, (patches, k), [m2]."""
+        most = [float(self.surface.border_m2[part].sum()) for part in self.parts[:patches]]
+        most = np.minimum(most, 0.9 * self.totals.area_m2[:patches])
+        return np.stack([one * draws.geometry(n) for n, one in enumerate(most.tolist())])
+
+    def u(self, row: int, error_w: FloatArray, error_m2: FloatArray) -> FloatArray:
+        """Return draws of the U-value of part `row`, (k,), [W/(m2 K)]; see `element` for its errors."""
+        area_m2 = self.totals.area_m2[row] + error_m2
+        return (self.totals.flow_w[row] + error_w) / area_m2 / self.draws.difference_k
 
     def own_error_k(self, number: int) -> FloatArray:
         """Draw the reading error that part `number` does not share with other parts, shape (k,), [K]."""
         return self.draws.local(self.conditions.camera.repeatability.off_by, number)
 
     def element(
-        self, name: str, row: int, every: IntArray, error_w: FloatArray, width_shares: Mapping[str, float]
+        self,
+        name: str,
+        row: int,
+        every: IntArray,
+        error_w: FloatArray,
+        error_m2: FloatArray,
+        width_shares: Mapping[str, float],
     ) -> Element:
-        """Return the results of part `row`; `every` are its triangles, `error_w` draws of its own error, (k,), [W]."""
+        """Return the results of part `row`; `every` are its triangles.
+
+        `error_w`, [W], and `error_m2`, [m2], are draws of what its flow and its area are off by on their own, (k,).
+        """
         surface, counted, area = self.surface, self.parts[row], float(self.totals.area_m2[row])
         uncut = every[surface.why_not[every] != list(WHY_NOT).index("cut")]
         flow_w = self.totals.flow_w[row] + error_w
         return Element(
             name=name,
             area_m2=area,
+            area_range_m2=interval_of(area + error_m2),
             unobserved_m2=max(float(surface.area_m2[uncut].sum()) - area, 0.0),
             surface_c=interval_of(self.totals.surface_c[row]),
             loss_w=interval_of(flow_w),
-            u_w_m2k=interval_of(self.u(row, error_w)),
+            u_w_m2k=interval_of(self.u(row, error_w, error_m2)),
             u_by_model={model: float(u[row]) for model, u in self.u_by_model.items()},
             width_shares=width_shares,
             unsupported_share=float(surface.area_m2[counted] @ surface.unsupported[counted]) / area,
@@ -407,14 +429,16 @@ class _Parts:
         def widths(draws: Draws) -> tuple[FloatArray, FloatArray]:
             draws = with_references(self.surface, self.conditions, draws)
             flow_w = part_totals(self.conditions, self.groups, draws, few_rows).flow_w
-            flow_w = flow_w + of_patches @ self.own_w(draws, of_patches.shape[1])
-            u = flow_w / draws.difference_k if self.conditions.outside_known else flow_w
+            patches = of_patches.shape[1]
+            flow_w = flow_w + of_patches @ self.own_w(draws, flow_w[:patches])
+            off = of_patches @ self.own_m2(draws, patches) / self.totals.area_m2[rows, None]
+            u = flow_w / draws.difference_k / (1.0 + off) if self.conditions.outside_known else flow_w
             return width_of(flow_w), width_of(u)
 
         few_rows = self.rows[[*rows, *[len(self.parts) + row for row in rows]]]
         few, budget, found = self.draws.first(_FEW), dict[str, float](), [dict[str, float]() for _ in rows]
         every_w, every_u = widths(few)
-        for cause in causes(self.conditions):
+        for cause in causes(self.conditions) + [GEOMETRY] * bool(self.surface.border_m2.any()):
             flow_w, u = widths(few.frozen(cause))
             budget[cause] = max(float(every_w[-1] - flow_w[-1]), 0.0)
             for one, share in zip(found, np.maximum(1.0 - u / np.maximum(every_u, 1e-300), 0.0).tolist()):
@@ -444,6 +468,9 @@ class _Parts:
         calm, spot = zone + 1, zone + 2
         flow_w = totals.flow_w[zone] + self.slope_w_k[zone] * off_k
         extra = flow_w - totals.flow_w[calm] / max(totals.area_m2[calm], 1e-12) * one.base_area_m2
+        if surface.border_m2.any():  # both ends of its length lie within half a triangle's edge
+            edge = float(np.sqrt(2.0 * surface.area_m2[one.core].mean()))
+            extra = extra * (1.0 + self.draws.geometry(zone) * min(edge / one.length_m, 0.9))
         per_kelvin = extra / self.draws.difference_k / (one.length_m if one.kind == "line" else 1.0)
         self.coefficients[zone] = per_kelvin
         extra_w, f_rsi = interval_of(extra), tuple(map(interval_of, self.temperature_factors(spot, off_k)))

@@ -15,11 +15,19 @@ import tyro
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.commands.installed_commands import command_of
-from thermoxels_ns.core.checks import check_direction, check_positive, remove_file, result_folder, writable_folder
+from thermoxels_ns.core.checks import (
+    check_direction,
+    check_positive,
+    is_number,
+    remove_file,
+    result_folder,
+    writable_folder,
+)
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.data.layouts import LayoutName
 
 if TYPE_CHECKING:
+    from thermoxels_ns.audit.compare import Comparison
     from thermoxels_ns.audit.envelope import Envelope
     from thermoxels_ns.audit.run import Audit as Found
     from thermoxels_ns.mesh.boundary.patches import Vector
@@ -70,6 +78,11 @@ class Audit:
     write_agreement: Path | None = None
     """Write what a client signs before the survey (purpose, conditions, limits) to this .pdf or .html file, and do
     nothing else. What the section survey of --conditions says is filled in; the rest are lines to fill in by hand."""
+    compare: Path | None = None
+    """The answers.json of an earlier audit of the same building, with its surface.vtp beside it: what changed since,
+    with intervals. The two meshes may have different coordinates, both in metres."""
+    compare_difference: float | None = None
+    """Inside minus outside air at which --compare compares heat losses, [K]. Default: that of the later survey."""
     write_patches: Path | None = None
     """Propose patches: find walls, roofs, windows, doors and the ground on the mesh, write them to this yaml file with
     a picture of their names beside it, and do nothing else. Needs no conditions."""
@@ -93,6 +106,7 @@ class Audit:
 
 def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     """Audit a mesh, write all files, return the result; None if conditions or patches were written instead."""
+    from thermoxels_ns.audit.compare import compare
     from thermoxels_ns.audit.conditions import EXAMPLE, load_conditions
     from thermoxels_ns.audit.envelope import envelope_of
     from thermoxels_ns.audit.run import audit
@@ -120,6 +134,9 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         missing = "mesh" if options.mesh is None else "conditions"
         remedy = "Pass the mesh.vtu of an export, and --conditions; --write-conditions writes an example of these."
         raise AuditError(missing, expected="a file", got="none", remedy=remedy)
+    if options.compare is not None and options.compare.resolve().parent == options.output_dir.resolve():
+        remedy = "Pass another --output-dir."
+        raise AuditError("output folder", expected="another one than that of --compare", got="the same", remedy=remedy)
     begin, least_w = clock.perf_counter(), options.least_bridge_w
     if not 0.0 <= least_w < math.inf:
         remedy = "Pass --least-bridge-w 0 to count all."
@@ -134,6 +151,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     if options.envelope and conditions.side != "outside":
         remedy = "Leave --envelope out; rooms are not written."
         raise AuditError("envelope", expected="a survey from outside", got="one from inside", remedy=remedy)
+    earlier = None if options.compare is None else read_earlier(options.compare, options.compare_difference)
     scene = None  # is read before anything slow
     if options.scene is not None:
         scene = read_scene_file(options.scene, "skip", options.layout, options.thermal_bounds)
@@ -141,6 +159,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     building = find_building(mesh, up, options.north) if options.envelope else None  # raises before anything slow
     found = without_slight(audit(mesh, conditions, up), least_w)
     envelope = None if building is None else envelope_of(found, building)
+    compared = None if earlier is None else compare(earlier(), found, options.compare_difference)
     most_u, impossible = impossible_u(found)
     for words in (*found.check.forbidden, *found.check.doubts, *impossible):
         say(f"Warning: {plain_names(words)}")
@@ -162,9 +181,11 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         range_c = shown_range_c(found)
         photographs = photographs_of_defects(scene, scale, found, range_c)
         say(f"Photographs show {sum(not found.defects[number].not_counted for number in photographs)} of them.")
-    names = _write(
-        folder, options, found, photographs, {"range_c": range_c, "most_u": most_u, "impossible": impossible}, envelope
-    )
+    if compared is not None:
+        for line in compared.lines():
+            say(line)
+    shown = {"range_c": range_c, "most_u": most_u, "impossible": impossible, "compared": compared}
+    names = _write(folder, options, found, photographs, shown, envelope)
     say(f"Written to {folder}: {', '.join(names)} ({clock.perf_counter() - begin:.1f} s)")
     return found
 
@@ -211,6 +232,33 @@ def _read(path: Path, options: Audit, say: Say) -> tuple[TetMesh, Vector, dict[s
     return mesh, (x, y, z), export
 
 
+def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
+    """Read an earlier audit from its answers.json and the surface.vtp beside it; return a function that repeats it.
+
+    Raises `AuditError` or `MeshError` if a file is missing or damaged, or `difference_k` is not above 0.
+    """
+    from thermoxels_ns.audit.compare import earlier_conditions
+    from thermoxels_ns.audit.run import audit
+    from thermoxels_ns.core.json_values import read_json_object
+    from thermoxels_ns.mesh.files.vtu import read_surface
+
+    if difference_k is not None:
+        check_positive("--compare-difference", difference_k, "Pass --compare-difference 20.", AuditError)
+    again = "Pass the answers.json that thermoxels audit wrote, with its surface.vtp beside it."
+    content = read_json_object(path, again, AuditError)
+    kinds = {"conditions": dict, "up": list}
+    missing = [key for key, kind in kinds.items() if not isinstance(content.get(key), kind)]
+    if missing:
+        got = f"one without {' and '.join(missing)}"
+        raise AuditError(
+            str(path), expected="the answers.json of an audit", got=got, remedy=f"{again} Audit again first."
+        )
+    conditions, mesh = earlier_conditions(path.name, content["conditions"]), read_surface(path.with_name(SURFACE))
+    x, y, z = check_direction(f"{path}: up", content["up"], again, AuditError).tolist()
+    least_w = content.get("least_bridge_w")
+    return lambda: without_slight(audit(mesh, conditions, (x, y, z)), least_w if is_number(least_w) else 0.0)
+
+
 def without_slight(found: Found, least_w: float) -> Found:
     """Return an audit in which bridges that lose less than `least_w` extra, [W], are not counted and not judged."""
     from thermoxels_ns.audit.run import verdict
@@ -240,7 +288,7 @@ def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
 
     A sentence names the two inputs that widen the U-value's interval most: one of these clashes with the readings.
     """
-    from thermoxels_ns.audit.draws import REPEATABILITY
+    from thermoxels_ns.audit.draws import GEOMETRY, REPEATABILITY
     from thermoxels_ns.audit.exchange import most_u_w_m2k
 
     surface, every, most = found.surface, np.flatnonzero(found.surface.counted), dict[str, float]()
@@ -249,7 +297,11 @@ def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
         on = every[surface.selection.facet_patch[every] == number]
         most[one.name] = most_u_w_m2k(surface, found.conditions, on)
     most |= {one.name: max(most.values()) for one in (*found.storeys, found.whole)}
-    widest = [name for name, share in found.whole.width_shares.items() if share > 0.0 and name != REPEATABILITY]
+    widest = [
+        name
+        for name, share in found.whole.width_shares.items()
+        if share > 0.0 and name not in (GEOMETRY, REPEATABILITY)
+    ]
     inputs = " and ".join(widest[:2]) or "the airs and the camera"
     over = [one.name for one in found.patches if one.u_w_m2k.value > most[one.name]]
     ends = [one.name for one in found.patches if one.u_w_m2k.value <= most[one.name] < one.u_w_m2k.high]
@@ -268,7 +320,9 @@ def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
     return most, tuple(said)
 
 
-def answers_of(options: Audit, found: Found, envelope: Envelope | None = None) -> dict[str, Any]:
+def answers_of(
+    options: Audit, found: Found, envelope: Envelope | None = None, compared: Comparison | None = None
+) -> dict[str, Any]:
     """Return the content of answers.json; numbers and ends of intervals that are NaN or infinite become null."""
     from pydantic_core import to_jsonable_python
 
@@ -277,6 +331,8 @@ def answers_of(options: Audit, found: Found, envelope: Envelope | None = None) -
     named = ("found", "units", "refused", "moved_most_by", "misfit_k", "history_h", "doubt")
     told = {
         "mesh": options.mesh,
+        "up": found.surface.selection.up,
+        "least_bridge_w": options.least_bridge_w,
         **{name: getattr(found, name) for name in same},
         "calibration": None if calibration is None else {name: getattr(calibration, name) for name in named},
         "forbidden": found.check.forbidden,
@@ -286,6 +342,7 @@ def answers_of(options: Audit, found: Found, envelope: Envelope | None = None) -
         "loss_narrower_by_w": found.budget,
         **{name: getattr(found, name) for name in ("draws", "failing_models", "remembered")},
         **({} if envelope is None else {"envelope": envelope.figures()}),
+        **({} if compared is None else {"compared": compared}),
     }
     return to_jsonable_python(told, inf_nan_mode="null")
 
@@ -312,10 +369,17 @@ def _write(
     inputs = (options.mesh, options.mesh.with_name(f"{options.mesh.stem}-boundary.vtp"), options.conditions)
     weather, energy = found.conditions.weather, found.conditions.energy
     series = weather and weather.file, energy and energy.climate
-    more = [options.patches, *(Path(one) for one in series if one)]
+    more = [options.patches, options.compare, *(Path(one) for one in series if one)]
     north = options.north if options.envelope else None
-    report = identify((*inputs, *filter(None, more)), options.up, options.least_bridge_w, north)
-    answers = answers_of(options, found, envelope) | {"report": asdict(report), "impossible": shown["impossible"]}
+    report = identify(
+        (*inputs, *filter(None, more)),
+        options.up,
+        options.least_bridge_w,
+        north,
+        *filter(None, [options.compare_difference]),
+    )
+    answers = answers_of(options, found, envelope, shown["compared"])
+    answers |= {"report": asdict(report), "impossible": shown["impossible"]}
     summary_text(answers)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
     write_vtk(vtkXMLPolyDataWriter(), folder / SURFACE, found.to_pyvista())

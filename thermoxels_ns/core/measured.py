@@ -72,9 +72,11 @@ class Unit:
     above: bool = False  # True: the value must be above `low`, not equal to it
 
     def read(self, content: object) -> Measured:
-        """Return `content`, a `Measured` or what `read_measured` can read, as a value in this unit. Raises ValueError,
-        made from a `ThermoxelsError` without a name, if it cannot be read or is not within the limits."""
+        """Return `content`, a `Measured`, its fields, or what `read_measured` can read, in this unit. Raises
+        ValueError, made from a `ThermoxelsError` without a name, if it cannot be read or is not within the limits."""
         try:
+            if isinstance(content, dict) and content.keys() == {"value", "off_by"}:  # as answers.json has it
+                content = Measured(**content)
             found = content if isinstance(content, Measured) else read_measured("", content, self.name)
             low, high = (found.low, found.high) if self.surely else (found.value, found.value)
             if low < self.low or high > self.high + 1e-12 or (self.above and low <= self.low):

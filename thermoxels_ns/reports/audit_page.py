@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from thermoxels_ns.audit.compare import Comparison
 from thermoxels_ns.audit.conditions import Survey
 from thermoxels_ns.audit.draws import CONFIDENCE
 from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit, asked_of_survey
@@ -42,6 +43,7 @@ def audit_page(
     most_u: Mapping[str, float],
     impossible: Sequence[str],
     paper: bool = False,
+    compared: Comparison | None = None,
 ) -> str:
     """Return the html text of an audit's page; `command` made the audit, `files` lie beside the page.
 
@@ -49,7 +51,7 @@ def audit_page(
 
     `photographs` are pictures of defects by place in `audit.defects`, whose colours span `range_c`; without `pictures`
     the page has no drawings. `most_u` is the U-value by name of an element from which on a value is marked impossible,
-    `impossible` are sentences on such values.
+    `impossible` are sentences on such values; `compared` is what changed since an earlier survey.
     """
     numbered, asked = list(enumerate(audit.defects, start=1)), audit.conditions.calibrate
     counted = [(number, one) for number, one in numbered if not one.not_counted]
@@ -76,6 +78,7 @@ def audit_page(
         range_c=range_c,
         most_u=most_u,
         impossible=impossible,
+        compared=compared,
         photographs=defaultdict(tuple, photographs),
         confidence=100.0 * CONFIDENCE,
         severe_share=SEVERE_SHARE,

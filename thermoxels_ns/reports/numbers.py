@@ -58,6 +58,7 @@ _PLAIN = {
     r"emissivity of \*, entry \d+": "emissivity of the surfaces",
     r"(emissivity of .+?), entry \d+": r"\1",
     r"\bfilm (factor|coefficient)\b": r"heat transfer between surface and air (film: \1)",
+    r"\bgeometry\b": "where borders of the model's surfaces lie",
     r"\bfilm formula\b": "formula of the heat transfer between surface and air",
     r"\bcamera repeatability\b": "difference of the camera's readings between places (repeatability)",
     r"\bcamera offset\b": "common error of the camera's readings (offset)",

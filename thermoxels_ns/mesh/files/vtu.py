@@ -149,6 +149,25 @@ def read_mesh(path: Path | str) -> TetMesh:
     return mesh_of(_read(path), _read(beside), path.name, beside.name)
 
 
+def read_surface(path: Path) -> TetMesh:
+    """Return a file that has the arrays of `boundary_surface` as a mesh without tetrahedra; raises `MeshError`."""
+    data = _read(path)
+    points = np.array(data.points, dtype=np.float64)
+    data.point_data["node"] = np.arange(len(points))  # not those of the mesh, which is not there
+    facets, tags = _boundary(data, points, path.name)
+    on_box = _array(data.cell_data, "on_box", path.name) != 0
+    return TetMesh(
+        points_m=points,
+        tets=np.zeros((0, 4), dtype=np.int64),
+        temperature_c=_array(data.point_data, "temperature_c", path.name).astype(np.float64),
+        observed=_array(data.point_data, "observed", path.name) != 0,
+        facets=facets,
+        facet_tags=np.where(on_box, FACET_BOX, FACET_SURFACE).astype(np.int64),
+        region=np.zeros(0, dtype=np.int64),
+        boundary=tags,
+    )
+
+
 AnyMesh: TypeAlias = "pv.MultiBlock | pv.UnstructuredGrid | TetMesh | Path | str"
 """What `any_mesh` takes."""
 

@@ -1,0 +1,436 @@
+"""Two surveys of one building: bring them into one system of coordinates, and say what changed, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from thermoxels_ns.audit.conditions import Conditions
+from thermoxels_ns.audit.defects import FoundDefect
+from thermoxels_ns.audit.draws import FORMULA, SEED, Draws, Interval, draw, interval_of, uncertain
+from thermoxels_ns.audit.exchange import HALF_STEP_K, part_totals, with_references
+from thermoxels_ns.audit.run import Audit
+from thermoxels_ns.audit.surface import AuditedSurface, alike_triangles
+from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.core.yaml_records import as_record, raising
+
+_DRAWS = 4000  # Ends of intervals scatter by about 1 % of the width
+_NEAR_M = 0.3  # Surface moves by less: insulation is thinner, and reconstructions err by less, [m]
+_FACES = 0.7  # Least cosine between normals of the same surface
+_FITS_M, _UNMATCHED_M = 0.2, 1.0  # Largest median distance of meshes that fit; distance of points without a partner
+_TURN_DEG = 15.0  # Step between the directions in which an alignment starts
+_LIKE_BEST = 1.3  # A quite different position that fits as well, but for this factor, makes the alignment ambiguous
+_SEEN_SHARE = 0.2  # Least share of an element that the other survey has seen, too
+_OVERLAP = 0.3  # Least area that two findings of one bridge share, over the geometric mean of their areas
+_COMMON = ("film factor", FORMULA)
+"""Causes that err alike in both surveys, besides emissivities: whoever surveys twice uses the same formula."""
+
+State = Literal["in both", "appeared", "went"]
+
+
+@dataclass(frozen=True)
+class Change:
+    """How an element or a thermal bridge changed; numbers are those of the surface that both surveys saw."""
+
+    name: str  # Of the element; of a bridge its kind and element
+    state: State  # "appeared" or "went": a bridge that only the later or only the earlier survey found
+    at_m: tuple[float, float, float]  # Centroid in the coordinates of the later mesh
+    unit: str
+    before: Interval  # U-value; of a line psi, [W/(m K)], of a point or an area extra loss per kelvin, [W/K]
+    after: Interval
+    change: Interval  # After minus before
+    loss_change_w: Interval  # At `Comparison.difference_k`
+    significant: bool  # True if the interval of `change` does not hold 0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What changed between two surveys of one building."""
+
+    whole: Change  # All that both surveys saw
+    elements: tuple[Change, ...]  # Significant ones first, then by falling change of the loss
+    bridges: tuple[Change, ...]
+    only_before: tuple[str, ...]  # Names, in the earlier survey, of elements that only the earlier survey saw
+    only_after: tuple[str, ...]
+    difference_k: float  # Inside minus outside air at which losses are compared, [K]
+    common: tuple[str, ...]  # Causes of uncertainty that are drawn the same in both surveys
+    moved: bool  # True if the earlier mesh was turned and shifted onto the later one
+    residual_m: float  # Median distance between the two surfaces, [m]
+
+    def lines(self) -> list[str]:
+        """Return sentences for a log: how the meshes were aligned, and how many changes are significant."""
+        how = "turned and shifted onto the later one" if self.moved else "taken as it is: same coordinates"
+        sure = [one for one in (*self.elements, *self.bridges) if one.significant]
+        return [
+            f"Compared: the earlier mesh was {how}; median distance {1e3 * self.residual_m:.0f} mm.",
+            f"Significant changes: {', '.join(one.name for one in sure) or 'none'}.",
+            *(
+                f"Only {when}: {', '.join(n)}."
+                for when, n in (("before", self.only_before), ("after", self.only_after))
+                if n
+            ),
+        ]
+
+
+class Pose(NamedTuple):
+    """A rotation and a shift that take the earlier mesh's coordinates into those of the later one."""
+
+    turn: FloatArray  # Shape (3, 3)
+    shift_m: FloatArray  # Shape (3,)
+
+    def __call__(self, points_m: FloatArray) -> FloatArray:
+        """Return points, shape (n, 3), in the coordinates of the later mesh."""
+        return points_m @ self.turn.T + self.shift_m
+
+
+@raising(AuditError)
+def earlier_conditions(name: str, content: Mapping[str, Any]) -> Conditions:
+    """Return the `conditions` of an answers.json, without what a comparison does not need (limits, calibration)."""
+
+    def known(value: Any) -> Any:
+        if isinstance(value, Mapping):  # an air that was not known has the value null
+            return {
+                key: known(one)
+                for key, one in value.items()
+                if not (isinstance(one, dict) and one.get("value", 0) is None)
+            }
+        return value
+
+    unused = {"limits", "year", "calibrate", "weather"}
+    return as_record(name, {key: known(one) for key, one in content.items() if key not in unused}, Conditions)
+
+
+def compare(before: Audit, after: Audit, difference_k: float | None = None) -> Comparison:
+    """Return what changed between two audits of one building.
+
+    Elements are the patches of the later survey, on the surface that both saw. Losses are compared on the areas of the
+    later mesh and at `difference_k` between the airs, by default that of the later survey, [K]. Emissivities, the
+    film's factor and formula err alike in both, all else apart.
+
+    Raises:
+        AuditError: One survey is from inside and one from outside, a temperature outside is not known, or no position
+            of the earlier mesh fits the later one.
+    """
+    sides = (before.conditions.side, after.conditions.side)
+    for one in (before.conditions, after.conditions):
+        if sides[0] != sides[1] or not one.outside_known:
+            got = f"{sides[0]} before, {sides[1]} after" if sides[0] != sides[1] else "an air outside that is not known"
+            remedy = "Compare surveys from the same side, both with the air outside."
+            raise AuditError("compare", expected="two surveys whose U-values can be compared", got=got, remedy=remedy)
+    pose, residual_m, moved = aligned(before.surface, after.surface)
+    return _Compared(before, after, pose).result(difference_k or after.conditions.difference_k, residual_m, moved)
+
+
+class _Survey:
+    """Couplings of parts of one survey's surface in every draw."""
+
+    def __init__(self, audit: Audit, draws: Draws, partner: IntArray) -> None:
+        self.audit, self.surface, self.partner = audit, audit.surface, partner
+        self.draws = with_references(self.surface, audit.conditions, draws)
+        self.groups, self.area_m2 = alike_triangles(self.surface), audit.surface.area_m2
+        self.parts = list[IntArray]()
+
+    def add(self, which: IntArray) -> int:
+        """Add a part, indices of triangles that count; return its number."""
+        self.parts.append(which)
+        return len(self.parts) - 1
+
+    def from_other(self, which: IntArray) -> IntArray:
+        """Return the triangles whose partners in the other survey are among `which`."""
+        return np.flatnonzero(np.isin(self.partner, which))
+
+    def finish(self) -> None:
+        """Compute flow per kelvin, (parts, k), [W/K], and how readings change it, (parts,)."""
+        conditions, rows = self.audit.conditions, self.groups.rows(self.parts, self.area_m2)
+        totals = part_totals(conditions, self.groups, self.draws, rows)
+        low, high = (
+            part_totals(conditions, self.groups, self.draws.stated, rows, step).flow_w[:, 0]
+            for step in (-HALF_STEP_K, HALF_STEP_K)
+        )
+        self.total_m2, slope = totals.area_m2, (high - low) / (2.0 * HALF_STEP_K)
+        off = conditions.camera.repeatability.off_by
+        own = np.stack([slope[n] * self.draws.local(off, n) for n in range(len(self.parts))])
+        self.coupling_w_k, self.own_w_k = totals.flow_w / self.draws.difference_k, own / self.draws.difference_k
+
+    def u(self, part: int) -> FloatArray:
+        """Return draws of the U-value of a part, shape (k,)."""
+        return (self.coupling_w_k[part] + self.own_w_k[part]) / self.total_m2[part]
+
+    def extra_w_k(self, zone: int, base_m2: float) -> FloatArray:
+        """Return draws of what part `zone` loses beyond the undisturbed part `zone + 1`, on an area, (k,), [W/K]."""
+        calm = self.coupling_w_k[zone + 1] / max(float(self.total_m2[zone + 1]), 1e-12)
+        return self.coupling_w_k[zone] + self.own_w_k[zone] - calm * base_m2
+
+
+class _Compared:
+    """The surface that two surveys share, and draws of both, in which common causes are the same."""
+
+    def __init__(self, before: Audit, after: Audit, pose: Pose) -> None:
+        self.moved_m = pose(before.surface.centroid_m)
+        normal, there = before.surface.selection.facet_normal @ pose.turn.T, after.surface
+        old, new = (np.flatnonzero(one.counted) for one in (before.surface, there))
+        at_old = _places(self.moved_m[old], normal[old])
+        at_new = _places(there.centroid_m[new], there.selection.facet_normal[new])
+        earlier = draw(before.conditions, _DRAWS, SEED)
+        later, self.common = _with_common(before.conditions, after.conditions, earlier)
+        self.old = _Survey(before, earlier, _partners(len(normal), old, at_old, new, at_new))
+        self.new = _Survey(after, later, _partners(len(there.counted), new, at_new, old, at_old))
+
+    def result(self, difference_k: float, residual_m: float, moved: bool) -> Comparison:
+        """Return the comparison; the other arguments are fields of it."""
+        old, new = self.old, self.new
+        elements, only_after = self._elements(new, old)
+        _, only_before = self._elements(old, new)
+        if not elements:
+            expected, remedy = "surface that both surveys saw", "Compare surveys that show the same walls."
+            raise AuditError("compare", expected=expected, got="none", remedy=remedy)
+        numbers = [
+            (name, old.add(old.from_other(part)), new.add(part), self._middle(part)) for name, part in elements.items()
+        ]
+        bridges = self._bridges()
+        old.finish()
+        new.finish()
+        changes, pairs = list[Change](), list[tuple[FloatArray, FloatArray]]()
+        for name, first, second, at in numbers:
+            pairs.append((old.u(first), new.u(second)))
+            area = float(new.total_m2[second])
+            changes.append(_change(name, "in both", at, "W/(m2 K)", *pairs[-1], area * difference_k))
+        areas = np.array([new.total_m2[second] for _, _, second, _ in numbers])
+        both = [np.einsum("p,pk->k", areas, np.stack(one)) / areas.sum() for one in zip(*pairs)]
+        at = self._middle(np.concatenate([*elements.values()]))
+        whole = _change("all that both saw", "in both", at, "W/(m2 K)", *both, float(areas.sum()) * difference_k)
+        found = [self._bridge(difference_k, *one) for one in bridges]
+        return Comparison(
+            whole=whole,
+            elements=_ranked(changes),
+            bridges=_ranked(found),
+            only_before=only_before,
+            only_after=only_after,
+            difference_k=difference_k,
+            common=self.common,
+            moved=moved,
+            residual_m=residual_m,
+        )
+
+    def _elements(self, one: _Survey, other: _Survey) -> tuple[dict[str, IntArray], tuple[str, ...]]:
+        """Return the triangles of each patch of a survey that the other saw, too, and names of patches it did not."""
+        shared, alone = dict[str, IntArray](), list[str]()
+        patch, names = one.surface.selection.facet_patch, one.surface.selection.patch_names
+        for number in np.unique(patch[one.surface.counted]):
+            every = np.flatnonzero(one.surface.counted & (patch == number))
+            part = every[one.partner[every] >= 0]
+            seen = one.area_m2[part].sum() >= _SEEN_SHARE * one.area_m2[every].sum()
+            if seen and len(other.from_other(part)):
+                shared[names[number]] = part
+            else:
+                alone.append(names[number])
+        return shared, tuple(alone)
+
+    def _bridges(self) -> list[tuple[FoundDefect, State, int, float, int, float]]:
+        """Add zones and references of bridges; return the bridge, its state, and part and base area in both surveys."""
+        old, new, found = self.old, self.new, list[tuple[FoundDefect, State, int, float, int, float]]()
+        counted = [[bridge for bridge in one.audit.found if not bridge.not_counted] for one in (old, new)]
+        left = list(counted[0])
+        for bridge in counted[1]:
+            size, on = new.area_m2[bridge.core].sum(), new.partner[bridge.core]
+            share = [
+                new.area_m2[bridge.core[np.isin(on, one.core)]].sum() / np.sqrt(size * old.area_m2[one.core].sum())
+                for one in left
+            ]
+            if share and max(share) >= _OVERLAP:
+                same = left.pop(int(np.argmax(share)))
+                parts = (*_own(old, same), *_own(new, bridge))
+                found.append((bridge, "in both", *parts))
+            elif (elsewhere := _transferred(old, new, bridge)) is not None:
+                found.append((bridge, "appeared", *elsewhere, *_own(new, bridge)))
+        for bridge in left:
+            if (elsewhere := _transferred(new, old, bridge)) is not None:
+                found.append((bridge, "went", *_own(old, bridge), *elsewhere))
+        return found
+
+    def _bridge(
+        self,
+        difference_k: float,
+        bridge: FoundDefect,
+        state: State,
+        first: int,
+        base: float,
+        second: int,
+        new_base: float,
+    ) -> Change:
+        length, unit = (bridge.length_m, "W/(m K)") if bridge.kind == "line" else (1.0, "W/K")
+        draws = (self.old.extra_w_k(first, base) / length, self.new.extra_w_k(second, new_base) / length)
+        names = (self.old if state == "went" else self.new).surface.selection.patch_names
+        at = self._middle(self.new.parts[second])
+        name = f"{'thermal bridge' if bridge.kind != 'area' else 'defect'} ({bridge.kind}) in {names[bridge.patch]}"
+        return _change(name, state, at, unit, *draws, length * difference_k)
+
+    def _middle(self, part: IntArray) -> tuple[float, float, float]:
+        surface = self.new.surface
+        x, y, z = np.average(surface.centroid_m[part], axis=0, weights=surface.area_m2[part]).tolist()
+        return x, y, z
+
+
+def _own(survey: _Survey, bridge: FoundDefect) -> tuple[int, float]:
+    zone = survey.add(bridge.zone)
+    survey.add(bridge.reference)
+    return zone, bridge.base_area_m2
+
+
+def _transferred(survey: _Survey, found_by: _Survey, bridge: FoundDefect) -> tuple[int, float] | None:
+    """Add the zone and the reference of a bridge that the other survey found; None if this one did not see them."""
+    zone, calm = survey.from_other(bridge.zone), survey.from_other(bridge.reference)
+    area, wanted = survey.area_m2[zone].sum(), found_by.area_m2[bridge.zone].sum()
+    if area < 0.5 * wanted or not len(calm):
+        return None
+    number = survey.add(zone)
+    survey.add(calm)
+    return number, bridge.base_area_m2 * float(area / wanted)
+
+
+def _change(
+    name: str,
+    state: State,
+    at_m: tuple[float, float, float],
+    unit: str,
+    before: FloatArray,
+    after: FloatArray,
+    per_unit_w: float,
+) -> Change:
+    """Return a change from draws, (k,), of what it was and is; times `per_unit_w` it is a change of the loss, [W]."""
+    change = interval_of(after - before)
+    loss = Interval(*(per_unit_w * one for one in (change.value, change.low, change.high)))
+    sure = not change.low <= 0.0 <= change.high
+    return Change(name, state, at_m, unit, interval_of(before), interval_of(after), change, loss, sure)
+
+
+def _ranked(changes: Sequence[Change]) -> tuple[Change, ...]:
+    return tuple(sorted(changes, key=lambda one: (not one.significant, -abs(one.loss_change_w.value))))
+
+
+def _with_common(before: Conditions, after: Conditions, earlier: Draws) -> tuple[Draws, tuple[str, ...]]:
+    """Return draws of the later survey in which what is common errs as in `earlier`, and the names of that."""
+    later = draw(after, _DRAWS, SEED + 1)
+    values, common, stated, was = dict(later.values), list[str](), uncertain(after), uncertain(before)
+    same_film = before.film.model == after.film.model
+    for name, what in stated.items():
+        alike = name.startswith("emissivity of ") or (name in _COMMON and same_film)
+        if alike and name in was and what.off_by > 0.0 and was[name].off_by > 0.0:
+            off = (earlier[name] - was[name].value) / was[name].off_by
+            values[name] = what.value + off * what.off_by
+            common.append(name)
+    if FORMULA in values and FORMULA in earlier.values and np.array_equal(before.film_shares, after.film_shares):
+        values[FORMULA] = earlier[FORMULA]
+        common.append(FORMULA)
+    return replace(later, values=values), tuple(common)
+
+
+def _places(points_m: FloatArray, normal: FloatArray) -> FloatArray:
+    """Return points in a space, shape (n, 6), in which surfaces that face another way are far from each other."""
+    return np.concatenate([points_m, _NEAR_M * normal], axis=1)
+
+
+def _partners(count: int, which: IntArray, at: FloatArray, others: IntArray, others_at: FloatArray) -> IntArray:
+    """Return for `which` triangles of a survey the nearest of the `others` that faces the same way, or -1, (count,)."""
+    nearest = np.asarray(KDTree(others_at).query(at)[1], dtype=np.int64)
+    apart = np.linalg.norm(at[:, :3] - others_at[nearest, :3], axis=1)
+    same = (apart <= _NEAR_M) & (np.einsum("ij,ij->i", at[:, 3:], others_at[nearest, 3:]) >= _FACES * _NEAR_M**2)
+    found = np.full(count, -1)
+    found[which[same]] = others[nearest[same]]
+    return found
+
+
+def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float, bool]:
+    """Return the pose of the earlier mesh, the median distance of the surfaces, [m], and whether it had to be moved.
+
+    Only triangles that count and that photographs support take part. Where both meshes have the same coordinates, the
+    pose is the identity. Else points are moved onto planes (Chen and Medioni 1992), from `_TURN_DEG` steps around the
+    vertical, with the middles of both surfaces together; the worst third of the points is left out each time.
+    Raises `AuditError` if nothing fits, or if two positions fit as well.
+    """
+    (points, normals), (target, facing) = (_samples(one) for one in (before, after))
+    tree = KDTree(_places(target, facing))
+
+    def distances(pose: Pose, points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        moved, turned = pose(points), normals @ pose.turn.T
+        nearest = np.asarray(tree.query(_places(moved, turned))[1], dtype=np.int64)
+        along = np.einsum("ij,ij->i", target[nearest] - moved, facing[nearest])
+        lost = np.linalg.norm(target[nearest] - moved, axis=1) > _UNMATCHED_M
+        lost |= np.einsum("ij,ij->i", turned, facing[nearest]) < _FACES
+        return np.where(lost, _UNMATCHED_M, along), moved, nearest
+
+    def residual(pose: Pose) -> tuple[float, float]:  # the mean tells what a notch or a balcony shows, the median not
+        off = np.abs(distances(pose, points, normals)[0])
+        return float(np.mean(off)), float(np.median(off))
+
+    def refined(pose: Pose, steps: int, some: slice) -> Pose:
+        for _ in range(steps):
+            along, moved, nearest = distances(pose, points[some], normals[some])
+            kept = np.argsort(np.abs(along))[: (2 * len(along)) // 3]
+            towards, middle = facing[nearest[kept]], moved[kept].mean(axis=0)
+            matrix = np.concatenate([np.cross(moved[kept] - middle, towards), towards], axis=1)
+            step = np.linalg.lstsq(matrix, along[kept], rcond=1e-3)[0]
+            turn = Rotation.from_rotvec(step[:3]).as_matrix()
+            pose = Pose(turn @ pose.turn, turn @ (pose.shift_m - middle) + middle + step[3:])
+        return pose
+
+    as_given = Pose(np.eye(3), np.zeros(3))
+    edge = 2.0 * float(np.sqrt(2.0 * max(np.median(one.area_m2[one.counted]) for one in (before, after))))
+    mean, given = residual(as_given)
+    if mean <= min(edge, _FITS_M):
+        return as_given, given, False
+    up = [np.array(one.selection.up) for one in (before, after)]
+    upright = Rotation.align_vectors(up[1][None], up[0][None])[0].as_matrix()
+    tried = list[tuple[float, float, Pose]]()
+    for degrees in np.arange(0.0, 360.0, _TURN_DEG):
+        turn = Rotation.from_rotvec(np.radians(degrees) * up[1]).as_matrix() @ upright
+        start = Pose(turn, target.mean(axis=0) - turn @ points.mean(axis=0))
+        pose = refined(start, 12, slice(None, None, 4))
+        tried.append((*residual(pose), pose))
+    poses = [refined(pose, 15, slice(None)) for _, _, pose in _first(tried)]
+    tried = sorted(((*residual(one), one) for one in poses), key=_mean)
+    best, median, pose = tried[0]
+    if given <= _FITS_M and mean <= 1.5 * best:
+        return as_given, given, False
+    if median > _FITS_M:
+        got = f"meshes {median:.2f} m apart (median) where they fit best, {given:.2f} m as they are"
+        remedy = "Compare surveys of the same building in metres, or pose the photographs of both together."
+        raise AuditError("compare", expected="two meshes that fit each other", got=got, remedy=remedy)
+    other = next((one for one in tried if _turned_deg(pose, one[2]) > _TURN_DEG), None)
+    if other is not None and other[0] <= _LIKE_BEST * best + 0.1 * edge:
+        got = f"two positions {_turned_deg(pose, other[2]):.0f} degrees apart, {best:.2f} and {other[0]:.2f} m off"
+        remedy = "Pose the photographs of both surveys together, so that both meshes have the same coordinates."
+        raise AuditError("compare", expected="one position in which the meshes fit", got=got, remedy=remedy)
+    return pose, median, True
+
+
+def _mean(one: tuple[float, float, Pose]) -> float:
+    return one[0]
+
+
+def _first(tried: list[tuple[float, float, Pose]]) -> list[tuple[float, float, Pose]]:
+    """Return the best six of the poses tried, no two of them alike."""
+    chosen = list[tuple[float, float, Pose]]()
+    for one in sorted(tried, key=_mean):
+        if all(_turned_deg(one[2], other[2]) > 0.5 * _TURN_DEG for other in chosen):
+            chosen.append(one)
+    return chosen[:6]
+
+
+def _turned_deg(one: Pose, other: Pose) -> float:
+    return float(np.degrees(Rotation.from_matrix(one.turn @ other.turn.T).magnitude()))
+
+
+def _samples(surface: AuditedSurface, most: int = 3000) -> tuple[FloatArray, FloatArray]:
+    """Return centroids and normals of triangles that count and are supported, drawn by their area, (n, 3) each."""
+    which = np.flatnonzero(surface.counted & ~surface.unsupported)
+    which = which if len(which) else np.flatnonzero(surface.counted)
+    share = surface.area_m2[which] / surface.area_m2[which].sum()
+    chosen = np.random.default_rng(SEED).choice(which, most, p=share)
+    return surface.centroid_m[chosen], surface.selection.facet_normal[chosen]
