@@ -63,23 +63,23 @@ NEVER = {
 """Other packages that a room does not import, not even inside a function."""
 
 MOST_LINES = {
-    "audit": 2950,
-    "capture": 4700,
-    "commands": 2880,
-    "core": 1855,
-    "data": 2895,
-    "evaluation": 515,
-    "fem": 3575,
+    "audit": 3790,
+    "capture": 4635,
+    "commands": 3020,
+    "core": 1875,
+    "data": 2870,
+    "evaluation": 440,
+    "fem": 3485,
     "field": 890,
-    "heat": 2610,
-    "mesh": 5875,
-    "multiview": 1850,
+    "heat": 2725,
+    "mesh": 5805,
+    "multiview": 1855,
     "radiometry": 1440,
     "render": 1670,
-    "reports": 1335,
-    "synthetic": 2810,
-    "training": 2685,
-    "root": 710,
+    "reports": 1545,
+    "synthetic": 2875,
+    "training": 2805,
+    "root": 715,
 }
 """Budget of lines of each room, comments and docstrings included: what it had when that was written down and 5 % more.
 Raising one is said in the message of the commit."""

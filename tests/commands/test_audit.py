@@ -97,6 +97,7 @@ def test_the_page_is_complete_in_itself_and_escapes_what_users_write(done) -> No
     headings = re.findall(r"<h2>(.*?)</h2>", page)
     assert headings == [
         *("What was asked for", "What was seen", "Findings", "The envelope, element by element"),
+        "A year: heat, money, carbon dioxide",
         *("Thermal bridges and defects", "Conditions", "The survey", "How sure this is", "Method and its limits"),
         *("How it was made", "For the file"),
     ]

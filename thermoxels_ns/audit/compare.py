@@ -102,7 +102,7 @@ def earlier_conditions(name: str, content: Mapping[str, Any]) -> Conditions:
             }
         return value
 
-    unused = {"limits", "year", "calibrate", "weather"}
+    unused = {"limits", "energy", "calibrate", "weather"}
     return as_record(name, {key: known(one) for key, one in content.items() if key not in unused}, Conditions)
 
 
@@ -202,9 +202,9 @@ class _Compared:
             area = float(new.total_m2[second])
             changes.append(_change(name, "in both", at, "W/(m2 K)", *pairs[-1], area * difference_k))
         areas = np.array([new.total_m2[second] for _, _, second, _ in numbers])
-        both = [np.einsum("p,pk->k", areas, np.stack(one)) / areas.sum() for one in zip(*pairs)]
+        was, now = (np.einsum("p,pk->k", areas, np.stack(one)) / areas.sum() for one in zip(*pairs))
         at = self._middle(np.concatenate([*elements.values()]))
-        whole = _change("all that both saw", "in both", at, "W/(m2 K)", *both, float(areas.sum()) * difference_k)
+        whole = _change("all that both saw", "in both", at, "W/(m2 K)", was, now, float(areas.sum()) * difference_k)
         found = [self._bridge(difference_k, *one) for one in bridges]
         return Comparison(
             whole=whole,
