@@ -141,7 +141,7 @@ class _Wall:
         if self.history is not None:
             change_k, weather = self.history["outside_c"], conditions.weather
             unseen_k = _UNSEEN_DAY_K if self.history_h < 24.0 else 0.0
-            self.stated[_BEFORE] = Measured(0.0, max(0.5 * float(np.ptp(change_k)), unseen_k))
+            self.stated[_BEFORE] = Measured(0.0, max(float(np.abs(change_k - change_k[0]).max()), unseen_k))
             if self.history["sun_w_m2"].any() and weather is not None:
                 self.stated[_ABSORPTANCE] = weather.absorptance
 

@@ -94,13 +94,11 @@ def earlier_conditions(name: str, content: Mapping[str, Any]) -> Conditions:
     """Return the `conditions` of an answers.json, without what a comparison does not need (limits, calibration)."""
 
     def known(value: Any) -> Any:
-        if isinstance(value, Mapping):  # an air that was not known has the value null
-            return {
-                key: known(one)
-                for key, one in value.items()
-                if not (isinstance(one, dict) and one.get("value", 0) is None)
-            }
-        return value
+        if not isinstance(value, Mapping):
+            return value
+        # An air that was not known has the value null.
+        pairs = value.items()
+        return {key: known(one) for key, one in pairs if not (isinstance(one, dict) and one.get("value", 0) is None)}
 
     unused = {"limits", "energy", "calibrate", "weather"}
     return as_record(name, {key: known(one) for key, one in content.items() if key not in unused}, Conditions)
@@ -123,6 +121,11 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
             got = f"{sides[0]} before, {sides[1]} after" if sides[0] != sides[1] else "an air outside that is not known"
             remedy = "Compare surveys from the same side, both with the air outside."
             raise AuditError("compare", expected="two surveys whose U-values can be compared", got=got, remedy=remedy)
+    films = tuple(one.conditions.film.model for one in (before, after))
+    if films[0] != films[1]:
+        remedy = "Audit the earlier mesh again with the film of the later conditions."
+        got = " and ".join(films)
+        raise AuditError("compare", expected="one film model in both surveys", got=got, remedy=remedy)
     pose, residual_m, moved = aligned(before.surface, after.surface)
     return _Compared(before, after, pose).result(difference_k or after.conditions.difference_k, residual_m, moved)
 
@@ -235,7 +238,10 @@ class _Compared:
     def _bridges(self) -> list[tuple[FoundDefect, State, int, float, int, float]]:
         """Add zones and references of bridges; return the bridge, its state, and part and base area in both surveys."""
         old, new, found = self.old, self.new, list[tuple[FoundDefect, State, int, float, int, float]]()
-        counted = [[bridge for bridge in one.audit.found if not bridge.not_counted] for one in (old, new)]
+        counted = [
+            [bridge for defect, bridge in zip(one.audit.defects, one.audit.found) if not defect.not_counted]
+            for one in (old, new)
+        ]
         left = list(counted[0])
         for bridge in counted[1]:
             size, on = new.area_m2[bridge.core].sum(), new.partner[bridge.core]
@@ -383,8 +389,11 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
     as_given = Pose(np.eye(3), np.zeros(3))
     edge = 2.0 * float(np.sqrt(2.0 * max(np.median(one.area_m2[one.counted]) for one in (before, after))))
     mean, given = residual(as_given)
-    if mean <= min(edge, _FITS_M):
-        return as_given, given, False
+    back = KDTree(_places(points, normals)).query(_places(target, facing))[0]  # one survey may have seen less
+    given_back = np.minimum(back, _UNMATCHED_M)
+    for average, median in ((mean, given), (float(given_back.mean()), float(np.median(given_back)))):
+        if average <= min(edge, _FITS_M):
+            return as_given, median, False
     up = [np.array(one.selection.up) for one in (before, after)]
     upright = Rotation.align_vectors(up[1][None], up[0][None])[0].as_matrix()
     tried = list[tuple[float, float, Pose]]()

@@ -15,7 +15,7 @@ COUNT, SEED = 10_000, 20260115
 """Number of draws behind each interval (JCGM 101, 7.2), and the seed that makes them repeat for the same conditions."""
 FORMULA, REPEATABILITY, GEOMETRY = "film formula", "camera repeatability", "geometry"
 """Causes of uncertainty that have no `Measured`; geometry: where borders of the reconstructed surface lie."""
-_COMMON_GEOMETRY = 3 * 10**6  # Argument `number` of `Draws.local` for the part of geometry that all parts share
+_COMMON_GEOMETRY = 6 * 10**6  # Argument `number` of `Draws.local` for the part of geometry that all parts share
 
 CONFIDENCE = 0.90  # Share of the draws that lie in an interval; as many draws lie below the interval as above
 ENDS = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE)

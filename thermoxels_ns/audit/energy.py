@@ -21,7 +21,7 @@ LEAVES_OUT = (
     "efficiency of the heating, and all surface that was not observed. U-values are those of the survey, with its wind "
     "and sky. So this is heat through the observed surface, not the demand of the building."
 )
-_YEAR_H, _MOST_OFF_H = 8760.0, 48.0  # Hours of a year, and by how much the years of a climate may be off
+_YEAR_H, _MOST_OFF_H = 8766.0, 48.0  # Hours of a mean year, and by how much the years of a climate may be off
 _MOST_GAP_H = 24.0  # Longest time between two lines of a climate
 _OF_ENERGY = 10**6 + 1  # First argument `number` of `Draws.local`, larger than any part's number
 
@@ -49,9 +49,9 @@ class EnergyResult:
 
 
 def year_of(
-    conditions: Conditions, draws: Draws, elements: Sequence[tuple[str, float, FloatArray]]
+    conditions: Conditions, draws: Draws, elements: Sequence[tuple[str, FloatArray, FloatArray]]
 ) -> EnergyResult | None:
-    """Return a year's heat, None if the conditions do not ask; `elements`: name, area [m2], U-value (k,) of patches.
+    """Return a year's heat, None if the conditions do not ask. `elements`: name, area, U-value of patches, (k,) each.
 
     heat = U area degree hours. Every draw has one climate, one price and one set of U-values for all elements, before
     measures and after. Raises `AuditError` if the climate or the patches of a measure cannot be used.
@@ -100,6 +100,9 @@ def _degree_hours(asked: Energy, drawn: Callable[[Measured], FloatArray]) -> Flo
         hours, air_c = found["hours"], found.get("outside_c")
         years = (hours[-1] - hours[0] + 1.0) / _YEAR_H
         whole = max(round(years), 1)
+        if air_c is not None and not ((air_c > -90.0) & (air_c < 70.0)).all():
+            got = f"{air_c.min():g} to {air_c.max():g} C"
+            raise wrong(asked.climate, "outside_c from -90 to 70 C", got, "Leave out lines without a value.")
         if air_c is None or abs(years - whole) * _YEAR_H > _MOST_OFF_H or np.diff(hours).max() > _MOST_GAP_H:
             got = f"{', '.join(found)}, {hours[-1] - hours[0]:g} hours with gaps of up to {np.diff(hours).max():g}"
             expected = f"outside_c of one or more whole years, without gaps above {_MOST_GAP_H:g} hours"
@@ -107,4 +110,4 @@ def _degree_hours(asked: Energy, drawn: Callable[[Measured], FloatArray]) -> Flo
     every_c = np.sort(np.interp(np.arange(hours[0], hours[-1] + 1e-6), hours, air_c))
     total = np.concatenate([[0.0], np.cumsum(every_c)])
     heated = np.searchsorted(every_c, drawn(asked.heating_limit))
-    return (drawn(asked.inside) * heated - total[heated]) / years
+    return (drawn(asked.inside) * heated - total[heated]) / whole

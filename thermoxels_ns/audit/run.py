@@ -283,7 +283,9 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     factors = work.temperature_factors(last, work.own_error_k(last))
     loss = work.totals.flow_w[-1] + own[-1]
     drawn = [(one.name, work.u(row, own[row], own_m2[row])) for row, one in enumerate(elements[: len(patches)])]
-    energy = year_of(conditions, draws, [(name, elements[n].area_m2, u) for n, (name, u) in enumerate(drawn)])
+    energy = year_of(
+        conditions, draws, [(name, elements[n].area_m2 + own_m2[n], u) for n, (name, u) in enumerate(drawn)]
+    )
     psi = [(one, work.coefficients[first + 3 * n]) for n, one in zip(order, defects)]
     left = {why: float(surface.area_m2[surface.why_not == n].sum()) for n, why in enumerate(WHY_NOT.values())}
     return Audit(

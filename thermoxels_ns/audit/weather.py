@@ -38,9 +38,13 @@ def survey_weather(
     with raising(AuditError, "weather: file: "):
         if date is None and file.lower().endswith(".epw"):
             remedy = "Add survey: {date: 2026-01-15T06:30:00+01:00}."
-            raise wrong(file, "the date of the survey beside an .epw file", "none", remedy)
+            raise wrong(file, "date and time of the survey beside an .epw file", "none", remedy)
         found = read_weather(file, date, facing_deg=facing_deg)
         hours = found["hours"]
+        for name, values in found.items():
+            if name.endswith("_c") and not ((values > -90.0) & (values < 70.0)).all():
+                got = f"{values.min():g} to {values.max():g} C"
+                raise wrong(file, f"{name} from -90 to 70 C", got, "Leave out lines without a value.")
         if not hours[0] < 0.0 <= hours[-1]:
             expected, got = "hours that grow from below 0, the survey, to 0", f"{hours[0]:g} to {hours[-1]:g}"
             raise wrong(file, expected, got, "Count hours from the survey.")

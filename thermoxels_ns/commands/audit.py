@@ -369,7 +369,8 @@ def _write(
     inputs = (options.mesh, options.mesh.with_name(f"{options.mesh.stem}-boundary.vtp"), options.conditions)
     weather, energy = found.conditions.weather, found.conditions.energy
     series = weather and weather.file, energy and energy.climate
-    more = [options.patches, options.compare, *(Path(one) for one in series if one)]
+    earlier = options.compare and options.compare.with_name(SURFACE)
+    more = [options.patches, options.compare, earlier, *(Path(one) for one in series if one)]
     north = options.north if options.envelope else None
     report = identify(
         (*inputs, *filter(None, more)),

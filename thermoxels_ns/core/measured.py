@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+from thermoxels_ns.core.checks import is_number
 from thermoxels_ns.core.errors import ThermoxelsError
 
 _NUMBER = r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?"
@@ -76,7 +77,11 @@ class Unit:
         ValueError, made from a `ThermoxelsError` without a name, if it cannot be read or is not within the limits."""
         try:
             if isinstance(content, dict) and content.keys() == {"value", "off_by"}:  # as answers.json has it
-                content = Measured(**content)
+                value, off_by = content["value"], content["off_by"]
+                if not (is_number(value) and is_number(off_by) and math.isfinite(value) and 0.0 <= off_by < math.inf):
+                    expected, remedy = "finite numbers, off_by of at least 0", "Write 20.0 +- 0.5 C, for example."
+                    raise _wrong("", expected, f"{content!r}", remedy)
+                content = Measured(value, off_by)
             found = content if isinstance(content, Measured) else read_measured("", content, self.name)
             low, high = (found.low, found.high) if self.surely else (found.value, found.value)
             if low < self.low or high > self.high + 1e-12 or (self.above and low <= self.low):

@@ -45,7 +45,7 @@ class LossWeights:
     tracks: float = 0.05
     """Make feature rays end at their points: tracks of structure from motion, depths on which photographs agree."""
     backdrop: float = 0.02  # Let rays through a plain backdrop (sky, a wall far behind) meet nothing in the box
-    bend: float = 0.003  # Keep surfaces flat in plain areas of photographs, where no depth is known
+    bend: float = 0.001  # Keep surfaces flat in plain areas of photographs, where no depth is known
     surroundings: float = 1e-3  # Keep the surroundings transparent where colour at infinity explains the photographs
 
 
