@@ -216,8 +216,10 @@ def test_impossible_dataparser_transforms_are_refused(transform, scale) -> None:
     ],
 )
 def test_wrong_options_are_refused_before_anything_runs(ball, tmp_path, options, name) -> None:
-    with pytest.raises(ThermoxelsError, match=f"{name}: expected"):
+    with pytest.raises(ThermoxelsError, match=f"{name}: expected") as refusal:
         export_snapshot(ball, np.eye(4), ExportOptions(**options), tmp_path / "out")
+    if name == "density_percentile":
+        assert "--density-percentile" in str(refusal.value), "an option is named as it is typed"
     assert not (tmp_path / "out").exists()
 
 

@@ -1,4 +1,5 @@
 import dataclasses
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -195,12 +196,13 @@ def test_air_follows_the_file_beside_the_scene_and_the_sky_follows_the_air(tmp_p
     assert varying.in_time and varying.resolution_s == 7200.0  # no step is longer than the file's shortest interval
 
 
-def test_air_follows_an_epw_file_over_the_end_of_its_year(tmp_path) -> None:
-    """The scene starts at noon of 31 December 2031; the file, of 2026, begins again at New Year."""
-    write_epw(tmp_path / "outside.epw", lambda h: 0.001 * h)
+@pytest.mark.parametrize(("year", "day"), [(2026, 0), (2024, 1)])
+def test_air_follows_an_epw_file_over_the_end_of_its_year(tmp_path, year, day) -> None:
+    """The scene starts at noon of 31 December 2031; the file begins again at New Year. 2024 has one day more."""
+    write_epw(tmp_path / "outside.epw", lambda h: 0.001 * h, hours=8760 + 24 * day, first=datetime(year, 1, 1))
     series = "outside.epw, air_start: 2031-12-31T12:00:00+01:00"
     outside = with_series(tmp_path, "", series=series).effects(room())[1]
-    for hours, air_c in ((0.0, 8.748), (6.5, 8.7545), (15.0, 0.003)):
+    for hours, air_c in ((0.0, 8.748 + 0.024 * day), (6.5, 8.7545 + 0.024 * day), (15.0, 0.003)):
         places = Places(np.zeros((1, 3)), np.zeros((1, 3)))
         assert outside.bounded("air_c").at(places, 3600.0 * hours) == pytest.approx(air_c, abs=1e-3)
     for wrong in ("outside.epw", "outside.csv, air_start: 2031-12-31T12:00:00+01:00"):

@@ -7,11 +7,18 @@ from pathlib import Path
 BEGIN = datetime(2026, 1, 1)
 
 
-def write_epw(path: Path, outside_c: Callable[[float], float], *, hours: int = 8760, mixed_years: bool = False) -> Path:
+def write_epw(
+    path: Path,
+    outside_c: Callable[[float], float],
+    *,
+    hours: int = 8760,
+    mixed_years: bool = False,
+    first: datetime = BEGIN,
+) -> Path:
     """An .epw file of Geneva (UTC+1), with air of `outside_c(hours after New Year)`, and direct light at noon."""
     lines = ["LOCATION,Geneva,-,CHE,made up,067000,46.25,6.13,1.0,416.0", *(f"HEADER {n}" for n in range(7))]
     for hour in range(hours):
-        begin = BEGIN + timedelta(hours=hour)
+        begin = first + timedelta(hours=hour)
         year = 2000 + begin.month * 7 % 12 if mixed_years else begin.year
         direct = 500 if 10 <= begin.hour < 14 else 0
         air = f"{outside_c(hour + 1.0):.3f},-2.0,80,97000"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -251,7 +252,14 @@ def check_options(options: ExportOptions) -> CheckedOptions:
         remedy = "Pass --formats vtu glb, for example."
         raise MeshError("formats", expected="at least one format, each once", got=options.formats, remedy=remedy)
     MeshOptions(options.boundary, options.coarsest_cell)  # raises if a value is out of range
-    selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
+    try:
+        selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
+    except MeshError as problem:
+        option = re.split(r"[: ]", str(problem), maxsplit=1)[0].replace("_", "-")
+        said = str(problem).removesuffix("Correct it.")
+        if said == str(problem):
+            raise
+        raise MeshError(f"{said}Correct --{option}, or leave it out.") from problem
     rules = PatchRules() if options.patches is None else load_patch_rules(options.patches)
     return CheckedOptions(selection, rules, distance, *_heat_settings(options))
 
@@ -365,10 +373,8 @@ def export_snapshot(
     from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
     from thermoxels_ns.mesh.files.surface import check_stl
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
-    from thermoxels_ns.mesh.quality.checks import boundary_facets
     from thermoxels_ns.mesh.quality.report import check_mesh, picture_of_quality
     from thermoxels_ns.mesh.tetrahedra import support_of_facets
-    from thermoxels_ns.mesh.voxel_tets import kuhn_tets
     from thermoxels_ns.reports import mesh_pictures
 
     checked = check_options(options)
@@ -464,8 +470,8 @@ def export_snapshot(
         if support_of_facets(mesh) is not None:
             mesh_pictures.add_support(folder / _MESH_PICTURES[2], mesh, look)
         # Faces of the voxels that are not exported are drawn in grey.
-        corners, tets = kuhn_tets(built.solid.left_out)
-        ghost = apply_transform(to_mesh, snapshot.lattice.index_to_world(corners)), boundary_facets(tets)
+        corners, faces = mesh_pictures.voxel_surface(built.solid.left_out)
+        ghost = apply_transform(to_mesh, snapshot.lattice.index_to_world(corners)), faces
         note = "grey: left out of the region" if len(ghost[0]) else "nothing is left out"
         beside: Any = {"title": "Region", "length_unit": unit, "ghost": ghost, "note": note, **look}
         mesh_pictures.write_picture(folder / _MESH_PICTURES[3], mesh_pictures.image_of_mesh(mesh, **beside))

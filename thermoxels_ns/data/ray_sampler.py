@@ -245,6 +245,8 @@ class CameraRays:
         Each image has the least such n. The grid starts in the middle of its first cell, so that it prefers no border.
         Along a side shorter than n, the grid has the middle pixel alone.
         """
+        if most is not None and most < 1:
+            raise ValueError(f"at most {most} rays of an image")
         numbers = []
         for first, width, height in zip(self.first_pixel, self.widths.tolist(), self.heights.tolist()):
             # Rows and columns are rounded up, so the square root alone may give a few pixels too many.

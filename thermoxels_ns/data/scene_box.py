@@ -277,10 +277,7 @@ def _read_colmap(folder: str, scene: SceneFile) -> FloatArray:
     The json may be in COLMAP's world or in one with other axes (``applied_transform``). The camera centres in both
     decide which. Raises `SceneError` if they do not fit, so that a stale model cannot give a wrong box.
     """
-    try:
-        model = read_model(scene.folder / folder)
-    except SceneError as problem:
-        raise SceneError(folder, expected="a readable COLMAP model", got=problem, remedy=_REMEDY) from problem
+    model = read_model(scene.folder / folder)
     centres = {Path(image.name).name: np.asarray(image.projection_center()) for image in model.images.values()}
     known = [(centres[frame.image.name], frame.pose[:3, 3]) for frame in scene.frames if frame.image.name in centres]
     in_colmap, in_json = (np.array(side).reshape(-1, 3) for side in (zip(*known) if known else ([], [])))

@@ -74,6 +74,8 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
     if lens is None:
         expected = "PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or OPENCV_FISHEYE"
         undistort = "Undistort the photographs to a pinhole camera."
+        if model == "EQUIRECTANGULAR":
+            undistort = "Cut each panorama into perspective photographs, each with its pose."
         raise SceneError(f"{where}: camera_model", expected=expected, got=model, remedy=undistort)
     size, orientation = None, 1
     if image is not None:

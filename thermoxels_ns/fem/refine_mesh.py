@@ -76,11 +76,17 @@ def _children() -> IntArray:
 _CHILDREN = _children()
 _FACET_CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 """Local nodes of a triangle's children: 0 to 2 are the corners and 3 to 5 the middles of `FACET_EDGES`."""
+_AT_ONCE = 1 << 15  # Tetrahedra whose angles are computed at once, each of which takes 2 kB
 _TIE = 1e-9  # Cosines that differ by at most this count as equal
 
 
 def _diagonals(points: FloatArray, local: IntArray) -> IntArray:
     """Return for each tetrahedron the diagonal for which the largest angle between faces is smallest, shape (t,)."""
+    starts = range(0, len(local), _AT_ONCE)
+    return np.concatenate([np.zeros(0, np.int64), *(_best_diagonals(points, local[n : n + _AT_ONCE]) for n in starts)])
+
+
+def _best_diagonals(points: FloatArray, local: IntArray) -> IntArray:
     best, chosen = np.full(len(local), -2.0), np.zeros(len(local), np.int64)
     one, other = np.triu_indices(4, 1)
     for option in range(3):

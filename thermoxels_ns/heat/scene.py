@@ -164,6 +164,8 @@ class HeatScene:
 
     def problem(self, mesh: TetMesh, *, up: Vector | None = None) -> HeatProblem:
         """Return the problem on a mesh. If the scene has no `up`, the argument counts, or z. Raises as `effects`."""
+        with raising(HeatError):
+            mesh.check()
         start_c = self.initial_c
         if start_c is None and self.steady and not mesh.has_temperatures:
             start_c = _ANY_START_C

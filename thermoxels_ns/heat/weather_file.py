@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from calendar import isleap
 from collections.abc import Sequence
 from datetime import datetime
 from importlib import import_module
@@ -69,6 +71,8 @@ def _read_epw(path: Path, start: datetime | None, facing_deg: Sequence[float], a
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
         year = start.year if start is not None and any_year else None
+        if year is not None and not isleap(year):
+            text = "\n".join(line for line in text.splitlines() if not re.match(r"\d+, *0?2, *29,", line))
         data, place = pvlib.iotools.read_epw(StringIO(text), coerce_year=year)  # a path it might take for an address
         begins, zone = data.index, data.index.tz
         if len(begins) < 2:

@@ -118,6 +118,8 @@ def build_mesh(
         tets, facets = number[tets[stays[tets[:, 0]]]], number[facets[stays[facets[:, 0]]]]
         points, temperature_c, observed = points[stays], temperature_c[stays], observed[stays]
     edges, conductance = tet_conductances(points, tets)
+    if voxel:  # diagonals of voxels conduct nothing, and sides join all nodes
+        edges, conductance = edges[conductance > 0.0], conductance[conductance > 0.0]
     if known is not None:
         temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
         measured_c = known[snapshot.observed_weight >= MIN_OBSERVED_WEIGHT]

@@ -37,6 +37,18 @@ _MATTER = {"ambient": 0.5, "diffuse": 0.65, "smooth_shading": False}  # Light th
 _DARKEST = 0.1  # Share of the colour map inferno left out at its dark end, where shading would look like cold
 
 
+def voxel_surface(cells: BoolArray) -> tuple[FloatArray, IntArray]:
+    """Return the surface of the voxels that are True: points in lattice indices, (n, 3), and triangles, (m, 3)."""
+    squares = [np.zeros((0, 4, 3), np.int64)]
+    for axis in range(3):
+        u, v = np.eye(3, dtype=np.int64)[[(axis + 1) % 3, (axis + 2) % 3]]
+        width = [(1, 1) if one == axis else (0, 0) for one in range(3)]
+        low = np.argwhere(np.diff(np.pad(cells, width).astype(np.int8), axis=axis))
+        squares.append(low[:, None] + np.stack([0 * u, u, u + v, v]))
+    points, corners = np.unique(np.concatenate(squares).reshape(-1, 3), axis=0, return_inverse=True)
+    return points.astype(np.float64), corners.reshape(-1, 4)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+
+
 def image_of_surface(
     points_m: FloatArray,
     facets: IntArray,

@@ -333,7 +333,7 @@ class ThermoxelsModel(Model):
     def _bend_loss(self, areas: PlainAreas) -> Tensor:
         """Return `bend_loss` of random pixels of plain areas."""
         generator = torch.Generator().manual_seed((self.config.seed + 1) * 5_000_011 + self.step)
-        near, most = self.config.near_plane * self.unit, self.config.track_rays // 4
+        near, most = self.config.near_plane * self.unit, max(1, self.config.track_rays // 4)
         request, length = areas.request(most, near, generator, self.device)
         seen = render_rays(self.grid, request, self._options(), self.config.backend)
         return bend_loss(seen.depth, seen.accumulation, length, self.grid.lattice.voxel_size)

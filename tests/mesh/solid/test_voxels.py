@@ -101,7 +101,7 @@ def test_a_hollow_house_that_a_box_halves_is_filled_up_to_the_box():
     """What is left out still hides the inside from the cameras, so the half is as full as the whole would be."""
     shell = OBJECT & ~box(WIDE, (-0.2, -0.1, 0.2), (0.2, 0.1, 0.7))
     snapshot = field(WIDE, shell, ring())
-    selection = SolidSelection(close_gaps=0, region_box=(-5.0, -5.0, -1.0, 0.0, 5.0, 3.0))
+    selection = SolidSelection(close_gaps=0, region_box=[-5.0, -5.0, -1.0, 0.0, 5.0, 3.0])  # type: ignore[arg-type]
     left = WIDE.cell_centres()[..., 0] < 0.0
     assert np.array_equal(select_solid(snapshot, selection).cells, OBJECT & left)
 

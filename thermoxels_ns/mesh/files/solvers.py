@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import check_positive, remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays
@@ -263,6 +263,10 @@ class HeatStep:
     specific_heat_j_kgk: float  # Specific heat capacity, [J / (kg K)], above 0
     steps: int  # Number of steps, at least 1
     step_seconds: float  # Length of a step, [s], above 0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            check_positive(name, value, "Pass a number above 0.", MeshError)
 
 
 def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> None:

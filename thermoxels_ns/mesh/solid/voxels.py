@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 from scipy import ndimage
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -22,8 +22,11 @@ from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
 
 RegionKind = Literal["auto", "all"]
 InteriorKind = Literal["solid", "hollow"]
-Box = tuple[float, float, float, float, float, float]
-Ball = tuple[float, float, float, float]
+_AsTuple = BeforeValidator(
+    lambda given: tuple(np.asarray(given).tolist()) if isinstance(given, (list, np.ndarray)) else given
+)
+Box = Annotated[tuple[float, float, float, float, float, float], _AsTuple]
+Ball = Annotated[tuple[float, float, float, float], _AsTuple]
 
 SMALLEST_BODY = 0.01
 """Bodies (voxels that touch, if only by corners) with less than this share of the largest body's voxels are removed."""
