@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pyvista as pv
-from PIL import Image
+from PIL import Image, ImageFile
 
 from tests.support.audited_wall import INSIDE, STATED, audited_wall, photographed, solve_wall, true_draws
 from tests.support.flat_houses import house_corner
@@ -176,6 +176,7 @@ def test_an_agreement_is_written_before_a_survey(tmp_path, name, begins) -> None
     assert cli.main(words) == 0
     written = (tmp_path / "new" / name).read_bytes()
     assert written.startswith(begins)
+    assert not ImageFile.LOAD_TRUNCATED_IMAGES, "half a photograph is still damaged"
     if name == "a.html":
         page = written.decode()
         assert "A &lt;b&gt;house" in page and "<td>C. Lient</td>" in page and "<td>to find leaks</td>" in page

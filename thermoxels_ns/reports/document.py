@@ -10,6 +10,9 @@ from thermoxels_ns.core.errors import ThermoxelsError
 
 def why_no_pdf() -> str:
     """Return a sentence that says what WeasyPrint lacks here and how to get it; "" if it can be used."""
+    from PIL import ImageFile
+
+    damaged_too = ImageFile.LOAD_TRUNCATED_IMAGES
     try:
         import weasyprint  # noqa: F401
     except ImportError:
@@ -17,6 +20,8 @@ def why_no_pdf() -> str:
     except OSError as problem:
         library = "apt install libpango-1.0-0 libpangoft2-1.0-0 (Debian, Ubuntu) or brew install pango (macOS)"
         return f"WeasyPrint does not find its system library pango ({problem}); install that: {library}."
+    finally:
+        ImageFile.LOAD_TRUNCATED_IMAGES = damaged_too  # else this process would take half photographs for whole ones
     return ""
 
 
