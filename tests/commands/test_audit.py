@@ -165,7 +165,7 @@ def test_the_page_is_printed_as_a_document_where_weasyprint_is(export, tmp_path,
     capsys.readouterr()
     monkeypatch.setitem(sys.modules, "weasyprint", None)
     _, page = audited(export / "mesh.vtu", export / "conditions.yaml", tmp_path / "out", *words)
-    assert "thermoxels-ns[pdf]" in capsys.readouterr().out and "audit.pdf" not in page.partition("answers.json")[2]
+    assert "pip install weasyprint" in capsys.readouterr().out and "audit.pdf" not in page.partition("answers.json")[2]
     assert not (tmp_path / "out" / "audit.pdf").exists()
 
 
@@ -321,3 +321,7 @@ def test_an_earlier_audit_is_compared_on_the_page_and_in_the_answers(export, don
     (tmp_path / "answers.json").write_text("{}")
     assert cli.main([*given, str(tmp_path / "answers.json"), "--output-dir", str(tmp_path / "other")]) == 1
     assert "without conditions and up" in capsys.readouterr().err
+    damaged = json.loads(before) | {"up": ["x", "y", "z"]}
+    (tmp_path / "answers.json").write_text(json.dumps(damaged))
+    assert cli.main([*given, str(tmp_path / "answers.json"), "--output-dir", str(tmp_path / "other")]) == 1
+    assert "without up" in capsys.readouterr().err

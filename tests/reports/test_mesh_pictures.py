@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thermoxels_ns.reports.mesh_pictures import change_colours, image_of_mesh, write_picture
+from thermoxels_ns.reports.mesh_pictures import change_colours, image_of_mesh, voxel_surface, write_picture
 
 SIZE = (400, 300)
 
@@ -75,3 +75,14 @@ def test_a_few_large_changes_do_not_make_all_others_grey() -> None:
     assert colours["note"] == "colours: 95 % of the nodes; all: -3.4 to 0.1 K"
     even = change_colours(np.linspace(-2.0, 1.0, 50))
     assert even["clim"] == (-2.0, 2.0) and even["note"] == ""
+
+
+def test_the_surface_of_voxels_has_their_outer_sides_alone() -> None:
+    cells = np.zeros((4, 4, 3), bool)
+    cells[:2, :3, :1] = cells[3, 3, 2] = True  # a block of 2 x 3 x 1 and one voxel by itself
+    points, triangles = voxel_surface(cells)
+    first, second, third = points[triangles].transpose(1, 0, 2)
+    area = np.linalg.norm(np.cross(second - first, third - first), axis=1) / 2.0
+    assert np.allclose(area, 0.5) and area.sum() == 22.0 + 6.0
+    assert points.min(axis=0).tolist() == [0.0, 0.0, 0.0] and points.max(axis=0).tolist() == [4.0, 4.0, 3.0]
+    assert [len(part) for part in voxel_surface(np.zeros_like(cells))] == [0, 0]

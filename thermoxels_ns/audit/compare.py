@@ -243,6 +243,13 @@ class _Compared:
             for one in (old, new)
         ]
         left = list(counted[0])
+        cores = [np.concatenate([np.zeros(0, np.int64), *(bridge.core for bridge in some)]) for some in counted]
+
+        def part_of_one(bridge: FoundDefect, here: _Survey, others: IntArray) -> bool:
+            """True if most of a bridge lies in bridges of the other survey, which may have found two as one."""
+            inside = np.isin(here.partner[bridge.core], others)
+            return bool(here.area_m2[bridge.core[inside]].sum() >= 0.5 * here.area_m2[bridge.core].sum())
+
         for bridge in counted[1]:
             size, on = new.area_m2[bridge.core].sum(), new.partner[bridge.core]
             share = [
@@ -253,9 +260,13 @@ class _Compared:
                 same = left.pop(int(np.argmax(share)))
                 parts = (*_own(old, same), *_own(new, bridge))
                 found.append((bridge, "in both", *parts))
+            elif part_of_one(bridge, new, cores[0]):
+                continue
             elif (elsewhere := _transferred(old, new, bridge)) is not None:
                 found.append((bridge, "appeared", *elsewhere, *_own(new, bridge)))
         for bridge in left:
+            if part_of_one(bridge, old, cores[1]):
+                continue
             if (elsewhere := _transferred(new, old, bridge)) is not None:
                 found.append((bridge, "went", *_own(old, bridge), *elsewhere))
         return found

@@ -74,7 +74,7 @@ class Audit:
     """Draw pictures and the 3-D view for the page."""
     pdf: bool = False
     """Print the page into audit.pdf as well: a document to sign. It takes some seconds, and needs WeasyPrint (pip
-    install 'thermoxels-ns[pdf]')."""
+    install weasyprint)."""
     write_agreement: Path | None = None
     """Write what a client signs before the survey (purpose, conditions, limits) to this .pdf or .html file, and do
     nothing else. What the section survey of --conditions says is filled in; the rest are lines to fill in by hand."""
@@ -248,13 +248,16 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
     content = read_json_object(path, again, AuditError)
     kinds = {"conditions": dict, "up": list}
     missing = [key for key, kind in kinds.items() if not isinstance(content.get(key), kind)]
+    if "up" not in missing and not all(map(is_number, content["up"])):
+        missing.append("up")
     if missing:
         got = f"one without {' and '.join(missing)}"
         raise AuditError(
             str(path), expected="the answers.json of an audit", got=got, remedy=f"{again} Audit again first."
         )
     conditions, mesh = earlier_conditions(path.name, content["conditions"]), read_surface(path.with_name(SURFACE))
-    x, y, z = check_direction(f"{path}: up", content["up"], again, AuditError).tolist()
+    direction = check_direction(f"{path}: up", content["up"], again, AuditError)
+    x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
     least_w = content.get("least_bridge_w")
     return lambda: without_slight(audit(mesh, conditions, (x, y, z)), least_w if is_number(least_w) else 0.0)
 

@@ -66,7 +66,7 @@ def _read_epw(path: Path, start: datetime | None, facing_deg: Sequence[float], a
     try:
         pvlib: Any = import_module("pvlib")  # optional: it brings pandas
     except ImportError as problem:
-        remedy = "Run pip install 'thermoxels-ns[weather]'."
+        remedy = "Run pip install pvlib."
         raise wrong(str(path), "the package pvlib, which reads .epw files", "none", remedy) from problem
     try:
         text = path.read_text(encoding="utf-8", errors="replace")

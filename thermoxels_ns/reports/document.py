@@ -16,7 +16,7 @@ def why_no_pdf() -> str:
     try:
         import weasyprint  # noqa: F401
     except ImportError:
-        return "WeasyPrint is not installed; install it with: pip install 'thermoxels-ns[pdf]'."
+        return "WeasyPrint is not installed; install it with: pip install weasyprint."
     except OSError as problem:
         library = "apt install libpango-1.0-0 libpangoft2-1.0-0 (Debian, Ubuntu) or brew install pango (macOS)"
         return f"WeasyPrint does not find its system library pango ({problem}); install that: {library}."
