@@ -13,7 +13,7 @@ export PYTHON
 activate = PATH="$(abspath $(1))/bin:$$PATH" VIRTUAL_ENV="$(abspath $(1))"
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo figures test test-newest nightly lint site wheel format clean
+.PHONY: help setup demo figures test test-newest nightly gpu-check lint site wheel format clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -36,6 +36,10 @@ test-newest: ## Run the tests with the newest versions that pyproject.toml allow
 
 nightly: setup ## Files changed at random, 2,000 of each kind
 	$(call activate,$(VENV)) NIGHTLY=1 OMP_NUM_THREADS=1 pytest --numprocesses logical tests/stability/test_files_changed_at_random.py $(ARGS)
+
+gpu-check: setup ## On a machine with a CUDA device: its tests, and how fast steps and views are there and on the CPU
+	$(call activate,$(VENV)) OMP_NUM_THREADS=1 pytest -m cuda tests/training/test_devices.py tests/data/test_datamanager.py
+	$(call activate,$(VENV)) python tests/benchmarks/step_speed.py --resolutions 128 $(ARGS)
 
 lint: setup ## Check format, style and types
 	$(call activate,$(VENV)) ruff format --check .

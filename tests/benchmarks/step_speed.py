@@ -9,7 +9,7 @@ A synthetic house with a thermal camera of its own is trained to the middle of i
 same from all sides there, as it is for the first four fifths of a training.
 
 Every figure is a median; ratios are against the reference in the same run: plain torch on the same sparse lattice,
-which skips what is empty.
+which skips what is empty. Where there is a CUDA device, the same state goes on there, by the reference.
 """
 
 import statistics
@@ -61,6 +61,7 @@ class StepSpeed:
         print_head(
             *("voxels", "kept", "fused step", "against the lattice before", "reference step", "reference / fused"),
             "320 x 240 view",
+            *(("CUDA step", "fused / CUDA", "CUDA view") if torch.cuda.is_available() else ()),
         )
         before = None
         for row in rows:
@@ -70,7 +71,11 @@ class StepSpeed:
             growth = "" if before is None else f"{fused / before:.2f}"
             view = f"{1e3 * row['view']:.0f} ms"
             kept = f"{row['kept']:.1%}"
-            print_row(row["resolution"], kept, f"{1e3 * fused:.0f} ms", growth, *baselines, view)
+            on_gpu = ()
+            if "cuda" in row:
+                ms = [f"{1e3 * row[name]:.1f} ms" for name in ("cuda", "cuda_view")]
+                on_gpu = ms[0], f"{fused / row['cuda']:.1f}", ms[1]
+            print_row(row["resolution"], kept, f"{1e3 * fused:.0f} ms", growth, *baselines, view, *on_gpu)
             before = fused
 
     def measure(self, scene: Path, resolution: int) -> dict:
@@ -101,6 +106,14 @@ class StepSpeed:
             run.pipeline.eval()
             camera = datamanager.eval_dataset.cameras[0:1]
             figures["view"] = self.median(lambda: model.get_outputs_for_camera(camera))
+            if torch.cuda.is_available():
+                there = Training(pipeline, schedule.steps, config, saved=run.save(), device="cuda")
+                there.step = run.step
+                figures["cuda"] = self.median(lambda: (there.take_step(), torch.cuda.synchronize()))
+                there.pipeline.eval()
+                on_gpu = camera.to("cuda")
+                shown = there.pipeline.model.get_outputs_for_camera
+                figures["cuda_view"] = self.median(lambda: (shown(on_gpu), torch.cuda.synchronize()))
         voxels = model.grid.voxels
         return {"resolution": resolution, "kept": len(voxels) / voxels.mask().size, **figures}
 

@@ -257,6 +257,7 @@ def test_a_fisheye_lens_spans_its_angles():
     np.testing.assert_allclose(ends, [[54, 33], [66, 27]], atol=0.5)
 
 
+@pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("images_on_gpu", [False, True])
 def test_cuda_gives_the_batch_of_the_cpu(scene_folder, images_on_gpu):

@@ -27,13 +27,20 @@ class Training:
         config: A method to begin with in place of the default one.
         rate: Factor on all learning rates.
         saved: A checkpoint to go on from.
+        device: Where the model is.
     """
 
     def __init__(
-        self, overrides: dict[str, Any], steps: int, config: Any = None, rate: float = 1.0, saved: bytes | None = None
+        self,
+        overrides: dict[str, Any],
+        steps: int,
+        config: Any = None,
+        rate: float = 1.0,
+        saved: bytes | None = None,
+        device: str = "cpu",
     ):
         config = deepcopy(config or thermoxels.config)  # nerfstudio writes the folder into it
-        pipeline = with_overrides(config.pipeline, overrides).setup(device="cpu", test_mode="val")
+        pipeline = with_overrides(config.pipeline, overrides).setup(device=device, test_mode="val")
         assert isinstance(pipeline, ThermoxelsPipeline)
         pipeline.train()
         self.pipeline, self.step, self.loss = pipeline, 0, torch.zeros(())
@@ -65,7 +72,8 @@ class Training:
 
     def take_step(self) -> None:
         self.optimizers.zero_grad_all()
-        self.loss = torch.stack(list(self.pipeline.get_train_loss_dict(self.step)[1].values())).sum()
+        self.terms = self.pipeline.get_train_loss_dict(self.step)[1]
+        self.loss = torch.stack(list(self.terms.values())).sum()
         self.loss.backward()
         self.optimizers.optimizer_step_all()
 

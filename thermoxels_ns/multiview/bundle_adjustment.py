@@ -274,7 +274,7 @@ def _adjust(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: int) ->
         normal = np.zeros((len(points), 3, 3))
         np.add.at(normal, tracks.point, np.einsum("nki,nkj->nij", by_point, by_point))
         normal += 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        inverse = sparse.block_diag(list(np.linalg.inv(normal)), format="csr")
+        inverse = sparse.block_diag([sparse.coo_array(one) for one in np.linalg.inv(normal)], format="csr")
         mixed = a.T @ b
         precision = (middle / np.deg2rad(POSE_ERROR_DEG)) ** 2
         turned = Rotation.from_matrix(rotations @ start.transpose(0, 2, 1)).as_rotvec()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -81,6 +82,37 @@ class SceneRender:
     thermal: Float[Tensor, "rays 1"]  # Normalised temperature
     box: RayRender  # Result of the box alone
     around: AroundRender | None  # None without surroundings
+
+
+def split_render(requests: Sequence[RayRequest], render: Callable[[RayRequest], SceneRender]) -> list[SceneRender]:
+    """Render the rays of several requests in one call of `render`, and return what those of each see."""
+    ends = [request.near_and_far() for request in requests]
+    counts = [len(request.origins) for request in requests]
+    every = torch.ones(sum(counts), dtype=torch.bool, device=requests[0].origins.device)
+    wants = [
+        torch.cat([every[:count] if bits is None else bits for bits, count in zip(chosen, counts)])
+        for chosen in ([request.rgb_rays for request in requests], [request.thermal_rays for request in requests])
+    ]
+    origins, directions = (
+        torch.cat([getattr(request, name) for request in requests]) for name in ("origins", "directions")
+    )
+    near, far = (torch.cat([pair[number] for pair in ends]) for number in range(2))
+    seen, parts, first = render(RayRequest(origins, directions, near, far, *wants)), [], 0
+    for count in counts:
+        parts.append(_rays_of(seen, slice(first, first + count)))
+        first += count
+    return parts
+
+
+def _rays_of(result: Any, part: slice) -> Any:
+    """Return a result of rendering with some of its rays only."""
+    cut = {}
+    for name, value in vars(result).items():
+        if isinstance(value, Tensor):
+            cut[name] = value[part]
+        elif isinstance(value, (RayRender, AroundRender)):
+            cut[name] = _rays_of(value, part)
+    return replace(result, **cut)
 
 
 def render_scene(

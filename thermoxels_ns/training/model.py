@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, Surrou
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.reference import intersect_box
-from thermoxels_ns.render.renderers import GridSamples, Scene, SceneRender, render_rays, render_scene, sample_rays
+from thermoxels_ns.render.renderers import GridSamples, Scene, SceneRender, render_scene, sample_rays, split_render
 from thermoxels_ns.training import losses
 from thermoxels_ns.training.degrees_view import DegreesView
 from thermoxels_ns.training.image_metrics import (
@@ -254,7 +255,13 @@ class ThermoxelsModel(Model):
                 request = replace(request, rgb_rays=rgb_rays)
             return batch | self._image_outputs(request)
         request = replace(request, rgb_rays=rgb_rays, thermal_rays=thermal_rays)
-        seen = self.render_rays(request, self._training_options())
+        known = self._known_rays()
+        # All in one call, which on a GPU takes little longer than one for the photographs' rays alone.
+        seen, *ends = split_render(
+            [request, *(rays for rays, _ in known.values())],
+            lambda joined: self.render_rays(joined, self._training_options()),
+        )
+        terms = {name: loss(end) for (name, (_, loss)), end in zip(known.items(), ends)}
         rgb, thermal = seen.rgb, seen.thermal
         # The gradient of `index_select` adds rays in their order; with an index instead, threads would race.
         gains_on, offsets_on = self.corrected.tolist()
@@ -265,7 +272,11 @@ class ThermoxelsModel(Model):
         if self.thermal_offset is not None and offsets_on:
             offset = self._correction(self.thermal_offset, self.config.per_image_offset)
             thermal = thermal + (offset - offset.mean()).index_select(0, photograph)[:, None]
-        return batch | {"rgb": rgb, "thermal": thermal, "accumulation": seen.box.accumulation[:, None], "render": seen}
+        accumulation = seen.box.accumulation[:, None]
+        return batch | {
+            **{"rgb": rgb, "thermal": thermal, "accumulation": accumulation},
+            **{"render": seen, "known_rays": terms},
+        }
 
     def _correction(self, correction: Tensor, wanted: str) -> Tensor:
         """Return a correction, without gradient if `wanted` is auto and the distortion ramp has not ended yet."""
@@ -320,37 +331,39 @@ class ThermoxelsModel(Model):
             terms["distortion_loss"] = self._distortion_weight() * box.distortion.mean()
         if weights.surroundings and around is not None:
             terms["surroundings_loss"] = weights.surroundings * (1.0 - around.transmittance).mean()
+        return terms | outputs["known_rays"]
+
+    def _known_rays(self) -> dict[str, tuple[RayRequest, Callable[[SceneRender], Tensor]]]:
+        """Return random rays about whose ends photographs say something, and the loss of what they see, by its name."""
+        weights, near, voxel = self.loss_weights, self.config.near_plane * self.unit, self.grid.lattice.voxel_size
+        known: dict[str, tuple[RayRequest, Callable[[SceneRender], Tensor]]] = {}
         for name, weight, sampler in (
             ("tracks", weights.tracks, self.feature_ray_sampler),
             ("backdrop", weights.backdrop, self.backdrop_ray_sampler),
         ):
             if weight and sampler is not None:
-                terms[f"{name}_loss"] = weight * self._feature_ray_loss(sampler)
+                generator = torch.Generator().manual_seed((self.config.seed + 1) * 2_000_003 + self.step)
+                step = 0.0 if self.seen_surroundings is None else self.seen_surroundings.step
+                request = sampler.request(self.config.track_rays, near, voxel, generator, self.device, step)
+                known[f"{name}_loss"] = request, partial(self._feature_ray_loss, weight, sampler)
         if weights.bend and self.plain_areas:  # None, or without any, in a scene without plain areas
-            terms["bend_loss"] = weights.bend * self._bend_loss(self.plain_areas)
-        return terms
+            generator = torch.Generator().manual_seed((self.config.seed + 1) * 5_000_011 + self.step)
+            most = max(1, self.config.track_rays // 4)
+            request, length = self.plain_areas.request(most, near, generator, self.device)
+            known["bend_loss"] = (
+                request,
+                lambda seen: weights.bend * bend_loss(seen.box.depth, seen.box.accumulation, length, voxel),
+            )
+        return known
 
-    def _bend_loss(self, areas: PlainAreas) -> Tensor:
-        """Return `bend_loss` of random pixels of plain areas."""
-        generator = torch.Generator().manual_seed((self.config.seed + 1) * 5_000_011 + self.step)
-        near, most = self.config.near_plane * self.unit, max(1, self.config.track_rays // 4)
-        request, length = areas.request(most, near, generator, self.device)
-        seen = render_rays(self.grid, request, self._options(), self.config.backend)
-        return bend_loss(seen.depth, seen.accumulation, length, self.grid.lattice.voxel_size)
-
-    def _feature_ray_loss(self, rays: losses.FeatureRaySampler) -> Tensor:
-        """Return `losses.feature_ray_loss` of random rays of a sampler; a coarse lattice may let light pass points."""
-        config, near, lattice = self.config, self.config.near_plane * self.unit, self.grid.lattice
-        generator = torch.Generator().manual_seed((config.seed + 1) * 2_000_003 + self.step)
-        step = 0.0 if self.seen_surroundings is None else self.seen_surroundings.step
-        request = rays.request(config.track_rays, near, lattice.voxel_size, generator, self.device, step)
-        seen = self.render_rays(request, self._options())
+    def _feature_ray_loss(self, weight: float, rays: losses.FeatureRaySampler, seen: SceneRender) -> Tensor:
+        """Return the weighted `losses.feature_ray_loss` of rays; a coarse lattice may let light pass points."""
         lost, left = seen.box.accumulation, seen.box.transmittance
         if seen.around is not None:
             left = left * seen.around.transmittance
             lost = 1.0 - left
-        last = max(lattice.cell_shape) >= config.resolutions[-1]
-        return losses.feature_ray_loss(lost, left, 0.0 if last else rays.coarse_light)
+        last = max(self.grid.lattice.cell_shape) >= self.config.resolutions[-1]
+        return weight * losses.feature_ray_loss(lost, left, 0.0 if last else rays.coarse_light)
 
     def _distortion_weight(self) -> float:
         """Return the weight of the distortion term at this step; over `distortion_ramp` the weight grows from 0."""
