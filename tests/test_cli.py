@@ -49,7 +49,7 @@ def test_synthetic_writes_the_scene_that_was_asked_for(tmp_path, capsys):
 
 
 def test_bad_input_is_one_sentence_and_exit_status_1(tmp_path, capsys):
-    assert cli.main(["synthetic", "sphere", "--output-dir", str(tmp_path), "--noise-k", "-1"]) == 1
+    assert cli.main(["synthetic", "sphere", "--output-dir", str(tmp_path), "--noise-k", "-1"]) == 2
     shown = capsys.readouterr()
     assert shown.err.splitlines() == [
         "Error: noise_k: expected a finite number of at least 0, got -1.0. Correct --noise-k."
@@ -101,7 +101,7 @@ def test_the_entry_point_hands_the_status_to_the_shell(tmp_path):
         capture_output=True,
         text=True,
     )
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert done.stderr.startswith("Error: output folder: expected a folder that can be written to")
     assert "Traceback" not in done.stderr
 

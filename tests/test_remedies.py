@@ -113,7 +113,9 @@ def test_commands_without_options_of_the_scene_say_where_they_stand(monkeypatch,
     problem = SceneError("frame 1", expected="x", got="y", remedy=f"Pass --{field.replace('_', '-')} 2.")
     for command, says in (("ns-eval", True), ("ns-viewer", True), ("ns-train", False), ("thermoxels", False)):
         monkeypatch.setattr("sys.argv", [f"/usr/bin/{command}"])
-        sys.excepthook(SceneError, problem, None)
+        with pytest.raises(SystemExit) as ended:
+            sys.excepthook(SceneError, problem, None)
+        assert ended.value.code == 2
         said = capsys.readouterr().err
         advice = f"{command} has them in config.yml: change {field} there, below dataparser."
         assert said == f"Error: {problem}{' ' + advice if says else ''}\n"

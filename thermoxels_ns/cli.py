@@ -13,12 +13,13 @@ from typing import Annotated, Literal, Union
 import tyro
 
 from thermoxels_ns.commands.audit import Audit
+from thermoxels_ns.commands.batch import Batch
 from thermoxels_ns.commands.capture import Capture
 from thermoxels_ns.commands.cost import Cost
 from thermoxels_ns.commands.demo import Demo
 from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.core import quiet_warnings
-from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError, exit_status
 from thermoxels_ns.data.layouts import LayoutName
 from thermoxels_ns.synthetic.catalogue import SceneWord
 from thermoxels_ns.synthetic.imperfections import Imperfections
@@ -90,6 +91,7 @@ Commands = tyro.conf.FlagConversionOff[
         Annotated[Cost, tyro.conf.subcommand(name="cost")],
         Annotated[Heat, tyro.conf.subcommand(name="heat")],
         Annotated[Audit, tyro.conf.subcommand(name="audit")],
+        Annotated[Batch, tyro.conf.subcommand(name="batch")],
     ]
 ]
 
@@ -101,7 +103,8 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: The words after ``thermoxels``; the arguments of this process if left out.
 
     Returns:
-        The exit status: 0 on success, 1 after a `ThermoxelsError`, which is printed, 130 after the user's interrupt.
+        The exit status: 0 on success, 130 after the user's interrupt; after a `ThermoxelsError`, which is printed, 3 if
+        memory does not suffice, else 2.
     """
     command = tyro.cli(
         Commands, prog="thermoxels", args=arguments, description="RGB and thermal photographs to a solid with heat."
@@ -110,7 +113,7 @@ def main(arguments: list[str] | None = None) -> int:
         command.main()
     except ThermoxelsError as problem:
         _complain("[bold red]Error:[/bold red]", str(problem))
-        return 1
+        return exit_status(problem)
     except KeyboardInterrupt:
         _complain("[bold red]Interrupted.[/bold red]")
         return 130

@@ -18,7 +18,7 @@ import yaml
 
 from thermoxels_ns.core.checks import refuse_what_is_in_the_way, writable_folder
 from thermoxels_ns.core.config_loader import ConfigLoader, ModuleWith, check_run
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError, exit_status
 
 if TYPE_CHECKING:
     from thermoxels_ns.evaluation.truth_comparison import RenderedRays
@@ -41,7 +41,7 @@ def install() -> None:
 def print_our_errors_plainly() -> None:
     """Make an uncaught `ThermoxelsError` end an ``ns-*`` command with its message instead of a traceback.
 
-    The exit status stays 1. Every other exception goes to the hook that was installed before.
+    The exit status is `errors.exit_status`. Every other exception goes to the hook that was installed before.
     """
     previous = sys.excepthook
     if getattr(previous, "prints_thermoxels_errors", False):
@@ -52,6 +52,8 @@ def print_our_errors_plainly() -> None:
             print(f"Error: {problem}{_where_to_say_it(str(problem))}", file=sys.stderr)
         else:
             previous(kind, problem, traceback)
+        if isinstance(problem, (ThermoxelsError, MemoryError)):
+            raise SystemExit(exit_status(problem))
 
     hook.prints_thermoxels_errors = True  # type: ignore[attr-defined]
     sys.excepthook = hook

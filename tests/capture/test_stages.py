@@ -337,7 +337,7 @@ def test_given_poses_and_a_given_rig_are_kept(capture, tmp_path):
 
 
 def test_the_command(capture, tmp_path, capsys):
-    assert cli.main(["capture", str(tmp_path / "nowhere"), "--output", str(tmp_path / "scene")]) == 1
+    assert cli.main(["capture", str(tmp_path / "nowhere"), "--output", str(tmp_path / "scene")]) == 2
     assert "nothing at" in capsys.readouterr().err
     card, scene, _, _ = capture
     words = ["--skip-bad", "True", "--max-features", "500", "--thermal-field-of-view-deg", str(ANGLE_DEG)]

@@ -259,7 +259,7 @@ def test_patches_are_proposed_taken_and_written_as_an_envelope(tmp_path, capsys)
     propose = ["audit", str(tmp_path / "mesh.vtu"), "--write-patches", str(patches), "--north", "1", "0", "0"]
     assert cli.main(propose) == 0
     assert "window-east-4" in capsys.readouterr().out and np.ptp(np.asarray(Image.open(picture))) > 100
-    assert cli.main(propose) == 1 and "write_patches" in capsys.readouterr().err
+    assert cli.main(propose) == 2 and "write_patches" in capsys.readouterr().err
     text = (configs_folder() / "house-corner-conditions.yaml").read_text()
     (tmp_path / "c.yaml").write_text(text.replace(", reveals]", "]").replace('"*-wall"', '"wall-*"'))
     words = [
@@ -292,7 +292,7 @@ camera: {offset: 0 K, repeatability: 0 K}
 surfaces: [{emissivity: 0.93}]
 """)
     given = ["audit", str(export / "mesh.vtu"), "--conditions", str(tmp_path / "c.yaml"), "--envelope", "gbxml"]
-    assert cli.main([*given, "--output-dir", str(tmp_path / "out")]) == 1
+    assert cli.main([*given, "--output-dir", str(tmp_path / "out")]) == 2
     assert "envelope: expected" in capsys.readouterr().err and not [*(tmp_path / "out").iterdir()]
 
 
@@ -300,8 +300,8 @@ def test_a_scene_that_cannot_be_read_is_refused_before_the_audit(export, tmp_pat
     monkeypatch.setattr("thermoxels_ns.audit.run.audit", lambda *_: pytest.fail("too late"))
     given = ["audit", str(export / "mesh.vtu"), "--conditions", str(export / "conditions.yaml")]
     given += ["--output-dir", str(tmp_path / "out"), "--scene", str(tmp_path)]
-    assert cli.main(given) == 1 and "expected transforms.json" in capsys.readouterr().err
-    assert cli.main([*given, "--layout", "colmap"]) == 1
+    assert cli.main(given) == 2 and "expected transforms.json" in capsys.readouterr().err
+    assert cli.main([*given, "--layout", "colmap"]) == 2
 
 
 def test_an_earlier_audit_is_compared_on_the_page_and_in_the_answers(export, done, tmp_path, capsys) -> None:
@@ -316,12 +316,12 @@ def test_an_earlier_audit_is_compared_on_the_page_and_in_the_answers(export, don
     assert "same coordinates" in capsys.readouterr().out and "answers.json" in dict(answers["report"]["inputs"])
     given = ["audit", str(export / "mesh.vtu"), "--conditions", str(export / "conditions.yaml"), "--compare"]
     before = (done / "answers.json").read_bytes()
-    assert cli.main([*given, str(done / "answers.json"), "--output-dir", str(done)]) == 1
+    assert cli.main([*given, str(done / "answers.json"), "--output-dir", str(done)]) == 2
     assert "output folder: expected" in capsys.readouterr().err and (done / "answers.json").read_bytes() == before
     (tmp_path / "answers.json").write_text("{}")
-    assert cli.main([*given, str(tmp_path / "answers.json"), "--output-dir", str(tmp_path / "other")]) == 1
+    assert cli.main([*given, str(tmp_path / "answers.json"), "--output-dir", str(tmp_path / "other")]) == 2
     assert "without conditions and up" in capsys.readouterr().err
     damaged = json.loads(before) | {"up": ["x", "y", "z"]}
     (tmp_path / "answers.json").write_text(json.dumps(damaged))
-    assert cli.main([*given, str(tmp_path / "answers.json"), "--output-dir", str(tmp_path / "other")]) == 1
+    assert cli.main([*given, str(tmp_path / "answers.json"), "--output-dir", str(tmp_path / "other")]) == 2
     assert "without up" in capsys.readouterr().err

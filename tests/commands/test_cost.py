@@ -262,7 +262,7 @@ def test_the_command_line(commands, scene, tmp_path, capsys):
     assert cli.main(words) == 0
     assert "an RGB PSNR of at least 24 dB: 32:100" in " ".join(capsys.readouterr().out.split())
     assert commands.calls()[0][-2:] == ["--pipeline.model.seed", "3"]
-    assert cli.main([*words[:5], "32"]) == 1
+    assert cli.main([*words[:5], "32"]) == 2
     assert "Error: settings: expected voxels and steps" in capsys.readouterr().err
 
 

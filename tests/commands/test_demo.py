@@ -233,7 +233,7 @@ def test_the_demo_of_the_house_ends_with_its_audit(quick_demo, fake_command, tmp
 @pytest.mark.parametrize(("fscore", "shown"), [(0.59, "0.590"), (math.nan, "not measured")])
 def test_a_missed_target_is_shown_and_fails_after_the_page_is_written(quick_demo, tmp_path, capfd, fscore, shown):
     quick_demo(SUMMARY | {"truth": SUMMARY["truth"] | {"fscore": fscore}})
-    assert cli.main(["demo", "--output-dir", str(tmp_path / "demo"), "--scene", "sphere"]) == 1
+    assert cli.main(["demo", "--output-dir", str(tmp_path / "demo"), "--scene", "sphere"]) == 2
     error = capfd.readouterr().err
     assert f"Surface F-score at 1.5 voxels {shown} (target ≥ 0.600)" in error
     assert "RGB PSNR" not in error
@@ -242,7 +242,7 @@ def test_a_missed_target_is_shown_and_fails_after_the_page_is_written(quick_demo
 
 def test_a_failing_step_stops_the_demo(quick_demo, fake_command, tmp_path, capfd):
     fake_command("ns-eval", "sys.exit('checkpoint not found')")
-    assert cli.main(["demo", "--output-dir", str(tmp_path / "demo"), "--scene", "sphere"]) == 1
+    assert cli.main(["demo", "--output-dir", str(tmp_path / "demo"), "--scene", "sphere"]) == 2
     shown_text = capfd.readouterr()
     assert "ns-eval: expected exit status 0, got 1" in shown_text.err
     assert "checkpoint not found" in shown_text.err

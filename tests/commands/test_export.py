@@ -413,7 +413,7 @@ def test_main_prints_one_clean_error_and_exits_1_but_hides_no_bug(
     with pytest.raises(SystemExit if named else ZeroDivisionError) as ended:
         ExportThermoxelsMesh(load_config=config_file, output_dir=tmp_path / "out").main()
     if named:
-        assert isinstance(ended.value, SystemExit) and ended.value.code == 1
+        assert isinstance(ended.value, SystemExit) and ended.value.code == 2
         printed = " ".join(capsys.readouterr().out.split())
         assert f"Error: {named}" in printed and "Traceback" not in printed
 

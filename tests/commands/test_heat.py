@@ -150,7 +150,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_of_a_file(folder, hour, tmp_
     words = ["heat", str(folder / "room" / "mesh.vtu"), "--scene", str(folder / "hour.yaml"), *PROBES]
     capsys.readouterr()
     with files_end_after(size_bytes):
-        assert cli.main([*words, "--output-dir", str(tmp_path / "out")]) == 1
+        assert cli.main([*words, "--output-dir", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and broken in said and "space" in said, said
     left = files_of(tmp_path / "out")
@@ -217,7 +217,7 @@ def test_the_up_of_an_export_is_used(folder, tmp_path) -> None:
 
 def test_bad_input_is_one_sentence_and_exit_status_1(folder, tmp_path, capsys) -> None:
     words = ["heat", str(folder / "room" / "mesh.vtu"), "--output-dir", str(tmp_path / "out")]
-    assert cli.main([*words, "--scene", "summer-nite"]) == 1
+    assert cli.main([*words, "--scene", "summer-nite"]) == 2
     shown = capsys.readouterr().err.splitlines()
     assert len(shown) == 1 and shown[0].startswith("Error: heat scene: expected"), shown
     (tmp_path / "out" / "report.html").mkdir(parents=True)
@@ -362,7 +362,7 @@ def test_an_example_of_a_scene_is_written_and_read(folder, tmp_path, capsys) -> 
     words = ["heat", "--write-scene", str(tmp_path / "mine.yaml")]
     assert cli.main(words) == 0 and "pass it with --scene" in capsys.readouterr().out
     assert load_heat_scene(tmp_path / "mine.yaml") == load_heat_scene("all-effects")
-    assert cli.main(words) == 1 and "a name that is free" in capsys.readouterr().err
+    assert cli.main(words) == 2 and "a name that is free" in capsys.readouterr().err
 
 
 def test_an_audits_resistances_become_layers(folder, tmp_path) -> None:

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import remove_file, result_folder
 from thermoxels_ns.core.config_loader import check_run
-from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, SceneError, ThermoxelsError, exit_status
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.core.lattice import Lattice, input_from_world
 from thermoxels_ns.data.scene_scale import (
@@ -187,7 +187,7 @@ class ExportThermoxelsMesh(ExportOptions):
     """Folder for the results; made if it does not exist."""
 
     def main(self) -> None:
-        """Run the export; a `ThermoxelsError` is printed as one sentence, and the exit status is then 1."""
+        """Run the export; a `ThermoxelsError` is printed as one sentence, and ends with `errors.exit_status`."""
         from nerfstudio.utils.rich_utils import CONSOLE
         from rich.markup import escape
 
@@ -197,7 +197,7 @@ class ExportThermoxelsMesh(ExportOptions):
                 self.run(lambda line: CONSOLE.print(escape(line)))
         except ThermoxelsError as problem:
             CONSOLE.print(f"[bold red]Error:[/bold red] {escape(str(problem))}")
-            raise SystemExit(1) from None
+            raise SystemExit(exit_status(problem)) from None
 
     def run(self, say: Say) -> dict[str, Any]:
         """Run the export and return the summary that summary.json holds, or raise `ThermoxelsError`."""

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from thermoxels_ns.core import quiet_warnings
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import BAD_DATA, CRASH, LACK_OF_MEMORY, ThermoxelsError, explain
 
 if TYPE_CHECKING:
     # Linux reports for a process at least the peak memory of the process that started it: import little here.
@@ -39,6 +39,19 @@ class ProcessCost(NamedTuple):
     peak_memory_gb: float
     """Largest resident memory of the process, [1e9 bytes]; NaN if the system has no `wait4`, or if the process took no
     more memory than the process that started it."""
+
+
+class CommandFailed(ThermoxelsError):
+    """A command of this installation ended with an error."""
+
+    def __init__(self, message: str, returncode: int, lines: Sequence[str]) -> None:
+        super().__init__("\n".join([message, *(f"    {line}" for line in lines[-_LAST_LINES:])]))
+        killed = returncode in (-9, 137)  # as Linux does where memory runs out
+        self.exit_status = (
+            LACK_OF_MEMORY if killed else returncode if returncode in (BAD_DATA, LACK_OF_MEMORY) else CRASH
+        )
+        self.last_line = "killed" if killed else lines[-1].strip() if lines else f"exit status {returncode}"
+        """Last line of its output, which says why."""
 
 
 def command_line(arguments: Sequence[str | Path]) -> str:
@@ -96,7 +109,7 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
         remedy = f"Its whole output is in {log}; its last lines:"
         message = explain(words[0], expected="exit status 0", got=process.returncode, remedy=remedy)
         lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-        raise ThermoxelsError("\n".join([message, *(f"    {line}" for line in lines[-_LAST_LINES:])]))
+        raise CommandFailed(message, process.returncode, lines)
     return ProcessCost(time.monotonic() - start, peak_memory_gb)
 
 

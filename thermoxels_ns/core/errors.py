@@ -2,6 +2,8 @@
 
 import unicodedata
 
+BAD_DATA, LACK_OF_MEMORY, CRASH = 2, 3, 1
+"""Exit statuses of commands: their input or options are wrong; memory does not suffice; an error of the program."""
 _UNPRINTED = ("Cc", "Cs")  # categories of control characters, which break lines or terminals, and undecodable bytes
 
 
@@ -50,6 +52,13 @@ class AuditError(ThermoxelsError, ValueError):
 
 class OutputError(ThermoxelsError, OSError):
     """A result cannot be written to the place that was asked for."""
+
+
+def exit_status(problem: BaseException) -> int:
+    """Return the exit status of a command that ends with an error."""
+    if isinstance(problem, MemoryError):
+        return LACK_OF_MEMORY
+    return BAD_DATA if isinstance(problem, ThermoxelsError) else CRASH
 
 
 def explain(name: str, *, expected: str, got: object, remedy: str) -> str:
