@@ -25,6 +25,7 @@ too, for the truth as for the audits, and a calm, clear night is added, whose sk
 
 import csv
 import shutil
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass, replace
@@ -222,15 +223,22 @@ class AuditTruth:
 
     def main(self) -> None:
         rows: Rows = {}
+        refused: Counter[str] = Counter()
         if self.trained:
             return run_trained(self.output, self.trained, self.seeds)
         if self.calibrate and self.history_h > 0.0:
             with TemporaryDirectory() as folder:
                 for seed, side, steady in product(range(self.seeds), ("outside", "inside"), (False, True)):
                     how = f"{side}, {'as if steady' if steady else f'{self.history_h:g} h of air'}"
-                    found, _ = calibrated_after(side, seed, Path(folder), self.history_h, steady)
-                    rows.setdefault((how, "conductivity of wall"), []).append((CONDUCTIVITY["wall"], found))
+                    found, calibration = calibrated_after(side, seed, Path(folder), self.history_h, steady)
+                    print(seed, how, *astuple(found)[:3], calibration.refused[:60], sep="; ", file=sys.stderr)
+                    if calibration.refused:
+                        refused[how] += 1
+                    else:
+                        rows.setdefault((how, "conductivity of wall"), []).append((CONDUCTIVITY["wall"], found))
             report(rows)
+            for how, count in refused.items():
+                print(f"{how}: {count} of {self.seeds} refused")
             return
         if self.calibrate:
             for seed, side in product(range(self.seeds), ("outside", "inside")):
