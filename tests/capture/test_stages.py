@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.support.board_pictures import BOARD, board_pairs, write_board_folder
 from tests.support.camera_card import photograph
 from tests.support.posed_model import ring_model
 from tests.support.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
 from thermoxels_ns import cli
-from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.rig_types import PARAMETERS, RigEstimate, RigFrame
 from thermoxels_ns.capture.scene_writer import TRACKS_NAME, scene_names, write_scene_folder
@@ -236,9 +236,8 @@ def test_tracks_say_which_training_photograph_sees_which_point(written):
 
 def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, tmp_path, monkeypatch):
     scene, folder = written
-    overlay = np.ones((VISIBLE.height, VISIBLE.width), dtype=bool)
-    overlay[:40, :100] = False
-    masked = replace(scene, masks=PhotographMasks((VISIBLE.width, VISIBLE.height), overlay))
+    Image.new("L", (VISIBLE.width, VISIBLE.height)).save(tmp_path / "mask.png")
+    masked = replace(scene, masks={scene.frames[0].name: tmp_path / "mask.png"})
     write_scene_folder(masked, folder)
     assert (folder / "masks").is_dir()
     (folder / "notes.txt").write_text("mine")

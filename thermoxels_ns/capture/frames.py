@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_mask, read_photograph_facts
+from thermoxels_ns.capture.photograph import GpsFix, mask_files, open_photograph, read_photograph_facts
 from thermoxels_ns.capture.stage_cache import load_json
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
@@ -78,13 +78,12 @@ def read_frames(
     folder: Path,
     radiometry: RadiometryOptions,
     skip_bad: bool,
-    thermal_mask: Path | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> CaptureFrames:
     """Write each pair's temperatures, and photographs taken out of thermal files, to `folder`; return the frames.
 
-    Pixels of the thermal sensor that are stuck at one value, and pixels that the user's mask excludes, become NaN. With
-    `skip_bad` a pair with an unreadable file goes to `dropped`, as thermal images of an unusual size always do.
+    Pixels of the thermal sensor that are stuck at one value become NaN. With `skip_bad` a pair with an unreadable file
+    goes to `dropped`, as thermal images of an unusual size always do.
 
     Raises:
         ThermoxelsError: A file cannot be read and `skip_bad` is off, or no pair is left.
@@ -114,7 +113,7 @@ def read_frames(
             got, most = f"{own[0]} x {own[1]} pixels", f"{size[0]} x {size[1]}"
             dropped[frame.name] = f"{frame.thermal_source} has {got}, most have {most}: another thermal camera"
     kept = [frame for frame in frames if frame.name not in dropped]
-    dead, kept = _without_stuck_pixels(kept, size, thermal_mask)
+    dead, kept = _without_stuck_pixels(kept)
     result = CaptureFrames(tuple(kept), size, dead, dropped)
     bare = [replace(frame, photograph=frame.photograph.name, thermal=frame.thermal.name) for frame in kept]
     write_json(folder / _LIST, replace(result, frames=bare))
@@ -164,24 +163,40 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
     return frame, (width, height)
 
 
-def _without_stuck_pixels(
-    frames: list[CaptureFrame], size: tuple[int, int], thermal_mask: Path | None
-) -> tuple[int, list[CaptureFrame]]:
-    """Set stuck and masked pixels to NaN in all frames; return the number of stuck pixels and the frames."""
+def _without_stuck_pixels(frames: list[CaptureFrame]) -> tuple[int, list[CaptureFrame]]:
+    """Set stuck pixels to NaN in all frames; return their number and the frames."""
     some = np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FOR_DEAD_PIXELS)).round().astype(int)
     bad = find_dead_pixels(np.stack([np.load(frames[i].thermal) for i in some]))
-    dead = int(bad.sum())
-    if thermal_mask is not None:
-        bad = bad | ~read_mask(thermal_mask, *size)
     if not bad.any():
-        return dead, frames
+        return 0, frames
     changed = []
     for frame in frames:
         temperature_c = np.load(frame.thermal)
         temperature_c[bad] = np.nan
         np.save(frame.thermal, temperature_c)
         changed.append(replace(frame, masked=int(np.isnan(temperature_c).sum())))
-    return dead, changed
+    return int(bad.sum()), changed
+
+
+def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str, Path]:
+    """Return the user's mask file of each frame, named like its photograph or frame; frames without a mask are absent.
+
+    Raises `SceneError` if `folder` does not exist or no mask fits; without `folder` the result is empty.
+    """
+    if folder is None:
+        return {}
+    files = mask_files(folder)
+    found = {}
+    for frame in frames:
+        names = (Path(frame.photograph_source).stem.lower(), frame.name.lower())
+        own = next((files[name] for name in names if name in files), None)
+        if own is not None:
+            found[frame.name] = own
+    if not found:
+        remedy = f"Name them like {Path(frames[0].photograph_source).stem}.png."
+        got = f"{len(files)} pictures in {folder}, none of them named so"
+        raise SceneError("masks", expected="masks named like photographs", got=got, remedy=remedy)
+    return found
 
 
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:

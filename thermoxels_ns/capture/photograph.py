@@ -96,6 +96,20 @@ def read_mask(path: Path, width: int, height: int) -> BoolArray:
     return mask
 
 
+def mask_of(frame: str, masks: Mapping[str, Path], width: int, height: int) -> BoolArray:
+    """Return a frame's mask from its file in `masks`, see `read_mask`; True everywhere for a frame without a file."""
+    return read_mask(masks[frame], width, height) if frame in masks else np.ones((height, width), dtype=bool)
+
+
+def mask_files(folder: Path) -> dict[str, Path]:
+    """Return the masks in a folder by their names' stems in lower case; raise `SceneError` without such a folder."""
+    if not folder.is_dir():
+        raise SceneError("masks", expected="a folder of masks", got=f"no folder at {folder}", remedy="Check the path.")
+    return {
+        path.stem.lower(): path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".png", ".jpg", ".jpeg")
+    }
+
+
 def _number(value: object) -> float | None:
     """Return an EXIF value (number or fraction) as a finite float, or None if it is no finite number."""
     try:

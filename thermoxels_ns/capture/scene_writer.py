@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.capture.frames import CaptureFrame
-from thermoxels_ns.capture.masks import PhotographMasks
-from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.photograph import mask_of, open_photograph
 from thermoxels_ns.capture.rig_types import DriftEstimate, FloatArray, RigEstimate
 from thermoxels_ns.capture.sfm.scale_and_up import Up
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
@@ -46,7 +45,7 @@ class Scene:
     drift: DriftEstimate
     scale: SceneScale | None
     up: Up
-    masks: PhotographMasks
+    masks: Mapping[str, Path]  # the user's mask files by frame name; a frame without one is used everywhere
 
 
 def scene_names(count: int) -> list[str]:
@@ -65,7 +64,7 @@ def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = 
     """Write a scene into `output` in place of an earlier one; transforms.json comes last and marks it as complete."""
     new = output / CACHE_FOLDER / "new_scene"
     shutil.rmtree(new, ignore_errors=True)
-    for name in _FOLDERS if scene.masks.any else _FOLDERS[:2]:
+    for name in _FOLDERS if scene.masks else _FOLDERS[:2]:
         writable_folder(new / name)
     entries = []
     for number, (frame, name) in enumerate(zip(scene.frames, scene_names(len(scene.frames)))):
@@ -121,8 +120,9 @@ def _write_frame(scene: Scene, number: int, frame: CaptureFrame, name: str, fold
         "source": frame.photograph_source,
         "thermal_source": frame.thermal_source,
     }
-    if scene.masks.any:
-        mask = np.where(scene.masks.of(frame.name), np.uint8(255), np.uint8(0))
+    if scene.masks:
+        camera = scene.model.camera
+        mask = np.where(mask_of(frame.name, scene.masks, camera.width, camera.height), np.uint8(255), np.uint8(0))
         Image.fromarray(mask).save(folder / "masks" / f"{name}.png")
         entry["mask_path"] = f"masks/{name}.png"
     return entry

@@ -83,9 +83,5 @@ class CaptureSettings:
     """Side of one square of the checker board, in metres."""
     drift: Literal["auto", "off"] = "auto"
     """Correct vignetting and offsets between thermal images, if this helps at points that the fit does not use."""
-    find_overlays: bool = True
-    """Mask text and logos that the camera drew over all photographs."""
     masks: Path | None = None
     """Folder of masks, each named like its photograph: white where the photograph may be used."""
-    thermal_mask: Path | None = None
-    """One mask for all thermal images: white where the thermal images may be used."""

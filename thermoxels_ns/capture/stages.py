@@ -11,9 +11,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder
-from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
-from thermoxels_ns.capture.masks import PhotographMasks, find_masks, mask_files, user_masks
+from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames, user_masks
 from thermoxels_ns.capture.pairs import Pair, read_pair_list, search_pairs
+from thermoxels_ns.capture.photograph import mask_files
 from thermoxels_ns.capture.rig.board import CheckerBoard, board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.rig.drift import estimate_drift, no_drift
 from thermoxels_ns.capture.rig.search import estimate_rig
@@ -51,7 +51,6 @@ from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 PAGE_NAME = "capture.html"  # file name of the report, in the output folder
 _MOST_NAMED = 10  # how many of the files left out are named while the command runs; the page names all
 _LEAST_SIGHTINGS = 50  # with fewer sightings of scene points, thermal images and photographs cannot be compared
-_OVERLAY_FILE = "overlay.npy"
 
 
 @dataclass(frozen=True)
@@ -137,13 +136,9 @@ class _Capture:
         board = self.board_rig(model, read)
         rig, start = self.rig(model, frames, read, scale, scale_missing, board)
         drift = self.drift(model, frames, rig)
-        size, file = (model.camera.width, model.camera.height), self.output / CACHE_FOLDER / "poses" / _OVERLAY_FILE
-        overlay = np.load(file) if file.is_file() else None
-        if overlay is not None and overlay.shape != size[::-1]:
-            overlay = None
-        masks = PhotographMasks(size, overlay, user_masks(frames, self.settings.masks))
+        masks = user_masks(frames, self.settings.masks)
         scene = Scene(frames, model, rig, drift, scale, up, masks)
-        written = [self.output / name for name in SCENE_CONTENT if name != "masks" or masks.any]
+        written = [self.output / name for name in SCENE_CONTENT if name != "masks" or masks]
         self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
         given = self.settings.poses
         source = f"Given in {given.name}." if given else "Structure from motion on the photographs (COLMAP)."
@@ -202,11 +197,10 @@ class _Capture:
             "options": options,
             "library": given_fingerprints([library]),
             "skip_bad": settings.skip_bad,
-            "mask": given_fingerprints([settings.thermal_mask]),
         }
 
         def work(folder: Path) -> None:
-            read = read_frames(pairs, self.source, folder, options, settings.skip_bad, settings.thermal_mask, self.say)
+            read = read_frames(pairs, self.source, folder, options, settings.skip_bad, self.say)
             width, height = read.thermal_size
             self.say(f"temperatures: {len(read.frames)} thermal images of {width} x {height} pixels")
 
@@ -222,15 +216,11 @@ class _Capture:
             "options": {name: getattr(settings, name) for name in names},
             "poses": given_fingerprints([] if settings.poses is None else files_of(settings.poses)),
             "masks": given_fingerprints([] if settings.masks is None else list(mask_files(settings.masks).values())),
-            "overlays": settings.find_overlays,
         }
 
         def work(folder: Path) -> None:
             photographs = {frame.name: frame.photograph for frame in read.frames}
-            masks = find_masks(read.frames, settings.masks, settings.find_overlays)
-            if masks.overlay is not None:
-                np.save(folder / _OVERLAY_FILE, masks.overlay)
-                self.say(f"masks: {100 * (1 - masks.overlay.mean()):.1f} % of every photograph is drawn over")
+            masks = user_masks(read.frames, settings.masks)
             if settings.poses is None:
                 focal = [frame.focal_px for frame in read.frames if frame.focal_px]
                 middle = float(np.median(focal)) if focal else None

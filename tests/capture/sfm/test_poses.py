@@ -9,7 +9,6 @@ from PIL import Image
 from tests.support.colmap_model import write_colmap_model
 from tests.support.posed_model import CAMERA, ring_model
 from tests.support.textured_room import VISIBLE, write_card
-from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.colmap import model_of_colmap
 from thermoxels_ns.capture.sfm.poses import (
@@ -57,8 +56,9 @@ def test_masked_parts_have_no_features(card, tmp_path):
     photographs, _ = card
     use = np.ones((VISIBLE.height, VISIBLE.width), dtype=bool)
     use[:, :200] = False
-    masks = PhotographMasks((VISIBLE.width, VISIBLE.height), use)
+    Image.fromarray(use).save(tmp_path / "mask.png")
     some = {name: photographs[name] for name in ("shot0", "shot1", "shot2", "shot3")}
+    masks = dict.fromkeys(some, tmp_path / "mask.png")
     model = find_poses(some, tmp_path, SETTINGS, 430.0, masks).model
     assert model.sighting_pixel[:, 0].min() > 195
 

@@ -154,7 +154,7 @@ def rig_from_board_photos(
     there are no pairs, image sizes differ from the capture's, or fewer than three pairs show the board to both cameras.
     """
     found = search_pairs(source, settings, say=say).pairs
-    read = read_frames(found, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
+    read = read_frames(found, source, folder, radiometry, settings.skip_bad, say)
     pairs, size = [], (visible.width, visible.height)
     for frame in read.frames:
         photograph = open_photograph(frame.photograph)

@@ -6,13 +6,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from thermoxels_ns.capture.masks import PhotographMasks
-from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
+from thermoxels_ns.capture.photograph import mask_of, open_photograph, read_photograph_facts
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.capture.settings import CaptureSettings, LensModel, Matching
 from thermoxels_ns.capture.sfm.colmap import model_of_colmap, run_in_process
@@ -67,12 +67,13 @@ def find_poses(
     folder: Path,
     settings: CaptureSettings,
     focal_px: float | None = None,
-    masks: PhotographMasks | None = None,
+    masks: Mapping[str, Path] = MappingProxyType({}),
     say: Callable[[str], None] = lambda _: None,
 ) -> Poses:
     """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
 
-    `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length.
+    `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length;
+    `masks` are files by frame name.
     Results of an interrupted run in `folder` are reused. Only the largest set of photographs that fit together is kept.
 
     Raises:
@@ -104,7 +105,7 @@ def add_points(
     photographs: Mapping[str, Path],
     folder: Path,
     settings: CaptureSettings,
-    masks: PhotographMasks | None = None,
+    masks: Mapping[str, Path] = MappingProxyType({}),
     say: Callable[[str], None] = lambda _: None,
 ) -> SfmModel:
     """Return the model `given` with scene points that at least two photographs show; lens and poses stay unchanged.
@@ -169,7 +170,7 @@ def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[
 
 
 def _reduced(
-    photographs: Mapping[str, Path], folder: Path, size: tuple[int, int], longest: int, masks: PhotographMasks | None
+    photographs: Mapping[str, Path], folder: Path, size: tuple[int, int], longest: int, masks: Mapping[str, Path]
 ) -> tuple[ReducedPhotographs, tuple[int, int]]:
     """Write photographs for COLMAP, at most `longest` pixels wide and high, and their masks, into `folder`.
 
@@ -190,14 +191,13 @@ def _reduced(
             temporary = images / f".{file}"
             picture.save(temporary, format="JPEG", quality=_JPEG_QUALITY)
             temporary.replace(images / file)
-    masked = masks is not None and masks.any
-    if masks is not None and masked:
+    if masks:
         mask_folder.mkdir(exist_ok=True)
         for file, frame in files.items():
             # COLMAP looks for the photograph's name with .png behind it.
-            use = Image.fromarray(np.where(masks.of(frame), np.uint8(255), np.uint8(0)))
+            use = Image.fromarray(np.where(mask_of(frame, masks, *size), np.uint8(255), np.uint8(0)))
             use.resize(small, Image.Resampling.NEAREST).save(mask_folder / f"{file}.png")
-    return ReducedPhotographs(folder / _DATABASE, images, files, size, mask_folder if masked else None), small
+    return ReducedPhotographs(folder / _DATABASE, images, files, size, mask_folder if masks else None), small
 
 
 def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
