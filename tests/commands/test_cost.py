@@ -93,7 +93,7 @@ def start(scene, tmp_path, commands):
 
     def run(**options) -> str:
         console = Console(file=io.StringIO(), width=200)
-        defaults = {"settings": ("32:100", "64:400"), "qualities": (), "warm_up": False}
+        defaults = {"settings": ("32:100", "64:400"), "qualities": ()}
         run_cost(Cost(**({"scene": scene, "output_dir": tmp_path / "cost"} | defaults | options)), console)
         assert isinstance(console.file, io.StringIO)
         return console.file.getvalue()
@@ -176,12 +176,12 @@ def test_figures_of_the_runs_reach_all_files(start, scene, tmp_path):
 
 
 def test_the_real_commands_get_what_they_need(start, scene, tmp_path, commands):
-    start(settings=("64:400",), train_options="thermal-data --downscale-factor 2", keep_models=True)
+    start(settings=("64:400",), train_options="thermal-data --downscale-factor 2")
     train, evaluate = map(" ".join, commands.calls())
     assert train.startswith(f"ns-train thermoxels --data {scene} --output-dir {tmp_path / 'cost' / 'models'} ")
     assert " --max-num-iterations 400 " in train and train.endswith("thermal-data --downscale-factor 2")
     config = tmp_path / "cost" / "models" / "64-400-1" / "thermoxels" / "run" / "config.yml"
-    assert evaluate.startswith(f"ns-eval --load-config {config} --output-path ") and config.is_file()
+    assert evaluate.startswith(f"ns-eval --load-config {config} --output-path ")
 
 
 def test_finished_runs_are_not_run_again(start, commands, scene, tmp_path):
@@ -196,9 +196,6 @@ def test_finished_runs_are_not_run_again(start, commands, scene, tmp_path):
     assert [call[0] for call in commands.calls()] == ["ns-train", "ns-eval"]
     assert list(table(tmp_path / "cost")) == ["32:100", "48:200"]
     assert [key.setting for key in read_runs(tmp_path / "cost" / "runs.csv")] == ["32:100", "64:400", "48:200"]
-    start(again=True)
-    assert len(commands.calls()) == 4
-    assert sorted(key.setting for key in read_runs(tmp_path / "cost" / "runs.csv")) == ["32:100", "48:200", "64:400"]
     start(settings=("32:100",), train_options="--pipeline.model.seed 1")
     assert len(commands.calls()) == 2  # other options, and below other scenes
     for name, text in (("a.png", "1234"), ("a.png", "12345"), ("transforms.json", "[]")):
@@ -221,7 +218,7 @@ def test_an_interrupted_start_goes_on_where_it_stopped(start, commands, tmp_path
     empty = NS_EVAL.replace('"results": results', '"results": [1]')
     commands.write("ns-eval", empty)
     with pytest.raises(ThermoxelsError, match=r"1\.json: expected the results"):
-        start(again=True)
+        start(settings=("48:100",))
 
 
 def test_repeats_are_run_in_turns_and_their_medians_shown(start, commands, tmp_path):
@@ -236,17 +233,6 @@ def test_repeats_are_run_in_turns_and_their_medians_shown(start, commands, tmp_p
     assert "medians of 3 runs" in shown
 
 
-def test_the_warm_up_is_the_first_setting_and_does_not_count(start, commands, tmp_path):
-    start(settings=("32:100", "64:400"), qualities=("draft",), warm_up=True)
-    trained = [call for call in commands.calls() if call[0] == "ns-train"]
-    assert len(trained) == 4
-    assert trained[0][trained[0].index("--max-num-iterations") + 1] == "100"
-    assert len(read_runs(tmp_path / "cost" / "runs.csv")) == 3
-    assert not any((tmp_path / "cost" / "models").iterdir())
-    start(settings=("32:100", "64:400"), qualities=("draft",), warm_up=True)
-    assert commands.calls() == []
-
-
 def test_a_damaged_list_of_runs_is_named(start, tmp_path):
     start(settings=("32:100",))
     path = tmp_path / "cost" / "runs.csv"
@@ -258,7 +244,7 @@ def test_a_damaged_list_of_runs_is_named(start, tmp_path):
 
 def test_the_command_line(commands, scene, tmp_path, capsys):
     words = ["cost", str(scene), "--output-dir", str(tmp_path / "c"), "--settings", "32:100", "--qualities"]
-    words += ["--warm-up", "False", "--train-options=--pipeline.model.seed 3", "--target-psnr", "24"]
+    words += ["--train-options=--pipeline.model.seed 3", "--target-psnr", "24"]
     assert cli.main(words) == 0
     assert "an RGB PSNR of at least 24 dB: 32:100" in " ".join(capsys.readouterr().out.split())
     assert commands.calls()[0][-2:] == ["--pipeline.model.seed", "3"]
@@ -313,7 +299,7 @@ def test_the_cheapest_setting_keeps_all_targets(targets, name):
     assert (best and best.setting.name) == name
     if best is None:
         words = verdict(rows, targets, Path("s"))
-        assert "The best: MAE 0.30 °C (fine), PSNR 33.0 dB (fine)." in words and "--settings" in words
+        assert words.startswith("No measured setting has ") and "--settings" in words
 
 
 def test_the_table_has_only_columns_with_figures_and_marks_the_front():

@@ -12,7 +12,6 @@ import shlex
 import shutil
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -77,7 +76,8 @@ class Cost:
     and surface errors, as csv, plot and a table for a README.
 
     Finished runs are kept in runs.csv in the output folder; if the command was interrupted, start it again and it goes
-    on where it stopped. The machine should do nothing else."""
+    on where it stopped. Remove the file to measure again. The machine should do nothing else, and have trained once
+    before, because the first training compiles kernels."""
 
     scene: tyro.conf.Positional[Path]
     """Scene folder. In a synthetic scene the trained surface is compared with the exact surface."""
@@ -106,12 +106,6 @@ class Cost:
     train_options: str = ""
     """Further options for all ns-train commands, as one quoted text after an equals sign, for instance
     --train-options="--pipeline.model.near-plane 0.05"."""
-    warm_up: bool = True
-    """Train the first setting once before the measured runs, so that no measured run compiles kernels."""
-    keep_models: bool = False
-    """Keep the trained models in the folder models."""
-    again: bool = False
-    """Measure runs again that runs.csv already holds, for instance after a change of the program."""
 
     def main(self) -> None:
         """Measure and report; raises `ThermoxelsError` if an option or the scene cannot be used, or a run failed."""
@@ -176,23 +170,18 @@ def run_cost(cost: Cost, console: Console) -> None:
         for repeat in range(1, cost.repeats + 1)
         for setting in settings
     }
-    runs = {key: found for key, found in read_runs(folder / _RUNS).items() if not (cost.again and key in plan)}
+    runs = read_runs(folder / _RUNS)
     pending = [key for key in plan if key not in runs]
     if len(pending) < len(plan):
         kept = len(plan) - len(pending)
-        say(f"{kept} of {len(plan)} runs are in {folder / _RUNS} already; --again True measures them again.")
-    if pending and cost.warm_up:
-        first = plan[pending[0]]
-        say(f"Warm-up with {first.name}, not counted ...")
-        with suppress(ThermoxelsError):  # the first counted run reports the same error
-            measure(cost.scene, first, "warm-up", folder, False, console)
+        say(f"{kept} of {len(plan)} runs are in {folder / _RUNS} already; remove it to measure them again.")
     failed: list[str] = []
     for number, key in enumerate(pending, start=1):
         title = key.setting if cost.repeats == 1 else f"{key.setting}, run {key.repeat}"
         say(f"[{number}/{len(pending)}] {title} ...")
         try:
             name = re.sub(r"[^0-9A-Za-z.-]+", "-", f"{key.setting}-{key.repeat}")
-            runs[key] = measure(cost.scene, plan[key], name, folder, cost.keep_models, console)
+            runs[key] = measure(cost.scene, plan[key], name, folder, console)
         except ThermoxelsError as problem:
             failed.append(f"{title}: {problem}")
             say(f"{title} failed: {problem}")
@@ -336,8 +325,8 @@ def _write_csv(path: Path, head: Sequence[str], lines: Iterable[Sequence[object]
         csv.writer(file).writerows([head, *lines])
 
 
-def measure(scene: Path, setting: CostSetting, name: str, folder: Path, keep_model: bool, console: Console) -> Figures:
-    """Train a setting, evaluate the model, return all figures. Logs, model and results in `folder` are named `name`."""
+def measure(scene: Path, setting: CostSetting, name: str, folder: Path, console: Console) -> Figures:
+    """Train a setting, evaluate and remove the model, return all figures; logs and results are named `name`."""
     models, logs, evaluations = (writable_folder(folder / part) for part in ("models", "logs", "eval"))
     shutil.rmtree(models / name, ignore_errors=True)
     run_folder, output = models / name / setting.method / "run", evaluations / f"{name}.json"
@@ -349,8 +338,7 @@ def measure(scene: Path, setting: CostSetting, name: str, folder: Path, keep_mod
         figures = {"seconds": cost.seconds, "peak_memory_gb": cost.peak_memory_gb}
         return figures | {"training_seconds": training_seconds(run_folder), **read_evaluation(output)}
     finally:
-        if not keep_model:
-            shutil.rmtree(models / name, ignore_errors=True)
+        shutil.rmtree(models / name, ignore_errors=True)
 
 
 def training_seconds(run_folder: Path) -> float:
@@ -423,24 +411,14 @@ def cheapest(rows: Iterable[CostRow], targets: Mapping[str, float]) -> CostRow |
 
 
 def verdict(rows: Sequence[CostRow], targets: Mapping[str, float], scene: Path) -> str:
-    """Return a sentence on the fastest setting that meets all targets, or else on the best value of each figure."""
+    """Return a sentence on the fastest setting that meets all targets."""
     wanted = " and ".join(_TARGETS[name].format(bound) for name, bound in targets.items())
     best = cheapest(rows, targets)
-    if best is not None:
-        figures = ", ".join(_text(best.figures, name) for name in ("seconds", *_TARGETS))
-        found = f"Cheapest setting with {wanted}: {best.setting.name} ({figures})."
-        return f"{found} Train with: {best.setting.command('--data', str(scene))}"
-    nearest = []
-    for name in _TARGETS:
-        known = [row for row in rows if not math.isnan(row.figures[name])]
-        if known:
-            choose = max if FIGURES[name].higher_is_better else min
-            row = choose(known, key=lambda row: row.figures[name])
-            nearest.append(f"{FIGURES[name].short} {_text(row.figures, name)} ({row.setting.name})")
-    return (
-        f"No measured setting has {wanted}. The best: {', '.join(nearest)}. "
-        "Measure more steps or voxels with --settings, or relax the target."
-    )
+    if best is None:
+        return f"No measured setting has {wanted}. Measure more steps or voxels with --settings, or relax the target."
+    figures = ", ".join(_text(best.figures, name) for name in ("seconds", *_TARGETS))
+    found = f"Cheapest setting with {wanted}: {best.setting.name} ({figures})."
+    return f"{found} Train with: {best.setting.command('--data', str(scene))}"
 
 
 def markdown_table(rows: Sequence[CostRow], baseline: str) -> str:
@@ -459,36 +437,23 @@ def markdown_table(rows: Sequence[CostRow], baseline: str) -> str:
 
 
 def draw_plot(path: Path, rows: Sequence[CostRow], targets: Mapping[str, float], title: str) -> None:
-    """Draw a panel for each known figure against seconds; filled marks are on the Pareto front of the panel."""
+    """Draw a panel for each known figure against seconds."""
     from matplotlib.figure import Figure as Canvas
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    every = [row.figures for row in rows]
-    names = [name for name in shown_figures(every) if FIGURES[name].panel]
+    names = [name for name in shown_figures([row.figures for row in rows]) if FIGURES[name].panel]
     lines = math.ceil(len(names) / 2)
     figure = Canvas(figsize=(11, 4.4 * lines + 1), layout="constrained")
     axes = figure.subplots(lines, 2, squeeze=False).ravel()
     for name, axis in zip(names, axes):
-        points = [(one["seconds"], one[name]) for one in every]
-        front = pareto_front(every, name)
-        axis.plot(
-            *zip(*sorted(point for point, on in zip(points, front) if on)),
-            **{"color": "lightgrey", "drawstyle": "steps-post", "zorder": 1},
-        )
-        for number, (row, point, on) in enumerate(zip(rows, points, front)):
-            look = {"color": f"C{number}", "markerfacecolor": f"C{number}" if on else "white"}
-            axis.plot(*point, "osDv^"[number // 10 % 5], label=row.setting.name, **look)
+        for number, row in enumerate(rows):
+            axis.plot(row.figures["seconds"], row.figures[name], "osDv^"[number // 10 % 5], label=row.setting.name)
         if name in targets:
             axis.axhline(targets[name], color="grey", linestyle=":", linewidth=1)
-        axis.set_xscale("log")
-        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.xaxis.set_minor_formatter(NullFormatter())
         axis.set(xlabel="ns-train, wall time [s]", title=FIGURES[name].panel)
-        axis.grid(alpha=0.3, which="major")
+        axis.grid(alpha=0.3)
     for axis in axes[len(names) :]:
         axis.set_visible(False)
-    figure.suptitle(f"{title}\n(filled: Pareto front)", fontsize=11)
+    figure.suptitle(title, fontsize=11)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     with replace_when_done(path) as temporary:
         figure.savefig(temporary, dpi=130)
