@@ -223,8 +223,7 @@ def _read(path: Path, options: Audit, say: Say) -> tuple[TetMesh, Vector, dict[s
     rules = None if options.patches is None else load_patch_rules(options.patches)
     mesh, export = read_mesh(path), read_export_summary(path, say)
     up = export.get("up") if options.up is None else options.up
-    direction = check_direction("up", up or (0.0, 0.0, 1.0), "Pass --up 0 0 1.", AuditError)
-    x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
+    x, y, z = check_direction("up", up or (0.0, 0.0, 1.0), "Pass --up 0 0 1.", AuditError).tolist()
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.facets):,} boundary triangles.")
     if rules is not None:
         mesh, idle = with_patches(mesh, rules, (x, y, z))
@@ -256,8 +255,7 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
             str(path), expected="the answers.json of an audit", got=got, remedy=f"{again} Audit again first."
         )
     conditions, mesh = earlier_conditions(path.name, content["conditions"]), read_surface(path.with_name(SURFACE))
-    direction = check_direction(f"{path}: up", content["up"], again, AuditError)
-    x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
+    x, y, z = check_direction(f"{path}: up", content["up"], again, AuditError).tolist()
     least_w = content.get("least_bridge_w")
     return lambda: without_slight(audit(mesh, conditions, (x, y, z)), least_w if is_number(least_w) else 0.0)
 

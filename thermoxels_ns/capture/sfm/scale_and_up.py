@@ -30,6 +30,7 @@ _MARKER_ERROR_PX = 2.0
 _UP_OF_ORIENTATION = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """Direction to the upper edge of the upright picture in the stored picture (x right, y up), by EXIF's orientation."""
 _ROLLED_DEG = 2.0  # standard deviation of how level people hold a picture's sides, [degrees]
+_LEAST_COSINE = 0.3  # of up with the mean of the pictures' upward directions: cameras look down by up to 72 degrees
 _BELIEVED_DEG = 5.0  # largest accepted standard error of the common normal of the cameras' level axes, [degrees]
 
 
@@ -262,7 +263,7 @@ def find_up(
     turned = math.sqrt(max(float(values[1]), 0.0))  # sine of how far the axes spread, root mean square
     if len(level) >= 3 and _BELIEVED_DEG * math.sqrt(len(level)) * turned > _ROLLED_DEG:
         normal = vectors[:, 0] if vectors[:, 0] @ mean > 0 else -vectors[:, 0]
-        if normal @ mean > math.cos(math.radians(45.0)):
+        if normal @ mean > _LEAST_COSINE:
             off = np.degrees(np.arcsin(np.clip(np.abs(level @ normal), 0.0, 1.0)))
             return Up(normal, "Assumed: the photographs' sides were held level.", float(np.median(off)))
     return Up(mean, "Assumed: the mean of the photographs' upward directions.", _median_angle(held, mean))
