@@ -45,8 +45,6 @@ class CaptureSettings:
     """Longest time between the two exposures where a pair is found by time alone, in seconds."""
     clock_offset_s: float = 0.0
     """How far the thermal camera's clock is ahead of the photographs' clock, in seconds."""
-    poses: Path | None = None
-    """Known poses: folder of a COLMAP model, or a transforms.json. Default: poses are found from the photographs."""
     matching: Matching = "auto"
     """Pairs of photographs to compare. exhaustive: all; sequential: neighbours in time and some far ones; auto:
     exhaustive up to 80 photographs, else sequential."""

@@ -21,7 +21,7 @@ from thermoxels_ns.capture.rig.start import kept_start, read_rig, rig_frames, ri
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.scene_writer import SCENE_CONTENT, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.poses import add_points, find_poses, fitted_to_photographs, read_given_poses
+from thermoxels_ns.capture.sfm.poses import find_poses
 from thermoxels_ns.capture.sfm.scale_and_up import (
     Up,
     find_up,
@@ -65,7 +65,6 @@ class CaptureResult:
     scene: Scene
     start: RigEstimate  # the rig that the search started from
     scale_missing: str  # reason why no metric scale was found; empty where a scale was found
-    poses_source: str  # phrase for the report that says where the poses come from
     seconds: Sequence[tuple[str, float]]  # stages and the time each took, [s]
 
     @property
@@ -140,12 +139,8 @@ class _Capture:
         scene = Scene(frames, model, rig, drift, scale, up, masks)
         written = [self.output / name for name in SCENE_CONTENT if name != "masks" or masks]
         self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
-        given = self.settings.poses
-        source = f"Given in {given.name}." if given else "Structure from motion on the photographs (COLMAP)."
         left_out, seconds = self.dropped, self.cache.seconds
-        result = CaptureResult(
-            self.source, self.output, pairs, left_out, read, scene, start, scale_missing, source, seconds
-        )
+        result = CaptureResult(self.source, self.output, pairs, left_out, read, scene, start, scale_missing, seconds)
         self.cache.run("page", {}, lambda _: write_page(result), [result.page])
         return result
 
@@ -209,28 +204,21 @@ class _Capture:
         return read
 
     def poses(self, read: CaptureFrames) -> SfmModel:
-        """Return camera, poses and scene points; they are found from the photographs or given by the user."""
+        """Return camera, poses and scene points, which are found from the photographs."""
         settings = self.settings
         names = ("image_size", "max_features", "matching", "lens", "seed", "threads")
         depends = {
             "options": {name: getattr(settings, name) for name in names},
-            "poses": given_fingerprints([] if settings.poses is None else files_of(settings.poses)),
             "masks": given_fingerprints([] if settings.masks is None else list(mask_files(settings.masks).values())),
         }
 
         def work(folder: Path) -> None:
             photographs = {frame.name: frame.photograph for frame in read.frames}
             masks = user_masks(read.frames, settings.masks)
-            if settings.poses is None:
-                focal = [frame.focal_px for frame in read.frames if frame.focal_px]
-                middle = float(np.median(focal)) if focal else None
-                poses = find_poses(photographs, folder, settings, middle, masks, self.say)
-            else:
-                given = read_given_poses(settings.poses, {f.name: f.photograph_source for f in read.frames})
-                poses = fitted_to_photographs(given, photographs)
+            focal = [frame.focal_px for frame in read.frames if frame.focal_px]
+            middle = float(np.median(focal)) if focal else None
+            poses = find_poses(photographs, folder, settings, middle, masks, self.say)
             model = poses.model
-            if not len(model.points):
-                model = add_points(model, photographs, folder, settings, masks, self.say)
             save(folder / "model.npz", model)
             write_json(folder / "dropped.json", dict(poses.dropped))
             self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
@@ -240,7 +228,7 @@ class _Capture:
         return load(folder / "model.npz", SfmModel)
 
     def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, SceneScale | None, str, Up]:
-        """Return the model (turned upright unless its poses are given), scale or None, reason for None, and up."""
+        """Return the model turned upright, scale or None, reason for None, and up."""
         settings = self.settings
         depends = {
             "known": [settings.known_distance, settings.known_distance_error_m],
@@ -253,12 +241,10 @@ class _Capture:
             scale, missing = self._metric_scale(found, frames)
             gimbal, orientation = [frame.gimbal_deg for frame in frames], [frame.orientation for frame in frames]
             up = find_up(found.camera_to_world, gimbal, orientation)
-            model = found
-            if settings.poses is None:
-                rotation = level_rotation(up.direction, -found.camera_to_world[:, :3, 2].mean(axis=0))
-                origin = np.median(found.points, axis=0) if len(found.points) else found.centres.mean(axis=0)
-                model = found.moved(rotation, origin)
-                up = Up(rotation @ up.direction, up.source, up.spread_deg)
+            rotation = level_rotation(up.direction, -found.camera_to_world[:, :3, 2].mean(axis=0))
+            origin = np.median(found.points, axis=0) if len(found.points) else found.centres.mean(axis=0)
+            model = found.moved(rotation, origin)
+            up = Up(rotation @ up.direction, up.source, up.spread_deg)
             save(folder / "model.npz", model)
             write_json(folder / "scale.json", {"scale": scale, "missing": missing, "up": up})
             self.say(f"scale: {missing}" if scale is None else f"scale: {scale.metres_per_unit:.5g} m per unit")
