@@ -65,7 +65,6 @@ FIGURES: Mapping[str, Figure] = {
 """All measured figures, by the names of their columns in csv files."""
 FRONTS = tuple(name for name, figure in FIGURES.items() if figure.short)
 _EVALUATED = tuple(name for name in FIGURES if name not in ("seconds", "training_seconds", "peak_memory_gb"))
-_TARGETS = {"thermal_mae_c": "a thermal MAE of at most {:g} °C", "psnr": "an RGB PSNR of at least {:g} dB"}
 _RUNS, _TABLE, _PLOT, _PAGE = "runs.csv", "cost.csv", "cost.png", "cost.md"
 _GROUPS = ("density", "sh", "temperature", "background", "corrections")
 
@@ -90,22 +89,14 @@ class Cost:
     """Named qualities of ns-train to train as well. May be empty."""
     methods: tuple[str, ...] = ("thermoxels",)
     """Training methods. The first method trains all settings and qualities; each further method, such as plenoxels-t,
-    adds a row: the baseline with that method."""
+    adds a row: the baseline (standard, or else the last quality or setting) with that method."""
     recipes: tuple[str, ...] = ("default",)
     """Loss recipes. All rows use the first recipe (default: the method's own); each further recipe, such as paper, adds
     a row: the baseline with that recipe."""
-    baseline: str | None = None
-    """Setting or quality whose time is 1 in the table, and at which further methods and recipes are trained. Default:
-    standard, or else the last quality, or else the last setting."""
     repeats: int = 1
     """Number of runs of each setting; the table shows medians."""
     target_mae: float | None = None
     """Name the cheapest setting whose thermal MAE is at most this, [degrees Celsius]."""
-    target_psnr: float | None = None
-    """Name the cheapest setting whose RGB PSNR is at least this, [dB]. With --target-mae both must hold."""
-    train_options: str = ""
-    """Further options for all ns-train commands, as one quoted text after an equals sign, for instance
-    --train-options="--pipeline.model.near-plane 0.05"."""
 
     def main(self) -> None:
         """Measure and report; raises `ThermoxelsError` if an option or the scene cannot be used, or a run failed."""
@@ -156,7 +147,8 @@ def run_cost(cost: Cost, console: Console) -> None:
     def say(line: str) -> None:
         console.print(line, markup=False, soft_wrap=True)
 
-    targets = _targets(cost)
+    if cost.target_mae is not None:
+        check_positive("target_mae", cost.target_mae, "Correct --target-mae, or leave it out.")
     settings, baseline = planned_settings(cost)
     if cost.repeats < 1:
         raise ThermoxelsError("repeats", expected="1 or more", got=cost.repeats, remedy="Pass --repeats 3.")
@@ -196,9 +188,9 @@ def run_cost(cost: Cost, console: Console) -> None:
         scene, machine = cost.scene.resolve().name, f"a machine with {os.cpu_count()} processors"
         words = [markdown_table(rows, baseline)]
         words.append(f"{scene}: {medians} on {machine}; memory is that of the ns-train process.")
-        words += [verdict(rows, targets, cost.scene)] if targets else []
+        words += [verdict(rows, cost.target_mae, cost.scene)] if cost.target_mae else []
         write_table(folder / _TABLE, rows, baseline)
-        draw_plot(folder / _PLOT, rows, targets, f"What accuracy costs: {scene}")
+        draw_plot(folder / _PLOT, rows, cost.target_mae, f"What accuracy costs: {scene}")
         with replace_when_done(folder / _PAGE) as temporary:  # names may hold markup, which is escaped
             temporary.write_text(html.escape("\n\n".join(words), quote=False) + "\n", encoding="utf-8")
         for text in ("", *words, f"Written to {folder}: {', '.join((_TABLE, _PLOT, _PAGE, _RUNS))}"):
@@ -210,26 +202,17 @@ def run_cost(cost: Cost, console: Console) -> None:
 
 def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     """Return the rows of the table and the name of the baseline; raises `ThermoxelsError` for wrong options."""
-    try:
-        further = tuple(shlex.split(cost.train_options))
-    except ValueError as problem:
-        expected, remedy = "words as in a shell", "Close the quotes."
-        raise ThermoxelsError("train_options", expected=expected, got=str(problem), remedy=remedy) from problem
-
     words = {text: training_options(text) for text in cost.settings}
     words |= {quality: ("--quality", quality) for quality in cost.qualities}
     if not words:
         remedy = "Pass --settings 64:800."
         raise ThermoxelsError("settings", expected="a setting or a quality", got="none", remedy=remedy)
-    baseline = cost.baseline or ("standard" if "standard" in words else [*words][-1])
-    if baseline not in words:
-        expected = f"one of {', '.join(words)}"
-        raise ThermoxelsError("baseline", expected=expected, got=baseline, remedy="Name one of them.")
+    baseline = "standard" if "standard" in words else [*words][-1]
 
     def row(of: str, method: str, recipe: str, kind: str = "") -> CostSetting:
         # The recipe "default" is the method's own recipe, which needs no option.
         recipe_words = () if recipe == "default" else ("--pipeline.model.recipe", recipe)
-        return CostSetting(f"{of}{kind}", method, (*words[of], *recipe_words, *further))
+        return CostSetting(f"{of}{kind}", method, (*words[of], *recipe_words))
 
     method, *methods = dict.fromkeys(cost.methods or ("thermoxels",))
     recipe, *recipes = dict.fromkeys(cost.recipes or ("default",))
@@ -237,16 +220,6 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     rows += [row(baseline, other, recipe, f", {other}") for other in methods]
     rows += [row(baseline, method, other, f", recipe {other}") for other in recipes]
     return rows, baseline
-
-
-def _targets(cost: Cost) -> dict[str, float]:
-    """Return the targets that the user set, by names of `FIGURES`; raises `ThermoxelsError` unless all are above 0."""
-    bounds = {"thermal_mae_c": ("target_mae", cost.target_mae), "psnr": ("target_psnr", cost.target_psnr)}
-    return {
-        figure: check_positive(name, value, f"Correct --{name.replace('_', '-')}, or leave it out.")
-        for figure, (name, value) in bounds.items()
-        if value is not None
-    }
 
 
 def training_options(setting: str) -> tuple[str, ...]:
@@ -400,23 +373,14 @@ def median_rows(settings: Iterable[CostSetting], runs: Mapping[RunKey, Figures],
     ]
 
 
-def cheapest(rows: Iterable[CostRow], targets: Mapping[str, float]) -> CostRow | None:
-    """Return the row with the least wall time among the rows that meet all targets; None if no row does."""
-
-    def kept(name: str, value: float) -> bool:
-        return value >= targets[name] if FIGURES[name].higher_is_better else value <= targets[name]
-
-    able = [row for row in rows if all(kept(name, row.figures[name]) for name in targets)]
-    return min(able, key=lambda row: row.figures["seconds"], default=None)
-
-
-def verdict(rows: Sequence[CostRow], targets: Mapping[str, float], scene: Path) -> str:
-    """Return a sentence on the fastest setting that meets all targets."""
-    wanted = " and ".join(_TARGETS[name].format(bound) for name, bound in targets.items())
-    best = cheapest(rows, targets)
-    if best is None:
+def verdict(rows: Sequence[CostRow], target_mae: float, scene: Path) -> str:
+    """Return a sentence on the fastest setting whose thermal MAE is at most the target, [degrees Celsius]."""
+    wanted = f"a thermal MAE of at most {target_mae:g} °C"
+    able = [row for row in rows if row.figures["thermal_mae_c"] <= target_mae]
+    if not able:
         return f"No measured setting has {wanted}. Measure more steps or voxels with --settings, or relax the target."
-    figures = ", ".join(_text(best.figures, name) for name in ("seconds", *_TARGETS))
+    best = min(able, key=lambda row: row.figures["seconds"])
+    figures = ", ".join(_text(best.figures, name) for name in ("seconds", "thermal_mae_c", "psnr"))
     found = f"Cheapest setting with {wanted}: {best.setting.name} ({figures})."
     return f"{found} Train with: {best.setting.command('--data', str(scene))}"
 
@@ -436,7 +400,7 @@ def markdown_table(rows: Sequence[CostRow], baseline: str) -> str:
     return "\n".join(lines)
 
 
-def draw_plot(path: Path, rows: Sequence[CostRow], targets: Mapping[str, float], title: str) -> None:
+def draw_plot(path: Path, rows: Sequence[CostRow], target_mae: float | None, title: str) -> None:
     """Draw a panel for each known figure against seconds."""
     from matplotlib.figure import Figure as Canvas
 
@@ -447,8 +411,8 @@ def draw_plot(path: Path, rows: Sequence[CostRow], targets: Mapping[str, float],
     for name, axis in zip(names, axes):
         for number, row in enumerate(rows):
             axis.plot(row.figures["seconds"], row.figures[name], "osDv^"[number // 10 % 5], label=row.setting.name)
-        if name in targets:
-            axis.axhline(targets[name], color="grey", linestyle=":", linewidth=1)
+        if name == "thermal_mae_c" and target_mae is not None:
+            axis.axhline(target_mae, color="grey", linestyle=":", linewidth=1)
         axis.set(xlabel="ns-train, wall time [s]", title=FIGURES[name].panel)
         axis.grid(alpha=0.3)
     for axis in axes[len(names) :]:
