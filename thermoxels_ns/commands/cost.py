@@ -33,9 +33,7 @@ class Figure(NamedTuple):
 
     heading: str = ""  # Heading of the figure's column in the table; empty: the figure is in the csv file alone
     form: str = ""  # Format of the value with its unit
-    higher_is_better: bool = False
     panel: str = ""  # Title of the figure's panel in the plot; empty: no panel
-    short: str = ""  # Name of the figure in the column of Pareto fronts; empty: no front
 
 
 FIGURES: Mapping[str, Figure] = {
@@ -44,12 +42,12 @@ FIGURES: Mapping[str, Figure] = {
     # Wall time of the whole ns-train command, from its start to its end.
     "seconds": Figure("ns-train", "{:.0f} s"),
     # RGB PSNR [dB] and SSIM, and mean absolute temperature error [degrees Celsius], on held-out views.
-    "psnr": Figure("RGB PSNR", "{:.1f} dB", True, "RGB PSNR [dB], higher is better", "PSNR"),
+    "psnr": Figure("RGB PSNR", "{:.1f} dB", "RGB PSNR [dB], higher is better"),
     "ssim": Figure(),
-    "thermal_mae_c": Figure("thermal MAE", "{:.2f} °C", False, "thermal MAE [°C], lower is better", "MAE"),
+    "thermal_mae_c": Figure("thermal MAE", "{:.2f} °C", "thermal MAE [°C], lower is better"),
     # F-score of the surface at 1.5 voxels of a lattice of 128 voxels, and at 1.5 voxels of the setting's own lattice.
     "fscore_128": Figure(
-        *("F-score, 1.5 of 128 voxels", "{:.2f}", True, "surface F-score at 1.5 of 128 voxels, higher is better")
+        *("F-score, 1.5 of 128 voxels", "{:.2f}", "surface F-score at 1.5 of 128 voxels, higher is better")
     ),
     "fscore": Figure("F-score, 1.5 own voxels", "{:.2f}"),
     "precision": Figure(),
@@ -60,10 +58,9 @@ FIGURES: Mapping[str, Figure] = {
     # Share of rays that neither pass through the scene nor are stopped.
     "half_transparent": Figure("half-transparent rays", "{:.1%}"),
     # Largest resident memory of the ns-train process, 1e9 bytes.
-    "peak_memory_gb": Figure("memory", "{:.1f} GB", False, "peak memory [GB], lower is better"),
+    "peak_memory_gb": Figure("memory", "{:.1f} GB", "peak memory [GB], lower is better"),
 }
 """All measured figures, by the names of their columns in csv files."""
-FRONTS = tuple(name for name, figure in FIGURES.items() if figure.short)
 _EVALUATED = tuple(name for name in FIGURES if name not in ("seconds", "training_seconds", "peak_memory_gb"))
 _RUNS, _TABLE, _PLOT, _PAGE = "runs.csv", "cost.csv", "cost.png", "cost.md"
 _GROUPS = ("density", "sh", "temperature", "background", "corrections")
@@ -138,7 +135,6 @@ class CostRow(NamedTuple):
     repeats: int  # Number of runs
     figures: Figures  # Median of each figure
     time_ratio: float  # Median wall time divided by the baseline's; NaN if the baseline has no run
-    fronts: tuple[str, ...]  # Names in `FRONTS` of the figures whose Pareto front holds this row
 
 
 def run_cost(cost: Cost, console: Console) -> None:
@@ -278,14 +274,12 @@ def write_runs(path: Path, runs: Mapping[RunKey, Figures]) -> None:
 
 def write_table(path: Path, rows: Iterable[CostRow], baseline: str) -> None:
     """Write cost.csv: one line per row with all figures."""
-    fronts = [f"front_{name}" for name in FRONTS]
     lines = []
     for row in rows:
         ratio = "" if math.isnan(row.time_ratio) else f"{row.time_ratio:.6g}"
-        marks = [int(name in row.fronts) for name in FRONTS]
         one = row.setting
-        lines.append([one.name, row.repeats, *_cells(row.figures), ratio, baseline, *marks, one.command()])
-    _write_csv(path, ["setting", "repeats", *FIGURES, "time_ratio", "baseline", *fronts, "training"], lines)
+        lines.append([one.name, row.repeats, *_cells(row.figures), ratio, baseline, one.command()])
+    _write_csv(path, ["setting", "repeats", *FIGURES, "time_ratio", "baseline", "training"], lines)
 
 
 def _cells(figures: Figures) -> list[str]:
@@ -346,17 +340,6 @@ def shown_figures(figures: Sequence[Figures]) -> list[str]:
     return [name for name, one in FIGURES.items() if one.heading and not all(math.isnan(f[name]) for f in figures)]
 
 
-def pareto_front(figures: Sequence[Figures], name: str) -> list[bool]:
-    """Return for each run whether it is on the Pareto front of seconds and figure `name`.
-
-    A run is on the front if no other run is at least as fast and at least as good, except with equal values. A run
-    whose figure is NaN is not on the front and keeps no other run off the front."""
-    sign = -1.0 if FIGURES[name].higher_is_better else 1.0
-    points = [(one["seconds"], sign * one[name]) for one in figures]
-    valid = [p for p in points if not any(map(math.isnan, p))]
-    return [p in valid and not any(q[0] <= p[0] and q[1] <= p[1] and q != p for q in valid) for p in points]
-
-
 def median_rows(settings: Iterable[CostSetting], runs: Mapping[RunKey, Figures], baseline: str) -> list[CostRow]:
     """Return a row for every setting that has a run; time ratios relate to the row named `baseline`."""
     of_setting = {one: [found for key, found in runs.items() if key.setting == one.name] for one in settings}
@@ -366,10 +349,9 @@ def median_rows(settings: Iterable[CostSetting], runs: Mapping[RunKey, Figures],
         known = {name: [figures[name] for figures in own if not math.isnan(figures[name])] for name in FIGURES}
         medians.append({name: statistics.median(values) if values else math.nan for name, values in known.items()})
     base = next((m["seconds"] for m, setting in zip(medians, of_setting) if setting.name == baseline), math.nan)
-    marks = {name: pareto_front(medians, name) for name in FRONTS}
     return [
-        CostRow(setting, len(own), median, median["seconds"] / base, tuple(n for n in FRONTS if marks[n][number]))
-        for number, ((setting, own), median) in enumerate(zip(of_setting.items(), medians))
+        CostRow(setting, len(own), median, median["seconds"] / base)
+        for (setting, own), median in zip(of_setting.items(), medians)
     ]
 
 
@@ -391,12 +373,11 @@ def markdown_table(rows: Sequence[CostRow], baseline: str) -> str:
     time_at = 1 + names.index("seconds")
     heading = [FIGURES[name].heading for name in names]
     heading.insert(time_at, f"time / {baseline}")
-    lines = ["| setting | " + " | ".join(heading) + " | Pareto front |", "|---|" + "---:|" * len(heading) + "---|"]
+    lines = ["| setting | " + " | ".join(heading) + " |", "|---|" + "---:|" * len(heading)]
     for row in rows:
         cells = [_text(row.figures, name) for name in names]
         cells.insert(time_at, "-" if math.isnan(row.time_ratio) else f"{row.time_ratio:.2f}")
-        front = ", ".join(sorted(FIGURES[name].short for name in row.fronts))
-        lines.append(f"| {row.setting.name} | " + " | ".join(cells) + f" | {front} |")
+        lines.append(f"| {row.setting.name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
