@@ -119,11 +119,6 @@ def files_below(folder: Path, without: Sequence[Path] = (), say: Callable[[str],
     return sorted(files, key=lambda path: (natural_key(path.relative_to(folder)), path.as_posix()))
 
 
-def shown_name(path: Path) -> str:
-    """Return the name of a file with unprintable characters escaped."""
-    return printable(path.name)
-
-
 def identify(path: Path, folder: Path) -> CameraFile:
     """Return a file's role by content, for pictures by names below `folder`; raise `ThermoxelsError` if damaged."""
     with errors_name(path, "a camera file that can be decoded"):

@@ -20,12 +20,11 @@ from thermoxels_ns.capture.folder_scan import (
     CameraFolder,
     natural_key,
     scan_folder,
-    shown_name,
     words_of,
 )
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.core.checks import remedy_of
-from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.errors import SceneError, printable
 from thermoxels_ns.data.transforms_json import path_inside
 
 _DJI = re.compile(r"^(?P<head>.*?dji)_(?:(?P<time>\d{14})_)?(?P<number>\d{3,})_(?P<role>[a-z])(?P<tail>.*)$")
@@ -95,7 +94,7 @@ def search_pairs(
     ]
     got = ", ".join(f"{number} {what}" for number, what in parts if number) or "no files"
     for path, why in list(search.unpaired.items())[:1]:
-        got += f" ({shown_name(path)}: {why})"
+        got += f" ({printable(path.name)}: {why})"
     remedy = _REMEDY
     if any(file.dji for file in found.files) and settings.dji_library is None:
         remedy += f" {_DJI_LIBRARY}"

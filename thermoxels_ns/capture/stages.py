@@ -216,10 +216,9 @@ class _Capture:
             masks = user_masks(read.frames, settings.masks)
             focal = [frame.focal_px for frame in read.frames if frame.focal_px]
             middle = float(np.median(focal)) if focal else None
-            poses = find_poses(photographs, folder, settings, middle, masks, self.say)
-            model = poses.model
+            model, dropped = find_poses(photographs, folder, settings, middle, masks, self.say)
             save(folder / "model.npz", model)
-            write_json(folder / "dropped.json", dict(poses.dropped))
+            write_json(folder / "dropped.json", dropped)
             self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
 
         folder = self.cache.run("poses", depends, work)

@@ -35,7 +35,7 @@ def test_masked_parts_have_no_features(card, tmp_path):
     Image.fromarray(use).save(tmp_path / "mask.png")
     some = {name: photographs[name] for name in ("shot0", "shot1", "shot2", "shot3")}
     masks = dict.fromkeys(some, tmp_path / "mask.png")
-    model = find_poses(some, tmp_path, SETTINGS, 430.0, masks).model
+    model = find_poses(some, tmp_path, SETTINGS, 430.0, masks)[0]
     assert model.sighting_pixel[:, 0].min() > 195
 
 

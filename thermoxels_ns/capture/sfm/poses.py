@@ -38,14 +38,6 @@ _PAIR_CHUNK = 200
 
 
 @dataclass(frozen=True)
-class Poses:
-    """The poses that were found, and the frames without a pose."""
-
-    model: SfmModel
-    dropped: Mapping[str, str]  # reason by the frame's name
-
-
-@dataclass(frozen=True)
 class ReducedPhotographs:
     """Files that COLMAP reads and writes: reduced photographs, their masks, and a database of features and matches."""
 
@@ -65,12 +57,12 @@ def find_poses(
     focal_px: float | None = None,
     masks: Mapping[str, Path] = MappingProxyType({}),
     say: Callable[[str], None] = lambda _: None,
-) -> Poses:
+) -> tuple[SfmModel, dict[str, str]]:
     """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
 
     `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length;
-    `masks` are files by frame name.
-    Results of an interrupted run in `folder` are reused. Only the largest set of photographs that fit together is kept.
+    `masks` are files by frame name. Returns the model, and a reason for each frame without a pose, by its name.
+    Results of an interrupted run in `folder` are reused. Only the largest set of photographs that fit is kept.
 
     Raises:
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
@@ -93,7 +85,7 @@ def find_poses(
             dropped[name] = f"fits only to {elsewhere[name]} others, in a part of its own"
         elif name not in model.frames:
             dropped[name] = "too few matches with the other photographs"
-    return Poses(model, dropped)
+    return model, dropped
 
 
 def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, str]]:
