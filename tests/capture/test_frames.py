@@ -9,8 +9,7 @@ from tests.support.camera_card import counts, jpeg_bytes, photograph
 from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.frames import CaptureFrames, read_frames
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.capture.photograph import mask_files, mask_of, read_mask, read_photograph_facts
-from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.capture.photograph import read_photograph_facts
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 
@@ -126,20 +125,3 @@ def test_gimbal_angles_of_xmp(tmp_path, form):
     xmp = f'http://ns.adobe.com/xap/1.0/\0<x:xmpmeta {form} drone-dji:GimbalRollDegree="+1.5"/>'.encode()
     path.write_bytes(content[:2] + b"\xff\xe1" + struct.pack(">H", len(xmp) + 2) + xmp + content[2:])
     assert read_photograph_facts(path).gimbal_deg == (-30.5, 1.5)
-
-
-def test_a_frame_without_a_mask_is_used_everywhere(tmp_path):
-    hand = np.full((24, 32), 255, dtype=np.uint8)
-    hand[:, :4] = 0
-    Image.fromarray(hand).save(tmp_path / "IMG_1.png")
-    masks = {"a": mask_files(tmp_path)["img_1"]}
-    assert (~mask_of("a", masks, 32, 24)).sum() == 24 * 4
-    assert mask_of("b", masks, 32, 24).shape == (24, 32) and mask_of("b", masks, 32, 24).all()
-
-
-def test_a_mask_of_another_size_is_refused(tmp_path):
-    Image.new("L", (10, 10)).save(tmp_path / "m.png")
-    with pytest.raises(SceneError, match="a mask of 32 x 24 pixels"):
-        read_mask(tmp_path / "m.png", 32, 24)
-    with pytest.raises(SceneError, match="no folder at"):
-        mask_files(tmp_path / "nowhere")

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from tests.support.board_pictures import BOARD, board_pairs, write_board_folder
 from tests.support.camera_card import photograph
@@ -234,15 +233,10 @@ def test_tracks_say_which_training_photograph_sees_which_point(written):
     assert 0.5 * seen[train].sum() < len(outputs.metadata["feature_rays"].origins) <= seen[train].sum()
 
 
-def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, tmp_path, monkeypatch):
+def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, monkeypatch):
     scene, folder = written
-    Image.new("L", (VISIBLE.width, VISIBLE.height)).save(tmp_path / "mask.png")
-    masked = replace(scene, masks={scene.frames[0].name: tmp_path / "mask.png"})
-    write_scene_folder(masked, folder)
-    assert (folder / "masks").is_dir()
     (folder / "notes.txt").write_text("mine")
     write_scene_folder(scene, folder)
-    assert not (folder / "masks").exists()
     assert (folder / "notes.txt").read_text() == "mine"
     before = (folder / "transforms.json").read_bytes()
 
@@ -251,7 +245,7 @@ def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, t
 
     monkeypatch.setattr("thermoxels_ns.capture.scene_writer.write_points", stop)
     with pytest.raises(KeyboardInterrupt):
-        write_scene_folder(masked, folder)
+        write_scene_folder(scene, folder)
     assert (folder / "transforms.json").read_bytes() == before
     assert len(read_scene_file(folder).frames) == COUNT
 

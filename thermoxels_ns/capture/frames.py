@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.capture.photograph import GpsFix, mask_files, open_photograph, read_photograph_facts
+from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_photograph_facts
 from thermoxels_ns.capture.stage_cache import load_json
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
@@ -176,27 +176,6 @@ def _without_stuck_pixels(frames: list[CaptureFrame]) -> tuple[int, list[Capture
         np.save(frame.thermal, temperature_c)
         changed.append(replace(frame, masked=int(np.isnan(temperature_c).sum())))
     return int(bad.sum()), changed
-
-
-def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str, Path]:
-    """Return the user's mask file of each frame, named like its photograph or frame; frames without a mask are absent.
-
-    Raises `SceneError` if `folder` does not exist or no mask fits; without `folder` the result is empty.
-    """
-    if folder is None:
-        return {}
-    files = mask_files(folder)
-    found = {}
-    for frame in frames:
-        names = (Path(frame.photograph_source).stem.lower(), frame.name.lower())
-        own = next((files[name] for name in names if name in files), None)
-        if own is not None:
-            found[frame.name] = own
-    if not found:
-        remedy = f"Name them like {Path(frames[0].photograph_source).stem}.png."
-        got = f"{len(files)} pictures in {folder}, none of them named so"
-        raise SceneError("masks", expected="masks named like photographs", got=got, remedy=remedy)
-    return found
 
 
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:

@@ -77,5 +77,3 @@ class CaptureSettings:
     """Side of one square of the checker board, in metres."""
     drift: Literal["auto", "off"] = "auto"
     """Correct vignetting and offsets between thermal images, if this helps at points that the fit does not use."""
-    masks: Path | None = None
-    """Folder of masks, each named like its photograph: white where the photograph may be used."""

@@ -11,9 +11,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder
-from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames, user_masks
+from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
 from thermoxels_ns.capture.pairs import Pair, read_pair_list, search_pairs
-from thermoxels_ns.capture.photograph import mask_files
 from thermoxels_ns.capture.rig.board import CheckerBoard, board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.rig.drift import estimate_drift, no_drift
 from thermoxels_ns.capture.rig.search import estimate_rig
@@ -134,9 +133,8 @@ class _Capture:
         board = self.board_rig(model, read)
         rig, start = self.rig(model, frames, read, scale, scale_missing, board)
         drift = self.drift(model, frames, rig)
-        masks = user_masks(frames, self.settings.masks)
-        scene = Scene(frames, model, rig, drift, scale, up, masks)
-        written = [self.output / name for name in SCENE_CONTENT if name != "masks" or masks]
+        scene = Scene(frames, model, rig, drift, scale, up)
+        written = [self.output / name for name in SCENE_CONTENT]
         self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
         left_out, seconds = self.dropped, self.cache.seconds
         result = CaptureResult(self.source, self.output, pairs, left_out, read, scene, start, scale_missing, seconds)
@@ -208,15 +206,13 @@ class _Capture:
         names = ("image_size", "max_features", "matching", "lens", "seed", "threads")
         depends = {
             "options": {name: getattr(settings, name) for name in names},
-            "masks": given_fingerprints([] if settings.masks is None else list(mask_files(settings.masks).values())),
         }
 
         def work(folder: Path) -> None:
             photographs = {frame.name: frame.photograph for frame in read.frames}
-            masks = user_masks(read.frames, settings.masks)
             focal = [frame.focal_px for frame in read.frames if frame.focal_px]
             middle = float(np.median(focal)) if focal else None
-            model, dropped = find_poses(photographs, folder, settings, middle, masks, self.say)
+            model, dropped = find_poses(photographs, folder, settings, middle, self.say)
             save(folder / "model.npz", model)
             write_json(folder / "dropped.json", dropped)
             self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")

@@ -2,15 +2,13 @@
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from tests.support.colmap_model import write_colmap_model
 from tests.support.posed_model import CAMERA, ring_model
-from tests.support.textured_room import VISIBLE, write_card
+from tests.support.textured_room import write_card
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.colmap import model_of_colmap
 from thermoxels_ns.capture.sfm.poses import (
-    find_poses,
     image_pairs,
 )
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
@@ -26,17 +24,6 @@ def card(tmp_path_factory):
     truth = write_card(folder, COUNT)
     photographs = {path.name.split("-")[0]: path for path in sorted(folder.glob("*.jpg"))}
     return photographs, truth
-
-
-def test_masked_parts_have_no_features(card, tmp_path):
-    photographs, _ = card
-    use = np.ones((VISIBLE.height, VISIBLE.width), dtype=bool)
-    use[:, :200] = False
-    Image.fromarray(use).save(tmp_path / "mask.png")
-    some = {name: photographs[name] for name in ("shot0", "shot1", "shot2", "shot3")}
-    masks = dict.fromkeys(some, tmp_path / "mask.png")
-    model = find_poses(some, tmp_path, SETTINGS, 430.0, masks)[0]
-    assert model.sighting_pixel[:, 0].min() > 195
 
 
 def test_every_pair_is_compared_up_to_a_number_and_neighbours_beyond():

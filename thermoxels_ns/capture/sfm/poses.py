@@ -6,13 +6,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from thermoxels_ns.capture.photograph import mask_of, open_photograph, read_photograph_facts
+from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.capture.settings import CaptureSettings, LensModel, Matching
 from thermoxels_ns.capture.sfm.colmap import FIELDS, model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
@@ -39,7 +38,7 @@ _PAIR_CHUNK = 200
 
 @dataclass(frozen=True)
 class ReducedPhotographs:
-    """Files that COLMAP reads and writes: reduced photographs, their masks, and a database of features and matches."""
+    """Files that COLMAP reads and writes: reduced photographs, and a database of features and matches."""
 
     database: Path  # COLMAP's database file, made if it does not exist; COLMAP also writes to its folder
     images: Path  # folder of the reduced photographs, all of one size
@@ -47,7 +46,6 @@ class ReducedPhotographs:
     """Frame name by file name in `images`, in the order the photographs were taken."""
     size: tuple[int, int]
     """Width and height of the original photographs, [pixels]; the photographs in `images` may be smaller."""
-    masks: Path | None = None  # folder of pictures that are black where features are not used; None: no masks
 
 
 def find_poses(
@@ -55,13 +53,12 @@ def find_poses(
     folder: Path,
     settings: CaptureSettings,
     focal_px: float | None = None,
-    masks: Mapping[str, Path] = MappingProxyType({}),
     say: Callable[[str], None] = lambda _: None,
 ) -> tuple[SfmModel, dict[str, str]]:
     """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
 
-    `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length;
-    `masks` are files by frame name. Returns the model, and a reason for each frame without a pose, by its name.
+    `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length.
+    Returns the model, and a reason for each frame without a pose, by its name.
     Results of an interrupted run in `folder` are reused. Only the largest set of photographs that fit is kept.
 
     Raises:
@@ -72,7 +69,7 @@ def find_poses(
     if len(names) < MIN_FRAMES:
         raise _too_few(len(names), "photographs of one size")
     some = {name: photographs[name] for name in names}
-    reduced, small = _reduced(some, folder, size, settings.image_size, masks)
+    reduced, small = _reduced(some, folder, size, settings.image_size)
     # The photographs' own focal length or a usual one, the principal point at the centre.
     focal = focal_px or _GUESSED_FOCAL * max(size)
     start = Camera(*size, focal, focal, size[0] / 2.0, size[1] / 2.0).resized(*small)
@@ -99,15 +96,15 @@ def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[
 
 
 def _reduced(
-    photographs: Mapping[str, Path], folder: Path, size: tuple[int, int], longest: int, masks: Mapping[str, Path]
+    photographs: Mapping[str, Path], folder: Path, size: tuple[int, int], longest: int
 ) -> tuple[ReducedPhotographs, tuple[int, int]]:
-    """Write photographs for COLMAP, at most `longest` pixels wide and high, and their masks, into `folder`.
+    """Write photographs for COLMAP, at most `longest` pixels wide and high, into `folder`.
 
     The files have no EXIF, by which COLMAP would turn them. Returns the files, and their width and height [pixels].
     """
     factor = min(1.0, longest / max(size))
     small = max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
-    images, mask_folder = folder / "images", folder / "masks"
+    images = folder / "images"
     images.mkdir(exist_ok=True)
     digits = max(4, len(str(len(photographs))))
     files = {f"{index:0{digits}d}.jpg": name for index, name in enumerate(photographs)}
@@ -120,13 +117,7 @@ def _reduced(
             temporary = images / f".{file}"
             picture.save(temporary, format="JPEG", quality=_JPEG_QUALITY)
             temporary.replace(images / file)
-    if masks:
-        mask_folder.mkdir(exist_ok=True)
-        for file, frame in files.items():
-            # COLMAP looks for the photograph's name with .png behind it.
-            use = Image.fromarray(np.where(mask_of(frame, masks, *size), np.uint8(255), np.uint8(0)))
-            use.resize(small, Image.Resampling.NEAREST).save(mask_folder / f"{file}.png")
-    return ReducedPhotographs(folder / _DATABASE, images, files, size, mask_folder if masks else None), small
+    return ReducedPhotographs(folder / _DATABASE, images, files, size), small
 
 
 def _too_few(got: int, what: str) -> SceneError:
@@ -214,8 +205,6 @@ def _find_and_match(
     _add_images(photographs, camera, settings.lens, known_focal)
     database, names = photographs.database, list(photographs.frame_of_image)
     reader = pycolmap.ImageReaderOptions(camera_model=settings.lens, existing_camera_id=1)
-    if photographs.masks is not None:
-        reader.mask_path = str(photographs.masks)
     extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=settings.threads)
     extraction.sift.max_num_features = settings.max_features
     for start in range(0, len(names), _CHUNK):  # COLMAP skips photographs that already have features
