@@ -7,9 +7,6 @@ import re
 import zlib
 from collections.abc import Callable
 from functools import cache
-from typing import Annotated
-
-from tyro.constructors import PrimitiveConstructorSpec
 
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic import drawn_scenes
@@ -54,19 +51,6 @@ def check_scene_name(name: str) -> str:
         remedy = f"Choose one of these names, or write random-17 or {HOUSE}+sky=0.55,0.57,0.60."
         raise SceneError("synthetic scene", expected=expected, got=repr(name), remedy=remedy)
     return name
-
-
-SceneWord = Annotated[
-    str,
-    PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=f"{{{','.join((*SCENE_NAMES, *DEVELOPMENT_NAMES, *RANDOM_NAMES))}}}",
-        instance_from_str=lambda words: check_scene_name(words[0]),
-        is_instance=lambda value: isinstance(value, str),
-        str_from_instance=lambda value: [value],
-    ),
-]
-"""Type of a command's option that is a scene's name, which is checked while the command line is read."""
 
 
 @cache
