@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from thermoxels_ns.mesh.tetrahedra import TetMesh
     from thermoxels_ns.multiview.stereo import Depths
 
-Settings = TypeVar("Settings", "Material", "TimeSteps")
 Say = Callable[[str], None]
 Compare = Callable[["SolidCells", "TetMesh", float], "dict[str, Any] | None"]
 """Compares solid voxels and a mesh with the exact scene, given the metres per unit; None if no exact scene is known."""
@@ -126,12 +125,6 @@ class ExportOptions:
     """Number of time steps. Left out: as in the heat scene (10 for concrete)."""
     step_seconds: float | None = None
     """Length of a time step, [s]. Left out: as in the heat scene (60 for concrete)."""
-    conductivity_w_mk: float | None = None
-    """Thermal conductivity, [W / (m K)]. Left out: as in the heat scene."""
-    density_kg_m3: float | None = None
-    """Mass density of the material, [kg / m3]. Left out: as in the heat scene."""
-    specific_heat_j_kgk: float | None = None
-    """Specific heat capacity, [J / (kg K)]. Left out: as in the heat scene."""
     vtk_times: Literal["all"] | tuple[float, ...] = ()
     """Times whose temperatures are written for ParaView beside those of the start and of the end, [s]: for each the
     nearest time that the scene keeps. all: every kept time; each takes as much space as the mesh."""
@@ -264,24 +257,19 @@ def check_options(options: ExportOptions) -> CheckedOptions:
 
 
 def _heat_settings(options: ExportOptions) -> tuple[HeatScene, Material, TimeSteps]:
-    """Return the heat scene, its material and its time steps, all with the changes that options make."""
+    """Return the heat scene, its material, and its time steps with the changes that options make."""
     from thermoxels_ns.fem.problem import TimeSteps
     from thermoxels_ns.heat.scene import load_heat_scene
 
-    def changed(settings: Settings) -> Settings:
-        given = {field.name: getattr(options, field.name, None) for field in fields(settings)}
-        return replace(settings, **{name: value for name, value in given.items() if value is not None})
-
     scene = load_heat_scene(options.heat_preset)
-    given, *others = set(scene.materials.values())
+    material, *others = set(scene.materials.values())
     if others or not isinstance(scene.time, TimeSteps):
         expected = "a scene of one material, with time: {steps: 10, step_seconds: 60}"
         remedy = "Export without it, then run thermoxels heat with that scene on the mesh."
         raise HeatError("heat_preset", expected=expected, got=options.heat_preset, remedy=remedy)
-    material, time = changed(given), changed(scene.time)
-    if material != given:
-        material = replace(material, name=f"{material.name} (changed)")
-    return replace(scene, materials=dict.fromkeys(scene.materials, material), time=time), material, time
+    given = {"steps": options.steps, "step_seconds": options.step_seconds}
+    time = replace(scene.time, **{name: value for name, value in given.items() if value is not None})
+    return replace(scene, time=time), material, time
 
 
 def scale_of(options: ExportOptions, checked: CheckedOptions, scene_file: Mapping | None) -> SceneScale | None:
