@@ -5,7 +5,6 @@ from __future__ import annotations
 # Only light imports at the top, so that ``thermoxels --help`` answers at once.
 import shutil
 import time
-import webbrowser
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -44,8 +43,6 @@ class Demo:
     """Synthetic scene to photograph."""
     iterations: int | None = None
     """Training steps; the default of the method if left out."""
-    open_browser: bool = False
-    """Show the page in a web browser at the end."""
 
     def main(self) -> None:
         """Run the demo; raises `ThermoxelsError` if a command fails, a target is missed, or the folder is in use."""
@@ -102,8 +99,6 @@ def run_demo(demo: Demo, console: Console) -> None:
     page = demo_page(folder, demo.scene, targets, others, compared, seconds, shown)
     write_page(index, page)
     console.print(f"All pictures and figures: {index}", markup=False, soft_wrap=True)
-    if demo.open_browser:
-        webbrowser.open(index.resolve().as_uri())
     missed = [f"{t.name} {t.measured_text} (target {t.bound_text})" for t in targets if not t.met]
     if missed:
         remedy = f"See {index} for pictures."
