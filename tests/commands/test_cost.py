@@ -14,10 +14,8 @@ from thermoxels_ns.commands.cost import (
     Cost,
     CostRow,
     CostSetting,
-    RunKey,
     draw_plot,
     markdown_table,
-    median_rows,
     planned_settings,
     read_runs,
     run_cost,
@@ -132,7 +130,6 @@ def test_the_rows_of_settings_qualities_methods_and_recipes():
     [
         *(({"settings": (text,)}, "settings") for text in ("64", "0:800", "64:0", "64:8e2", "64:800:2", " 64:800", "")),
         ({"settings": (), "qualities": ()}, "settings"),
-        ({"repeats": 0}, "repeats"),
         ({"target_mae": math.nan}, "target_mae"),
         ({"scene": Path("nowhere")}, "scene"),
     ],
@@ -163,7 +160,7 @@ def test_figures_of_the_runs_reach_all_files(start, scene, tmp_path):
     assert "| 32:100 | 1 s |" in shown
     assert (folder / "cost.png").stat().st_size > 10_000
     assert not any((folder / "models").iterdir())
-    assert {path.name for path in (folder / "logs").iterdir()} >= {"32-100-1-train.log", "32-100-1-eval.log"}
+    assert {path.name for path in (folder / "logs").iterdir()} >= {"32-100-train.log", "32-100-eval.log"}
 
 
 def test_the_real_commands_get_what_they_need(start, scene, tmp_path, commands):
@@ -171,7 +168,7 @@ def test_the_real_commands_get_what_they_need(start, scene, tmp_path, commands):
     train, evaluate = map(" ".join, commands.calls())
     assert train.startswith(f"ns-train thermoxels --data {scene} --output-dir {tmp_path / 'cost' / 'models'} ")
     assert " --max-num-iterations 400 " in train
-    config = tmp_path / "cost" / "models" / "64-400-1" / "thermoxels" / "run" / "config.yml"
+    config = tmp_path / "cost" / "models" / "64-400" / "thermoxels" / "run" / "config.yml"
     assert evaluate.startswith(f"ns-eval --load-config {config} --output-path ")
 
 
@@ -206,26 +203,14 @@ def test_an_interrupted_start_goes_on_where_it_stopped(start, commands, tmp_path
     assert list(table(tmp_path / "cost")) == ["32:100", "64:400"]
     empty = NS_EVAL.replace('"results": results', '"results": [1]')
     commands.write("ns-eval", empty)
-    with pytest.raises(ThermoxelsError, match=r"1\.json: expected the results"):
+    with pytest.raises(ThermoxelsError, match=r"48-100\.json: expected the results"):
         start(settings=("48:100",))
-
-
-def test_repeats_are_run_in_turns_and_their_medians_shown(start, commands, tmp_path):
-    shown = start(repeats=3)
-    steps = [call[call.index("--max-num-iterations") + 1] for call in commands.calls() if call[0] == "ns-train"]
-    assert steps == ["100", "400"] * 3
-    runs = read_runs(tmp_path / "cost" / "runs.csv")
-    seconds = [figures["seconds"] for key, figures in runs.items() if key.setting == "32:100"]
-    row = table(tmp_path / "cost")["32:100"]
-    assert row["repeats"] == "3"
-    assert float(row["seconds"]) == pytest.approx(sorted(seconds)[1], rel=1e-5)
-    assert "medians of 3 runs" in shown
 
 
 def test_a_damaged_list_of_runs_is_named(start, tmp_path):
     start(settings=("32:100",))
     path = tmp_path / "cost" / "runs.csv"
-    for content in ("setting,repeat\n32:100,1\n", path.read_text().replace(",0.9,", ",much,"), "\0"):
+    for content in ("setting\n32:100\n", path.read_text().replace(",0.9,", ",much,"), "\0"):
         path.write_text(content)
         with pytest.raises(ThermoxelsError, match=r"runs\.csv: expected the finished runs of an earlier start"):
             start(settings=("32:100",))
@@ -240,19 +225,17 @@ def test_the_command_line(commands, scene, tmp_path, capsys):
     assert "Error: settings: expected voxels and steps" in capsys.readouterr().err
 
 
-def rows_of(baseline: str, **settings: list[dict[str, float]]) -> list[CostRow]:
-    """Rows of settings from the figures of their runs."""
-    keyed = {
-        RunKey(name, n, "scene", "1", ""): NOTHING | figures
-        for name, runs in settings.items()
-        for n, figures in enumerate(runs)
-    }
-    given = [CostSetting(name, "thermoxels", ("--quality", name)) for name in settings]
-    return median_rows(given, keyed, baseline)
+def rows_of(baseline: str, **settings: dict[str, float]) -> list[CostRow]:
+    """Rows of settings from their figures."""
+    base = settings[baseline]["seconds"]
+    return [
+        CostRow(CostSetting(name, "thermoxels", ("--quality", name)), NOTHING | figures, figures["seconds"] / base)
+        for name, figures in settings.items()
+    ]
 
 
-def measured(seconds: float, psnr: float, mae: float, **more: float) -> list[dict[str, float]]:
-    return [{"seconds": seconds, "psnr": psnr, "thermal_mae_c": mae, **more}]
+def measured(seconds: float, psnr: float, mae: float, **more: float) -> dict[str, float]:
+    return {"seconds": seconds, "psnr": psnr, "thermal_mae_c": mae, **more}
 
 
 @pytest.mark.parametrize(

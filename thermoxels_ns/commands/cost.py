@@ -10,7 +10,6 @@ import os
 import re
 import shlex
 import shutil
-import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,7 +77,7 @@ class Cost:
     scene: tyro.conf.Positional[Path]
     """Scene folder. In a synthetic scene the trained surface is compared with the exact surface."""
     output_dir: Path = Path("cost")
-    """Folder for runs.csv (single runs), cost.csv (medians), cost.png, cost.md and logs."""
+    """Folder for runs.csv (finished runs), cost.csv, cost.png, cost.md and logs."""
     settings: tuple[str, ...] = ("32:400", "128:800")
     """Settings to train, each as resolution:steps: voxels along the longest side of the scene box, and training steps;
     the training schedule is scaled to both. May be empty."""
@@ -90,8 +89,6 @@ class Cost:
     recipes: tuple[str, ...] = ("default",)
     """Loss recipes. All rows use the first recipe (default: the method's own); each further recipe, such as paper, adds
     a row: the baseline with that recipe."""
-    repeats: int = 1
-    """Number of runs of each setting; the table shows medians."""
     target_mae: float | None = None
     """Name the cheapest setting whose thermal MAE is at most this, [degrees Celsius]."""
 
@@ -118,7 +115,6 @@ class RunKey(NamedTuple):
     """Identity of a run: runs with equal keys measure the same, so a run in runs.csv is not repeated."""
 
     setting: str  # `CostSetting.name`
-    repeat: int  # Number of the repetition, from 1
     scene: str  # Result of `scene_fingerprint`
     version: str  # Version of this package
     training: str  # The ns-train command, without the scene
@@ -129,12 +125,11 @@ Figures = dict[str, float]
 
 
 class CostRow(NamedTuple):
-    """A row of the table: a setting with the medians of its runs."""
+    """A row of the table: a setting with the figures of its run."""
 
     setting: CostSetting
-    repeats: int  # Number of runs
-    figures: Figures  # Median of each figure
-    time_ratio: float  # Median wall time divided by the baseline's; NaN if the baseline has no run
+    figures: Figures
+    time_ratio: float  # Wall time divided by the baseline's; NaN if the baseline has no run
 
 
 def run_cost(cost: Cost, console: Console) -> None:
@@ -146,18 +141,11 @@ def run_cost(cost: Cost, console: Console) -> None:
     if cost.target_mae is not None:
         check_positive("target_mae", cost.target_mae, "Correct --target-mae, or leave it out.")
     settings, baseline = planned_settings(cost)
-    if cost.repeats < 1:
-        raise ThermoxelsError("repeats", expected="1 or more", got=cost.repeats, remedy="Pass --repeats 3.")
     if not cost.scene.is_dir():
         raise SceneError("scene", expected="a scene folder", got=f"none at {cost.scene}", remedy="Correct the path.")
     folder, fingerprint = writable_folder(cost.output_dir), scene_fingerprint(cost.scene)
 
-    # Repeats of a setting lie apart in time, so that a slow spell of the machine does not fall on one setting.
-    plan = {
-        RunKey(setting.name, repeat, fingerprint, __version__, setting.command()): setting
-        for repeat in range(1, cost.repeats + 1)
-        for setting in settings
-    }
+    plan = {RunKey(one.name, fingerprint, __version__, one.command()): one for one in settings}
     runs = read_runs(folder / _RUNS)
     pending = [key for key in plan if key not in runs]
     if len(pending) < len(plan):
@@ -165,10 +153,10 @@ def run_cost(cost: Cost, console: Console) -> None:
         say(f"{kept} of {len(plan)} runs are in {folder / _RUNS} already; remove it to measure them again.")
     failed: list[str] = []
     for number, key in enumerate(pending, start=1):
-        title = key.setting if cost.repeats == 1 else f"{key.setting}, run {key.repeat}"
+        title = key.setting
         say(f"[{number}/{len(pending)}] {title} ...")
         try:
-            name = re.sub(r"[^0-9A-Za-z.-]+", "-", f"{key.setting}-{key.repeat}")
+            name = re.sub(r"[^0-9A-Za-z.-]+", "-", title)
             runs[key] = measure(cost.scene, plan[key], name, folder, console)
         except ThermoxelsError as problem:
             failed.append(f"{title}: {problem}")
@@ -177,13 +165,13 @@ def run_cost(cost: Cost, console: Console) -> None:
         write_runs(folder / _RUNS, runs)
         shown = (f"{FIGURES[of].heading} {_text(runs[key], of)}" for of in shown_figures([runs[key]]))
         say(f"{title}: {', '.join(shown)}")
-    rows = median_rows(settings, {key: runs[key] for key in plan if key in runs}, baseline)
+    measured = {plan[key]: runs[key] for key in plan if key in runs}
+    base = next((found["seconds"] for one, found in measured.items() if one.name == baseline), math.nan)
+    rows = [CostRow(one, found, found["seconds"] / base) for one, found in measured.items()]
     if rows:
-        counts = sorted({row.repeats for row in rows})
-        medians = "one run each" if counts == [1] else f"medians of {' or '.join(map(str, counts))} runs"
         scene, machine = cost.scene.resolve().name, f"a machine with {os.cpu_count()} processors"
         words = [markdown_table(rows, baseline)]
-        words.append(f"{scene}: {medians} on {machine}; memory is that of the ns-train process.")
+        words.append(f"{scene}: one run each on {machine}; memory is that of the ns-train process.")
         words += [verdict(rows, cost.target_mae, cost.scene)] if cost.target_mae else []
         write_table(folder / _TABLE, rows, baseline)
         draw_plot(folder / _PLOT, rows, cost.target_mae, f"What accuracy costs: {scene}")
@@ -255,9 +243,7 @@ def read_runs(path: Path) -> dict[RunKey, Figures]:
             if missing := {*RunKey._fields, *FIGURES} - set(reader.fieldnames or ()):
                 raise ValueError(f"no column {', '.join(sorted(missing))}")
             return {
-                RunKey(**{**{name: row[name] for name in RunKey._fields}, "repeat": int(row["repeat"])}): {
-                    name: float(row[name] or "nan") for name in FIGURES
-                }
+                RunKey(*(row[name] for name in RunKey._fields)): {name: float(row[name] or "nan") for name in FIGURES}
                 for row in reader
             }
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as problem:
@@ -278,8 +264,8 @@ def write_table(path: Path, rows: Iterable[CostRow], baseline: str) -> None:
     for row in rows:
         ratio = "" if math.isnan(row.time_ratio) else f"{row.time_ratio:.6g}"
         one = row.setting
-        lines.append([one.name, row.repeats, *_cells(row.figures), ratio, baseline, one.command()])
-    _write_csv(path, ["setting", "repeats", *FIGURES, "time_ratio", "baseline", "training"], lines)
+        lines.append([one.name, *_cells(row.figures), ratio, baseline, one.command()])
+    _write_csv(path, ["setting", *FIGURES, "time_ratio", "baseline", "training"], lines)
 
 
 def _cells(figures: Figures) -> list[str]:
@@ -338,21 +324,6 @@ def _text(figures: Figures, name: str) -> str:
 def shown_figures(figures: Sequence[Figures]) -> list[str]:
     """Return the names of figures that have a heading and that are known in at least one run."""
     return [name for name, one in FIGURES.items() if one.heading and not all(math.isnan(f[name]) for f in figures)]
-
-
-def median_rows(settings: Iterable[CostSetting], runs: Mapping[RunKey, Figures], baseline: str) -> list[CostRow]:
-    """Return a row for every setting that has a run; time ratios relate to the row named `baseline`."""
-    of_setting = {one: [found for key, found in runs.items() if key.setting == one.name] for one in settings}
-    of_setting = {setting: own for setting, own in of_setting.items() if own}
-    medians: list[Figures] = []
-    for own in of_setting.values():
-        known = {name: [figures[name] for figures in own if not math.isnan(figures[name])] for name in FIGURES}
-        medians.append({name: statistics.median(values) if values else math.nan for name, values in known.items()})
-    base = next((m["seconds"] for m, setting in zip(medians, of_setting) if setting.name == baseline), math.nan)
-    return [
-        CostRow(setting, len(own), median, median["seconds"] / base)
-        for (setting, own), median in zip(of_setting.items(), medians)
-    ]
 
 
 def verdict(rows: Sequence[CostRow], target_mae: float, scene: Path) -> str:
