@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import shutil
 import signal
 import threading
 from collections.abc import Callable, Mapping
@@ -18,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.errors import OutputError, ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.data.colmap_model import camera_to_world
 
 Say = Callable[[str], None]
@@ -26,8 +25,6 @@ _Result = TypeVar("_Result")
 
 _KILLED = -int(getattr(signal, "SIGKILL", 9))
 _FATAL_ONLY = 3
-_FULL_BYTES = 1_000_000
-"""With less free space, a full disk is taken as the reason why COLMAP ended: programs write whole pages."""
 FIELDS: dict[str, tuple[str, ...]] = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
@@ -46,7 +43,6 @@ def run_in_process(
     module, and its arguments and result must be picklable.
 
     Raises:
-        OutputError: The process ended because the disk of `folder` is full.
         ThermoxelsError: `work` raised this error, or the process ended without a result.
         OSError: `work` raised this error.
     """
@@ -73,10 +69,7 @@ def run_in_process(
         words = log.read_text("utf-8", "replace") if log.is_file() else ""
         log.unlink(missing_ok=True)
     if ended is None:
-        reason, free = _reason(child.exitcode, words), shutil.disk_usage(folder).free
-        if free < _FULL_BYTES or "disk is full" in reason:  # whatever COLMAP says
-            expected, got = f"free space for features, matches and poses in {folder}", f"{free / 1e6:.0f} MB"
-            raise OutputError("disk", expected=expected, got=got, remedy="Make space; finished stages are kept.")
+        reason = _reason(child.exitcode, words)
         remedy = "Check free space and memory and run the command again; if that does not help, begin anew with "
         raise ThermoxelsError("COLMAP", expected="to end", got=reason, remedy=remedy + "--from-stage poses.")
     if ended[1] is not None:
