@@ -8,7 +8,6 @@ from typing import Literal
 
 StageName = Literal["pairs", "temperatures", "poses", "scale", "board", "rig", "drift", "scene", "page"]
 """The stages of a capture in order."""
-Matching = Literal["auto", "exhaustive", "sequential"]
 LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
 
@@ -45,9 +44,6 @@ class CaptureSettings:
     """Longest time between the two exposures where a pair is found by time alone, in seconds."""
     clock_offset_s: float = 0.0
     """How far the thermal camera's clock is ahead of the photographs' clock, in seconds."""
-    matching: Matching = "auto"
-    """Pairs of photographs to compare. exhaustive: all; sequential: neighbours in time and some far ones; auto:
-    exhaustive up to 80 photographs, else sequential."""
     lens: LensModel = "SIMPLE_RADIAL"
     """Lens model of the photographs, by COLMAP's names. OPENCV fits strong distortion and needs many photographs."""
     image_size: int = 1600
@@ -60,8 +56,6 @@ class CaptureSettings:
     """Seed of all random choices; the same seed gives the same poses."""
     known_distance: tuple[str, float, float, float, float, float] | None = None
     """A measured length: name of a photograph, pixel x y of one end, pixel x y of the other end, length in metres."""
-    known_distance_error_m: float | None = None
-    """Standard error of --known-distance, in metres. Default: the length counts as exact."""
     thermal_field_of_view_deg: float | None = None
     """Horizontal angle of view of the thermal lens at the start of the search for the rig, in degrees. Default: what
     the files say."""

@@ -203,7 +203,7 @@ class _Capture:
     def poses(self, read: CaptureFrames) -> SfmModel:
         """Return camera, poses and scene points, which are found from the photographs."""
         settings = self.settings
-        names = ("image_size", "max_features", "matching", "lens", "seed", "threads")
+        names = ("image_size", "max_features", "lens", "seed", "threads")
         depends = {
             "options": {name: getattr(settings, name) for name in names},
         }
@@ -225,7 +225,7 @@ class _Capture:
         """Return the model turned upright, scale or None, reason for None, and up."""
         settings = self.settings
         depends = {
-            "known": [settings.known_distance, settings.known_distance_error_m],
+            "known": settings.known_distance,
         }
         by_name = {frame.name: frame for frame in read.frames}
         frames = [by_name[name] for name in found.frames]
@@ -254,8 +254,7 @@ class _Capture:
         settings = self.settings
         if settings.known_distance is not None:
             files = {frame.name: frame.photograph_source for frame in frames}
-            known, error_m = settings.known_distance, settings.known_distance_error_m
-            return scale_from_distance(model, known, files, error_m), ""
+            return scale_from_distance(model, settings.known_distance, files), ""
         return scale_from_gps(model.centres, [frame.gps for frame in frames])
 
     def board_rig(self, model: SfmModel, read: CaptureFrames) -> RigEstimate | None:

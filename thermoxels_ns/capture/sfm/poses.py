@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
-from thermoxels_ns.capture.settings import CaptureSettings, LensModel, Matching
+from thermoxels_ns.capture.settings import CaptureSettings, LensModel
 from thermoxels_ns.capture.sfm.colmap import FIELDS, model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.arrays import IntArray
@@ -25,12 +25,12 @@ _SAID_EVERY = 10
 _GUESSED_FOCAL = 1.0  # focal length as a share of the longest side, if no photograph states one: a 53 degree lens
 _JPEG_QUALITY = 95
 _DATABASE = "features.db"
-EXHAUSTIVE_UP_TO = 80  # auto matching compares all pairs up to this number of photographs; time grows with its square
+EXHAUSTIVE_UP_TO = 80  # all pairs are compared up to this number of photographs; time grows with its square
 _NEIGHBOURS = 8
-"""Sequential matching: each photograph is matched with the next `_NEIGHBOURS`, and with those 2, 4, 8, ... times
+"""Beyond it, each photograph is matched with the next `_NEIGHBOURS`, and with those 2, 4, 8, ... times
 `_NEIGHBOURS` places ahead."""
 _ANCHORS = 40
-"""Sequential matching: so many photographs, spread over the capture, are also matched with each other, so that a path
+"""Beyond it, so many photographs, spread over the capture, are also matched with each other, so that a path
 that returns to its start is closed."""
 _CHUNK = 8
 _PAIR_CHUNK = 200
@@ -170,15 +170,15 @@ def _options(seed: int) -> Any:
     return options
 
 
-def image_pairs(count: int, matching: Matching) -> IntArray:
+def image_pairs(count: int) -> IntArray:
     """Return the pairs of photographs to match, sorted, shape (p, 2): indices in order of time, the smaller first.
 
-    "exhaustive" gives every pair, "sequential" neighbours in time and some far pairs; "auto" chooses by `count`.
+    These are all pairs up to `EXHAUSTIVE_UP_TO` photographs, beyond it neighbours in time and some far pairs.
 
-    >>> image_pairs(3, "exhaustive").tolist()
+    >>> image_pairs(3).tolist()
     [[0, 1], [0, 2], [1, 2]]
     """
-    if matching == "exhaustive" or (matching == "auto" and count <= EXHAUSTIVE_UP_TO):
+    if count <= EXHAUSTIVE_UP_TO:
         return np.stack(np.triu_indices(count, 1), axis=1).astype(np.int64)
     steps = [*range(1, _NEIGHBOURS), *(_NEIGHBOURS * 2**power for power in range(count.bit_length()))]
     first, step = (grid.ravel() for grid in np.meshgrid(np.arange(count), steps, indexing="ij"))
@@ -212,7 +212,7 @@ def _find_and_match(
         given: dict[str, Any] = {"reader_options": reader, "extraction_options": extraction}
         pycolmap.extract_features(database, photographs.images, some, **given)
         say(f"features: {start + len(some)} of {len(names)} photographs")
-    pairs = image_pairs(len(names), settings.matching)
+    pairs = image_pairs(len(names))
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=settings.threads)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = settings.seed

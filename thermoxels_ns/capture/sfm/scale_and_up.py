@@ -84,7 +84,6 @@ def scale_from_distance(
     model: SfmModel,
     known: tuple[str, float, float, float, float, float],
     photograph_of: Mapping[str, str],
-    standard_error_m: float | None = None,
 ) -> SceneScale:
     """Find the scale from the measured distance between two points that one photograph shows.
 
@@ -95,7 +94,6 @@ def scale_from_distance(
         model: Poses and scene points.
         known: Name of the photograph or its frame, x and y of one end, x and y of the other [pixels], distance [m].
         photograph_of: Photograph's file, relative to the capture, by frame name.
-        standard_error_m: Standard error of the distance [m]; None counts as 0.
 
     Raises:
         ThermoxelsError: The photograph has no pose, a pixel lies outside or has no scene points around it, or the
@@ -114,7 +112,7 @@ def scale_from_distance(
     if not apart > 0:
         raise SceneError("known distance", expected="two different points", got="one", remedy="Pass two pixels.")
     along = (second - first) / apart
-    relative = math.hypot(error @ along / apart, other_error @ along / apart, (standard_error_m or 0.0) / metres)
+    relative = math.hypot(error @ along / apart, other_error @ along / apart)
     source = f"From {metres:g} m measured between two points in {name}."
     return SceneScale(metres / apart, metres / apart * relative, source)
 
