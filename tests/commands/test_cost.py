@@ -146,18 +146,17 @@ def test_figures_of_the_runs_reach_all_files(start, scene, tmp_path):
     rows = table(folder)
     assert list(rows) == ["32:100", "64:400", "64:400, plenoxels-t"]
     small, large, other = rows.values()
-    assert (float(small["training_seconds"]), float(large["training_seconds"])) == (1.0, 4.0)
     assert (float(small["psnr"]), float(large["psnr"]), other["psnr"]) == (25.0, 40.0, "")
     assert (small["thermal_mae_c"], small["fscore"], small["half_transparent"]) == ("0.8", "0.9", "0.02")
     assert float(small["seconds"]) > 0
     assert float(large["time_ratio"]) == 1.0 and large["baseline"] == "64:400"
     assert float(small["time_ratio"]) == pytest.approx(float(small["seconds"]) / float(large["seconds"]), rel=1e-4)
     page = (folder / "cost.md").read_text()
-    assert page.startswith("| setting | training | ns-train | time / 64:400 | RGB PSNR | thermal MAE |")
+    assert page.startswith("| setting | ns-train | time / 64:400 | RGB PSNR | thermal MAE |")
     assert "scene [1] &lt;b&gt;: one run each" in page
     best = "Cheapest setting with a thermal MAE of at most 0.5 °C: 64:400"
     assert best in page and best in shown
-    assert "| 32:100 | 1 s |" in shown
+    assert "| 32:100 | " in shown
     assert (folder / "cost.png").stat().st_size > 10_000
     assert not any((folder / "models").iterdir())
     assert {path.name for path in (folder / "logs").iterdir()} >= {"32-100-train.log", "32-100-eval.log"}

@@ -36,8 +36,6 @@ class Figure(NamedTuple):
 
 
 FIGURES: Mapping[str, Figure] = {
-    # From the first training step to the last checkpoint.
-    "training_seconds": Figure("training", "{:.0f} s"),
     # Wall time of the whole ns-train command, from its start to its end.
     "seconds": Figure("ns-train", "{:.0f} s"),
     # RGB PSNR [dB] and SSIM, and mean absolute temperature error [degrees Celsius], on held-out views.
@@ -60,7 +58,7 @@ FIGURES: Mapping[str, Figure] = {
     "peak_memory_gb": Figure("memory", "{:.1f} GB", "peak memory [GB], lower is better"),
 }
 """All measured figures, by the names of their columns in csv files."""
-_EVALUATED = tuple(name for name in FIGURES if name not in ("seconds", "training_seconds", "peak_memory_gb"))
+_EVALUATED = tuple(name for name in FIGURES if name not in ("seconds", "peak_memory_gb"))
 _RUNS, _TABLE, _PLOT, _PAGE = "runs.csv", "cost.csv", "cost.png", "cost.md"
 _GROUPS = ("density", "sh", "temperature", "background", "corrections")
 
@@ -288,21 +286,9 @@ def measure(scene: Path, setting: CostSetting, name: str, folder: Path, console:
     try:
         cost = run_command([*train, *PLAIN_TRAINING, *setting.options], logs / f"{name}-train.log", console)
         run_command(evaluate, logs / f"{name}-eval.log", console)
-        figures = {"seconds": cost.seconds, "peak_memory_gb": cost.peak_memory_gb}
-        return figures | {"training_seconds": training_seconds(run_folder), **read_evaluation(output)}
+        return {"seconds": cost.seconds, "peak_memory_gb": cost.peak_memory_gb, **read_evaluation(output)}
     finally:
         shutil.rmtree(models / name, ignore_errors=True)
-
-
-def training_seconds(run_folder: Path) -> float:
-    """Return the seconds of training, from the file time of dataparser_transforms.json to the last checkpoint's."""
-    start = run_folder / "dataparser_transforms.json"
-    checkpoints = sorted((run_folder / "nerfstudio_models").glob("step-*.ckpt"))
-    if not (start.is_file() and checkpoints):
-        expected = "dataparser_transforms.json and a checkpoint of a finished run"
-        remedy = "Look into the run's log."
-        raise ThermoxelsError(str(run_folder), expected=expected, got="a folder without them", remedy=remedy)
-    return checkpoints[-1].stat().st_mtime - start.stat().st_mtime
 
 
 def read_evaluation(path: Path) -> Figures:
