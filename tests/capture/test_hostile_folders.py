@@ -28,7 +28,7 @@ def no_pairs_said(card: Path, **more: object) -> str:
     [
         ((), (), ("1 files of other kinds",)),
         (("a0", "a1", "a2"), (), ("3 photographs", "no partner")),
-        (("a",), ("b",), ("1 photographs, 1 thermal images", "--pairs", "--clock-offset-s")),
+        (("a",), ("b",), ("1 photographs, 1 thermal images", "--clock-offset-s")),
     ],
 )
 def test_a_folder_without_pairs_says_what_is_in_it_and_what_helps(tmp_path, photographs, thermal, said):

@@ -7,7 +7,6 @@ import pytest
 
 from tests.support.unreadable import forbid
 from thermoxels_ns.capture.folder_scan import identify
-from thermoxels_ns.capture.pairs import read_pair_list
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig.images import read_photograph
 from thermoxels_ns.capture.rig_types import RigFrame
@@ -33,7 +32,6 @@ def read_rig_photograph(path: Path) -> None:
 READERS = {
     "tracks.npz": read_tracks,
     "runs.csv": read_runs,
-    "pairs.csv": lambda path: read_pair_list(path, path.parent),
     "points.ply": _read_ply,
     "any.json": read_json,
     "any.yaml": read_yaml,

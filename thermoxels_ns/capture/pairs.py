@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
@@ -23,9 +22,7 @@ from thermoxels_ns.capture.folder_scan import (
     words_of,
 )
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError, printable
-from thermoxels_ns.data.transforms_json import path_inside
 
 _DJI = re.compile(r"^(?P<head>.*?dji)_(?:(?P<time>\d{14})_)?(?P<number>\d{3,})_(?P<role>[a-z])(?P<tail>.*)$")
 _DJI_LATE_S = 3.0  # largest difference between the time stamps of the two images of one shot, [s]
@@ -38,7 +35,7 @@ _CLOCK_STEP_S = 0.5
 _REMEDY = (
     "Copy photographs and thermal files (FLIR or DJI R-JPEG, radiometric TIFF, .npy, .csv) of the same shots into the "
     "folder, as the camera wrote them; give both of a shot the same name (DJI: _T and _V or _W), or the right time "
-    "(--clock-offset-s, --time-limit-s), or list them in a file with --pairs."
+    "(--clock-offset-s, --time-limit-s)."
 )
 _DJI_LIBRARY = (
     "DJI's thermal images also need DJI's own library: download the DJI Thermal SDK and pass --dji-library with the "
@@ -53,7 +50,7 @@ class Pair:
     name: str  # name of the frame, unique in the capture; letters, digits, dot, dash and underscore
     photograph: Path
     thermal: Path  # the same path as `photograph` where the camera writes both into one file
-    how: str  # the rule or list by which the two files were paired
+    how: str  # the rule by which the two files were paired
 
     @property
     def in_one_file(self) -> bool:
@@ -65,7 +62,7 @@ class Pair:
 class PairSearch:
     """All pairs of a folder, and for every other camera file the reason why no pair contains that file."""
 
-    pairs: tuple[Pair, ...]  # sorted by the photographs' paths (`natural_key`), or in the order of the user's list
+    pairs: tuple[Pair, ...]  # sorted by the photographs' paths (`natural_key`)
     unpaired: dict[Path, str] = field(default_factory=dict)  # reason by file
 
 
@@ -130,42 +127,6 @@ def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: f
         tuple(Pair(name, photo.path, partner.path, how) for name, (photo, partner, how) in zip(names, ordered)),
         dict(sorted(unpaired.items(), key=lambda item: natural_key(item[0]))),
     )
-
-
-def read_pair_list(file: Path, folder: Path) -> PairSearch:
-    """Read the user's list of pairs, a CSV file with ``photograph,thermal`` per line, paths relative to `folder`.
-
-    If neither name in the first line is a file, that line is skipped as a heading.
-
-    Raises:
-        SceneError: The list is unreadable or empty, or names a file twice, a missing file, or one outside `folder`.
-    """
-    try:
-        rows = [row for row in csv.reader(file.read_text(encoding="utf-8-sig").splitlines()) if any(row)]
-    except (OSError, UnicodeDecodeError, csv.Error) as problem:
-        got, remedy = str(problem), remedy_of(problem, "Write it again.")
-        raise SceneError(str(file), expected="a CSV file of pairs", got=got, remedy=remedy) from problem
-    pairs = []
-    for number, row in enumerate(rows, start=1):
-        where = f"{file.name}: line {number}"
-        if len(row) != 2:
-            got, remedy = ",".join(row), "Write two names per line."
-            raise SceneError(where, expected="photograph,thermal", got=got, remedy=remedy)
-        photograph, thermal = (path_inside(folder, name.strip(), where) for name in row)
-        missing = [path for path in (photograph, thermal) if not path.is_file()]
-        if missing and number == 1 and len(missing) == 2:
-            continue
-        if missing:
-            raise SceneError(where, expected=f"a file {missing[0]}", got="none", remedy="Correct the name in the list.")
-        pairs.append((photograph, thermal))
-    twice = [path.name for side in zip(*pairs) for path, count in Counter(side).items() if count > 1]
-    if twice or not pairs:
-        expected = "at least one pair, and every file in one pair only"
-        got = f"{twice[0]} twice" if twice else "no pair"
-        raise SceneError(str(file), expected=expected, got=got, remedy="Correct the list.")
-    root = folder.resolve()
-    names = _names([photograph for photograph, _ in pairs], root)
-    return PairSearch(tuple(Pair(n, p, t, f"listed in {file.name}") for n, (p, t) in zip(names, pairs)))
 
 
 _Found = tuple[list[tuple[CameraFile, CameraFile, str]], dict[Path, str]]

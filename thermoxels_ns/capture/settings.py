@@ -37,9 +37,6 @@ class CaptureSettings:
     """Air temperature, in degrees C. Default: the camera's setting."""
     dji_library: Path | None = None
     """Path of DJI's libdirp.so or libdirp.dll, for DJI R-JPEG (from the DJI Thermal SDK)."""
-    pairs: Path | None = None
-    """CSV file with one photograph and its thermal image per line, relative to the input folder. Default: pairs are
-    found by content, names and times."""
     time_limit_s: float = 1.5
     """Longest time between the two exposures where a pair is found by time alone, in seconds."""
     clock_offset_s: float = 0.0

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
-from thermoxels_ns.capture.pairs import Pair, read_pair_list, search_pairs
+from thermoxels_ns.capture.pairs import Pair, search_pairs
 from thermoxels_ns.capture.rig.board import CheckerBoard, board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.rig.drift import estimate_drift, no_drift
 from thermoxels_ns.capture.rig.search import estimate_rig
@@ -148,15 +148,12 @@ class _Capture:
         return RadiometryOptions(**{each.name: given[each.name] for each in fields(RadiometryOptions)})
 
     def pairs(self) -> tuple[Pair, ...]:
-        """Return the pairs of photograph and thermal image, found in the folder or listed by the user."""
+        """Return the pairs of photograph and thermal image that are found in the folder."""
         settings = self.settings
-        inside = files_below(self.source, [self.output])
-        if settings.pairs is None:
-            inside = [path for path in inside if path.suffix.lower() in SUFFIXES]
+        inside = [path for path in files_below(self.source, [self.output]) if path.suffix.lower() in SUFFIXES]
         depends = {
             "times": [settings.time_limit_s, settings.clock_offset_s],
             "files": fingerprint(inside, self.source),
-            "list": given_fingerprints([settings.pairs]),
             "skip_bad": settings.skip_bad,
         }
 
@@ -164,10 +161,7 @@ class _Capture:
             return Path(os.path.relpath(path, self.source)).as_posix()
 
         def work(folder: Path) -> None:
-            if settings.pairs is None:
-                search = search_pairs(self.source, settings, [self.output], self.say)
-            else:
-                search = read_pair_list(settings.pairs, self.source)
+            search = search_pairs(self.source, settings, [self.output], self.say)
             rows = [(each.name, name_of(each.photograph), name_of(each.thermal), each.how) for each in search.pairs]
             left_out = {printable(name_of(path)): why for path, why in search.unpaired.items()}
             write_json(folder / "pairs.json", {"pairs": rows, "left_out": left_out})
