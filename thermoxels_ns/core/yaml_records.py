@@ -182,8 +182,8 @@ def _mistake(name: str, path: list[str | int], value: object, one: dict[str, Any
         return explain(above, expected=expected, got=got, remedy=remedy)
     if kind == "unexpected_keyword_argument":
         known = tuple(key for key in _keys_at(target, path[:-1]) if key != path[-1])
-        meant = _meant(str(path[-1]), known)
-        remedy = f"Did you mean {meant}?" if meant else "Correct or remove that key."
+        meant = difflib.get_close_matches(str(path[-1]), known, n=1)
+        remedy = f"Did you mean {meant[0]}?" if meant else "Correct or remove that key."
         if str(path[-1])[:1].isdigit():
             remedy = "Within braces a comma ends an entry: write decimals with a point."
         return explain(above, expected=f"keys out of {', '.join(known)}", got=path[-1], remedy=remedy)
@@ -212,14 +212,6 @@ def _keys_at(hint: Any, path: list[str | int]) -> tuple[str, ...]:
         return _keys_at(get_type_hints(hint, include_extras=True).get(str(path[0])), path[1:])
     rest = path[1:] if get_origin(hint) in (tuple, dict, Mapping) else path
     return tuple(key for part in get_args(hint) for key in _keys_at(part, rest))
-
-
-def _meant(key: str, known: tuple[str, ...]) -> str:
-    """Return the known key that a wrong `key` probably means, by its first word (air_k: air_c) or spelling, or ""."""
-    word = re.split(r"[_-]", key)[0]
-    same = [name for name in known if name.split("_")[0] == word]
-    close = difflib.get_close_matches(key, same or known, n=1, cutoff=0.0 if len(same) == 1 else 0.6)
-    return close[0] if close else ""
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
