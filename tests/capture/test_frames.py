@@ -62,7 +62,10 @@ def test_a_photograph_inside_a_flir_file_is_taken_out(tmp_path):
     (card / "F.jpg").write_bytes(flir.jpeg())
     (frame,) = read([Pair("F", card / "F.jpg", card / "F.jpg", "")], tmp_path).frames
     assert np.asarray(Image.open(frame.photograph)).mean(axis=(0, 1)) == pytest.approx((200, 30, 30), abs=3)
-    assert frame.picture_in_picture is not None and frame.picture_in_picture.real_to_thermal == pytest.approx(1.2)
+    assert (
+        frame.metadata.picture_in_picture is not None
+        and frame.metadata.picture_in_picture.real_to_thermal == pytest.approx(1.2)
+    )
     assert not frame.photograph.is_relative_to(card)
 
 
