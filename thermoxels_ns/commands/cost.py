@@ -160,7 +160,7 @@ def run_cost(cost: Cost, console: Console) -> None:
             failed.append(f"{title}: {problem}")
             say(f"{title} failed: {problem}")
             continue
-        write_runs(folder / _RUNS, runs)
+        _write_csv(folder / _RUNS, [*RunKey._fields, *FIGURES], ([*one, *_cells(runs[one])] for one in runs))
         shown = (f"{FIGURES[of].heading} {_text(runs[key], of)}" for of in shown_figures([runs[key]]))
         say(f"{title}: {', '.join(shown)}")
     measured = {plan[key]: runs[key] for key in plan if key in runs}
@@ -249,11 +249,6 @@ def read_runs(path: Path) -> dict[RunKey, Figures]:
         got = f"{type(problem).__name__}: {problem}"
         remedy = remedy_of(problem, "Remove the file to measure again, or choose another --output-dir.")
         raise ThermoxelsError(str(path), expected=expected, got=got, remedy=remedy) from problem
-
-
-def write_runs(path: Path, runs: Mapping[RunKey, Figures]) -> None:
-    """Write the finished runs to runs.csv; an interrupted write leaves the old file."""
-    _write_csv(path, [*RunKey._fields, *FIGURES], ([*key, *_cells(figures)] for key, figures in runs.items()))
 
 
 def write_table(path: Path, rows: Iterable[CostRow], baseline: str) -> None:

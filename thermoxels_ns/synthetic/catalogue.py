@@ -12,7 +12,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic import drawn_scenes
 from thermoxels_ns.synthetic.appearance import plain
 from thermoxels_ns.synthetic.drawn_scenes import HOUSE
-from thermoxels_ns.synthetic.random_scene import RANDOM_NAMES, random_scene, random_seed, with_room, with_street
+from thermoxels_ns.synthetic.random_scene import random_scene, random_seed, with_room, with_street
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 _BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
@@ -46,8 +46,8 @@ def check_scene_name(name: str) -> str:
     known = base in _BUILDERS or random_seed(base) is not None
     known &= all(variant in ("white", "street", "room") or _SKY.fullmatch(variant) for variant in variants)
     if not known or len(kinds) < len(variants) or kinds >= {"street", "room"} or ("white" in kinds and base != HOUSE):
-        every, seeded = ", ".join(_BUILDERS), " or ".join(RANDOM_NAMES)
-        expected = f"{seeded} with a whole number N from 0 on, or one of {every}; with {VARIANTS} if you like"
+        every = ", ".join(_BUILDERS)
+        expected = f"random-N or wild-N with a whole number N from 0 on, or one of {every}; with {VARIANTS} if you like"
         remedy = f"Choose one of these names, or write random-17 or {HOUSE}+sky=0.55,0.57,0.60."
         raise SceneError("synthetic scene", expected=expected, got=repr(name), remedy=remedy)
     return name
