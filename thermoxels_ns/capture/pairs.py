@@ -13,14 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoxels_ns.capture.folder_scan import (
-    ROLE_WORDS,
-    CameraFile,
-    CameraFolder,
-    natural_key,
-    scan_folder,
-    words_of,
-)
+from thermoxels_ns.capture.folder_scan import ROLE_WORDS, CameraFile, CameraFolder, natural_key, scan_folder, words_of
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.core.errors import SceneError, printable
 

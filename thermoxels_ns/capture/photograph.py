@@ -49,11 +49,6 @@ class PhotographFacts:
     gimbal_deg: tuple[float, float] | None
     """Pitch (0 is level, -90 looks straight down) and roll of the camera against gravity, [degrees]."""
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the photograph, [pixels]."""
-        return self.width, self.height
-
 
 def read_photograph_facts(path: Path) -> PhotographFacts:
     """Read a photograph's header; raise `SceneError` if the file is no picture or claims an absurd size."""

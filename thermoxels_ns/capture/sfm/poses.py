@@ -87,7 +87,8 @@ def find_poses(
 
 def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, str]]:
     """Return the width and height that most photographs have, and a reason for each frame of another size."""
-    sizes = {name: read_photograph_facts(path).size for name, path in photographs.items()}
+    facts = {name: read_photograph_facts(path) for name, path in photographs.items()}
+    sizes = {name: (one.width, one.height) for name, one in facts.items()}
     if not sizes:
         raise _too_few(0, "photographs")
     size = Counter(sizes.values()).most_common(1)[0][0]

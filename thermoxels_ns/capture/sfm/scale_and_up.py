@@ -153,7 +153,7 @@ def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> t
         keep = off <= 3.0 * 1.4826 * float(np.median(off)) + 1e-12
     at, usual = float(plane[0]), float(np.median(inverse))
     at = at if at > 0.25 * usual else usual  # a plane far behind the points gives no depth; take their median
-    ray = model.ray(index, np.asarray(pixel))
+    ray = (camera.rays([pixel])[0] * (1.0, -1.0, -1.0)) @ model.camera_to_world[index, :3, :3].T  # of depth 1
     error = float(np.sqrt(np.mean(off[keep] ** 2))) / at**2 / math.sqrt(max(int(keep.sum()) - 3, 1))
     return model.centres[index] + ray / at, ray * error
 

@@ -51,11 +51,6 @@ class SfmModel:
         pose = self.camera_to_world[frame]
         return (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3] @ OPENGL_FROM_OPENCV[:3, :3]
 
-    def ray(self, frame: int, pixel: npt.NDArray[np.floating]) -> FloatArray:
-        """Return the world vector (3,) from frame number `frame`'s camera to what a pixel (2,) shows at depth 1."""
-        pose = self.camera_to_world[frame]
-        return (self.camera.rays(pixel[None]) * (1.0, -1.0, -1.0))[0] @ pose[:3, :3].T
-
     def sighting_error_px(self) -> FloatArray:
         """Return the distance between each sighting's pixel and its point's projection, shape (s,), [pixels]."""
         errors = [np.zeros(0)]
