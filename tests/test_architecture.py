@@ -64,9 +64,9 @@ NEVER = {
 
 MOST_LINES = {
     "audit": 3790,
-    "capture": 4635,
-    "commands": 3345,
-    "core": 1875,
+    "capture": 4000,
+    "commands": 2805,
+    "core": 1855,
     "data": 2870,
     "evaluation": 440,
     "fem": 3485,
@@ -74,10 +74,10 @@ MOST_LINES = {
     "heat": 2725,
     "mesh": 5805,
     "multiview": 1855,
-    "radiometry": 1440,
+    "radiometry": 1360,
     "render": 1670,
     "reports": 1545,
-    "synthetic": 2875,
+    "synthetic": 2780,
     "training": 2805,
     "root": 715,
 }

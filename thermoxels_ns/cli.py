@@ -21,7 +21,6 @@ from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.core import quiet_warnings
 from thermoxels_ns.core.errors import ThermoxelsError, exit_status
 from thermoxels_ns.data.layouts import LayoutName
-from thermoxels_ns.synthetic.catalogue import SceneWord
 from thermoxels_ns.synthetic.imperfections import Imperfections
 
 
@@ -29,8 +28,9 @@ from thermoxels_ns.synthetic.imperfections import Imperfections
 class Synthetic:
     """Write a synthetic scene, whose shape and temperature are known exactly, as photographs and thermal images."""
 
-    scene: tyro.conf.Positional[SceneWord]
-    """Name of the scene. random-N and wild-N are made from the seed N; wild scenes have smooth, plain or textured
+    scene: tyro.conf.Positional[str]
+    """Name of the scene: hot-object, house-corner, sphere, courtyard, pipes, wall-object, facade, street, or random-N
+    or wild-N, which are made from the seed N; wild scenes have smooth, plain or textured
     surroundings, and some have plain walls, mirroring panes or a thin railing. After the name, in any order: +sky=R,G,B
     for a sky or backdrop of one colour (0 to 1), +street for houses and trees around, +room for a room around, +white
     for white plaster under a white sky (house-corner only); for example house-corner+sky=0.55,0.57,0.60 or

@@ -1,7 +1,6 @@
 import struct
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -9,10 +8,8 @@ from PIL import Image
 from tests.support.camera_card import counts, jpeg_bytes, photograph
 from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.frames import CaptureFrames, read_frames
-from thermoxels_ns.capture.masks import PhotographMasks, find_overlay, mask_files, read_mask
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import read_photograph_facts
-from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 
@@ -25,10 +22,10 @@ def pair(folder: Path, name: str, temperature_c: np.ndarray | None = None, **exi
     )
 
 
-def read(pairs, tmp_path, skip_bad=False, mask=None):
+def read(pairs, tmp_path, skip_bad=False):
     work = tmp_path / "work"
     work.mkdir(exist_ok=True)
-    return read_frames(pairs, tmp_path / "card", work, RadiometryOptions(), skip_bad, mask)
+    return read_frames(pairs, tmp_path / "card", work, RadiometryOptions(), skip_bad)
 
 
 def test_degrees_and_what_the_files_say(tmp_path):
@@ -65,7 +62,10 @@ def test_a_photograph_inside_a_flir_file_is_taken_out(tmp_path):
     (card / "F.jpg").write_bytes(flir.jpeg())
     (frame,) = read([Pair("F", card / "F.jpg", card / "F.jpg", "")], tmp_path).frames
     assert np.asarray(Image.open(frame.photograph)).mean(axis=(0, 1)) == pytest.approx((200, 30, 30), abs=3)
-    assert frame.picture_in_picture is not None and frame.picture_in_picture.real_to_thermal == pytest.approx(1.2)
+    assert (
+        frame.metadata.picture_in_picture is not None
+        and frame.metadata.picture_in_picture.real_to_thermal == pytest.approx(1.2)
+    )
     assert not frame.photograph.is_relative_to(card)
 
 
@@ -88,21 +88,18 @@ def test_a_frame_of_another_thermal_camera_is_dropped_by_name(tmp_path):
     assert "8 x 6 pixels, most have 16 x 12" in frames.dropped["odd"]
 
 
-def test_stuck_pixels_and_the_users_mask_become_nan(tmp_path):
+def test_stuck_pixels_become_nan(tmp_path):
     rng = np.random.default_rng(0)
     pairs = []
     for number in range(6):
         temperature_c = rng.uniform(10, 30, (12, 16))
         temperature_c[5, 7] = 99.0
         pairs.append(pair(tmp_path / "card", f"p{number}", temperature_c))
-    mask = np.full((12, 16), 255, dtype=np.uint8)
-    mask[:, 15] = 0
-    Image.fromarray(mask).save(tmp_path / "mask.png")
-    frames = read(pairs, tmp_path, mask=tmp_path / "mask.png")
+    frames = read(pairs, tmp_path)
     assert frames.dead_pixels == 1
     for frame in frames.frames:
         missing = np.isnan(np.load(frame.thermal))
-        assert missing[5, 7] and missing[:, 15].all() and missing.sum() == 13 == frame.masked
+        assert missing[5, 7] and missing.sum() == 1 == frame.masked
 
 
 @pytest.mark.parametrize(("fraction", "microsecond"), [("25", 250000), ("782/1000", 782000), ("x", 0), (None, 0)])
@@ -131,64 +128,3 @@ def test_gimbal_angles_of_xmp(tmp_path, form):
     xmp = f'http://ns.adobe.com/xap/1.0/\0<x:xmpmeta {form} drone-dji:GimbalRollDegree="+1.5"/>'.encode()
     path.write_bytes(content[:2] + b"\xff\xe1" + struct.pack(">H", len(xmp) + 2) + xmp + content[2:])
     assert read_photograph_facts(path).gimbal_deg == (-30.5, 1.5)
-
-
-def write(folder, number, pixels):
-    path = folder / f"{number}.jpg"
-    Image.fromarray(pixels).save(path, quality=90)
-    return path
-
-
-def scenes(count=10, seed=0):
-    """Different smooth pictures, 320 x 240."""
-    rng = np.random.default_rng(seed)
-    for _ in range(count):
-        yield cv2.resize(rng.integers(0, 255, (6, 8, 3), dtype=np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
-
-
-def test_text_and_a_scale_bar_are_masked(tmp_path):
-    paths, drawn = [], np.zeros((240, 320), dtype=np.uint8)
-    cv2.putText(drawn, "FLIR 21.5", (10, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, 255, 2)
-    cv2.rectangle(drawn, (300, 60), (312, 200), 255, -1)
-    for number, pixels in enumerate(scenes()):
-        pixels[drawn > 0] = 255
-        paths.append(write(tmp_path, number, pixels))
-    use = find_overlay(paths)
-    assert (~use)[drawn > 0].mean() > 0.97
-    far = cv2.dilate(drawn, np.ones((31, 31), np.uint8)) == 0
-    assert use[far].all()
-
-
-def test_what_the_scene_shows_is_no_overlay(tmp_path):
-    """Nothing drawn; still cameras; few photographs; a still patch like its surroundings; stripes, as of a fence."""
-    still = next(scenes(1))
-    few, patch, fence = list(scenes(4)), list(scenes(16)), list(scenes())
-    for pixels in few:
-        pixels[20:40, 20:60] = 255
-    for pixels in patch:
-        pixels[100:130, 100:150] = 127
-    for pixels in fence:
-        pixels[:, np.arange(320) // 8 % 2 == 0] = 255
-    for pictures in (scenes(), [still] * 8, few, patch, fence):
-        assert find_overlay([write(tmp_path, n, pixels) for n, pixels in enumerate(pictures)]) is None
-
-
-def test_the_users_mask_and_the_overlay_both_count(tmp_path):
-    hand = np.full((24, 32), 255, dtype=np.uint8)
-    hand[:, :4] = 0
-    Image.fromarray(hand).save(tmp_path / "IMG_1.png")
-    overlay = np.ones((24, 32), dtype=bool)
-    overlay[:2] = False
-    files = mask_files(tmp_path)
-    masks = PhotographMasks((32, 24), overlay, {"a": files["img_1"]})
-    assert (~masks.of("a")).sum() == 24 * 4 + 2 * 28
-    assert (~masks.of("b")).sum() == 2 * 32
-    assert masks.any and not PhotographMasks((32, 24)).any
-
-
-def test_a_mask_of_another_size_is_refused(tmp_path):
-    Image.new("L", (10, 10)).save(tmp_path / "m.png")
-    with pytest.raises(SceneError, match="a mask of 32 x 24 pixels"):
-        read_mask(tmp_path / "m.png", 32, 24)
-    with pytest.raises(SceneError, match="no folder at"):
-        mask_files(tmp_path / "nowhere")

@@ -7,10 +7,10 @@ import pytest
 
 from tests.support.camera_card import counts, photograph, write_pairs
 from tests.support.flir_file import dji_jpeg
-from thermoxels_ns.capture.folder_scan import scan_folder, shown_name
+from thermoxels_ns.capture.folder_scan import scan_folder
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.commands.capture import capture_folder
-from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError, printable
 
 
 def capture(card: Path, **more: object) -> None:
@@ -28,7 +28,7 @@ def no_pairs_said(card: Path, **more: object) -> str:
     [
         ((), (), ("1 files of other kinds",)),
         (("a0", "a1", "a2"), (), ("3 photographs", "no partner")),
-        (("a",), ("b",), ("1 photographs, 1 thermal images", "--pairs", "--clock-offset-s")),
+        (("a",), ("b",), ("1 photographs, 1 thermal images", "--clock-offset-s")),
     ],
 )
 def test_a_folder_without_pairs_says_what_is_in_it_and_what_helps(tmp_path, photographs, thermal, said):
@@ -69,7 +69,7 @@ def test_a_name_that_cannot_be_printed_is_refused_and_can_be_left_out(tmp_path, 
     found = scan_folder(tmp_path / "card")
     assert "Rename the file" in found.unreadable[path]
     assert [file.path.name for file in found.files] == ["ok.jpg"]
-    for text in (shown_name(path), found.unreadable[path], no_pairs_said(tmp_path / "card", skip_bad=True)):
+    for text in (printable(path.name), found.unreadable[path], no_pairs_said(tmp_path / "card", skip_bad=True)):
         assert text.isprintable() and text.encode("utf-8")
 
 

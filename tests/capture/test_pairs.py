@@ -7,8 +7,7 @@ import pytest
 from tests.support.camera_card import counts, jpeg_bytes, photograph
 from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.folder_scan import CameraFile, CameraFolder, scan_folder
-from thermoxels_ns.capture.pairs import PairSearch, find_pairs, read_pair_list
-from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.capture.pairs import PairSearch, find_pairs
 
 ROOT = Path("/card")
 NOON = datetime(2024, 5, 1, 12)
@@ -143,26 +142,3 @@ def test_a_plain_jpeg_that_is_named_thermal_is_no_photograph(tmp_path):
         "visible/a.jpg": "photograph",
         "thermal rgb/visible/b.jpg": "photograph",
     }
-
-
-def test_a_list_of_pairs_goes_before_names(card, tmp_path):
-    listed = tmp_path / "pairs.csv"
-    listed.write_text("photograph,thermal\n1-visible.jpg,1-radiometric.tiff\n")
-    search = read_pair_list(listed, card)
-    assert names(search) == [("1-visible.jpg", "1-radiometric.tiff")]
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("1-visible.jpg\n", "two names per line"),
-        ("1-visible.jpg,missing.tiff\n", "missing.tiff"),
-        ("1-visible.jpg,1-radiometric.tiff\n1-visible.jpg,FLIR2.jpg\n", "1-visible.jpg twice"),
-        ("../secret.jpg,1-radiometric.tiff\n", "line 1: expected a file inside"),
-    ],
-)
-def test_a_wrong_list_of_pairs_says_where(card, tmp_path, text, words):
-    listed = tmp_path / "pairs.csv"
-    listed.write_text(text)
-    with pytest.raises(SceneError, match=words):
-        read_pair_list(listed, card)

@@ -12,7 +12,6 @@ from tests.support.camera_card import photograph
 from tests.support.posed_model import ring_model
 from tests.support.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
 from thermoxels_ns import cli
-from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.rig_types import PARAMETERS, RigEstimate, RigFrame
 from thermoxels_ns.capture.scene_writer import TRACKS_NAME, scene_names, write_scene_folder
@@ -234,16 +233,10 @@ def test_tracks_say_which_training_photograph_sees_which_point(written):
     assert 0.5 * seen[train].sum() < len(outputs.metadata["feature_rays"].origins) <= seen[train].sum()
 
 
-def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, tmp_path, monkeypatch):
+def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, monkeypatch):
     scene, folder = written
-    overlay = np.ones((VISIBLE.height, VISIBLE.width), dtype=bool)
-    overlay[:40, :100] = False
-    masked = replace(scene, masks=PhotographMasks((VISIBLE.width, VISIBLE.height), overlay))
-    write_scene_folder(masked, folder)
-    assert (folder / "masks").is_dir()
     (folder / "notes.txt").write_text("mine")
     write_scene_folder(scene, folder)
-    assert not (folder / "masks").exists()
     assert (folder / "notes.txt").read_text() == "mine"
     before = (folder / "transforms.json").read_bytes()
 
@@ -252,7 +245,7 @@ def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, t
 
     monkeypatch.setattr("thermoxels_ns.capture.scene_writer.write_points", stop)
     with pytest.raises(KeyboardInterrupt):
-        write_scene_folder(masked, folder)
+        write_scene_folder(scene, folder)
     assert (folder / "transforms.json").read_bytes() == before
     assert len(read_scene_file(folder).frames) == COUNT
 
@@ -319,20 +312,12 @@ def test_a_board_gives_the_rig_and_a_scale_is_needed_for_it(capture, tmp_path):
     assert "5/9 board: as before" in said
 
 
-def test_given_poses_and_a_given_rig_are_kept(capture, tmp_path):
+def test_a_given_rig_is_kept(capture, tmp_path):
     card, scene, _, _ = capture
     meta = content(scene)
-    # The poses of the first capture, under the names that the photographs have on the card.
-    given = {**meta, "frames": [{**entry, "file_path": entry["source"]} for entry in meta["frames"]]}
-    file = tmp_path / "transforms.json"
-    file.write_text(json.dumps(given))
-    more = {"skip_bad": True, "poses": file, "rig": scene / "transforms.json"}
-    result = capture_folder(card, tmp_path / "scene", settings(**more))
+    result = capture_folder(card, tmp_path / "scene", settings(skip_bad=True, rig=scene / "transforms.json"))
     new = content(tmp_path / "scene")
-    before = {entry["source"]: entry["transform_matrix"] for entry in meta["frames"]}
-    assert {entry["source"]: entry["transform_matrix"] for entry in new["frames"]} == before
     assert new["rig"] == meta["rig"] and new["thermal_camera"] == meta["thermal_camera"]
-    assert f"shot{COUNT}" in result.dropped and "no pose" in result.dropped[f"shot{COUNT}"]
     assert result.scene.drift.used
 
 

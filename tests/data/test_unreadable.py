@@ -7,8 +7,7 @@ import pytest
 
 from tests.support.unreadable import forbid
 from thermoxels_ns.capture.folder_scan import identify
-from thermoxels_ns.capture.pairs import read_pair_list
-from thermoxels_ns.capture.photograph import open_photograph, read_mask
+from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig.images import read_photograph
 from thermoxels_ns.capture.rig_types import RigFrame
 from thermoxels_ns.commands.cost import read_runs
@@ -33,7 +32,6 @@ def read_rig_photograph(path: Path) -> None:
 READERS = {
     "tracks.npz": read_tracks,
     "runs.csv": read_runs,
-    "pairs.csv": lambda path: read_pair_list(path, path.parent),
     "points.ply": _read_ply,
     "any.json": read_json,
     "any.yaml": read_yaml,
@@ -45,7 +43,6 @@ READERS = {
     "card.png": lambda path: identify(path, path.parent),
     "photograph.jpg": open_photograph,
     "rig.jpg": read_rig_photograph,
-    "mask.png": lambda path: read_mask(path, 4, 3),
     "points3D.bin": lambda path: read_model(path.parent),
     "images.txt": lambda path: read_model(path.parent),
     "step.ckpt": load_checkpoint,

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
+from scipy.optimize import brentq
 
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.radiometry.measurement_model import (
@@ -12,7 +13,6 @@ from thermoxels_ns.radiometry.measurement_model import (
     AirConstants,
     ConditionOverrides,
     Conditions,
-    PlanckBand,
     PlanckConstants,
     RadiometricModel,
     corrected_temperature_c,
@@ -48,7 +48,7 @@ def test_a_count_becomes_the_temperature_computed_by_hand():
 def test_a_signal_of_nothing_has_no_temperature():
     assert np.isnan(E60.temperature_k([6233.0, 6000.0])).all()
     assert np.isfinite(E60.temperature_k([6234.0])).all()
-    assert np.isnan(LONG_WAVE.temperature_k([0.0, -1.0, 1e-30])).all()
+    assert np.isnan(LONG_WAVE.temperature_k([0.0, -1.0])).all()
 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=["E60", "i7", "band"])
@@ -59,15 +59,19 @@ def test_sensor_curves_rise_and_are_inverted(sensor):
     np.testing.assert_allclose(sensor.temperature_k(signal), kelvin, rtol=1e-12)
 
 
-def test_the_band_is_the_integral_of_planck():
-    def spectral(wavelength_um: float, kelvin: float) -> float:
-        h, c, k = 6.62607015e-34, 299792458.0, 1.380649e-23
-        metres = wavelength_um * 1e-6
-        return 2 * h * c**2 / metres**5 / math.expm1(h * c / (metres * k * kelvin)) * 1e-6
+def test_a_camera_without_constants_is_corrected_as_the_band_of_its_sensor_would():
+    """Planck's law over 7.5 to 13 micrometres, at 40 degrees C with emissivity 0.9 and reflections of -20 degrees C."""
 
-    for kelvin in (200.0, 288.0, 300.0, 373.0, 900.0):
-        exact = quad(spectral, 8.0, 14.0, args=(kelvin,), epsrel=1e-11)[0]
-        assert PlanckBand(8.0, 14.0).signal(kelvin) == pytest.approx(exact, rel=1e-6)
+    def radiance(kelvin: float) -> float:
+        def spectral(wavelength_um: float) -> float:
+            return wavelength_um**-5 / math.expm1(14387.76877 / (wavelength_um * kelvin))
+
+        return quad(spectral, 7.5, 13.0, epsrel=1e-11)[0]
+
+    of_object = (radiance(313.15) - 0.1 * radiance(253.15)) / 0.9
+    exact_k = brentq(lambda kelvin: radiance(kelvin) - of_object, 300.0, 340.0)
+    found_c = corrected_temperature_c(40.0, Conditions(), Conditions(emissivity=0.9, reflected_c=-20.0))
+    assert found_c + 273.15 == pytest.approx(exact_k, abs=0.05)
 
 
 @pytest.mark.parametrize("sensor", SENSORS, ids=["E60", "i7", "band"])
@@ -150,7 +154,7 @@ def test_air_hides_an_object_behind_its_own_temperature():
 @pytest.mark.parametrize(
     ("values", "named"),
     [
-        *(({"emissivity": value}, "emissivity") for value in (0.0, 1.01, math.nan, True)),
+        *(({"emissivity": value}, "emissivity") for value in (0.0, 1.01, math.nan)),
         ({"relative_humidity": 50.0}, "relative_humidity"),
         ({"relative_humidity": -0.1}, "relative_humidity"),
         ({"distance_m": -1.0}, "distance_m"),

@@ -6,11 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import tyro
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.catalogue import DEVELOPMENT_NAMES, SCENE_NAMES, SceneWord, make_scene
+from thermoxels_ns.synthetic.catalogue import DEVELOPMENT_NAMES, SCENE_NAMES, make_scene
 from thermoxels_ns.synthetic.random_plan import SMALLEST, Plan
 from thermoxels_ns.synthetic.random_scene import FAMILIES
 from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
@@ -215,15 +214,6 @@ def test_a_pane_mirrors_what_lies_along_the_reflected_ray() -> None:
 
 # Things that rest on something are this close to it, found by the nearest of random points [voxels of the plan].
 CONTACT = 0.06
-
-
-def test_the_command_line_takes_names_and_seeds_and_refuses_others(capsys: pytest.CaptureFixture[str]) -> None:
-    assert tyro.cli(SceneWord, args=["random-3"]) == "random-3"  # type: ignore[call-overload]
-    assert tyro.cli(SceneWord, args=["sphere"]) == "sphere"  # type: ignore[call-overload]
-    with pytest.raises(SystemExit) as stop:
-        tyro.cli(SceneWord, args=["random-03"])  # type: ignore[call-overload]
-    assert stop.value.code == 2
-    assert "random-N" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("seed", range(10))

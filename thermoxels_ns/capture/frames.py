@@ -9,16 +9,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_mask, read_photograph_facts
+from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_photograph_facts
 from thermoxels_ns.capture.stage_cache import load_json
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
-from thermoxels_ns.radiometry.flir_rjpeg import PictureInPicture, read_flir_jpeg
-from thermoxels_ns.radiometry.measurement_model import Conditions, conditions_text
+from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
+from thermoxels_ns.radiometry.measurement_model import conditions_text
 from thermoxels_ns.radiometry.thermal_pixels import find_dead_pixels
-from thermoxels_ns.radiometry.thermogram import RadiometryOptions, read_thermogram
+from thermoxels_ns.radiometry.thermogram import RadiometryOptions, ThermogramMetadata, read_thermogram
 
 _LIST = "frames.json"
 _MOST_FOR_DEAD_PIXELS = 60  # at most so many frames are searched for stuck pixels, to save memory
@@ -33,17 +34,13 @@ class CaptureFrame:
     thermal: Path  # a .npy file of float32 degrees C, shape (height, width), NaN where no temperature is known
     photograph_source: str  # path of the camera's file with the photograph, relative to the capture folder
     thermal_source: str  # path of the camera's file with the thermal image, relative to the capture folder
-    camera: str | None = None  # maker and model of the thermal camera
+    metadata: ThermogramMetadata  # what the thermal file states besides its temperatures
+    camera: str | None = None  # maker and model of the thermal camera, or else of the photograph's
     focal_px: float | None = None  # focal length that the photograph states, [pixels]
     orientation: int = 1  # EXIF's orientation of the photograph, 1 to 8
     gps: GpsFix | None = None
     gimbal_deg: tuple[float, float] | None = None  # pitch and roll of the camera, [degrees]
     thermal_focal_px: float | None = None  # focal length that the thermal file states, [thermal pixels]
-    thermal_field_of_view_deg: float | None = None  # horizontal angle of view that the thermal file states, [degrees]
-    picture_in_picture: PictureInPicture | None = None  # factory alignment of FLIR cameras
-    celsius_per_count: float | None = None  # temperature step of one count of the thermal file, [K]
-    format: str | None = None  # format of the thermal file, detected from its content
-    conditions: Conditions | None = None  # emissivity, distance etc. that the temperatures were computed with
     masked: int = 0  # number of thermal pixels without a temperature
 
 
@@ -60,16 +57,12 @@ class CaptureFrames:
     def load(cls, folder: Path, root: Path) -> CaptureFrames:
         """Read the list that `read_frames` wrote to `folder`; `root` is the capture folder, and both may have moved."""
         content = load_json(folder / _LIST)
-        for row in content["frames"]:
-            for name, kind in (("gps", GpsFix), ("picture_in_picture", PictureInPicture), ("conditions", Conditions)):
-                row[name] = None if row[name] is None else kind(**row[name])
-            row["gimbal_deg"] = None if row["gimbal_deg"] is None else tuple(row["gimbal_deg"])
-            row["thermal"] = folder / "thermal" / f"{row['name']}.npy"
-            taken_out = row["photograph_source"] == row["thermal_source"]
-            inside = folder / "photographs" / row["photograph"]
-            row["photograph"] = inside if taken_out else root / row["photograph_source"]
-        frames = tuple(CaptureFrame(**row) for row in content["frames"])
-        return cls(**{**content, "frames": frames, "thermal_size": tuple(content["thermal_size"])})
+        frames = list[CaptureFrame]()
+        for frame in TypeAdapter(list[CaptureFrame]).validate_python(content["frames"]):
+            taken_out = frame.photograph_source == frame.thermal_source
+            photograph = folder / "photographs" / frame.photograph if taken_out else root / frame.photograph_source
+            frames.append(replace(frame, photograph=photograph, thermal=folder / "thermal" / f"{frame.name}.npy"))
+        return cls(**{**content, "frames": tuple(frames), "thermal_size": tuple(content["thermal_size"])})
 
 
 def read_frames(
@@ -78,13 +71,12 @@ def read_frames(
     folder: Path,
     radiometry: RadiometryOptions,
     skip_bad: bool,
-    thermal_mask: Path | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> CaptureFrames:
     """Write each pair's temperatures, and photographs taken out of thermal files, to `folder`; return the frames.
 
-    Pixels of the thermal sensor that are stuck at one value, and pixels that the user's mask excludes, become NaN. With
-    `skip_bad` a pair with an unreadable file goes to `dropped`, as thermal images of an unusual size always do.
+    Pixels of the thermal sensor that are stuck at one value become NaN. With `skip_bad` a pair with an unreadable file
+    goes to `dropped`, as thermal images of an unusual size always do.
 
     Raises:
         ThermoxelsError: A file cannot be read and `skip_bad` is off, or no pair is left.
@@ -114,7 +106,7 @@ def read_frames(
             got, most = f"{own[0]} x {own[1]} pixels", f"{size[0]} x {size[1]}"
             dropped[frame.name] = f"{frame.thermal_source} has {got}, most have {most}: another thermal camera"
     kept = [frame for frame in frames if frame.name not in dropped]
-    dead, kept = _without_stuck_pixels(kept, size, thermal_mask)
+    dead, kept = _without_stuck_pixels(kept)
     result = CaptureFrames(tuple(kept), size, dead, dropped)
     bare = [replace(frame, photograph=frame.photograph.name, thermal=frame.thermal.name) for frame in kept]
     write_json(folder / _LIST, replace(result, frames=bare))
@@ -147,51 +139,42 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
         thermal=thermal.resolve(),
         photograph_source=Path(os.path.relpath(pair.photograph, root)).as_posix(),
         thermal_source=Path(os.path.relpath(pair.thermal, root)).as_posix(),
+        metadata=metadata,
         camera=metadata.camera or facts.exif.camera,
         focal_px=facts.focal_px,
         orientation=facts.orientation,
         gps=facts.gps or holder.gps,
         gimbal_deg=facts.gimbal_deg or holder.gimbal_deg,
         thermal_focal_px=thermal_focal,
-        thermal_field_of_view_deg=metadata.field_of_view_deg,
-        picture_in_picture=metadata.picture_in_picture,
-        celsius_per_count=metadata.celsius_per_count,
-        format=metadata.format,
-        conditions=metadata.conditions,
         masked=thermogram.report.masked,
     )
     height, width = thermogram.temperature_c.shape
     return frame, (width, height)
 
 
-def _without_stuck_pixels(
-    frames: list[CaptureFrame], size: tuple[int, int], thermal_mask: Path | None
-) -> tuple[int, list[CaptureFrame]]:
-    """Set stuck and masked pixels to NaN in all frames; return the number of stuck pixels and the frames."""
+def _without_stuck_pixels(frames: list[CaptureFrame]) -> tuple[int, list[CaptureFrame]]:
+    """Set stuck pixels to NaN in all frames; return their number and the frames."""
     some = np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FOR_DEAD_PIXELS)).round().astype(int)
     bad = find_dead_pixels(np.stack([np.load(frames[i].thermal) for i in some]))
-    dead = int(bad.sum())
-    if thermal_mask is not None:
-        bad = bad | ~read_mask(thermal_mask, *size)
     if not bad.any():
-        return dead, frames
+        return 0, frames
     changed = []
     for frame in frames:
         temperature_c = np.load(frame.thermal)
         temperature_c[bad] = np.nan
         np.save(frame.thermal, temperature_c)
         changed.append(replace(frame, masked=int(np.isnan(temperature_c).sum())))
-    return dead, changed
+    return int(bad.sum()), changed
 
 
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:
     """Return lines (name, text) for the report on formats of thermal files and settings of their temperatures."""
+    known = [frame.metadata for frame in frames]
     formats = Counter(
-        f.format + ("" if f.celsius_per_count is None else f" with {f.celsius_per_count:.4g} K per count")
-        for f in frames
-        if f.format
+        one.format + ("" if one.celsius_per_count is None else f" with {one.celsius_per_count:.4g} K per count")
+        for one in known
     )
-    conditions = Counter(conditions_text(frame.conditions) for frame in frames if frame.conditions)
+    conditions = Counter(conditions_text(one.conditions) for one in known if one.conditions)
     rows = []
     for name, counted in (("thermal files", formats), ("computed with", conditions)):
         listed = [f"{text} ({number} frames)" if len(counted) > 1 else text for text, number in counted.most_common()]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
@@ -14,19 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoxels_ns.capture.folder_scan import (
-    ROLE_WORDS,
-    CameraFile,
-    CameraFolder,
-    natural_key,
-    scan_folder,
-    shown_name,
-    words_of,
-)
+from thermoxels_ns.capture.folder_scan import ROLE_WORDS, CameraFile, CameraFolder, natural_key, scan_folder, words_of
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.core.checks import remedy_of
-from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.transforms_json import path_inside
+from thermoxels_ns.core.errors import SceneError, printable
 
 _DJI = re.compile(r"^(?P<head>.*?dji)_(?:(?P<time>\d{14})_)?(?P<number>\d{3,})_(?P<role>[a-z])(?P<tail>.*)$")
 _DJI_LATE_S = 3.0  # largest difference between the time stamps of the two images of one shot, [s]
@@ -39,7 +28,7 @@ _CLOCK_STEP_S = 0.5
 _REMEDY = (
     "Copy photographs and thermal files (FLIR or DJI R-JPEG, radiometric TIFF, .npy, .csv) of the same shots into the "
     "folder, as the camera wrote them; give both of a shot the same name (DJI: _T and _V or _W), or the right time "
-    "(--clock-offset-s, --time-limit-s), or list them in a file with --pairs."
+    "(--clock-offset-s, --time-limit-s)."
 )
 _DJI_LIBRARY = (
     "DJI's thermal images also need DJI's own library: download the DJI Thermal SDK and pass --dji-library with the "
@@ -54,7 +43,7 @@ class Pair:
     name: str  # name of the frame, unique in the capture; letters, digits, dot, dash and underscore
     photograph: Path
     thermal: Path  # the same path as `photograph` where the camera writes both into one file
-    how: str  # the rule or list by which the two files were paired
+    how: str  # the rule by which the two files were paired
 
     @property
     def in_one_file(self) -> bool:
@@ -66,7 +55,7 @@ class Pair:
 class PairSearch:
     """All pairs of a folder, and for every other camera file the reason why no pair contains that file."""
 
-    pairs: tuple[Pair, ...]  # sorted by the photographs' paths (`natural_key`), or in the order of the user's list
+    pairs: tuple[Pair, ...]  # sorted by the photographs' paths (`natural_key`)
     unpaired: dict[Path, str] = field(default_factory=dict)  # reason by file
 
 
@@ -95,7 +84,7 @@ def search_pairs(
     ]
     got = ", ".join(f"{number} {what}" for number, what in parts if number) or "no files"
     for path, why in list(search.unpaired.items())[:1]:
-        got += f" ({shown_name(path)}: {why})"
+        got += f" ({printable(path.name)}: {why})"
     remedy = _REMEDY
     if any(file.dji for file in found.files) and settings.dji_library is None:
         remedy += f" {_DJI_LIBRARY}"
@@ -133,81 +122,33 @@ def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: f
     )
 
 
-def read_pair_list(file: Path, folder: Path) -> PairSearch:
-    """Read the user's list of pairs, a CSV file with ``photograph,thermal`` per line, paths relative to `folder`.
-
-    If neither name in the first line is a file, that line is skipped as a heading.
-
-    Raises:
-        SceneError: The list is unreadable or empty, or names a file twice, a missing file, or one outside `folder`.
-    """
-    try:
-        rows = [row for row in csv.reader(file.read_text(encoding="utf-8-sig").splitlines()) if any(row)]
-    except (OSError, UnicodeDecodeError, csv.Error) as problem:
-        got, remedy = str(problem), remedy_of(problem, "Write it again.")
-        raise SceneError(str(file), expected="a CSV file of pairs", got=got, remedy=remedy) from problem
-    pairs = []
-    for number, row in enumerate(rows, start=1):
-        where = f"{file.name}: line {number}"
-        if len(row) != 2:
-            got, remedy = ",".join(row), "Write two names per line."
-            raise SceneError(where, expected="photograph,thermal", got=got, remedy=remedy)
-        photograph, thermal = (path_inside(folder, name.strip(), where) for name in row)
-        missing = [path for path in (photograph, thermal) if not path.is_file()]
-        if missing and number == 1 and len(missing) == 2:
-            continue
-        if missing:
-            raise SceneError(where, expected=f"a file {missing[0]}", got="none", remedy="Correct the name in the list.")
-        pairs.append((photograph, thermal))
-    twice = [path.name for side in zip(*pairs) for path, count in Counter(side).items() if count > 1]
-    if twice or not pairs:
-        expected = "at least one pair, and every file in one pair only"
-        got = f"{twice[0]} twice" if twice else "no pair"
-        raise SceneError(str(file), expected=expected, got=got, remedy="Correct the list.")
-    root = folder.resolve()
-    names = _names([photograph for photograph, _ in pairs], root)
-    return PairSearch(tuple(Pair(n, p, t, f"listed in {file.name}") for n, (p, t) in zip(names, pairs)))
-
-
 _Found = tuple[list[tuple[CameraFile, CameraFile, str]], dict[Path, str]]
 
 
 def _by_dji_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile]) -> _Found:
     """Pair DJI_0001_T with DJI_0001_V (or _W); times in the two names may differ by up to `_DJI_LATE_S`."""
-    taken: dict[tuple, list[tuple[re.Match[str], CameraFile]]] = defaultdict(list)
+    shots: dict[tuple, list[tuple[str, float, CameraFile]]] = defaultdict(list)
     for file in (*photographs, *thermal):
-        match = _DJI.match(file.path.stem.lower())
-        if match:
-            taken[(file.path.parent, match["head"], match["number"], match["tail"])].append((match, file))
-    pairs, others = [], []
-    for group in taken.values():
-        photos = [(match, file) for match, file in group if file.role == "photograph"]
-        for match, file in group:
-            if match["role"] != "t" or file.role == "photograph":
-                continue
-            near = [(m["role"], f) for m, f in photos if _seconds_apart(m, match) <= _DJI_LATE_S]
-            sides = [[f for letter, f in near if letter == each] for each in _DJI_PHOTOGRAPHS]
-            best = next((side for side in sides if side), [])
-            if len(best) == 1:
-                pairs.append((best[0], file, "DJI's names"))
-                others.append([f.path for _, f in near if f is not best[0]])
-    counted = Counter(photo.path for photo, _, _ in pairs)
-    clear, explained = [], dict[Path, str]()
-    for pair, rest in zip(pairs, others):
-        if counted[pair[0].path] == 1:
-            clear.append(pair)
-            explained |= {path: f"{pair[0].path.name} is the partner of {pair[1].path.name}" for path in rest}
-    return clear, {path: why for path, why in explained.items() if path not in counted}
+        if match := _DJI.match(file.path.stem.lower()):
+            shot = file.path.parent, match["head"], match["number"], match["tail"]
+            shots[shot].append((match["role"], _seconds(match["time"] or ""), file))
+    pairs, explained = [], dict[Path, str]()
+    for group in shots.values():
+        photos = [one for one in group if one[2].role == "photograph"]
+        for role, time_s, file in group:
+            near = {letter: other for letter, at_s, other in photos if abs(at_s - time_s) <= _DJI_LATE_S}
+            best = next((near[letter] for letter in _DJI_PHOTOGRAPHS if letter in near), None)
+            if role == "t" and file.role != "photograph" and best is not None:
+                pairs.append((best, file, "DJI's names"))
+                why = f"{best.path.name} is the partner of {file.path.name}"
+                explained |= {other.path: why for other in near.values() if other is not best}
+    return pairs, explained
 
 
-def _seconds_apart(first: re.Match[str], second: re.Match[str]) -> float:
-    if not first["time"] or not second["time"]:
-        return 0.0 if first["time"] == second["time"] else np.inf
-
-    def seconds(digits: str) -> int:
-        return int(digits[6:8]) * 86400 + int(digits[8:10]) * 3600 + int(digits[10:12]) * 60 + int(digits[12:])
-
-    return abs(seconds(first["time"]) - seconds(second["time"]))
+def _seconds(digits: str) -> float:
+    """Return the seconds since the start of the month of a time such as 20220723151219; 0 without a time."""
+    day, hour, minute, second = (int(digits[at : at + 2] or 0) for at in (6, 8, 10, 12))
+    return 86400.0 * day + 3600.0 * hour + 60.0 * minute + second
 
 
 def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], folder: Path) -> _Found:

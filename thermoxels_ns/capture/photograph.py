@@ -1,4 +1,4 @@
-"""Reads photographs, masks, and the headers of photographs: time, place, lens and orientation."""
+"""Reads photographs and the headers of photographs: time, place, lens and orientation."""
 
 from __future__ import annotations
 
@@ -11,11 +11,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from PIL import Image
 
-from thermoxels_ns.core.arrays import BoolArray
-from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.decoders import ExifFacts, errors_name, read_exif_facts
 
 _EXPECTED = "a photograph that can be decoded"
@@ -52,11 +49,6 @@ class PhotographFacts:
     gimbal_deg: tuple[float, float] | None
     """Pitch (0 is level, -90 looks straight down) and roll of the camera against gravity, [degrees]."""
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the photograph, [pixels]."""
-        return self.width, self.height
-
 
 def read_photograph_facts(path: Path) -> PhotographFacts:
     """Read a photograph's header; raise `SceneError` if the file is no picture or claims an absurd size."""
@@ -84,16 +76,6 @@ def open_photograph(path: Path) -> Image.Image:
     """Return a photograph's RGB pixels as stored, not turned by EXIF; raise `SceneError` if it cannot be decoded."""
     with errors_name(path, _EXPECTED, _REMEDY), Image.open(path) as image:
         return image.convert("RGB")
-
-
-def read_mask(path: Path, width: int, height: int) -> BoolArray:
-    """Return a mask (height, width), True where the file is light (128 or more); raise `SceneError` for a bad size."""
-    mask = np.asarray(open_photograph(path).convert("L")) >= 128
-    if mask.shape != (height, width):
-        expected = f"a mask of {width} x {height} pixels, as the images have"
-        remedy = "Draw it on one of the images: white where they may be used, black elsewhere."
-        raise SceneError(str(path), expected=expected, got=f"{mask.shape[1]} x {mask.shape[0]}", remedy=remedy)
-    return mask
 
 
 def _number(value: object) -> float | None:

@@ -82,9 +82,6 @@ class RigEstimate:
     """Names (of `PARAMETERS`) of the rows and columns of `covariance`. Empty: nothing was estimated."""
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """Covariance of the changes named in `parameters`, shape (n, n); that of the prior if the search found no rig."""
-    score_before: float = math.nan
-    """Agreement of thermal and visible edges (`RigScore.value`) with the start values, -1 to 1; NaN: not compared."""
-    score_after: float = math.nan  # the same agreement with the values returned
     projection_sigma_px: float = math.nan
     """Typical standard error of a scene point's place in the thermal image, both axes together [thermal pixels]."""
 

@@ -1,4 +1,4 @@
-"""Writes the scene folder that the dataparser reads: photographs, temperatures, masks, points, transforms.json."""
+"""Writes the scene folder that the dataparser reads: photographs, temperatures, points, transforms.json."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.capture.frames import CaptureFrame
-from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig_types import DriftEstimate, FloatArray, RigEstimate
 from thermoxels_ns.capture.sfm.scale_and_up import Up
@@ -27,9 +26,9 @@ from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, write_tracks
 JSON_NAME = "transforms.json"
 POINTS_NAME = "sparse_points.ply"
 TRACKS_NAME = "sparse_tracks.npz"
-_FOLDERS = ("images", "thermal", "masks")
+_FOLDERS = ("images", "thermal")
 SCENE_CONTENT = (JSON_NAME, POINTS_NAME, TRACKS_NAME, *_FOLDERS)
-"""Names of a scene's files and folders in the output folder; the folder masks exists only if the scene has masks."""
+"""Names of a scene's files and folders in the output folder."""
 _COPIED = {"JPEG": ".jpg", "PNG": ".png"}
 _MOST_POINT_ERROR_PX = 2.0
 _LEAST_SIGHTINGS = 3
@@ -46,7 +45,6 @@ class Scene:
     drift: DriftEstimate
     scale: SceneScale | None
     up: Up
-    masks: PhotographMasks
 
 
 def scene_names(count: int) -> list[str]:
@@ -65,7 +63,7 @@ def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = 
     """Write a scene into `output` in place of an earlier one; transforms.json comes last and marks it as complete."""
     new = output / CACHE_FOLDER / "new_scene"
     shutil.rmtree(new, ignore_errors=True)
-    for name in _FOLDERS if scene.masks.any else _FOLDERS[:2]:
+    for name in _FOLDERS:
         writable_folder(new / name)
     entries = []
     for number, (frame, name) in enumerate(zip(scene.frames, scene_names(len(scene.frames)))):
@@ -84,8 +82,7 @@ def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = 
     remove_file(output / JSON_NAME)
     for name in _FOLDERS:
         shutil.rmtree(output / name, ignore_errors=True)
-        if (new / name).is_dir():
-            (new / name).rename(output / name)
+        (new / name).rename(output / name)
     for name in (POINTS_NAME, TRACKS_NAME, JSON_NAME):
         (new / name).replace(output / name)
     shutil.rmtree(new, ignore_errors=True)
@@ -121,10 +118,6 @@ def _write_frame(scene: Scene, number: int, frame: CaptureFrame, name: str, fold
         "source": frame.photograph_source,
         "thermal_source": frame.thermal_source,
     }
-    if scene.masks.any:
-        mask = np.where(scene.masks.of(frame.name), np.uint8(255), np.uint8(0))
-        Image.fromarray(mask).save(folder / "masks" / f"{name}.png")
-        entry["mask_path"] = f"masks/{name}.png"
     return entry
 
 

@@ -8,7 +8,6 @@ from typing import Literal
 
 StageName = Literal["pairs", "temperatures", "poses", "scale", "board", "rig", "drift", "scene", "page"]
 """The stages of a capture in order."""
-Matching = Literal["auto", "exhaustive", "sequential"]
 LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
 
@@ -38,18 +37,10 @@ class CaptureSettings:
     """Air temperature, in degrees C. Default: the camera's setting."""
     dji_library: Path | None = None
     """Path of DJI's libdirp.so or libdirp.dll, for DJI R-JPEG (from the DJI Thermal SDK)."""
-    pairs: Path | None = None
-    """CSV file with one photograph and its thermal image per line, relative to the input folder. Default: pairs are
-    found by content, names and times."""
     time_limit_s: float = 1.5
     """Longest time between the two exposures where a pair is found by time alone, in seconds."""
     clock_offset_s: float = 0.0
     """How far the thermal camera's clock is ahead of the photographs' clock, in seconds."""
-    poses: Path | None = None
-    """Known poses: folder of a COLMAP model, or a transforms.json. Default: poses are found from the photographs."""
-    matching: Matching = "auto"
-    """Pairs of photographs to compare. exhaustive: all; sequential: neighbours in time and some far ones; auto:
-    exhaustive up to 80 photographs, else sequential."""
     lens: LensModel = "SIMPLE_RADIAL"
     """Lens model of the photographs, by COLMAP's names. OPENCV fits strong distortion and needs many photographs."""
     image_size: int = 1600
@@ -62,12 +53,6 @@ class CaptureSettings:
     """Seed of all random choices; the same seed gives the same poses."""
     known_distance: tuple[str, float, float, float, float, float] | None = None
     """A measured length: name of a photograph, pixel x y of one end, pixel x y of the other end, length in metres."""
-    known_distance_error_m: float | None = None
-    """Standard error of --known-distance, in metres. Default: the length counts as exact."""
-    marker_side_m: float | None = None
-    """Side of the black square of printed ArUco markers (dictionary 4x4, numbers 0 to 49) in the scene, in metres."""
-    marker_error_m: float | None = None
-    """Standard error of --marker-side-m, in metres. Default: the side counts as exact."""
     thermal_field_of_view_deg: float | None = None
     """Horizontal angle of view of the thermal lens at the start of the search for the rig, in degrees. Default: what
     the files say."""
@@ -83,9 +68,3 @@ class CaptureSettings:
     """Side of one square of the checker board, in metres."""
     drift: Literal["auto", "off"] = "auto"
     """Correct vignetting and offsets between thermal images, if this helps at points that the fit does not use."""
-    find_overlays: bool = True
-    """Mask text and logos that the camera drew over all photographs."""
-    masks: Path | None = None
-    """Folder of masks, each named like its photograph: white where the photograph may be used."""
-    thermal_mask: Path | None = None
-    """One mask for all thermal images: white where the thermal images may be used."""

@@ -23,7 +23,7 @@ from thermoxels_ns.core.version import __version__
 
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
-_FORMAT = 2  # number of the results' file format; a higher number makes all earlier results invalid
+_FORMAT = 3  # number of the results' file format; a higher number makes all earlier results invalid
 _KEY_FILE, _DONE_FILE = "key.txt", "seconds.txt"
 _Record = TypeVar("_Record")
 _EXPECTED, _REMEDY = "what an earlier stage of the capture wrote", "Run it again with --from-stage pairs."

@@ -12,8 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
-from thermoxels_ns.capture.masks import PhotographMasks, find_masks, mask_files, user_masks
-from thermoxels_ns.capture.pairs import Pair, read_pair_list, search_pairs
+from thermoxels_ns.capture.pairs import Pair, search_pairs
 from thermoxels_ns.capture.rig.board import CheckerBoard, board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.rig.drift import estimate_drift, no_drift
 from thermoxels_ns.capture.rig.search import estimate_rig
@@ -21,14 +20,13 @@ from thermoxels_ns.capture.rig.start import kept_start, read_rig, rig_frames, ri
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.scene_writer import SCENE_CONTENT, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.poses import add_points, find_poses, fitted_to_photographs, read_given_poses
+from thermoxels_ns.capture.sfm.poses import find_poses
 from thermoxels_ns.capture.sfm.scale_and_up import (
     Up,
     find_up,
     level_rotation,
     scale_from_distance,
     scale_from_gps,
-    scale_from_markers,
 )
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import (
@@ -51,7 +49,6 @@ from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 PAGE_NAME = "capture.html"  # file name of the report, in the output folder
 _MOST_NAMED = 10  # how many of the files left out are named while the command runs; the page names all
 _LEAST_SIGHTINGS = 50  # with fewer sightings of scene points, thermal images and photographs cannot be compared
-_OVERLAY_FILE = "overlay.npy"
 
 
 @dataclass(frozen=True)
@@ -66,7 +63,6 @@ class CaptureResult:
     scene: Scene
     start: RigEstimate  # the rig that the search started from
     scale_missing: str  # reason why no metric scale was found; empty where a scale was found
-    poses_source: str  # phrase for the report that says where the poses come from
     seconds: Sequence[tuple[str, float]]  # stages and the time each took, [s]
 
     @property
@@ -137,20 +133,11 @@ class _Capture:
         board = self.board_rig(model, read)
         rig, start = self.rig(model, frames, read, scale, scale_missing, board)
         drift = self.drift(model, frames, rig)
-        size, file = (model.camera.width, model.camera.height), self.output / CACHE_FOLDER / "poses" / _OVERLAY_FILE
-        overlay = np.load(file) if file.is_file() else None
-        if overlay is not None and overlay.shape != size[::-1]:
-            overlay = None
-        masks = PhotographMasks(size, overlay, user_masks(frames, self.settings.masks))
-        scene = Scene(frames, model, rig, drift, scale, up, masks)
-        written = [self.output / name for name in SCENE_CONTENT if name != "masks" or masks.any]
+        scene = Scene(frames, model, rig, drift, scale, up)
+        written = [self.output / name for name in SCENE_CONTENT]
         self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
-        given = self.settings.poses
-        source = f"Given in {given.name}." if given else "Structure from motion on the photographs (COLMAP)."
         left_out, seconds = self.dropped, self.cache.seconds
-        result = CaptureResult(
-            self.source, self.output, pairs, left_out, read, scene, start, scale_missing, source, seconds
-        )
+        result = CaptureResult(self.source, self.output, pairs, left_out, read, scene, start, scale_missing, seconds)
         self.cache.run("page", {}, lambda _: write_page(result), [result.page])
         return result
 
@@ -161,15 +148,12 @@ class _Capture:
         return RadiometryOptions(**{each.name: given[each.name] for each in fields(RadiometryOptions)})
 
     def pairs(self) -> tuple[Pair, ...]:
-        """Return the pairs of photograph and thermal image, found in the folder or listed by the user."""
+        """Return the pairs of photograph and thermal image that are found in the folder."""
         settings = self.settings
-        inside = files_below(self.source, [self.output])
-        if settings.pairs is None:
-            inside = [path for path in inside if path.suffix.lower() in SUFFIXES]
+        inside = [path for path in files_below(self.source, [self.output]) if path.suffix.lower() in SUFFIXES]
         depends = {
             "times": [settings.time_limit_s, settings.clock_offset_s],
             "files": fingerprint(inside, self.source),
-            "list": given_fingerprints([settings.pairs]),
             "skip_bad": settings.skip_bad,
         }
 
@@ -177,10 +161,7 @@ class _Capture:
             return Path(os.path.relpath(path, self.source)).as_posix()
 
         def work(folder: Path) -> None:
-            if settings.pairs is None:
-                search = search_pairs(self.source, settings, [self.output], self.say)
-            else:
-                search = read_pair_list(settings.pairs, self.source)
+            search = search_pairs(self.source, settings, [self.output], self.say)
             rows = [(each.name, name_of(each.photograph), name_of(each.thermal), each.how) for each in search.pairs]
             left_out = {printable(name_of(path)): why for path, why in search.unpaired.items()}
             write_json(folder / "pairs.json", {"pairs": rows, "left_out": left_out})
@@ -202,11 +183,10 @@ class _Capture:
             "options": options,
             "library": given_fingerprints([library]),
             "skip_bad": settings.skip_bad,
-            "mask": given_fingerprints([settings.thermal_mask]),
         }
 
         def work(folder: Path) -> None:
-            read = read_frames(pairs, self.source, folder, options, settings.skip_bad, settings.thermal_mask, self.say)
+            read = read_frames(pairs, self.source, folder, options, settings.skip_bad, self.say)
             width, height = read.thermal_size
             self.say(f"temperatures: {len(read.frames)} thermal images of {width} x {height} pixels")
 
@@ -215,34 +195,20 @@ class _Capture:
         return read
 
     def poses(self, read: CaptureFrames) -> SfmModel:
-        """Return camera, poses and scene points; they are found from the photographs or given by the user."""
+        """Return camera, poses and scene points, which are found from the photographs."""
         settings = self.settings
-        names = ("image_size", "max_features", "matching", "lens", "seed", "threads")
+        names = ("image_size", "max_features", "lens", "seed", "threads")
         depends = {
             "options": {name: getattr(settings, name) for name in names},
-            "poses": given_fingerprints([] if settings.poses is None else files_of(settings.poses)),
-            "masks": given_fingerprints([] if settings.masks is None else list(mask_files(settings.masks).values())),
-            "overlays": settings.find_overlays,
         }
 
         def work(folder: Path) -> None:
             photographs = {frame.name: frame.photograph for frame in read.frames}
-            masks = find_masks(read.frames, settings.masks, settings.find_overlays)
-            if masks.overlay is not None:
-                np.save(folder / _OVERLAY_FILE, masks.overlay)
-                self.say(f"masks: {100 * (1 - masks.overlay.mean()):.1f} % of every photograph is drawn over")
-            if settings.poses is None:
-                focal = [frame.focal_px for frame in read.frames if frame.focal_px]
-                middle = float(np.median(focal)) if focal else None
-                poses = find_poses(photographs, folder, settings, middle, masks, self.say)
-            else:
-                given = read_given_poses(settings.poses, {f.name: f.photograph_source for f in read.frames})
-                poses = fitted_to_photographs(given, photographs)
-            model = poses.model
-            if not len(model.points):
-                model = add_points(model, photographs, folder, settings, masks, self.say)
+            focal = [frame.focal_px for frame in read.frames if frame.focal_px]
+            middle = float(np.median(focal)) if focal else None
+            model, dropped = find_poses(photographs, folder, settings, middle, self.say)
             save(folder / "model.npz", model)
-            write_json(folder / "dropped.json", dict(poses.dropped))
+            write_json(folder / "dropped.json", dropped)
             self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
 
         folder = self.cache.run("poses", depends, work)
@@ -250,11 +216,10 @@ class _Capture:
         return load(folder / "model.npz", SfmModel)
 
     def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, SceneScale | None, str, Up]:
-        """Return the model (turned upright unless its poses are given), scale or None, reason for None, and up."""
+        """Return the model turned upright, scale or None, reason for None, and up."""
         settings = self.settings
         depends = {
-            "known": [settings.known_distance, settings.known_distance_error_m],
-            "markers": [settings.marker_side_m, settings.marker_error_m],
+            "known": settings.known_distance,
         }
         by_name = {frame.name: frame for frame in read.frames}
         frames = [by_name[name] for name in found.frames]
@@ -263,12 +228,10 @@ class _Capture:
             scale, missing = self._metric_scale(found, frames)
             gimbal, orientation = [frame.gimbal_deg for frame in frames], [frame.orientation for frame in frames]
             up = find_up(found.camera_to_world, gimbal, orientation)
-            model = found
-            if settings.poses is None:
-                rotation = level_rotation(up.direction, -found.camera_to_world[:, :3, 2].mean(axis=0))
-                origin = np.median(found.points, axis=0) if len(found.points) else found.centres.mean(axis=0)
-                model = found.moved(rotation, origin)
-                up = Up(rotation @ up.direction, up.source, up.spread_deg)
+            rotation = level_rotation(up.direction, -found.camera_to_world[:, :3, 2].mean(axis=0))
+            origin = np.median(found.points, axis=0) if len(found.points) else found.centres.mean(axis=0)
+            model = found.moved(rotation, origin)
+            up = Up(rotation @ up.direction, up.source, up.spread_deg)
             save(folder / "model.npz", model)
             write_json(folder / "scale.json", {"scale": scale, "missing": missing, "up": up})
             self.say(f"scale: {missing}" if scale is None else f"scale: {scale.metres_per_unit:.5g} m per unit")
@@ -281,15 +244,11 @@ class _Capture:
         return load(folder / "model.npz", SfmModel), scale, content["missing"], Up(**up)
 
     def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
-        """Return metres per unit from a known distance, else markers, else GPS; or None and the reason for None."""
+        """Return metres per unit from a known distance, else from GPS; or None and the reason for None."""
         settings = self.settings
         if settings.known_distance is not None:
             files = {frame.name: frame.photograph_source for frame in frames}
-            known, error_m = settings.known_distance, settings.known_distance_error_m
-            return scale_from_distance(model, known, files, error_m), ""
-        if settings.marker_side_m is not None:
-            photographs = {frame.name: frame.photograph for frame in frames}
-            return scale_from_markers(model, photographs, settings.marker_side_m, settings.marker_error_m)
+            return scale_from_distance(model, settings.known_distance, files), ""
         return scale_from_gps(model.centres, [frame.gps for frame in frames])
 
     def board_rig(self, model: SfmModel, read: CaptureFrames) -> RigEstimate | None:

@@ -15,6 +15,7 @@ import tyro
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.commands.installed_commands import command_of
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import (
     check_direction,
     check_positive,
@@ -38,6 +39,8 @@ ANSWERS, PAGE, DOCUMENT, SURFACE = "answers.json", "audit.html", "audit.pdf", "s
 """Files that an audit writes."""
 ENVELOPES = {"hbjson": "envelope.hbjson", "gbxml": "envelope-gbxml.xml"}
 """Files that an audit writes if `Audit.envelope` asks for them."""
+_PATCHES = {"wall": "tan", "roof": "indianred", "window": "deepskyblue", "door": "saddlebrown", "ground": "yellowgreen"}
+"""Colours of proposed patches."""
 
 Say = Callable[[str], None]
 
@@ -111,7 +114,6 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     from thermoxels_ns.audit.envelope import envelope_of
     from thermoxels_ns.audit.run import audit
     from thermoxels_ns.commands.audit_photographs import photographs_of_defects, shown_range_c
-    from thermoxels_ns.commands.proposed_patches import propose_patches
     from thermoxels_ns.core.yaml_records import write_example
     from thermoxels_ns.data.scene_file import read_scene_file
     from thermoxels_ns.mesh.boundary.planes import find_building
@@ -215,6 +217,50 @@ def write_agreement(path: Path, conditions: Path | None) -> None:
         (write_page if path.suffix == ".html" else write_pdf)(path, agreement_page(title, survey))
 
 
+def propose_patches(path: Path, mesh: TetMesh, up: Vector, north: Vector, say: Say) -> None:
+    """Find the flat elements of a building, write them as rules to `path`, and draw them in a PNG file beside it.
+
+    Raises `AuditError` if one of the files exists already, `MeshError` if no planes of the mesh enclose a body.
+    """
+    from thermoxels_ns.mesh.boundary.patches import with_patches, write_patch_rules
+    from thermoxels_ns.mesh.boundary.planes import find_building, proposed_rules
+    from thermoxels_ns.reports.mesh_pictures import image_of_surface, write_picture
+
+    picture = path.with_suffix(".png")
+    for one in (path, picture):
+        if one.exists() or path == picture:
+            remedy = "Choose another name with --write-patches, such as patches.yaml."
+            got = f"{one}, which is there" if one.exists() else f"{one}, the name of the picture"
+            raise AuditError("write_patches", expected="a name of a yaml file that is free", got=got, remedy=remedy)
+    building = find_building(mesh, up, north)
+    rules = proposed_rules(building)
+    tagged, _ = with_patches(mesh, rules, up)
+    assert tagged.boundary is not None
+    patch, names = tagged.boundary.patch, tagged.boundary.patch_names
+    areas = ", ".join(f"{one.name} {one.net_area_m2:.1f}" for one in building.every() if len(one.facets))
+    say(f"Found, [m2]: {areas}. {100 * building.left_out:.0f} % of the volume stands out from walls or is not flat.")
+    writable_folder(path.parent)
+    at, views = tagged.points_m[tagged.facets].mean(axis=1), []
+    normals = {one.name: one.normal for one in building.every()}
+    kinds = np.array([name.split("-")[0] for name in names])[patch]
+    painted = [(kind, colour, kinds == kind) for kind, colour in _PATCHES.items()]
+    painted.append(("no patch", "lightgrey", ~np.isin(kinds, [*_PATCHES])))
+    for title, towards in (("south and east", (-0.7, 0.9, -0.55)), ("north and west", (0.7, -0.9, -0.55))):
+        direction, labels = building.axes @ towards, list[tuple[str, FloatArray]]()
+        for number in np.unique(patch).tolist():
+            on, normal = at[patch == number], normals.get(names[number])
+            if normal is not None and normal @ towards < 0.0:
+                labels.append((names[number], on.mean(axis=0)))
+            elif names[number] == "ground":  # its middle may be under the house
+                labels.append(("ground", on[np.argsort(on @ direction)[len(on) // 50]]))
+        look = {"up": up, "view_direction": direction, "painted": painted, "labels": labels}
+        shape = mesh.points_m, mesh.facets, mesh.temperature_c
+        views.append(image_of_surface(*shape, title=f"Proposed patches, from {title}", **look))
+    write_patch_rules(path, rules, "Proposed by thermoxels audit; see the picture beside, correct and rename.")
+    write_picture(picture, np.concatenate(views, axis=1))
+    say(f"Written to {path} and {picture}: look at the picture, correct the file, and pass it with --patches.")
+
+
 def _read(path: Path, options: Audit, say: Say) -> tuple[TetMesh, Vector, dict[str, Any]]:
     """Return the mesh with the patches asked for, the unit vector that points up, and the summary of the export."""
     from thermoxels_ns.mesh.boundary.patches import load_patch_rules, with_patches
@@ -223,8 +269,7 @@ def _read(path: Path, options: Audit, say: Say) -> tuple[TetMesh, Vector, dict[s
     rules = None if options.patches is None else load_patch_rules(options.patches)
     mesh, export = read_mesh(path), read_export_summary(path, say)
     up = export.get("up") if options.up is None else options.up
-    direction = check_direction("up", up or (0.0, 0.0, 1.0), "Pass --up 0 0 1.", AuditError)
-    x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
+    x, y, z = check_direction("up", up or (0.0, 0.0, 1.0), "Pass --up 0 0 1.", AuditError).tolist()
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.facets):,} boundary triangles.")
     if rules is not None:
         mesh, idle = with_patches(mesh, rules, (x, y, z))
@@ -256,8 +301,7 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
             str(path), expected="the answers.json of an audit", got=got, remedy=f"{again} Audit again first."
         )
     conditions, mesh = earlier_conditions(path.name, content["conditions"]), read_surface(path.with_name(SURFACE))
-    direction = check_direction(f"{path}: up", content["up"], again, AuditError)
-    x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
+    x, y, z = check_direction(f"{path}: up", content["up"], again, AuditError).tolist()
     least_w = content.get("least_bridge_w")
     return lambda: without_slight(audit(mesh, conditions, (x, y, z)), least_w if is_number(least_w) else 0.0)
 

@@ -10,9 +10,7 @@ import os
 import re
 import shlex
 import shutil
-import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -34,23 +32,19 @@ class Figure(NamedTuple):
 
     heading: str = ""  # Heading of the figure's column in the table; empty: the figure is in the csv file alone
     form: str = ""  # Format of the value with its unit
-    higher_is_better: bool = False
     panel: str = ""  # Title of the figure's panel in the plot; empty: no panel
-    short: str = ""  # Name of the figure in the column of Pareto fronts; empty: no front
 
 
 FIGURES: Mapping[str, Figure] = {
-    # From the first training step to the last checkpoint.
-    "training_seconds": Figure("training", "{:.0f} s"),
     # Wall time of the whole ns-train command, from its start to its end.
     "seconds": Figure("ns-train", "{:.0f} s"),
     # RGB PSNR [dB] and SSIM, and mean absolute temperature error [degrees Celsius], on held-out views.
-    "psnr": Figure("RGB PSNR", "{:.1f} dB", True, "RGB PSNR [dB], higher is better", "PSNR"),
+    "psnr": Figure("RGB PSNR", "{:.1f} dB", "RGB PSNR [dB], higher is better"),
     "ssim": Figure(),
-    "thermal_mae_c": Figure("thermal MAE", "{:.2f} °C", False, "thermal MAE [°C], lower is better", "MAE"),
+    "thermal_mae_c": Figure("thermal MAE", "{:.2f} °C", "thermal MAE [°C], lower is better"),
     # F-score of the surface at 1.5 voxels of a lattice of 128 voxels, and at 1.5 voxels of the setting's own lattice.
     "fscore_128": Figure(
-        *("F-score, 1.5 of 128 voxels", "{:.2f}", True, "surface F-score at 1.5 of 128 voxels, higher is better")
+        *("F-score, 1.5 of 128 voxels", "{:.2f}", "surface F-score at 1.5 of 128 voxels, higher is better")
     ),
     "fscore": Figure("F-score, 1.5 own voxels", "{:.2f}"),
     "precision": Figure(),
@@ -61,12 +55,10 @@ FIGURES: Mapping[str, Figure] = {
     # Share of rays that neither pass through the scene nor are stopped.
     "half_transparent": Figure("half-transparent rays", "{:.1%}"),
     # Largest resident memory of the ns-train process, 1e9 bytes.
-    "peak_memory_gb": Figure("memory", "{:.1f} GB", False, "peak memory [GB], lower is better"),
+    "peak_memory_gb": Figure("memory", "{:.1f} GB", "peak memory [GB], lower is better"),
 }
 """All measured figures, by the names of their columns in csv files."""
-FRONTS = tuple(name for name, figure in FIGURES.items() if figure.short)
-_EVALUATED = tuple(name for name in FIGURES if name not in ("seconds", "training_seconds", "peak_memory_gb"))
-_TARGETS = {"thermal_mae_c": "a thermal MAE of at most {:g} °C", "psnr": "an RGB PSNR of at least {:g} dB"}
+_EVALUATED = tuple(name for name in FIGURES if name not in ("seconds", "peak_memory_gb"))
 _RUNS, _TABLE, _PLOT, _PAGE = "runs.csv", "cost.csv", "cost.png", "cost.md"
 _GROUPS = ("density", "sh", "temperature", "background", "corrections")
 
@@ -77,12 +69,13 @@ class Cost:
     and surface errors, as csv, plot and a table for a README.
 
     Finished runs are kept in runs.csv in the output folder; if the command was interrupted, start it again and it goes
-    on where it stopped. The machine should do nothing else."""
+    on where it stopped. Remove the file to measure again. The machine should do nothing else, and have trained once
+    before, because the first training compiles kernels."""
 
     scene: tyro.conf.Positional[Path]
     """Scene folder. In a synthetic scene the trained surface is compared with the exact surface."""
     output_dir: Path = Path("cost")
-    """Folder for runs.csv (single runs), cost.csv (medians), cost.png, cost.md and logs."""
+    """Folder for runs.csv (finished runs), cost.csv, cost.png, cost.md and logs."""
     settings: tuple[str, ...] = ("32:400", "128:800")
     """Settings to train, each as resolution:steps: voxels along the longest side of the scene box, and training steps;
     the training schedule is scaled to both. May be empty."""
@@ -90,28 +83,12 @@ class Cost:
     """Named qualities of ns-train to train as well. May be empty."""
     methods: tuple[str, ...] = ("thermoxels",)
     """Training methods. The first method trains all settings and qualities; each further method, such as plenoxels-t,
-    adds a row: the baseline with that method."""
+    adds a row: the baseline (standard, or else the last quality or setting) with that method."""
     recipes: tuple[str, ...] = ("default",)
     """Loss recipes. All rows use the first recipe (default: the method's own); each further recipe, such as paper, adds
     a row: the baseline with that recipe."""
-    baseline: str | None = None
-    """Setting or quality whose time is 1 in the table, and at which further methods and recipes are trained. Default:
-    standard, or else the last quality, or else the last setting."""
-    repeats: int = 1
-    """Number of runs of each setting; the table shows medians."""
     target_mae: float | None = None
     """Name the cheapest setting whose thermal MAE is at most this, [degrees Celsius]."""
-    target_psnr: float | None = None
-    """Name the cheapest setting whose RGB PSNR is at least this, [dB]. With --target-mae both must hold."""
-    train_options: str = ""
-    """Further options for all ns-train commands, as one quoted text after an equals sign, for instance
-    --train-options="--pipeline.model.near-plane 0.05"."""
-    warm_up: bool = True
-    """Train the first setting once before the measured runs, so that no measured run compiles kernels."""
-    keep_models: bool = False
-    """Keep the trained models in the folder models."""
-    again: bool = False
-    """Measure runs again that runs.csv already holds, for instance after a change of the program."""
 
     def main(self) -> None:
         """Measure and report; raises `ThermoxelsError` if an option or the scene cannot be used, or a run failed."""
@@ -136,7 +113,6 @@ class RunKey(NamedTuple):
     """Identity of a run: runs with equal keys measure the same, so a run in runs.csv is not repeated."""
 
     setting: str  # `CostSetting.name`
-    repeat: int  # Number of the repetition, from 1
     scene: str  # Result of `scene_fingerprint`
     version: str  # Version of this package
     training: str  # The ns-train command, without the scene
@@ -147,13 +123,11 @@ Figures = dict[str, float]
 
 
 class CostRow(NamedTuple):
-    """A row of the table: a setting with the medians of its runs."""
+    """A row of the table: a setting with the figures of its run."""
 
     setting: CostSetting
-    repeats: int  # Number of runs
-    figures: Figures  # Median of each figure
-    time_ratio: float  # Median wall time divided by the baseline's; NaN if the baseline has no run
-    fronts: tuple[str, ...]  # Names in `FRONTS` of the figures whose Pareto front holds this row
+    figures: Figures
+    time_ratio: float  # Wall time divided by the baseline's; NaN if the baseline has no run
 
 
 def run_cost(cost: Cost, console: Console) -> None:
@@ -162,54 +136,43 @@ def run_cost(cost: Cost, console: Console) -> None:
     def say(line: str) -> None:
         console.print(line, markup=False, soft_wrap=True)
 
-    targets = _targets(cost)
+    if cost.target_mae is not None:
+        check_positive("target_mae", cost.target_mae, "Correct --target-mae, or leave it out.")
     settings, baseline = planned_settings(cost)
-    if cost.repeats < 1:
-        raise ThermoxelsError("repeats", expected="1 or more", got=cost.repeats, remedy="Pass --repeats 3.")
     if not cost.scene.is_dir():
         raise SceneError("scene", expected="a scene folder", got=f"none at {cost.scene}", remedy="Correct the path.")
     folder, fingerprint = writable_folder(cost.output_dir), scene_fingerprint(cost.scene)
 
-    # Repeats of a setting lie apart in time, so that a slow spell of the machine does not fall on one setting.
-    plan = {
-        RunKey(setting.name, repeat, fingerprint, __version__, setting.command()): setting
-        for repeat in range(1, cost.repeats + 1)
-        for setting in settings
-    }
-    runs = {key: found for key, found in read_runs(folder / _RUNS).items() if not (cost.again and key in plan)}
+    plan = {RunKey(one.name, fingerprint, __version__, one.command()): one for one in settings}
+    runs = read_runs(folder / _RUNS)
     pending = [key for key in plan if key not in runs]
     if len(pending) < len(plan):
         kept = len(plan) - len(pending)
-        say(f"{kept} of {len(plan)} runs are in {folder / _RUNS} already; --again True measures them again.")
-    if pending and cost.warm_up:
-        first = plan[pending[0]]
-        say(f"Warm-up with {first.name}, not counted ...")
-        with suppress(ThermoxelsError):  # the first counted run reports the same error
-            measure(cost.scene, first, "warm-up", folder, False, console)
+        say(f"{kept} of {len(plan)} runs are in {folder / _RUNS} already; remove it to measure them again.")
     failed: list[str] = []
     for number, key in enumerate(pending, start=1):
-        title = key.setting if cost.repeats == 1 else f"{key.setting}, run {key.repeat}"
+        title = key.setting
         say(f"[{number}/{len(pending)}] {title} ...")
         try:
-            name = re.sub(r"[^0-9A-Za-z.-]+", "-", f"{key.setting}-{key.repeat}")
-            runs[key] = measure(cost.scene, plan[key], name, folder, cost.keep_models, console)
+            name = re.sub(r"[^0-9A-Za-z.-]+", "-", title)
+            runs[key] = measure(cost.scene, plan[key], name, folder, console)
         except ThermoxelsError as problem:
             failed.append(f"{title}: {problem}")
             say(f"{title} failed: {problem}")
             continue
-        write_runs(folder / _RUNS, runs)
+        _write_csv(folder / _RUNS, [*RunKey._fields, *FIGURES], ([*one, *_cells(runs[one])] for one in runs))
         shown = (f"{FIGURES[of].heading} {_text(runs[key], of)}" for of in shown_figures([runs[key]]))
         say(f"{title}: {', '.join(shown)}")
-    rows = median_rows(settings, {key: runs[key] for key in plan if key in runs}, baseline)
+    measured = {plan[key]: runs[key] for key in plan if key in runs}
+    base = next((found["seconds"] for one, found in measured.items() if one.name == baseline), math.nan)
+    rows = [CostRow(one, found, found["seconds"] / base) for one, found in measured.items()]
     if rows:
-        counts = sorted({row.repeats for row in rows})
-        medians = "one run each" if counts == [1] else f"medians of {' or '.join(map(str, counts))} runs"
         scene, machine = cost.scene.resolve().name, f"a machine with {os.cpu_count()} processors"
         words = [markdown_table(rows, baseline)]
-        words.append(f"{scene}: {medians} on {machine}; memory is that of the ns-train process.")
-        words += [verdict(rows, targets, cost.scene)] if targets else []
+        words.append(f"{scene}: one run each on {machine}; memory is that of the ns-train process.")
+        words += [verdict(rows, cost.target_mae, cost.scene)] if cost.target_mae else []
         write_table(folder / _TABLE, rows, baseline)
-        draw_plot(folder / _PLOT, rows, targets, f"What accuracy costs: {scene}")
+        draw_plot(folder / _PLOT, rows, cost.target_mae, f"What accuracy costs: {scene}")
         with replace_when_done(folder / _PAGE) as temporary:  # names may hold markup, which is escaped
             temporary.write_text(html.escape("\n\n".join(words), quote=False) + "\n", encoding="utf-8")
         for text in ("", *words, f"Written to {folder}: {', '.join((_TABLE, _PLOT, _PAGE, _RUNS))}"):
@@ -221,26 +184,17 @@ def run_cost(cost: Cost, console: Console) -> None:
 
 def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     """Return the rows of the table and the name of the baseline; raises `ThermoxelsError` for wrong options."""
-    try:
-        further = tuple(shlex.split(cost.train_options))
-    except ValueError as problem:
-        expected, remedy = "words as in a shell", "Close the quotes."
-        raise ThermoxelsError("train_options", expected=expected, got=str(problem), remedy=remedy) from problem
-
     words = {text: training_options(text) for text in cost.settings}
     words |= {quality: ("--quality", quality) for quality in cost.qualities}
     if not words:
         remedy = "Pass --settings 64:800."
         raise ThermoxelsError("settings", expected="a setting or a quality", got="none", remedy=remedy)
-    baseline = cost.baseline or ("standard" if "standard" in words else [*words][-1])
-    if baseline not in words:
-        expected = f"one of {', '.join(words)}"
-        raise ThermoxelsError("baseline", expected=expected, got=baseline, remedy="Name one of them.")
+    baseline = "standard" if "standard" in words else [*words][-1]
 
     def row(of: str, method: str, recipe: str, kind: str = "") -> CostSetting:
         # The recipe "default" is the method's own recipe, which needs no option.
         recipe_words = () if recipe == "default" else ("--pipeline.model.recipe", recipe)
-        return CostSetting(f"{of}{kind}", method, (*words[of], *recipe_words, *further))
+        return CostSetting(f"{of}{kind}", method, (*words[of], *recipe_words))
 
     method, *methods = dict.fromkeys(cost.methods or ("thermoxels",))
     recipe, *recipes = dict.fromkeys(cost.recipes or ("default",))
@@ -248,16 +202,6 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     rows += [row(baseline, other, recipe, f", {other}") for other in methods]
     rows += [row(baseline, method, other, f", recipe {other}") for other in recipes]
     return rows, baseline
-
-
-def _targets(cost: Cost) -> dict[str, float]:
-    """Return the targets that the user set, by names of `FIGURES`; raises `ThermoxelsError` unless all are above 0."""
-    bounds = {"thermal_mae_c": ("target_mae", cost.target_mae), "psnr": ("target_psnr", cost.target_psnr)}
-    return {
-        figure: check_positive(name, value, f"Correct --{name.replace('_', '-')}, or leave it out.")
-        for figure, (name, value) in bounds.items()
-        if value is not None
-    }
 
 
 def training_options(setting: str) -> tuple[str, ...]:
@@ -297,9 +241,7 @@ def read_runs(path: Path) -> dict[RunKey, Figures]:
             if missing := {*RunKey._fields, *FIGURES} - set(reader.fieldnames or ()):
                 raise ValueError(f"no column {', '.join(sorted(missing))}")
             return {
-                RunKey(**{**{name: row[name] for name in RunKey._fields}, "repeat": int(row["repeat"])}): {
-                    name: float(row[name] or "nan") for name in FIGURES
-                }
+                RunKey(*(row[name] for name in RunKey._fields)): {name: float(row[name] or "nan") for name in FIGURES}
                 for row in reader
             }
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as problem:
@@ -309,21 +251,14 @@ def read_runs(path: Path) -> dict[RunKey, Figures]:
         raise ThermoxelsError(str(path), expected=expected, got=got, remedy=remedy) from problem
 
 
-def write_runs(path: Path, runs: Mapping[RunKey, Figures]) -> None:
-    """Write the finished runs to runs.csv; an interrupted write leaves the old file."""
-    _write_csv(path, [*RunKey._fields, *FIGURES], ([*key, *_cells(figures)] for key, figures in runs.items()))
-
-
 def write_table(path: Path, rows: Iterable[CostRow], baseline: str) -> None:
     """Write cost.csv: one line per row with all figures."""
-    fronts = [f"front_{name}" for name in FRONTS]
     lines = []
     for row in rows:
         ratio = "" if math.isnan(row.time_ratio) else f"{row.time_ratio:.6g}"
-        marks = [int(name in row.fronts) for name in FRONTS]
         one = row.setting
-        lines.append([one.name, row.repeats, *_cells(row.figures), ratio, baseline, *marks, one.command()])
-    _write_csv(path, ["setting", "repeats", *FIGURES, "time_ratio", "baseline", *fronts, "training"], lines)
+        lines.append([one.name, *_cells(row.figures), ratio, baseline, one.command()])
+    _write_csv(path, ["setting", *FIGURES, "time_ratio", "baseline", "training"], lines)
 
 
 def _cells(figures: Figures) -> list[str]:
@@ -336,8 +271,8 @@ def _write_csv(path: Path, head: Sequence[str], lines: Iterable[Sequence[object]
         csv.writer(file).writerows([head, *lines])
 
 
-def measure(scene: Path, setting: CostSetting, name: str, folder: Path, keep_model: bool, console: Console) -> Figures:
-    """Train a setting, evaluate the model, return all figures. Logs, model and results in `folder` are named `name`."""
+def measure(scene: Path, setting: CostSetting, name: str, folder: Path, console: Console) -> Figures:
+    """Train a setting, evaluate and remove the model, return all figures; logs and results are named `name`."""
     models, logs, evaluations = (writable_folder(folder / part) for part in ("models", "logs", "eval"))
     shutil.rmtree(models / name, ignore_errors=True)
     run_folder, output = models / name / setting.method / "run", evaluations / f"{name}.json"
@@ -346,22 +281,9 @@ def measure(scene: Path, setting: CostSetting, name: str, folder: Path, keep_mod
     try:
         cost = run_command([*train, *PLAIN_TRAINING, *setting.options], logs / f"{name}-train.log", console)
         run_command(evaluate, logs / f"{name}-eval.log", console)
-        figures = {"seconds": cost.seconds, "peak_memory_gb": cost.peak_memory_gb}
-        return figures | {"training_seconds": training_seconds(run_folder), **read_evaluation(output)}
+        return {"seconds": cost.seconds, "peak_memory_gb": cost.peak_memory_gb, **read_evaluation(output)}
     finally:
-        if not keep_model:
-            shutil.rmtree(models / name, ignore_errors=True)
-
-
-def training_seconds(run_folder: Path) -> float:
-    """Return the seconds of training, from the file time of dataparser_transforms.json to the last checkpoint's."""
-    start = run_folder / "dataparser_transforms.json"
-    checkpoints = sorted((run_folder / "nerfstudio_models").glob("step-*.ckpt"))
-    if not (start.is_file() and checkpoints):
-        expected = "dataparser_transforms.json and a checkpoint of a finished run"
-        remedy = "Look into the run's log."
-        raise ThermoxelsError(str(run_folder), expected=expected, got="a folder without them", remedy=remedy)
-    return checkpoints[-1].stat().st_mtime - start.stat().st_mtime
+        shutil.rmtree(models / name, ignore_errors=True)
 
 
 def read_evaluation(path: Path) -> Figures:
@@ -385,62 +307,16 @@ def shown_figures(figures: Sequence[Figures]) -> list[str]:
     return [name for name, one in FIGURES.items() if one.heading and not all(math.isnan(f[name]) for f in figures)]
 
 
-def pareto_front(figures: Sequence[Figures], name: str) -> list[bool]:
-    """Return for each run whether it is on the Pareto front of seconds and figure `name`.
-
-    A run is on the front if no other run is at least as fast and at least as good, except with equal values. A run
-    whose figure is NaN is not on the front and keeps no other run off the front."""
-    sign = -1.0 if FIGURES[name].higher_is_better else 1.0
-    points = [(one["seconds"], sign * one[name]) for one in figures]
-    valid = [p for p in points if not any(map(math.isnan, p))]
-    return [p in valid and not any(q[0] <= p[0] and q[1] <= p[1] and q != p for q in valid) for p in points]
-
-
-def median_rows(settings: Iterable[CostSetting], runs: Mapping[RunKey, Figures], baseline: str) -> list[CostRow]:
-    """Return a row for every setting that has a run; time ratios relate to the row named `baseline`."""
-    of_setting = {one: [found for key, found in runs.items() if key.setting == one.name] for one in settings}
-    of_setting = {setting: own for setting, own in of_setting.items() if own}
-    medians: list[Figures] = []
-    for own in of_setting.values():
-        known = {name: [figures[name] for figures in own if not math.isnan(figures[name])] for name in FIGURES}
-        medians.append({name: statistics.median(values) if values else math.nan for name, values in known.items()})
-    base = next((m["seconds"] for m, setting in zip(medians, of_setting) if setting.name == baseline), math.nan)
-    marks = {name: pareto_front(medians, name) for name in FRONTS}
-    return [
-        CostRow(setting, len(own), median, median["seconds"] / base, tuple(n for n in FRONTS if marks[n][number]))
-        for number, ((setting, own), median) in enumerate(zip(of_setting.items(), medians))
-    ]
-
-
-def cheapest(rows: Iterable[CostRow], targets: Mapping[str, float]) -> CostRow | None:
-    """Return the row with the least wall time among the rows that meet all targets; None if no row does."""
-
-    def kept(name: str, value: float) -> bool:
-        return value >= targets[name] if FIGURES[name].higher_is_better else value <= targets[name]
-
-    able = [row for row in rows if all(kept(name, row.figures[name]) for name in targets)]
-    return min(able, key=lambda row: row.figures["seconds"], default=None)
-
-
-def verdict(rows: Sequence[CostRow], targets: Mapping[str, float], scene: Path) -> str:
-    """Return a sentence on the fastest setting that meets all targets, or else on the best value of each figure."""
-    wanted = " and ".join(_TARGETS[name].format(bound) for name, bound in targets.items())
-    best = cheapest(rows, targets)
-    if best is not None:
-        figures = ", ".join(_text(best.figures, name) for name in ("seconds", *_TARGETS))
-        found = f"Cheapest setting with {wanted}: {best.setting.name} ({figures})."
-        return f"{found} Train with: {best.setting.command('--data', str(scene))}"
-    nearest = []
-    for name in _TARGETS:
-        known = [row for row in rows if not math.isnan(row.figures[name])]
-        if known:
-            choose = max if FIGURES[name].higher_is_better else min
-            row = choose(known, key=lambda row: row.figures[name])
-            nearest.append(f"{FIGURES[name].short} {_text(row.figures, name)} ({row.setting.name})")
-    return (
-        f"No measured setting has {wanted}. The best: {', '.join(nearest)}. "
-        "Measure more steps or voxels with --settings, or relax the target."
-    )
+def verdict(rows: Sequence[CostRow], target_mae: float, scene: Path) -> str:
+    """Return a sentence on the fastest setting whose thermal MAE is at most the target, [degrees Celsius]."""
+    wanted = f"a thermal MAE of at most {target_mae:g} °C"
+    able = [row for row in rows if row.figures["thermal_mae_c"] <= target_mae]
+    if not able:
+        return f"No measured setting has {wanted}. Measure more steps or voxels with --settings, or relax the target."
+    best = min(able, key=lambda row: row.figures["seconds"])
+    figures = ", ".join(_text(best.figures, name) for name in ("seconds", "thermal_mae_c", "psnr"))
+    found = f"Cheapest setting with {wanted}: {best.setting.name} ({figures})."
+    return f"{found} Train with: {best.setting.command('--data', str(scene))}"
 
 
 def markdown_table(rows: Sequence[CostRow], baseline: str) -> str:
@@ -449,46 +325,32 @@ def markdown_table(rows: Sequence[CostRow], baseline: str) -> str:
     time_at = 1 + names.index("seconds")
     heading = [FIGURES[name].heading for name in names]
     heading.insert(time_at, f"time / {baseline}")
-    lines = ["| setting | " + " | ".join(heading) + " | Pareto front |", "|---|" + "---:|" * len(heading) + "---|"]
+    lines = ["| setting | " + " | ".join(heading) + " |", "|---|" + "---:|" * len(heading)]
     for row in rows:
         cells = [_text(row.figures, name) for name in names]
         cells.insert(time_at, "-" if math.isnan(row.time_ratio) else f"{row.time_ratio:.2f}")
-        front = ", ".join(sorted(FIGURES[name].short for name in row.fronts))
-        lines.append(f"| {row.setting.name} | " + " | ".join(cells) + f" | {front} |")
+        lines.append(f"| {row.setting.name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
-def draw_plot(path: Path, rows: Sequence[CostRow], targets: Mapping[str, float], title: str) -> None:
-    """Draw a panel for each known figure against seconds; filled marks are on the Pareto front of the panel."""
+def draw_plot(path: Path, rows: Sequence[CostRow], target_mae: float | None, title: str) -> None:
+    """Draw a panel for each known figure against seconds."""
     from matplotlib.figure import Figure as Canvas
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    every = [row.figures for row in rows]
-    names = [name for name in shown_figures(every) if FIGURES[name].panel]
+    names = [name for name in shown_figures([row.figures for row in rows]) if FIGURES[name].panel]
     lines = math.ceil(len(names) / 2)
     figure = Canvas(figsize=(11, 4.4 * lines + 1), layout="constrained")
     axes = figure.subplots(lines, 2, squeeze=False).ravel()
     for name, axis in zip(names, axes):
-        points = [(one["seconds"], one[name]) for one in every]
-        front = pareto_front(every, name)
-        axis.plot(
-            *zip(*sorted(point for point, on in zip(points, front) if on)),
-            **{"color": "lightgrey", "drawstyle": "steps-post", "zorder": 1},
-        )
-        for number, (row, point, on) in enumerate(zip(rows, points, front)):
-            look = {"color": f"C{number}", "markerfacecolor": f"C{number}" if on else "white"}
-            axis.plot(*point, "osDv^"[number // 10 % 5], label=row.setting.name, **look)
-        if name in targets:
-            axis.axhline(targets[name], color="grey", linestyle=":", linewidth=1)
-        axis.set_xscale("log")
-        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.xaxis.set_minor_formatter(NullFormatter())
+        for number, row in enumerate(rows):
+            axis.plot(row.figures["seconds"], row.figures[name], "osDv^"[number // 10 % 5], label=row.setting.name)
+        if name == "thermal_mae_c" and target_mae is not None:
+            axis.axhline(target_mae, color="grey", linestyle=":", linewidth=1)
         axis.set(xlabel="ns-train, wall time [s]", title=FIGURES[name].panel)
-        axis.grid(alpha=0.3, which="major")
+        axis.grid(alpha=0.3)
     for axis in axes[len(names) :]:
         axis.set_visible(False)
-    figure.suptitle(f"{title}\n(filled: Pareto front)", fontsize=11)
+    figure.suptitle(title, fontsize=11)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     with replace_when_done(path) as temporary:
         figure.savefig(temporary, dpi=130)

@@ -5,7 +5,6 @@ from __future__ import annotations
 # Only light imports at the top, so that ``thermoxels --help`` answers at once.
 import shutil
 import time
-import webbrowser
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,7 +29,6 @@ _WRITTEN = (
     "logs",
 )
 _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT = 42, 6, 320, 240
-_BUILDINGS: tuple[SceneName, ...] = ("house-corner", "courtyard")
 _AUDITED: SceneName = "house-corner"  # The scene whose U-values are known
 _WALLS = ("--metres-per-unit", "1", "--interior", "hollow", "--wall-thickness", "0.3")  # Options that make rooms
 
@@ -45,8 +43,6 @@ class Demo:
     """Synthetic scene to photograph."""
     iterations: int | None = None
     """Training steps; the default of the method if left out."""
-    open_browser: bool = False
-    """Show the page in a web browser at the end."""
 
     def main(self) -> None:
         """Run the demo; raises `ThermoxelsError` if a command fails, a target is missed, or the folder is in use."""
@@ -100,11 +96,9 @@ def run_demo(demo: Demo, console: Console) -> None:
         print_targets(targets, console)
 
     index, shown = folder / "index.html", [command_line(command) for command in commands]
-    page = demo_page(folder, demo.scene, targets, others, compared, seconds, shown, next_steps(folder, demo.scene))
+    page = demo_page(folder, demo.scene, targets, others, compared, seconds, shown)
     write_page(index, page)
     console.print(f"All pictures and figures: {index}", markup=False, soft_wrap=True)
-    if demo.open_browser:
-        webbrowser.open(index.resolve().as_uri())
     missed = [f"{t.name} {t.measured_text} (target {t.bound_text})" for t in targets if not t.met]
     if missed:
         remedy = f"See {index} for pictures."
@@ -179,31 +173,3 @@ def print_targets(targets: Iterable[Target], console: Console) -> None:
         met = "[green]yes[/green]" if target.met else "[bold red]no[/bold red]"
         table.add_row(target.name, target.measured_text, target.bound_text, met)
     console.print(table)
-
-
-def next_steps(folder: Path, scene: str) -> list[tuple[str, str]]:
-    """Return commands to try after a demo, each with a sentence on what the command does."""
-    config = folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml"
-    steps: list[tuple[list[str | Path], str]] = [
-        (["ns-viewer", "--load-config", config], "Walk around the trained model in a browser:")
-    ]
-    mesh, name, said = folder / "export" / "mesh.vtu", "original", "ten windy, sunny minutes"
-    if scene in _BUILDINGS and scene != _AUDITED:
-        mesh, name, said = folder / "walls" / "mesh.vtu", "winter-night", "a winter night"
-        what = "Export the building with rooms; photographs do not show how thick its walls are, so say it:"
-        export = ["ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", mesh.parent, *_WALLS]
-        steps.append((export, what))
-    heat = ["thermoxels", "heat", mesh, "--scene", name, "--output-dir", folder / "heat"]
-    capture = ["thermoxels", "capture", "PHOTOGRAPHS", "--output", "SCENE"]
-    weather = (heat, f"Let {said} act on it; report.html says how much heat goes where:")
-    if scene == _AUDITED:  # the demo did that
-        weather = (
-            ["thermoxels", "heat", "--write-scene", "scene.yaml"],
-            "Write a heat scene to change, every key explained:",
-        )
-    steps += [
-        weather,
-        (capture, "Make a scene of your own from a folder of photographs and thermal images:"),
-        (["ns-train", "thermoxels", "--data", "SCENE"], "Train on it, and then go on with ns-export as above:"),
-    ]
-    return [(command_line(words), what) for words, what in steps]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,11 +177,10 @@ def demo_page(
     compared: Sequence[Compared],
     seconds: Sequence[tuple[str, float]],
     commands: Sequence[str],
-    next_steps: Sequence[tuple[str, str]],
 ) -> str:
     """Return the html text of a demo's page; raises `ThermoxelsError` if a picture is missing in the demo's folder.
 
-    `others`: names and texts of figures; `seconds`: names and durations of steps; `next_steps`: commands and sentences.
+    `others`: names and texts of figures; `seconds`: names and durations of steps.
     """
     night = folder / "heat" / "surface-end.png"
     export, renders, drawn = folder / "export", folder / "renders" / "test", folder / "scene"
@@ -212,7 +212,8 @@ def demo_page(
             measured=(export / "mesh-measured.png").read_bytes(),
             seconds=seconds,
             commands=commands,
-            next_steps=next_steps,
+            config=shlex.quote(str(folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml")),
+            exported=shlex.quote(str(export / "mesh.vtu")),
         )
 
 

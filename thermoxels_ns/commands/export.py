@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.core.checks import remove_file, result_folder
+from thermoxels_ns.core.checks import check_direction, remove_file, result_folder
 from thermoxels_ns.core.config_loader import check_run
 from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, SceneError, ThermoxelsError, exit_status
 from thermoxels_ns.core.json_values import read_json_object
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
     from thermoxels_ns.mesh.tetrahedra import TetMesh
     from thermoxels_ns.multiview.stereo import Depths
 
-Settings = TypeVar("Settings", "Material", "TimeSteps")
 Say = Callable[[str], None]
 Compare = Callable[["SolidCells", "TetMesh", float], "dict[str, Any] | None"]
 """Compares solid voxels and a mesh with the exact scene, given the metres per unit; None if no exact scene is known."""
@@ -127,12 +125,6 @@ class ExportOptions:
     """Number of time steps. Left out: as in the heat scene (10 for concrete)."""
     step_seconds: float | None = None
     """Length of a time step, [s]. Left out: as in the heat scene (60 for concrete)."""
-    conductivity_w_mk: float | None = None
-    """Thermal conductivity, [W / (m K)]. Left out: as in the heat scene."""
-    density_kg_m3: float | None = None
-    """Mass density of the material, [kg / m3]. Left out: as in the heat scene."""
-    specific_heat_j_kgk: float | None = None
-    """Specific heat capacity, [J / (kg K)]. Left out: as in the heat scene."""
     vtk_times: Literal["all"] | tuple[float, ...] = ()
     """Times whose temperatures are written for ParaView beside those of the start and of the end, [s]: for each the
     nearest time that the scene keeps. all: every kept time; each takes as much space as the mesh."""
@@ -265,24 +257,19 @@ def check_options(options: ExportOptions) -> CheckedOptions:
 
 
 def _heat_settings(options: ExportOptions) -> tuple[HeatScene, Material, TimeSteps]:
-    """Return the heat scene, its material and its time steps, all with the changes that options make."""
+    """Return the heat scene, its material, and its time steps with the changes that options make."""
     from thermoxels_ns.fem.problem import TimeSteps
     from thermoxels_ns.heat.scene import load_heat_scene
 
-    def changed(settings: Settings) -> Settings:
-        given = {field.name: getattr(options, field.name, None) for field in fields(settings)}
-        return replace(settings, **{name: value for name, value in given.items() if value is not None})
-
     scene = load_heat_scene(options.heat_preset)
-    given, *others = set(scene.materials.values())
+    material, *others = set(scene.materials.values())
     if others or not isinstance(scene.time, TimeSteps):
         expected = "a scene of one material, with time: {steps: 10, step_seconds: 60}"
         remedy = "Export without it, then run thermoxels heat with that scene on the mesh."
         raise HeatError("heat_preset", expected=expected, got=options.heat_preset, remedy=remedy)
-    material, time = changed(given), changed(scene.time)
-    if material != given:
-        material = replace(material, name=f"{material.name} (changed)")
-    return replace(scene, materials=dict.fromkeys(scene.materials, material), time=time), material, time
+    given = {"steps": options.steps, "step_seconds": options.step_seconds}
+    time = replace(scene.time, **{name: value for name, value in given.items() if value is not None})
+    return replace(scene, time=time), material, time
 
 
 def scale_of(options: ExportOptions, checked: CheckedOptions, scene_file: Mapping | None) -> SceneScale | None:
@@ -309,10 +296,7 @@ def up_of(
 ) -> tuple[tuple[float, float, float], str]:
     """Return the unit vector up and a sentence on its source: --up, else the scene's json, else `viewpoint`."""
     if options.up is not None:
-        length = math.sqrt(sum(value * value for value in options.up))
-        if not (math.isfinite(length) and length > 0.0):
-            raise MeshError("up", expected="a direction", got=options.up, remedy="Pass --up 0 0 1, for example.")
-        x, y, z = (value / length for value in options.up)
+        x, y, z = check_direction("up", options.up, "Pass --up 0 0 1, for example.", MeshError).tolist()
         return (x, y, z), "Given with --up."
     in_file = up_from_scene_file(scene_file or {})
     if in_file is not None:
@@ -605,18 +589,14 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
     Poses are in the trained scene (x right, y up, z back), shape (n, 3, 4) or (n, 4, 4). If the cameras stood all
     around, `view_direction` is None, which means obliquely from above.
     """
+    from thermoxels_ns.capture.sfm.scale_and_up import find_up
+
     rotation = np.asarray(world_to_input, np.float64)[:3, :3]
     axes = np.einsum("ij,njk->nik", rotation / np.cbrt(np.linalg.det(rotation)), np.asarray(camera_to_worlds)[:, :, :3])
-    up = axes[:, :, 1].mean(axis=0)
-    if np.linalg.norm(up) < 0.1:  # the cameras' up directions cancel out
+    if np.linalg.norm(axes[:, :, 1].mean(axis=0)) < 0.1:  # the cameras' up directions cancel out
         return Viewpoint()
-    up /= np.linalg.norm(up)
-    source = "The mean of what was up in the photographs; cameras that all look down or up tilt it."
-    # People hold cameras level: if the pictures' horizontal axes span a plane, up is at right angles to this plane.
-    spread, directions = np.linalg.eigh(np.einsum("ni,nj->ij", axes[:, :, 0], axes[:, :, 0]) / len(axes))
-    level = directions[:, 0] * np.sign(directions[:, 0] @ up)
-    if spread[1] > 0.05 and spread[0] < 0.2 * spread[1] and level @ up > 0.3:
-        up, source = level, "At right angles to the horizontal axes of the photographs."
+    found = find_up(axes, [None] * len(axes), [1] * len(axes))
+    up, source = found.direction, found.source
     forward = -axes[:, :, 2].mean(axis=0)
     level = forward - (forward @ up) * up
     direction = None
@@ -627,14 +607,10 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
 
 
 def _check_config(config: TrainerConfig) -> None:
-    """Raise `CheckpointError` for a run of another method or a run without a checkpoint."""
+    """Raise `CheckpointError` for a run of another method."""
     pipeline: Any = config.pipeline
     if not callable(getattr(pipeline._target, "grid_snapshot", None)):
         expected = "a model trained with a Thermoxels method"
         got = f"the checkpoint of another method ({config.method_name})"
         remedy = "Train with ns-train thermoxels, or choose another subcommand of ns-export."
         raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
-    folder = config.get_checkpoint_dir()
-    if not any(folder.glob("step-*.ckpt")):
-        remedy = "Run the command in the folder where ns-train ran, or train to the first checkpoint."
-        raise CheckpointError("checkpoint", expected=f"a file step-*.ckpt in {folder}", got="none", remedy=remedy)

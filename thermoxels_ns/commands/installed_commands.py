@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 PLAIN_TRAINING = ("--timestamp", "run", "--vis", "tensorboard", "--logging.steps-per-log", "100")
 """Options of ns-train for a run that nobody watches in the viewer, in a folder whose name is known."""
 
-_QUIET_S = 20.0  # Time without output after which a line says that the command still runs, [s]
 _LAST_LINES = 12  # Lines of output that an error shows
 
 
@@ -80,8 +79,8 @@ def command_of(name: str, options: Any) -> str:
 def run_command(arguments: Sequence[str | Path], log: Path, console: Console) -> ProcessCost:
     """Run a command of this installation, write its output to the file `log`, and return its time and memory.
 
-    The folder of `log` must exist. `console` shows the output as it comes; off a terminal, a line says now and then
-    that a quiet command still runs. Raises `ThermoxelsError` if the command fails or does not exist.
+    The folder of `log` must exist. `console` shows the output as it comes. Raises `ThermoxelsError` if the command
+    fails or does not exist.
     """
     words = [str(argument) for argument in arguments]
     folder = Path(sys.executable).parent
@@ -100,7 +99,7 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
             [program, *words[1:]], stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, env=environment
         )
     try:
-        peak_memory_gb = _wait(process, log, console, f"... {words[0]} is at work")
+        peak_memory_gb = _wait(process, log, console)
     finally:
         if process.poll() is None:
             process.terminate()
@@ -113,21 +112,15 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
     return ProcessCost(time.monotonic() - start, peak_memory_gb)
 
 
-def _wait(process: subprocess.Popen[bytes], log: Path, console: Console, quiet: str) -> float:
+def _wait(process: subprocess.Popen[bytes], log: Path, console: Console) -> float:
     """Show the output until a process ends; return its peak memory [1e9 bytes]."""
-    start = heard = time.monotonic()
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")  # output so far may end within a character
     with log.open("rb") as output:
         while True:
             ended, peak_memory_gb = _ended(process)
-            now = time.monotonic()
             if arrived := output.read():
-                heard = now
                 console.file.write(decoder.decode(arrived))
                 console.file.flush()
-            elif now - heard > _QUIET_S and not console.is_terminal:
-                heard = now
-                console.print(f"{quiet}, {now - start:.0f} s", highlight=False)
             if ended:
                 return peak_memory_gb
             time.sleep(0.05)

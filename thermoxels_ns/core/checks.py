@@ -77,12 +77,12 @@ def check_shape(
 def check_direction(
     name: str, vector: npt.ArrayLike, remedy: str, error: type[ThermoxelsError] = ThermoxelsError
 ) -> FloatArray:
-    """Return `vector`, shape (3,), if its numbers are finite and its length is above 0, else raise `error`."""
+    """Return `vector`, shape (3,), made 1 long; raise `error` if a number is not finite or all are 0."""
     array = np.asarray(vector, dtype=np.float64)
     length = float(np.linalg.norm(array)) if array.shape == (3,) else 0.0
     if not (math.isfinite(length) and length > 0.0):
         raise error(name, expected="three finite numbers that are not all 0", got=array.tolist(), remedy=remedy)
-    return array
+    return array / length
 
 
 def writable_folder(path: Path | str, room_bytes: float = 0.0) -> Path:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
-import math
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -183,8 +182,8 @@ def _mistake(name: str, path: list[str | int], value: object, one: dict[str, Any
         return explain(above, expected=expected, got=got, remedy=remedy)
     if kind == "unexpected_keyword_argument":
         known = tuple(key for key in _keys_at(target, path[:-1]) if key != path[-1])
-        meant = _meant(str(path[-1]), known)
-        remedy = f"Did you mean {meant}?" if meant else "Correct or remove that key."
+        meant = difflib.get_close_matches(str(path[-1]), known, n=1)
+        remedy = f"Did you mean {meant[0]}?" if meant else "Correct or remove that key."
         if str(path[-1])[:1].isdigit():
             remedy = "Within braces a comma ends an entry: write decimals with a point."
         return explain(above, expected=f"keys out of {', '.join(known)}", got=path[-1], remedy=remedy)
@@ -194,7 +193,7 @@ def _mistake(name: str, path: list[str | int], value: object, one: dict[str, Any
         expected = _EXPECTED[kind].format(**one.get("ctx", {}))
     else:
         expected = re.sub(r"^\w+ should (be |have |match )?| after validation.*", "", one["msg"])
-    remedy = {"float_type": _as_number(value), "string_type": "Put it in quotes."}.get(kind, "Correct it.")
+    remedy = {"float_type": _NUMBER, "string_type": "Put it in quotes."}.get(kind, "Correct it.")
     return explain(where or above, expected=expected, got=shown(value), remedy=remedy)
 
 
@@ -213,27 +212,6 @@ def _keys_at(hint: Any, path: list[str | int]) -> tuple[str, ...]:
         return _keys_at(get_type_hints(hint, include_extras=True).get(str(path[0])), path[1:])
     rest = path[1:] if get_origin(hint) in (tuple, dict, Mapping) else path
     return tuple(key for part in get_args(hint) for key in _keys_at(part, rest))
-
-
-def _as_number(content: object) -> str:
-    """Return the remedy for a text where a number is expected; yaml reads 1e0 and 1.0e0 as texts."""
-    number = math.nan
-    with suppress(ValueError):
-        number = float(content) if isinstance(content, str) else math.nan
-    if not math.isfinite(number):
-        return _NUMBER
-    mantissa, _, exponent = f"{number:.15g}".partition("e")
-    if exponent:
-        mantissa = f"{mantissa if '.' in mantissa else mantissa + '.0'}e{exponent}"
-    return f"Write {mantissa}, without quotes; a power of ten needs a point and a sign in yaml, as in 1.0e+0."
-
-
-def _meant(key: str, known: tuple[str, ...]) -> str:
-    """Return the known key that a wrong `key` probably means, by its first word (air_k: air_c) or spelling, or ""."""
-    word = re.split(r"[_-]", key)[0]
-    same = [name for name in known if name.split("_")[0] == word]
-    close = difflib.get_close_matches(key, same or known, n=1, cutoff=0.0 if len(same) == 1 else 0.6)
-    return close[0] if close else ""
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):

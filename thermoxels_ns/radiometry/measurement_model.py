@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.core.checks import check_positive, is_number
+from thermoxels_ns.core.checks import check_positive, check_ranges
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin, kelvin_to_celsius
 
@@ -19,10 +18,7 @@ DEFAULT_RELATIVE_HUMIDITY = 0.5
 _COLDEST_AIR_C, _HOTTEST_AIR_C = -100.0, 150.0
 _LARGEST_ATTENUATION, _LARGEST_WEIGHT = 1.0, 10.0
 _LARGEST_EXPONENT = 700.0
-FIRST_RADIATION_W_UM4_M2_SR = 1.191042972e8  # 2 h c^2 (exact constants of the SI, rounded), [W um^4 / (m2 sr)]
-SECOND_RADIATION_UM_K = 14387.76877  # h c / k (exact constants of the SI, rounded), [um K]
-_COLDEST_K, _HOTTEST_K = 50.0, 6000.0
-_STEPS = 8192
+_ABOVE_0 = sys.float_info.min
 _PLANCK_REMEDY = "Use the constants of the camera file."
 
 Floats = npt.NDArray[np.floating]
@@ -43,10 +39,13 @@ class Conditions:
     window_c: float | None = None  # Temperature of the window, [degrees C]; required if its transmission is below 1
 
     def __post_init__(self) -> None:
-        for name in ("emissivity", "window_transmission"):
-            check_between(name, getattr(self, name), 0.0, 1.0, "above 0, at most 1", zero=False)
-        check_between("relative_humidity", self.relative_humidity, 0.0, 1.0, "from 0 to 1 (50 % is 0.5)")
-        check_between("distance_m", self.distance_m, 0.0, 1e5, "from 0 to 100000 m")
+        values = {
+            "emissivity": (self.emissivity, _ABOVE_0, 1.0, "above 0, at most 1"),
+            "window_transmission": (self.window_transmission, _ABOVE_0, 1.0, "above 0, at most 1"),
+            "relative_humidity": (self.relative_humidity, 0.0, 1.0, "from 0 to 1 (50 % is 0.5)"),
+            "distance_m": (self.distance_m, 0.0, 1e5, "from 0 to 100000 m"),
+        }
+        check_ranges("--", values)
         for name, needed, why in (
             ("reflected_c", self.emissivity < 1, f"an emissivity of {self.emissivity:g}"),
             ("air_c", self.distance_m > 0, f"a distance of {self.distance_m:g} m"),
@@ -55,7 +54,7 @@ class Conditions:
             value = getattr(self, name)
             if value is not None:
                 low, high = (_COLDEST_AIR_C, _HOTTEST_AIR_C) if name == "air_c" else (-ZERO_CELSIUS_K, 5000.0)
-                check_between(name, value, low, high, f"from {low:g} to {high:g} degrees C")
+                check_ranges("--", {name: (value, low, high, f"from {low:g} to {high:g} degrees C")})
             elif needed:
                 expected = f"a temperature, because {why} needs one"
                 remedy = f"Pass --{name.replace('_', '-')} in degrees C; indoors the room's is a good guess."
@@ -108,13 +107,6 @@ def conditions_text(conditions: Conditions) -> str:
     return ", ".join(parts)
 
 
-def check_between(name: str, value: float, low: float, high: float, expected: str, *, zero: bool = True) -> None:
-    """Raise `ThermoxelsError` unless setting `name` has a `value` from `low` to `high`, above 0 if `zero` is False."""
-    if not (is_number(value) and low <= value <= high and (zero or value > 0)):
-        remedy = f"Pass a right --{name.replace('_', '-')}."
-        raise ThermoxelsError(name, expected=expected, got=repr(value), remedy=remedy)
-
-
 @dataclass(frozen=True)
 class PlanckConstants:
     """Calibration of a sensor: the constants that give its counts as a function of a black body's temperature."""
@@ -150,48 +142,10 @@ class PlanckConstants:
         return self.b / np.log(self.r1 / (self.r2 * radiance) + self.f)
 
 
-@dataclass(frozen=True)
-class PlanckBand:
-    """Planck's law integrated over a wavelength band, for cameras that give degrees but not their calibration.
-
-    The curve is a table of the logarithm of radiance over 1 / T, which is nearly a straight line. The linear pieces of
-    the table are read in both directions, so that `temperature_k` exactly inverts `signal`.
-    """
-
-    shortest_um: float = 7.5  # lower end of the band, [micrometres]
-    longest_um: float = 13.0  # upper end of the band, [micrometres]
-
-    @cached_property
-    def _table(self) -> tuple[FloatArray, FloatArray]:
-        """Table of 1 / T [1/K], rising, and of the logarithm of the radiance [W / (m2 sr)], each shape (8192,)."""
-        inverse_k = np.linspace(1.0 / _HOTTEST_K, 1.0 / _COLDEST_K, _STEPS)
-        nodes, weights = np.polynomial.legendre.leggauss(48)
-        half = 0.5 * (self.longest_um - self.shortest_um)
-        wavelength = self.shortest_um + half * (nodes + 1.0)
-        strength = half * weights * FIRST_RADIATION_W_UM4_M2_SR / wavelength**5
-        radiance = 1.0 / np.expm1(SECOND_RADIATION_UM_K * inverse_k[:, None] / wavelength)
-        return inverse_k, np.log(radiance @ strength)
-
-    def signal(self, temperature_k: npt.ArrayLike) -> Floats:
-        """Return the radiance [W / (m2 sr)] of a black body in the band; temperatures 50 to 6000 K, any shape, float64.
-
-        >>> round(float(PlanckBand().signal(300.0)), 2)
-        51.48
-        """
-        inverse_k, logarithm = self._table
-        return np.exp(np.interp(1.0 / np.asarray(temperature_k, dtype=np.float64), inverse_k, logarithm))
-
-    def temperature_k(self, signal: npt.ArrayLike) -> Floats:
-        """Return the temperature [K] of a black body with this radiance; NaN for less radiance than at 50 K."""
-        inverse_k, logarithm = self._table
-        radiance = np.asarray(signal, dtype=np.float64)
-        known = radiance >= np.exp(logarithm[-1])
-        falling = np.log(np.where(known, radiance, 1.0))
-        return np.where(known, 1.0 / np.interp(falling, logarithm[::-1], inverse_k[::-1]), np.nan)
-
-
-SensorCurve = PlanckConstants | PlanckBand  # a sensor's signal as a function of a black body's temperature
-LONG_WAVE = PlanckBand()  # the band of microbolometer cameras, 7.5 to 13 micrometres
+LONG_WAVE = PlanckConstants(r1=1.0, r2=1.0, b=1450.0, f=1.0, o=0.0)
+"""Stands for microbolometers whose files hold degrees but no constants; only B and F matter to a correction. With
+emissivities from 0.9 on it corrects surfaces of -20 to 40 degrees C as Planck's law integrated from 7.5 to 13
+micrometres does, but for 0.04 K."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +161,7 @@ class AirConstants:
     def __post_init__(self) -> None:
         for field in fields(self):
             limit = _LARGEST_WEIGHT if field.name == "x" else _LARGEST_ATTENUATION
-            check_between(field.name, getattr(self, field.name), -limit, limit, f"from {-limit:g} to {limit:g}")
+            check_ranges("", {field.name: (getattr(self, field.name), -limit, limit, f"from {-limit:g} to {limit:g}")})
 
     def transmission(self, distance_m: float, air_c: float, relative_humidity: float) -> float:
         """Return the share of the object's radiation that reaches the camera through air, 1 at distance 0 m.
@@ -243,7 +197,7 @@ class RadiometricModel:
     """
 
     conditions: Conditions
-    sensor: SensorCurve = LONG_WAVE
+    sensor: PlanckConstants = LONG_WAVE
     air: AirConstants = AirConstants()
 
     def signal(self, temperature_c: npt.ArrayLike) -> Floats:
@@ -285,7 +239,7 @@ class RadiometricModel:
 
 
 def corrected_temperature_c(
-    temperature_c: npt.ArrayLike, before: Conditions, after: Conditions, sensor: SensorCurve = LONG_WAVE
+    temperature_c: npt.ArrayLike, before: Conditions, after: Conditions, sensor: PlanckConstants = LONG_WAVE
 ) -> Floats:
     """Return temperatures [degrees C] as the camera would have shown them with other settings, any shape, float64.
 

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from thermoxels_ns.capture.folder_scan import shown_name
 from thermoxels_ns.capture.frames import measurement_rows
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig.start import rig_frames
@@ -20,6 +19,7 @@ from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.core.errors import printable
 from thermoxels_ns.radiometry.thermal_pixels import MIN_FRAMES
 from thermoxels_ns.reports.charts import PERCENTILES, bars, colours, histogram
 from thermoxels_ns.reports.page import build_page, image_file, write_page
@@ -124,7 +124,7 @@ def capture_page(
         frames.append((name, frame, len(own), f"{np.median(own):.2f}" if len(own) else "-"))
     return build_page(
         "capture.html.j2",
-        name=shown_name(result.source.resolve()),
+        name=printable(result.source.resolve().name),
         result=result,
         overlays=overlays,
         cameras=_cameras(result),

@@ -7,15 +7,12 @@ import re
 import zlib
 from collections.abc import Callable
 from functools import cache
-from typing import Annotated
-
-from tyro.constructors import PrimitiveConstructorSpec
 
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic import drawn_scenes
 from thermoxels_ns.synthetic.appearance import plain
 from thermoxels_ns.synthetic.drawn_scenes import HOUSE
-from thermoxels_ns.synthetic.random_scene import RANDOM_NAMES, random_scene, random_seed, with_room, with_street
+from thermoxels_ns.synthetic.random_scene import random_scene, random_seed, with_room, with_street
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 _BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
@@ -49,24 +46,11 @@ def check_scene_name(name: str) -> str:
     known = base in _BUILDERS or random_seed(base) is not None
     known &= all(variant in ("white", "street", "room") or _SKY.fullmatch(variant) for variant in variants)
     if not known or len(kinds) < len(variants) or kinds >= {"street", "room"} or ("white" in kinds and base != HOUSE):
-        every, seeded = ", ".join(_BUILDERS), " or ".join(RANDOM_NAMES)
-        expected = f"{seeded} with a whole number N from 0 on, or one of {every}; with {VARIANTS} if you like"
+        every = ", ".join(_BUILDERS)
+        expected = f"random-N or wild-N with a whole number N from 0 on, or one of {every}; with {VARIANTS} if you like"
         remedy = f"Choose one of these names, or write random-17 or {HOUSE}+sky=0.55,0.57,0.60."
         raise SceneError("synthetic scene", expected=expected, got=repr(name), remedy=remedy)
     return name
-
-
-SceneWord = Annotated[
-    str,
-    PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=f"{{{','.join((*SCENE_NAMES, *DEVELOPMENT_NAMES, *RANDOM_NAMES))}}}",
-        instance_from_str=lambda words: check_scene_name(words[0]),
-        is_instance=lambda value: isinstance(value, str),
-        str_from_instance=lambda value: [value],
-    ),
-]
-"""Type of a command's option that is a scene's name, which is checked while the command line is read."""
 
 
 @cache

@@ -35,9 +35,6 @@ from thermoxels_ns.synthetic.random_plan import Plan, bounds_of
 from thermoxels_ns.synthetic.scene_truth import Body, CameraRing, DegreesFunction, RgbFunction, SyntheticScene
 from thermoxels_ns.synthetic.solids import Box, Solid, Sphere, box_beside, box_between, distance_to_box
 
-RANDOM_NAMES = ("random-N", "wild-N")
-"""Patterns of the names of these scenes, for lists of names; N is the seed."""
-
 _NAME = re.compile(r"(?:random|wild)-(0|[1-9][0-9]{0,17})")
 _STREAM, _WILD_STREAM = 7411, 7413
 _HARDSHIP_SHARE = 0.4

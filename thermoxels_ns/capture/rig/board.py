@@ -154,7 +154,7 @@ def rig_from_board_photos(
     there are no pairs, image sizes differ from the capture's, or fewer than three pairs show the board to both cameras.
     """
     found = search_pairs(source, settings, say=say).pairs
-    read = read_frames(found, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
+    read = read_frames(found, source, folder, radiometry, settings.skip_bad, say)
     pairs, size = [], (visible.width, visible.height)
     for frame in read.frames:
         photograph = open_photograph(frame.photograph)
@@ -177,7 +177,7 @@ def in_scene_units(rig: RigEstimate, scale: SceneScale | None, missing: str) -> 
     """Convert a rig's lengths from metres to scene units; raise `SceneError` (text: `missing`) if `scale` is None."""
     if scale is None:
         expected = "a known scale, because a board gives the distance of the lenses in metres"
-        remedy = "Pass --known-distance or --marker-side-m; poses that were found are kept."
+        remedy = "Pass --known-distance; poses that were found are kept."
         raise SceneError("scale", expected=expected, got=f"none: {missing}", remedy=remedy)
     transform, covariance = rig.visible_to_thermal.copy(), rig.covariance.copy()
     transform[:3, 3] /= scale.metres_per_unit

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -13,8 +13,7 @@ from scipy.sparse import csr_matrix
 
 from thermoxels_ns.capture.rig.images import read_temperatures
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigFrame, radius_squared
-from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
-from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from thermoxels_ns.core.arrays import Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 
 _RADIAL_TERMS = 2
@@ -28,13 +27,8 @@ _MOST_LAG = 6
 _FEWEST_POINTS = 50
 _GAIN_OF_OFFSETS, _GAIN_OF_RADIAL = 0.05, 0.01
 _RIDGE = 1e-9
-
-_FEWEST_PER_FRAME, _SHARE_PER_FRAME = 1000, 0.5
-"""How many of a frame's points are read: the number or the share, whichever is more; points that most frames share come
-first. Such points lie close together: for 36 frames of 15,000 points, offsets erred by 0.35 K (1000), 0.08 K (half)."""
 _BLUR_PX = 1.0
 _SMOOTH_SHARE = 0.4
-_DEPTH_TOLERANCE = 0.03
 _BORDER_PX = 2.0
 
 
@@ -148,53 +142,27 @@ class DriftSamples:
 
 
 def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_thermal: FloatArray) -> DriftSamples:
-    """Read the temperature of scene points in all thermal images that see them.
+    """Read the temperature of scene points in all thermal images in whose photographs structure from motion saw them.
 
-    A frame sees a point if structure from motion found the point in that frame, or if the point falls into the image
-    at the depth of the frame's own points nearby. Points on steep temperature edges are left out, because there a
-    small error in place is a large error in temperature.
+    Points on steep temperature edges are left out, because there a small error in place is a large error in
+    temperature.
     """
-    world, tracked = _chosen_points(frames)
     columns = []
     for number, frame in enumerate(frames):
-        visible = replace(frame, points_world=world).points_visible()
-        pixels = camera.project(visible @ visible_to_thermal[:3, :3].T + visible_to_thermal[:3, 3])
-        near = np.flatnonzero(camera.contains(pixels, _BORDER_PX) & (visible[:, 2] > 0.0))
-        ahead = visible[near]
-        around, distance = SparseDepth(frame.points_visible()).at(ahead / ahead[:, 2:])
-        unhidden = (np.abs(ahead[:, 2] - around) < _DEPTH_TOLERANCE * around) & (distance < _DEPTH_TOLERANCE)
-        near = near[tracked[number][near] | unhidden]
-        reading, steepness = _read(read_temperatures(frame, camera), pixels[near])
+        pixels = camera.project(frame.points_visible() @ visible_to_thermal[:3, :3].T + visible_to_thermal[:3, 3])
+        inside = camera.contains(pixels, _BORDER_PX)
+        ids, pixels = frame.point_ids[inside], pixels[inside]
+        reading, steepness = _read(read_temperatures(frame, camera), pixels)
         known = np.isfinite(reading) & np.isfinite(steepness)
-        near, reading, steepness = near[known], reading[known], steepness[known]
-        if len(near):
-            smooth = steepness <= np.quantile(steepness, _SMOOTH_SHARE)
-            near, reading = near[smooth], reading[smooth]
-        radius2 = radius_squared(pixels[near], camera.width, camera.height)
-        columns.append((near, np.full(len(near), number), reading, radius2))
+        smooth = known & (steepness <= np.quantile(steepness[known], _SMOOTH_SHARE) if known.any() else known)
+        radius2 = radius_squared(pixels[smooth], camera.width, camera.height)
+        columns.append((ids[smooth], np.full(len(radius2), number), reading[smooth], radius2))
     point, frame_number, reading, radius2 = (np.concatenate(parts) for parts in zip(*columns))
+    _, number, count = np.unique(point, return_inverse=True, return_counts=True)
     order = np.lexsort((frame_number, point))
-    order = order[np.bincount(point, minlength=len(world))[point[order]] >= 2]
+    order = order[count[number[order]] >= 2]
     number = np.unique(point[order], return_inverse=True)[1].ravel()
     return DriftSamples(number, frame_number[order], reading[order], radius2[order], len(frames))
-
-
-def _chosen_points(frames: Sequence[RigFrame]) -> tuple[FloatArray, BoolArray]:
-    """Return positions (n, 3) of each frame's most shared points, and a table (frames, n) of who tracks which point."""
-    every = np.concatenate([frame.point_ids for frame in frames])
-    ids, first, inverse = np.unique(every, return_index=True, return_inverse=True)
-    world = np.concatenate([np.asarray(frame.points_world, dtype=np.float64).reshape(-1, 3) for frame in frames])[first]
-    views = np.bincount(inverse.ravel(), minlength=len(ids))
-    seen = np.split(inverse.ravel(), np.cumsum([len(frame.point_ids) for frame in frames])[:-1])
-    chosen = np.zeros(len(ids), dtype=bool)
-    for members in seen:
-        shared = members[views[members] >= 2]
-        most = max(_FEWEST_PER_FRAME, round(_SHARE_PER_FRAME * len(members)))
-        chosen[shared[np.argsort(-views[shared], kind="stable")[:most]]] = True
-    tracked = np.zeros((len(frames), len(ids)), dtype=bool)
-    for number, members in enumerate(seen):
-        tracked[number, members] = True
-    return world[chosen], tracked[:, chosen]
 
 
 def _read(image: Float32Array, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -77,13 +77,12 @@ def estimate_rig(
     rig = RigModel(start.thermal_camera, np.asarray(start.visible_to_thermal, dtype=np.float64))
     unchanged = np.zeros(len(PARAMETERS))
     coarse = prepared.score(rig, unchanged, sizes[0], _COARSE_BLUR_PX)
-    before = coarse.value(unchanged)
 
     def kept(reason: str) -> RigEstimate:
         covariance = np.diag(sigmas**2)
         error_px = _projection_sigma(prepared, rig, unchanged, covariance)
         text = f"Not determined, the start value is kept ({start.source}): {reason}."
-        return RigEstimate(rig.camera, rig.transform, False, text, PARAMETERS, covariance, before, before, error_px)
+        return RigEstimate(rig.camera, rig.transform, False, text, PARAMETERS, covariance, error_px)
 
     if len(chosen) < _FEWEST_FRAMES:
         return kept(f"{len(chosen)} frames are too few to tell; at least {_FEWEST_FRAMES} are needed")
@@ -113,7 +112,7 @@ def estimate_rig(
         say(f"Comparing edges, {size[0]} x {size[1]} pixels")
         score = prepared.score(rig, change, size, _FINE_BLUR_PX if size == sizes[-1] else _COARSE_BLUR_PX)
         change = RigPosterior(score, sigmas, depth).maximum(change)
-    before, covariance = score.value(unchanged), RigPosterior(score, sigmas, depth).covariance(change)
+    covariance = RigPosterior(score, sigmas, depth).covariance(change)
 
     def rejection(change: FloatArray, covariance: FloatArray) -> str | None:
         """Return why a rig is too far from the start or too uncertain; None if it is acceptable."""
@@ -129,7 +128,7 @@ def estimate_rig(
         return None
 
     reason = rejection(change, covariance)
-    if score.value(change) < before:
+    if score.value(change) < score.value(unchanged):
         reason = "the start agrees better than all that was tried"
     if reason is not None:
         return kept(reason)
@@ -140,8 +139,8 @@ def estimate_rig(
         change, covariance, count = better
         windows = f" and {count} windows of them that agree"
     camera, transform = rig.changed(change)
-    after, error_px = score.value(change), _projection_sigma(prepared, rig, change, covariance)
-    found = RigEstimate(camera, transform, True, "", PARAMETERS, covariance, before, after, error_px)
+    error_px = _projection_sigma(prepared, rig, change, covariance)
+    found = RigEstimate(camera, transform, True, "", PARAMETERS, covariance, error_px)
     explanation = (
         f"Found from {len(chosen)} frames{windows}: focal length {camera.fl_x:.1f} pixels, turned by "
         f"{found.turn_deg:.2f} ± {found.turn_error_deg:.2f} degrees and {np.linalg.norm(transform[:3, 3]):.3g} "

@@ -59,8 +59,8 @@ def rig_start(
         return Camera(width, height, focal_px, focal_px, width / 2, height / 2)
 
     lens = [frame.thermal_focal_px for frame in frames if frame.thermal_focal_px]
-    flir = [frame.picture_in_picture for frame in frames if frame.picture_in_picture]
-    angles = [frame.thermal_field_of_view_deg for frame in frames if frame.thermal_field_of_view_deg]
+    flir = [frame.metadata.picture_in_picture for frame in frames if frame.metadata.picture_in_picture]
+    angles = [frame.metadata.field_of_view_deg for frame in frames if frame.metadata.field_of_view_deg]
     angles = [angle for angle in angles if _BELIEVED_DEG[0] < angle < _BELIEVED_DEG[1]]
     if field_of_view_deg is not None:
         camera = Camera.from_field_of_view(width, height, field_of_view_deg)

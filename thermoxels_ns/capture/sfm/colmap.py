@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import shutil
 import signal
 import threading
 from collections.abc import Callable, Mapping
@@ -18,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.data.colmap_model import camera_to_world
 
 Say = Callable[[str], None]
@@ -26,16 +25,12 @@ _Result = TypeVar("_Result")
 
 _KILLED = -int(getattr(signal, "SIGKILL", 9))
 _FATAL_ONLY = 3
-_FULL_BYTES = 1_000_000
-"""With less free space, a full disk is taken as the reason why COLMAP ended: programs write whole pages."""
-_FIELDS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
+FIELDS: dict[str, tuple[str, ...]] = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
-"""The lens models of COLMAP that `Camera` can hold, and the order of their parameters; f is both focal lengths."""
+"""COLMAP's lens models that --lens offers, and the order of their parameters; f is both focal lengths."""
 
 
 def run_in_process(
@@ -48,7 +43,6 @@ def run_in_process(
     module, and its arguments and result must be picklable.
 
     Raises:
-        OutputError: The process ended because the disk of `folder` is full.
         ThermoxelsError: `work` raised this error, or the process ended without a result.
         OSError: `work` raised this error.
     """
@@ -75,10 +69,7 @@ def run_in_process(
         words = log.read_text("utf-8", "replace") if log.is_file() else ""
         log.unlink(missing_ok=True)
     if ended is None:
-        reason, free = _reason(child.exitcode, words), shutil.disk_usage(folder).free
-        if free < _FULL_BYTES or "disk is full" in reason:  # whatever COLMAP says
-            expected, got = f"free space for features, matches and poses in {folder}", f"{free / 1e6:.0f} MB"
-            raise OutputError("disk", expected=expected, got=got, remedy="Make space; finished stages are kept.")
+        reason = _reason(child.exitcode, words)
         remedy = "Check free space and memory and run the command again; if that does not help, begin anew with "
         raise ThermoxelsError("COLMAP", expected="to end", got=reason, remedy=remedy + "--from-stage poses.")
     if ended[1] is not None:
@@ -121,32 +112,20 @@ def _reason(status: int | None, words: str) -> str:
     return f"exit status {status}" + (f" ({telling[-1]})" if telling else "")
 
 
-def model_of_colmap(
-    reconstruction: Any, frame_of_image: Mapping[str, str], size: tuple[int, int] | None = None
-) -> SfmModel:
-    """Convert a pycolmap.Reconstruction into an `SfmModel`.
+def model_of_colmap(reconstruction: Any, frame_of_image: Mapping[str, str], size: tuple[int, int]) -> SfmModel:
+    """Convert a pycolmap.Reconstruction with one camera into an `SfmModel`.
 
     The model has the posed images that are keys of `frame_of_image`, in that order. `size` is the original photographs'
-    width and height, if the images were reduced. Raises `SceneError` for no pose, several cameras or an unknown lens.
+    width and height, from which the images may have been reduced.
     """
     by_name = {image.name: image for image in reconstruction.images.values() if image.has_pose}
     posed = [by_name[name] for name in frame_of_image if name in by_name]
-    cameras = {image.camera_id for image in posed}
-    if len(cameras) != 1:
-        remedy = "Give a model of these photographs with one camera (--ImageReader.single_camera 1)."
-        got = f"{len(posed)} of the {len(frame_of_image)} photographs, of {len(cameras)} cameras"
-        raise SceneError("COLMAP model", expected="photographs of one camera", got=got, remedy=remedy)
-    camera = reconstruction.cameras[cameras.pop()]
-    name = camera.model.name
-    if name not in _FIELDS:
-        remedy = "Run COLMAP with --ImageReader.camera_model OPENCV, or let thermoxels capture find the poses."
-        raise SceneError("COLMAP camera", expected="a lens model out of " + ", ".join(_FIELDS), got=name, remedy=remedy)
-    values: dict[str, Any] = dict(zip(_FIELDS[name], map(float, camera.params)))
+    camera = reconstruction.cameras[posed[0].camera_id]
+    values: dict[str, Any] = dict(zip(FIELDS[camera.model.name], map(float, camera.params)))
     focal = values.pop("f", None)
     if focal is not None:
         values |= {"fl_x": focal, "fl_y": focal}
     found = Camera(int(camera.width), int(camera.height), **values)
-    size = size or (found.width, found.height)
     factor = np.array([size[0] / found.width, size[1] / found.height])
     ids = sorted(reconstruction.points3D)
     points = [reconstruction.points3D[i] for i in ids]

@@ -1,57 +1,44 @@
-"""Finds the poses of the photographs by structure from motion, or reads poses that the user gives."""
+"""Finds the poses of the photographs by structure from motion."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
-from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
-from thermoxels_ns.capture.settings import CaptureSettings, LensModel, Matching
-from thermoxels_ns.capture.sfm.colmap import model_of_colmap, run_in_process
+from thermoxels_ns.capture.settings import CaptureSettings, LensModel
+from thermoxels_ns.capture.sfm.colmap import FIELDS, model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.json_values import read_json
-from thermoxels_ns.data.colmap_model import read_model
-from thermoxels_ns.data.transforms_json import path_inside, read_intrinsics, read_pose
 
 MIN_FRAMES = 3  # smallest number of photographs that are reconstructed
 _SAID_EVERY = 10
 _GUESSED_FOCAL = 1.0  # focal length as a share of the longest side, if no photograph states one: a 53 degree lens
 _JPEG_QUALITY = 95
 _DATABASE = "features.db"
-EXHAUSTIVE_UP_TO = 80  # auto matching compares all pairs up to this number of photographs; time grows with its square
+EXHAUSTIVE_UP_TO = 80  # all pairs are compared up to this number of photographs; time grows with its square
 _NEIGHBOURS = 8
-"""Sequential matching: each photograph is matched with the next `_NEIGHBOURS`, and with those 2, 4, 8, ... times
+"""Beyond it, each photograph is matched with the next `_NEIGHBOURS`, and with those 2, 4, 8, ... times
 `_NEIGHBOURS` places ahead."""
 _ANCHORS = 40
-"""Sequential matching: so many photographs, spread over the capture, are also matched with each other, so that a path
+"""Beyond it, so many photographs, spread over the capture, are also matched with each other, so that a path
 that returns to its start is closed."""
 _CHUNK = 8
 _PAIR_CHUNK = 200
 
 
 @dataclass(frozen=True)
-class Poses:
-    """The poses that were found or given, and the frames without a pose."""
-
-    model: SfmModel
-    dropped: Mapping[str, str]  # reason by the frame's name
-
-
-@dataclass(frozen=True)
 class ReducedPhotographs:
-    """Files that COLMAP reads and writes: reduced photographs, their masks, and a database of features and matches."""
+    """Files that COLMAP reads and writes: reduced photographs, and a database of features and matches."""
 
     database: Path  # COLMAP's database file, made if it does not exist; COLMAP also writes to its folder
     images: Path  # folder of the reduced photographs, all of one size
@@ -59,7 +46,6 @@ class ReducedPhotographs:
     """Frame name by file name in `images`, in the order the photographs were taken."""
     size: tuple[int, int]
     """Width and height of the original photographs, [pixels]; the photographs in `images` may be smaller."""
-    masks: Path | None = None  # folder of pictures that are black where features are not used; None: no masks
 
 
 def find_poses(
@@ -67,13 +53,13 @@ def find_poses(
     folder: Path,
     settings: CaptureSettings,
     focal_px: float | None = None,
-    masks: PhotographMasks | None = None,
     say: Callable[[str], None] = lambda _: None,
-) -> Poses:
+) -> tuple[SfmModel, dict[str, str]]:
     """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
 
     `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length.
-    Results of an interrupted run in `folder` are reused. Only the largest set of photographs that fit together is kept.
+    Returns the model, and a reason for each frame without a pose, by its name.
+    Results of an interrupted run in `folder` are reused. Only the largest set of photographs that fit is kept.
 
     Raises:
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
@@ -83,7 +69,7 @@ def find_poses(
     if len(names) < MIN_FRAMES:
         raise _too_few(len(names), "photographs of one size")
     some = {name: photographs[name] for name in names}
-    reduced, small = _reduced(some, folder, size, settings.image_size, masks)
+    reduced, small = _reduced(some, folder, size, settings.image_size)
     # The photographs' own focal length or a usual one, the principal point at the centre.
     focal = focal_px or _GUESSED_FOCAL * max(size)
     start = Camera(*size, focal, focal, size[0] / 2.0, size[1] / 2.0).resized(*small)
@@ -96,71 +82,13 @@ def find_poses(
             dropped[name] = f"fits only to {elsewhere[name]} others, in a part of its own"
         elif name not in model.frames:
             dropped[name] = "too few matches with the other photographs"
-    return Poses(model, dropped)
-
-
-def add_points(
-    given: SfmModel,
-    photographs: Mapping[str, Path],
-    folder: Path,
-    settings: CaptureSettings,
-    masks: PhotographMasks | None = None,
-    say: Callable[[str], None] = lambda _: None,
-) -> SfmModel:
-    """Return the model `given` with scene points that at least two photographs show; lens and poses stay unchanged.
-
-    The photographs must have the size of `given.camera`. Results of an interrupted run in `folder` are reused.
-    """
-    size, posed = (given.camera.width, given.camera.height), {name: photographs[name] for name in given.frames}
-    reduced, small = _reduced(posed, folder, size, settings.image_size, masks)
-    to_match = reduced, given.camera.resized(*small), True, replace(settings, lens="OPENCV")
-    run_in_process(_find_and_match, to_match, folder, say)
-    return run_in_process(_triangulate, (reduced, given, settings.seed), folder, say)
-
-
-def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
-    """Read poses, in their own world coordinates, from a COLMAP model's folder or a transforms.json.
-
-    `photographs` maps frame names to the camera's files, relative to the capture. The model of a transforms.json has no
-    points. Frames without a pose are in `dropped`. Raises `ThermoxelsError` if `path` is missing or unreadable, names
-    none of the photographs, has several cameras, or has a name that leads out of its folder.
-    """
-    if path.is_dir():
-        reconstruction = read_model(path)
-        names = [image.name for image in reconstruction.images.values()]
-        model = model_of_colmap(reconstruction, _frames_of(names, photographs, path))
-    elif path.is_file():
-        model = _read_transforms(path, photographs)
-    else:
-        expected, got = "a COLMAP model's folder or a transforms.json", f"nothing at {path}"
-        raise SceneError("poses", expected=expected, got=got, remedy="Check the path.")
-    missing = {name: f"{path.name} has no pose of it" for name in photographs if name not in model.frames}
-    return Poses(model, missing)
-
-
-def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Poses:
-    """Convert camera and pixels of given poses to the size of the photographs, which may have been reduced for them.
-
-    Frames whose photographs have another size than most go to `dropped`. Raises `SceneError` for other proportions.
-    """
-    size, other = common_size({name: photographs[name] for name in poses.model.frames})
-    dropped = dict(poses.dropped) | other
-    model, camera = poses.model.without(list(other)), poses.model.camera
-    if size == (camera.width, camera.height):
-        return Poses(model, dropped)
-    factors = np.array([size[0] / camera.width, size[1] / camera.height])
-    # The sides of a reduced image are rounded to whole pixels.
-    if abs(factors[0] / factors[1] - 1.0) > 1.0 / min(*size, camera.width, camera.height):
-        expected = f"photographs with the proportions of {camera.width} x {camera.height} pixels, as their camera has"
-        remedy = "Use the photographs that the poses were computed from, neither cropped nor turned."
-        raise SceneError("given poses", expected=expected, got=f"{size[0]} x {size[1]}", remedy=remedy)
-    error_px, pixel = model.point_error_px * float(factors.mean()), model.sighting_pixel * factors
-    return Poses(replace(model, camera=camera.resized(*size), point_error_px=error_px, sighting_pixel=pixel), dropped)
+    return model, dropped
 
 
 def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, str]]:
     """Return the width and height that most photographs have, and a reason for each frame of another size."""
-    sizes = {name: read_photograph_facts(path).size for name, path in photographs.items()}
+    facts = {name: read_photograph_facts(path) for name, path in photographs.items()}
+    sizes = {name: (one.width, one.height) for name, one in facts.items()}
     if not sizes:
         raise _too_few(0, "photographs")
     size = Counter(sizes.values()).most_common(1)[0][0]
@@ -169,15 +97,15 @@ def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[
 
 
 def _reduced(
-    photographs: Mapping[str, Path], folder: Path, size: tuple[int, int], longest: int, masks: PhotographMasks | None
+    photographs: Mapping[str, Path], folder: Path, size: tuple[int, int], longest: int
 ) -> tuple[ReducedPhotographs, tuple[int, int]]:
-    """Write photographs for COLMAP, at most `longest` pixels wide and high, and their masks, into `folder`.
+    """Write photographs for COLMAP, at most `longest` pixels wide and high, into `folder`.
 
     The files have no EXIF, by which COLMAP would turn them. Returns the files, and their width and height [pixels].
     """
     factor = min(1.0, longest / max(size))
     small = max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
-    images, mask_folder = folder / "images", folder / "masks"
+    images = folder / "images"
     images.mkdir(exist_ok=True)
     digits = max(4, len(str(len(photographs))))
     files = {f"{index:0{digits}d}.jpg": name for index, name in enumerate(photographs)}
@@ -190,73 +118,12 @@ def _reduced(
             temporary = images / f".{file}"
             picture.save(temporary, format="JPEG", quality=_JPEG_QUALITY)
             temporary.replace(images / file)
-    masked = masks is not None and masks.any
-    if masks is not None and masked:
-        mask_folder.mkdir(exist_ok=True)
-        for file, frame in files.items():
-            # COLMAP looks for the photograph's name with .png behind it.
-            use = Image.fromarray(np.where(masks.of(frame), np.uint8(255), np.uint8(0)))
-            use.resize(small, Image.Resampling.NEAREST).save(mask_folder / f"{file}.png")
-    return ReducedPhotographs(folder / _DATABASE, images, files, size, mask_folder if masked else None), small
-
-
-def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
-    content: Any = read_json(path)
-    entries = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise SceneError(str(path), expected="a list 'frames'", got="none", remedy="Pass another transforms.json.")
-    numbers = {}
-    for index, entry in enumerate(entries):
-        name = str(entry.get("file_path", ""))
-        path_inside(path.parent, name, f"{path.name}: frame {index}")
-        numbers[name] = index
-    frames, poses, cameras = [], [], set()
-    for name, frame in _frames_of(list(numbers), photographs, path).items():
-        entry, where = entries[numbers[name]], f"{path.name}: frame {numbers[name]}"
-        camera = read_intrinsics(content, entry, None, where)
-        if camera.k3 or camera.k4 or camera.lens != "perspective":
-            expected = "a perspective lens with distortion k1, k2, p1, p2"
-            got = f"{camera.lens}, k3 {camera.k3}, k4 {camera.k4}"
-            raise SceneError(where, expected=expected, got=got, remedy="Undistort first.")
-        cameras.add(camera)
-        frames.append(frame)
-        poses.append(read_pose(entry.get("transform_matrix"), f"{where}: transform_matrix"))
-    if len(cameras) != 1:
-        remedy = "Give one set of intrinsics for all frames, or let thermoxels capture find the poses."
-        got = f"{len(frames)} photographs of {len(cameras)} cameras"
-        raise SceneError(str(path), expected="photographs of one camera", got=got, remedy=remedy)
-    none, sightings = np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
-    points = none, none.astype(np.uint8), none[:, 0]
-    return SfmModel(tuple(frames), cameras.pop(), np.stack(poses), *points, sightings, sightings, none[:, :2])
-
-
-def _frames_of(names: list[str], photographs: Mapping[str, str], path: Path) -> dict[str, str]:
-    """Return frames by the `names` in a file of poses, in the photographs' order; unique stems are enough to match."""
-    by_file: dict[str, list[str]] = {}
-    for frame, source in photographs.items():
-        for key in {source, PurePosixPath(source).name, PurePosixPath(source).stem, frame}:
-            by_file.setdefault(key.lower(), []).append(frame)
-    found: dict[str, str] = {}
-    for name in names:
-        plain = PureWindowsPath(name).as_posix()
-        for key in (plain, PurePosixPath(plain).name, PurePosixPath(plain).stem):
-            frames = by_file.get(key.lower(), [])
-            if len(frames) == 1:
-                found[name] = frames[0]
-                break
-    twice = {frame for frame, count in Counter(found.values()).items() if count > 1}
-    if not found or twice:
-        remedy = "Pass the poses of these photographs; they are recognised by their file names."
-        got = f"{sorted(twice)[0]} twice" if twice else f"{names[0] if names else 'no name'} and no known one"
-        raise SceneError(str(path), expected="names of the capture's photographs", got=got, remedy=remedy)
-    order = list(photographs)
-    return dict(sorted(found.items(), key=lambda item: order.index(item[1])))
+    return ReducedPhotographs(folder / _DATABASE, images, files, size), small
 
 
 def _too_few(got: int, what: str) -> SceneError:
     remedy = (
-        "Take more photographs with more overlap (each part of the scene in three or more), in focus and "
-        "with texture; or give poses with --poses."
+        "Take more photographs with more overlap (each part of the scene in three or more), in focus and with texture."
     )
     return SceneError("poses", expected=f"at least {MIN_FRAMES} {what}", got=got, remedy=remedy)
 
@@ -290,43 +157,6 @@ def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> 
     return model_of_colmap(largest, matched.frame_of_image, matched.size), elsewhere
 
 
-def _triangulate(matched: ReducedPhotographs, posed: SfmModel, seed: int, say: Callable[[str], None]) -> SfmModel:
-    """Return `posed` with points triangulated from the matches, in place of its own points."""
-    import pycolmap
-
-    say("poses: given; looking for points")
-    number = {frame: index for index, frame in enumerate(posed.frames)}
-    with pycolmap.Database.open(matched.database) as opened:
-        ids = {image.name: image.image_id for image in opened.read_all_images()}
-        stored = opened.read_camera(1)
-    camera = posed.camera.resized(stored.width, stored.height)
-    start = pycolmap.Reconstruction()
-    start.add_camera_with_trivial_rig(as_colmap(camera, "OPENCV"))
-    for name, frame in matched.frame_of_image.items():
-        inverse = np.linalg.inv(posed.camera_to_world[number[frame]] @ OPENGL_FROM_OPENCV)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(inverse[:3, :3]), inverse[:3, 3])
-        start.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=ids[name]), pose)
-    options = _options(seed)
-    options.ba_refine_focal_length = options.ba_refine_extra_params = False
-    options.constant_cameras = {1}
-    options.fix_existing_frames = True
-    folder = matched.database.parent
-    pycolmap.set_random_seed(seed)
-    given = start, matched.database, matched.images, folder
-    found = pycolmap.triangulate_points(*given, clear_points=True, options=options, refine_intrinsics=False)
-    model = model_of_colmap(found, matched.frame_of_image, matched.size)
-    sighting_frame = np.array([number[frame] for frame in model.frames], dtype=np.int64)[model.sighting_frame]
-    return replace(
-        posed,
-        points=model.points,
-        colours=model.colours,
-        point_error_px=model.point_error_px,
-        sighting_frame=sighting_frame,
-        sighting_point=model.sighting_point,
-        sighting_pixel=model.sighting_pixel,
-    )
-
-
 def _options(seed: int) -> Any:
     import pycolmap
 
@@ -341,15 +171,15 @@ def _options(seed: int) -> Any:
     return options
 
 
-def image_pairs(count: int, matching: Matching) -> IntArray:
+def image_pairs(count: int) -> IntArray:
     """Return the pairs of photographs to match, sorted, shape (p, 2): indices in order of time, the smaller first.
 
-    "exhaustive" gives every pair, "sequential" neighbours in time and some far pairs; "auto" chooses by `count`.
+    These are all pairs up to `EXHAUSTIVE_UP_TO` photographs, beyond it neighbours in time and some far pairs.
 
-    >>> image_pairs(3, "exhaustive").tolist()
+    >>> image_pairs(3).tolist()
     [[0, 1], [0, 2], [1, 2]]
     """
-    if matching == "exhaustive" or (matching == "auto" and count <= EXHAUSTIVE_UP_TO):
+    if count <= EXHAUSTIVE_UP_TO:
         return np.stack(np.triu_indices(count, 1), axis=1).astype(np.int64)
     steps = [*range(1, _NEIGHBOURS), *(_NEIGHBOURS * 2**power for power in range(count.bit_length()))]
     first, step = (grid.ravel() for grid in np.meshgrid(np.arange(count), steps, indexing="ij"))
@@ -369,15 +199,13 @@ def _find_and_match(
     """Find features in photographs and match them, adding to what an interrupted run left in the database.
 
     `camera` is the start value of the lens, at the size of the reduced photographs; `known_focal` is True if its focal
-    length is stated by photographs or poses, not guessed.
+    length is stated by photographs, not guessed.
     """
     import pycolmap
 
     _add_images(photographs, camera, settings.lens, known_focal)
     database, names = photographs.database, list(photographs.frame_of_image)
     reader = pycolmap.ImageReaderOptions(camera_model=settings.lens, existing_camera_id=1)
-    if photographs.masks is not None:
-        reader.mask_path = str(photographs.masks)
     extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=settings.threads)
     extraction.sift.max_num_features = settings.max_features
     for start in range(0, len(names), _CHUNK):  # COLMAP skips photographs that already have features
@@ -385,7 +213,7 @@ def _find_and_match(
         given: dict[str, Any] = {"reader_options": reader, "extraction_options": extraction}
         pycolmap.extract_features(database, photographs.images, some, **given)
         say(f"features: {start + len(some)} of {len(names)} photographs")
-    pairs = image_pairs(len(names), settings.matching)
+    pairs = image_pairs(len(names))
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=settings.threads)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = settings.seed
@@ -399,16 +227,6 @@ def _find_and_match(
         say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
 
 
-def as_colmap(camera: Camera, lens: LensModel) -> Any:
-    """Return a camera as a pycolmap.Camera with number 1 and the given lens model."""
-    import pycolmap
-
-    numbers = [camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
-    if lens != "OPENCV":
-        numbers = [numbers[0], *numbers[2 : 5 if lens == "SIMPLE_RADIAL" else 6]]
-    return pycolmap.Camera(camera_id=1, model=lens, width=camera.width, height=camera.height, params=numbers)
-
-
 def _add_images(photographs: ReducedPhotographs, camera: Camera, lens: LensModel, known_focal: bool) -> None:
     """Create the database with photographs numbered in order; the feature threads would number them by chance."""
     import pycolmap
@@ -417,7 +235,10 @@ def _add_images(photographs: ReducedPhotographs, camera: Camera, lens: LensModel
         return
     names = photographs.frame_of_image
     with replace_when_done(photographs.database) as temporary, pycolmap.Database.open(temporary) as opened:
-        colmap_camera = as_colmap(camera, lens)
+        numbers = {"f": camera.fl_x, **vars(camera)}
+        params = [numbers[name] for name in FIELDS[lens]]
+        size = {"width": camera.width, "height": camera.height}
+        colmap_camera = pycolmap.Camera(camera_id=1, model=lens, params=params, **size)
         colmap_camera.has_prior_focal_length = known_focal
         opened.write_camera(colmap_camera, use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +29,7 @@ class SfmModel:
     frames: tuple[str, ...]  # names of the frames that have a pose, in order, all different
     camera: Camera  # lens of all photographs, at their original size
     camera_to_world: FloatArray  # poses, shape (f, 4, 4), camera axes x right, y up, z back, as in transforms.json
-    points: FloatArray  # scene points, shape (n, 3), in world units; n is 0 if poses were given without points
+    points: FloatArray  # scene points, shape (n, 3), in world units
     colours: npt.NDArray[np.uint8]  # red, green and blue of the points, shape (n, 3)
     point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
     sighting_frame: IntArray  # index into `frames`, shape (s,)
@@ -52,11 +51,6 @@ class SfmModel:
         pose = self.camera_to_world[frame]
         return (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3] @ OPENGL_FROM_OPENCV[:3, :3]
 
-    def ray(self, frame: int, pixel: npt.NDArray[np.floating]) -> FloatArray:
-        """Return the world vector (3,) from frame number `frame`'s camera to what a pixel (2,) shows at depth 1."""
-        pose = self.camera_to_world[frame]
-        return (self.camera.rays(pixel[None]) * (1.0, -1.0, -1.0))[0] @ pose[:3, :3].T
-
     def sighting_error_px(self) -> FloatArray:
         """Return the distance between each sighting's pixel and its point's projection, shape (s,), [pixels]."""
         errors = [np.zeros(0)]
@@ -72,20 +66,6 @@ class SfmModel:
         poses[:, :3, :3] = rotation @ poses[:, :3, :3]
         poses[:, :3, 3] = (poses[:, :3, 3] - origin) @ rotation.T
         return replace(self, camera_to_world=poses, points=(self.points - origin) @ rotation.T)
-
-    def without(self, names: Sequence[str]) -> SfmModel:
-        """Return the model without some frames; all points stay, also points that no remaining frame shows."""
-        keep = np.array([name not in set(names) for name in self.frames], dtype=bool)
-        number = np.cumsum(keep) - 1
-        stays = keep[self.sighting_frame]
-        return replace(
-            self,
-            frames=tuple(name for name, stay in zip(self.frames, keep) if stay),
-            camera_to_world=self.camera_to_world[keep],
-            sighting_frame=number[self.sighting_frame[stays]],
-            sighting_point=self.sighting_point[stays],
-            sighting_pixel=self.sighting_pixel[stays],
-        )
 
 
 class SparseDepth:
