@@ -216,7 +216,7 @@ def test_what_cannot_be_drawn_is_refused(field):
 
 
 def test_the_folder_gives_wrong_poses_and_tells_the_truth(tmp_path: Path):
-    scene, flaws = make_scene("sphere"), Imperfections(pose_error_deg=1.0, focal_error=0.01)
+    scene, flaws = make_scene("sphere"), Imperfections(pose_error_deg=1.0, rig_error_deg=1.0, focal_error=0.01)
     write_scene(
         scene, tmp_path, 4, 1, 40, 30, own_thermal_camera=True, imperfections=flaws, photo_format="png", progress=False
     )

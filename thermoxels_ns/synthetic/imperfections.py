@@ -41,6 +41,9 @@ class Imperfections:
     """Standard deviation of the temperature offset of each thermal image, [K], as uncooled cameras have it."""
     thermal_blur_px: float = 0.0
     """Standard deviation of the thermal camera's Gaussian point spread, [thermal pixels]."""
+    rig_error_deg: float = 0.0
+    """Standard deviation of the angle, about each axis, by which the given poses of a separate thermal camera are
+    turned against those of the photographs, [degrees], by the same angles in all poses."""
     passers_by: float = 0.0
     """Share of the pairs of images in which a person, 31 C warm, walks before the scene."""
 
@@ -82,6 +85,7 @@ class DrawnFlaws:
         errors *= np.deg2rad(flaws.pose_error_deg)
         far = np.linalg.norm(poses[:, :3, 3] - np.asarray(middle, dtype=np.float64), axis=1)
         self.turns_rad, self._moves = errors[:, :3], errors[:, 3:] * far[:, None]  # about, and along, each axis
+        self._rig_turn_rad = np.deg2rad(flaws.rig_error_deg) * self._normal(3, stream=5)
         self._passing: BoolArray = np.random.default_rng([seed, 6]).random(count) < flaws.passers_by
 
     def _normal(self, *shape: int, stream: int, number: int | None = None) -> FloatArray:
@@ -92,12 +96,16 @@ class DrawnFlaws:
 
     def given_poses(self) -> FloatArray:
         """Return the wrong poses (n, 4, 4) that a scene folder contains in place of the true poses."""
-        from scipy.spatial.transform import Rotation  # imported here so that --help stays fast
-
         given = self._poses.copy()
-        given[:, :3, :3] = given[:, :3, :3] @ Rotation.from_rotvec(self.turns_rad).as_matrix()
+        given[:, :3, :3] = given[:, :3, :3] @ _turned(self.turns_rad)
         given[:, :3, 3] += self._moves
         return given
+
+    def given_rig_turn(self) -> FloatArray:
+        """Return the transform (4, 4) by which the given poses of a separate thermal camera are wrong."""
+        turn = np.eye(4)
+        turn[:3, :3] = _turned(self._rig_turn_rad)
+        return turn
 
     def bounds_c(self, lowest_c: float, highest_c: float) -> tuple[float, float]:
         """Return the lowest and highest reading of thermal images of a scene of `lowest_c` to `highest_c`, [C]."""
@@ -137,9 +145,17 @@ class DrawnFlaws:
             "imperfections": vars(self.flaws),
             "gains": self.gains.tolist(),
             "drift_k": self.drifts_k.tolist(),
+            "rig_turn_deg": np.rad2deg(self._rig_turn_rad).tolist(),
             "passers_by": np.flatnonzero(self._passing).tolist(),
             "poses": self._poses.tolist(),
         }
+
+
+def _turned(rotation_vectors: FloatArray) -> FloatArray:
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    from scipy.spatial.transform import Rotation  # imported here so that --help stays fast
+
+    return Rotation.from_rotvec(rotation_vectors).as_matrix()
 
 
 def _passer_by(shape: tuple[int, ...], place: float) -> BoolArray:
