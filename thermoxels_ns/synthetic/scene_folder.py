@@ -100,7 +100,7 @@ def write_scene(
     train, held_out = scene.poses(num_train, num_eval)
     names = [f"frame_{kind}_{i + 1:05d}" for kind, n in (("train", num_train), ("eval", num_eval)) for i in range(n)]
     poses = np.concatenate([train, held_out])
-    flaws = DrawnFlaws(imperfections, seed, poses, np.mean(scene.scene_box, axis=0))
+    flaws = DrawnFlaws(imperfections, seed, poses, np.mean(scene.scene_box, axis=0), scene.temperature_bounds_c)
     given_poses, given_offset = flaws.given_poses(), offset @ flaws.given_rig_turn()
     bounds = flaws.bounds_c(*scene.temperature_bounds_c)
     # Temperature [C] = count * celsius_per_count + celsius_offset.
