@@ -53,6 +53,10 @@ class CaptureSettings:
     """Seed of all random choices; the same seed gives the same poses."""
     known_distance: tuple[str, float, float, float, float, float] | None = None
     """A measured length: name of a photograph, pixel x y of one end, pixel x y of the other end, length in metres."""
+    marker_side_m: float | None = None
+    """Side of the black square of printed ArUco markers (dictionary 4x4, numbers 0 to 49) in the scene, in metres."""
+    marker_error_m: float | None = None
+    """Standard error of --marker-side-m, in metres. Default: the side counts as exact."""
     thermal_field_of_view_deg: float | None = None
     """Horizontal angle of view of the thermal lens at the start of the search for the rig, in degrees. Default: what
     the files say."""

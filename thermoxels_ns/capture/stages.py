@@ -27,6 +27,7 @@ from thermoxels_ns.capture.sfm.scale_and_up import (
     level_rotation,
     scale_from_distance,
     scale_from_gps,
+    scale_from_markers,
 )
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import (
@@ -220,6 +221,7 @@ class _Capture:
         settings = self.settings
         depends = {
             "known": settings.known_distance,
+            "markers": [settings.marker_side_m, settings.marker_error_m],
         }
         by_name = {frame.name: frame for frame in read.frames}
         frames = [by_name[name] for name in found.frames]
@@ -244,11 +246,14 @@ class _Capture:
         return load(folder / "model.npz", SfmModel), scale, content["missing"], Up(**up)
 
     def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
-        """Return metres per unit from a known distance, else from GPS; or None and the reason for None."""
+        """Return metres per unit from a known distance, else markers, else GPS; or None and the reason for None."""
         settings = self.settings
         if settings.known_distance is not None:
             files = {frame.name: frame.photograph_source for frame in frames}
             return scale_from_distance(model, settings.known_distance, files), ""
+        if settings.marker_side_m is not None:
+            photographs = {frame.name: frame.photograph for frame in frames}
+            return scale_from_markers(model, photographs, settings.marker_side_m, settings.marker_error_m)
         return scale_from_gps(model.centres, [frame.gps for frame in frames])
 
     def board_rig(self, model: SfmModel, read: CaptureFrames) -> RigEstimate | None:

@@ -1,6 +1,8 @@
 import io
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image, ImageOps
@@ -13,7 +15,9 @@ from thermoxels_ns.capture.sfm.scale_and_up import (
     local_metres,
     scale_from_distance,
     scale_from_gps,
+    scale_from_markers,
 )
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.synthetic.scene_truth import look_at
 
@@ -100,6 +104,36 @@ def test_a_measured_length_on_a_wall_gives_the_scale_though_some_points_are_near
 def test_a_wrong_length_is_refused(known, words):
     with pytest.raises(ThermoxelsError, match=words):
         scale_from_distance(ring_model(), known, {})
+
+
+def wall_photographs(model: SfmModel, places: list[float], folder: Path, unit_m: float = 1.0) -> dict[str, Path]:
+    """Photographs of a wall with an ArUco marker of 0.4 m, whose middle is at x as given in each of them."""
+    marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 240)
+    texture = cv2.copyMakeBorder(marker, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    pixel = np.stack(np.meshgrid(np.arange(640) + 0.5, np.arange(480) + 0.5), -1).reshape(-1, 2)
+    files = {}
+    for name, pose, place in zip(model.frames, model.camera_to_world, places):
+        rays = CAMERA.rays(pixel) * (1, -1, -1) @ pose[:3, :3].T
+        centre = pose[:3, 3] * unit_m
+        hit = centre + rays * ((1.0 - centre[1]) / rays[:, 1])[:, None]
+        x = ((hit[:, 0] - place + 0.3) / 0.6 * 360 - 0.5).astype(np.float32).reshape(480, 640)
+        y = ((1.3 - hit[:, 2]) / 0.6 * 360 - 0.5).astype(np.float32).reshape(480, 640)
+        seen = cv2.remap(texture, x, y, cv2.INTER_AREA, borderMode=cv2.BORDER_CONSTANT, borderValue=(128,))
+        files[name] = folder / f"{name}.png"
+        Image.fromarray(seen).save(files[name])
+    return files
+
+
+def test_a_marker_gives_the_scale_and_one_that_moved_between_photographs_none(tmp_path):
+    model = ring_model(count=4, unit_m=UNIT_M)
+    scale, why = scale_from_markers(model, wall_photographs(model, [0.0] * 4, tmp_path, UNIT_M), 0.4, 0.001)
+    assert scale is not None and scale.standard_error is not None, why
+    assert scale.metres_per_unit == pytest.approx(UNIT_M, rel=0.01)
+    assert abs(scale.metres_per_unit - UNIT_M) < 4 * scale.standard_error
+    assert "1 ArUco marker of 0.4 m (7)" in scale.source
+    moved = wall_photographs(model, [-0.3, 0.3, -0.3, 0.3], tmp_path, UNIT_M)
+    found, why = scale_from_markers(model, moved, 0.4)
+    assert found is None and "[7]" in why
 
 
 def test_places_that_are_a_mirror_image_of_the_path_are_no_scale() -> None:

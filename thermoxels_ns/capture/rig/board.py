@@ -177,7 +177,7 @@ def in_scene_units(rig: RigEstimate, scale: SceneScale | None, missing: str) -> 
     """Convert a rig's lengths from metres to scene units; raise `SceneError` (text: `missing`) if `scale` is None."""
     if scale is None:
         expected = "a known scale, because a board gives the distance of the lenses in metres"
-        remedy = "Pass --known-distance; poses that were found are kept."
+        remedy = "Pass --known-distance or --marker-side-m; poses that were found are kept."
         raise SceneError("scale", expected=expected, got=f"none: {missing}", remedy=remedy)
     transform, covariance = rig.visible_to_thermal.copy(), rig.covariance.copy()
     transform[:3, 3] /= scale.metres_per_unit

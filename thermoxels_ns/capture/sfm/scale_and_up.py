@@ -1,4 +1,4 @@
-"""Finds the metres per unit of a model (from GPS or a measured distance), and the direction of up."""
+"""Finds the metres per unit of a model (from GPS, a measured distance or markers), and the direction of up."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.photograph import GpsFix
+from thermoxels_ns.capture.photograph import GpsFix, open_photograph
 from thermoxels_ns.capture.rig_types import FloatArray
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.checks import check_positive
@@ -22,6 +23,10 @@ _WORST_GPS = 0.3  # largest relative standard error of a scale from GPS that is 
 _LEAST_FIXES = 4
 _NEAR_POINTS = 12  # most scene points around a pixel that the pixel's depth is computed from
 _NEAR_SHARE = 0.08  # largest distance of these points from the pixel, as a share of the photograph's longest side
+_MARKER_DICTIONARY = cv2.aruco.DICT_4X4_50
+_MARKER_ERROR_PX = 2.0
+"""A marker whose corners miss their rays by more than this (median) counts as moved and is not used, [pixels]."""
+
 _UP_OF_ORIENTATION = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """Direction to the upper edge of the upright picture in the stored picture (x right, y up), by EXIF's orientation."""
 _ROLLED_DEG = 2.0  # standard deviation of how level people hold a picture's sides, [degrees]
@@ -117,6 +122,52 @@ def scale_from_distance(
     return SceneScale(metres / apart, metres / apart * relative, source)
 
 
+def scale_from_markers(
+    model: SfmModel, photographs: Mapping[str, Path], side_m: float, standard_error_m: float | None = None
+) -> tuple[SceneScale | None, str]:
+    """Find the scale from printed ArUco markers (4 x 4 cells, numbers 0 to 49) of known side; or None and a reason.
+
+    A marker's corners are triangulated from all photographs that show the marker (linear least squares of the rays).
+    Every marker gives four sides; the standard error combines that of the sides' mean with `standard_error_m`.
+    """
+    check_positive("marker side", side_m, "Pass the side of the black square in metres.")
+    seen: dict[int, list[tuple[int, FloatArray]]] = {}
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(_MARKER_DICTIONARY), parameters)
+    for index, name in enumerate(model.frames):
+        grey = np.asarray(open_photograph(photographs[name]).convert("L"))
+        corners, ids, _ = detector.detectMarkers(grey)
+        for four, marker in zip(corners, [] if ids is None else ids.ravel()):
+            seen.setdefault(int(marker), []).append((index, np.asarray(four, dtype=np.float64).reshape(4, 2) + 0.5))
+    sides, offs, used = [], [], []
+    for marker, views in sorted(seen.items()):
+        if len(views) < 2:
+            continue
+        placed = [_triangulate(model, [(index, four[corner]) for index, four in views]) for corner in range(4)]
+        missed = float(np.median(np.concatenate([error for _, error in placed])))
+        if missed > _MARKER_ERROR_PX:
+            continue
+        square = np.stack([point for point, _ in placed])
+        sides.append(np.linalg.norm(square - np.roll(square, 1, axis=0), axis=1))
+        offs.append(missed)
+        used.append(marker)
+    if not used:
+        if not seen:
+            return None, "no photograph shows an ArUco marker of 4 x 4 cells"
+        return None, f"markers {sorted(seen)} are in one photograph only, or moved between photographs"
+    lengths = np.concatenate(sides)
+    mean = float(lengths.mean())
+    relative = float(lengths.std(ddof=1)) / mean / math.sqrt(len(lengths))
+    relative = math.hypot(relative, (standard_error_m or 0.0) / side_m)
+    scale = side_m / mean
+    source = (
+        f"From {len(used)} ArUco marker{'s' * (len(used) != 1)} of {side_m:g} m "
+        f"({', '.join(map(str, used))}), whose corners miss their rays by {np.mean(offs):.2f} pixels."
+    )
+    return SceneScale(scale, scale * relative, source), ""
+
+
 def _similarity(model: FloatArray, metres: FloatArray, weight: FloatArray) -> tuple[float, FloatArray]:
     """Return the scale of the best similarity from model to metres, and each point's residual (n,), [m]."""
     share = weight / weight.sum()
@@ -156,6 +207,19 @@ def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> t
     ray = (camera.rays([pixel])[0] * (1.0, -1.0, -1.0)) @ model.camera_to_world[index, :3, :3].T  # of depth 1
     error = float(np.sqrt(np.mean(off[keep] ** 2))) / at**2 / math.sqrt(max(int(keep.sum()) - 3, 1))
     return model.centres[index] + ray / at, ray * error
+
+
+def _triangulate(model: SfmModel, views: Sequence[tuple[int, npt.NDArray]]) -> tuple[FloatArray, FloatArray]:
+    """Return the point nearest to all rays, shape (3,), and its reprojection errors, shape (views,), [pixels]."""
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for index, pixel in views:
+        ray = model.ray(index, pixel)
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+        normal += across
+        right += across @ model.centres[index]
+    point = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+    off = [np.linalg.norm(model.camera.project(model.in_camera(i, point[None]))[0] - pixel) for i, pixel in views]
+    return point, np.nan_to_num(np.array(off), nan=np.inf)
 
 
 @dataclass(frozen=True)
