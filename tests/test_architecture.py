@@ -38,7 +38,7 @@ MAY_IMPORT = {
 }
 """What each room may import besides itself; None: anything."""
 
-WALLS = {"fem": {"mesh": {"mesh.tetrahedra"}}}
+WALLS = {"fem": {"mesh": {"mesh.tetrahedra", "mesh.quality.tet_shapes"}}}
 """Where only some modules of another room may be imported."""
 
 DRAWING = {"pyvista", "vtk", "vtkmodules"}

@@ -22,7 +22,7 @@ from thermoxels_ns.fem.forms import (
     at_time,
     effect_forms,
 )
-from thermoxels_ns.fem.p1_kernels import lumped_mass
+from thermoxels_ns.fem.linear_tets import lumped_mass
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import Assembled, FacetHeat
 from thermoxels_ns.fem.space import Space

@@ -13,8 +13,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
-from thermoxels_ns.mesh.quality.checks import TET_EDGES
-from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
+from thermoxels_ns.mesh.quality.tet_shapes import TET_EDGES, shapes_in_chunks
 
 MIN_OBSERVED_WEIGHT = 0.5
 """Least weight of thermal rays at a measured node or corner, [fully absorbed rays]. Less weight is leakage through a
@@ -134,5 +133,5 @@ def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, Floa
     """
     conductances = np.empty((len(tets), 6))
     for which, shapes in shapes_in_chunks(points, tets):
-        conductances[which] = -shapes.stiffness(shapes.dihedral_cosines()).T
+        conductances[which] = -shapes.stiffness().T
     return tets[:, TET_EDGES].reshape(-1, 2), conductances.ravel()

@@ -16,8 +16,6 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_normals
 
 OUTWARD_FACES: IntArray = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 """Node positions of a tetrahedron's faces; face f lies opposite node f, and its right-hand normal points outwards."""
-TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int64)
-"""Node positions of the two ends of a tetrahedron's six edges, shape (6, 2)."""
 
 
 @dataclass(frozen=True)
