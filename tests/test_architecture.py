@@ -38,7 +38,7 @@ MAY_IMPORT = {
 }
 """What each room may import besides itself; None: anything."""
 
-WALLS = {"fem": {"mesh": {"mesh.tetrahedra"}}}
+WALLS = {"fem": {"mesh": {"mesh.tetrahedra", "mesh.quality.tet_shapes"}}}
 """Where only some modules of another room may be imported."""
 
 DRAWING = {"pyvista", "vtk", "vtkmodules"}
@@ -69,10 +69,10 @@ MOST_LINES = {
     "core": 1855,
     "data": 2870,
     "evaluation": 440,
-    "fem": 3485,
+    "fem": 3310,
     "field": 890,
     "heat": 2725,
-    "mesh": 5805,
+    "mesh": 5640,
     "multiview": 1855,
     "radiometry": 1360,
     "render": 1670,

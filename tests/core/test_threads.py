@@ -98,10 +98,10 @@ def test_what_was_compiled_from_other_sources_goes_and_nothing_else(tmp_path: Pa
 
 
 def test_the_kernels_in_use_are_watched():
-    from thermoxels_ns.fem.p1_kernels import _add_couplings as in_fem
+    from thermoxels_ns.mesh.solid.free_space import _enter_solid as in_mesh
     from thermoxels_ns.render.kernels import march_rays as in_render
 
-    for dispatcher in (in_fem, in_render):
+    for dispatcher in (in_mesh, in_render):
         assert (Path(dispatcher.stats.cache_path) / "thermoxels-kernels.sha256").is_file()
 
 

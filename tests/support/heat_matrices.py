@@ -7,7 +7,7 @@ from scipy import sparse
 from skfem import BilinearForm
 
 from thermoxels_ns.fem.implicit_equation import LinearSolver
-from thermoxels_ns.fem.p1_kernels import lumped_mass, stiffness_matrix
+from thermoxels_ns.fem.linear_tets import lumped_mass, stiffness_matrix
 from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
@@ -18,7 +17,6 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import HeatProblem, Term, effect_labels
-from thermoxels_ns.fem.solution import Assembled
 from thermoxels_ns.fem.space import Space, sums_by_number
 
 Vector = FloatArray
@@ -322,13 +320,10 @@ class EffectForms:
         return (*self.convection, *self.loads, *self.radiation)
 
 
-def effect_forms(
-    problem: HeatProblem, space: Space, reference_c: float, assembled: Assembled | None = None
-) -> EffectForms:
+def effect_forms(problem: HeatProblem, space: Space, reference_c: float) -> EffectForms:
     """Return the forms of a problem's effects; an effect that acts on no triangle or tetrahedron gets no form.
 
-    Temperatures are relative to `reference_c`. The forms of fixed temperatures are counted in `assembled`; `HeatSystem`
-    counts the other forms. Raises `HeatError` if the mesh lacks a patch or region of an effect.
+    Temperatures are relative to `reference_c`. Raises `HeatError` if the mesh lacks a patch or region of an effect.
     """
     made = {
         "convection": ConvectionForm,
@@ -341,8 +336,7 @@ def effect_forms(
     for label, effect in zip(effect_labels(problem), problem.effects):
         term = effect.term(space.selection)
         if len(term.parts):
-            with assembled.form("fixed") if assembled and term.kind == "fixed" else nullcontext():
-                forms.append(made[term.kind](label, term, space, reference_c))
+            forms.append(made[term.kind](label, term, space, reference_c))
 
     def of(*kinds: str) -> tuple[Any, ...]:
         return tuple(form for form in forms if form.kind in kinds)

@@ -17,7 +17,7 @@ from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.core.yaml_records import raising
-from thermoxels_ns.fem.p1_kernels import refuse_flat_tets
+from thermoxels_ns.fem.linear_tets import refuse_flat_tets
 from thermoxels_ns.fem.quantities import Bounded, Bounds
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.mesh.tetrahedra import TetMesh

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.fem.p1_kernels import FACET_EDGES, TET_EDGES, mesh_edges
+from thermoxels_ns.fem.linear_tets import FACET_EDGES, TET_EDGES, mesh_edges
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 
@@ -23,7 +23,7 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
     node counts as observed if both ends of its edge are observed.
     """
     edges = mesh_edges(mesh.tets, len(mesh.points_m))
-    num_nodes, low, high = len(mesh.points_m), edges.smaller_nodes(), edges.other
+    num_nodes, (low, high) = len(mesh.points_m), edges.ends.T
     points = np.concatenate([mesh.points_m, edges.midpoints(mesh.points_m)])
     local = np.concatenate([mesh.tets, num_nodes + edges.numbers(mesh.tets, TET_EDGES)], axis=1)
     facets = np.concatenate([mesh.facets, num_nodes + edges.numbers(mesh.facets, FACET_EDGES)], axis=1)

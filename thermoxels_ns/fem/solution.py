@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -19,30 +18,6 @@ from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = FloatArray
-
-
-@dataclass
-class Assembled:
-    """Counts and times of the forms that were assembled, by kind; a kind that was not assembled has no entry.
-
-    >>> assembled = Assembled()
-    >>> with assembled.form("stiffness"):
-    ...     pass
-    >>> assembled.counts
-    {'stiffness': 1}
-    """
-
-    counts: dict[str, int] = field(default_factory=dict)
-    """How often each kind was assembled: stiffness, mass, convection, flux, radiation, source, fixed."""
-    seconds: dict[str, float] = field(default_factory=dict)  # Time each kind took, [s]
-
-    @contextmanager
-    def form(self, kind: str) -> Iterator[None]:
-        """Return a context that counts and times the assembly of one form of this kind."""
-        start = time.perf_counter()
-        yield
-        self.seconds[kind] = self.seconds.get(kind, 0.0) + time.perf_counter() - start
-        self.counts[kind] = self.counts.get(kind, 0) + 1
 
 
 @dataclass(frozen=True)
@@ -113,7 +88,8 @@ class HeatSolution:
     """Most by which a temperature left the range of the start and of the surroundings, [K]; 0 if at most 0.01 K."""
     last_facet_heat: tuple[FacetHeat, ...] = ()
     """Heat flow of each effect through boundary triangles at the end, as if fixed nodes stored nothing."""
-    assembled: Assembled = field(default_factory=Assembled)  # Counts and times of the assembly
+    assembled: Counter[str] = field(default_factory=Counter)
+    """How often each kind of form was assembled: stiffness, mass, convection, flux, radiation, source, fixed."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +103,7 @@ class SteadySolution:
     status: str  # Sentences on how the iterations converged
     iterations: int  # Iterations of the linear solver
     newton_iterations: int  # Steps of Newton's method; 0 without radiation
-    assembled: Assembled  # Counts and times of the assembly
+    assembled: Counter[str]  # How often each kind of form was assembled
     edge_temperature_c: FloatArray = field(default_factory=lambda: np.zeros(0))
     """Temperatures of the middles of the mesh's edges, in the order of `mesh_edges`, shape (e,), [degrees Celsius];
     empty with linear tetrahedra."""

@@ -15,13 +15,7 @@ from skfem.refdom import RefTet, RefTri
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.p1_kernels import (
-    FACET_EDGES,
-    TET_EDGES,
-    MeshEdges,
-    mesh_edges,
-    stiffness_matrix,
-)
+from thermoxels_ns.fem.linear_tets import FACET_EDGES, TET_EDGES, MeshEdges, mesh_edges, stiffness_matrix
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.fem.selection import Selection
 
@@ -43,7 +37,7 @@ def conduction(u, v, w):
 class Space:
     """The n unknowns of a body: one per node of the mesh, then, for quadratic tetrahedra, one per middle of an edge.
 
-    Scikit-fem assembles the matrices of quadratic tetrahedra, `p1_kernels` those of linear ones. Convection and
+    Scikit-fem assembles the matrices of quadratic tetrahedra, `linear_tets` those of linear ones. Convection and
     radiation are evaluated at the nodes of linear tetrahedra, which keeps temperatures in the range of the
     surroundings, and are integrated over the triangles of quadratic ones. Quadratic tetrahedra serve steady states
     only: lumping their mass would make the masses of corners negative, and with the consistent mass temperatures leave
@@ -66,7 +60,7 @@ class Space:
     @property
     def num_nodes(self) -> int:
         """Number of unknowns, n."""
-        return len(self.selection.mesh.points_m) + (len(self.edges.other) if self.order == 2 else 0)
+        return len(self.selection.mesh.points_m) + (len(self.edges.ends) if self.order == 2 else 0)
 
     @property
     def points_m(self) -> Vector:
@@ -94,7 +88,7 @@ class Space:
         """Return K, integral(k grad phi_i . grad phi_j), (n, n), [W / K], for a conductivity k per tetrahedron."""
         mesh = self.selection.mesh
         if self.order == 1:
-            return stiffness_matrix(mesh.points_m, mesh.tets, conductivity_w_mk, edges=self.edges)
+            return stiffness_matrix(mesh.points_m, mesh.tets, conductivity_w_mk)
         return self.assembled(conduction, 2, conductivity=conductivity_w_mk)
 
     def assembled(self, form: BilinearForm, degree: int, **tet_values: Vector) -> sparse.csr_matrix:

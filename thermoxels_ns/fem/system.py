@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -22,9 +23,9 @@ from thermoxels_ns.fem.forms import (
     at_time,
     effect_forms,
 )
-from thermoxels_ns.fem.p1_kernels import lumped_mass
+from thermoxels_ns.fem.linear_tets import lumped_mass
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.solution import Assembled, FacetHeat
+from thermoxels_ns.fem.solution import FacetHeat
 from thermoxels_ns.fem.space import Space
 
 Vector = FloatArray
@@ -84,7 +85,9 @@ class HeatSystem:
 
     def __init__(self, problem: HeatProblem, *, order: int = 1) -> None:
         """Turn effects into forms and assemble the stiffness; `order` 1: linear tetrahedra, 2: quadratic ones."""
-        self.problem, self.assembled = problem, Assembled()
+        self.problem = problem
+        self.assembled: Counter[str] = Counter()
+        """How often each kind of form was assembled."""
         start = problem.start_c
         # The middle of the range, not the mean: exact for a uniform temperature.
         self.reference_c: float = 0.5 * (float(start.min()) + float(start.max()))
@@ -93,15 +96,16 @@ class HeatSystem:
         """The unknowns at the nodes, and the integrals over triangles and tetrahedra."""
         self.num_nodes: int = self.space.num_nodes
         """Number of nodes; with quadratic tetrahedra the mesh's nodes come first, then the middles of its edges."""
-        forms = effect_forms(problem, self.space, self.reference_c, self.assembled)
+        forms = effect_forms(problem, self.space, self.reference_c)
         self._convection, self._loads, self._radiation = forms.convection, forms.loads, forms.radiation
         self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*forms.convection, *forms.radiation)
         """Convection and radiation: the forms whose heat flow depends on the temperature of the surface."""
         self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
         """Nodes whose temperature is given."""
-        with self.assembled.form("stiffness"):
-            self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
-            """Stiffness K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
+        self.assembled.update({"fixed": len(forms.fixed)} if forms.fixed else {})
+        self.assembled["stiffness"] += 1
+        self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
+        """Stiffness K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
         self.pieces: Pieces = Pieces(self.stiffness)
         """Connected pieces of the body, between which no heat is conducted."""
         self.matrix_in_time: bool = any(form.matrix_in_time for form in self._convection)
@@ -128,9 +132,9 @@ class HeatSystem:
     @cached_property
     def nodal_mass_j_k(self) -> Vector:
         """Diagonal of the lumped mass matrix of linear tetrahedra, shape (n,), [J / K]."""
-        with self.assembled.form("mass"):
-            mesh = self.problem.mesh
-            return lumped_mass(mesh.points_m, mesh.tets, self.problem.heat_capacity_j_m3k)
+        self.assembled["mass"] += 1
+        mesh = self.problem.mesh
+        return lumped_mass(mesh.points_m, mesh.tets, self.problem.heat_capacity_j_m3k)
 
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix | None:
         """Return R, the heat that convection takes from each node per kelvin, (n, n), [W / K]; None without convection.
@@ -144,8 +148,8 @@ class HeatSystem:
             return None
         total = sparse.csr_matrix(self.stiffness.shape)
         for form in self._convection:
-            with self.assembled.form("convection"):
-                total = sparse.csr_matrix(total + form.convection_matrix(time_s))
+            self.assembled["convection"] += 1
+            total = sparse.csr_matrix(total + form.convection_matrix(time_s))
         most = float(np.max(total.diagonal() / np.maximum(self.stiffness.diagonal(), _LEAST)))
         if not most <= MOST_TIMES_CONDUCTION:
             remedy = "Give the surface the temperature of the air instead, or a smaller coefficient."
@@ -171,8 +175,8 @@ class HeatSystem:
         def add_up(at_s: float) -> Vector:
             total = np.zeros(self.num_nodes)
             for form in forms:
-                with self.assembled.form(form.kind):
-                    total += form.load(at_s)
+                self.assembled[form.kind] += 1
+                total += form.load(at_s)
             return total
 
         return at_time(kept, time_s if any(form.load_in_time for form in forms) else 0.0, add_up)
@@ -181,16 +185,16 @@ class HeatSystem:
         """Return the net heat that radiation brings to each node, shape (n,), [W]."""
         total = np.zeros(self.num_nodes)
         for form in self._radiation:
-            with self.assembled.form("radiation"):
-                total += form.load(relative_k, time_s)
+            self.assembled["radiation"] += 1
+            total += form.load(relative_k, time_s)
         return total
 
     def radiation_slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
         """Return minus the derivative of `radiation_load` by the temperatures, shape (n, n), [W / K]."""
         total = sparse.csr_matrix((self.num_nodes, self.num_nodes))
         for form in self._radiation:
-            with self.assembled.form("radiation"):
-                total = sparse.csr_matrix(total + form.slope(relative_k, time_s))
+            self.assembled["radiation"] += 1
+            total = sparse.csr_matrix(total + form.slope(relative_k, time_s))
         return total
 
     def exchange_parts(self, relative_k: Vector, time_s: float) -> list[Vector]:

@@ -12,9 +12,7 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.core.lattice import CORNER_OFFSETS
-from thermoxels_ns.mesh.quality.checks import TET_EDGES
-from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
+from thermoxels_ns.mesh.quality.tet_shapes import TET_EDGES, shapes_in_chunks
 
 MIN_OBSERVED_WEIGHT = 0.5
 """Least weight of thermal rays at a measured node or corner, [fully absorbed rays]. Less weight is leakage through a
@@ -42,18 +40,13 @@ def interpolate_corners(
         values: Values at the points, shape (n,) or (n, k); 0 where all eight corners have weight 0.
         weight: sum_c t_c w_c, shape (n,).
     """
-    shape = weights.shape
-    low = np.clip(np.floor(points_index).astype(np.int64), 0, np.array(shape) - 2)
-    fraction = np.clip(points_index - low, 0.0, 1.0)
-    flat_values, flat_weights = values.reshape(-1, *values.shape[3:]), weights.ravel()
-    trailing = (slice(None), *[None] * (values.ndim - 3))
-    total, weight = np.zeros((len(low), *values.shape[3:])), np.zeros(len(low))
-    for offset in CORNER_OFFSETS:
-        at = np.ravel_multi_index(tuple((low + offset).T), shape)
-        share = np.prod(np.where(offset == 1, fraction, 1.0 - fraction), axis=1) * flat_weights[at]
-        weight += share
-        total += share[trailing] * flat_values[at]
-    return total / np.where(weight > 0.0, weight, 1.0)[trailing], weight
+    at, known = points_index.T, np.asarray(weights, dtype=np.float64)
+    weight, total = ndimage.map_coordinates(known, at, order=1, mode="nearest"), []
+    for column in np.moveaxis(values.reshape(*known.shape, -1), -1, 0):
+        sums = known * np.where(known > 0.0, column, 0.0)
+        total.append(ndimage.map_coordinates(sums, at, order=1, mode="nearest"))
+    found = np.stack(total, axis=-1) / np.where(weight > 0.0, weight, 1.0)[:, None]
+    return found.reshape(len(points_index), *values.shape[3:]), weight
 
 
 def extend_harmonically(
@@ -65,8 +58,8 @@ def extend_harmonically(
     """Return the temperatures of all nodes, shape (n,), [degrees Celsius], with unobserved nodes filled in.
 
     Observed nodes keep their value. Every other node i meets sum_j w_ij (T_i - T_j) = 0 over its edges, as in steady
-    heat conduction in an insulated body, solved by conjugate gradients. No value leaves the range observed in its
-    connected component, because weights below a very small positive weight are raised to it.
+    heat conduction in an insulated body, solved by conjugate gradients. No value leaves the observed range, because
+    weights below a very small positive weight are raised to it.
 
     Args:
         edges: Node pairs, shape (e, 2); if a pair is listed several times, its weights add up.
@@ -117,12 +110,7 @@ def extend_harmonically(
         expected, got = f"convergence in {_MOST_ROUNDS} iterations", f"none with {len(free)} unobserved nodes"
         raise MeshError("harmonic extension of the temperature", expected=expected, got=got, remedy=remedy)
 
-    labels = np.arange(count)
-    low, high = (
-        np.asarray(extreme(temperature[fixed], component[fixed], labels))[component[free]]
-        for extreme in (ndimage.minimum, ndimage.maximum)
-    )
-    temperature[free] = np.clip(middle + found, low, high)
+    temperature[free] = np.clip(middle + found, temperature[fixed].min(), temperature[fixed].max())
     return temperature
 
 
@@ -134,5 +122,5 @@ def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, Floa
     """
     conductances = np.empty((len(tets), 6))
     for which, shapes in shapes_in_chunks(points, tets):
-        conductances[which] = -shapes.stiffness(shapes.dihedral_cosines()).T
+        conductances[which] = -shapes.stiffness().T
     return tets[:, TET_EDGES].reshape(-1, 2), conductances.ravel()

@@ -15,7 +15,6 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import (
-    TET_EDGES,
     SurfaceComponent,
     component_of,
     count_open_edges,
@@ -26,7 +25,7 @@ from thermoxels_ns.mesh.quality.checks import (
     group_sides,
     surface_topology,
 )
-from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
+from thermoxels_ns.mesh.quality.tet_shapes import TET_EDGES, shapes_in_chunks
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_areas
 
 if TYPE_CHECKING:

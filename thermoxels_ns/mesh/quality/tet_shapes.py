@@ -9,12 +9,16 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 
+TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int64)
+"""Node positions of the two ends of a tetrahedron's six edges, shape (6, 2)."""
 _CHUNK = 1 << 14  # tetrahedra worked on at a time, so that their data stay in the processor's cache
 _FACE_PAIRS = ((2, 3), (1, 3), (1, 2), (0, 3), (0, 2), (0, 1))
-"""For each edge of `checks.TET_EDGES` the two faces that meet in the edge; face f is opposite node f."""
+"""For each edge of `TET_EDGES` the two faces that meet in the edge; face f is opposite node f."""
 _RIGHT_ANGLE = 1e-6
 """Angles whose cosine is smaller than this in magnitude count as right angles. In national coordinates, five million
 metres from the origin, nodes have steps of a nanometre, which change cosines in voxels of 1 cm by less than this."""
+_ANGLE_ROUND_OFF = 32.0 * float(np.finfo(np.float64).eps)
+"""Upper estimate of the round-off of the cosine of an angle, for a tetrahedron as large as its largest coordinate."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,7 @@ class TetShapes:
     normals: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
     """Inward normals of the faces opposite nodes 0 to 3, with twice the face's area as length, each (3, t), [m^2]."""
     six_volumes: FloatArray  # six times the signed volume, shape (t,), [m^3]
+    reach: float  # largest coordinate of the mesh in magnitude, from which round-off is estimated, [m]
 
     @property
     def volumes(self) -> FloatArray:
@@ -33,7 +38,7 @@ class TetShapes:
         return self.six_volumes / 6.0
 
     def dihedral_cosines(self) -> FloatArray:
-        """Return the cosines of the dihedral angles at the edges `checks.TET_EDGES`, shape (6, t).
+        """Return the cosines of the dihedral angles at the edges `TET_EDGES`, shape (6, t).
 
         Angles at a face without area count as 0 degrees. Cosines smaller than `_RIGHT_ANGLE` in magnitude become 0.
         """
@@ -59,33 +64,48 @@ class TetShapes:
         np.divide(6.0 * self.six_volumes**2, scale, out=ratios, where=(self.six_volumes > 0.0) & (scale > 0.0))
         return np.minimum(ratios, 1.0, out=ratios)
 
-    def stiffness(self, cosines: FloatArray) -> FloatArray:
+    @property
+    def flatness(self) -> FloatArray:
+        """Return the least height of each tetrahedron over its longest side along an axis, below 0 if turned over."""
+        largest = np.sqrt(np.max([_dot(normal, normal) for normal in self.normals], axis=0))
+        return np.divide(self.six_volumes, largest * self.size, out=np.zeros_like(largest), where=largest > 0.0)
+
+    @property
+    def size(self) -> FloatArray:
+        """Return the longest extent of the sides along an axis, shape (t,), [m]."""
+        return np.max([np.abs(side).max(axis=0) for side in self.sides], axis=0)
+
+    def stiffness(self) -> FloatArray:
         """Return the stiffness entries of each tetrahedron's edges at conductivity 1, shape (6, t), [m].
 
         For linear shape functions f the entry of edge ij is V grad(f_i) . grad(f_j) = n_i . n_j / (36 V) (`normals` n).
         This equals -l cot(a) / 6 with the length l of the opposite edge and the dihedral angle a there: the entry is
-        positive if a is obtuse. If V is 0 the entry is 0. `cosines` are those of `dihedral_cosines`.
+        positive if a is obtuse, and 0 if a is right up to round-off of the coordinates, or if V is 0.
         """
-        entries = np.empty_like(cosines)
+        entries = np.empty((6, len(self.six_volumes)))
         weight = np.zeros_like(self.six_volumes)
         np.divide(1.0, 6.0 * self.six_volumes, out=weight, where=self.six_volumes != 0.0)
+        squares = [_dot(normal, normal) for normal in self.normals]
+        right = _ANGLE_ROUND_OFF * self.reach / np.maximum(self.size, np.finfo(np.float64).tiny)
         # Nodes i and j of edge e lie opposite the two faces that meet in the opposite edge, which is edge 5 - e.
         for edge, (i, j) in enumerate(reversed(_FACE_PAIRS)):
-            np.multiply(_dot(self.normals[i], self.normals[j]), weight, out=entries[edge])
-        entries[cosines[::-1] == 0.0] = 0.0
+            product = _dot(self.normals[i], self.normals[j])
+            product[np.abs(product) <= right * np.minimum(squares[i], squares[j])] = 0.0
+            np.multiply(product, weight, out=entries[edge])
         return entries
 
 
 def shapes_in_chunks(points: FloatArray, tets: IntArray) -> Iterator[tuple[slice, TetShapes]]:
     """Yield, for one chunk of tetrahedra (t, 4) after another, its slice of `tets` and its shapes, to save memory."""
     columns = np.ascontiguousarray(np.asarray(points, dtype=np.float64).T)
+    reach = float(np.abs(columns).max(initial=0.0))
     for start in range(0, len(tets), _CHUNK):
         which = slice(start, min(start + _CHUNK, len(tets)))
         nodes = np.ascontiguousarray(tets[which].T)
         origin = columns.take(nodes[0], axis=1)
         a, b, c = (columns.take(nodes[n], axis=1) - origin for n in (1, 2, 3))
         one, two, three = _cross(b, c), _cross(c, a), _cross(a, b)
-        yield which, TetShapes((a, b, c), (-(one + two + three), one, two, three), _dot(a, one))
+        yield which, TetShapes((a, b, c), (-(one + two + three), one, two, three), _dot(a, one), reach)
 
 
 def signed_volumes(points: FloatArray, tets: IntArray) -> FloatArray:

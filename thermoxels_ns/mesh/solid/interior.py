@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-import numpy.typing as npt
 from scipy import fft, ndimage
 from scipy.spatial import KDTree
 
@@ -164,39 +163,23 @@ def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
     between two solid voxels, or next to a voxel that is neither solid nor air, are no surface. For triangles see
     Jacobson, Kavan and Sorkine-Hornung 2013, Robust inside-outside segmentation using generalized winding numbers,
     equation 5. The number w jumps by one across the surface and is harmonic elsewhere: Lap w = div J with the jumps J.
-    This equation is solved by sine transforms, with one value per block of 2^3 voxels.
+    This equation is solved by sine transforms.
     """
-    shape = solid.shape
     # The lattice is padded to lengths for which the transforms are fast, and lies about in the middle.
-    blocks = [_fast_length(int(np.ceil((0.5 + MARGIN) * n)) + 3) - 1 for n in shape]
-    before = [(count - (n + 1) // 2) // 2 for count, n in zip(blocks, shape)]
-    pads = [(2 * b, 2 * count - n - 2 * b) for b, count, n in zip(before, blocks, shape)]
-    side = np.pad(solid.astype(np.int8) - air.astype(np.int8), pads)
-    sources = np.zeros(blocks, dtype=np.float32)
+    lengths = [_fast_length(int(np.ceil((1.0 + 2.0 * MARGIN) * n)) + 3) - 1 for n in solid.shape]
+    before = [(length - n) // 2 for length, n in zip(lengths, solid.shape)]
+    pads = [(b, length - n - b) for b, length, n in zip(before, lengths, solid.shape)]
+    side, sources = np.pad(solid.astype(np.int8) - air.astype(np.int8), pads), np.zeros(lengths, dtype=np.float32)
     for axis in range(3):
-        jumps = _jumps(side, axis)
-        sources += jumps
-        np.moveaxis(sources, axis, 0)[1:] -= np.moveaxis(jumps, axis, 0)[:-1]
+        row, source = np.moveaxis(side, axis, 0), np.moveaxis(sources, axis, 0)
+        jump = np.where(row[:-1] * row[1:] == -1, row[:-1], 0)  # to the next voxel: 1 for solid before air, else -1
+        source[:-1] += jump
+        source[1:] -= jump
     waves = np.asarray(fft.dstn(sources, type=1, overwrite_x=True), dtype=np.float32)
-    stiffness = [2.0 - 2.0 * np.cos(np.pi * np.arange(1, n + 1) / (n + 1)) for n in blocks]
+    stiffness = [2.0 - 2.0 * np.cos(np.pi * np.arange(1, n + 1) / (n + 1)) for n in lengths]
     waves /= np.add.outer(np.add.outer(stiffness[0], stiffness[1]), stiffness[2]).astype(np.float32)
     winding = np.asarray(fft.idstn(waves, type=1, overwrite_x=True), dtype=np.float32)
-    winding = winding[tuple(slice(b, b + (n + 1) // 2) for b, n in zip(before, shape))]
-    return repeated(winding, 2)[tuple(slice(n) for n in shape)]
-
-
-def _jumps(side: npt.NDArray[np.int8], axis: int) -> Float32Array:
-    """Return the jump from each block to the next along an axis: 1 for solid before air, -1 for air before solid."""
-    # A face in the middle of a block counts half at each of the block's ends.
-    row, jump = np.moveaxis(side, axis, 0), np.zeros_like(side)
-    np.moveaxis(jump, axis, 0)[:-1] = np.where(row[:-1] * row[1:] == -1, row[:-1], 0)
-    nx, ny, nz = (n // 2 for n in side.shape)
-    others = tuple(2 * other + 1 for other in range(3) if other != axis)
-    pairs = jump.reshape(nx, 2, ny, 2, nz, 2).sum(axis=others, dtype=np.float32) * np.float32(0.25)
-    middle, end = np.moveaxis(pairs, axis + 1, 0)
-    total = end + 0.5 * middle
-    np.moveaxis(total, axis, 0)[:-1] += 0.5 * np.moveaxis(middle, axis, 0)[1:]
-    return total
+    return winding[tuple(slice(b, b + n) for b, n in zip(before, solid.shape))]
 
 
 def wall_behind(cells: BoolArray, lattice: Lattice, views: Views, thickness: float) -> BoolArray:

@@ -9,8 +9,6 @@ from scipy.spatial import ConvexHull
 
 from thermoxels_ns.core.arrays import BoolArray
 
-_PLANES_AT_A_TIME = 64
-
 
 def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
     """Return slices of the box of all solid voxels and `margin` more on each side; the box is empty if none is solid.
@@ -118,15 +116,14 @@ def convex_hull(cells: BoolArray) -> BoolArray:
     nx, ny, nz = cells.shape
     x, y = np.arange(nx)[:, None] + 0.5, np.arange(ny)[None, :] + 0.5
     low, high = np.full((nx, ny), -np.inf), np.full((nx, ny), np.inf)
-    for start in range(0, len(planes), _PLANES_AT_A_TIME):
-        a, b, c, d = (v[:, None, None] for v in planes[start : start + _PLANES_AT_A_TIME].T)
+    for a, b, c, d in planes:
         # Inside is a x + b y + c z + d <= 0. Planes parallel to the columns bound no z, but may exclude a column.
         rest = a * x + b * y + d
-        upright = np.abs(c) < 1e-9
-        with np.errstate(divide="ignore", invalid="ignore"):
-            z = -rest / c
-        ceiling = np.where(upright, np.where(rest > 1e-9, -np.inf, np.inf), z)
-        high = np.minimum(high, ceiling.min(axis=0, where=(c > 0) | upright, initial=np.inf))
-        low = np.maximum(low, z.max(axis=0, where=(c < 0) & ~upright, initial=-np.inf))
+        if abs(c) < 1e-9:
+            high[rest > 1e-9] = -np.inf
+        elif c > 0.0:
+            high = np.minimum(high, -rest / c)
+        else:
+            low = np.maximum(low, -rest / c)
     centre = np.arange(nz) + 0.5
     return (centre >= low[..., None] - 1e-9) & (centre <= high[..., None] + 1e-9)
