@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.audit.defects import FoundDefect
 from thermoxels_ns.audit.draws import FORMULA, SEED, Draws, Interval, draw, interval_of, uncertain
-from thermoxels_ns.audit.exchange import HALF_STEP_K, part_totals, with_references
+from thermoxels_ns.audit.exchange import part_totals, with_references
 from thermoxels_ns.audit.run import Audit
 from thermoxels_ns.audit.surface import AuditedSurface, alike_triangles
 from thermoxels_ns.core.arrays import FloatArray, IntArray
@@ -151,14 +151,9 @@ class _Survey:
     def finish(self) -> None:
         """Compute flow per kelvin, (parts, k), [W/K], and how readings change it, (parts,)."""
         conditions, rows = self.audit.conditions, self.groups.rows(self.parts, self.area_m2)
-        totals = part_totals(conditions, self.groups, self.draws, rows)
-        low, high = (
-            part_totals(conditions, self.groups, self.draws.stated, rows, step).flow_w[:, 0]
-            for step in (-HALF_STEP_K, HALF_STEP_K)
-        )
-        self.total_m2, slope = totals.area_m2, (high - low) / (2.0 * HALF_STEP_K)
-        off = conditions.camera.repeatability.off_by
-        own = np.stack([slope[n] * self.draws.local(off, n) for n in range(len(self.parts))])
+        totals, off = part_totals(conditions, self.groups, self.draws, rows), conditions.camera.repeatability.off_by
+        own = np.stack([totals.slope_w_k[n] * self.draws.local(off, n) for n in range(len(self.parts))])
+        self.total_m2 = totals.area_m2
         self.coupling_w_k, self.own_w_k = totals.flow_w / self.draws.difference_k, own / self.draws.difference_k
 
     def u(self, part: int) -> FloatArray:

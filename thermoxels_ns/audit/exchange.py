@@ -50,6 +50,7 @@ class PartTotals(NamedTuple):
     area_m2: FloatArray  # Area, shape (p,), [m2]
     surface_c: FloatArray  # Mean surface temperature, shape (p, k), [degrees Celsius]
     flow_w: FloatArray  # Heat flow from inside to outside, shape (p, k), [W]
+    slope_w_k: FloatArray  # Change of the stated flow per kelvin that all readings of a part are higher, shape (p,)
 
 
 def exchange(conditions: Conditions, groups: AlikeTriangles, draws: Draws, warmer_k: float = 0.0) -> Exchange:
@@ -72,22 +73,20 @@ def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
     return draws["emissivity set in the camera"], celsius_to_kelvin(reflected_c)
 
 
-def part_totals(
-    conditions: Conditions, groups: AlikeTriangles, draws: Draws, rows: sparse.csr_array, warmer_k: float = 0.0
-) -> PartTotals:
-    """Return totals of p parts, whose `AlikeTriangles.rows` are `rows`, (2 p, g); `warmer_k`: see `exchange`."""
+def part_totals(conditions: Conditions, groups: AlikeTriangles, draws: Draws, rows: sparse.csr_array) -> PartTotals:
+    """Return totals of p parts, whose `AlikeTriangles.rows` are `rows`, (2 p, g)."""
     parts = (len(rows.indptr) - 1) // 2
     area, off = rows[:parts].tocsc(), rows[parts:]
     total = np.asarray(area.sum(axis=1)).reshape(-1, 1)
-    low, high = (exchange(conditions, groups, draws.stated, warmer_k + step) for step in (-HALF_STEP_K, HALF_STEP_K))
-    temperature, flow_w = (
-        np.repeat(off @ (above - below) / (2.0 * HALF_STEP_K), draws.count, axis=1) for below, above in zip(low, high)
-    )
+    low, high = (exchange(conditions, groups, draws.stated, step) for step in (-HALF_STEP_K, HALF_STEP_K))
+    slopes = [(above - below) / (2.0 * HALF_STEP_K) for below, above in zip(low, high)]
+    temperature, flow_w = (np.repeat(off @ slope, draws.count, axis=1) for slope in slopes)
     for part in chunks(len(groups.reading_c), draws):
-        some = exchange(conditions, groups.some(part), draws, warmer_k)
+        some = exchange(conditions, groups.some(part), draws)
         flow_w += area[:, part] @ some.flow_w_m2
         temperature += area[:, part] @ some.surface_c
-    return PartTotals(total[:, 0], temperature / np.where(total > 0.0, total, 1.0), flow_w)
+    mean_c = temperature / np.where(total > 0.0, total, 1.0)
+    return PartTotals(total[:, 0], mean_c, flow_w, (area @ slopes[1])[:, 0])
 
 
 def chunks(count: int, draws: Draws) -> Iterator[slice]:

@@ -345,11 +345,6 @@ class _Parts:
         self.conditions, self.surface, self.groups, self.draws = conditions, surface, groups, draws
         self.parts, self.rows = parts, groups.rows([*parts], surface.area_m2)
         self.totals = part_totals(conditions, groups, draws, self.rows)
-        low, high = (
-            part_totals(conditions, groups, draws.stated, self.rows, step).flow_w[:, 0]
-            for step in (-HALF_STEP_K, HALF_STEP_K)
-        )
-        self.slope_w_k = (high - low) / (2.0 * HALF_STEP_K)  # Change of flow per kelvin of reading, shape (parts,)
         self.coefficients = dict[int, FloatArray]()  # By the number of its zone: draws of a `Defect.coefficient`
         self.u_by_model = dict[str, FloatArray]()  # U-values by each film model from the stated values, shape (parts,)
         for model, chosen in other_models(conditions):
@@ -359,7 +354,7 @@ class _Parts:
     def own_w(self, draws: Draws, flow_w: FloatArray) -> FloatArray:
         """Draw by how much the flow of each of the first parts, `flow_w`, (p, k), is off on its own, (p, k), [W]."""
         off, area_m2 = self.conditions.camera.repeatability.off_by, self.totals.area_m2[: len(flow_w), None]
-        read = np.stack([self.slope_w_k[n] * draws.local(off, n) for n in range(len(flow_w))])
+        read = np.stack([self.totals.slope_w_k[n] * draws.local(off, n) for n in range(len(flow_w))])
         wider = self.own_m2(draws, len(flow_w)) / area_m2
         return read + (flow_w + read) * wider
 
@@ -454,7 +449,7 @@ class _Parts:
         """
         if self.conditions.side == "outside":
             return ()
-        flow = self.totals.flow_w[part] + self.slope_w_k[part] * off_k
+        flow = self.totals.flow_w[part] + self.totals.slope_w_k[part] * off_k
         flow = np.maximum(flow / max(self.totals.area_m2[part], 1e-12), _LEAST_FLOW_W_M2)
         above = self.totals.surface_c[part] + off_k - self.draws["outside air"]
         return tuple(np.asarray(temperature_factor(above / flow, one)) for one in F_RSI_M2K_W)
@@ -468,7 +463,7 @@ class _Parts:
         """
         surface, totals = self.surface, self.totals
         calm, spot = zone + 1, zone + 2
-        flow_w = totals.flow_w[zone] + self.slope_w_k[zone] * off_k
+        flow_w = totals.flow_w[zone] + self.totals.slope_w_k[zone] * off_k
         extra = flow_w - totals.flow_w[calm] / max(totals.area_m2[calm], 1e-12) * one.base_area_m2
         if surface.border_m2.any():  # both ends of its length lie within half a triangle's edge
             edge = float(np.sqrt(2.0 * surface.area_m2[one.core].mean()))
@@ -595,7 +590,7 @@ def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tup
             found.append(Asked(what, asked, f"{stated.value:.3g} {unit}", "met" if met else "not met"))
 
     ask("air inside warmer than outside, during the survey", difference, LEAST_DIFFERENCE_K, "K")
-    ask("the same, all the last 24 hours", survey.least_difference_24h, LEAST_DIFFERENCE_K, "K")
+    ask("air inside warmer than outside, all the last 24 hours", survey.least_difference_24h, LEAST_DIFFERENCE_K, "K")
     ask("wind", wind, MOST_WIND_M_S, "m/s", least=False)
     if conditions is None or conditions.side == "outside":
         ask("time since the sun shone on the surface", survey.hours_since_sun, LEAST_HOURS_WITHOUT_SUN, "h")
@@ -607,28 +602,12 @@ def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tup
 
 def check_survey(conditions: Conditions) -> SurveyCheck:
     """Return what EN 13187 forbids and misses in the conditions of a survey, and what makes results doubtful."""
-    survey, wind, difference = conditions.survey, conditions.outside.wind, conditions.difference_k
-    least, sun, dry = survey.least_difference_24h, survey.hours_since_sun, survey.hours_dry
-    forbidden = []
-    if difference < LEAST_DIFFERENCE_K:
-        forbidden.append(f"The airs differ by {difference:.1f} K; EN 13187 asks for {LEAST_DIFFERENCE_K:g} K.")
-    elif least is not None and least.value < LEAST_DIFFERENCE_K:
-        forbidden.append(
-            f"During the last 24 hours the airs differed by {least.value:g} K at times; EN 13187 asks for "
-            f"{LEAST_DIFFERENCE_K:g} K all the time."
-        )
-    if wind is not None and wind.value > MOST_WIND_M_S:
-        forbidden.append(f"The wind was {wind.value:.1f} m/s; EN 13187 allows {MOST_WIND_M_S:g} m/s.")
-    if conditions.side == "outside":
-        if sun is not None and sun.value < LEAST_HOURS_WITHOUT_SUN:
-            forbidden.append(
-                f"The sun shone on the surface {sun.value:g} hours before; EN 13187 asks for "
-                f"{LEAST_HOURS_WITHOUT_SUN:g} hours without, heavy walls need more."
-            )
-        if dry is not None and dry.value < LEAST_HOURS_DRY:
-            asked = f"EN 13187 asks for {LEAST_HOURS_DRY:g} hours."
-            forbidden.append(f"The surface was wet {dry.value:g} hours before; {asked}")
-    asked = asked_of_survey(survey, conditions)
+    asked = asked_of_survey(conditions.survey, conditions)
+    forbidden = [
+        f"{one.what[0].upper()}{one.what[1:]}: {one.stated}. EN 13187 asks for {one.asked}."
+        for one in asked
+        if one.verdict == "not met"
+    ]
     return SurveyCheck(asked, tuple(forbidden), _doubts(conditions), _missing(conditions))
 
 
