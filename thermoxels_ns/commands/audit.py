@@ -361,10 +361,9 @@ def _write(
     """Write all files and return their names."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    from thermoxels_ns.audit.envelope import gbxml, hbjson
-    from thermoxels_ns.mesh.files.content import write_bytes
+    from thermoxels_ns.audit.envelope import hbjson
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtk
-    from thermoxels_ns.reports.audit_page import audit_page, draw_audit
+    from thermoxels_ns.reports.audit_page import audit_page, draw_audit, gbxml
     from thermoxels_ns.reports.document import why_no_pdf, write_pdf
     from thermoxels_ns.reports.page import identify, write_page
 
@@ -394,7 +393,7 @@ def _write(
         elif kind == "hbjson":
             write_summary(folder / name, hbjson(envelope, title))
         else:
-            write_bytes(folder / name, [gbxml(envelope, title)])
+            write_page(folder / name, gbxml(envelope, title))
     pictures = draw_audit(found) if options.pictures else None
     command, document = command_of("audit", options), options.pdf and not why_no_pdf()
     files = (PAGE, DOCUMENT, ANSWERS, SURFACE) if document else (PAGE, ANSWERS, SURFACE)

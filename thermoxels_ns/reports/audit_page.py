@@ -12,9 +12,11 @@ import numpy as np
 from thermoxels_ns.audit.compare import Comparison
 from thermoxels_ns.audit.conditions import Survey
 from thermoxels_ns.audit.draws import CONFIDENCE
+from thermoxels_ns.audit.envelope import Envelope
 from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit, asked_of_survey
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.version import __version__
+from thermoxels_ns.mesh.boundary.planes import FlatElement, plane_axes
 from thermoxels_ns.reports.audit_view import drawn_triangles, plotly_script, view_data
 from thermoxels_ns.reports.charts import gradient
 from thermoxels_ns.reports.numbers import number_text, stated_text
@@ -106,6 +108,19 @@ def agreement_page(title: str, survey: Survey) -> str:
     """Return the html text of what a client signs before a survey: purpose, conditions and limits."""
     about = {"title": title, "survey": survey, "asked": asked_of_survey(survey)}
     return build_page("agreement.html.j2", **about, version=__version__, confidence=100.0 * CONFIDENCE)
+
+
+def gbxml(envelope: Envelope, title: str) -> str:
+    """Return a building of one space as gbXML 6.01; intervals of U-values are in descriptions of constructions."""
+
+    def rectangle(one: FlatElement) -> tuple[list[float], float, float]:
+        """Return the corner, [m], the width and the height of the rectangle around an element."""
+        low, high = np.array(one.flat().bounds).reshape(2, 2)
+        corner = plane_axes(one.normal) @ low + (one.outline_m[0] @ one.normal) * one.normal
+        return corner.tolist(), *(high - low).tolist()
+
+    about = {"envelope": envelope, "title": title, "confidence": 100.0 * CONFIDENCE}
+    return build_page("envelope.gbxml.j2", **about, rectangle=rectangle)
 
 
 def _survey(survey: Survey) -> list[tuple[str, str]]:
