@@ -19,7 +19,7 @@ from thermoxels_ns.core.version import __version__
 from thermoxels_ns.mesh.boundary.planes import FlatElement, plane_axes
 from thermoxels_ns.reports.audit_view import drawn_triangles, plotly_script, view_data
 from thermoxels_ns.reports.charts import gradient
-from thermoxels_ns.reports.numbers import number_text, stated_text
+from thermoxels_ns.reports.numbers import stated_text
 from thermoxels_ns.reports.page import Picture, Report, build_page, image_file
 
 AuditPictures: TypeAlias = dict[str, list[bytes]]
@@ -57,7 +57,7 @@ def audit_page(
     """
     numbered, asked = list(enumerate(audit.defects, start=1)), audit.conditions.calibrate
     counted = [(number, one) for number, one in numbered if not one.not_counted]
-    loss, bound = abs(audit.whole.loss_w.value), audit.whole.loss_w.at_most or audit.whole.loss_w.unknown
+    loss = abs(audit.whole.loss_w.value)
     start = {} if asked is None else asked.stated()
     unknown = set() if asked is None else {one.name() for one in asked.unknown}
     shown = dict[str, Any](
@@ -66,11 +66,6 @@ def audit_page(
         doubted=[(number, one) for number, one in numbered if one.not_counted],
         worst=max(counted, key=lambda item: item[1].extra_w.value, default=None),
         worth_measuring=[name for name, width in audit.budget.items() if width > 0.05 * loss][:3],
-        budget=[
-            (name, number_text(width, width), "" if bound else f"{100.0 * width / (loss or 1.0):.0f} %")
-            for name, width in audit.budget.items()
-            if width > 5e-4 * (loss or 1.0)
-        ],
         start=start,
         known={name: value for name, value in start.items() if name not in unknown},
         survey_rows=_survey(audit.conditions.survey),

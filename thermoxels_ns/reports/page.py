@@ -91,7 +91,6 @@ def _environment() -> Environment:
     )
     environment.filters |= {
         "address": image_address,
-        "area": numbers.area_text,
         "count": "{:,}".format,
         "degrees": numbers.degrees,
         "duration": numbers.duration_text,
