@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy import sparse
@@ -12,7 +11,8 @@ from scipy import sparse
 from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
-from thermoxels_ns.fem.selection import Selection, matching_names
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.selection import chosen_names as names_chosen
 from thermoxels_ns.mesh.quality.checks import group_sides
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
@@ -29,6 +29,8 @@ WHY_NOT = {
     "left out": "that the conditions leave out",
 }
 """Reasons why a triangle does not count; the texts complete a sentence that begins with "triangles"."""
+
+chosen_names = partial(names_chosen, error=AuditError)  # `AuditError` if a pattern matches no name
 
 
 @dataclass(frozen=True)
@@ -202,15 +204,3 @@ def alike_triangles(surface: AuditedSurface) -> AlikeTriangles:
         off_k=off_k,
         up=surface.selection.up,
     )
-
-
-def chosen_names(name: str, names: tuple[str, ...], patterns: Iterable[str], what: str = "patches") -> set[str]:
-    """Return those of `names` that match a pattern; raises `AuditError` on entry `name` if a pattern has no match."""
-    chosen = set[str]()
-    for pattern in patterns:
-        found = matching_names(names, pattern)
-        if not found:
-            remedy = f"Correct the name; {what} are those of the mesh, see --patches of ns-export thermoxels-mesh."
-            raise AuditError(name, expected=f"{what} out of {', '.join(names)}", got=repr(pattern), remedy=remedy)
-        chosen |= set(found)
-    return chosen

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 
 import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
-from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.fem.solution import (
     Solution,
     SolutionNodes,
@@ -365,8 +364,8 @@ def wall_result(
 
 def matching_facets(selection: Selection, patterns: Sequence[str]) -> BoolArray:
     """Return True for each boundary triangle whose patch matches a name or pattern, shape (f,)."""
-    matching = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in selection.patch_names]
-    return np.array(matching, dtype=bool)[selection.facet_patch]
+    matching = [name for pattern in patterns for name in matching_names(selection.patch_names, pattern)]
+    return np.isin(selection.patch_names, matching)[selection.facet_patch]
 
 
 def heat_by_part(solution: Solution, part: IntArray, count: int) -> Vector:

@@ -24,7 +24,7 @@ from thermoxels_ns.core.measured import read_measured
 from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml, record, wrong
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Places, Quantity, Varying
-from thermoxels_ns.fem.selection import Selection, matching_names
+from thermoxels_ns.fem.selection import Selection, chosen_names, matching_names
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
@@ -205,10 +205,7 @@ class HeatScene:
         """Return the material of a mesh, by region if regions differ; `HeatError` if a region has none."""
         chosen: dict[str, Material] = {}
         for pattern, made_of in self.materials.items():
-            matching = [name for name in mesh.region_names if fnmatchcase(name, pattern)]
-            if not matching:
-                expected = f"names or patterns of the regions {', '.join(mesh.region_names)}"
-                raise unclear("materials", expected, repr(pattern), "Correct the name, or use '*' for all regions.")
+            matching = chosen_names("materials", mesh.region_names, (pattern,), "regions")
             chosen |= dict.fromkeys(matching, made_of)
         used = {mesh.region_names[number] for number in np.unique(mesh.region)}
         missing = sorted(used - set(chosen))
@@ -392,15 +389,7 @@ class ScenePatches:
 
     def matching(self, name: str, patterns: Sequence[str]) -> set[str]:
         """Return the patches that match any pattern of the entry `name`; `HeatError` if a pattern matches none."""
-        found: set[str] = set()
-        for pattern in patterns:
-            matches = set(matching_names(self.area_m2, pattern))
-            if not matches:
-                expected = f"names or patterns of the patches {', '.join(self.area_m2)}"
-                remedy = "Correct the name, or tag the mesh so that it has such a patch."
-                raise HeatError(f"{name}: patches", expected=expected, got=repr(pattern), remedy=remedy)
-            found |= matches
-        return found
+        return chosen_names(f"{name}: patches", self.area_m2, patterns)
 
     def of_surfaces(
         self, surfaces: Sequence[Surface], value: Callable[[Surface], float | None], allowed: set[str] | None = None
