@@ -231,10 +231,16 @@ def audit_mesh(
         return audit(body, conditions, (x, y, z))
 
 
-def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Audit:
+def audit(
+    mesh: TetMesh,
+    conditions: Conditions,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    least_bridge_w: float = 0.0,
+) -> Audit:
     """Compute heat flows, U-values, thermal bridges and all else that an `Audit` holds, with intervals.
 
-    `up` is the unit vector that points up. Raises `AuditError` if the conditions do not fit the mesh.
+    `up` is the unit vector that points up. Bridges that lose less than `least_bridge_w` extra, [W], are not counted and
+    not judged. Raises `AuditError` if the conditions do not fit the mesh.
     """
     surface = audited_surface(mesh, conditions, up)
     groups = alike_triangles(surface)
@@ -277,6 +283,10 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
         )
         for n, one in enumerate(found)
     ]
+    if least_bridge_w > 0.0:
+        why = f"It loses less than {least_bridge_w:g} W extra (--least-bridge-w)."
+        slight = [not one.not_counted and one.extra_w.value < least_bridge_w for one in defects]
+        defects = [replace(one, not_counted=why) if drop else one for one, drop in zip(defects, slight)]
     order = sorted(range(len(found)), key=lambda n: (bool(defects[n].not_counted), -defects[n].extra_w.value))
     found, defects = [found[n] for n in order], [defects[n] for n in order]
     last, check, (remembered, told) = len(parts) - 2, check_survey(conditions), _remembered(conditions)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -157,7 +157,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         scene = read_scene_file(options.scene, "skip", options.layout, options.thermal_bounds)
     mesh, up, export = _read(options.mesh, options, say)
     building = find_building(mesh, up, options.north) if options.envelope else None  # raises before anything slow
-    found = without_slight(audit(mesh, conditions, up), least_w)
+    found = audit(mesh, conditions, up, least_w)
     envelope = None if building is None else envelope_of(found, building)
     compared = None if earlier is None else compare(earlier(), found, options.compare_difference)
     most_u, impossible = impossible_u(found)
@@ -259,31 +259,7 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
     direction = check_direction(f"{path}: up", content["up"], again, AuditError)
     x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
     least_w = content.get("least_bridge_w")
-    return lambda: without_slight(audit(mesh, conditions, (x, y, z)), least_w if is_number(least_w) else 0.0)
-
-
-def without_slight(found: Found, least_w: float) -> Found:
-    """Return an audit in which bridges that lose less than `least_w` extra, [W], are not counted and not judged."""
-    from thermoxels_ns.audit.run import verdict
-
-    if least_w == 0.0:
-        return found
-    why = f"It loses less than {least_w:g} W extra (--least-bridge-w)."
-    pairs = [
-        (replace(one, not_counted=why) if not one.not_counted and one.extra_w.value < least_w else one, triangles)
-        for one, triangles in zip(found.defects, found.found)
-    ]
-    pairs.sort(key=lambda pair: bool(pair[0].not_counted))  # those that count stay first
-    lines = [one for one, _ in pairs if one.kind == "line" and not one.not_counted]
-    limits = [one for one in found.limits if one.unit != "W/(m K)"]
-    for one in [one for one in found.limits if one.unit == "W/(m K)" and lines]:
-        worst = max(lines, key=lambda line: line.coefficient.value)
-        psi, name = worst.coefficient, f"{one.name.partition(', in ')[0]}, in {worst.patch}"
-        if psi != one.found:  # the chance was of the draws of the line that does not count
-            one = replace(one, name=name, found=psi, verdict=verdict(psi, one.limit), missed_share=math.nan)
-        limits.append(one)
-    defects, triangles = zip(*pairs) if pairs else ((), ())
-    return replace(found, defects=defects, found=triangles, limits=tuple(limits))
+    return lambda: audit(mesh, conditions, (x, y, z), least_w if is_number(least_w) else 0.0)
 
 
 def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
