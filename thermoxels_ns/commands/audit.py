@@ -115,8 +115,8 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     from thermoxels_ns.core.yaml_records import write_example
     from thermoxels_ns.data.scene_file import read_scene_file
     from thermoxels_ns.mesh.boundary.planes import find_building
-    from thermoxels_ns.reports.document import why_no_pdf
     from thermoxels_ns.reports.numbers import interval_text, plain_names
+    from thermoxels_ns.reports.page import why_no_pdf
 
     if options.write_conditions is not None:
         write_example(options.write_conditions, EXAMPLE, AuditError)
@@ -198,8 +198,7 @@ def write_agreement(path: Path, conditions: Path | None) -> None:
     from thermoxels_ns.audit.conditions import Survey
     from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml
     from thermoxels_ns.reports.audit_page import agreement_page
-    from thermoxels_ns.reports.document import write_pdf
-    from thermoxels_ns.reports.page import write_page
+    from thermoxels_ns.reports.page import write_page, write_pdf
 
     if path.suffix not in (".pdf", ".html") or path.exists():
         got = "a file that is there" if path.exists() else path.name
@@ -340,8 +339,7 @@ def _write(
     from thermoxels_ns.audit.envelope import hbjson
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtk
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit, gbxml
-    from thermoxels_ns.reports.document import why_no_pdf, write_pdf
-    from thermoxels_ns.reports.page import identify, write_page
+    from thermoxels_ns.reports.page import identify, why_no_pdf, write_page, write_pdf
 
     assert options.mesh is not None and options.conditions is not None
     inputs = (options.mesh, options.mesh.with_name(f"{options.mesh.stem}-boundary.vtp"), options.conditions)

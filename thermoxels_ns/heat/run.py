@@ -185,7 +185,7 @@ def run_scene(
     probes = place_probes(mesh, np.array(probes_m, dtype=np.float64).reshape(-1, 3))
     about_patches = patch_warnings(scene, mesh, problem.up)
     inner, harmless = ((), ()) if about_patches else inner_surface_warnings(scene, mesh, problem.up)
-    about_scene = (*unused_settings(scene), *doubtful_temperatures(scene))
+    about_scene = (*short_series(scene), *doubtful_temperatures(scene))
     over = [one.patch for one in layers if one.body_m2k_w > 1.05 * one.asked_m2k_w]
     if over:
         what = f"The body alone resists more than the audit found: {', '.join(over)}. There the heat loss is too low"
@@ -374,16 +374,10 @@ def with_layers(
     return replace(scene, outside_air=outside, convection=(*scene.convection, *effects)), tuple(layers)
 
 
-def unused_settings(scene: HeatScene) -> tuple[str, ...]:
-    """Return warnings on a steady scene's initial temperature and on air series that do not cover the scene's time."""
+def short_series(scene: HeatScene) -> tuple[str, ...]:
+    """Return warnings on air series that do not cover the scene's time."""
     if scene.time is None:
-        if scene.initial_c is None:
-            return ()
-        return (
-            f"The scene gives an initial temperature of {scene.initial_c:g} degrees Celsius, but asks for the steady "
-            "state, which does not depend on the start: initial changes nothing. Remove it, or give time in place of "
-            "steady.",
-        )
+        return ()
     hours, warnings = scene.time.duration_s / 3600.0, []
     for name, air in (("inside_air", scene.inside_air), ("outside_air", scene.outside_air)):
         if air is None or air.air_series is None:

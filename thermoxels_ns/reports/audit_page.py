@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -19,7 +18,6 @@ from thermoxels_ns.core.version import __version__
 from thermoxels_ns.mesh.boundary.planes import FlatElement, plane_axes
 from thermoxels_ns.reports.audit_view import drawn_triangles, plotly_script, view_data
 from thermoxels_ns.reports.charts import gradient
-from thermoxels_ns.reports.numbers import stated_text
 from thermoxels_ns.reports.page import Picture, Report, build_page, image_file
 
 AuditPictures: TypeAlias = dict[str, list[bytes]]
@@ -57,7 +55,6 @@ def audit_page(
     """
     numbered, asked = list(enumerate(audit.defects, start=1)), audit.conditions.calibrate
     counted = [(number, one) for number, one in numbered if not one.not_counted]
-    loss = abs(audit.whole.loss_w.value)
     start = {} if asked is None else asked.stated()
     unknown = set() if asked is None else {one.name() for one in asked.unknown}
     shown = dict[str, Any](
@@ -65,10 +62,8 @@ def audit_page(
         counted=counted,
         doubted=[(number, one) for number, one in numbered if one.not_counted],
         worst=max(counted, key=lambda item: item[1].extra_w.value, default=None),
-        worth_measuring=[name for name, width in audit.budget.items() if width > 0.05 * loss][:3],
         start=start,
         known={name: value for name, value in start.items() if name not in unknown},
-        survey_rows=_survey(audit.conditions.survey),
         pictures=pictures,
         report=report,
         gradient=gradient(),
@@ -116,17 +111,6 @@ def gbxml(envelope: Envelope, title: str) -> str:
 
     about = {"envelope": envelope, "title": title, "confidence": 100.0 * CONFIDENCE}
     return build_page("envelope.gbxml.j2", **about, rectangle=rectangle)
-
-
-def _survey(survey: Survey) -> list[tuple[str, str]]:
-    """Return name and text of each fact that a survey states."""
-    units = {"pressure_difference": "Pa", "least_difference_24h": "K", "hours_since_sun": "h", "hours_dry": "h"}
-    said = [(field.name, getattr(survey, field.name)) for field in fields(survey)]
-    return [
-        (name.replace("_", " "), stated_text(value, units.get(name, "")))
-        for name, value in said
-        if value not in (None, "")
-    ]
 
 
 def draw_audit(audit: Audit) -> AuditPictures:
