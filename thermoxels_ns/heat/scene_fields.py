@@ -202,7 +202,7 @@ class OutsideAir(_Air):
         super().__post_init__()
         _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
         windy = self.coefficient not in (None, "iso-6946-combined")
-        _check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
+        check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
 
     def convection(self) -> Convection:
         """Return the convection between the open air and the body."""
@@ -239,7 +239,7 @@ class Sky:
     """Temperature of the outside air minus that of the sky, [K]; 6 is common with some clouds (Whillier 1967)."""
 
     def __post_init__(self) -> None:
-        _check_one(temperature_c=self.temperature_c, model=self.model, below_air_k=self.below_air_k)
+        check_one(temperature_c=self.temperature_c, model=self.model, below_air_k=self.below_air_k)
 
     @property
     def needs_air(self) -> bool:
@@ -287,14 +287,14 @@ class Sun:
     patches: Patches = OUTSIDE  # Patches that sunlight may reach, by name or pattern
 
     def __post_init__(self) -> None:
-        _check_one(start=self.start, towards=self.towards)
+        check_one(start=self.start, towards=self.towards)
         for name in ("latitude_deg", "longitude_deg", "north"):
             given = getattr(self, name)
             if self.start is None and given is not None:
                 raise unclear(name, "a date and time in start beside it", "none", f"Add start or remove {name}.")
             if self.start is not None and given is None:
                 raise unclear("start", f"{name} beside it", "none", f"Add {name}.")
-        _check_one(clear_sky=self.clear_sky, direct_w_m2=self.direct_w_m2)
+        check_one(clear_sky=self.clear_sky, direct_w_m2=self.direct_w_m2)
         if self.clear_sky is not None and self.start is None:
             raise unclear("clear_sky", "a date and time in start beside it", "none", "Give direct_w_m2 instead.")
         if self.clear_sky is not None and self.diffuse_w_m2 > 0.0:
@@ -303,11 +303,11 @@ class Sun:
 
 
 def _check_coefficient(named: str | None, number: float | None, emissivity: float | None) -> None:
-    _check_one(coefficient=named, coefficient_w_m2k=number)
-    _check_only_if("emissivity", emissivity, named == "iso-6946-separate", named or "coefficient_w_m2k")
+    check_one(coefficient=named, coefficient_w_m2k=number)
+    check_only_if("emissivity", emissivity, named == "iso-6946-separate", named or "coefficient_w_m2k")
 
 
-def _check_one(**values: object) -> None:
+def check_one(**values: object) -> None:
     """Raise `HeatError` unless exactly one of the fields is given."""
     given = [name for name, value in values.items() if value is not None]
     if len(given) != 1:
@@ -317,11 +317,12 @@ def _check_one(**values: object) -> None:
         raise unclear(" or ".join(names), expected, " and ".join(given) or "none", remedy)
 
 
-def _check_only_if(name: str, value: float | None, needed: bool, coefficient: str) -> None:
+def check_only_if(name: str, value: object, needed: bool, what: str) -> None:
+    """Raise `HeatError` unless the field `name` is given just where it is `needed`, beside `what`."""
     if needed and value is None:
-        raise unclear(name, f"a number, because {coefficient} depends on it", "none", f"Add {name}.")
+        raise unclear(name, f"one, because {what} needs it", "none", f"Add {name}.")
     if not needed and value is not None:
-        raise unclear(name, f"none, because {coefficient} does not depend on it", f"{value:g}", f"Remove {name}.")
+        raise unclear(name, f"none, because {what} does not need it", "one", f"Remove {name}.")
 
 
 def unclear(name: str, expected: str, got: object, remedy: str) -> HeatError:
