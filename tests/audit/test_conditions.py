@@ -67,7 +67,11 @@ def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) 
         (("outside",), {"wind": "1 m/s"}, r"outside: air"),
         (("surfaces", "0", "emissivity"), "0.99 +- 0.02", r"surfaces entry 1: emissivity"),
         (("surfaces", "0", "emisivity"), 0.9, r"surfaces entry 1: .*Did you mean emissivity"),
-        (("surroundings",), {"ground": "1 C"}, r"surroundings: reflected or sky: expected one of reflected, sky, got none"),
+        (
+            ("surroundings",),
+            {"ground": "1 C"},
+            r"surroundings: reflected or sky: expected one of reflected, sky, got none",
+        ),
         (("surroundings", "ground"), "1 C", r"surroundings: ground"),
         (("surroundings",), {"sky": {"cloud": 2, "dew_point": "0 C"}}, r"surroundings: sky: cloud"),
         (("film", "model"), "madding", r"film: model"),

@@ -17,13 +17,14 @@ import numpy as np
 from thermoxels_ns.audit.conditions import Calibrate, Conditions, Film
 from thermoxels_ns.audit.draws import FORMULA, Draws, Interval, emissivity_name, interval_of
 from thermoxels_ns.audit.exchange import HALF_STEP_K, film_flow_w_m2, radiant_k4, triangle_exchange
+from thermoxels_ns.audit.heat_flow import SIMPLE
 from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface, chosen_names
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.fem.problem import GivenSteps
-from thermoxels_ns.fem.quantities import Places, Varying
+from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER
 from thermoxels_ns.fem.selection import matching_names
 from thermoxels_ns.fem.steady import solve_steady
@@ -31,7 +32,7 @@ from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import OUTSIDE_RESISTANCE_M2K_W, inside_coefficient, outside_coefficient
+from thermoxels_ns.heat.scene_fields import OUTSIDE_RESISTANCE_M2K_W
 
 _UNITS = {"conductivity": "W/(m K)", "thickness": "m", "film": "W/(m2 K)", "capacity": "kJ/(m3 K)"}
 _BEFORE, _ABSORPTANCE = "air before the weather file", "absorptance of the walls"  # Uncertain with a history alone
@@ -259,11 +260,8 @@ class _Wall:
         """Return the coefficient of film and layers on the side not photographed, shape (b,), [W/(m2 K)]."""
         surface = self.surface
         normals = surface.selection.facet_normal[self.behind]
-        film = outside_coefficient("iso-6946-combined") * np.ones(len(self.behind))
-        if self.conditions.side == "outside":
-            places = Places(np.zeros_like(normals), normals, surface.selection.up)
-            film = np.asarray(inside_coefficient("iso-6946-combined").function(places, 0.0))
-        resistance = 1.0 / film
+        far = SIMPLE["inside" if self.conditions.side == "outside" else "outside"]["iso-6946-combined"]
+        resistance = np.ones(len(normals)) / far.w_m2k(0.0, 0.0, normals @ np.array(surface.selection.up))
         for name, where in self._layers.items():
             resistance = resistance + where * values[f"thickness of {name}"] / values[f"conductivity of {name}"]
         return 1.0 / resistance

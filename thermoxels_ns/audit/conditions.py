@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 from pydantic import Field
 
-from thermoxels_ns.audit.heat_flow import CONVECTION
+from thermoxels_ns.audit.heat_flow import CONVECTION, SIMPLE
 from thermoxels_ns.audit.weather import survey_weather, with_weather
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import AuditError
@@ -36,14 +36,9 @@ FilmModel: TypeAlias = str
 """Name of a model of heat exchange at a surface; the formulas stand in `thermoxels_ns.audit.heat_flow`."""
 
 BALANCE: FilmModel = "balance"  # Radiation to what each triangle sees, and convection by formulas that are drawn
-SIMPLE: Mapping[Side, tuple[FilmModel, ...]] = {
-    "outside": ("iso-6946-combined", "albatici-tonelli", "dallo"),
-    "inside": ("iso-6946-combined",),
-}
-"""Models that take all that a surface sees to be as warm as the air."""
 FILM_MODELS: Mapping[Side, tuple[FilmModel, ...]] = {
     "outside": (BALANCE, *CONVECTION["outside"], *SIMPLE["outside"], "given"),
-    "inside": (BALANCE, *CONVECTION["inside"], "madding", *SIMPLE["inside"], "given"),
+    "inside": (BALANCE, *CONVECTION["inside"], *SIMPLE["inside"], "given"),
 }
 WINDLESS: tuple[FilmModel, ...] = ("iso-6946-combined", "given")  # Need no wind speed for an outer surface
 

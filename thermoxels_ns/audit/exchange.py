@@ -13,10 +13,8 @@ from thermoxels_ns.audit.conditions import BALANCE, FILM_MODELS, WINDLESS, Condi
 from thermoxels_ns.audit.draws import FORMULA, Draws, emissivity_name
 from thermoxels_ns.audit.heat_flow import (
     CONVECTION,
-    albatici_tonelli_w_m2,
-    dallo_w_m2,
+    SIMPLE,
     fourth_power,
-    madding_w_m2,
     net_radiation_w_m2,
     reading_k,
     sky_emissivity,
@@ -27,8 +25,7 @@ from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
-from thermoxels_ns.fem.quantities import Places
-from thermoxels_ns.heat.scene_fields import inside_coefficient, outside_coefficient
+from thermoxels_ns.heat.scene_fields import OUTSIDE_RESISTANCE_M2K_W
 
 CHUNK = 400_000  # Values, groups times draws, of one array that are in memory at the same time
 HALF_STEP_K = 0.05  # Half the step of difference quotients with respect to readings, [K]
@@ -137,30 +134,20 @@ def film_flow_w_m2(
 
     `surface_k`, `around_k4` (see `radiant_k4`) and `emissivity` have shape (g, k), `normals` has shape (g, 3).
     """
-    model, factor = conditions.film.model, draws["film factor"]
-    inside = conditions.side == "inside"
+    model, inside = conditions.film.model, conditions.side == "inside"
     air_k = celsius_to_kelvin(draws["inside air" if inside else "outside air"])
-    if model == "albatici-tonelli":
-        return albatici_tonelli_w_m2(emissivity, draws["wind"], surface_k, air_k, factor)
-    if model == "dallo":
-        return dallo_w_m2(draws["wind"], surface_k, air_k, factor)
-    if model == "madding":
-        return madding_w_m2(emissivity, surface_k, np.sqrt(np.sqrt(around_k4)), air_k, factor)
-    outward = -1.0 if inside else 1.0
-    combined = model == "iso-6946-combined"
+    warmer_k, upward = surface_k - air_k, (normals @ np.array(up))[:, None]
+    simple = SIMPLE[conditions.side].get(model)
     if model == "given":
         coefficient = draws["film coefficient"]
-    elif inside and combined:
-        here = Places(np.zeros_like(normals), normals, up)
-        coefficient = np.asarray(inside_coefficient("iso-6946-combined").function(here, 0.0))[:, None]
-    elif combined:
-        coefficient = outside_coefficient("iso-6946-combined")
+    elif simple is not None:
+        coefficient = simple.w_m2k(draws.values.get("wind", np.zeros(draws.count)), warmer_k, upward)
     else:
-        coefficient = _convection_w_m2k(conditions, draws, surface_k - air_k, (normals @ np.array(up))[:, None])
-    flow = outward * factor * coefficient * (surface_k - air_k)
-    if not combined:
-        flow = flow + outward * net_radiation_w_m2(emissivity, surface_k, around_k4)
-    return flow
+        coefficient = _convection_w_m2k(conditions, draws, warmer_k, upward)
+    flow = draws["film factor"] * coefficient * warmer_k
+    if simple is None or simple.radiates != "included":
+        flow = flow + net_radiation_w_m2(emissivity, surface_k, around_k4 if simple is None else fourth_power(air_k))
+    return -flow if inside else flow
 
 
 def _convection_w_m2k(conditions: Conditions, draws: Draws, warmer_k: FloatArray, upward: FloatArray) -> FloatArray:
@@ -198,9 +185,8 @@ def most_u_w_m2k(surface: AuditedSurface, conditions: Conditions, which: IntArra
     area. A larger U-value is impossible: an input clashes with the readings.
     """
     normal = surface.selection.facet_normal[which] * (-1.0 if conditions.side == "outside" else 1.0)
-    inner = Places(np.zeros_like(normal), normal, surface.selection.up)
-    inside = np.asarray(inside_coefficient("iso-6946-combined").function(inner, 0.0))
-    allowed = 1.0 / (1.0 / inside + 1.0 / outside_coefficient("iso-6946-combined"))
+    inside = SIMPLE["inside"]["iso-6946-combined"].w_m2k(0.0, 0.0, normal @ np.array(surface.selection.up))
+    allowed = 1.0 / (1.0 / inside + OUTSIDE_RESISTANCE_M2K_W)
     return float(np.average(allowed, weights=surface.area_m2[which]))
 
 

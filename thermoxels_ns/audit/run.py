@@ -11,7 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.audit.calibration import Calibration, calibrated
-from thermoxels_ns.audit.conditions import BALANCE, SIMPLE, Conditions, Survey, load_conditions
+from thermoxels_ns.audit.conditions import BALANCE, Conditions, Survey, load_conditions
 from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
 from thermoxels_ns.audit.draws import (
     ENDS,
@@ -35,7 +35,7 @@ from thermoxels_ns.audit.exchange import (
     triangle_exchange,
     with_references,
 )
-from thermoxels_ns.audit.heat_flow import temperature_factor
+from thermoxels_ns.audit.heat_flow import SIMPLE, temperature_factor
 from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
 from thermoxels_ns.audit.weather import remembered_share
 from thermoxels_ns.core.arrays import FloatArray, IntArray
