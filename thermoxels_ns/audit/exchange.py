@@ -64,6 +64,12 @@ def exchange(conditions: Conditions, groups: AlikeTriangles, draws: Draws, warme
     return Exchange(surface_k - ZERO_CELSIUS_K, flow)
 
 
+def slopes(conditions: Conditions, groups: AlikeTriangles, draws: Draws) -> Exchange:
+    """Return by how much an `exchange` of the stated values changes per kelvin of readings, shape (g, 1)."""
+    low, high = (exchange(conditions, groups, draws.stated, step) for step in (-HALF_STEP_K, HALF_STEP_K))
+    return Exchange(*((above - below) / (2.0 * HALF_STEP_K) for below, above in zip(low, high)))
+
+
 def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
     """Return the emissivity and the reflected temperature, [K], set in the camera; 0 C if no temperature was stated."""
     reflected_c = draws.values.get("reflected temperature set in the camera", np.zeros(draws.count))
@@ -75,15 +81,14 @@ def part_totals(conditions: Conditions, groups: AlikeTriangles, draws: Draws, ro
     parts = (len(rows.indptr) - 1) // 2
     area, off = rows[:parts].tocsc(), rows[parts:]
     total = np.asarray(area.sum(axis=1)).reshape(-1, 1)
-    low, high = (exchange(conditions, groups, draws.stated, step) for step in (-HALF_STEP_K, HALF_STEP_K))
-    slopes = [(above - below) / (2.0 * HALF_STEP_K) for below, above in zip(low, high)]
-    temperature, flow_w = (np.repeat(off @ slope, draws.count, axis=1) for slope in slopes)
+    slope = slopes(conditions, groups, draws)
+    temperature, flow_w = (np.repeat(off @ one, draws.count, axis=1) for one in slope)
     for part in chunks(len(groups.reading_c), draws):
         some = exchange(conditions, groups.some(part), draws)
         flow_w += area[:, part] @ some.flow_w_m2
         temperature += area[:, part] @ some.surface_c
     mean_c = temperature / np.where(total > 0.0, total, 1.0)
-    return PartTotals(total[:, 0], mean_c, flow_w, (area @ slopes[1])[:, 0])
+    return PartTotals(total[:, 0], mean_c, flow_w, (area @ slope.flow_w_m2)[:, 0])
 
 
 def chunks(count: int, draws: Draws) -> Iterator[slice]:
@@ -99,12 +104,9 @@ def triangle_exchange(
 
     Both follow from the first draw, the stated values. Both are NaN where a triangle does not count.
     """
-    steps = (-HALF_STEP_K, 0.0, HALF_STEP_K)
-    low, mean, high = (exchange(conditions, groups, draws, step) for step in steps)
-    off = groups.off_k / (2.0 * HALF_STEP_K)
+    of, pairs = groups.of_triangle, zip(exchange(conditions, groups, draws), slopes(conditions, groups, draws))
     temperature, flow = (
-        np.where(surface.counted, at[groups.of_triangle, 0] + off * (above - below)[groups.of_triangle, 0], np.nan)
-        for below, at, above in zip(low, mean, high)
+        np.where(surface.counted, mean[of, 0] + groups.off_k * slope[of, 0], np.nan) for mean, slope in pairs
     )
     return temperature, flow
 

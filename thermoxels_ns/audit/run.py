@@ -26,12 +26,12 @@ from thermoxels_ns.audit.draws import (
 )
 from thermoxels_ns.audit.energy import EnergyResult, year_of
 from thermoxels_ns.audit.exchange import (
-    HALF_STEP_K,
     chunks,
     exchange,
     other_models,
     part_totals,
     reference_doubts,
+    slopes,
     triangle_exchange,
     with_references,
 )
@@ -414,17 +414,15 @@ class _Parts:
 
     def triangle_u(self) -> FloatArray:
         """Return the U-value of each triangle and both ends of its interval; see `Audit.triangle_u`."""
-        few, found, slopes = self.draws.first(_FEW), [], []
+        few, found = self.draws.first(_FEW), []
+        slope = slopes(self.conditions, self.groups, few).flow_w_m2
         off = few.local(self.conditions.camera.repeatability.off_by, _OF_A_TRIANGLE)
         for part in chunks(len(self.groups.reading_c), few):
-            some = self.groups.some(part)
-            flow = exchange(self.conditions, some, few).flow_w_m2
-            warmer = exchange(self.conditions, some, few.stated, HALF_STEP_K).flow_w_m2
-            slopes.append((warmer - flow[:, :1]) / HALF_STEP_K)
-            u = (flow + slopes[-1] * off) / few.difference_k
+            flow = exchange(self.conditions, self.groups.some(part), few).flow_w_m2
+            u = (flow + slope[part] * off) / few.difference_k
             found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ENDS, axis=1).T], axis=1))
-        of_group, slope = (np.concatenate(one)[self.groups.of_triangle] for one in (found, slopes))
-        u = of_group + slope * self.groups.off_k[:, None] / few.difference_k[0]
+        of = self.groups.of_triangle
+        u = np.concatenate(found)[of] + slope[of] * self.groups.off_k[:, None] / few.difference_k[0]
         return np.where(self.surface.counted[:, None], u, np.nan)
 
     def narrower(self, rows: list[int], of_patches: FloatArray) -> tuple[dict[str, float], list[dict[str, float]]]:

@@ -41,9 +41,6 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 if TYPE_CHECKING:
     import pyvista as pv
 
-Vector = FloatArray
-
-
 _OUTSIDE = 1e-9
 """Distance outside a tetrahedron, as a share of its height, up to which a point counts as on its face."""
 
@@ -56,7 +53,7 @@ class Probes:
     nodes: IntArray  # Nodes of the tetrahedron around each point, shape (p, 4)
     weights: FloatArray  # Barycentric coordinates of each point in its tetrahedron, shape (p, 4), sum 1
 
-    def at(self, nodal: Vector) -> Vector:
+    def at(self, nodal: FloatArray) -> FloatArray:
         """Return values at the points, shape (..., p), interpolated from values at the nodes, shape (..., n)."""
         return np.einsum("...pa,pa->...p", nodal[..., self.nodes], self.weights)
 
@@ -89,14 +86,14 @@ def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
     return Probes(points, nodes, weights)
 
 
-def _barycentric(corner: Vector, point: Vector) -> Vector:
+def _barycentric(corner: FloatArray, point: FloatArray) -> FloatArray:
     """Return the barycentric coordinates of a point in k tetrahedra with corners (k, 4, 3), shape (k, 4)."""
     sides = corner[:, 1:] - corner[:, :1]
     others = np.linalg.solve(np.swapaxes(sides, 1, 2), (point - corner[:, 0])[..., None])[..., 0]
     return np.concatenate([1.0 - others.sum(axis=1, keepdims=True), others], axis=1)
 
 
-def _outside(mesh: TetMesh, number: int, point: Vector) -> HeatError:
+def _outside(mesh: TetMesh, number: int, point: FloatArray) -> HeatError:
     distance = np.linalg.norm(mesh.points_m - point, axis=1)
     x, y, z = mesh.points_m[np.argmin(distance)]
     return HeatError(
@@ -127,9 +124,9 @@ class HeatRun(HasTables):
     wall: WallResult | None
     """U-value and f_Rsi of the body between two airs in a steady state; None without airs, or if `no_wall` says why."""
     no_wall: str  # Sentence on why a steady state between two unlike airs gave no `wall`; else empty
-    mean_c: Vector  # Mean temperature of the volume at each time, shape (s,), [degrees Celsius]
+    mean_c: FloatArray  # Mean temperature of the volume at each time, shape (s,), [degrees Celsius]
     probes: Probes  # Points where temperatures are followed, in the mesh of `nodes`
-    probes_c: Vector  # Temperatures at `probes`, shape (s, p), [degrees Celsius]
+    probes_c: FloatArray  # Temperatures at `probes`, shape (s, p), [degrees Celsius]
     seconds: Mapping[str, float]  # Time to solve, "solve", and then to work out the results, "answers", [s]
 
     def __repr__(self) -> str:
@@ -259,27 +256,24 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
     patches the scene names are not checked.
     """
     selection = Selection(mesh, up)
-    inside, outside = matching_facets(selection, INSIDE), matching_facets(selection, OUTSIDE)
-    inside_air = scene.inside_air is not None and scene.inside_air.patches[:1] == INSIDE
-    outside_air = scene.outside_air is not None and scene.outside_air.patches[:1] == OUTSIDE
-    inside = matching_facets(selection, scene.inside_air.patches) if scene.inside_air and inside_air else inside
-    warnings = []
-    if (inside_air or outside_air) and _outwards(selection, outside) < _INWARDS:
-        warnings.append(
+    inside_air = scene.inside_air if scene.inside_air and scene.inside_air.patches[:1] == INSIDE else None
+    outside_air = scene.outside_air if scene.outside_air and scene.outside_air.patches[:1] == OUTSIDE else None
+    if (inside_air or outside_air) and _outwards(selection, matching_facets(selection, OUTSIDE)) < _INWARDS:
+        return (
             "The surface that photographs see faces inwards, as that of a room photographed from within. The scene's "
             "outside air (and sun and sky) acts on surfaces that were seen, its inside air on those that were not. If "
             "the seen surface is that of the room, give inside_air and outside_air their patches in the scene: "
-            'patches: ["exterior-*"] to the inside air, patches: ["interior-*"] to the outside air.'
+            'patches: ["exterior-*"] to the inside air, patches: ["interior-*"] to the outside air.',
         )
-    elif inside_air and not _has_rooms(selection, inside):
-        area = float(selection.facet_area_m2[inside].sum())
-        warnings.append(
+    if inside_air is not None and not _has_rooms(selection, matching_facets(selection, inside_air.patches)):
+        area = float(selection.facet_area_m2[matching_facets(selection, inside_air.patches)].sum())
+        return (
             f"The scene names air inside, but the body has no rooms: of the {area:.4g} m² that no photograph saw, next "
             "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
             "and heat losses are those of that. Export again with --interior hollow --wall-thickness 0.3, or "
-            "name the inner surface with --patches."
+            "name the inner surface with --patches.",
         )
-    return tuple(warnings)
+    return ()
 
 
 def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[tuple[str, ...], tuple[str, ...]]:
