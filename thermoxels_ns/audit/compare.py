@@ -25,6 +25,7 @@ _NEAR_M = 0.3  # Surface moves by less: insulation is thinner, and reconstructio
 _FACES = 0.7  # Least cosine between normals of the same surface
 _FITS_M, _UNMATCHED_M = 0.2, 1.0  # Largest median distance of meshes that fit; distance of points without a partner
 _TURN_DEG = 15.0  # Step between the directions in which an alignment starts
+_ALIGN_STEPS = 25  # Steps of each alignment
 _LIKE_BEST = 1.3  # A quite different position that fits as well, but for this factor, makes the alignment ambiguous
 _SEEN_SHARE = 0.2  # Least share of an element that the other survey has seen, too
 _OVERLAP = 0.3  # Least area that two findings of one bridge share, over the geometric mean of their areas
@@ -329,7 +330,7 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
     (points, normals), (target, facing) = (_samples(one) for one in (before, after))
     tree = KDTree(_places(target, facing))
 
-    def distances(pose: Pose, points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    def distances(pose: Pose) -> tuple[FloatArray, FloatArray, IntArray]:
         moved, turned = pose(points), normals @ pose.turn.T
         nearest = np.asarray(tree.query(_places(moved, turned))[1], dtype=np.int64)
         along = np.einsum("ij,ij->i", target[nearest] - moved, facing[nearest])
@@ -338,12 +339,12 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
         return np.where(lost, _UNMATCHED_M, along), moved, nearest
 
     def residual(pose: Pose) -> tuple[float, float]:  # the mean tells what a notch or a balcony shows, the median not
-        off = np.abs(distances(pose, points, normals)[0])
+        off = np.abs(distances(pose)[0])
         return float(np.mean(off)), float(np.median(off))
 
-    def refined(pose: Pose, steps: int, some: slice) -> Pose:
-        for _ in range(steps):
-            along, moved, nearest = distances(pose, points[some], normals[some])
+    def refined(pose: Pose) -> Pose:
+        for _ in range(_ALIGN_STEPS):
+            along, moved, nearest = distances(pose)
             kept = np.argsort(np.abs(along))[: (2 * len(along)) // 3]
             towards, middle = facing[nearest[kept]], moved[kept].mean(axis=0)
             matrix = np.concatenate([np.cross(moved[kept] - middle, towards), towards], axis=1)
@@ -366,10 +367,9 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
     for degrees in np.arange(0.0, 360.0, _TURN_DEG):
         turn = Rotation.from_rotvec(np.radians(degrees) * up[1]).as_matrix() @ upright
         start = Pose(turn, target.mean(axis=0) - turn @ points.mean(axis=0))
-        pose = refined(start, 12, slice(None, None, 4))
+        pose = refined(start)
         tried.append((*residual(pose), pose))
-    poses = [refined(pose, 15, slice(None)) for _, _, pose in _first(tried)]
-    tried = sorted(((*residual(one), one) for one in poses), key=_mean)
+    tried.sort(key=lambda one: one[0])
     best, median, pose = tried[0]
     if given <= _FITS_M and mean <= 1.5 * best:
         return as_given, given, False
@@ -383,19 +383,6 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
         remedy = "Pose the photographs of both surveys together, so that both meshes have the same coordinates."
         raise AuditError("compare", expected="one position in which the meshes fit", got=got, remedy=remedy)
     return pose, median, True
-
-
-def _mean(one: tuple[float, float, Pose]) -> float:
-    return one[0]
-
-
-def _first(tried: list[tuple[float, float, Pose]]) -> list[tuple[float, float, Pose]]:
-    """Return the best six of the poses tried, no two of them alike."""
-    chosen = list[tuple[float, float, Pose]]()
-    for one in sorted(tried, key=_mean):
-        if all(_turned_deg(one[2], other[2]) > 0.5 * _TURN_DEG for other in chosen):
-            chosen.append(one)
-    return chosen[:6]
 
 
 def _turned_deg(one: Pose, other: Pose) -> float:

@@ -525,16 +525,6 @@ def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ..
     return "severe" if share >= SEVERE_SHARE else "moderate" if share >= MODERATE_SHARE else "slight"
 
 
-def verdict(found: Interval, limit: float, at_most: bool = True) -> Verdict:
-    """Return whether an interval keeps an upper (`at_most`) or a lower limit; "cannot tell" if the limit is inside.
-
-    >>> verdict(Interval(0.3, 0.2, 0.4), 0.5), verdict(Interval(0.3, 0.2, 0.4), 0.25)
-    ('met', 'cannot tell')
-    """
-    low, high, edge = (found.low, found.high, limit) if at_most else (-found.high, -found.low, -limit)
-    return "met" if high <= edge else "not met" if low > edge else "cannot tell"
-
-
 def _limits(
     conditions: Conditions,
     patches: Sequence[tuple[str, FloatArray]],
@@ -547,9 +537,11 @@ def _limits(
 
     def judge(name: str, limit: Measured, unit: str, drawn: FloatArray, at_most: bool = True) -> None:
         value, edge = interval_of(drawn), limit.value
+        beyond = interval_of(drawn - edge if at_most else edge - drawn)  # above 0: the limit is not kept
+        verdict: Verdict = "met" if beyond.high <= 0.0 else "not met" if beyond.low > 0.0 else "cannot tell"
         missed = float(np.mean(drawn[1:] > edge if at_most else drawn[1:] < edge))
         missed = missed if np.isfinite(value.value) else np.nan
-        found.append(Limit(name, edge, unit, at_most, value, verdict(value, edge, at_most), missed))
+        found.append(Limit(name, edge, unit, at_most, value, verdict, missed))
 
     for name, u in patches:
         chosen = [limit for pattern, limit in limits.u.items() if matching_names([name], pattern)]
