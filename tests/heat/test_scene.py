@@ -152,7 +152,7 @@ def test_every_patch_is_spoken_of() -> None:
         ),
         (
             {"ground_contact": GROUND, "sun": SUN, "surfaces": (Surface(absorptivity=0.6),)},
-            "ground_contact entry 1: expected contact with the ground alone",
+            "sun: expected contact with the ground alone",
         ),
     ],
 )
