@@ -88,6 +88,6 @@ def test_the_radiation_of_a_clear_sky() -> None:
 
 
 def test_a_roof_sees_the_sky_a_wall_a_part_of_it_and_a_ceiling_the_ground() -> None:
-    up, wall, down = view_shares(np.array([[0, 0, 1.0], [0.6, 0.8, 0], [0, 0, -1.0]]), (0.0, 0.0, 1.0))
+    up, wall, down = view_shares(np.array([1.0, 0.0, -1.0]))
     assert up == pytest.approx([1.0, 0.0, 0.0]) and down == pytest.approx([0.0, 0.0, 1.0])
     assert wall == pytest.approx([0.5**1.5, 0.5 - 0.5**1.5, 0.5])

@@ -231,15 +231,14 @@ class _Wall:
         self, values: Mapping[str, float], draws: Draws, at_c: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return coefficient and air temperature, (s,) each, with which convection is the film's tangent at `at_c`."""
-        surface, up = self.surface, self.surface.selection.up
-        normals = surface.selection.facet_normal[self.seen]
+        surface, upward = self.surface, self.surface.upward[self.seen]
         every = np.stack([draws[emissivity_name(self.conditions, n)] for n in range(len(self.conditions.surfaces))])
         emissivity = every[surface.surface_entry[self.seen]]
-        around_k4 = radiant_k4(self.conditions, draws, normals, up)
+        around_k4 = radiant_k4(self.conditions, draws, upward)
 
         def flow(conditions: Conditions, here: Draws, warmer_k: float) -> FloatArray:
             surface_k = celsius_to_kelvin(at_c + warmer_k)[:, None]
-            out = film_flow_w_m2(conditions, here, surface_k, around_k4, emissivity, normals, up)[:, 0]
+            out = film_flow_w_m2(conditions, here, surface_k, around_k4, emissivity, upward)[:, 0]
             return -out if self.conditions.side == "inside" else out
 
         def tangent(conditions: Conditions, here: Draws) -> tuple[FloatArray, FloatArray]:
@@ -258,10 +257,8 @@ class _Wall:
 
     def _far_side(self, values: Mapping[str, float]) -> FloatArray:
         """Return the coefficient of film and layers on the side not photographed, shape (b,), [W/(m2 K)]."""
-        surface = self.surface
-        normals = surface.selection.facet_normal[self.behind]
         far = SIMPLE["inside" if self.conditions.side == "outside" else "outside"]["iso-6946-combined"]
-        resistance = np.ones(len(normals)) / far.w_m2k(0.0, 0.0, normals @ np.array(surface.selection.up))
+        resistance = np.ones(len(self.behind)) / far.w_m2k(0.0, 0.0, self.surface.upward[self.behind])
         for name, where in self._layers.items():
             resistance = resistance + where * values[f"thickness of {name}"] / values[f"conductivity of {name}"]
         return 1.0 / resistance

@@ -57,10 +57,10 @@ def exchange(conditions: Conditions, groups: AlikeTriangles, draws: Draws, warme
     """
     emissivity = np.stack([draws[emissivity_name(conditions, n)] for n in range(len(conditions.surfaces))])
     emissivity = emissivity[groups.surface_entry]
-    around_k4 = radiant_k4(conditions, draws, groups.normal, groups.up)
+    around_k4 = radiant_k4(conditions, draws, groups.upward)
     reading_k = celsius_to_kelvin(groups.reading_c + warmer_k)[:, None] + draws["camera offset"]
     surface_k = surface_temperature_k(reading_k, emissivity, around_k4, *_camera_settings(draws))
-    flow = film_flow_w_m2(conditions, draws, surface_k, around_k4, emissivity, groups.normal, groups.up)
+    flow = film_flow_w_m2(conditions, draws, surface_k, around_k4, emissivity, groups.upward)
     return Exchange(surface_k - ZERO_CELSIUS_K, flow)
 
 
@@ -111,16 +111,15 @@ def triangle_exchange(
     return temperature, flow
 
 
-def radiant_k4(conditions: Conditions, draws: Draws, normals: FloatArray, up: tuple[float, float, float]) -> FloatArray:
-    """Return the fourth power of the surroundings' radiant temperature, (g, k), [K^4], for normals of shape (g, 3)."""
+def radiant_k4(conditions: Conditions, draws: Draws, upward: FloatArray) -> FloatArray:
+    """Return the fourth power of the surroundings' radiant temperature, (g, k), [K^4]; `upward`: see `view_shares`."""
     if conditions.surroundings.sky is None:
-        return np.broadcast_to(
-            fourth_power(celsius_to_kelvin(draws["reflected temperature"])), (len(normals), draws.count)
-        )
+        reflected_k4 = fourth_power(celsius_to_kelvin(draws["reflected temperature"]))
+        return np.broadcast_to(reflected_k4, (len(upward), draws.count))
     air_k4 = fourth_power(celsius_to_kelvin(draws["outside air"]))
     sky_k4 = sky_emissivity(draws["dew point"], draws["cloud"]) * air_k4
     ground_k4 = fourth_power(celsius_to_kelvin(draws.values.get("ground", draws["outside air"])))
-    return view_shares(normals, up) @ np.stack([sky_k4, air_k4, ground_k4])
+    return view_shares(upward) @ np.stack([sky_k4, air_k4, ground_k4])
 
 
 def film_flow_w_m2(
@@ -129,16 +128,15 @@ def film_flow_w_m2(
     surface_k: FloatArray,
     around_k4: FloatArray,
     emissivity: FloatArray,
-    normals: FloatArray,
-    up: tuple[float, float, float],
+    upward: FloatArray,
 ) -> FloatArray:
     """Return the heat flow from inside to outside by the film model, shape (g, k), [W/m2].
 
-    `surface_k`, `around_k4` (see `radiant_k4`) and `emissivity` have shape (g, k), `normals` has shape (g, 3).
+    `surface_k`, `around_k4` (see `radiant_k4`) and `emissivity` have shape (g, k), `upward` (see `view_shares`) (g,).
     """
     model, inside = conditions.film.model, conditions.side == "inside"
     air_k = celsius_to_kelvin(draws["inside air" if inside else "outside air"])
-    warmer_k, upward = surface_k - air_k, (normals @ np.array(up))[:, None]
+    warmer_k, upward = surface_k - air_k, upward[:, None]
     simple = SIMPLE[conditions.side].get(model)
     if model == "given":
         coefficient = draws["film coefficient"]
@@ -186,8 +184,8 @@ def most_u_w_m2k(surface: AuditedSurface, conditions: Conditions, which: IntArra
     1 / (Rsi + Rse) of ISO 6946, by the direction in which heat flows through each of the triangles `which`; the mean by
     area. A larger U-value is impossible: an input clashes with the readings.
     """
-    normal = surface.selection.facet_normal[which] * (-1.0 if conditions.side == "outside" else 1.0)
-    inside = SIMPLE["inside"]["iso-6946-combined"].w_m2k(0.0, 0.0, normal @ np.array(surface.selection.up))
+    upward = surface.upward[which] * (-1.0 if conditions.side == "outside" else 1.0)
+    inside = SIMPLE["inside"]["iso-6946-combined"].w_m2k(0.0, 0.0, upward)
     allowed = 1.0 / (1.0 / inside + OUTSIDE_RESISTANCE_M2K_W)
     return float(np.average(allowed, weights=surface.area_m2[which]))
 
@@ -201,15 +199,14 @@ def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draw
     """
     if not conditions.references:
         return draws
-    up, offsets = surface.selection.up, []
+    offsets = []
     for number in range(len(conditions.references)):
         near = _near(surface, conditions, number)
         area = surface.area_m2[near]
-        normal = area @ surface.selection.facet_normal[near]
-        normal = (normal / np.linalg.norm(normal))[None]
+        upward = np.atleast_1d(np.average(surface.upward[near], weights=area))
         emissivity = draws[emissivity_name(conditions, int(surface.surface_entry[near[0]]))]
         contact_k = celsius_to_kelvin(draws[f"contact temperature {number + 1}"])
-        around_k4 = radiant_k4(conditions, draws, normal, up)[0]
+        around_k4 = radiant_k4(conditions, draws, upward)[0]
         needed_k = reading_k(contact_k, emissivity, around_k4, *_camera_settings(draws))
         read_k = celsius_to_kelvin(float(np.average(surface.reading_c[near], weights=area)))
         own = draws.local(conditions.camera.repeatability.off_by, _OF_A_REFERENCE + number)

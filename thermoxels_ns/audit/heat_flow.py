@@ -14,7 +14,6 @@ import numpy.typing as npt
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4
 from thermoxels_ns.heat.scene_fields import INSIDE_CONVECTION_W_M2K, INSIDE_RESISTANCE_M2K_W, OUTSIDE_RESISTANCE_M2K_W
-from thermoxels_ns.heat.sky import ground_view, sky_view
 
 Values: TypeAlias = Any  # A number or an array
 
@@ -188,17 +187,14 @@ def sky_emissivity(dew_point_c: npt.ArrayLike, cloud: npt.ArrayLike) -> FloatArr
     return clear * (1.0 + 0.0224 * tenths - 0.0035 * tenths**2 + 0.00028 * tenths**3)
 
 
-def view_shares(normals: FloatArray, up: tuple[float, float, float]) -> FloatArray:
+def view_shares(upward: FloatArray) -> FloatArray:
     """Return the shares of sky, air near the horizon, and ground in a surface's view, (k, 3); rows add up to 1.
 
     F_ground = (1 - cos tilt) / 2. Of the rest, a share b = sqrt((1 + cos tilt) / 2) is sky, and 1 - b is air near the
     horizon, about as warm as the air at the ground (EnergyPlus Engineering Reference, "External Longwave Radiation";
-    Walton 1983). A wall sees 0.354 sky, 0.146 horizon and 0.5 ground.
-
-    Args:
-        normals: Outward unit normals, shape (k, 3).
-        up: Unit vector that points up.
+    Walton 1983). A wall sees 0.354 sky, 0.146 horizon and 0.5 ground. `upward`, the cosine of the tilt, is the upward
+    part of outward unit normals, shape (k,).
     """
-    above, below = sky_view(normals, up), ground_view(normals, up)
+    above = np.clip(0.5 * (1.0 + upward), 0.0, 1.0)
     sky = above * np.sqrt(above)
-    return np.stack([sky, above - sky, below], axis=1)
+    return np.stack([sky, above - sky, 1.0 - above], axis=1)
