@@ -11,8 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, cast
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from thermoxels_ns.audit.conditions import Calibrate, Conditions, Film
 from thermoxels_ns.audit.draws import FORMULA, Draws, Interval, emissivity_name, interval_of
@@ -300,31 +302,22 @@ class _Fit:
         return measured - self.wall.computed_c(values, draws, measured)
 
     def _search(self) -> FloatArray:
-        """Return the logarithms with the least squares, shape (m,), by Gauss-Newton's method.
+        """Return the logarithms with the least squares, shape (m,), by Gauss-Newton's method in a trust region."""
+        root, steps = np.sqrt(self.weight), _STEP * np.eye(len(self.names))
 
-        Steps that do not lower the squares are halved. There are no steps along directions that change nothing."""
-        x = np.zeros(len(self.names))
-        residual = self._residual(x, self._first)
-        for _ in range(_MOST_STEPS):
-            moved = [self._residual(x + _STEP * row, self._first) for row in np.eye(len(x))]
-            slope = np.stack([(residual - one) / _STEP for one in moved], axis=1)
-            normal = slope.T @ (self.weight[:, None] * slope)
-            values, vectors = np.linalg.eigh(normal)
-            self.slope, self.sensitive_k, self.directions = slope, np.sqrt(np.maximum(values, 0.0)), vectors
-            told = self.sensitive_k > 0.1 * _LEAST_K
-            pull = vectors.T @ (slope.T @ (self.weight * residual))
-            step = vectors @ np.where(told, pull / np.where(told, values, 1.0), 0.0)
-            step *= min(1.0, _MOST_STEP / max(float(np.abs(step).max()), 1e-300))
-            while True:
-                tried = self._residual(x + step, self._first)
-                if self.weight @ tried**2 <= self.weight @ residual**2 or np.abs(step).max() < _ENOUGH:
-                    break
-                step = 0.5 * step
-            x, residual = x + step, tried
-            if np.abs(step).max() < _ENOUGH or np.abs(x).max() > 2.0 * _FAR:
-                break
-        self.residual_k = residual
-        return x
+        def residual(x: FloatArray) -> FloatArray:
+            return root * self._residual(x, self._first)
+
+        def slope(x: FloatArray) -> FloatArray:
+            here = residual(x)
+            return np.stack([(residual(x + step) - here) / _STEP for step in steps], axis=1)
+
+        far, jacobian = (-2.0 * _FAR, 2.0 * _FAR), cast(Any, slope)  # stubs of scipy take no function
+        found = least_squares(residual, np.zeros(len(steps)), jacobian, far, ftol=_ENOUGH, xtol=_ENOUGH)
+        self.residual_k, self.slope = found.fun / root, -found.jac / root[:, None]
+        values, self.directions = np.linalg.eigh(found.jac.T @ found.jac)
+        self.sensitive_k = np.sqrt(np.maximum(values, 0.0))
+        return found.x
 
     def what_cannot_be_told(self, units: Mapping[str, str]) -> str:
         """Return sentences on properties that the readings do not determine; empty if all are determined."""

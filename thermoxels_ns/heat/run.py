@@ -80,7 +80,11 @@ def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
         # A point on a face or node lies in several tetrahedra: take the one it lies deepest in, the first of equals.
         best = int(np.argmax(shares.min(axis=1))) if len(near) else -1
         if best < 0 or shares[best].min() < -_OUTSIDE:
-            raise _outside(mesh, number, point)
+            distance = np.linalg.norm(mesh.points_m - point, axis=1)
+            node = np.round(mesh.points_m[np.argmin(distance)], 6).tolist()
+            got = f"{np.round(point, 6).tolist()}, which is outside"
+            remedy = f"Move it; the nearest node is {node}, {distance.min():.3g} m away."
+            raise HeatError(f"probe {number + 1}", expected="a point inside the body", got=got, remedy=remedy)
         inside = np.clip(shares[best], 0.0, 1.0)
         nodes[number], weights[number] = mesh.tets[near[best]], inside / inside.sum()
     return Probes(points, nodes, weights)
@@ -91,17 +95,6 @@ def _barycentric(corner: FloatArray, point: FloatArray) -> FloatArray:
     sides = corner[:, 1:] - corner[:, :1]
     others = np.linalg.solve(np.swapaxes(sides, 1, 2), (point - corner[:, 0])[..., None])[..., 0]
     return np.concatenate([1.0 - others.sum(axis=1, keepdims=True), others], axis=1)
-
-
-def _outside(mesh: TetMesh, number: int, point: FloatArray) -> HeatError:
-    distance = np.linalg.norm(mesh.points_m - point, axis=1)
-    x, y, z = mesh.points_m[np.argmin(distance)]
-    return HeatError(
-        f"probe {number + 1}",
-        expected="a point inside the body",
-        got=f"({', '.join(f'{part:.6g}' for part in point)}), which is outside",
-        remedy=f"Move it; the nearest node is ({x:.6g}, {y:.6g}, {z:.6g}), {distance.min():.3g} m away.",
-    )
 
 
 @dataclass(frozen=True)
