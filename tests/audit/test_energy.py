@@ -92,10 +92,10 @@ AIRS = {"inside": "20 C", "heating_limit": "15 C"}
 @pytest.mark.parametrize(
     ("content", "named"),
     [
-        ({}, "energy: expected either climate or degree_hours"),
-        ({"climate": "a.epw", "degree_hours": "80000 K h", **AIRS}, "energy: expected either"),
+        ({}, "energy: climate or degree_hours: expected one of climate, degree_hours"),
+        ({"climate": "a.epw", "degree_hours": "80000 K h", **AIRS}, "energy: climate or degree_hours: expected one of"),
         ({"climate": "a.epw", "inside": "20 C"}, "energy: heating_limit: expected one"),
-        ({"degree_hours": "80000 K h", "inside": "20 C"}, "energy: inside: expected one beside climate"),
+        ({"degree_hours": "80000 K h", "inside": "20 C"}, "energy: inside: expected none, because degree_hours"),
         ({"climate": "a.epw", **AIRS, "heating_limit": "21 C"}, "energy: heating_limit: expected surely"),
         ({"degree_hours": "80000"}, "energy: degree_hours: expected"),
         ({"degree_hours": "3000 K d", "price": "12 EUR"}, "energy: price: expected"),

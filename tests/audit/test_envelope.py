@@ -9,11 +9,12 @@ import pytest
 
 from tests.support.flat_houses import house_corner
 from thermoxels_ns.audit.conditions import Limits, load_conditions
-from thermoxels_ns.audit.envelope import Envelope, envelope_of, gbxml, hbjson
+from thermoxels_ns.audit.envelope import Envelope, envelope_of, hbjson
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.mesh.boundary.patches import with_patches
 from thermoxels_ns.mesh.boundary.planes import find_building, proposed_rules
+from thermoxels_ns.reports.audit_page import gbxml
 
 SCHEMA = json.loads((Path(__file__).parent / "honeybee-model-2.3.0.json").read_text())
 NAMESPACE = "{http://www.gbxml.org/schema}"

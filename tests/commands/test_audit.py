@@ -148,7 +148,7 @@ def test_what_forbids_a_survey_stands_first(export, tmp_path) -> None:
     text = (export / "conditions.yaml").read_text().replace("wind: 1.0 +- 0.5 m/s", "wind: 7.0 +- 0.5 m/s")
     (tmp_path / "c.yaml").write_text(re.sub(r"  client:.*\n", "", text))
     _, page = audited(export / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "out", "--pictures", "False")
-    assert page.index("Look at this first") < page.index("The wind was 7.0 m/s") < page.index('class="cards')
+    assert page.index("Look at this first") < page.index("Wind: 7 m/s") < page.index('class="cards')
     assert "this one does not know: client." in page and "data:image/png" not in page
 
 

@@ -17,7 +17,7 @@ from thermoxels_ns.heat.run import (
     place_probes,
     run_scene,
     shell_warnings,
-    unused_settings,
+    short_series,
 )
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import OUTSIDE, InsideAir, OutsideAir
@@ -57,13 +57,6 @@ def test_a_room_seen_from_within_is_inside_out() -> None:
 def test_up_decides_what_an_underside_is(up) -> None:
     """What faces down as the mesh was made is a wall if another direction is up."""
     assert patch_warnings(HeatScene(CONCRETE, **AIRS), filled(), up) == ()
-
-
-def test_a_start_that_a_steady_state_does_not_know_is_named() -> None:
-    (said,) = unused_settings(HeatScene(CONCRETE, initial_c=15.0, **AIRS))
-    assert "initial temperature of 15 degrees" in said and "initial changes nothing" in said
-    assert unused_settings(HeatScene(CONCRETE, **AIRS)) == ()
-    assert unused_settings(HeatScene(CONCRETE, TimeSteps(2, 60.0), initial_c=15.0, **AIRS)) == ()
 
 
 def test_the_rim_of_a_hole_is_no_spot_of_the_inner_surface() -> None:
@@ -157,11 +150,11 @@ def test_a_series_that_ends_before_the_run_is_named(tmp_path, time) -> None:
     path = tmp_path / "air.csv"
     path.write_text("hours,outside_c\n0,10\n1,12\n")
     airs = {"outside_air": OutsideAir(10.0, "iso-6946-combined", air_series=str(path))}
-    (warning,) = unused_settings(HeatScene(CONCRETE, time, **airs))
+    (warning,) = short_series(HeatScene(CONCRETE, time, **airs))
     scene = HeatScene(CONCRETE, time, adiabatic=("interior*", "cut"), **airs)
     assert warning in run_scene(scene, room(), Goals()).warnings
     assert "outside_air is from 0 to 1 hours" in warning and "from 0 to 2 hours" in warning
-    assert unused_settings(HeatScene(CONCRETE, TimeSteps(60, 60.0), **airs)) == ()
+    assert short_series(HeatScene(CONCRETE, TimeSteps(60, 60.0), **airs)) == ()
 
 
 def test_air_that_was_given_in_kelvin_is_named() -> None:

@@ -7,7 +7,7 @@ import pytest
 from tests.support.scene_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import TimeSteps
-from thermoxels_ns.fem.quantities import Places
+from thermoxels_ns.fem.quantities import Places, Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Effect, GroundContact, Radiation
@@ -20,7 +20,6 @@ from thermoxels_ns.heat.scene_fields import (
     Sky,
     Sun,
     Surface,
-    inside_coefficient,
     radiative_coefficient,
 )
 from thermoxels_ns.heat.sky import swinbank_sky_c
@@ -153,7 +152,7 @@ def test_every_patch_is_spoken_of() -> None:
         ),
         (
             {"ground_contact": GROUND, "sun": SUN, "surfaces": (Surface(absorptivity=0.6),)},
-            "ground_contact entry 1: expected contact with the ground alone",
+            "sun: expected contact with the ground alone",
         ),
     ],
 )
@@ -273,7 +272,8 @@ def test_radiation_made_linear(mean_c: float, published: float) -> None:
 def test_horizontal_reaches_to_30_degrees() -> None:
     angle = np.radians([-31, -30, -29, 29, 30, 31])
     normals = np.stack([np.cos(angle), np.zeros(6), np.sin(angle)], axis=1)
-    coefficient = inside_coefficient("iso-6946-convection", "out-of-body")
+    coefficient = InsideAir(20.0, "iso-6946-convection", heat_flow="out-of-body").convection().coefficient_w_m2k
+    assert isinstance(coefficient, Varying)
     found = coefficient.function(Places(np.zeros((6, 3)), normals, (0.0, 0.0, 1.0)), 0.0)
     assert np.asarray(found).tolist() == [0.7, 2.5, 2.5, 2.5, 2.5, 5.0]
 

@@ -111,12 +111,6 @@ def test_a_sun_that_moves() -> None:
     assert np.asarray(given.function(walls, 0.0)).tolist() == [0.0, 0.0]
 
 
-def test_a_time_without_a_date_is_refused() -> None:
-    sun = moving_sun(datetime(2026, 1, 1, tzinfo=UTC), 50.0, 0.0, NORTH)
-    with pytest.raises(HeatError, match=r"time of the sun: expected a date of the years 1 to 9999, got 1e\+12 s"):
-        sun.function(Places(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), Z_UP), 1e12)
-
-
 def test_swinbank_at_300_kelvin() -> None:
     """0.0552 * 300^1.5 = 286.83 K: 13 K below the air."""
     assert swinbank_sky_c(26.85) == pytest.approx(13.68, abs=0.01)

@@ -98,7 +98,7 @@ def test_findings_are_consistent_with_causes_and_prove_none(found) -> None:
 @pytest.mark.parametrize(
     ("change", "what", "verdict"),
     [
-        ({"least_difference_24h": None}, "the same, all the last 24 hours", "not stated"),
+        ({"least_difference_24h": None}, "air inside warmer than outside, all the last 24 hours", "not stated"),
         ({"hours_dry": 20.0}, "time since the surface was wet", "not met"),
         ({"hours_dry": 24.0}, "time since the surface was wet", "met"),
         ({"certificate": "7, level 2"}, "operator", "met"),

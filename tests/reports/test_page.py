@@ -10,9 +10,8 @@ from PIL import Image
 
 from thermoxels_ns.audit.draws import Interval
 from thermoxels_ns.commands.demo_results import Compared, Target
-from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.reports.charts import bars, colours, histogram
-from thermoxels_ns.reports.page import _environment, build_page, image_address
+from thermoxels_ns.reports.page import _environment, build_page
 
 HOSTILE = "<script>alert('1')</script>\"'&"
 
@@ -82,11 +81,6 @@ def test_words_stay_words() -> None:
     text = rendered(source, evil=HOSTILE, png=picture("red"), chart=bars(np.array([1.0, -2.0]), HOSTILE))
     assert "<script" not in text
     assert "".join(Outline(text).words).count(HOSTILE) == 11
-
-
-def test_what_is_no_picture_is_refused() -> None:
-    with pytest.raises(ThermoxelsError, match=r"the roof: expected the content of a PNG or JPEG file, got 6 bytes"):
-        image_address(b"GIF89a", "the roof")
 
 
 def test_charts_are_the_same_for_the_same_figures_and_none_without_values() -> None:

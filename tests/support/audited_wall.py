@@ -148,7 +148,7 @@ def true_draws(conditions: Conditions, seed: int | None) -> Draws:
 
 def radiant_c(conditions: Conditions, draws: Draws, normals: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Temperature of what surfaces of these normals exchange radiation with, (n,)."""
-    return kelvin_to_celsius(radiant_k4(conditions, draws, normals, UP)[:, 0] ** 0.25)
+    return kelvin_to_celsius(radiant_k4(conditions, draws, normals @ np.array(UP))[:, 0] ** 0.25)
 
 
 def solve_wall(mesh: TetMesh, conditions: Conditions, draws: Draws) -> Truth:
@@ -206,7 +206,7 @@ def photographed(truth: Truth, conditions: Conditions, seed: int | None = None) 
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = normal / np.where(length > 0.0, length, 1.0)
     emissivity = float(draws[emissivity_name(conditions, 0)][0])
-    around_k4 = radiant_k4(conditions, draws, normal, UP)[:, 0]
+    around_k4 = radiant_k4(conditions, draws, normal @ np.array(UP))[:, 0]
     arrives = emissivity * celsius_to_kelvin(mesh.temperature_c) ** 4 + (1.0 - emissivity) * around_k4
     reading = kelvin_to_celsius(arrives**0.25) - float(draws["camera offset"][0])
     if seed is not None:

@@ -11,19 +11,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, cast
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from thermoxels_ns.audit.conditions import Calibrate, Conditions, Film
 from thermoxels_ns.audit.draws import FORMULA, Draws, Interval, emissivity_name, interval_of
 from thermoxels_ns.audit.exchange import HALF_STEP_K, film_flow_w_m2, radiant_k4, triangle_exchange
+from thermoxels_ns.audit.heat_flow import SIMPLE
 from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface, chosen_names
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.fem.problem import GivenSteps
-from thermoxels_ns.fem.quantities import Places, Varying
+from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER
 from thermoxels_ns.fem.selection import matching_names
 from thermoxels_ns.fem.steady import solve_steady
@@ -31,7 +34,7 @@ from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_fields import OUTSIDE_RESISTANCE_M2K_W, inside_coefficient, outside_coefficient
+from thermoxels_ns.heat.scene_fields import OUTSIDE_RESISTANCE_M2K_W
 
 _UNITS = {"conductivity": "W/(m K)", "thickness": "m", "film": "W/(m2 K)", "capacity": "kJ/(m3 K)"}
 _BEFORE, _ABSORPTANCE = "air before the weather file", "absorptance of the walls"  # Uncertain with a history alone
@@ -230,15 +233,14 @@ class _Wall:
         self, values: Mapping[str, float], draws: Draws, at_c: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return coefficient and air temperature, (s,) each, with which convection is the film's tangent at `at_c`."""
-        surface, up = self.surface, self.surface.selection.up
-        normals = surface.selection.facet_normal[self.seen]
+        surface, upward = self.surface, self.surface.upward[self.seen]
         every = np.stack([draws[emissivity_name(self.conditions, n)] for n in range(len(self.conditions.surfaces))])
         emissivity = every[surface.surface_entry[self.seen]]
-        around_k4 = radiant_k4(self.conditions, draws, normals, up)
+        around_k4 = radiant_k4(self.conditions, draws, upward)
 
         def flow(conditions: Conditions, here: Draws, warmer_k: float) -> FloatArray:
             surface_k = celsius_to_kelvin(at_c + warmer_k)[:, None]
-            out = film_flow_w_m2(conditions, here, surface_k, around_k4, emissivity, normals, up)[:, 0]
+            out = film_flow_w_m2(conditions, here, surface_k, around_k4, emissivity, upward)[:, 0]
             return -out if self.conditions.side == "inside" else out
 
         def tangent(conditions: Conditions, here: Draws) -> tuple[FloatArray, FloatArray]:
@@ -257,13 +259,8 @@ class _Wall:
 
     def _far_side(self, values: Mapping[str, float]) -> FloatArray:
         """Return the coefficient of film and layers on the side not photographed, shape (b,), [W/(m2 K)]."""
-        surface = self.surface
-        normals = surface.selection.facet_normal[self.behind]
-        film = outside_coefficient("iso-6946-combined") * np.ones(len(self.behind))
-        if self.conditions.side == "outside":
-            places = Places(np.zeros_like(normals), normals, surface.selection.up)
-            film = np.asarray(inside_coefficient("iso-6946-combined").function(places, 0.0))
-        resistance = 1.0 / film
+        far = SIMPLE["inside" if self.conditions.side == "outside" else "outside"]["iso-6946-combined"]
+        resistance = np.ones(len(self.behind)) / far.w_m2k(0.0, 0.0, self.surface.upward[self.behind])
         for name, where in self._layers.items():
             resistance = resistance + where * values[f"thickness of {name}"] / values[f"conductivity of {name}"]
         return 1.0 / resistance
@@ -305,31 +302,22 @@ class _Fit:
         return measured - self.wall.computed_c(values, draws, measured)
 
     def _search(self) -> FloatArray:
-        """Return the logarithms with the least squares, shape (m,), by Gauss-Newton's method.
+        """Return the logarithms with the least squares, shape (m,), by Gauss-Newton's method in a trust region."""
+        root, steps = np.sqrt(self.weight), _STEP * np.eye(len(self.names))
 
-        Steps that do not lower the squares are halved. There are no steps along directions that change nothing."""
-        x = np.zeros(len(self.names))
-        residual = self._residual(x, self._first)
-        for _ in range(_MOST_STEPS):
-            moved = [self._residual(x + _STEP * row, self._first) for row in np.eye(len(x))]
-            slope = np.stack([(residual - one) / _STEP for one in moved], axis=1)
-            normal = slope.T @ (self.weight[:, None] * slope)
-            values, vectors = np.linalg.eigh(normal)
-            self.slope, self.sensitive_k, self.directions = slope, np.sqrt(np.maximum(values, 0.0)), vectors
-            told = self.sensitive_k > 0.1 * _LEAST_K
-            pull = vectors.T @ (slope.T @ (self.weight * residual))
-            step = vectors @ np.where(told, pull / np.where(told, values, 1.0), 0.0)
-            step *= min(1.0, _MOST_STEP / max(float(np.abs(step).max()), 1e-300))
-            while True:
-                tried = self._residual(x + step, self._first)
-                if self.weight @ tried**2 <= self.weight @ residual**2 or np.abs(step).max() < _ENOUGH:
-                    break
-                step = 0.5 * step
-            x, residual = x + step, tried
-            if np.abs(step).max() < _ENOUGH or np.abs(x).max() > 2.0 * _FAR:
-                break
-        self.residual_k = residual
-        return x
+        def residual(x: FloatArray) -> FloatArray:
+            return root * self._residual(x, self._first)
+
+        def slope(x: FloatArray) -> FloatArray:
+            here = residual(x)
+            return np.stack([(residual(x + step) - here) / _STEP for step in steps], axis=1)
+
+        far, jacobian = (-2.0 * _FAR, 2.0 * _FAR), cast(Any, slope)  # stubs of scipy take no function
+        found = least_squares(residual, np.zeros(len(steps)), jacobian, far, ftol=_ENOUGH, xtol=_ENOUGH)
+        self.residual_k, self.slope = found.fun / root, -found.jac / root[:, None]
+        values, self.directions = np.linalg.eigh(found.jac.T @ found.jac)
+        self.sensitive_k = np.sqrt(np.maximum(values, 0.0))
+        return found.x
 
     def what_cannot_be_told(self, units: Mapping[str, str]) -> str:
         """Return sentences on properties that the readings do not determine; empty if all are determined."""

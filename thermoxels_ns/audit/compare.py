@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.audit.defects import FoundDefect
 from thermoxels_ns.audit.draws import FORMULA, SEED, Draws, Interval, draw, interval_of, uncertain
-from thermoxels_ns.audit.exchange import HALF_STEP_K, part_totals, with_references
+from thermoxels_ns.audit.exchange import part_totals, with_references
 from thermoxels_ns.audit.run import Audit
 from thermoxels_ns.audit.surface import AuditedSurface, alike_triangles
 from thermoxels_ns.core.arrays import FloatArray, IntArray
@@ -25,6 +25,7 @@ _NEAR_M = 0.3  # Surface moves by less: insulation is thinner, and reconstructio
 _FACES = 0.7  # Least cosine between normals of the same surface
 _FITS_M, _UNMATCHED_M = 0.2, 1.0  # Largest median distance of meshes that fit; distance of points without a partner
 _TURN_DEG = 15.0  # Step between the directions in which an alignment starts
+_ALIGN_STEPS = 25  # Steps of each alignment
 _LIKE_BEST = 1.3  # A quite different position that fits as well, but for this factor, makes the alignment ambiguous
 _SEEN_SHARE = 0.2  # Least share of an element that the other survey has seen, too
 _OVERLAP = 0.3  # Least area that two findings of one bridge share, over the geometric mean of their areas
@@ -126,189 +127,144 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
         remedy = "Audit the earlier mesh again with the film of the later conditions."
         got = " and ".join(films)
         raise AuditError("compare", expected="one film model in both surveys", got=got, remedy=remedy)
+    difference_k = difference_k or after.conditions.difference_k
     pose, residual_m, moved = aligned(before.surface, after.surface)
-    return _Compared(before, after, pose).result(difference_k or after.conditions.difference_k, residual_m, moved)
+    there = after.surface
+    counted = [np.flatnonzero(one.surface.counted) for one in (before, after)]
+    at_old = _places(pose(before.surface.centroid_m), before.surface.selection.facet_normal @ pose.turn.T)[counted[0]]
+    at_new = _places(there.centroid_m, there.selection.facet_normal)[counted[1]]
+    earlier = draw(before.conditions, _DRAWS, SEED)
+    later, common = _with_common(before.conditions, after.conditions, earlier)
+    old = _Survey(before, earlier, _partners(len(before.surface.counted), counted[0], at_old, counted[1], at_new))
+    new = _Survey(after, later, _partners(len(there.counted), counted[1], at_new, counted[0], at_old))
+    elements, only_after = new.elements(old)
+    if not elements:
+        expected, remedy = "surface that both surveys saw", "Compare surveys that show the same walls."
+        raise AuditError("compare", expected=expected, got="none", remedy=remedy)
+    bridges, parts = _matched(old, new), list(elements.values())
+    was = old.flows([*map(old.from_other, parts), *(part for _, _, place, _ in bridges for part in place[:2])])
+    now = new.flows([*parts, *(part for _, _, _, place in bridges for part in place[:2])])
+
+    def middle(part: IntArray) -> tuple[float, float, float]:
+        x, y, z = np.average(there.centroid_m[part], axis=0, weights=there.area_m2[part]).tolist()
+        return x, y, z
+
+    def change_of_u(name: str, part: IntArray, before: FloatArray, after: FloatArray, area_m2: float) -> Change:
+        return _change(name, "in both", middle(part), "W/(m2 K)", before, after, area_m2 * difference_k)
+
+    areas, u = now.area_m2[: len(parts)], (was.u, now.u)
+    changes = [change_of_u(name, part, u[0][n], u[1][n], areas[n]) for n, (name, part) in enumerate(elements.items())]
+    mean_was, mean_now = (areas @ one[: len(parts)] / areas.sum() for one in u)
+    found = list[Change]()
+    for n, (bridge, state, (_, _, old_m2), (zone, _, new_m2)) in enumerate(bridges):
+        length, unit = (bridge.length_m, "W/(m K)") if bridge.kind == "line" else (1.0, "W/K")
+        row = len(parts) + 2 * n
+        drawn = (was.extra_w_k(row, old_m2) / length, now.extra_w_k(row, new_m2) / length)
+        patch = (old if state == "went" else new).surface.selection.patch_names[bridge.patch]
+        name = f"{'thermal bridge' if bridge.kind != 'area' else 'defect'} ({bridge.kind}) in {patch}"
+        found.append(_change(name, state, middle(zone), unit, *drawn, length * difference_k))
+    return Comparison(
+        whole=change_of_u("all that both saw", np.concatenate(parts), mean_was, mean_now, float(areas.sum())),
+        elements=_ranked(changes),
+        bridges=_ranked(found),
+        only_before=old.elements(new)[1],
+        only_after=only_after,
+        difference_k=difference_k,
+        common=common,
+        moved=moved,
+        residual_m=residual_m,
+    )
+
+
+Place = tuple[IntArray, IntArray, float]
+"""Triangles of a bridge's zone and of the undisturbed surface near by, and the area without the bridge, [m2]."""
+
+
+class _Flows(NamedTuple):
+    """Heat flows per kelvin through p parts of one survey's surface in k draws."""
+
+    area_m2: FloatArray  # Shape (p,)
+    coupling_w_k: FloatArray  # Shape (p, k)
+    own_w_k: FloatArray  # By how much readings of each part alone change it, shape (p, k)
+
+    @property
+    def u(self) -> FloatArray:
+        """Draws of the U-value of each part, shape (p, k)."""
+        return (self.coupling_w_k + self.own_w_k) / self.area_m2[:, None]
+
+    def extra_w_k(self, zone: int, base_m2: float) -> FloatArray:
+        """Return draws of what part `zone` loses beyond the undisturbed part `zone + 1`, on an area, (k,), [W/K]."""
+        calm = self.coupling_w_k[zone + 1] / max(float(self.area_m2[zone + 1]), 1e-12)
+        return self.coupling_w_k[zone] + self.own_w_k[zone] - calm * base_m2
 
 
 class _Survey:
-    """Couplings of parts of one survey's surface in every draw."""
+    """One survey, its draws, and the triangle of the other survey beside each of its triangles, -1 without one."""
 
     def __init__(self, audit: Audit, draws: Draws, partner: IntArray) -> None:
-        self.audit, self.surface, self.partner = audit, audit.surface, partner
+        self.audit, self.surface, self.partner, self.area_m2 = audit, audit.surface, partner, audit.surface.area_m2
         self.draws = with_references(self.surface, audit.conditions, draws)
-        self.groups, self.area_m2 = alike_triangles(self.surface), audit.surface.area_m2
-        self.parts = list[IntArray]()
-
-    def add(self, which: IntArray) -> int:
-        """Add a part, indices of triangles that count; return its number."""
-        self.parts.append(which)
-        return len(self.parts) - 1
+        pairs = zip(audit.defects, audit.found)
+        self.bridges = [bridge for defect, bridge in pairs if not defect.not_counted]
 
     def from_other(self, which: IntArray) -> IntArray:
         """Return the triangles whose partners in the other survey are among `which`."""
         return np.flatnonzero(np.isin(self.partner, which))
 
-    def finish(self) -> None:
-        """Compute flow per kelvin, (parts, k), [W/K], and how readings change it, (parts,)."""
-        conditions, rows = self.audit.conditions, self.groups.rows(self.parts, self.area_m2)
-        totals = part_totals(conditions, self.groups, self.draws, rows)
-        low, high = (
-            part_totals(conditions, self.groups, self.draws.stated, rows, step).flow_w[:, 0]
-            for step in (-HALF_STEP_K, HALF_STEP_K)
-        )
-        self.total_m2, slope = totals.area_m2, (high - low) / (2.0 * HALF_STEP_K)
-        off = conditions.camera.repeatability.off_by
-        own = np.stack([slope[n] * self.draws.local(off, n) for n in range(len(self.parts))])
-        self.coupling_w_k, self.own_w_k = totals.flow_w / self.draws.difference_k, own / self.draws.difference_k
-
-    def u(self, part: int) -> FloatArray:
-        """Return draws of the U-value of a part, shape (k,)."""
-        return (self.coupling_w_k[part] + self.own_w_k[part]) / self.total_m2[part]
-
-    def extra_w_k(self, zone: int, base_m2: float) -> FloatArray:
-        """Return draws of what part `zone` loses beyond the undisturbed part `zone + 1`, on an area, (k,), [W/K]."""
-        calm = self.coupling_w_k[zone + 1] / max(float(self.total_m2[zone + 1]), 1e-12)
-        return self.coupling_w_k[zone] + self.own_w_k[zone] - calm * base_m2
-
-
-class _Compared:
-    """The surface that two surveys share, and draws of both, in which common causes are the same."""
-
-    def __init__(self, before: Audit, after: Audit, pose: Pose) -> None:
-        self.moved_m = pose(before.surface.centroid_m)
-        normal, there = before.surface.selection.facet_normal @ pose.turn.T, after.surface
-        old, new = (np.flatnonzero(one.counted) for one in (before.surface, there))
-        at_old = _places(self.moved_m[old], normal[old])
-        at_new = _places(there.centroid_m[new], there.selection.facet_normal[new])
-        earlier = draw(before.conditions, _DRAWS, SEED)
-        later, self.common = _with_common(before.conditions, after.conditions, earlier)
-        self.old = _Survey(before, earlier, _partners(len(normal), old, at_old, new, at_new))
-        self.new = _Survey(after, later, _partners(len(there.counted), new, at_new, old, at_old))
-
-    def result(self, difference_k: float, residual_m: float, moved: bool) -> Comparison:
-        """Return the comparison; the other arguments are fields of it."""
-        old, new = self.old, self.new
-        elements, only_after = self._elements(new, old)
-        _, only_before = self._elements(old, new)
-        if not elements:
-            expected, remedy = "surface that both surveys saw", "Compare surveys that show the same walls."
-            raise AuditError("compare", expected=expected, got="none", remedy=remedy)
-        numbers = [
-            (name, old.add(old.from_other(part)), new.add(part), self._middle(part)) for name, part in elements.items()
-        ]
-        bridges = self._bridges()
-        old.finish()
-        new.finish()
-        changes, pairs = list[Change](), list[tuple[FloatArray, FloatArray]]()
-        for name, first, second, at in numbers:
-            pairs.append((old.u(first), new.u(second)))
-            area = float(new.total_m2[second])
-            changes.append(_change(name, "in both", at, "W/(m2 K)", *pairs[-1], area * difference_k))
-        areas = np.array([new.total_m2[second] for _, _, second, _ in numbers])
-        was, now = (np.einsum("p,pk->k", areas, np.stack(one)) / areas.sum() for one in zip(*pairs))
-        at = self._middle(np.concatenate([*elements.values()]))
-        whole = _change("all that both saw", "in both", at, "W/(m2 K)", was, now, float(areas.sum()) * difference_k)
-        found = [self._bridge(difference_k, *one) for one in bridges]
-        return Comparison(
-            whole=whole,
-            elements=_ranked(changes),
-            bridges=_ranked(found),
-            only_before=only_before,
-            only_after=only_after,
-            difference_k=difference_k,
-            common=self.common,
-            moved=moved,
-            residual_m=residual_m,
-        )
-
-    def _elements(self, one: _Survey, other: _Survey) -> tuple[dict[str, IntArray], tuple[str, ...]]:
-        """Return the triangles of each patch of a survey that the other saw, too, and names of patches it did not."""
-        shared, alone = dict[str, IntArray](), list[str]()
-        patch, names = one.surface.selection.facet_patch, one.surface.selection.patch_names
-        for number in np.unique(patch[one.surface.counted]):
-            every = np.flatnonzero(one.surface.counted & (patch == number))
-            part = every[one.partner[every] >= 0]
-            seen = one.area_m2[part].sum() >= _SEEN_SHARE * one.area_m2[every].sum()
+    def elements(self, other: _Survey) -> tuple[dict[str, IntArray], tuple[str, ...]]:
+        """Return the triangles of each patch that the other survey saw, too, and names of patches it did not."""
+        shared, alone, counted = dict[str, IntArray](), list[str](), self.surface.counted
+        patch, names = self.surface.selection.facet_patch, self.surface.selection.patch_names
+        for number in np.unique(patch[counted]):
+            every = np.flatnonzero(counted & (patch == number))
+            part = every[self.partner[every] >= 0]
+            seen = self.area_m2[part].sum() >= _SEEN_SHARE * self.area_m2[every].sum()
             if seen and len(other.from_other(part)):
                 shared[names[number]] = part
             else:
                 alone.append(names[number])
         return shared, tuple(alone)
 
-    def _bridges(self) -> list[tuple[FoundDefect, State, int, float, int, float]]:
-        """Add zones and references of bridges; return the bridge, its state, and part and base area in both surveys."""
-        old, new, found = self.old, self.new, list[tuple[FoundDefect, State, int, float, int, float]]()
-        counted = [
-            [bridge for defect, bridge in zip(one.audit.defects, one.audit.found) if not defect.not_counted]
-            for one in (old, new)
+    def place_of(self, bridge: FoundDefect, found_by: _Survey) -> Place | None:
+        """Return where a bridge that the other survey found lies in this one; None if this one did not see it."""
+        zone, calm = self.from_other(bridge.zone), self.from_other(bridge.reference)
+        share = float(self.area_m2[zone].sum() / found_by.area_m2[bridge.zone].sum())
+        return (zone, calm, bridge.base_area_m2 * share) if share >= 0.5 and len(calm) else None
+
+    def mostly_in(self, bridge: FoundDefect, others: Sequence[FoundDefect]) -> bool:
+        """Return whether most of a bridge lies in `others`, of the other survey, which may have found two as one."""
+        cores = [np.zeros(0, np.int64), *(one.core for one in others)]
+        inside = np.isin(self.partner[bridge.core], np.concatenate(cores))
+        return bool(self.area_m2[bridge.core[inside]].sum() >= 0.5 * self.area_m2[bridge.core].sum())
+
+    def flows(self, parts: list[IntArray]) -> _Flows:
+        """Return flows through parts, indices of triangles that count."""
+        conditions, groups = self.audit.conditions, alike_triangles(self.surface)
+        totals = part_totals(conditions, groups, self.draws, groups.rows(parts, self.area_m2))
+        off, difference_k = conditions.camera.repeatability.off_by, self.draws.difference_k
+        own = np.stack([totals.slope_w_k[n] * self.draws.local(off, n) for n in range(len(parts))])
+        return _Flows(totals.area_m2, totals.flow_w / difference_k, own / difference_k)
+
+
+def _matched(old: _Survey, new: _Survey) -> list[tuple[FoundDefect, State, Place, Place]]:
+    """Return the bridges of two surveys, each with its state and its place in the earlier and in the later survey."""
+    found, left = list[tuple[FoundDefect, State, Place, Place]](), list(old.bridges)
+    for bridge in new.bridges:
+        own = bridge.zone, bridge.reference, bridge.base_area_m2
+        size, on = new.area_m2[bridge.core].sum(), new.partner[bridge.core]
+        share = [
+            new.area_m2[bridge.core[np.isin(on, one.core)]].sum() / np.sqrt(size * old.area_m2[one.core].sum())
+            for one in left
         ]
-        left = list(counted[0])
-        cores = [np.concatenate([np.zeros(0, np.int64), *(bridge.core for bridge in some)]) for some in counted]
-
-        def part_of_one(bridge: FoundDefect, here: _Survey, others: IntArray) -> bool:
-            """True if most of a bridge lies in bridges of the other survey, which may have found two as one."""
-            inside = np.isin(here.partner[bridge.core], others)
-            return bool(here.area_m2[bridge.core[inside]].sum() >= 0.5 * here.area_m2[bridge.core].sum())
-
-        for bridge in counted[1]:
-            size, on = new.area_m2[bridge.core].sum(), new.partner[bridge.core]
-            share = [
-                new.area_m2[bridge.core[np.isin(on, one.core)]].sum() / np.sqrt(size * old.area_m2[one.core].sum())
-                for one in left
-            ]
-            if share and max(share) >= _OVERLAP:
-                same = left.pop(int(np.argmax(share)))
-                parts = (*_own(old, same), *_own(new, bridge))
-                found.append((bridge, "in both", *parts))
-            elif part_of_one(bridge, new, cores[0]):
-                continue
-            elif (elsewhere := _transferred(old, new, bridge)) is not None:
-                found.append((bridge, "appeared", *elsewhere, *_own(new, bridge)))
-        for bridge in left:
-            if part_of_one(bridge, old, cores[1]):
-                continue
-            if (elsewhere := _transferred(new, old, bridge)) is not None:
-                found.append((bridge, "went", *_own(old, bridge), *elsewhere))
-        return found
-
-    def _bridge(
-        self,
-        difference_k: float,
-        bridge: FoundDefect,
-        state: State,
-        first: int,
-        base: float,
-        second: int,
-        new_base: float,
-    ) -> Change:
-        length, unit = (bridge.length_m, "W/(m K)") if bridge.kind == "line" else (1.0, "W/K")
-        draws = (self.old.extra_w_k(first, base) / length, self.new.extra_w_k(second, new_base) / length)
-        names = (self.old if state == "went" else self.new).surface.selection.patch_names
-        at = self._middle(self.new.parts[second])
-        name = f"{'thermal bridge' if bridge.kind != 'area' else 'defect'} ({bridge.kind}) in {names[bridge.patch]}"
-        return _change(name, state, at, unit, *draws, length * difference_k)
-
-    def _middle(self, part: IntArray) -> tuple[float, float, float]:
-        surface = self.new.surface
-        x, y, z = np.average(surface.centroid_m[part], axis=0, weights=surface.area_m2[part]).tolist()
-        return x, y, z
-
-
-def _own(survey: _Survey, bridge: FoundDefect) -> tuple[int, float]:
-    zone = survey.add(bridge.zone)
-    survey.add(bridge.reference)
-    return zone, bridge.base_area_m2
-
-
-def _transferred(survey: _Survey, found_by: _Survey, bridge: FoundDefect) -> tuple[int, float] | None:
-    """Add the zone and the reference of a bridge that the other survey found; None if this one did not see them."""
-    zone, calm = survey.from_other(bridge.zone), survey.from_other(bridge.reference)
-    area, wanted = survey.area_m2[zone].sum(), found_by.area_m2[bridge.zone].sum()
-    if area < 0.5 * wanted or not len(calm):
-        return None
-    number = survey.add(zone)
-    survey.add(calm)
-    return number, bridge.base_area_m2 * float(area / wanted)
+        if share and max(share) >= _OVERLAP:
+            same = left.pop(int(np.argmax(share)))
+            found.append((bridge, "in both", (same.zone, same.reference, same.base_area_m2), own))
+        elif not new.mostly_in(bridge, old.bridges) and (elsewhere := old.place_of(bridge, new)) is not None:
+            found.append((bridge, "appeared", elsewhere, own))
+    for bridge in left:
+        if not old.mostly_in(bridge, new.bridges) and (elsewhere := new.place_of(bridge, old)) is not None:
+            found.append((bridge, "went", (bridge.zone, bridge.reference, bridge.base_area_m2), elsewhere))
+    return found
 
 
 def _change(
@@ -374,7 +330,7 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
     (points, normals), (target, facing) = (_samples(one) for one in (before, after))
     tree = KDTree(_places(target, facing))
 
-    def distances(pose: Pose, points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    def distances(pose: Pose) -> tuple[FloatArray, FloatArray, IntArray]:
         moved, turned = pose(points), normals @ pose.turn.T
         nearest = np.asarray(tree.query(_places(moved, turned))[1], dtype=np.int64)
         along = np.einsum("ij,ij->i", target[nearest] - moved, facing[nearest])
@@ -383,12 +339,12 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
         return np.where(lost, _UNMATCHED_M, along), moved, nearest
 
     def residual(pose: Pose) -> tuple[float, float]:  # the mean tells what a notch or a balcony shows, the median not
-        off = np.abs(distances(pose, points, normals)[0])
+        off = np.abs(distances(pose)[0])
         return float(np.mean(off)), float(np.median(off))
 
-    def refined(pose: Pose, steps: int, some: slice) -> Pose:
-        for _ in range(steps):
-            along, moved, nearest = distances(pose, points[some], normals[some])
+    def refined(pose: Pose) -> Pose:
+        for _ in range(_ALIGN_STEPS):
+            along, moved, nearest = distances(pose)
             kept = np.argsort(np.abs(along))[: (2 * len(along)) // 3]
             towards, middle = facing[nearest[kept]], moved[kept].mean(axis=0)
             matrix = np.concatenate([np.cross(moved[kept] - middle, towards), towards], axis=1)
@@ -411,10 +367,9 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
     for degrees in np.arange(0.0, 360.0, _TURN_DEG):
         turn = Rotation.from_rotvec(np.radians(degrees) * up[1]).as_matrix() @ upright
         start = Pose(turn, target.mean(axis=0) - turn @ points.mean(axis=0))
-        pose = refined(start, 12, slice(None, None, 4))
+        pose = refined(start)
         tried.append((*residual(pose), pose))
-    poses = [refined(pose, 15, slice(None)) for _, _, pose in _first(tried)]
-    tried = sorted(((*residual(one), one) for one in poses), key=_mean)
+    tried.sort(key=lambda one: one[0])
     best, median, pose = tried[0]
     if given <= _FITS_M and mean <= 1.5 * best:
         return as_given, given, False
@@ -428,19 +383,6 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
         remedy = "Pose the photographs of both surveys together, so that both meshes have the same coordinates."
         raise AuditError("compare", expected="one position in which the meshes fit", got=got, remedy=remedy)
     return pose, median, True
-
-
-def _mean(one: tuple[float, float, Pose]) -> float:
-    return one[0]
-
-
-def _first(tried: list[tuple[float, float, Pose]]) -> list[tuple[float, float, Pose]]:
-    """Return the best six of the poses tried, no two of them alike."""
-    chosen = list[tuple[float, float, Pose]]()
-    for one in sorted(tried, key=_mean):
-        if all(_turned_deg(one[2], other[2]) > 0.5 * _TURN_DEG for other in chosen):
-            chosen.append(one)
-    return chosen[:6]
 
 
 def _turned_deg(one: Pose, other: Pose) -> float:

@@ -13,13 +13,14 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 from pydantic import Field
 
-from thermoxels_ns.audit.heat_flow import CONVECTION
+from thermoxels_ns.audit.heat_flow import CONVECTION, SIMPLE
 from thermoxels_ns.audit.weather import survey_weather, with_weather
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured, Unit
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, record
+from thermoxels_ns.heat.scene_fields import check_one, check_only_if
 from thermoxels_ns.heat.weather_file import ALL_AROUND_DEG
 
 Share: TypeAlias = Annotated[Measured, Unit("1")]
@@ -35,14 +36,9 @@ FilmModel: TypeAlias = str
 """Name of a model of heat exchange at a surface; the formulas stand in `thermoxels_ns.audit.heat_flow`."""
 
 BALANCE: FilmModel = "balance"  # Radiation to what each triangle sees, and convection by formulas that are drawn
-SIMPLE: Mapping[Side, tuple[FilmModel, ...]] = {
-    "outside": ("iso-6946-combined", "albatici-tonelli", "dallo"),
-    "inside": ("iso-6946-combined",),
-}
-"""Models that take all that a surface sees to be as warm as the air."""
 FILM_MODELS: Mapping[Side, tuple[FilmModel, ...]] = {
     "outside": (BALANCE, *CONVECTION["outside"], *SIMPLE["outside"], "given"),
-    "inside": (BALANCE, *CONVECTION["inside"], "madding", *SIMPLE["inside"], "given"),
+    "inside": (BALANCE, *CONVECTION["inside"], *SIMPLE["inside"], "given"),
 }
 WINDLESS: tuple[FilmModel, ...] = ("iso-6946-combined", "given")  # Need no wind speed for an outer surface
 
@@ -111,10 +107,7 @@ class Surroundings:
     ground: Temperature | None = None  # Temperature of the ground below a sky; None: as warm as the outside air
 
     def __post_init__(self) -> None:
-        if (self.reflected is None) == (self.sky is None):
-            got = "neither" if self.sky is None else "both"
-            remedy = "Write reflected: -3 +- 3 C, or sky: {cloud: 0.3 +- 0.1, dew_point: -4 +- 1 C}."
-            raise AuditError("", expected="either reflected or sky", got=got, remedy=remedy)
+        check_one(reflected=self.reflected, sky=self.sky)
         if self.ground is not None and self.sky is None:
             remedy = "Remove ground, or give a sky instead of reflected."
             raise AuditError("ground", expected="none beside reflected", got="one", remedy=remedy)
@@ -132,11 +125,7 @@ class Film:
     """Model balance only: how often each formula of convection is drawn, by name; the others are not drawn."""
 
     def __post_init__(self) -> None:
-        if (self.model == "given") != (self.coefficient is not None):
-            expected = "one beside the model given, and none beside others"
-            remedy = "Add coefficient: 8 +- 1 W/(m2 K) and model: given, or remove both."
-            got = "none" if self.coefficient is None else f"one beside {self.model}"
-            raise AuditError("coefficient", expected=expected, got=got, remedy=remedy)
+        check_only_if("coefficient", self.coefficient, self.model == "given", f"model: {self.model}")
         if self.weights and (self.model != BALANCE or not 0.0 < sum(self.weights.values()) < math.inf):
             got = f"weights beside {self.model}" if self.model != BALANCE else "none above 0"
             remedy = f"Write model: {BALANCE} and weights: {{iso-6946: 1}}, or remove the weights."
@@ -216,15 +205,9 @@ class Energy:
     measures: dict[str, Measure] = field(default_factory=dict)  # By name; each alone, on the envelope as it is
 
     def __post_init__(self) -> None:
-        if (self.degree_hours is None) == (self.climate is None):
-            got = "neither" if self.climate is None else "both"
-            remedy = "Write climate: place.epw, or degree_hours: 80000 +- 5000 K h."
-            raise AuditError("", expected="either climate or degree_hours", got=got, remedy=remedy)
+        check_one(climate=self.climate, degree_hours=self.degree_hours)
         for name, value in (("inside", self.inside), ("heating_limit", self.heating_limit)):
-            if (value is None) != (self.climate is None):
-                expected, got = "one beside climate, and none beside degree_hours", "none" if value is None else "one"
-                remedy = f"Add {name}: {20 if name == 'inside' else 15} +- 1 C." if value is None else f"Remove {name}."
-                raise AuditError(name, expected=expected, got=got, remedy=remedy)
+            check_only_if(name, value, self.climate is not None, "climate" if self.climate else "degree_hours")
         if self.inside is not None and self.heating_limit is not None and self.heating_limit.high > self.inside.low:
             expected, got = "surely at most the air inside", f"{self.heating_limit.high:g} above {self.inside.low:g} C"
             remedy = "Write the outside air above which nobody heats, such as 15 C."

@@ -1,18 +1,16 @@
-"""The envelope of an audited building for energy programs, with U-values, as HBJSON and as gbXML."""
+"""The envelope of an audited building for energy programs, with U-values, and as HBJSON."""
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.audit.draws import CONFIDENCE, Interval
+from thermoxels_ns.audit.draws import Interval
 from thermoxels_ns.audit.run import Audit
-from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.mesh.boundary.planes import Building, FlatElement, plane_axes
+from thermoxels_ns.mesh.boundary.planes import Building, FlatElement
 
 SHGC = 0.6
 """Share of the sun's heat that windows are assumed to let in: HBJSON demands a number that no thermal image tells."""
@@ -109,69 +107,3 @@ def hbjson(envelope: Envelope, title: str) -> dict[str, Any]:
         "rooms": [{"type": "Room", "identifier": "building", "faces": faces, "properties": inside}],
         "properties": {"type": "ModelProperties", "energy": energy},
     }
-
-
-def gbxml(envelope: Envelope, title: str) -> bytes:
-    """Return a building of one space as gbXML 6.01; intervals of U-values are in descriptions of constructions."""
-    building = envelope.building
-    units = {"temperatureUnit": "C", "lengthUnit": "Meters", "areaUnit": "SquareMeters", "volumeUnit": "CubicMeters"}
-    units |= {"useSIUnitsForResults": "true", "version": "6.01", "xmlns": "http://www.gbxml.org/schema"}
-    root = ElementTree.Element("gbXML", units)
-
-    def add(
-        parent: ElementTree.Element, tag: str, text: str | float | None = None, **given: str
-    ) -> ElementTree.Element:
-        made = ElementTree.SubElement(parent, tag, given)
-        made.text = text if text is None or isinstance(text, str) else f"{text:.4f}"
-        return made
-
-    def point(parent: ElementTree.Element, at_m: FloatArray) -> None:
-        made = add(parent, "CartesianPoint")
-        for value in at_m.tolist():
-            add(made, "Coordinate", value)
-
-    def shape(parent: ElementTree.Element, one: FlatElement) -> None:
-        axes = plane_axes(one.normal)
-        low, high = np.array(one.flat().bounds).reshape(2, 2)
-        rectangle = add(parent, "RectangularGeometry")
-        add(rectangle, "Azimuth", one.azimuth_deg)
-        point(rectangle, axes @ low + (one.outline_m[0] @ one.normal) * one.normal)
-        for tag, value in {"Tilt": one.tilt_deg, "Height": high[1] - low[1], "Width": high[0] - low[0]}.items():
-            add(rectangle, tag, float(value))
-        loop = add(add(parent, "PlanarGeometry"), "PolyLoop")
-        for corner in one.outline_m:
-            point(loop, corner)
-
-    campus = add(root, "Campus", id="campus")
-    add(add(campus, "Location"), "ZipcodeOrPostalCode", "unknown")
-    house = add(campus, "Building", id="building", buildingType="Unknown")
-    add(house, "Name", title or "audited building")
-    floor_m2 = sum(one.net_area_m2 for one in building.elements if one.kind == "floor")
-    add(house, "Area", floor_m2)
-    space = add(house, "Space", id="space")
-    add(space, "Area", floor_m2)
-    add(space, "Volume", building.volume_m3)
-    kinds = {"roof": "Roof", "wall": "ExteriorWall", "floor": "RaisedFloor"}
-    for one in building.elements:
-        kind = {"air": kinds.get(one.kind, ""), "ground": "SlabOnGrade", "cover": "InteriorWall"}[one.behind]
-        surface = add(campus, "Surface", id=one.name, surfaceType=kind, constructionIdRef=f"{one.name}-construction")
-        add(surface, "AdjacentSpaceId", spaceIdRef="space")
-        shape(surface, one)
-        for hole in one.openings:
-            window = hole.kind == "window"
-            made = {"windowTypeIdRef" if window else "constructionIdRef": f"{hole.name}-construction"}
-            kind = "OperableWindow" if window else "NonSlidingDoor"
-            shape(add(surface, "Opening", id=hole.name, openingType=kind, **made), hole)
-    for one in building.every():
-        made = add(root, "WindowType" if one.kind == "window" else "Construction", id=f"{one.name}-construction")
-        add(made, "Name", one.name)
-        interval = envelope.u[one.name]
-        if interval is None:
-            add(made, "Description", "U-value not measured")
-        else:
-            ends = f"{interval.low:.2f} to {interval.high:.2f} W/(m2 K), {100 * CONFIDENCE:.0f} %"
-            add(made, "Description", f"U-value measured by thermography: {ends}")
-            if interval.value > 0.0:
-                add(made, "U-value", float(interval.value), unit="WPerSquareMeterK")
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)

@@ -13,10 +13,8 @@ from thermoxels_ns.audit.conditions import BALANCE, FILM_MODELS, WINDLESS, Condi
 from thermoxels_ns.audit.draws import FORMULA, Draws, emissivity_name
 from thermoxels_ns.audit.heat_flow import (
     CONVECTION,
-    albatici_tonelli_w_m2,
-    dallo_w_m2,
+    SIMPLE,
     fourth_power,
-    madding_w_m2,
     net_radiation_w_m2,
     reading_k,
     sky_emissivity,
@@ -27,8 +25,7 @@ from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
-from thermoxels_ns.fem.quantities import Places
-from thermoxels_ns.heat.scene_fields import inside_coefficient, outside_coefficient
+from thermoxels_ns.heat.scene_fields import OUTSIDE_RESISTANCE_M2K_W
 
 CHUNK = 400_000  # Values, groups times draws, of one array that are in memory at the same time
 HALF_STEP_K = 0.05  # Half the step of difference quotients with respect to readings, [K]
@@ -50,6 +47,7 @@ class PartTotals(NamedTuple):
     area_m2: FloatArray  # Area, shape (p,), [m2]
     surface_c: FloatArray  # Mean surface temperature, shape (p, k), [degrees Celsius]
     flow_w: FloatArray  # Heat flow from inside to outside, shape (p, k), [W]
+    slope_w_k: FloatArray  # Change of the stated flow per kelvin that all readings of a part are higher, shape (p,)
 
 
 def exchange(conditions: Conditions, groups: AlikeTriangles, draws: Draws, warmer_k: float = 0.0) -> Exchange:
@@ -59,11 +57,17 @@ def exchange(conditions: Conditions, groups: AlikeTriangles, draws: Draws, warme
     """
     emissivity = np.stack([draws[emissivity_name(conditions, n)] for n in range(len(conditions.surfaces))])
     emissivity = emissivity[groups.surface_entry]
-    around_k4 = radiant_k4(conditions, draws, groups.normal, groups.up)
+    around_k4 = radiant_k4(conditions, draws, groups.upward)
     reading_k = celsius_to_kelvin(groups.reading_c + warmer_k)[:, None] + draws["camera offset"]
     surface_k = surface_temperature_k(reading_k, emissivity, around_k4, *_camera_settings(draws))
-    flow = film_flow_w_m2(conditions, draws, surface_k, around_k4, emissivity, groups.normal, groups.up)
+    flow = film_flow_w_m2(conditions, draws, surface_k, around_k4, emissivity, groups.upward)
     return Exchange(surface_k - ZERO_CELSIUS_K, flow)
+
+
+def slopes(conditions: Conditions, groups: AlikeTriangles, draws: Draws) -> Exchange:
+    """Return by how much an `exchange` of the stated values changes per kelvin of readings, shape (g, 1)."""
+    low, high = (exchange(conditions, groups, draws.stated, step) for step in (-HALF_STEP_K, HALF_STEP_K))
+    return Exchange(*((above - below) / (2.0 * HALF_STEP_K) for below, above in zip(low, high)))
 
 
 def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
@@ -72,22 +76,19 @@ def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
     return draws["emissivity set in the camera"], celsius_to_kelvin(reflected_c)
 
 
-def part_totals(
-    conditions: Conditions, groups: AlikeTriangles, draws: Draws, rows: sparse.csr_array, warmer_k: float = 0.0
-) -> PartTotals:
-    """Return totals of p parts, whose `AlikeTriangles.rows` are `rows`, (2 p, g); `warmer_k`: see `exchange`."""
+def part_totals(conditions: Conditions, groups: AlikeTriangles, draws: Draws, rows: sparse.csr_array) -> PartTotals:
+    """Return totals of p parts, whose `AlikeTriangles.rows` are `rows`, (2 p, g)."""
     parts = (len(rows.indptr) - 1) // 2
     area, off = rows[:parts].tocsc(), rows[parts:]
     total = np.asarray(area.sum(axis=1)).reshape(-1, 1)
-    low, high = (exchange(conditions, groups, draws.stated, warmer_k + step) for step in (-HALF_STEP_K, HALF_STEP_K))
-    temperature, flow_w = (
-        np.repeat(off @ (above - below) / (2.0 * HALF_STEP_K), draws.count, axis=1) for below, above in zip(low, high)
-    )
+    slope = slopes(conditions, groups, draws)
+    temperature, flow_w = (np.repeat(off @ one, draws.count, axis=1) for one in slope)
     for part in chunks(len(groups.reading_c), draws):
-        some = exchange(conditions, groups.some(part), draws, warmer_k)
+        some = exchange(conditions, groups.some(part), draws)
         flow_w += area[:, part] @ some.flow_w_m2
         temperature += area[:, part] @ some.surface_c
-    return PartTotals(total[:, 0], temperature / np.where(total > 0.0, total, 1.0), flow_w)
+    mean_c = temperature / np.where(total > 0.0, total, 1.0)
+    return PartTotals(total[:, 0], mean_c, flow_w, (area @ slope.flow_w_m2)[:, 0])
 
 
 def chunks(count: int, draws: Draws) -> Iterator[slice]:
@@ -103,26 +104,22 @@ def triangle_exchange(
 
     Both follow from the first draw, the stated values. Both are NaN where a triangle does not count.
     """
-    steps = (-HALF_STEP_K, 0.0, HALF_STEP_K)
-    low, mean, high = (exchange(conditions, groups, draws, step) for step in steps)
-    off = groups.off_k / (2.0 * HALF_STEP_K)
+    of, pairs = groups.of_triangle, zip(exchange(conditions, groups, draws), slopes(conditions, groups, draws))
     temperature, flow = (
-        np.where(surface.counted, at[groups.of_triangle, 0] + off * (above - below)[groups.of_triangle, 0], np.nan)
-        for below, at, above in zip(low, mean, high)
+        np.where(surface.counted, mean[of, 0] + groups.off_k * slope[of, 0], np.nan) for mean, slope in pairs
     )
     return temperature, flow
 
 
-def radiant_k4(conditions: Conditions, draws: Draws, normals: FloatArray, up: tuple[float, float, float]) -> FloatArray:
-    """Return the fourth power of the surroundings' radiant temperature, (g, k), [K^4], for normals of shape (g, 3)."""
+def radiant_k4(conditions: Conditions, draws: Draws, upward: FloatArray) -> FloatArray:
+    """Return the fourth power of the surroundings' radiant temperature, (g, k), [K^4]; `upward`: see `view_shares`."""
     if conditions.surroundings.sky is None:
-        return np.broadcast_to(
-            fourth_power(celsius_to_kelvin(draws["reflected temperature"])), (len(normals), draws.count)
-        )
+        reflected_k4 = fourth_power(celsius_to_kelvin(draws["reflected temperature"]))
+        return np.broadcast_to(reflected_k4, (len(upward), draws.count))
     air_k4 = fourth_power(celsius_to_kelvin(draws["outside air"]))
     sky_k4 = sky_emissivity(draws["dew point"], draws["cloud"]) * air_k4
     ground_k4 = fourth_power(celsius_to_kelvin(draws.values.get("ground", draws["outside air"])))
-    return view_shares(normals, up) @ np.stack([sky_k4, air_k4, ground_k4])
+    return view_shares(upward) @ np.stack([sky_k4, air_k4, ground_k4])
 
 
 def film_flow_w_m2(
@@ -131,37 +128,26 @@ def film_flow_w_m2(
     surface_k: FloatArray,
     around_k4: FloatArray,
     emissivity: FloatArray,
-    normals: FloatArray,
-    up: tuple[float, float, float],
+    upward: FloatArray,
 ) -> FloatArray:
     """Return the heat flow from inside to outside by the film model, shape (g, k), [W/m2].
 
-    `surface_k`, `around_k4` (see `radiant_k4`) and `emissivity` have shape (g, k), `normals` has shape (g, 3).
+    `surface_k`, `around_k4` (see `radiant_k4`) and `emissivity` have shape (g, k), `upward` (see `view_shares`) (g,).
     """
-    model, factor = conditions.film.model, draws["film factor"]
-    inside = conditions.side == "inside"
+    model, inside = conditions.film.model, conditions.side == "inside"
     air_k = celsius_to_kelvin(draws["inside air" if inside else "outside air"])
-    if model == "albatici-tonelli":
-        return albatici_tonelli_w_m2(emissivity, draws["wind"], surface_k, air_k, factor)
-    if model == "dallo":
-        return dallo_w_m2(draws["wind"], surface_k, air_k, factor)
-    if model == "madding":
-        return madding_w_m2(emissivity, surface_k, np.sqrt(np.sqrt(around_k4)), air_k, factor)
-    outward = -1.0 if inside else 1.0
-    combined = model == "iso-6946-combined"
+    warmer_k, upward = surface_k - air_k, upward[:, None]
+    simple = SIMPLE[conditions.side].get(model)
     if model == "given":
         coefficient = draws["film coefficient"]
-    elif inside and combined:
-        here = Places(np.zeros_like(normals), normals, up)
-        coefficient = np.asarray(inside_coefficient("iso-6946-combined").function(here, 0.0))[:, None]
-    elif combined:
-        coefficient = outside_coefficient("iso-6946-combined")
+    elif simple is not None:
+        coefficient = simple.w_m2k(draws.values.get("wind", np.zeros(draws.count)), warmer_k, upward)
     else:
-        coefficient = _convection_w_m2k(conditions, draws, surface_k - air_k, (normals @ np.array(up))[:, None])
-    flow = outward * factor * coefficient * (surface_k - air_k)
-    if not combined:
-        flow = flow + outward * net_radiation_w_m2(emissivity, surface_k, around_k4)
-    return flow
+        coefficient = _convection_w_m2k(conditions, draws, warmer_k, upward)
+    flow = draws["film factor"] * coefficient * warmer_k
+    if simple is None or simple.radiates != "included":
+        flow = flow + net_radiation_w_m2(emissivity, surface_k, around_k4 if simple is None else fourth_power(air_k))
+    return -flow if inside else flow
 
 
 def _convection_w_m2k(conditions: Conditions, draws: Draws, warmer_k: FloatArray, upward: FloatArray) -> FloatArray:
@@ -198,10 +184,9 @@ def most_u_w_m2k(surface: AuditedSurface, conditions: Conditions, which: IntArra
     1 / (Rsi + Rse) of ISO 6946, by the direction in which heat flows through each of the triangles `which`; the mean by
     area. A larger U-value is impossible: an input clashes with the readings.
     """
-    normal = surface.selection.facet_normal[which] * (-1.0 if conditions.side == "outside" else 1.0)
-    inner = Places(np.zeros_like(normal), normal, surface.selection.up)
-    inside = np.asarray(inside_coefficient("iso-6946-combined").function(inner, 0.0))
-    allowed = 1.0 / (1.0 / inside + 1.0 / outside_coefficient("iso-6946-combined"))
+    upward = surface.upward[which] * (-1.0 if conditions.side == "outside" else 1.0)
+    inside = SIMPLE["inside"]["iso-6946-combined"].w_m2k(0.0, 0.0, upward)
+    allowed = 1.0 / (1.0 / inside + OUTSIDE_RESISTANCE_M2K_W)
     return float(np.average(allowed, weights=surface.area_m2[which]))
 
 
@@ -214,15 +199,14 @@ def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draw
     """
     if not conditions.references:
         return draws
-    up, offsets = surface.selection.up, []
+    offsets = []
     for number in range(len(conditions.references)):
         near = _near(surface, conditions, number)
         area = surface.area_m2[near]
-        normal = area @ surface.selection.facet_normal[near]
-        normal = (normal / np.linalg.norm(normal))[None]
+        upward = np.atleast_1d(np.average(surface.upward[near], weights=area))
         emissivity = draws[emissivity_name(conditions, int(surface.surface_entry[near[0]]))]
         contact_k = celsius_to_kelvin(draws[f"contact temperature {number + 1}"])
-        around_k4 = radiant_k4(conditions, draws, normal, up)[0]
+        around_k4 = radiant_k4(conditions, draws, upward)[0]
         needed_k = reading_k(contact_k, emissivity, around_k4, *_camera_settings(draws))
         read_k = celsius_to_kelvin(float(np.average(surface.reading_c[near], weights=area)))
         own = draws.local(conditions.camera.repeatability.off_by, _OF_A_REFERENCE + number)

@@ -6,15 +6,14 @@ unless the name ends in `_c`; arguments broadcast."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4
-from thermoxels_ns.heat.scene_fields import INSIDE_CONVECTION_W_M2K
-from thermoxels_ns.heat.sky import ground_view, sky_view
+from thermoxels_ns.heat.scene_fields import INSIDE_CONVECTION_W_M2K, INSIDE_RESISTANCE_M2K_W, OUTSIDE_RESISTANCE_M2K_W
 
 Values: TypeAlias = Any  # A number or an array
 
@@ -26,30 +25,12 @@ def fourth_power(values: Values) -> Values:
     return np.square(np.square(values))
 
 
-def radiation_w_m2(emissivity: Values, surface_k: Values, surroundings_k: Values) -> Values:
-    """Return the net radiation that leaves a surface, eps sigma (Ts^4 - Trefl^4) (Fokaides and Kalogirou 2011)."""
-    return net_radiation_w_m2(emissivity, surface_k, fourth_power(surroundings_k))
-
-
 def net_radiation_w_m2(emissivity: Values, surface_k: Values, surroundings_k4: Values) -> Values:
-    """Return `radiation_w_m2` from the fourth power of the temperature of the surroundings, [K^4]."""
-    return emissivity * STEFAN_BOLTZMANN_W_M2K4 * (fourth_power(surface_k) - surroundings_k4)
+    """Return the net radiation that leaves a surface, eps sigma (Ts^4 - Trefl^4) (Fokaides and Kalogirou 2011).
 
-
-def albatici_tonelli_w_m2(
-    emissivity: Values, wind_m_s: Values, surface_k: Values, air_k: Values, factor: Values = 1.0
-) -> Values:
-    """Return 5.67 eps ((Ts/100)^4 - (Te/100)^4) + 3.8054 v (Ts - Te) (Albatici and Tonelli 2010).
-
-    This is the heat flow at an outer surface; `factor` multiplies the second term, convection.
+    `surroundings_k4` is the fourth power of the temperature of the surroundings, [K^4].
     """
-    radiation = 5.67 * emissivity * (fourth_power(surface_k / 100.0) - fourth_power(air_k / 100.0))
-    return radiation + factor * WIND_W_S_M3K * wind_m_s * (surface_k - air_k)
-
-
-def dallo_w_m2(wind_m_s: Values, surface_k: Values, air_k: Values, factor: Values = 1.0) -> Values:
-    """Return `factor` (5.8 + 3.8054 v) (Ts - Te), the flow at an outer surface (Dall'O, Sarto and Panza 2013)."""
-    return factor * (5.8 + WIND_W_S_M3K * wind_m_s) * (surface_k - air_k)
+    return emissivity * STEFAN_BOLTZMANN_W_M2K4 * (fourth_power(surface_k) - surroundings_k4)
 
 
 def natural_w_m2k(warmer_k: Values, upward: Values) -> Values:
@@ -73,6 +54,8 @@ class Convection(NamedTuple):
     w_m2k: Callable[[Values, Values, Values], Values]
     """The coefficient, from the wind beside the surface [m/s], how much warmer than the air the surface is [K], and the
     upward part of its outward unit normal."""
+    radiates: Literal["seen", "air", "included"] = "seen"
+    """Radiation beside it: to what the surface sees, to surroundings as warm as the air, or within the coefficient."""
 
 
 def _mowitt(factor: float, power: float) -> Convection:
@@ -84,7 +67,14 @@ def _mixed(factor: float, power: float) -> Convection:
 
 
 _SPARROW = 2.537 * 1.67 * 0.5**0.5  # For walls of brick with a perimeter over area of 0.5 per metre
-_HCI, _SLANT = INSIDE_CONVECTION_W_M2K, 0.5 + 1e-9
+_SLANT = 0.5 + 1e-9  # Sine of 30 degrees, up to which a heat flow counts as horizontal (ISO 6946)
+_COMBINED = {direction: 1.0 / resistance for direction, resistance in INSIDE_RESISTANCE_M2K_W.items()}
+
+
+def _by_direction(w_m2k: Mapping[Any, float]) -> Callable[[Values, Values, Values], Values]:
+    """Return the coefficient in a room by the direction of the heat flow, which is up through surfaces facing down."""
+    return lambda v, dt, up: np.select([up < -_SLANT, up > _SLANT], [w_m2k["up"], w_m2k["down"]], w_m2k["horizontal"])
+
 
 CONVECTION: Mapping[str, Mapping[str, Convection]] = {
     "outside": {
@@ -100,15 +90,13 @@ CONVECTION: Mapping[str, Mapping[str, Convection]] = {
         "emmel-leeward": _mixed(3.54, 0.76),
     },
     "inside": {
-        "iso-6946": Convection(
-            1.0,
-            lambda v, dt, up: np.select([up < -_SLANT, up > _SLANT], [_HCI["up"], _HCI["down"]], _HCI["horizontal"]),
-        ),
+        "iso-6946": Convection(1.0, _by_direction(INSIDE_CONVECTION_W_M2K)),
         "walton": Convection(1.0, lambda v, dt, up: natural_w_m2k(dt, up)),
         "khalifa": Convection(
             1.0,
             lambda v, dt, up: np.where(np.abs(up) > _SLANT, natural_w_m2k(dt, up), 2.30 * np.power(np.abs(dt), 0.24)),
         ),
+        "madding": Convection(0.0, lambda v, dt, up: 1.31 * np.cbrt(np.abs(dt))),
     },
 }
 """Formulas of the full balance by the side of the surface; radiation to what the surface sees is added to each.
@@ -123,21 +111,22 @@ half of the wind's part leeward (Sparrow and others 1979, Walton 1983), Rf 1.67 
 EnergyPlus). Windward and leeward are each drawn half as often, as surveys rarely know. ISO, Juerges, McAdams, Watmuff
 mean the wind beside the surface, the others the wind that comes up to the building.
 Inside: iso-6946, hci by the direction of the heat flow; walton, `natural_w_m2k`; khalifa, 2.30 dT^0.24 for walls
-without a heater (Khalifa and Marshall 1990), elsewhere as walton."""
+without a heater (Khalifa and Marshall 1990), elsewhere as walton; madding, 1.31 dT^(1/3) for all (Madding 2008), drawn
+only if weights name it."""
 
 
-def madding_w_m2(
-    emissivity: Values, surface_k: Values, reflected_k: Values, air_k: Values, factor: Values = 1.0
-) -> Values:
-    """Return 4 eps sigma Tm^3 (Trefl - Ts) + 1.31 (Ti - Ts)^(4/3), the flow at an inner surface (Madding 2008).
+SIMPLE: Mapping[str, Mapping[str, Convection]] = {
+    "outside": {
+        "iso-6946-combined": Convection(0.0, lambda v, dt, up: 1.0 / OUTSIDE_RESISTANCE_M2K_W, "included"),
+        "albatici-tonelli": Convection(0.0, lambda v, dt, up: WIND_W_S_M3K * v, "air"),
+        "dallo": Convection(0.0, lambda v, dt, up: 5.8 + WIND_W_S_M3K * v, "included"),
+    },
+    "inside": {"iso-6946-combined": Convection(0.0, _by_direction(_COMBINED), "included")},
+}
+"""Models that take all that a surface sees to be as warm as the air, by the side of the surface.
 
-    Tm is the mean of Trefl and Ts. If the surface is warmer than the air, the second term, convection, is negative.
-    `factor` multiplies convection.
-    """
-    mean = 0.5 * (reflected_k + surface_k)
-    radiation = 4.0 * emissivity * STEFAN_BOLTZMANN_W_M2K4 * mean**3 * (reflected_k - surface_k)
-    colder = air_k - surface_k
-    return radiation + factor * 1.31 * colder * np.cbrt(np.abs(colder))
+iso-6946-combined, 1 / Rse, and inside 1 / Rsi by the direction of the heat flow; albatici-tonelli, 3.8054 v beside
+radiation to the air (Albatici and Tonelli 2010); dallo, 5.8 + 3.8054 v (Dall'O, Sarto and Panza 2013)."""
 
 
 def surface_temperature_k(
@@ -198,17 +187,14 @@ def sky_emissivity(dew_point_c: npt.ArrayLike, cloud: npt.ArrayLike) -> FloatArr
     return clear * (1.0 + 0.0224 * tenths - 0.0035 * tenths**2 + 0.00028 * tenths**3)
 
 
-def view_shares(normals: FloatArray, up: tuple[float, float, float]) -> FloatArray:
+def view_shares(upward: FloatArray) -> FloatArray:
     """Return the shares of sky, air near the horizon, and ground in a surface's view, (k, 3); rows add up to 1.
 
     F_ground = (1 - cos tilt) / 2. Of the rest, a share b = sqrt((1 + cos tilt) / 2) is sky, and 1 - b is air near the
     horizon, about as warm as the air at the ground (EnergyPlus Engineering Reference, "External Longwave Radiation";
-    Walton 1983). A wall sees 0.354 sky, 0.146 horizon and 0.5 ground.
-
-    Args:
-        normals: Outward unit normals, shape (k, 3).
-        up: Unit vector that points up.
+    Walton 1983). A wall sees 0.354 sky, 0.146 horizon and 0.5 ground. `upward`, the cosine of the tilt, is the upward
+    part of outward unit normals, shape (k,).
     """
-    above, below = sky_view(normals, up), ground_view(normals, up)
+    above = np.clip(0.5 * (1.0 + upward), 0.0, 1.0)
     sky = above * np.sqrt(above)
-    return np.stack([sky, above - sky, below], axis=1)
+    return np.stack([sky, above - sky, 1.0 - above], axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.audit.calibration import Calibration, calibrated
-from thermoxels_ns.audit.conditions import BALANCE, SIMPLE, Conditions, Survey, load_conditions
+from thermoxels_ns.audit.conditions import BALANCE, Conditions, Survey, load_conditions
 from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
 from thermoxels_ns.audit.draws import (
     ENDS,
@@ -26,16 +26,16 @@ from thermoxels_ns.audit.draws import (
 )
 from thermoxels_ns.audit.energy import EnergyResult, year_of
 from thermoxels_ns.audit.exchange import (
-    HALF_STEP_K,
     chunks,
     exchange,
     other_models,
     part_totals,
     reference_doubts,
+    slopes,
     triangle_exchange,
     with_references,
 )
-from thermoxels_ns.audit.heat_flow import temperature_factor
+from thermoxels_ns.audit.heat_flow import SIMPLE, temperature_factor
 from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
 from thermoxels_ns.audit.weather import remembered_share
 from thermoxels_ns.core.arrays import FloatArray, IntArray
@@ -231,10 +231,16 @@ def audit_mesh(
         return audit(body, conditions, (x, y, z))
 
 
-def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Audit:
+def audit(
+    mesh: TetMesh,
+    conditions: Conditions,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    least_bridge_w: float = 0.0,
+) -> Audit:
     """Compute heat flows, U-values, thermal bridges and all else that an `Audit` holds, with intervals.
 
-    `up` is the unit vector that points up. Raises `AuditError` if the conditions do not fit the mesh.
+    `up` is the unit vector that points up. Bridges that lose less than `least_bridge_w` extra, [W], are not counted and
+    not judged. Raises `AuditError` if the conditions do not fit the mesh.
     """
     surface = audited_surface(mesh, conditions, up)
     groups = alike_triangles(surface)
@@ -277,6 +283,10 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
         )
         for n, one in enumerate(found)
     ]
+    if least_bridge_w > 0.0:
+        why = f"It loses less than {least_bridge_w:g} W extra (--least-bridge-w)."
+        slight = [not one.not_counted and one.extra_w.value < least_bridge_w for one in defects]
+        defects = [replace(one, not_counted=why) if drop else one for one, drop in zip(defects, slight)]
     order = sorted(range(len(found)), key=lambda n: (bool(defects[n].not_counted), -defects[n].extra_w.value))
     found, defects = [found[n] for n in order], [defects[n] for n in order]
     last, check, (remembered, told) = len(parts) - 2, check_survey(conditions), _remembered(conditions)
@@ -345,11 +355,6 @@ class _Parts:
         self.conditions, self.surface, self.groups, self.draws = conditions, surface, groups, draws
         self.parts, self.rows = parts, groups.rows([*parts], surface.area_m2)
         self.totals = part_totals(conditions, groups, draws, self.rows)
-        low, high = (
-            part_totals(conditions, groups, draws.stated, self.rows, step).flow_w[:, 0]
-            for step in (-HALF_STEP_K, HALF_STEP_K)
-        )
-        self.slope_w_k = (high - low) / (2.0 * HALF_STEP_K)  # Change of flow per kelvin of reading, shape (parts,)
         self.coefficients = dict[int, FloatArray]()  # By the number of its zone: draws of a `Defect.coefficient`
         self.u_by_model = dict[str, FloatArray]()  # U-values by each film model from the stated values, shape (parts,)
         for model, chosen in other_models(conditions):
@@ -359,7 +364,7 @@ class _Parts:
     def own_w(self, draws: Draws, flow_w: FloatArray) -> FloatArray:
         """Draw by how much the flow of each of the first parts, `flow_w`, (p, k), is off on its own, (p, k), [W]."""
         off, area_m2 = self.conditions.camera.repeatability.off_by, self.totals.area_m2[: len(flow_w), None]
-        read = np.stack([self.slope_w_k[n] * draws.local(off, n) for n in range(len(flow_w))])
+        read = np.stack([self.totals.slope_w_k[n] * draws.local(off, n) for n in range(len(flow_w))])
         wider = self.own_m2(draws, len(flow_w)) / area_m2
         return read + (flow_w + read) * wider
 
@@ -409,17 +414,15 @@ class _Parts:
 
     def triangle_u(self) -> FloatArray:
         """Return the U-value of each triangle and both ends of its interval; see `Audit.triangle_u`."""
-        few, found, slopes = self.draws.first(_FEW), [], []
+        few, found = self.draws.first(_FEW), []
+        slope = slopes(self.conditions, self.groups, few).flow_w_m2
         off = few.local(self.conditions.camera.repeatability.off_by, _OF_A_TRIANGLE)
         for part in chunks(len(self.groups.reading_c), few):
-            some = self.groups.some(part)
-            flow = exchange(self.conditions, some, few).flow_w_m2
-            warmer = exchange(self.conditions, some, few.stated, HALF_STEP_K).flow_w_m2
-            slopes.append((warmer - flow[:, :1]) / HALF_STEP_K)
-            u = (flow + slopes[-1] * off) / few.difference_k
+            flow = exchange(self.conditions, self.groups.some(part), few).flow_w_m2
+            u = (flow + slope[part] * off) / few.difference_k
             found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ENDS, axis=1).T], axis=1))
-        of_group, slope = (np.concatenate(one)[self.groups.of_triangle] for one in (found, slopes))
-        u = of_group + slope * self.groups.off_k[:, None] / few.difference_k[0]
+        of = self.groups.of_triangle
+        u = np.concatenate(found)[of] + slope[of] * self.groups.off_k[:, None] / few.difference_k[0]
         return np.where(self.surface.counted[:, None], u, np.nan)
 
     def narrower(self, rows: list[int], of_patches: FloatArray) -> tuple[dict[str, float], list[dict[str, float]]]:
@@ -454,7 +457,7 @@ class _Parts:
         """
         if self.conditions.side == "outside":
             return ()
-        flow = self.totals.flow_w[part] + self.slope_w_k[part] * off_k
+        flow = self.totals.flow_w[part] + self.totals.slope_w_k[part] * off_k
         flow = np.maximum(flow / max(self.totals.area_m2[part], 1e-12), _LEAST_FLOW_W_M2)
         above = self.totals.surface_c[part] + off_k - self.draws["outside air"]
         return tuple(np.asarray(temperature_factor(above / flow, one)) for one in F_RSI_M2K_W)
@@ -468,7 +471,7 @@ class _Parts:
         """
         surface, totals = self.surface, self.totals
         calm, spot = zone + 1, zone + 2
-        flow_w = totals.flow_w[zone] + self.slope_w_k[zone] * off_k
+        flow_w = totals.flow_w[zone] + self.totals.slope_w_k[zone] * off_k
         extra = flow_w - totals.flow_w[calm] / max(totals.area_m2[calm], 1e-12) * one.base_area_m2
         if surface.border_m2.any():  # both ends of its length lie within half a triangle's edge
             edge = float(np.sqrt(2.0 * surface.area_m2[one.core].mean()))
@@ -522,16 +525,6 @@ def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ..
     return "severe" if share >= SEVERE_SHARE else "moderate" if share >= MODERATE_SHARE else "slight"
 
 
-def verdict(found: Interval, limit: float, at_most: bool = True) -> Verdict:
-    """Return whether an interval keeps an upper (`at_most`) or a lower limit; "cannot tell" if the limit is inside.
-
-    >>> verdict(Interval(0.3, 0.2, 0.4), 0.5), verdict(Interval(0.3, 0.2, 0.4), 0.25)
-    ('met', 'cannot tell')
-    """
-    low, high, edge = (found.low, found.high, limit) if at_most else (-found.high, -found.low, -limit)
-    return "met" if high <= edge else "not met" if low > edge else "cannot tell"
-
-
 def _limits(
     conditions: Conditions,
     patches: Sequence[tuple[str, FloatArray]],
@@ -544,9 +537,11 @@ def _limits(
 
     def judge(name: str, limit: Measured, unit: str, drawn: FloatArray, at_most: bool = True) -> None:
         value, edge = interval_of(drawn), limit.value
+        beyond = interval_of(drawn - edge if at_most else edge - drawn)  # above 0: the limit is not kept
+        verdict: Verdict = "met" if beyond.high <= 0.0 else "not met" if beyond.low > 0.0 else "cannot tell"
         missed = float(np.mean(drawn[1:] > edge if at_most else drawn[1:] < edge))
         missed = missed if np.isfinite(value.value) else np.nan
-        found.append(Limit(name, edge, unit, at_most, value, verdict(value, edge, at_most), missed))
+        found.append(Limit(name, edge, unit, at_most, value, verdict, missed))
 
     for name, u in patches:
         chosen = [limit for pattern, limit in limits.u.items() if matching_names([name], pattern)]
@@ -595,7 +590,7 @@ def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tup
             found.append(Asked(what, asked, f"{stated.value:.3g} {unit}", "met" if met else "not met"))
 
     ask("air inside warmer than outside, during the survey", difference, LEAST_DIFFERENCE_K, "K")
-    ask("the same, all the last 24 hours", survey.least_difference_24h, LEAST_DIFFERENCE_K, "K")
+    ask("air inside warmer than outside, all the last 24 hours", survey.least_difference_24h, LEAST_DIFFERENCE_K, "K")
     ask("wind", wind, MOST_WIND_M_S, "m/s", least=False)
     if conditions is None or conditions.side == "outside":
         ask("time since the sun shone on the surface", survey.hours_since_sun, LEAST_HOURS_WITHOUT_SUN, "h")
@@ -607,28 +602,12 @@ def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tup
 
 def check_survey(conditions: Conditions) -> SurveyCheck:
     """Return what EN 13187 forbids and misses in the conditions of a survey, and what makes results doubtful."""
-    survey, wind, difference = conditions.survey, conditions.outside.wind, conditions.difference_k
-    least, sun, dry = survey.least_difference_24h, survey.hours_since_sun, survey.hours_dry
-    forbidden = []
-    if difference < LEAST_DIFFERENCE_K:
-        forbidden.append(f"The airs differ by {difference:.1f} K; EN 13187 asks for {LEAST_DIFFERENCE_K:g} K.")
-    elif least is not None and least.value < LEAST_DIFFERENCE_K:
-        forbidden.append(
-            f"During the last 24 hours the airs differed by {least.value:g} K at times; EN 13187 asks for "
-            f"{LEAST_DIFFERENCE_K:g} K all the time."
-        )
-    if wind is not None and wind.value > MOST_WIND_M_S:
-        forbidden.append(f"The wind was {wind.value:.1f} m/s; EN 13187 allows {MOST_WIND_M_S:g} m/s.")
-    if conditions.side == "outside":
-        if sun is not None and sun.value < LEAST_HOURS_WITHOUT_SUN:
-            forbidden.append(
-                f"The sun shone on the surface {sun.value:g} hours before; EN 13187 asks for "
-                f"{LEAST_HOURS_WITHOUT_SUN:g} hours without, heavy walls need more."
-            )
-        if dry is not None and dry.value < LEAST_HOURS_DRY:
-            asked = f"EN 13187 asks for {LEAST_HOURS_DRY:g} hours."
-            forbidden.append(f"The surface was wet {dry.value:g} hours before; {asked}")
-    asked = asked_of_survey(survey, conditions)
+    asked = asked_of_survey(conditions.survey, conditions)
+    forbidden = [
+        f"{one.what[0].upper()}{one.what[1:]}: {one.stated}. EN 13187 asks for {one.asked}."
+        for one in asked
+        if one.verdict == "not met"
+    ]
     return SurveyCheck(asked, tuple(forbidden), _doubts(conditions), _missing(conditions))
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy import sparse
@@ -12,7 +11,8 @@ from scipy import sparse
 from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
-from thermoxels_ns.fem.selection import Selection, matching_names
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.selection import chosen_names as names_chosen
 from thermoxels_ns.mesh.quality.checks import group_sides
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
@@ -29,6 +29,8 @@ WHY_NOT = {
     "left out": "that the conditions leave out",
 }
 """Reasons why a triangle does not count; the texts complete a sentence that begins with "triangles"."""
+
+chosen_names = partial(names_chosen, error=AuditError)  # `AuditError` if a pattern matches no name
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class AuditedSurface:
     def mesh(self) -> TetMesh:
         """Mesh whose boundary this is."""
         return self.selection.mesh
+
+    @property
+    def upward(self) -> FloatArray:
+        """Upward part of each triangle's unit normal, shape (f,)."""
+        return self.selection.facet_normal @ np.array(self.selection.up)
 
     @property
     def height_m(self) -> FloatArray:
@@ -95,18 +102,16 @@ class AlikeTriangles:
     """Groups of triangles that count; a group shares a patch, and nearly the same reading and inclination."""
 
     reading_c: FloatArray  # Mean reading of each group, weighted by area, shape (g,), [degrees Celsius]
-    normal: FloatArray  # Unit normal with the group's mean inclination and an arbitrary azimuth, shape (g, 3)
+    upward: FloatArray  # Mean upward part of the group's unit normals, shape (g,)
     surface_entry: IntArray  # Place in `Conditions.surfaces` of the group's emissivity, shape (g,)
     of_triangle: IntArray  # Group of each boundary triangle, shape (f,); -1 where a triangle does not count
     off_k: FloatArray  # Reading of each triangle minus that of its group, shape (f,), [K]; 0 where it does not count
-    up: tuple[float, float, float]  # Unit vector that points up
 
     def some(self, part: slice) -> AlikeTriangles:
         """Return the groups in the slice `part`, without triangles."""
         none = np.zeros(0, dtype=np.int64)
-        return AlikeTriangles(
-            self.reading_c[part], self.normal[part], self.surface_entry[part], none, none.astype(np.float64), self.up
-        )
+        values = self.reading_c[part], self.upward[part], self.surface_entry[part]
+        return AlikeTriangles(*values, none, none.astype(np.float64))
 
     def rows(self, parts: list[IntArray], area_m2: FloatArray) -> sparse.csr_array:
         """Return areas of `parts`, indices of triangles that count: shape (2 parts, g).
@@ -177,18 +182,13 @@ def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, floa
 def alike_triangles(surface: AuditedSurface) -> AlikeTriangles:
     """Group the triangles that count by patch, reading and inclination."""
     which = np.flatnonzero(surface.counted)
-    normal, area = surface.selection.facet_normal[which], np.maximum(surface.area_m2[which], 1e-300)
-    reading, upward = surface.reading_c[which], normal @ np.array(surface.selection.up)
+    area, reading, upward = np.maximum(surface.area_m2[which], 1e-300), surface.reading_c[which], surface.upward[which]
     # All film and sky models depend on the inclination of a normal alone, not on its azimuth.
     key = np.rint(reading / _STEP_K).astype(np.int64)
     key = (key - key.min()) * (2 + round(2.0 / _STEP_COSINE)) + np.rint((upward + 1.0) / _STEP_COSINE).astype(np.int64)
     key = key * len(surface.selection.patch_names) + surface.selection.facet_patch[which]
     _, first, group = np.unique(key, return_index=True, return_inverse=True)
     total = np.bincount(group, area)
-    up = np.array(surface.selection.up)
-    mean_up = np.clip(np.bincount(group, area * upward) / total, -1.0, 1.0)
-    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    across /= np.linalg.norm(across)
     of_triangle = np.full(len(surface.counted), -1)
     of_triangle[which] = group
     mean_c = np.bincount(group, area * reading) / total
@@ -196,21 +196,8 @@ def alike_triangles(surface: AuditedSurface) -> AlikeTriangles:
     off_k[which] = reading - mean_c[group]
     return AlikeTriangles(
         reading_c=mean_c,
-        normal=mean_up[:, None] * up + np.sqrt(1.0 - mean_up**2)[:, None] * across,
+        upward=np.bincount(group, area * upward) / total,
         surface_entry=surface.surface_entry[which[first]],
         of_triangle=of_triangle,
         off_k=off_k,
-        up=surface.selection.up,
     )
-
-
-def chosen_names(name: str, names: tuple[str, ...], patterns: Iterable[str], what: str = "patches") -> set[str]:
-    """Return those of `names` that match a pattern; raises `AuditError` on entry `name` if a pattern has no match."""
-    chosen = set[str]()
-    for pattern in patterns:
-        found = matching_names(names, pattern)
-        if not found:
-            remedy = f"Correct the name; {what} are those of the mesh, see --patches of ns-export thermoxels-mesh."
-            raise AuditError(name, expected=f"{what} out of {', '.join(names)}", got=repr(pattern), remedy=remedy)
-        chosen |= set(found)
-    return chosen

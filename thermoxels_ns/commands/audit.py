@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -117,8 +117,8 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     from thermoxels_ns.core.yaml_records import write_example
     from thermoxels_ns.data.scene_file import read_scene_file
     from thermoxels_ns.mesh.boundary.planes import find_building
-    from thermoxels_ns.reports.document import why_no_pdf
     from thermoxels_ns.reports.numbers import interval_text, plain_names
+    from thermoxels_ns.reports.page import why_no_pdf
 
     if options.write_conditions is not None:
         write_example(options.write_conditions, EXAMPLE, AuditError)
@@ -159,7 +159,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         scene = read_scene_file(options.scene, "skip", options.layout, options.thermal_bounds)
     mesh, up, export = _read(options.mesh, options, say)
     building = find_building(mesh, up, options.north) if options.envelope else None  # raises before anything slow
-    found = without_slight(audit(mesh, conditions, up), least_w)
+    found = audit(mesh, conditions, up, least_w)
     envelope = None if building is None else envelope_of(found, building)
     compared = None if earlier is None else compare(earlier(), found, options.compare_difference)
     most_u, impossible = impossible_u(found)
@@ -200,8 +200,7 @@ def write_agreement(path: Path, conditions: Path | None) -> None:
     from thermoxels_ns.audit.conditions import Survey
     from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml
     from thermoxels_ns.reports.audit_page import agreement_page
-    from thermoxels_ns.reports.document import write_pdf
-    from thermoxels_ns.reports.page import write_page
+    from thermoxels_ns.reports.page import write_page, write_pdf
 
     if path.suffix not in (".pdf", ".html") or path.exists():
         got = "a file that is there" if path.exists() else path.name
@@ -303,31 +302,7 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
     conditions, mesh = earlier_conditions(path.name, content["conditions"]), read_surface(path.with_name(SURFACE))
     x, y, z = check_direction(f"{path}: up", content["up"], again, AuditError).tolist()
     least_w = content.get("least_bridge_w")
-    return lambda: without_slight(audit(mesh, conditions, (x, y, z)), least_w if is_number(least_w) else 0.0)
-
-
-def without_slight(found: Found, least_w: float) -> Found:
-    """Return an audit in which bridges that lose less than `least_w` extra, [W], are not counted and not judged."""
-    from thermoxels_ns.audit.run import verdict
-
-    if least_w == 0.0:
-        return found
-    why = f"It loses less than {least_w:g} W extra (--least-bridge-w)."
-    pairs = [
-        (replace(one, not_counted=why) if not one.not_counted and one.extra_w.value < least_w else one, triangles)
-        for one, triangles in zip(found.defects, found.found)
-    ]
-    pairs.sort(key=lambda pair: bool(pair[0].not_counted))  # those that count stay first
-    lines = [one for one, _ in pairs if one.kind == "line" and not one.not_counted]
-    limits = [one for one in found.limits if one.unit != "W/(m K)"]
-    for one in [one for one in found.limits if one.unit == "W/(m K)" and lines]:
-        worst = max(lines, key=lambda line: line.coefficient.value)
-        psi, name = worst.coefficient, f"{one.name.partition(', in ')[0]}, in {worst.patch}"
-        if psi != one.found:  # the chance was of the draws of the line that does not count
-            one = replace(one, name=name, found=psi, verdict=verdict(psi, one.limit), missed_share=math.nan)
-        limits.append(one)
-    defects, triangles = zip(*pairs) if pairs else ((), ())
-    return replace(found, defects=defects, found=triangles, limits=tuple(limits))
+    return lambda: audit(mesh, conditions, (x, y, z), least_w if is_number(least_w) else 0.0)
 
 
 def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
@@ -405,12 +380,10 @@ def _write(
     """Write all files and return their names."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    from thermoxels_ns.audit.envelope import gbxml, hbjson
-    from thermoxels_ns.mesh.files.content import write_bytes
+    from thermoxels_ns.audit.envelope import hbjson
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtk
-    from thermoxels_ns.reports.audit_page import audit_page, draw_audit
-    from thermoxels_ns.reports.document import why_no_pdf, write_pdf
-    from thermoxels_ns.reports.page import identify, write_page
+    from thermoxels_ns.reports.audit_page import audit_page, draw_audit, gbxml
+    from thermoxels_ns.reports.page import identify, why_no_pdf, write_page, write_pdf
 
     assert options.mesh is not None and options.conditions is not None
     inputs = (options.mesh, options.mesh.with_name(f"{options.mesh.stem}-boundary.vtp"), options.conditions)
@@ -438,7 +411,7 @@ def _write(
         elif kind == "hbjson":
             write_summary(folder / name, hbjson(envelope, title))
         else:
-            write_bytes(folder / name, [gbxml(envelope, title)])
+            write_page(folder / name, gbxml(envelope, title))
     pictures = draw_audit(found) if options.pictures else None
     command, document = command_of("audit", options), options.pdf and not why_no_pdf()
     files = (PAGE, DOCUMENT, ANSWERS, SURFACE) if document else (PAGE, ANSWERS, SURFACE)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from fnmatch import fnmatchcase
 from functools import cached_property
 
 import numpy as np
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.errors import HeatError, ThermoxelsError
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas, facet_normals
 
@@ -37,11 +37,14 @@ class Selection:
 
     def facets(self, patterns: tuple[str, ...]) -> IntArray:
         """Return the numbers of the triangles of patches that match a pattern; `HeatError` if a pattern fits none."""
-        return np.flatnonzero(_matching("patches", patterns, self.patch_names)[self.facet_patch])
+        chosen = np.isin(self.patch_names, [*chosen_names("patches", self.patch_names, patterns)])
+        return np.flatnonzero(chosen[self.facet_patch])
 
     def tets(self, patterns: tuple[str, ...]) -> IntArray:
         """Return the numbers of the tetrahedra of regions that match a pattern; `HeatError` if a pattern fits none."""
-        return np.flatnonzero(_matching("regions", patterns, self.mesh.region_names)[self.mesh.region])
+        names = self.mesh.region_names
+        chosen = np.isin(names, [*chosen_names("regions", names, patterns, "regions")])
+        return np.flatnonzero(chosen[self.mesh.region])
 
     def facet_places(self, facets: IntArray) -> Places:
         """Return the centroids of boundary triangles as places with outward normals."""
@@ -65,13 +68,19 @@ def matching_names(names: Collection[str], pattern: str) -> list[str]:
     return [pattern] if pattern in names else []
 
 
-def _matching(field: str, patterns: tuple[str, ...], names: tuple[str, ...]) -> BoolArray:
-    """Return True for each name that matches any pattern, case-sensitively; `HeatError` if a pattern matches none."""
-    chosen = np.zeros(len(names), dtype=bool)
+def chosen_names(
+    name: str,
+    names: Collection[str],
+    patterns: Iterable[str],
+    what: str = "patches",
+    error: type[ThermoxelsError] = HeatError,
+) -> set[str]:
+    """Return those of `names` that match a pattern; raises an `error` about entry `name` if a pattern has no match."""
+    chosen = set[str]()
     for pattern in patterns:
-        matches = matching_names(names, pattern)
-        if not matches:
-            expected, remedy = ", ".join(names), "Correct the name, or tag the mesh so that it has such a part."
-            raise HeatError(field, expected=f"names or patterns of {expected}", got=repr(pattern), remedy=remedy)
-        chosen |= np.isin(names, matches) if len(matches) > 1 else np.array(names) == matches[0]
+        found = matching_names(names, pattern)
+        if not found:
+            remedy = f"Correct the name; {what} are those of the mesh, see --patches of ns-export thermoxels-mesh."
+            raise error(name, expected=f"{what} out of {', '.join(names)}", got=repr(pattern), remedy=remedy)
+        chosen |= set(found)
     return chosen

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import Effect, Term
@@ -27,52 +28,50 @@ class SurfaceEffect(Effect):
 
     patches: tuple[str, ...]  # Names of boundary patches, or patterns such as exterior-*; * is the whole boundary
 
+    form: ClassVar[
+        Literal["convection", "flux", "fixed"]
+    ]  # The form of the equation below, into which the quantities go in the order of `bounds`
+
+    def term(self, selection: Selection) -> Term:
+        """Return the effect's equation on the triangles of its patches."""
+        return Term(self.form, selection.facets(self.patches), tuple(self.bounded(name) for name in self.bounds))
+
 
 @dataclass(frozen=True)
 class FixedTemperature(SurfaceEffect):
-    """A surface that is kept at a given temperature."""
+    """A surface that is kept at a given temperature: T = `temperature_c` at its nodes."""
 
     temperature_c: Quantity  # Temperature of the surface, [degrees Celsius], at least -273.15; evaluated at nodes
 
     kind = "fixed temperature"
+    form = "fixed"
     bounds = {"temperature_c": Bounds("temperature_c", "degrees Celsius", _ABSOLUTE_ZERO_C, HOTTEST_C)}
-
-    def term(self, selection: Selection) -> Term:
-        """Return the term that fixes T = `temperature_c` at the nodes of the patches."""
-        return Term("fixed", selection.facets(self.patches), (self.bounded("temperature_c"),))
 
 
 @dataclass(frozen=True)
 class HeatFlux(SurfaceEffect):
-    """A given heat flux through a surface."""
+    """A given heat flux through a surface, k grad T . n = `flux_w_m2`."""
 
     flux_w_m2: Quantity  # Heat flux, [W / m2], positive into the body
 
     kind = "heat flux"
+    form = "flux"
     bounds = {"flux_w_m2": Bounds("flux_w_m2", "W/m2")}
-
-    def term(self, selection: Selection) -> Term:
-        """Return the term of the given heat flux into the body, k grad T . n = `flux_w_m2`."""
-        return Term("flux", selection.facets(self.patches), (self.bounded("flux_w_m2"),))
 
 
 @dataclass(frozen=True)
 class Convection(SurfaceEffect):
-    """Heat exchange with air (Newton's law of cooling)."""
+    """Heat exchange with air (Newton's law of cooling), k grad T . n = h (T_air - T)."""
 
     coefficient_w_m2k: Quantity  # Surface heat transfer coefficient h, [W / (m2 K)], at least 0
     air_c: Quantity  # Temperature of the air, [degrees Celsius], at least -273.15
 
     kind = "convection"
+    form = "convection"
     bounds = {
         "coefficient_w_m2k": Bounds("coefficient_w_m2k", "W/(m2 K)", 0.0),
         "air_c": Bounds("air_c", "degrees Celsius", _ABSOLUTE_ZERO_C, HOTTEST_C),
     }
-
-    def term(self, selection: Selection) -> Term:
-        """Return the term of the heat flux into the body, k grad T . n = h (T_air - T)."""
-        quantities = self.bounded("coefficient_w_m2k"), self.bounded("air_c")
-        return Term("convection", selection.facets(self.patches), quantities)
 
 
 @dataclass(frozen=True)
@@ -102,21 +101,17 @@ class Radiation(SurfaceEffect):
 
 @dataclass(frozen=True)
 class AbsorbedSolar(SurfaceEffect):
-    """Sunlight that a surface absorbs."""
+    """Sunlight that a surface absorbs, k grad T . n = absorptivity times irradiance."""
 
     absorptivity: Quantity  # Share of the sunlight that the surface absorbs, 0 to 1
     irradiance_w_m2: Quantity  # Sunlight that falls on the surface, [W / m2] of the surface itself, at least 0
 
     kind = "absorbed solar"
+    form = "flux"
     bounds = {
         "absorptivity": Bounds("absorptivity", "1", 0.0, 1.0),
         "irradiance_w_m2": Bounds("irradiance_w_m2", "W/m2", 0.0),
     }
-
-    def term(self, selection: Selection) -> Term:
-        """Return the term of the heat flux into the body, k grad T . n = absorptivity times irradiance."""
-        factors = self.bounded("absorptivity"), self.bounded("irradiance_w_m2")
-        return Term("flux", selection.facets(self.patches), factors)
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 
 import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
-from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.fem.solution import (
     Solution,
     SolutionNodes,
@@ -23,8 +22,6 @@ from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.mesh.quality.checks import facet_owners
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-
-Vector = FloatArray
 
 
 @dataclass(frozen=True)
@@ -134,7 +131,7 @@ def region_behind_facets(mesh: TetMesh) -> IntArray:
     return mesh.region[facet_owners(mesh.tets, mesh.facets)[0]]
 
 
-def volume_shares(mesh: TetMesh) -> Vector:
+def volume_shares(mesh: TetMesh) -> FloatArray:
     """Return each node's share of the volume, shape (n,), with sum 1: a quarter of each tetrahedron around it."""
     weights = np.bincount(
         mesh.tets.ravel(), np.repeat(signed_volumes(mesh.points_m, mesh.tets) / 4.0, 4), len(mesh.points_m)
@@ -151,7 +148,7 @@ def _spot(selection: Selection, nodes: SolutionNodes, time: int, node: int) -> S
 
 
 def _patches(
-    problem: HeatProblem, solution: Solution, selection: Selection, nodes: SolutionNodes, lengths: Vector
+    problem: HeatProblem, solution: Solution, selection: Selection, nodes: SolutionNodes, lengths: FloatArray
 ) -> tuple[PatchResult, ...]:
     mesh, area, names, last_c = selection.mesh, selection.facet_area_m2, selection.patch_names, nodes.states_c[-1]
     heat = {name: np.zeros(len(lengths)) for name in names}
@@ -183,7 +180,7 @@ def _patches(
 
 
 def _effects(
-    problem: HeatProblem, solution: Solution, selection: Selection, lengths: Vector
+    problem: HeatProblem, solution: Solution, selection: Selection, lengths: FloatArray
 ) -> tuple[EffectResult, ...]:
     by_patch = np.bincount(selection.facet_patch, selection.facet_area_m2, len(selection.patch_names))
     area = dict(zip(selection.patch_names, by_patch.tolist()))
@@ -234,7 +231,7 @@ def _regions(
     return tuple(results)
 
 
-def _balance(solution: Solution, lengths: Vector) -> EnergyBalance:
+def _balance(solution: Solution, lengths: FloatArray) -> EnergyBalance:
     steady = isinstance(solution, SteadySolution)
     # Flows are summed by patch: heat in through one patch and out through another must not cancel.
     flows = np.concatenate([np.zeros((len(lengths), 0)), *(heat.group_heat_w for heat in solution.effects)], axis=1)
@@ -365,11 +362,11 @@ def wall_result(
 
 def matching_facets(selection: Selection, patterns: Sequence[str]) -> BoolArray:
     """Return True for each boundary triangle whose patch matches a name or pattern, shape (f,)."""
-    matching = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in selection.patch_names]
-    return np.array(matching, dtype=bool)[selection.facet_patch]
+    matching = [name for pattern in patterns for name in matching_names(selection.patch_names, pattern)]
+    return np.isin(selection.patch_names, matching)[selection.facet_patch]
 
 
-def heat_by_part(solution: Solution, part: IntArray, count: int) -> Vector:
+def heat_by_part(solution: Solution, part: IntArray, count: int) -> FloatArray:
     """Return the heat flow into the body through each part of the surface at the end, shape (count,), [W].
 
     `part`, shape (f,), is the number of the part, below `count`, of each boundary triangle of the mesh solved on.

@@ -41,9 +41,6 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 if TYPE_CHECKING:
     import pyvista as pv
 
-Vector = FloatArray
-
-
 _OUTSIDE = 1e-9
 """Distance outside a tetrahedron, as a share of its height, up to which a point counts as on its face."""
 
@@ -56,7 +53,7 @@ class Probes:
     nodes: IntArray  # Nodes of the tetrahedron around each point, shape (p, 4)
     weights: FloatArray  # Barycentric coordinates of each point in its tetrahedron, shape (p, 4), sum 1
 
-    def at(self, nodal: Vector) -> Vector:
+    def at(self, nodal: FloatArray) -> FloatArray:
         """Return values at the points, shape (..., p), interpolated from values at the nodes, shape (..., n)."""
         return np.einsum("...pa,pa->...p", nodal[..., self.nodes], self.weights)
 
@@ -83,28 +80,21 @@ def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
         # A point on a face or node lies in several tetrahedra: take the one it lies deepest in, the first of equals.
         best = int(np.argmax(shares.min(axis=1))) if len(near) else -1
         if best < 0 or shares[best].min() < -_OUTSIDE:
-            raise _outside(mesh, number, point)
+            distance = np.linalg.norm(mesh.points_m - point, axis=1)
+            node = np.round(mesh.points_m[np.argmin(distance)], 6).tolist()
+            got = f"{np.round(point, 6).tolist()}, which is outside"
+            remedy = f"Move it; the nearest node is {node}, {distance.min():.3g} m away."
+            raise HeatError(f"probe {number + 1}", expected="a point inside the body", got=got, remedy=remedy)
         inside = np.clip(shares[best], 0.0, 1.0)
         nodes[number], weights[number] = mesh.tets[near[best]], inside / inside.sum()
     return Probes(points, nodes, weights)
 
 
-def _barycentric(corner: Vector, point: Vector) -> Vector:
+def _barycentric(corner: FloatArray, point: FloatArray) -> FloatArray:
     """Return the barycentric coordinates of a point in k tetrahedra with corners (k, 4, 3), shape (k, 4)."""
     sides = corner[:, 1:] - corner[:, :1]
     others = np.linalg.solve(np.swapaxes(sides, 1, 2), (point - corner[:, 0])[..., None])[..., 0]
     return np.concatenate([1.0 - others.sum(axis=1, keepdims=True), others], axis=1)
-
-
-def _outside(mesh: TetMesh, number: int, point: Vector) -> HeatError:
-    distance = np.linalg.norm(mesh.points_m - point, axis=1)
-    x, y, z = mesh.points_m[np.argmin(distance)]
-    return HeatError(
-        f"probe {number + 1}",
-        expected="a point inside the body",
-        got=f"({', '.join(f'{part:.6g}' for part in point)}), which is outside",
-        remedy=f"Move it; the nearest node is ({x:.6g}, {y:.6g}, {z:.6g}), {distance.min():.3g} m away.",
-    )
 
 
 @dataclass(frozen=True)
@@ -127,9 +117,9 @@ class HeatRun(HasTables):
     wall: WallResult | None
     """U-value and f_Rsi of the body between two airs in a steady state; None without airs, or if `no_wall` says why."""
     no_wall: str  # Sentence on why a steady state between two unlike airs gave no `wall`; else empty
-    mean_c: Vector  # Mean temperature of the volume at each time, shape (s,), [degrees Celsius]
+    mean_c: FloatArray  # Mean temperature of the volume at each time, shape (s,), [degrees Celsius]
     probes: Probes  # Points where temperatures are followed, in the mesh of `nodes`
-    probes_c: Vector  # Temperatures at `probes`, shape (s, p), [degrees Celsius]
+    probes_c: FloatArray  # Temperatures at `probes`, shape (s, p), [degrees Celsius]
     seconds: Mapping[str, float]  # Time to solve, "solve", and then to work out the results, "answers", [s]
 
     def __repr__(self) -> str:
@@ -185,7 +175,7 @@ def run_scene(
     probes = place_probes(mesh, np.array(probes_m, dtype=np.float64).reshape(-1, 3))
     about_patches = patch_warnings(scene, mesh, problem.up)
     inner, harmless = ((), ()) if about_patches else inner_surface_warnings(scene, mesh, problem.up)
-    about_scene = (*unused_settings(scene), *doubtful_temperatures(scene))
+    about_scene = (*short_series(scene), *doubtful_temperatures(scene))
     over = [one.patch for one in layers if one.body_m2k_w > 1.05 * one.asked_m2k_w]
     if over:
         what = f"The body alone resists more than the audit found: {', '.join(over)}. There the heat loss is too low"
@@ -259,27 +249,24 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
     patches the scene names are not checked.
     """
     selection = Selection(mesh, up)
-    inside, outside = matching_facets(selection, INSIDE), matching_facets(selection, OUTSIDE)
-    inside_air = scene.inside_air is not None and scene.inside_air.patches[:1] == INSIDE
-    outside_air = scene.outside_air is not None and scene.outside_air.patches[:1] == OUTSIDE
-    inside = matching_facets(selection, scene.inside_air.patches) if scene.inside_air and inside_air else inside
-    warnings = []
-    if (inside_air or outside_air) and _outwards(selection, outside) < _INWARDS:
-        warnings.append(
+    inside_air = scene.inside_air if scene.inside_air and scene.inside_air.patches[:1] == INSIDE else None
+    outside_air = scene.outside_air if scene.outside_air and scene.outside_air.patches[:1] == OUTSIDE else None
+    if (inside_air or outside_air) and _outwards(selection, matching_facets(selection, OUTSIDE)) < _INWARDS:
+        return (
             "The surface that photographs see faces inwards, as that of a room photographed from within. The scene's "
             "outside air (and sun and sky) acts on surfaces that were seen, its inside air on those that were not. If "
             "the seen surface is that of the room, give inside_air and outside_air their patches in the scene: "
-            'patches: ["exterior-*"] to the inside air, patches: ["interior-*"] to the outside air.'
+            'patches: ["exterior-*"] to the inside air, patches: ["interior-*"] to the outside air.',
         )
-    elif inside_air and not _has_rooms(selection, inside):
-        area = float(selection.facet_area_m2[inside].sum())
-        warnings.append(
+    if inside_air is not None and not _has_rooms(selection, matching_facets(selection, inside_air.patches)):
+        area = float(selection.facet_area_m2[matching_facets(selection, inside_air.patches)].sum())
+        return (
             f"The scene names air inside, but the body has no rooms: of the {area:.4g} m² that no photograph saw, next "
             "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
             "and heat losses are those of that. Export again with --interior hollow --wall-thickness 0.3, or "
-            "name the inner surface with --patches."
+            "name the inner surface with --patches.",
         )
-    return tuple(warnings)
+    return ()
 
 
 def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -374,16 +361,10 @@ def with_layers(
     return replace(scene, outside_air=outside, convection=(*scene.convection, *effects)), tuple(layers)
 
 
-def unused_settings(scene: HeatScene) -> tuple[str, ...]:
-    """Return warnings on a steady scene's initial temperature and on air series that do not cover the scene's time."""
+def short_series(scene: HeatScene) -> tuple[str, ...]:
+    """Return warnings on air series that do not cover the scene's time."""
     if scene.time is None:
-        if scene.initial_c is None:
-            return ()
-        return (
-            f"The scene gives an initial temperature of {scene.initial_c:g} degrees Celsius, but asks for the steady "
-            "state, which does not depend on the start: initial changes nothing. Remove it, or give time in place of "
-            "steady.",
-        )
+        return ()
     hours, warnings = scene.time.duration_s / 3600.0, []
     for name, air in (("inside_air", scene.inside_air), ("outside_air", scene.outside_air)):
         if air is None or air.air_series is None:

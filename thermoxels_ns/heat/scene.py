@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import glob
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -12,6 +13,7 @@ from copy import deepcopy
 from dataclasses import fields, make_dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cache, partial
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
@@ -24,7 +26,7 @@ from thermoxels_ns.core.measured import read_measured
 from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml, record, wrong
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Places, Quantity, Varying
-from thermoxels_ns.fem.selection import Selection, matching_names
+from thermoxels_ns.fem.selection import Selection, chosen_names, matching_names
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
@@ -144,7 +146,7 @@ class HeatScene:
                 return section
             taken = {name for one in others for pattern in one for name in matching_names(tags.patch_names, pattern)}
             chosen = [n for n in own if (seen[n] > 0.5 * whole[n]) == (section.patches == OUTSIDE)]
-            names = [_as_pattern(tags.patch_names[n]) for n in chosen if tags.patch_names[n] not in taken]
+            names = [glob.escape(tags.patch_names[n]) for n in chosen if tags.patch_names[n] not in taken]
             return replace(section, patches=(*section.patches, *names))  # type: ignore[type-var]
 
         named = [*airs, *(effect.patches for effect in contacts), self.adiabatic]
@@ -205,10 +207,7 @@ class HeatScene:
         """Return the material of a mesh, by region if regions differ; `HeatError` if a region has none."""
         chosen: dict[str, Material] = {}
         for pattern, made_of in self.materials.items():
-            matching = [name for name in mesh.region_names if fnmatchcase(name, pattern)]
-            if not matching:
-                expected = f"names or patterns of the regions {', '.join(mesh.region_names)}"
-                raise unclear("materials", expected, repr(pattern), "Correct the name, or use '*' for all regions.")
+            matching = chosen_names("materials", mesh.region_names, (pattern,), "regions")
             chosen |= dict.fromkeys(matching, made_of)
         used = {mesh.region_names[number] for number in np.unique(mesh.region)}
         missing = sorted(used - set(chosen))
@@ -248,26 +247,25 @@ class HeatScene:
 
     def _check_counted_once(self, where: list[tuple[str, set[str]]]) -> None:
         """Raise `HeatError` for two contacts with air or ground, or radiation counted twice, on one patch."""
-        touching = ("inside_air", "outside_air", "convection", "ground_contact")
-        contacts = [(name, patches) for name, patches in where if name.startswith(touching)]
-        check_disjoint("contact with air or ground", contacts, _PATCHES_OF_THEIR_OWN)
-        buried = [(name, patches) for name, patches in where if name.startswith("ground_contact")]
-        for name, patches in where:
-            if name.startswith(("sky and ground", "radiation", "sun")):
-                for contact in buried:
-                    check_disjoint("contact with the ground alone", [contact, (name, patches)], _PATCHES_OF_THEIR_OWN)
         airs = {"inside_air": self.inside_air, "outside_air": self.outside_air}
-        linear = {name for name, air in airs.items() if air is not None and air.coefficient in WITH_RADIATION}
-        full = self.sky is not None and self.ground is not None and self.ground.surface_c is not None
-        for name, chosen in where:
-            if name not in linear and not (full and name == "sky and ground"):
+        whole = {name for name, air in airs.items() if air is not None and air.coefficient in WITH_RADIATION}
+        if self.sky is not None and self.ground is not None and self.ground.surface_c is not None:
+            whole.add("sky and ground")  # like a film with radiation, this leaves nothing else to radiate to
+        for (first, patches), (second, elsewhere) in combinations(where, 2):
+            names, shared, remedy = (first, second), sorted(patches & elsewhere), _PATCHES_OF_THEIR_OWN
+            if all(name.startswith((*airs, "convection", "ground_contact")) for name in names):
+                what = "contact with air or ground"
+            elif second.startswith("ground_contact") and first.startswith(("sky and ground", "radiation", "sun")):
+                what = "contact with the ground alone"
+            elif first in whole and second.startswith(("sky and ground", "radiation")):
+                what, remedy = "radiation", "Remove one of the two, or name other patches."
+                if first in airs:
+                    remedy = f"Set coefficient: iso-6946-convection in {first}, which leaves radiation out."
+            else:
                 continue
-            for other, elsewhere in where:
-                if other.startswith(("sky and ground", "radiation")) and other != name:
-                    remedy = "Remove one of the two, or name other patches."
-                    if name in linear:
-                        remedy = f"Set coefficient: iso-6946-convection in {name}, which leaves radiation out."
-                    check_disjoint("radiation", [(name, chosen), (other, elsewhere)], remedy)
+            if shared:
+                got = f"{second} on {', '.join(shared)} as well"
+                raise HeatError(first, expected=f"{what} once on each patch", got=got, remedy=remedy)
 
 
 def _steps(content: Any) -> str:
@@ -392,15 +390,7 @@ class ScenePatches:
 
     def matching(self, name: str, patterns: Sequence[str]) -> set[str]:
         """Return the patches that match any pattern of the entry `name`; `HeatError` if a pattern matches none."""
-        found: set[str] = set()
-        for pattern in patterns:
-            matches = set(matching_names(self.area_m2, pattern))
-            if not matches:
-                expected = f"names or patterns of the patches {', '.join(self.area_m2)}"
-                remedy = "Correct the name, or tag the mesh so that it has such a patch."
-                raise HeatError(f"{name}: patches", expected=expected, got=repr(pattern), remedy=remedy)
-            found |= matches
-        return found
+        return chosen_names(f"{name}: patches", self.area_m2, patterns)
 
     def of_surfaces(
         self, surfaces: Sequence[Surface], value: Callable[[Surface], float | None], allowed: set[str] | None = None
@@ -417,7 +407,7 @@ class ScenePatches:
         groups: dict[float, list[str]] = {}
         for patch in self.area_m2:
             if patch in chosen and (allowed is None or patch in allowed):
-                groups.setdefault(chosen[patch], []).append(_as_pattern(patch))
+                groups.setdefault(chosen[patch], []).append(glob.escape(patch))
         return [(tuple(names), number) for number, names in groups.items()]
 
     def check_all_named(self, acting: set[str], adiabatic: Sequence[str]) -> None:
@@ -436,19 +426,3 @@ class ScenePatches:
             )
             remedy = f"Name them in an entry that acts on them, or write adiabatic: {written.strip()}."
             raise HeatError("heat scene", expected=expected, got=f"nothing on {got}", remedy=remedy)
-
-
-def check_disjoint(what: str, entries: Sequence[tuple[str, set[str]]], remedy: str) -> None:
-    """Raise `HeatError`, worded with `what` and `remedy`, if two entries (name and patches) share a patch."""
-    taken: dict[str, str] = {}
-    for second, elsewhere in entries:
-        for first in sorted({taken[patch] for patch in elsewhere & taken.keys()})[:1]:
-            both = sorted(patch for patch in elsewhere if taken.get(patch) == first)
-            got = f"{second} on {', '.join(both)} as well"
-            raise HeatError(first, expected=f"{what} once on each patch", got=got, remedy=remedy)
-        taken |= dict.fromkeys(elsewhere, second)
-
-
-def _as_pattern(name: str) -> str:
-    """Return a pattern that matches a name and nothing else."""
-    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in name)

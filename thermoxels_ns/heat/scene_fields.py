@@ -39,48 +39,10 @@ INSIDE_CONVECTION_W_M2K: Mapping[HeatDirection, float] = MappingProxyType({"up":
 _HORIZONTAL = 0.5 + 1e-9  # Sine of 30 degrees, up to which a heat flow counts as horizontal, with room for round-off
 
 
-def inside_coefficient(
-    name: InsideCoefficient, heat_flow: HeatFlow = "into-body", mean_c: float = 20.0, emissivity: float = 0.9
-) -> Varying:
-    """Return the coefficient of surfaces in a room by their orientation, for `Convection.coefficient_w_m2k`.
-
-    ISO 6946 has one value each for heat that flows up, down or horizontally (up to 30 degrees off), as warm air rises.
-    iso-6946-combined is 1 / Rsi, for convection and radiation between surfaces of emissivity 0.9; iso-6946-convection
-    is hci; iso-6946-separate is hci + hr, hr being the `radiative_coefficient` of `emissivity` at `mean_c`, the mean
-    temperature of surface and room.
-    """
-    directions: tuple[HeatDirection, ...] = ("up", "horizontal", "down")
-    if name == "iso-6946-combined":
-        table = np.array([1.0 / INSIDE_RESISTANCE_M2K_W[direction] for direction in directions])
-    else:
-        radiative = radiative_coefficient(mean_c, emissivity) if name == "iso-6946-separate" else 0.0
-        table = np.array([INSIDE_CONVECTION_W_M2K[direction] + radiative for direction in directions])
-    return Varying(partial(_by_orientation, table, -1.0 if heat_flow == "into-body" else 1.0), in_time=False)
-
-
 def _by_orientation(table: FloatArray, sign: float, places: Places, _: float) -> FloatArray:
+    """Return values of a table for heat that flows up, horizontally (up to 30 degrees off) and down (ISO 6946)."""
     upward = sign * (places.normals @ np.array(places.up))
     return table[np.where(upward > _HORIZONTAL, 0, np.where(upward < -_HORIZONTAL, 2, 1))]
-
-
-def outside_coefficient(
-    name: OutsideCoefficient, wind_m_s: float = 4.0, mean_c: float = 0.0, emissivity: float = 0.9
-) -> float:
-    """Return the coefficient of surfaces in the open air at a wind speed v, [W / (m2 K)].
-
-    iso-6946-combined is 1 / Rse, iso-6946-separate 4 + 4 v + hr, iso-6946-convection 4 + 4 v, thermoxels-original
-    18.6 v^0.605, which is 0 in calm air and about twice the value of ISO 6946 in wind. hr is the
-    `radiative_coefficient` of `emissivity` at `mean_c`, the mean temperature of surface and surroundings.
-
-    >>> outside_coefficient("iso-6946-combined")
-    25.0
-    """
-    if name == "iso-6946-combined":
-        return 1.0 / OUTSIDE_RESISTANCE_M2K_W
-    if name == "thermoxels-original":
-        return 18.6 * wind_m_s**0.605
-    convection = 4.0 + 4.0 * wind_m_s
-    return convection + radiative_coefficient(mean_c, emissivity) if name == "iso-6946-separate" else convection
 
 
 def radiative_coefficient(mean_c: float, emissivity: float) -> float:
@@ -177,11 +139,15 @@ class InsideAir(_Air):
 
     def convection(self) -> Convection:
         """Return the convection between the air of the room and the body."""
-        coefficient: Quantity | None = self.coefficient_w_m2k
-        if self.coefficient is not None:
-            coefficient = inside_coefficient(self.coefficient, self.heat_flow, self.air_c, self.emissivity or 0.0)
-        assert coefficient is not None, "checked when the section was made"
-        return Convection(self.patches, coefficient, self.temperature)
+        if self.coefficient_w_m2k is not None:
+            return Convection(self.patches, self.coefficient_w_m2k, self.temperature)
+        radiative = radiative_coefficient(self.air_c, self.emissivity or 0.0)
+        table = [convection + radiative for convection in INSIDE_CONVECTION_W_M2K.values()]
+        if self.coefficient == "iso-6946-combined":
+            table = [1.0 / resistance for resistance in INSIDE_RESISTANCE_M2K_W.values()]
+        sign = -1.0 if self.heat_flow == "into-body" else 1.0
+        by_orientation = Varying(partial(_by_orientation, np.array(table), sign), in_time=False)
+        return Convection(self.patches, by_orientation, self.temperature)
 
 
 @record(HeatError)
@@ -202,15 +168,17 @@ class OutsideAir(_Air):
         super().__post_init__()
         _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
         windy = self.coefficient not in (None, "iso-6946-combined")
-        _check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
+        check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
 
     def convection(self) -> Convection:
         """Return the convection between the open air and the body."""
-        coefficient = self.coefficient_w_m2k
-        if self.coefficient is not None:
-            wind, emissivity = self.wind_m_s or 0.0, self.emissivity or 0.0
-            coefficient = outside_coefficient(self.coefficient, wind, self.air_c, emissivity)
-        assert coefficient is not None, "checked when the section was made"
+        wind, coefficient = self.wind_m_s or 0.0, self.coefficient_w_m2k
+        if self.coefficient == "iso-6946-combined":
+            coefficient = 1.0 / OUTSIDE_RESISTANCE_M2K_W
+        elif self.coefficient == "thermoxels-original":
+            coefficient = 18.6 * wind**0.605
+        elif coefficient is None:
+            coefficient = 4.0 + 4.0 * wind + radiative_coefficient(self.air_c, self.emissivity or 0.0)
         return Convection(self.patches, coefficient, self.temperature)
 
 
@@ -239,7 +207,7 @@ class Sky:
     """Temperature of the outside air minus that of the sky, [K]; 6 is common with some clouds (Whillier 1967)."""
 
     def __post_init__(self) -> None:
-        _check_one(temperature_c=self.temperature_c, model=self.model, below_air_k=self.below_air_k)
+        check_one(temperature_c=self.temperature_c, model=self.model, below_air_k=self.below_air_k)
 
     @property
     def needs_air(self) -> bool:
@@ -287,14 +255,14 @@ class Sun:
     patches: Patches = OUTSIDE  # Patches that sunlight may reach, by name or pattern
 
     def __post_init__(self) -> None:
-        _check_one(start=self.start, towards=self.towards)
+        check_one(start=self.start, towards=self.towards)
         for name in ("latitude_deg", "longitude_deg", "north"):
             given = getattr(self, name)
             if self.start is None and given is not None:
                 raise unclear(name, "a date and time in start beside it", "none", f"Add start or remove {name}.")
             if self.start is not None and given is None:
                 raise unclear("start", f"{name} beside it", "none", f"Add {name}.")
-        _check_one(clear_sky=self.clear_sky, direct_w_m2=self.direct_w_m2)
+        check_one(clear_sky=self.clear_sky, direct_w_m2=self.direct_w_m2)
         if self.clear_sky is not None and self.start is None:
             raise unclear("clear_sky", "a date and time in start beside it", "none", "Give direct_w_m2 instead.")
         if self.clear_sky is not None and self.diffuse_w_m2 > 0.0:
@@ -303,11 +271,11 @@ class Sun:
 
 
 def _check_coefficient(named: str | None, number: float | None, emissivity: float | None) -> None:
-    _check_one(coefficient=named, coefficient_w_m2k=number)
-    _check_only_if("emissivity", emissivity, named == "iso-6946-separate", named or "coefficient_w_m2k")
+    check_one(coefficient=named, coefficient_w_m2k=number)
+    check_only_if("emissivity", emissivity, named == "iso-6946-separate", named or "coefficient_w_m2k")
 
 
-def _check_one(**values: object) -> None:
+def check_one(**values: object) -> None:
     """Raise `HeatError` unless exactly one of the fields is given."""
     given = [name for name, value in values.items() if value is not None]
     if len(given) != 1:
@@ -317,11 +285,12 @@ def _check_one(**values: object) -> None:
         raise unclear(" or ".join(names), expected, " and ".join(given) or "none", remedy)
 
 
-def _check_only_if(name: str, value: float | None, needed: bool, coefficient: str) -> None:
+def check_only_if(name: str, value: object, needed: bool, what: str) -> None:
+    """Raise `HeatError` unless the field `name` is given just where it is `needed`, beside `what`."""
     if needed and value is None:
-        raise unclear(name, f"a number, because {coefficient} depends on it", "none", f"Add {name}.")
+        raise unclear(name, f"one, because {what} needs it", "none", f"Add {name}.")
     if not needed and value is not None:
-        raise unclear(name, f"none, because {coefficient} does not depend on it", f"{value:g}", f"Remove {name}.")
+        raise unclear(name, f"none, because {what} does not need it", "one", f"Remove {name}.")
 
 
 def unclear(name: str, expected: str, got: object, remedy: str) -> HeatError:

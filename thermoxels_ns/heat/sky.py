@@ -224,18 +224,9 @@ def _from_moving_sun(
     places: Places,
     time_s: float,
 ) -> FloatArray:
-    position = sun_position(_later(where[0], time_s), *where[1:3])
+    position = sun_position(where[0] + timedelta(seconds=time_s), *where[1:3])
     light = light or meinel_clear_sky(position.elevation_deg, position.distance_au)
     return facet_irradiance(places.normals, places.up, towards_sun(position, places.up, where[3]), light, reflected)
-
-
-def _later(start: datetime, time_s: float) -> datetime:
-    try:
-        return start + timedelta(seconds=time_s)
-    except OverflowError as problem:
-        expected, remedy = "a date of the years 1 to 9999", "Follow the body for a shorter time."
-        got = f"{time_s:.3g} s after {start.isoformat()}"
-        raise HeatError("time of the sun", expected=expected, got=got, remedy=remedy) from problem
 
 
 def _days(moment: datetime) -> float:

@@ -12,9 +12,9 @@ import numpy as np
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.forms import FixedForm, effect_forms
-from thermoxels_ns.fem.problem import AdaptiveSteps, Effect, HeatProblem, TimeSteps, effect_labels
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Bounds
-from thermoxels_ns.fem.solution import HeatSolution, Solution, SteadySolution, mean_flows_w
+from thermoxels_ns.fem.solution import Solution, SteadySolution, mean_flows_w
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
@@ -27,7 +27,6 @@ from thermoxels_ns.fem.tolerance import (
     steady_error,
 )
 
-Vector = FloatArray
 Say = Callable[[str], None]
 Time = TimeSteps | AdaptiveSteps | None  # Time steps in which a body is followed; None: its steady state
 
@@ -37,10 +36,7 @@ allows for a heat flow (ISO 10211: 1 %)."""
 MOST_ESTIMATED = 300_000
 """Most tetrahedra for which the error of the mesh is estimated without being asked for. The estimate solves with
 quadratic tetrahedra, which take 60 times as long as linear ones (131,712 tetrahedra: 5.4 s instead of 0.09 s)."""
-MOST_ATTEMPTS = 4  # Most solutions with effects left out; the next solution leaves out nothing
 SAY_EVERY_S = 10.0  # Least time between two lines of progress, [s]
-_LEAST_TIMES, _MOST_TIMES = 241, 200_001
-"""Least and most times at which `_looks` has an effect evaluated in adaptive steps."""
 
 _BOUNDS = {
     "tolerance_k": Bounds("tolerance", "K", 0.0, above_low=True, remedy="Pass --tolerance 0.05."),
@@ -135,11 +131,8 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
             expected, got = f"at most {describe_bytes(goals.memory_bytes)}", f"about {describe_bytes(needed)}"
             remedy = "Pass a larger --memory-gb, fewer steps or outputs, or export a coarser mesh."
             raise HeatError("memory of the heat problem", expected=expected, got=got, remedy=remedy)
-    # With a tolerance, steps are adaptive even if the scene asks for equal ones.
-    asked = AdaptiveSteps(time.duration_s) if goals.estimated and time is not None else time
-    labels, left = effect_labels(problem), _weak(problem, asked, goals.left_out_share)
-    for attempt in range(MOST_ATTEMPTS + 1):
-        left = left if attempt < MOST_ATTEMPTS else []
+    labels, left = effect_labels(problem), _weak(problem, time, goals.left_out_share)
+    while True:  # each solution leaves out less than the one before
         kept = replace(problem, effects=tuple(e for n, e in enumerate(problem.effects) if n not in left))
         say(f"Built: {', '.join(label for n, label in enumerate(labels) if n not in left) or 'nothing'}.")
         try:
@@ -153,7 +146,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
         if not left:
             return _with_mesh_error(found, goals)
         through_w = 0.5 * sum(map(abs, mean_flows_w(found.solution).values()))
-        brings_w = _largest_w(problem, left, asked, found.solution)
+        brings_w = _largest_w(problem, left, np.atleast_2d(found.solution.temperature_c))
         # The smallest effects stay left out, as many as together bring no more heat than allowed.
         order = sorted(left, key=brings_w.__getitem__)
         total_w = np.cumsum([brings_w[n] for n in order])
@@ -167,12 +160,19 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
         back = ", ".join(f"{labels[n]} (up to {brings_w[n]:.3g} W)" for n in sorted(set(left) - set(still)))
         say(f"Of {through_w:.3g} W that flow too much is left out: solved again with {back}.")
         left = still
-    raise AssertionError("without anything left out the first solution counts")
 
 
 def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
-    """Return the numbers of the weakest effects, which together have at most `share` of the power of the others."""
-    power_w = _largest_w(problem, range(len(problem.effects)), time)
+    """Return the numbers of the weakest effects, which together have at most `share` of the power of the others.
+
+    An effect's power is its heat flow at the coldest and the warmest temperature of start and surroundings.
+    """
+    forms = effect_forms(problem, Space(problem.selection), 0.0)
+    around_c = [form.surroundings_k(0.0).ravel() for form in (*forms.convection, *forms.radiation, *forms.fixed)]
+    every_c = np.concatenate([np.zeros(0) if time is None else problem.start_c, *around_c])
+    ends_c = [every_c.min(), every_c.max()] if len(every_c) else [0.0]
+    states_c = np.repeat(np.array(ends_c)[:, None], len(problem.mesh.points_m), axis=1)
+    power_w = _largest_w(problem, range(len(problem.effects)), states_c)
     total_w = sum(power for power in power_w.values() if np.isfinite(power))
     weak, left_w = list[int](), 0.0
     for number in sorted(power_w, key=power_w.__getitem__):
@@ -182,63 +182,26 @@ def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
     return weak
 
 
-def _largest_w(
-    problem: HeatProblem, chosen: Sequence[int], time: Time, found: Solution | None = None
-) -> dict[int, float]:
-    """Return by number of each `chosen` effect the sum of the sizes of its heat flows, at its worst time, [W].
+def _largest_w(problem: HeatProblem, chosen: Sequence[int], states_c: FloatArray) -> dict[int, float]:
+    """Return by number of each `chosen` effect the sum of the sizes of its heat flows in the worst state, [W].
 
-    Temperatures are those of `found`, or if it is None the coldest and the warmest of start and surroundings. The sum
-    is infinite for fixed temperatures, and for effects that may change in time at an unknown rate.
+    `states_c`, (s, n), are temperatures, [degrees Celsius]. The sum is infinite for what fixes temperatures or changes
+    with time: these are never left out.
     """
     reference_c, num_nodes = float(problem.start_c.mean()), len(problem.mesh.points_m)
     forms = effect_forms(problem, Space(problem.selection), reference_c)
-    kept_s = found.times_s if isinstance(found, HeatSolution) else np.zeros(1)
     numbers = {label: number for number, label in enumerate(effect_labels(problem))}
-    looks = [_looks(effect, time, kept_s) for effect in problem.effects]
-    start_k = problem.start_c - reference_c
-    ends_k = [] if time is None else [float(start_k.min()), float(start_k.max())]
-    if found is None:
-        for form in (*forms.convection, *forms.radiation, *forms.fixed):
-            for time_s in looks[numbers[form.effect]]:
-                around_k = form.surroundings_k(time_s)
-                ends_k += [float(around_k.min()), float(around_k.max())]
-
-    def states(time_s: float) -> tuple[Vector, ...]:
-        if found is None:
-            return tuple(np.full(num_nodes, end_k) for end_k in {min(ends_k, default=0.0), max(ends_k, default=0.0)})
-        found_c = found.temperature_c[..., :num_nodes]
-        if isinstance(found, HeatSolution):
-            after = min(max(int(np.searchsorted(kept_s, time_s)), 1), len(kept_s) - 1)
-            share = (time_s - kept_s[after - 1]) / (kept_s[after] - kept_s[after - 1])
-            found_c = (1.0 - share) * found_c[after - 1] + share * found_c[after]
-        return (found_c - reference_c,)
-
     largest = dict.fromkeys(chosen, 0.0)
     for form in (*forms.exchanging, *forms.fixed):
         number = numbers[form.effect]
         if number in largest:
-            largest[number] = np.inf
-            if not isinstance(form, FixedForm) and len(looks[number]):
-                sizes = (np.abs(form.part_heat_w(k, t)).sum() for t in looks[number] for k in states(t))
-                largest[number] = float(max(sizes))
+            effect = problem.effects[number]
+            if isinstance(form, FixedForm) or any(effect.bounded(name).in_time for name in effect.bounds):
+                largest[number] = np.inf
+            else:
+                flows_w = (np.abs(form.part_heat_w(one - reference_c, 0.0)) for one in states_c[:, :num_nodes])
+                largest[number] = float(max(flow_w.sum() for flow_w in flows_w))
     return largest
-
-
-def _looks(effect: Effect, time: Time, kept_s: Vector) -> list[float]:
-    """Return times, [s], at which to evaluate an effect so that no change is missed; empty if no times would do.
-
-    With equal steps these are their ends, added up as in the time loop. With adaptive steps, which may evaluate an
-    effect at any time, there are two times per `resolution_s`. If the effect or body does not change: `kept_s`.
-    """
-    quantities = [effect.bounded(name) for name in effect.bounds]
-    if time is None or not any(quantity.in_time for quantity in quantities):
-        return kept_s.tolist()
-    if isinstance(time, TimeSteps):
-        return [0.0, *(time.times_s[:-1] + time.step_seconds).tolist()]
-    count = 2.0 * time.duration_s / min(quantity.resolution_s for quantity in quantities)
-    if any(quantity.unresolved for quantity in quantities) or not count < _MOST_TIMES:
-        return []
-    return np.linspace(0.0, time.duration_s, max(int(np.ceil(count)) + 1, _LEAST_TIMES)).tolist()
 
 
 def _solve(problem: HeatProblem, time: Time, goals: Goals, say: Say) -> SolvedProblem:

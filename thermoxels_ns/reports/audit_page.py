@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -12,12 +11,13 @@ import numpy as np
 from thermoxels_ns.audit.compare import Comparison
 from thermoxels_ns.audit.conditions import Survey
 from thermoxels_ns.audit.draws import CONFIDENCE
+from thermoxels_ns.audit.envelope import Envelope
 from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit, asked_of_survey
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.version import __version__
+from thermoxels_ns.mesh.boundary.planes import FlatElement, plane_axes
 from thermoxels_ns.reports.audit_view import drawn_triangles, plotly_script, view_data
 from thermoxels_ns.reports.charts import gradient
-from thermoxels_ns.reports.numbers import number_text, stated_text
 from thermoxels_ns.reports.page import Picture, Report, build_page, image_file
 
 AuditPictures: TypeAlias = dict[str, list[bytes]]
@@ -55,7 +55,6 @@ def audit_page(
     """
     numbered, asked = list(enumerate(audit.defects, start=1)), audit.conditions.calibrate
     counted = [(number, one) for number, one in numbered if not one.not_counted]
-    loss, bound = abs(audit.whole.loss_w.value), audit.whole.loss_w.at_most or audit.whole.loss_w.unknown
     start = {} if asked is None else asked.stated()
     unknown = set() if asked is None else {one.name() for one in asked.unknown}
     shown = dict[str, Any](
@@ -63,15 +62,8 @@ def audit_page(
         counted=counted,
         doubted=[(number, one) for number, one in numbered if one.not_counted],
         worst=max(counted, key=lambda item: item[1].extra_w.value, default=None),
-        worth_measuring=[name for name, width in audit.budget.items() if width > 0.05 * loss][:3],
-        budget=[
-            (name, number_text(width, width), "" if bound else f"{100.0 * width / (loss or 1.0):.0f} %")
-            for name, width in audit.budget.items()
-            if width > 5e-4 * (loss or 1.0)
-        ],
         start=start,
         known={name: value for name, value in start.items() if name not in unknown},
-        survey_rows=_survey(audit.conditions.survey),
         pictures=pictures,
         report=report,
         gradient=gradient(),
@@ -108,15 +100,17 @@ def agreement_page(title: str, survey: Survey) -> str:
     return build_page("agreement.html.j2", **about, version=__version__, confidence=100.0 * CONFIDENCE)
 
 
-def _survey(survey: Survey) -> list[tuple[str, str]]:
-    """Return name and text of each fact that a survey states."""
-    units = {"pressure_difference": "Pa", "least_difference_24h": "K", "hours_since_sun": "h", "hours_dry": "h"}
-    said = [(field.name, getattr(survey, field.name)) for field in fields(survey)]
-    return [
-        (name.replace("_", " "), stated_text(value, units.get(name, "")))
-        for name, value in said
-        if value not in (None, "")
-    ]
+def gbxml(envelope: Envelope, title: str) -> str:
+    """Return a building of one space as gbXML 6.01; intervals of U-values are in descriptions of constructions."""
+
+    def rectangle(one: FlatElement) -> tuple[list[float], float, float]:
+        """Return the corner, [m], the width and the height of the rectangle around an element."""
+        low, high = np.array(one.flat().bounds).reshape(2, 2)
+        corner = plane_axes(one.normal) @ low + (one.outline_m[0] @ one.normal) * one.normal
+        return corner.tolist(), *(high - low).tolist()
+
+    about = {"envelope": envelope, "title": title, "confidence": 100.0 * CONFIDENCE}
+    return build_page("envelope.gbxml.j2", **about, rectangle=rectangle)
 
 
 def draw_audit(audit: Audit) -> AuditPictures:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -118,6 +118,7 @@ def capture_page(
     scene, rig, drift = result.scene, result.scene.rig, result.scene.drift
     errors, known_c = scene.model.sighting_error_px(), temperatures_c[np.isfinite(temperatures_c)]
     label = "temperature, °C; how many pixels of a sample, without the coldest and hottest 0.1 %"
+    off = {**rig.standard_errors, "focal": rig.standard_errors.get("log_focal", math.nan) * rig.thermal_camera.fl_x}
     frames = []
     for index, (name, frame) in enumerate(zip(scene_names(len(scene.frames)), scene.model.frames)):
         own = errors[scene.model.sighting_frame == index] if errors.size else errors
@@ -127,7 +128,9 @@ def capture_page(
         name=printable(result.source.resolve().name),
         result=result,
         overlays=overlays,
-        cameras=_cameras(result),
+        cameras=[(scene.model.camera, {}), (result.start.thermal_camera, {}), (rig.thermal_camera, off)],
+        with_error=with_error,
+        angle_deg=lambda camera: 2.0 * math.degrees(math.atan(camera.width / (2.0 * camera.fl_x))),
         turn=with_error(rig.turn_deg, rig.turn_error_deg, 2),
         shift=float(np.linalg.norm(rig.visible_to_thermal[:3, 3])),
         errors=errors,
@@ -143,24 +146,6 @@ def capture_page(
         min_frames=MIN_FRAMES,
         drift_chart=bars(drift.offsets_k.tolist(), "frame; how much it reads too high, K") if drift.used else "",
     )
-
-
-def _cameras(result: CaptureResult) -> list[tuple[str, ...]]:
-    """Return table rows on the photographs' camera, and on the thermal camera as assumed at first and as found."""
-    rig = result.scene.rig
-    errors = dict(rig.standard_errors)
-    errors["focal"] = errors.get("log_focal", math.nan) * rig.thermal_camera.fl_x
-
-    def described(camera: Camera, errors: Mapping[str, float]) -> tuple[str, ...]:
-        values = {"focal": camera.fl_x, "cx": camera.cx, "cy": camera.cy}
-        focal, x, y = (with_error(value, errors.get(name, math.nan), 1) for name, value in values.items())
-        angle = 2.0 * math.degrees(math.atan(camera.width / (2.0 * camera.fl_x)))
-        size = f"{camera.width} x {camera.height}"
-        return size, focal, f"{angle:.1f}", f"{x}, {y}", f"{camera.k1:.4f}, {camera.k2:.4f}"
-
-    names = ("size, pixels", "focal length, pixels", "angle of view, degrees", "principal point, pixels")
-    cameras = (result.scene.model.camera, {}), (result.start.thermal_camera, {}), (rig.thermal_camera, errors)
-    return [*zip((*names, "distortion k1, k2"), *(described(*one) for one in cameras))]
 
 
 def with_error(value: float, error: float, decimals: int) -> str:

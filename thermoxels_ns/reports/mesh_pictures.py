@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -30,7 +29,6 @@ _MESH_AREA = (0.04, 0.16, 0.80, 0.90)
 _INK = "#202020"
 _SUPPORT_COLOURS: tuple[str, ...] = ("green", "gold", "red", "grey")
 _LEAST_CHANGE_K = 1e-3  # Smallest end of a colour bar of changes, [K]; the other end is its negative
-_SHARE_OF_CHANGES = 0.95  # Share of the nodes whose changes the colours span if a few nodes change far more
 HEAT_PICTURES = ("surface-start.png", "surface-end.png", "surface-change.png", "cut.png")
 """File names of the pictures of a heat run; a steady state only has the second and the last picture."""
 _MATTER = {"ambient": 0.5, "diffuse": 0.65, "smooth_shading": False}  # Light that keeps colours readable in the shade
@@ -115,8 +113,6 @@ def image_of_surface(
         below.append(f"colours: middle 99 %; all: {float(shown.min()):.1f} to {float(shown.max()):.1f}")
 
     height = window_size[1]
-    # DejaVu Sans, which comes with matplotlib, is the easiest to read in small pictures.
-    font = str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
     plotter = pv.Plotter(off_screen=True, window_size=list(window_size))
     try:
         plotter.renderer.set_background("white")
@@ -125,7 +121,9 @@ def image_of_surface(
             surface.point_data["value"] = values
             start = _DARKEST if colour_map == "inferno" else 0.0
             colours = ListedColormap(matplotlib.colormaps[colour_map](np.linspace(start, 1.0, 256)))
-            bar_look: Any = _colour_bar(bar_title, high - low, height)
+            place = {"vertical": True, "position_x": 0.86, "position_y": 0.2, "width": 0.06, "height": 0.6}
+            size = {"title_font_size": round(height / 38), "label_font_size": round(height / 38)}
+            bar_look: Any = {"title": f"{bar_title}\n", "color": _INK, "unconstrained_font_size": True, **place, **size}
             plotter.add_mesh(surface, cmap=colours, clim=(low, high), scalar_bar_args=bar_look, **_MATTER)
         for _, colour, which in painted:
             if which.any():
@@ -135,15 +133,11 @@ def image_of_surface(
             plotter.add_mesh(pv.PolyData.from_regular_faces(*ghost), color="grey", opacity=0.35, **_MATTER)
             in_sight = np.concatenate((in_sight, ghost[0]))
         if labels:
-            look: Any = {"font_size": round(height / 45), "font_file": font, "text_color": _INK, "shape_color": "white"}
+            look: Any = {"font_size": round(height / 45), "text_color": _INK, "shape_color": "white"}
             points = np.array([point for _, point in labels], dtype=np.float64)
             texts = [text for text, _ in labels]
             plotter.add_point_labels(points, texts, show_points=False, always_visible=True, **look)
-        for bar in plotter.scalar_bars.values():
-            for text in (bar.GetTitleTextProperty(), bar.GetLabelTextProperty()):
-                text.SetFontFamily(4)  # VTK_FONT_FILE
-                text.SetFontFile(font)
-        written: Any = {"viewport": True, "color": _INK, "font_file": font}
+        written: Any = {"viewport": True, "color": _INK}
         plotter.add_text(title, position=(0.04, 0.925), font_size=round(height / 60), **written)
         lines = "\n".join(line for line in below if line)
         plotter.add_text(lines, position=(0.17, 0.04), font_size=round(height / 78), **written)
@@ -203,15 +197,12 @@ def before_after_change(
 def change_colours(change: npt.NDArray[np.floating]) -> dict[str, Any]:
     """Return arguments of `image_of_mesh` for changes, [K], above and below 0: colours, and a note below the picture.
 
-    If a few nodes changed far more than the rest, the colours end at the size of change that 95 % of the nodes do not
-    exceed, and the note says so; otherwise the note is empty.
+    If few nodes changed far more than the rest, colours span the middle 99 %, and the note says so; else it is empty.
     """
-    size = np.abs(change)
-    most, end = float(size.max()), float(np.quantile(size, _SHARE_OF_CHANGES))
-    beyond = most > 2.0 * end > _LEAST_CHANGE_K
-    end = max(end if beyond else most, _LEAST_CHANGE_K)
+    shown = _without_outliers(change)
+    end = max(float(np.abs(shown).max()), _LEAST_CHANGE_K)
     extremes = f"{float(change.min()):.2g} to {float(change.max()):.2g} K"
-    note = f"colours: {100 * _SHARE_OF_CHANGES:.0f} % of the nodes; all: {extremes}" if beyond else ""
+    note = f"colours: middle 99 %; all: {extremes}" if len(shown) < len(change) else ""
     return {"clim": (-end, end), "colour_map": "coolwarm", "bar_title": "change [K]", "note": note}
 
 
@@ -234,19 +225,6 @@ def _without_outliers(values: FloatArray) -> FloatArray:
     low, high = np.quantile(values, (0.005, 0.995))
     few = np.ptp(values) > 2.0 * (high - low) > 0.0
     return values[(values >= low) & (values <= high)] if few else values
-
-
-def _colour_bar(title: str, span: float, height: int) -> dict[str, Any]:
-    """Return pyvista's arguments of a colour bar for values of range `span`, in a picture of `height` [pixels]."""
-    import pyvista as pv
-
-    decimals = 1 if span > 2.0 else 2 + max(0, math.ceil(-math.log10(span)))
-    place = {"vertical": True, "position_x": 0.86, "position_y": 0.2, "width": 0.06, "height": 0.6}
-    points = round(height / 38)
-    size = {"title_font_size": points, "label_font_size": points, "unconstrained_font_size": True}
-    # From VTK 9.6 on, formats are written as in Python instead of as in printf.
-    form = f"{{:.{decimals}f}}" if pv.vtk_version_info >= (9, 6) else f"%.{decimals}f"
-    return {"title": f"{title}\n", "fmt": form, "color": _INK, "n_labels": 5, **place, **size}
 
 
 def _frame(plotter: pv.Plotter, points: FloatArray, up: FloatArray, towards_camera: FloatArray) -> None:

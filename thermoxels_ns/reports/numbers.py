@@ -14,35 +14,17 @@ from thermoxels_ns.core.measured import Measured
 def figure(value: float) -> str:
     """Return a number with three significant digits; with a power of ten below 0.001 and from a million on.
 
-    >>> figure(1234.56), figure(0.0123456), figure(0.0)
+    What is below a millionth is round-off in all that pages show, and becomes 0.
+
+    >>> figure(1234.56), figure(0.0123456), figure(-6e-10)
     ('1,230', '0.0123', '0')
     """
-    if value == 0.0:
+    if abs(value) < 1e-6:
         return "0"
     if 1e-3 <= abs(value) < 1e6:
         digits = 2 - math.floor(math.log10(abs(value)))
         return f"{round(value, digits):,.{max(digits, 0)}f}"
     return f"{value:.2e}"
-
-
-def flow_text(heat_w: float, least_w: float, per_area: float | None = None) -> str:
-    """Return `per_area`, [W/m^2], or without it `heat_w`, as text; "0" if the size of `heat_w` is below `least_w`, [W].
-
-    >>> flow_text(6e-10, 1e-6), flow_text(6e-10, 1e-6, 1e5), flow_text(-12.5, 1e-6), flow_text(1e-2, 1e-6, 1e-3)
-    ('0', '0', '-12.5', '0.00100')
-    """
-    return "0" if abs(heat_w) < least_w else figure(heat_w if per_area is None else per_area)
-
-
-def least_flow(flows_w: Sequence[float], area_m2: float) -> float:
-    """Return the size below which heat flows count as round-off in a body with surface `area_m2`, [W].
-
-    This size is 1e-9 times the largest flow, or, if larger, 1e-9 W/m2 times the area.
-
-    >>> f"{least_flow((1e3, -1e3), 200.0):g} {least_flow((), 200.0):g}"
-    '1e-06 2e-07'
-    """
-    return 1e-9 * max(*map(abs, flows_w), area_m2, 0.0)
 
 
 def degrees(value_c: float) -> str:
@@ -77,17 +59,12 @@ def plain_names(text: str) -> str:
 
 
 def point_text(point_m: Sequence[float]) -> str:
-    """Return coordinates, [m], with three significant digits, but never finer than 1 mm or coarser than 1 m.
+    """Return coordinates, [m], with four significant digits.
 
-    >>> point_text((0.00625, 3.14159, -12.04)), point_text((51234.5, -0.0002, 1.0))
-    ('(0.006, 3.14, -12)', '(51234, 0, 1)')
+    >>> point_text((0.00625, 3.14159, -12.04))
+    '(0.00625, 3.142, -12.04)'
     """
-    texts = []
-    for value_m in point_m:
-        decimals = 3 if abs(value_m) < 1.0 else max(0, 2 - math.floor(math.log10(abs(value_m))))
-        text = f"{round(float(value_m), decimals) + 0.0:.{decimals}f}"
-        texts.append(text.rstrip("0").rstrip(".") if decimals else text)
-    return f"({', '.join(texts)})"
+    return f"({', '.join(f'{value_m:.4g}' for value_m in point_m)})"
 
 
 def unit_signs(unit: str) -> str:
@@ -172,15 +149,6 @@ def interval_lines(interval: Interval, bounds: bool = True) -> str:
     ('0.89\\n0.21 to 1.55', 'at most 0.80')
     """
     return interval_text(interval, "", bounds).replace(" (", "\n").rstrip(")")
-
-
-def area_text(area_m2: float) -> str:
-    """Return an area as text, [m2]: with one decimal from 10 m2 on, with two decimals below.
-
-    >>> area_text(12.04), area_text(0.4812)
-    ('12.0', '0.48')
-    """
-    return f"{area_m2:,.1f}" if area_m2 >= 10.0 else f"{area_m2:.2f}"
 
 
 def number_text(value: float, half_width: float) -> str:

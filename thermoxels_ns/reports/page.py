@@ -1,4 +1,7 @@
-"""Build html pages from templates; a page is one file that loads nothing else. Only the audit's runs a script."""
+"""Build html pages from templates and print them as PDF; a page is one file that loads nothing else.
+
+Only the page of an audit runs a script.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,6 @@ from thermoxels_ns.reports import numbers
 
 Picture: TypeAlias = tuple[bytes, str]
 """Content of a PNG or JPEG file, and its caption."""
-
-_SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def identify(files: Sequence[Path], *choices: object) -> Report:
 def build_page(template: str, **shown: Any) -> str:
     """Return the html text of a page, made from a file in the folder ``templates`` and the values of its variables.
 
-    Equal arguments give equal text. Raises `ThermoxelsError` for a picture that is neither PNG nor JPEG.
+    Equal arguments give equal text.
     """
     return _environment().get_template(template).render(**shown)
 
@@ -71,13 +72,41 @@ def image_file(picture: npt.NDArray[np.uint8], kind: Literal["PNG", "JPEG"] = "J
     return stream.getvalue()
 
 
-def image_address(image: bytes, words: str) -> str:
-    """Return a PNG or JPEG file as a ``data:`` address; raises a `ThermoxelsError` about `words` for other content."""
-    kind = next((kind for signature, kind in _SIGNATURES.items() if image.startswith(signature)), None)
-    if kind is None:
-        got, remedy = f"{len(image)} bytes that begin with {image[:8]!r}", "Draw the picture again."
-        raise ThermoxelsError(words, expected="the content of a PNG or JPEG file", got=got, remedy=remedy)
-    return f"data:{kind};base64,{base64.b64encode(image).decode()}"
+def image_address(image: bytes) -> str:
+    """Return a PNG or JPEG file as a ``data:`` address."""
+    kind = "png" if image.startswith(b"\x89PNG") else "jpeg"
+    return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
+
+
+def why_no_pdf() -> str:
+    """Return a sentence that says what WeasyPrint lacks here and how to get it; "" if it can be used."""
+    from PIL import ImageFile
+
+    damaged_too = ImageFile.LOAD_TRUNCATED_IMAGES
+    try:
+        import weasyprint  # noqa: F401
+    except ImportError:
+        return "WeasyPrint is not installed; install it with: pip install weasyprint."
+    except OSError as problem:
+        library = "apt install libpango-1.0-0 libpangoft2-1.0-0 (Debian, Ubuntu) or brew install pango (macOS)"
+        return f"WeasyPrint does not find its system library pango ({problem}); install that: {library}."
+    finally:
+        ImageFile.LOAD_TRUNCATED_IMAGES = damaged_too  # else this process would take half photographs for whole ones
+    return ""
+
+
+def write_pdf(path: Path, page: str) -> None:
+    """Print the html text of a page into a PDF file, whole or not at all.
+
+    Nothing is fetched: pictures lie in the page. Raises `ThermoxelsError` if `why_no_pdf` has a reason.
+    """
+    lacking = why_no_pdf()
+    if lacking:
+        raise ThermoxelsError(str(path), expected="a PDF file", got="none", remedy=lacking)
+    from weasyprint import HTML
+
+    with replace_when_done(path) as temporary:
+        HTML(string=page).write_pdf(temporary)
 
 
 @cache
@@ -91,7 +120,6 @@ def _environment() -> Environment:
     )
     environment.filters |= {
         "address": image_address,
-        "area": numbers.area_text,
         "count": "{:,}".format,
         "degrees": numbers.degrees,
         "duration": numbers.duration_text,
