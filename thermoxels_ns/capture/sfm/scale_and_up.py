@@ -204,16 +204,22 @@ def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> t
         keep = off <= 3.0 * 1.4826 * float(np.median(off)) + 1e-12
     at, usual = float(plane[0]), float(np.median(inverse))
     at = at if at > 0.25 * usual else usual  # a plane far behind the points gives no depth; take their median
-    ray = (camera.rays([pixel])[0] * (1.0, -1.0, -1.0)) @ model.camera_to_world[index, :3, :3].T  # of depth 1
+    ray = _ray_of_depth_1(model, index, pixel)
     error = float(np.sqrt(np.mean(off[keep] ** 2))) / at**2 / math.sqrt(max(int(keep.sum()) - 3, 1))
     return model.centres[index] + ray / at, ray * error
+
+
+def _ray_of_depth_1(model: SfmModel, index: int, pixel: npt.ArrayLike) -> FloatArray:
+    """Return the world vector (3,) from the camera of a frame to what a pixel (2,) shows at depth 1."""
+    along = model.camera.rays(np.asarray(pixel, dtype=np.float64)[None])[0] * (1.0, -1.0, -1.0)
+    return along @ model.camera_to_world[index, :3, :3].T
 
 
 def _triangulate(model: SfmModel, views: Sequence[tuple[int, npt.NDArray]]) -> tuple[FloatArray, FloatArray]:
     """Return the point nearest to all rays, shape (3,), and its reprojection errors, shape (views,), [pixels]."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for index, pixel in views:
-        ray = model.ray(index, pixel)
+        ray = _ray_of_depth_1(model, index, pixel)
         across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
         normal += across
         right += across @ model.centres[index]
