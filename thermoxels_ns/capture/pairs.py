@@ -127,28 +127,40 @@ _Found = tuple[list[tuple[CameraFile, CameraFile, str]], dict[Path, str]]
 
 def _by_dji_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile]) -> _Found:
     """Pair DJI_0001_T with DJI_0001_V (or _W); times in the two names may differ by up to `_DJI_LATE_S`."""
-    shots: dict[tuple, list[tuple[str, float, CameraFile]]] = defaultdict(list)
+    taken: dict[tuple, list[tuple[re.Match[str], CameraFile]]] = defaultdict(list)
     for file in (*photographs, *thermal):
-        if match := _DJI.match(file.path.stem.lower()):
-            shot = file.path.parent, match["head"], match["number"], match["tail"]
-            shots[shot].append((match["role"], _seconds(match["time"] or ""), file))
-    pairs, explained = [], dict[Path, str]()
-    for group in shots.values():
-        photos = [one for one in group if one[2].role == "photograph"]
-        for role, time_s, file in group:
-            near = {letter: other for letter, at_s, other in photos if abs(at_s - time_s) <= _DJI_LATE_S}
-            best = next((near[letter] for letter in _DJI_PHOTOGRAPHS if letter in near), None)
-            if role == "t" and file.role != "photograph" and best is not None:
-                pairs.append((best, file, "DJI's names"))
-                why = f"{best.path.name} is the partner of {file.path.name}"
-                explained |= {other.path: why for other in near.values() if other is not best}
-    return pairs, explained
+        match = _DJI.match(file.path.stem.lower())
+        if match:
+            taken[(file.path.parent, match["head"], match["number"], match["tail"])].append((match, file))
+    pairs, others = [], []
+    for group in taken.values():
+        photos = [(match, file) for match, file in group if file.role == "photograph"]
+        for match, file in group:
+            if match["role"] != "t" or file.role == "photograph":
+                continue
+            near = [(m["role"], f) for m, f in photos if _seconds_apart(m, match) <= _DJI_LATE_S]
+            sides = [[f for letter, f in near if letter == each] for each in _DJI_PHOTOGRAPHS]
+            best = next((side for side in sides if side), [])
+            if len(best) == 1:
+                pairs.append((best[0], file, "DJI's names"))
+                others.append([f.path for _, f in near if f is not best[0]])
+    counted = Counter(photo.path for photo, _, _ in pairs)
+    clear, explained = [], dict[Path, str]()
+    for pair, rest in zip(pairs, others):
+        if counted[pair[0].path] == 1:
+            clear.append(pair)
+            explained |= {path: f"{pair[0].path.name} is the partner of {pair[1].path.name}" for path in rest}
+    return clear, {path: why for path, why in explained.items() if path not in counted}
 
 
-def _seconds(digits: str) -> float:
-    """Return the seconds since the start of the month of a time such as 20220723151219; 0 without a time."""
-    day, hour, minute, second = (int(digits[at : at + 2] or 0) for at in (6, 8, 10, 12))
-    return 86400.0 * day + 3600.0 * hour + 60.0 * minute + second
+def _seconds_apart(first: re.Match[str], second: re.Match[str]) -> float:
+    if not first["time"] or not second["time"]:
+        return 0.0 if first["time"] == second["time"] else np.inf
+
+    def seconds(digits: str) -> int:
+        return int(digits[6:8]) * 86400 + int(digits[8:10]) * 3600 + int(digits[10:12]) * 60 + int(digits[12:])
+
+    return abs(seconds(first["time"]) - seconds(second["time"]))
 
 
 def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], folder: Path) -> _Found:
