@@ -114,6 +114,9 @@ def main(arguments: list[str] | None = None) -> int:
     except ThermoxelsError as problem:
         _complain("[bold red]Error:[/bold red]", str(problem))
         return exit_status(problem)
+    except MemoryError as problem:
+        _complain("[bold red]Error:[/bold red]", f"memory does not suffice: {problem}")
+        return exit_status(problem)
     except KeyboardInterrupt:
         _complain("[bold red]Interrupted.[/bold red]")
         return 130

@@ -18,7 +18,7 @@ import yaml
 
 from thermoxels_ns.core.checks import refuse_what_is_in_the_way, writable_folder
 from thermoxels_ns.core.config_loader import ConfigLoader, ModuleWith, check_run
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError, exit_status
+from thermoxels_ns.core.errors import CRASH, OutputError, SceneError, ThermoxelsError, exit_status
 
 if TYPE_CHECKING:
     from thermoxels_ns.evaluation.truth_comparison import RenderedRays
@@ -52,7 +52,7 @@ def print_our_errors_plainly() -> None:
             print(f"Error: {problem}{_where_to_say_it(str(problem))}", file=sys.stderr)
         else:
             previous(kind, problem, traceback)
-        if isinstance(problem, (ThermoxelsError, MemoryError)):
+        if exit_status(problem) != CRASH and not hasattr(sys, "ps1"):  # an interactive Python goes on
             raise SystemExit(exit_status(problem))
 
     hook.prints_thermoxels_errors = True  # type: ignore[attr-defined]

@@ -59,10 +59,11 @@ class OnGpu(torch.Tensor):
             kwargs["device"] = torch.device("cpu")
         met: list[torch.Tensor] = []
         tree_map(lambda value: met.append(value) if isinstance(value, torch.Tensor) else None, (args, kwargs))
-        # Formulas of gradients in C++ make zeros on what they take for the device.
-        strangers = [v.shape for v in met if not isinstance(v, OnGpu) and v.dim() and bool(v.any())]
+        strangers = [v for v in met if not isinstance(v, OnGpu) and v.dim()]
+        if torch._C._current_graph_task_id() != -1:  # formulas of gradients in C++ make zeros on what they take for it
+            strangers = [v for v in strangers if bool(v.any())]
         if strangers and function is not torch.ops.aten.copy_.default:
-            raise RuntimeError(f"{function}: {len(strangers)} of {len(met)} tensors are on the CPU: {strangers}")
+            raise RuntimeError(f"{function}: {len(strangers)} of {len(met)} tensors are on the CPU")
         result = function(*tree_map(_inside, args), **tree_map(_inside, kwargs))
         if function is torch.ops.aten.copy_.default and not isinstance(args[0], OnGpu):
             return args[0]
@@ -120,8 +121,10 @@ def pretended_gpu() -> Iterator[None]:
         for name in _FACTORIES:
             patch.setattr(torch, name, on_device(getattr(torch, name)))
         torch.__future__.set_overwrite_module_params_on_conversion(True)
-        yield
-        torch.__future__.set_overwrite_module_params_on_conversion(False)
+        try:
+            yield
+        finally:
+            torch.__future__.set_overwrite_module_params_on_conversion(False)
 
 
 class _Move(torch.autograd.Function):

@@ -5,24 +5,29 @@ from __future__ import annotations
 # Only light imports at the top, so that ``thermoxels --help`` answers at once.
 import csv
 import json
+import math
+import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import tyro
 
 from thermoxels_ns.commands.installed_commands import PLAIN_TRAINING, CommandFailed, run_command
 from thermoxels_ns.core.checks import hold_folder, remove_file, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import BAD_DATA, LACK_OF_MEMORY, SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import BAD_DATA, CRASH, LACK_OF_MEMORY, SceneError, ThermoxelsError
 
 BATCH, PAGE = "batch.json", "index.html"
-_WHY = {BAD_DATA: "input", LACK_OF_MEMORY: "memory"}
+_ENDED = 137  # Status of a stage that was ended from outside, as by a scheduler's limit of memory or time
+_WHY = {BAD_DATA: "input", LACK_OF_MEMORY: "memory", _ENDED: "from outside"}
+_TRIED_AGAIN = LACK_OF_MEMORY, _ENDED
 
 
 class Needs(NamedTuple):
@@ -41,7 +46,8 @@ STAGES: Mapping[str, Needs] = {
     "heat": Needs(1, 3000, 120),
     "audit": Needs(1, 3000, 60),
 }
-"""Stages in the order in which they follow. Memory is asked for once more, doubled, where a stage ran out of it."""
+"""Stages in the order in which they follow. A stage that ran out of memory or was ended is tried once more, and then
+asks for twice the memory and time."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +63,7 @@ class Building:
     patches: str = ""
     """File that names patches, for the export."""
     heat: str = ""
-    """Heat scene by name or file; empty: no heat."""
+    """Heat scene by name or .yaml file; empty: no heat."""
     conditions: str = ""
     """Conditions of the survey; empty: no audit."""
     train: str = ""
@@ -103,19 +109,18 @@ class Batch:
 
 def run_batch(batch: Batch, console: Any) -> None:
     """Run a `Batch`: read the list, start Snakemake, and write the page over all buildings."""
-    if batch.cores < 1 or (batch.memory_gb is not None and not batch.memory_gb > 0):
+    if batch.cores < 1 or not (batch.memory_gb is None or 0.0 < batch.memory_gb < math.inf):
         got, remedy = f"{batch.cores} and {batch.memory_gb} GB", "Leave them out for the defaults."
         raise ThermoxelsError("batch", expected="at least one processor and some memory", got=got, remedy=remedy)
     buildings = read_list(batch.list)
     if find_spec("snakemake") is None:
-        remedy = "Install it: pip install 'snakemake>=9'"
+        remedy = "Install it, with Python 3.11 or newer: pip install 'snakemake>=9'"
         raise ThermoxelsError("snakemake", expected="a package of this Python", got="none", remedy=remedy)
     folder = writable_folder(batch.output_dir).resolve()
-    lock = hold_folder(folder / ".batch.lock", "Wait for it, or pass another --output-dir.", console.print)
-    with lock:
-        with replace_when_done(folder / BATCH) as temporary:
-            content = {name: asdict(one) for name, one in buildings.items()}
-            temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    with hold_folder(folder / ".batch.lock", "Wait for it, or pass another --output-dir.", console.print) as lock:
+        _write_json(folder / BATCH, {name: asdict(one) for name, one in buildings.items()})
+        if not batch.dry_run:
+            _forget_what_changed(folder, buildings)
         command = [
             *(sys.executable, "-m", "snakemake", "--snakefile", str(_snakefile()), "--directory", str(folder)),
             *("--cores" if not batch.executor else "--jobs", str(batch.cores)),
@@ -125,20 +130,37 @@ def run_batch(batch: Batch, console: Any) -> None:
             *(("--dry-run",) if batch.dry_run else ("--quiet", "rules")),
         ]
         console.print(f"$ {shlex.join(command)}", style="bold", markup=False, soft_wrap=True)
-        ended = subprocess.run(command, check=False)
+        # Snakemake inherits the lock: while it runs, also without this process, no other batch begins in the folder.
+        held = lock._context.lock_file_fd
+        process = subprocess.Popen(command, pass_fds=[held] if held is not None and os.name == "posix" else [])
+        try:
+            process.wait()
+        except KeyboardInterrupt:
+            process.wait()  # it ends its jobs, also those on a cluster
+            raise
+        rows = [] if batch.dry_run else [_row(folder, name, building) for name, building in buildings.items()]
+        if process.returncode and not any(row["failed"] for row in rows):
+            remedy = "Its output says why."
+            raise ThermoxelsError("snakemake", expected="exit status 0", got=process.returncode, remedy=remedy)
         if batch.dry_run:
-            if ended.returncode:
-                remedy = "Its output says why."
-                raise ThermoxelsError("snakemake", expected="exit status 0", got=ended.returncode, remedy=remedy)
             return
-        rows = [_row(folder, name, building) for name, building in buildings.items()]
         _write_page(folder / PAGE, rows)
     console.print(f"All buildings: {folder / PAGE}", markup=False, soft_wrap=True)
     missing = [row for row in rows if not row["finished"]]
     if missing:
-        got = "; ".join(f"{row['name']}: {row['why']}" for row in missing[:5])
+        got = "; ".join(f"{row['name']}: {row['why'][0]}" for row in missing[:5])
         remedy = f"Correct what {folder / PAGE} names; the same command then goes on."
         raise ThermoxelsError("batch", expected=f"{len(rows)} buildings finished", got=got, remedy=remedy)
+
+
+def _forget_what_changed(folder: Path, buildings: Mapping[str, Building]) -> None:
+    """Remove the markers of stages whose commands differ from those of today, and what earlier runs say of failures."""
+    for name, building in buildings.items():
+        for stage, (command, _) in plan_of(building, Path(name)).items():
+            remove_file(folder / name / "logs" / f"{stage}.failed.json")
+            marker = folder / name / f"{stage}.json"
+            if marker.is_file() and _read(marker).get("command") != command:
+                remove_file(marker)
 
 
 def read_list(path: Path) -> dict[str, Building]:
@@ -151,34 +173,55 @@ def read_list(path: Path) -> dict[str, Building]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
-            columns, lines = reader.fieldnames or [], list(reader)
+            columns = reader.fieldnames or []
+            lines = [(reader.line_num, line) for line in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
         raise SceneError(str(path), expected="a csv file", got=str(problem), remedy="Pass the list.") from problem
     wrong = [f"unknown column {name!r}" for name in columns if name not in known]
+    wrong += [f"column {name!r} twice" for name in set(columns) if list(columns).count(name) > 1]
     wrong += [] if "name" in columns else ["no column 'name'"]
     buildings: dict[str, Building] = {}
-    for number, line in enumerate([] if wrong else lines, start=2):
+    for number, line in [] if wrong else lines:
         values = {name: (line.get(name) or "").strip() for name in columns}
-        for name in ("photographs", "scene", "patches", "conditions", "heat"):
-            there = path.parent.resolve() / values.get(name, "")
-            if values.get(name) and (there.exists() or name != "heat"):  # heat scenes have names of their own
-                wrong += [] if there.exists() else [f"line {number}: {name}: no {there}"]
-                values[name] = str(there)
+        mistakes = [] if not any(line.get(None, ())) else ["more entries than columns"]  # type: ignore[call-overload]
+        for name, is_there in _PLACES.items():
+            if values.get(name) and (name != "heat" or values[name].endswith((".yaml", ".yml"))):
+                place = path.parent.resolve() / values[name]
+                mistakes += [] if is_there(place) else [f"{name}: no {place}"]
+                values[name] = str(place)
         one = Building(**values)
-        if not re.fullmatch(r"[A-Za-z0-9][\w-]*", one.name, re.ASCII):
-            wrong.append(f"line {number}: name {one.name!r} is not of letters, digits, - and _")
-        if one.name in buildings:
-            wrong.append(f"line {number}: name {one.name!r} is there twice")
-        if bool(one.photographs) == bool(one.scene):
-            wrong.append(f"line {number}: needs either photographs or a scene")
-        if None in line:
-            wrong.append(f"line {number}: more entries than columns")
+        mistakes += [] if _KNOWN_NAME.fullmatch(one.name) else [f"name {one.name!r} is not of letters, digits, - and _"]
+        mistakes += [f"name {one.name!r} is there twice"] if one.name in buildings else []
+        mistakes += ["needs either photographs or a scene"] if bool(one.photographs) == bool(one.scene) else []
+        mistakes += _unknown_heat(one.heat)
+        for name in ("train", "export"):
+            try:
+                shlex.split(getattr(one, name))
+            except ValueError as problem:
+                mistakes.append(f"{name}: {problem}")
+        wrong += [f"line {number}: {mistake}" for mistake in mistakes]
         buildings[one.name] = one
     if wrong or not buildings:
         got = "; ".join(wrong) or "no building"
-        expected = f"a line per building with the columns {', '.join(known)}"
+        expected = f"a line per building, its entries apart by commas, with the columns {', '.join(known)}"
         raise SceneError(str(path), expected=expected, got=got, remedy="Correct the list.")
     return buildings
+
+
+_KNOWN_NAME = re.compile(r"[A-Za-z0-9][\w-]*", re.ASCII)
+_PLACES = {
+    **{"photographs": Path.is_dir, "scene": Path.exists},
+    **{"patches": Path.is_file, "conditions": Path.is_file, "heat": Path.is_file},
+}
+
+
+def _unknown_heat(heat: str) -> list[str]:
+    if not heat or heat.endswith((".yaml", ".yml")):
+        return []
+    from thermoxels_ns.heat.scene import heat_scene_names
+
+    known = heat_scene_names()
+    return [] if heat in known else [f"heat: {heat!r} is neither a .yaml file nor one of {', '.join(known)}"]
 
 
 def read_batch(folder: Path) -> dict[str, Building]:
@@ -193,13 +236,18 @@ def plan_of(building: Building, folder: Path) -> dict[str, Stage]:
     config = str(folder / "outputs" / "building" / "thermoxels" / "run" / "config.yml")
     mesh = str(folder / "mesh" / "mesh.vtu")
     capture = ["thermoxels", "capture", building.photographs, "--output", scene]
+    options = shlex.split(building.train)
+    threads = [] if "--pipeline.cpu-threads" in options else ["--pipeline.cpu-threads", str(STAGES["model"].threads)]
     train = [
         *("ns-train", "thermoxels", "--output-dir", str(folder / "outputs"), "--experiment-name", "building"),
-        *(*PLAIN_TRAINING, *shlex.split(building.train), "thermal-data", "--data", scene),
+        *(*PLAIN_TRAINING, *threads, *options, "thermal-data", "--data", scene),
     ]
     export = ["ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", str(folder / "mesh")]
     export += [*(["--patches", building.patches] if building.patches else []), *shlex.split(building.export)]
     audit = ["thermoxels", "audit", mesh, "--conditions", building.conditions, "--scene", scene]
+    for name, count in (("--layout", 1), ("--thermal-bounds", 2)):  # how the scene's thermal images are read
+        if name in options:
+            audit += options[options.index(name) : options.index(name) + 1 + count]
     commands = {
         "scene": capture if building.photographs else [],
         "model": train,
@@ -211,8 +259,13 @@ def plan_of(building: Building, folder: Path) -> dict[str, Stage]:
     after = {"model": "scene", "scores": "model", "mesh": "model", "heat": "mesh", "audit": "mesh"}
     wanted = {"scene": building.photographs, "heat": building.heat, "audit": building.conditions}
     stages = {name: command for name, command in commands.items() if wanted.get(name, "yes")}
+    reads = {"mesh": building.patches, "heat": building.heat, "audit": building.conditions}
     return {
-        name: Stage(command, [f"{folder.as_posix()}/{after[name]}.json"] if after.get(name) in stages else [])
+        name: Stage(
+            command,
+            [f"{folder.as_posix()}/{after[name]}.json"] * (after.get(name) in stages)
+            + [file for file in [reads.get(name, "")] if Path(file).is_absolute()],
+        )
         for name, command in stages.items()
     }
 
@@ -220,27 +273,28 @@ def plan_of(building: Building, folder: Path) -> dict[str, Stage]:
 def run_stage(name: str, stage: str, attempt: int) -> int:
     """Run a stage of a building in the folder of the batch, and return its exit status.
 
-    A stage that ended for another reason than memory is not tried a second time: `attempt` 2 then ends as it did.
+    A stage that ended by itself for another reason than memory is not tried a second time: `attempt` 2 then ends as it
+    did. What ends it before its command does leaves the note that it was ended from outside.
     """
     from rich.console import Console
 
     folder = writable_folder(Path(name) / "logs").parent
-    failed, done = folder / "logs" / f"{stage}.failed.json", folder / f"{stage}.json"
-    if attempt > 1 and failed.is_file():
-        earlier = int(json.loads(failed.read_text(encoding="utf-8"))["status"])
-        if earlier != LACK_OF_MEMORY:
-            return earlier
+    failed, log = folder / "logs" / f"{stage}.failed.json", folder / "logs" / f"{stage}.log"
+    earlier = _read(failed).get("status", _ENDED)
+    if attempt > 1 and earlier not in _TRIED_AGAIN:
+        return earlier
+    _write_json(failed, {"status": _ENDED, "why": "ended from outside, as by a limit of memory or time"})
+    command = plan_of(read_batch(Path())[name], Path(name))[stage].command
+    try:
+        with Path(os.devnull).open("w") as nowhere:  # the log has all
+            cost = run_command(command, log, Console(file=nowhere))
+        peak = cost.peak_memory_gb if math.isfinite(cost.peak_memory_gb) else None
+        _write_json(folder / f"{stage}.json", {"seconds": cost.seconds, "peak_memory_gb": peak, "command": command})
+    except (ThermoxelsError, OSError) as problem:
+        told = (problem.exit_status, problem.last_line) if isinstance(problem, CommandFailed) else (CRASH, str(problem))
+        _write_json(failed, dict(zip(("status", "why"), told)))
+        return told[0]
     remove_file(failed)
-    log = folder / "logs" / f"{stage}.log"
-    with (folder / "logs" / f"{stage}.shown").open("w", encoding="utf-8") as shown:
-        try:
-            cost = run_command(plan_of(read_batch(Path())[name], Path(name))[stage].command, log, Console(file=shown))
-        except CommandFailed as problem:
-            content = {"status": problem.exit_status, "why": problem.last_line}
-            failed.write_text(json.dumps(content), encoding="utf-8")
-            return problem.exit_status
-    with replace_when_done(done) as temporary:
-        temporary.write_text(json.dumps(cost._asdict()), encoding="utf-8")
     return 0
 
 
@@ -251,31 +305,40 @@ def _snakefile() -> Path:
 def _row(folder: Path, name: str, building: Building) -> dict[str, Any]:
     """Return what the page says of a building: how far it came, what it cost, and the main figures of its audit."""
     own, plan = folder / name, plan_of(building, Path(name))
-    costs = {stage: _read(own / f"{stage}.json") for stage in plan}
-    failed = {stage: _read(own / "logs" / f"{stage}.failed.json") for stage in plan}
-    stopped = next((stage for stage in plan if failed[stage]), next((s for s in plan if not costs[s]), ""))
-    said, answers = failed.get(stopped) or {}, _read(own / "audit" / "answers.json")
-    results = _read(own / "eval.json").get("results", {})
-    kind = _WHY.get(said.get("status", 0), "crash")
-    why = f"{stopped}: {said['why']} ({kind})" if said else f"{stopped}: not run"
-    memory = [cost["peak_memory_gb"] for cost in costs.values() if cost and cost["peak_memory_gb"] is not None]
+    costs = {stage: cost for stage in plan if (cost := _read(own / f"{stage}.json"))}
+    notes = {stage: _read(own / "logs" / f"{stage}.failed.json") for stage in plan if stage not in costs}
+    said = {stage: note for stage, note in notes.items() if note}
+    why = [f"{stage}: {one['why']} ({_WHY.get(one['status'], 'crash')})" for stage, one in said.items()]
+    answers = _read(own / "audit" / "answers.json") if "audit" in costs else {}
+    memory = [cost["peak_memory_gb"] for cost in costs.values() if cost["peak_memory_gb"] is not None]
     return {
-        **{"name": name, "finished": not stopped, "why": why if stopped else "", "psnr": results.get("psnr")},
-        "log": f"{name}/logs/{stopped}.log" if said else "",
-        "seconds": {stage: cost["seconds"] for stage, cost in costs.items() if cost},
-        "peak_gb": max((gb for gb in memory if gb == gb), default=None),
+        **{"name": name, "finished": len(costs) == len(plan), "failed": bool(said)},
+        "why": why or [f"{stage}: not run" for stage in plan if stage not in costs],
+        "logs": [f"{name}/logs/{stage}.log" for stage in said],
+        "psnr": _read(own / "eval.json").get("results", {}).get("psnr") if "scores" in costs else None,
+        "seconds": {stage: cost["seconds"] for stage, cost in costs.items()},
+        "peak_gb": max(memory, default=None),
         "loss_w": answers.get("whole", {}).get("loss_w"),
         "bridges": sum(not one["not_counted"] for one in answers.get("defects", ())) if answers else None,
         "pages": [
-            (words, f"{name}/{page}")
-            for words, page in (("audit", "audit/audit.html"), ("heat", "heat/report.html"))
-            if (own / page).is_file()
+            (stage, f"{name}/{page}")
+            for stage, page in (("audit", "audit/audit.html"), ("heat", "heat/report.html"))
+            if stage in costs
         ],
     }
 
 
 def _read(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    """Return the content of a json file; {} if there is none or it is not whole."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    with replace_when_done(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 def _write_page(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -285,5 +348,10 @@ def _write_page(path: Path, rows: list[dict[str, Any]]) -> None:
     write_page(path, build_page("batch.html.j2", rows=rows, stages=list(STAGES)))
 
 
+def _end(*_: Any) -> NoReturn:
+    sys.exit(_ENDED)  # ends the command of the stage, too
+
+
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, _end)
     sys.exit(run_stage(sys.argv[1], sys.argv[2], int(sys.argv[3])))

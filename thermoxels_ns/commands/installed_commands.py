@@ -49,7 +49,8 @@ class CommandFailed(ThermoxelsError):
         self.exit_status = (
             LACK_OF_MEMORY if killed else returncode if returncode in (BAD_DATA, LACK_OF_MEMORY) else CRASH
         )
-        self.last_line = "killed" if killed else lines[-1].strip() if lines else f"exit status {returncode}"
+        ended = f"ended by signal {-returncode}" if returncode < 0 else f"exit status {returncode}"
+        self.last_line = lines[-1].strip() if lines and returncode > 0 else ended
         """Last line of its output, which says why."""
 
 

@@ -56,8 +56,10 @@ class OutputError(ThermoxelsError, OSError):
 
 def exit_status(problem: BaseException) -> int:
     """Return the exit status of a command that ends with an error."""
-    if isinstance(problem, MemoryError):
+    if isinstance(problem, MemoryError) or type(problem).__name__ == "OutOfMemoryError":  # torch's
         return LACK_OF_MEMORY
+    if hasattr(problem, "exit_status"):  # of a command that failed
+        return problem.exit_status  # type: ignore[attr-defined]
     return BAD_DATA if isinstance(problem, ThermoxelsError) else CRASH
 
 

@@ -1,6 +1,6 @@
 """Build html pages from templates and print them as PDF; a page is one file that loads nothing else.
 
-Only the page of an audit runs a script.
+Only the pages of audits and batches run a script.
 """
 
 from __future__ import annotations
