@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.data.dataparser import survey_thermal_files
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixels, read_thermal_file
@@ -140,7 +141,9 @@ def test_a_tiff_of_64_bit_numbers_is_celsius(tmp_path, big_endian):
         entries = b"".join(struct.pack(">HHII", tag, 4, 1, value) for tag, value in tags.items())
         head = b"MM\0*" + struct.pack(">IH", 8, len(tags))
         path.write_bytes(head + entries + bytes(4) + values.astype(">f8").tobytes())
-    np.testing.assert_array_equal(read_thermal_file(path, BOUNDS).temperature_c, values.astype(np.float32))
+    for got in (read_thermal_file(path, BOUNDS).temperature_c, read_thermogram(path).temperature_c):
+        np.testing.assert_array_equal(got, values.astype(np.float32))
+    assert identify(path, tmp_path).role == "thermal"
 
 
 @pytest.mark.parametrize(

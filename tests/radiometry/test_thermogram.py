@@ -82,6 +82,21 @@ def test_whole_numbers_in_an_array_need_a_unit(tmp_path):
     np.testing.assert_allclose(got.temperature_c, WALL_C, atol=1e-5)
 
 
+def test_content_decides_and_not_the_name(tmp_path):
+    np.save(tmp_path / "a.npy", WALL_C)
+    np.savetxt(tmp_path / "a.csv", WALL_C, delimiter=";", fmt="%.2f")
+    save_tiff(tmp_path / "a.tiff", WALL_C.astype(np.float32))
+    Image.fromarray(counts_of(WALL_C, 0.01, -100.0)).save(tmp_path / "a.png")
+    for name, wrong, camera in (
+        *(("a.npy", "b.jpg", None), ("a.csv", "c.tiff", None)),
+        *(("a.tiff", "d.csv", None), ("a.png", "e.npy", "sensefly")),
+    ):
+        (tmp_path / name).rename(tmp_path / wrong)
+        got = read_thermogram(tmp_path / wrong, RadiometryOptions(camera=camera))
+        assert got.metadata.format == name[2:].upper() and got.temperature_c.dtype == np.float32
+        np.testing.assert_allclose(got.temperature_c, WALL_C, atol=1e-5)
+
+
 def test_stored_temperatures_are_corrected_by_the_model(tmp_path):
     np.save(tmp_path / "a.npy", WALL_C)
     options = RadiometryOptions(emissivity=0.9, reflected_c=10.0, distance_m=5.0, air_c=12.0)
@@ -162,10 +177,10 @@ HARD: dict[str, tuple[bytes, str, str]] = {
     "wide.csv": (b",".join([b"1.5"] * 30000), "30000 x", "damaged"),
     "tall.csv": (b"1\n" * (LARGEST_SIDE + 1), "1 x", "damaged"),
     "huge.png": (bad_png(30000, 30000), "30000|size", "damaged"),
-    "text.tiff": (b"Dear camera,\nplease", "readable", "copy"),
-    "program.jpg": (b"\x7fELF\2\1\1\0" + bytes(100), "expected a whole", "copy"),
+    "text.tiff": (b"Dear camera,\nplease", "starts with b'Dear", "Export"),
+    "program.jpg": (b"\x7fELF\2\1\1\0" + bytes(100), "starts with", "Export"),
     "ragged.csv": (b"1,2,3\n4,5", "lengths", "damaged"),
-    "words.csv": (b"warm,cold\nvery,not", "readable", "copy"),
+    "words.csv": (b"warm,cold\nvery,not", "starts with", "Export"),
     "cube.npy": (stored(np.ones((2, 3, 4))), "one temperature per pixel", "single-channel"),
     "pickle.npy": (stored(np.array([{"a": 1}], dtype=object)), "readable", "damaged"),
 }

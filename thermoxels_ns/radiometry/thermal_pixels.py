@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from contextlib import suppress
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, TiffImagePlugin
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.errors import ThermalFileError
@@ -30,6 +29,8 @@ THERMAL_SUFFIXES = (
     ".csv",
 )  # suffixes of the file types that `read_thermal_file` reads
 
+_WIDTH, _HEIGHT, _SAMPLE_BITS, _SAMPLE_FORMAT = 256, 257, 258, 339  # tags of TIFF
+_FLOATING = 3  # value of TIFF's sample format for floating-point numbers
 VALID_RANGE_C = (-100.0, 2000.0)  # temperatures outside this range count as no measurements, [degrees C]
 MIN_FRAMES = 5  # with fewer frames, no pixel counts as stuck
 _WINDOW = 2  # half width of a neighbourhood of 5 x 5 pixels, in which a dead column or row is a minority
@@ -113,19 +114,19 @@ class ThermalImage:
 
 
 def read_thermal_file(
-    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = VALID_RANGE_C
+    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = VALID_RANGE_C, suffix: str | None = None
 ) -> ThermalImage:
     """Read temperatures from PNG, JPG or TIFF counts, a float TIFF, a FLIR R-JPEG, ``.npy`` or ``.csv``.
 
     A FLIR R-JPEG is converted by the calibration and settings in the file; `unit` is ignored. Counts need a unit:
     bounds or linear for PNG and JPG, linear for TIFF. A floating-point TIFF is in degrees Celsius unless the unit is
     linear. ``.csv`` and floating-point ``.npy`` are always in degrees Celsius; an integer ``.npy`` holds counts if the
-    unit is linear, else degrees Celsius.
+    unit is linear, else degrees Celsius. `suffix`, if given, replaces the file name's suffix.
 
     Raises:
         ThermalFileError: The file is missing, damaged, a colour picture, or its counts have no unit.
     """
-    suffix = path.suffix.lower()
+    suffix = (suffix or path.suffix).lower()
     values: npt.NDArray[Any]
     no_data = None
     with errors_name(path, _EXPECTED, _REMEDY, ThermalFileError):
@@ -242,23 +243,26 @@ def _number(cell: str) -> float:
 def _read_image(path: Path) -> tuple[npt.NDArray[Any], BoolArray | None]:
     """Return the counts of a grey picture (height, width), and a mask of its transparent pixels (None: no alpha)."""
     pixels = None
-    with suppress(UnidentifiedImageError), Image.open(path) as image:  # of a TIFF of 64-bit numbers, for example
-        check_thermal_size(path, *image.size)
-        pages = getattr(image, "n_frames", 1)
-        if pages != 1:
-            remedy = "Save the page that holds the temperatures as a file of its own."
-            raise ThermalFileError(str(path), expected="one image", got=f"{pages} pages", remedy=remedy)
-        image.load()  # raises on truncated data
-        if image.mode in ("L", "F") or image.mode.startswith("I"):
-            pixels = np.asarray(image)
-            # Some versions of Pillow return 16-bit counts as 32 bits; some files have the other byte order.
-            short = image.mode == "I" and image.format == "PNG"
-            pixels = pixels.astype(np.uint16 if short else pixels.dtype.newbyteorder("="))
-    if pixels is None:  # a colour picture, of which Pillow would keep only 8 bits, or a kind that it does not know
+    size = size_of_double_tiff(path)  # Pillow cannot open a TIFF of 64-bit numbers
+    if size is not None:
+        check_thermal_size(path, *size)
+    else:
+        with Image.open(path) as image:
+            check_thermal_size(path, *image.size)
+            pages = getattr(image, "n_frames", 1)
+            if pages != 1:
+                remedy = "Save the page that holds the temperatures as a file of its own."
+                raise ThermalFileError(str(path), expected="one image", got=f"{pages} pages", remedy=remedy)
+            image.load()  # raises on truncated data
+            if image.mode in ("L", "F") or image.mode.startswith("I"):
+                pixels = np.asarray(image)
+                # Some versions of Pillow return 16-bit counts as 32 bits; some files have the other byte order.
+                short = image.mode == "I" and image.format == "PNG"
+                pixels = pixels.astype(np.uint16 if short else pixels.dtype.newbyteorder("="))
+    if pixels is None:  # a colour picture, of which Pillow would keep only 8 bits, or a 64-bit TIFF
         pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise _damaged(path, "an image that cannot be decoded")
-    check_thermal_size(path, pixels.shape[1], pixels.shape[0])
     if pixels.ndim == 2:
         return pixels, None
     has_alpha = pixels.shape[-1] in (2, 4)
@@ -271,6 +275,19 @@ def _read_image(path: Path) -> tuple[npt.NDArray[Any], BoolArray | None]:
         got = "a false-colour picture: its palette cannot be turned back into temperatures"
         raise ThermalFileError(str(path), expected="a grey image (all channels equal)", got=got, remedy=remedy)
     return np.ascontiguousarray(colours[..., 0]), pixels[..., -1] == 0 if has_alpha else None
+
+
+def size_of_double_tiff(path: Path) -> tuple[int, int] | None:
+    """Return width and height of a TIFF with one channel of 64-bit floating-point numbers; None for other files."""
+    with path.open("rb") as stream:
+        head = stream.read(8)
+        if not head.startswith((b"II*\0", b"MM\0*")):
+            return None
+        tags = TiffImagePlugin.ImageFileDirectory_v2(head)
+        stream.seek(tags.next)
+        tags.load(stream)
+    kind = [tags.get(tag, (0,)) for tag in (_SAMPLE_BITS, _SAMPLE_FORMAT)]
+    return (tags.get(_WIDTH, 0), tags.get(_HEIGHT, 0)) if kind == [(64,), (_FLOATING,)] else None
 
 
 def _damaged(path: Path, problem: object) -> ThermalFileError:

@@ -1,7 +1,8 @@
-"""Reads any thermal camera file, recognised by its suffix or content, as degrees C and metadata."""
+"""Reads any thermal camera file, recognised by its content, as degrees C and metadata."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -11,6 +12,8 @@ from PIL import Image
 from thermoxels_ns.core.arrays import Float32Array
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.decoders import (
+    JPEG_START,
+    PNG_START,
     ExifFacts,
     app_segments,
     check_file_size,
@@ -29,18 +32,23 @@ from thermoxels_ns.radiometry.thermal_pixels import (
     load_array,
     masked_image,
     read_thermal_file,
+    size_of_double_tiff,
 )
 
 ThermogramFormat = Literal["FLIR R-JPEG", "DJI R-JPEG", "TIFF", "PNG", "NPY", "CSV"]
 CameraName = Literal["workswell", "flir-high-gain", "flir-low-gain", "flir-duo", "sensefly"]
 
-_BY_SUFFIX: dict[str, ThermogramFormat] = {
-    ".tif": "TIFF",
-    ".tiff": "TIFF",
-    ".png": "PNG",
-    ".npy": "NPY",
-    ".csv": "CSV",
+_HEAD_BYTES = 4096
+_STARTS: dict[bytes, ThermogramFormat] = {
+    b"II*\0": "TIFF",
+    b"MM\0*": "TIFF",
+    b"II+\0": "TIFF",
+    b"MM\0+": "TIFF",
+    PNG_START: "PNG",
+    b"\x93NUMPY": "NPY",
 }
+_NUMBERS = re.compile(rb"(?:\xef\xbb\xbf)?[-+0-9.,;eE\s\"]|nan|na|n/a|null|none", re.IGNORECASE)
+_TEXT = re.compile(rb"[\t\n\r -~\xef\xbb\xbf]*")
 
 
 COUNT_SCALES: dict[CameraName, tuple[ThermalUnit, str]] = {
@@ -158,25 +166,28 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
 
 
 def detect_format(path: Path) -> ThermogramFormat:
-    """Return the format of a thermal file by its suffix, for cameras' JPEGs by content.
-
-    Raises `ThermalFileError` if the file is missing or empty, or holds no temperatures.
-    """
+    """Return the format of a thermal file by its content; raise `ThermalFileError` if it holds no temperatures."""
     if not path.is_file():
         got, remedy = "nothing there", "Check the path."
         raise ThermalFileError("thermal file", expected=f"a file at {path}", got=got, remedy=remedy)
     check_file_size(path)
-    if is_flir_jpeg(path):
-        return "FLIR R-JPEG"
-    found = _BY_SUFFIX.get(path.suffix.lower())
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    found: ThermogramFormat | None = next((name for start, name in _STARTS.items() if head.startswith(start)), None)
     if found is not None:
         return found
-    if is_dji_rjpeg(path):
-        return "DJI R-JPEG"
-    app_segments(path, whole=True)
+    if _TEXT.fullmatch(head) and _NUMBERS.match(head) and re.search(rb"[0-9]", head):  # a table of numbers
+        return "CSV"
     expected = "a FLIR or DJI R-JPEG, a TIFF, a 16-bit PNG, or a table of degrees C (.npy, .csv)"
-    got = "a plain JPEG: a photograph, or a false-colour picture, whose palette cannot be turned back"
-    remedy = "Use the file as the camera wrote it; editing, messengers and cloud albums drop the thermal part."
+    got, remedy = f"none of them: it starts with {head[:8]!r}", "Export it from the camera's program in one of these."
+    if head.startswith(JPEG_START):
+        if is_flir_jpeg(path):
+            return "FLIR R-JPEG"
+        if is_dji_rjpeg(path):
+            return "DJI R-JPEG"
+        app_segments(path, whole=True)
+        got = "a plain JPEG: a photograph, or a false-colour picture, whose palette cannot be turned back"
+        remedy = "Use the file as the camera wrote it; editing, messengers and cloud albums drop the thermal part."
     raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 
@@ -192,7 +203,7 @@ def _read_stored(
         remedy = "Pass --camera, or --celsius-per-count and --celsius-offset."
         raise ThermalFileError(str(path), expected=expected, got="whole numbers and no unit", remedy=remedy)
     unit = ThermalUnit.celsius() if unit is None or found == "CSV" else unit
-    image = read_thermal_file(path, unit)
+    image = read_thermal_file(path, unit, suffix=f".{found.lower()}")
     conditions = options.applied_to(Conditions())
     per_count = unit.scale if found in ("TIFF", "PNG") and unit.kind == "linear" else None
     metadata = ThermogramMetadata(found, exif.camera, conditions=conditions, celsius_per_count=per_count)
@@ -211,6 +222,8 @@ def _unit_of_image(path: Path, options: RadiometryOptions) -> tuple[ThermalUnit,
     Raises `ThermalFileError` for pictures with 8 bits or in colour, and for counts whose unit is unknown.
     """
     unit = options.given_unit
+    if size_of_double_tiff(path) is not None:
+        return unit or ThermalUnit.celsius(), ExifFacts()
     with Image.open(path, formats=("TIFF", "PNG")) as image:
         check_thermal_size(path, *image.size)
         mode, exif = image.mode, read_exif_facts(image)
