@@ -9,7 +9,7 @@ from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from tests.support.obtuse_bodies import body
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.quantities import Varying, tabulated
 from thermoxels_ns.fem.solution import SteadySolution, mean_flows_w
 from thermoxels_ns.heat import solving as heat_solving
 from thermoxels_ns.heat.effects import (
@@ -117,6 +117,19 @@ def test_what_changes_with_time_is_always_built(time) -> None:
     pulse = Varying(lambda _, t: 2000.0 if 7.6 < t < 7.8 else 0.0)
     problem = replace(tight_wall(0.0), effects=(*AIRS, AbsorbedSolar(SIDES, 0.7, pulse)))
     assert solved(problem, time).left_out == ()
+
+
+def test_beside_what_changes_with_time_nothing_is_left_out() -> None:
+    """A pane follows the day's air and is back at the room's temperature at each kept time, where no heat flows."""
+    pane = box_mesh(planes(0.0, 0.006, step=0.003), [0.0, 1.0], [0.0, 1.0])
+    hours = np.arange(73.0)
+    day = tabulated(3600.0 * hours, 20.0 + 5.0 * (1.0 - np.cos(2.0 * np.pi * hours / 24.0)))
+    airs = Convection(("x1",), 7.7, 20.0), Convection(("x0",), 25.0, day)
+    found = solved(
+        HeatProblem(pane, CONCRETE, np.full(len(pane.points_m), 20.0), airs), AdaptiveSteps(72 * 3600.0, 0.1, outputs=3)
+    )
+    heat_w = [float(np.ravel(one.heat_w).mean()) for one in found.solution.effects]
+    assert found.left_out == () and heat_w[0] < -25.0 and abs(sum(heat_w)) < 2.0
 
 
 def test_the_only_exchange_of_a_steady_body_stays() -> None:

@@ -120,7 +120,8 @@ def shown() -> dict[str, Any]:
         "measured": picture("purple"),
         "seconds": [("Train", 30.0), ("Export", 10.0)],
         "commands": ["ns-train thermoxels", "ns-eval --load-config 'a b'"],
-        "next_steps": [("ns-viewer --load-config x", "Look at it:")],
+        "config": "run/config.yml",
+        "exported": "export/mesh.vtu",
     }
 
 
@@ -141,7 +142,8 @@ def test_results_times_and_commands_are_shown(shown) -> None:
     assert "width: 0.0%" in build_page("demo.html.j2", **shown | {"seconds": [("Train", 0.0)]})
     words = outline.words
     assert "ns-train thermoxels" in words and "ns-eval --load-config 'a b'" in words
-    assert words.index("Look at it:") < words.index("ns-viewer --load-config x")
+    assert "ns-viewer --load-config run/config.yml" in words
+    assert "thermoxels heat export/mesh.vtu --scene original" in words
     ticks = re.findall(r"<span>([^<]*)</span>", text)
     assert ticks == ["10.0", "15.0", "20.0", "25.0", "30.0\xa0°C"]
     assert "audit/audit.html" in text and "audit/audit.html" not in build_page(
@@ -173,7 +175,8 @@ def test_nothing_is_fetched_and_words_stay_words(shown) -> None:
         "gradient": [HOSTILE, "red"],
         "seconds": [(HOSTILE, 1.0)],
         "commands": [HOSTILE],
-        "next_steps": [(HOSTILE, HOSTILE)],
+        "config": HOSTILE,
+        "exported": HOSTILE,
     }
     text = build_page("demo.html.j2", **shown | hostile)
     assert "<script" not in text

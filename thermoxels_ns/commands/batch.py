@@ -260,14 +260,12 @@ def plan_of(building: Building, folder: Path) -> dict[str, Stage]:
     wanted = {"scene": building.photographs, "heat": building.heat, "audit": building.conditions}
     stages = {name: command for name, command in commands.items() if wanted.get(name, "yes")}
     reads = {"mesh": building.patches, "heat": building.heat, "audit": building.conditions}
-    return {
-        name: Stage(
-            command,
-            [f"{folder.as_posix()}/{after[name]}.json"] * (after.get(name) in stages)
-            + [file for file in [reads.get(name, "")] if Path(file).is_absolute()],
-        )
-        for name, command in stages.items()
-    }
+    plan = {}
+    for name, command in stages.items():
+        markers = [f"{folder.as_posix()}/{after[name]}.json"] if after.get(name) in stages else []
+        files = [file for file in [reads.get(name, "")] if Path(file).is_absolute()]
+        plan[name] = Stage(command, markers + files)
+    return plan
 
 
 def run_stage(name: str, stage: str, attempt: int) -> int:

@@ -45,7 +45,7 @@ def check_ranges(prefix: str, values: Mapping[str, tuple[Any, float, float, str]
     `values` maps names to (value, least, largest, range in words); messages put `prefix`, such as "--", before them.
     """
     for name, (value, low, high, expected) in values.items():
-        if not low <= value <= high:  # NaN fails too
+        if not (is_number(value) and low <= value <= high):  # NaN fails too
             remedy = f"Correct {prefix}{name.replace('_', '-')}."
             raise ThermoxelsError(name.rpartition(".")[2], expected=expected, got=value, remedy=remedy)
 

@@ -364,4 +364,6 @@ class ImplicitEquation:
         if rise(0.0) >= 0.0 or rise(1.0) <= 0.0:
             return 1.0
         least = float(np.finfo(np.float64).tiny)
-        return root_scalar(rise, bracket=(0.0, 1.0), method="brentq", xtol=least, rtol=_SHORT_OF_LEAST).root
+        return root_scalar(
+            rise, bracket=(0.0, 1.0), method="brentq", xtol=least, rtol=_SHORT_OF_LEAST, maxiter=1100
+        ).root

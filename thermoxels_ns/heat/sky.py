@@ -224,7 +224,12 @@ def _from_moving_sun(
     places: Places,
     time_s: float,
 ) -> FloatArray:
-    position = sun_position(where[0] + timedelta(seconds=time_s), *where[1:3])
+    try:
+        moment = where[0] + timedelta(seconds=time_s)
+    except OverflowError:
+        expected, remedy = "a date of the years 1 to 9999", "Follow the body for a shorter time."
+        raise HeatError("sun", expected=expected, got=f"{where[0]} and {time_s:g} s", remedy=remedy) from None
+    position = sun_position(moment, *where[1:3])
     light = light or meinel_clear_sky(position.elevation_deg, position.distance_au)
     return facet_irradiance(places.normals, places.up, towards_sun(position, places.up, where[3]), light, reflected)
 

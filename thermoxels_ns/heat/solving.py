@@ -165,8 +165,11 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
 def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
     """Return the numbers of the weakest effects, which together have at most `share` of the power of the others.
 
-    An effect's power is its heat flow at the coldest and the warmest temperature of start and surroundings.
+    An effect's power is its heat flow at the coldest and the warmest temperature of start and surroundings. Where any
+    effect changes with time, all are kept: what they bring between kept times is not known.
     """
+    if time is not None and any(one.bounded(name).in_time for one in problem.effects for name in one.bounds):
+        return []
     forms = effect_forms(problem, Space(problem.selection), 0.0)
     around_c = [form.surroundings_k(0.0).ravel() for form in (*forms.convection, *forms.radiation, *forms.fixed)]
     every_c = np.concatenate([np.zeros(0) if time is None else problem.start_c, *around_c])

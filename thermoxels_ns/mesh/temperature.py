@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, sparse
+from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 from threadpoolctl import threadpool_limits
@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite
 from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.quality.tet_shapes import TET_EDGES, shapes_in_chunks
 
 MIN_OBSERVED_WEIGHT = 0.5
@@ -40,13 +41,17 @@ def interpolate_corners(
         values: Values at the points, shape (n,) or (n, k); 0 where all eight corners have weight 0.
         weight: sum_c t_c w_c, shape (n,).
     """
-    at, known = points_index.T, np.asarray(weights, dtype=np.float64)
-    weight, total = ndimage.map_coordinates(known, at, order=1, mode="nearest"), []
-    for column in np.moveaxis(values.reshape(*known.shape, -1), -1, 0):
-        sums = known * np.where(known > 0.0, column, 0.0)
-        total.append(ndimage.map_coordinates(sums, at, order=1, mode="nearest"))
-    found = np.stack(total, axis=-1) / np.where(weight > 0.0, weight, 1.0)[:, None]
-    return found.reshape(len(points_index), *values.shape[3:]), weight
+    # Not by ndimage.map_coordinates, which copies the lattice in double precision.
+    low = np.clip(np.floor(points_index).astype(np.int64), 0, np.array(weights.shape) - 2)
+    fraction = np.clip(points_index - low, 0.0, 1.0)
+    trailing = (slice(None), *[None] * (values.ndim - 3))
+    total, weight = np.zeros((len(low), *values.shape[3:])), np.zeros(len(low))
+    for offset in CORNER_OFFSETS:
+        at = tuple((low + offset).T)
+        share = np.prod(np.where(offset == 1, fraction, 1.0 - fraction), axis=1) * weights[at]
+        weight += share
+        total += share[trailing] * np.where(share[trailing] > 0.0, values[at], 0.0)
+    return total / np.where(weight > 0.0, weight, 1.0)[trailing], weight
 
 
 def extend_harmonically(

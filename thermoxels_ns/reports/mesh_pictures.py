@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -123,7 +124,11 @@ def image_of_surface(
             colours = ListedColormap(matplotlib.colormaps[colour_map](np.linspace(start, 1.0, 256)))
             place = {"vertical": True, "position_x": 0.86, "position_y": 0.2, "width": 0.06, "height": 0.6}
             size = {"title_font_size": round(height / 38), "label_font_size": round(height / 38)}
-            bar_look: Any = {"title": f"{bar_title}\n", "color": _INK, "unconstrained_font_size": True, **place, **size}
+            decimals = max(1, 2 - math.floor(math.log10(high - low)))  # so that no two labels are equal
+            # From VTK 9.6 on, formats are written as in Python instead of as in printf.
+            form = f"{{:.{decimals}f}}" if pv.vtk_version_info >= (9, 6) else f"%.{decimals}f"
+            bar_look: Any = {"title": f"{bar_title}\n", "fmt": form, "color": _INK, "unconstrained_font_size": True}
+            bar_look |= {**place, **size}
             plotter.add_mesh(surface, cmap=colours, clim=(low, high), scalar_bar_args=bar_look, **_MATTER)
         for _, colour, which in painted:
             if which.any():

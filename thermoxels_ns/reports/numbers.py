@@ -14,12 +14,12 @@ from thermoxels_ns.core.measured import Measured
 def figure(value: float) -> str:
     """Return a number with three significant digits; with a power of ten below 0.001 and from a million on.
 
-    What is below a millionth is round-off in all that pages show, and becomes 0.
+    What is below a thousand-millionth is round-off in all that pages show, and becomes 0.
 
     >>> figure(1234.56), figure(0.0123456), figure(-6e-10)
     ('1,230', '0.0123', '0')
     """
-    if abs(value) < 1e-6:
+    if abs(value) < 1e-9:
         return "0"
     if 1e-3 <= abs(value) < 1e6:
         digits = 2 - math.floor(math.log10(abs(value)))
@@ -59,12 +59,12 @@ def plain_names(text: str) -> str:
 
 
 def point_text(point_m: Sequence[float]) -> str:
-    """Return coordinates, [m], with four significant digits.
+    """Return coordinates, [m], to a millimetre.
 
-    >>> point_text((0.00625, 3.14159, -12.04))
-    '(0.00625, 3.142, -12.04)'
+    >>> point_text((0.00625, 3.14159, -12.04)), point_text((512345.6, -0.0002, 1.0))
+    ('(0.006, 3.142, -12.04)', '(512345.6, 0, 1)')
     """
-    return f"({', '.join(f'{value_m:.4g}' for value_m in point_m)})"
+    return f"({', '.join(f'{round(float(value_m), 3) + 0.0:.10g}' for value_m in point_m)})"
 
 
 def unit_signs(unit: str) -> str:

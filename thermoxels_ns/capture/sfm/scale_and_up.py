@@ -267,7 +267,8 @@ def find_up(
     turned = math.sqrt(max(float(values[1]), 0.0))  # sine of how far the axes spread, root mean square
     if len(level) >= 3 and _BELIEVED_DEG * math.sqrt(len(level)) * turned > _ROLLED_DEG:
         normal = vectors[:, 0] if vectors[:, 0] @ mean > 0 else -vectors[:, 0]
-        if normal @ mean > _LEAST_COSINE:
+        # Axes that lie in no plane are of cameras that were rolled, or that all look one way: they tell no normal.
+        if values[0] < 0.2 * values[1] and normal @ mean > _LEAST_COSINE:
             off = np.degrees(np.arcsin(np.clip(np.abs(level @ normal), 0.0, 1.0)))
             return Up(normal, "Assumed: the photographs' sides were held level.", float(np.median(off)))
     return Up(mean, "Assumed: the mean of the photographs' upward directions.", _median_angle(held, mean))
