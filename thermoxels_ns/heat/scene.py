@@ -251,7 +251,12 @@ class HeatScene:
         whole = {name for name, air in airs.items() if air is not None and air.coefficient in WITH_RADIATION}
         if self.sky is not None and self.ground is not None and self.ground.surface_c is not None:
             whole.add("sky and ground")  # like a film with radiation, this leaves nothing else to radiate to
-        for (first, patches), (second, elsewhere) in combinations(where, 2):
+        numbers: dict[str, list[int]] = {}
+        for number, (_, patches) in enumerate(where):
+            for patch in patches:
+                numbers.setdefault(patch, []).append(number)
+        for pair in sorted({pair for on_patch in numbers.values() for pair in combinations(on_patch, 2)}):
+            (first, patches), (second, elsewhere) = (where[number] for number in pair)
             names, shared, remedy = (first, second), sorted(patches & elsewhere), _PATCHES_OF_THEIR_OWN
             if all(name.startswith((*airs, "convection", "ground_contact")) for name in names):
                 what = "contact with air or ground"
@@ -263,9 +268,8 @@ class HeatScene:
                     remedy = f"Set coefficient: iso-6946-convection in {first}, which leaves radiation out."
             else:
                 continue
-            if shared:
-                got = f"{second} on {', '.join(shared)} as well"
-                raise HeatError(first, expected=f"{what} once on each patch", got=got, remedy=remedy)
+            got = f"{second} on {', '.join(shared)} as well"
+            raise HeatError(first, expected=f"{what} once on each patch", got=got, remedy=remedy)
 
 
 def _steps(content: Any) -> str:
