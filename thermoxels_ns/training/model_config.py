@@ -17,10 +17,12 @@ from thermoxels_ns.render.renderers import Backend
 from thermoxels_ns.training.schedule import COARSEST, QUALITIES, schedule_for
 
 _STANDARD = schedule_for(*QUALITIES["standard"])
-MOST_VOXELS = 2.0
-"""Most voxels along the longest side that a scene may ask for, divided by the last of the resolutions. wild-11, with
-far ground, asks for 256 voxels; F of the seen surface is 0.95 with 256 and 0.59 with 192. A statue photographed at 12
+MOST_VOXELS = 3.0
+"""Most voxels along the longest side that a scene may ask for, divided by the last of the resolutions. Where textured
+ground runs on around a body, a scene asks for many: with 192, 256 and 384 F of the seen surface is 0.59 and 0.95 on
+wild-11 (it asks for 256), 0.58 and 0.74 on wild-14 (256 and 384), 0.63 and 0.79 on wild-17. A statue photographed at 12
 megapixels asks for 512; after 1500 steps 17 % of its depths are off by 2 % with 384 voxels, 15 % with 192."""
+FINEST = 512  # Most voxels along the longest side that a scene may ask for, whatever the quality
 MOST_STRETCH = 1.5  # Voxels asked for, divided by the last of the resolutions, up to which no split is added
 STEP_OF_COARSEST = 8  # The coarsest resolution is a multiple of this number of voxels
 
@@ -230,8 +232,8 @@ class ThermoxelsModelConfig(ModelConfig):
 
         If `voxels` is at most `MOST_STRETCH` times the last resolution, or if `resolutions`, `refine_at` and `prune_at`
         are not those of `schedule_for`, one factor, at most `MOST_STRETCH`, scales all resolutions. Else `schedule_for`
-        gives all three, for at most `MOST_VOXELS` times the last resolution. Numbers are rounded, rather up: too few
-        voxels lose shape (courtyard: F of the seen surface is 0.81, 0.86 and 0.89 with 96, 112 and 128 voxels).
+        gives all three, for at most `MOST_VOXELS` times the last resolution and `FINEST`. Numbers are rounded, rather
+        up: too few voxels lose shape (courtyard: F of the seen surface is 0.81, 0.86 and 0.89 with 96, 112 and 128).
         """
         if not self.voxel_pixels or not math.isfinite(voxels):
             return self
@@ -241,7 +243,7 @@ class ThermoxelsModelConfig(ModelConfig):
         if voxels <= MOST_STRETCH * last or own != (usual.resolutions, usual.refine_at, usual.prune_at):
             coarsest = _in_steps(min(voxels, MOST_STRETCH * last) * first / last)
             return replace(self, resolutions=tuple(coarsest * each // first for each in self.resolutions))
-        wanted = min(voxels, MOST_VOXELS * last)
+        wanted = min(voxels, MOST_VOXELS * last, max(FINEST, last))
         while wanted / 2 ** (splits + 1) >= COARSEST - STEP_OF_COARSEST / 2:
             splits += 1
         found = schedule_for(_in_steps(wanted / 2**splits) * 2**splits, self.steps)
