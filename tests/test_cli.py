@@ -6,9 +6,12 @@ import warnings
 from typing import get_args
 
 import pytest
+import torch
 
 from thermoxels_ns import cli
 from thermoxels_ns.commands.demo import SceneName
+from thermoxels_ns.commands.installed_commands import CommandFailed
+from thermoxels_ns.core.errors import HeatMemoryError, MemoryBudgetError, SceneError, exit_status
 from thermoxels_ns.core.quiet_warnings import PROGRAMMERS_WARNINGS, environment_value
 from thermoxels_ns.synthetic.catalogue import SCENE_NAMES
 from thermoxels_ns.synthetic.scene_folder import load_truth
@@ -112,3 +115,30 @@ def test_a_reader_that_has_seen_enough_ends_the_help_without_a_traceback():
         assert process.stdout is not None and process.stderr is not None
         process.stdout.close()  # before anything is written
         assert process.stderr.read() == b""
+
+
+@pytest.mark.parametrize(
+    ("problem", "status"),
+    [
+        (SceneError("scene", expected="x", got="y", remedy="z"), 2),
+        (MemoryBudgetError("memory", expected="x", got="y", remedy="z"), 3),
+        (HeatMemoryError("memory", expected="x", got="y", remedy="z"), 3),
+        (MemoryError(), 3),
+        (torch.OutOfMemoryError("CUDA out of memory"), 3),
+        (CommandFailed("ns-train", 1, ["crash"]), 1),
+        (CommandFailed("ns-train", -9, ["step 3"]), 3),
+        (CommandFailed("ns-train", 2, ["Error: scene"]), 2),
+        (ValueError("x"), 1),
+    ],
+)
+def test_what_ended_a_command_is_its_exit_status(problem, status):
+    assert exit_status(problem) == status
+
+
+def test_a_lack_of_memory_is_one_sentence(monkeypatch, capsys):
+    def main(self) -> None:
+        raise MemoryError("Unable to allocate 8 TiB")
+
+    monkeypatch.setattr("thermoxels_ns.commands.demo.Demo.main", main)
+    assert cli.main(["demo"]) == 3
+    assert capsys.readouterr().err == "Error: memory does not suffice: Unable to allocate 8 TiB\n"

@@ -46,6 +46,10 @@ class HeatError(ThermoxelsError, ValueError):
     """A heat scene is wrong or does not fit its mesh, or the solver failed."""
 
 
+class HeatMemoryError(HeatError, MemoryError):
+    """A heat problem needs more memory than is allowed."""
+
+
 class AuditError(ThermoxelsError, ValueError):
     """The audit cannot give the answers asked for with these survey conditions or this mesh."""
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.errors import HeatError, HeatMemoryError
 from thermoxels_ns.fem.forms import FixedForm, effect_forms
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Bounds
@@ -130,7 +130,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
         if needed > goals.memory_bytes:
             expected, got = f"at most {describe_bytes(goals.memory_bytes)}", f"about {describe_bytes(needed)}"
             remedy = "Pass a larger --memory-gb, fewer steps or outputs, or export a coarser mesh."
-            raise HeatError("memory of the heat problem", expected=expected, got=got, remedy=remedy)
+            raise HeatMemoryError("memory of the heat problem", expected=expected, got=got, remedy=remedy)
     labels, left = effect_labels(problem), _weak(problem, time, goals.left_out_share)
     while True:  # each solution leaves out less than the one before
         kept = replace(problem, effects=tuple(e for n, e in enumerate(problem.effects) if n not in left))
