@@ -209,7 +209,8 @@ def test_an_interrupted_start_goes_on_where_it_stopped(start, commands, tmp_path
 def test_a_damaged_list_of_runs_is_named(start, tmp_path):
     start(settings=("32:100",))
     path = tmp_path / "cost" / "runs.csv"
-    for content in ("setting\n32:100\n", path.read_text().replace(",0.9,", ",much,"), "\0"):
+    repeated = "\n".join(f"{line},{word}" for line, word in zip(path.read_text().splitlines(), ("repeat", "1")))
+    for content in ("setting\n32:100\n", path.read_text().replace(",0.9,", ",much,"), "\0", repeated):
         path.write_text(content)
         with pytest.raises(ThermoxelsError, match=r"runs\.csv: expected the finished runs of an earlier start"):
             start(settings=("32:100",))

@@ -240,6 +240,8 @@ def read_runs(path: Path) -> dict[RunKey, Figures]:
             reader = csv.DictReader(file, strict=True)
             if missing := {*RunKey._fields, *FIGURES} - set(reader.fieldnames or ()):
                 raise ValueError(f"no column {', '.join(sorted(missing))}")
+            if "repeat" in (reader.fieldnames or ()):
+                raise ValueError("a column 'repeat' of an earlier version, which ran settings several times")
             return {
                 RunKey(*(row[name] for name in RunKey._fields)): {name: float(row[name] or "nan") for name in FIGURES}
                 for row in reader
