@@ -229,7 +229,7 @@ def test_a_missed_target_is_shown_and_fails_after_the_page_is_written(quick_demo
 
 def test_a_failing_step_stops_the_demo(quick_demo, fake_command, tmp_path, capfd):
     fake_command("ns-eval", "sys.exit('checkpoint not found')")
-    assert cli.main(["demo", "--output-dir", str(tmp_path / "demo"), "--scene", "sphere"]) == 2
+    assert cli.main(["demo", "--output-dir", str(tmp_path / "demo"), "--scene", "sphere"]) == 1
     shown_text = capfd.readouterr()
     assert "ns-eval: expected exit status 0, got 1" in shown_text.err
     assert "checkpoint not found" in shown_text.err
