@@ -103,8 +103,8 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: The words after ``thermoxels``; the arguments of this process if left out.
 
     Returns:
-        The exit status: 0 on success, 130 after the user's interrupt; after a `ThermoxelsError`, which is printed, 3 if
-        memory does not suffice, else 2.
+        The exit status: 0 on success, 130 after the user's interrupt; after an error, which is printed, that of
+        `errors.exit_status`.
     """
     command = tyro.cli(
         Commands, prog="thermoxels", args=arguments, description="RGB and thermal photographs to a solid with heat."

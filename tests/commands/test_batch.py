@@ -131,6 +131,14 @@ def test_a_batch_that_was_killed_goes_on(tmp_path, commands):
     assert again.returncode == 0, said
     assert (out / "one" / "model.json").exists() and "2 finished" in (out / "index.html").read_text()
 
+    # Changed conditions are audited again, and nothing else is done.
+    before = {name: (out / "one" / f"{name}.json").stat().st_mtime_ns for name in ("model", "mesh", "audit")}
+    (tmp_path / "conditions.yaml").write_text("air: 1")
+    said, _ = (changed := started(commands, path, "--output-dir", out)).communicate(timeout=120)
+    assert changed.returncode == 0, said
+    after = {name: (out / "one" / f"{name}.json").stat().st_mtime_ns for name in before}
+    assert [name for name in before if after[name] != before[name]] == ["audit"]
+
 
 @needs_snakemake
 def test_a_dry_run_says_what_each_stage_asks_for(tmp_path, commands):

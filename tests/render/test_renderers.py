@@ -9,7 +9,7 @@ from tests.reference.two_renderers import random_grid
 from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, Surroundings
 from thermoxels_ns.field.voxel_grid import raw_density
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
-from thermoxels_ns.render.renderers import Scene, render_scene
+from thermoxels_ns.render.renderers import Scene, render_scene, split_render
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
@@ -67,6 +67,25 @@ def test_the_renderers_agree_in_values_and_gradients(moves):
     assert len(found[0]) == 10
     for fused, reference in zip(*found, strict=True):
         torch.testing.assert_close(fused, reference, rtol=2e-3, atol=3e-4)
+
+
+def test_rays_of_several_requests_see_together_what_they_see_alone():
+    made, rays = scene(), request()
+    odd = torch.arange(60) % 2 == 1
+    requests = [
+        rays,
+        replace(rays, near=0.3, rgb_rays=odd),
+        RayRequest(rays.origins[:7], rays.directions[:7], 0.1, torch.full((7,), 1.5), None, odd[:7]),
+    ]
+    options = RenderOptions(distortion_scale=2.0, sparsity=True)
+    together = split_render(requests, lambda joined: render_scene(made, joined, options, "fused"))
+    for part, one in zip(together, requests, strict=True):
+        alone = render_scene(made, one, options, "fused")
+        assert alone.around is not None and part.around is not None
+        for here, there in ((part, alone), (part.box, alone.box), (part.around, alone.around)):
+            for name, value in vars(there).items():
+                if isinstance(value, torch.Tensor):
+                    torch.testing.assert_close(getattr(here, name), value)
 
 
 def test_rays_that_end_in_the_box_are_not_followed_out_of_it():

@@ -59,7 +59,7 @@ class OutputError(ThermoxelsError, OSError):
 
 
 def exit_status(problem: BaseException) -> int:
-    """Return the exit status of a command that ends with an error."""
+    """Return the exit status of a command that ends with an error; of a step that failed, that of the step."""
     if isinstance(problem, MemoryError) or type(problem).__name__ == "OutOfMemoryError":  # torch's
         return LACK_OF_MEMORY
     if hasattr(problem, "exit_status"):  # of a command that failed

@@ -14,7 +14,7 @@ from thermoxels_ns.core.measured import Measured
 def figure(value: float) -> str:
     """Return a number with three significant digits; with a power of ten below 0.001 and from a million on.
 
-    What is below a thousand-millionth is round-off in all that pages show, and becomes 0.
+    What is below 1e-9 is round-off in all that pages show, and becomes 0.
 
     >>> figure(1234.56), figure(0.0123456), figure(-6e-10)
     ('1,230', '0.0123', '0')

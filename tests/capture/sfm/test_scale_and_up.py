@@ -173,6 +173,16 @@ def test_up_of_pitch_and_roll_is_exact():
     assert "pitch and roll that 4 photographs state" in up.source
 
 
+def test_cameras_that_look_one_way_and_are_rolled_a_little_give_up():
+    """The axes of their sides fill no plane, whose normal would be anywhere."""
+    draws = np.random.default_rng(0)
+    count, off = 40, []
+    for _ in range(20):
+        turned, pitched, rolled = (draws.normal(0.0, spread, count) for spread in (5.0, 3.0, 3.0))
+        off.append(off_deg(find_up(held(turned, pitched, rolled), [None] * count, [1] * count)))
+    assert np.quantile(off, 0.9) < 3.0
+
+
 @pytest.mark.parametrize(("pitched_deg", "rolled_deg", "limit_deg"), [(-35.0, 0.0, 1e-5), (0.0, 2.0, 1.5)])
 def test_cameras_that_are_pitched_down_or_rolled_one_by_one_still_give_up(pitched_deg, rolled_deg, limit_deg):
     count = 30
