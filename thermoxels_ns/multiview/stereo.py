@@ -13,7 +13,13 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.threads import run_ranges
 from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.photographs import Photographs
-from thermoxels_ns.multiview.stereo_kernels import aggregate, correlate, refine_depths, weigh_patches
+from thermoxels_ns.multiview.stereo_kernels import (
+    add_differences,
+    aggregate,
+    correlate,
+    refine_depths,
+    weigh_patches,
+)
 
 NEIGHBOURS = 4
 """Most photographs that each photograph is compared with. At each pixel the better half of these neighbours counts, as
@@ -31,16 +37,22 @@ PLANES = (24, 128)
 """Least and most planes per photograph. Within, the picture moves by about a pixel from one plane to the next."""
 NOISE = (1.5 / 255.0, 1.0 / 255.0)
 """Standard deviations of noise within a patch: of brightness, of 1, and of temperature, of the scene's range."""
+DIFFERENCE, ALIKE = 0.4, 2.0
+"""Cost of a pixel that differs by at least `ALIKE` standard deviations from what another photograph shows on a plane; a
+smaller difference costs in proportion. The deviations are those of pixels whose patches correlate. Correlation cannot
+tell apart places along a shallow ramp, nor say where an even area ends: pixels of the body with a depth rise from 37,
+55, 35 and 52 % to 61, 66, 49 and 54 % with this (wild-7, courtyard, white house, saharov32), and the wrong ones among
+them fall to half. Costs of 0.1 to 0.8 and limits of 2 to 6 were tried, with margins of 0.03 to 0.1."""
 STEP, JUMP = 0.05, 0.6
 """Costs of a change of one plane, and of several planes, between pixels side by side. The cost of a correlation r is
 (1 - r) / 2. Steps of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes."""
 EDGE = 0.02  # Difference of two pixels, of 1, at which a jump between them costs half
-MARGIN = 0.05  # Least cost by which the best plane must beat every plane more than two planes away
+MARGIN = 0.06  # Least cost by which the best plane must beat every plane more than two planes away
 TOLERANCE = 0.3  # Depths of two photographs agree if they differ by this share of the sum of their planes' distances
 FEWEST_VIEWS = 2  # Other photographs whose own depths must agree with a sure depth
 VIEWS_PER_CONTRADICTION = 2  # Other photographs that must agree for each photograph that looks through the point
 VIEWS_TO_CONTRADICT = 3  # A depth may contradict others only if so many other photographs agree with it
-FEWEST_AROUND = 6  # Of the eight pixels around a sure one, this many must have its depth: outlines and noise have fewer
+PAIRS_IN_LINE = 3  # Of the four pairs of pixels around a sure one, those that lie in line with it; outlines have fewer
 REFINED_RADIUS, REFINED_LIKENESS = 3, 0.06
 """`RADIUS` and `LIKENESS` of refinement in larger photographs. Radii of 2 to 4 and a likeness of 0.025 to 10 were tried
 on house-corner and courtyard: the median error falls from 0.34 and 0.36 % to 0.28 and 0.22 %."""
@@ -49,6 +61,7 @@ ERROR_PLANES = 0.25  # Standard error of a depth, in planes of the sweep
 _NEAREST = 0.1  # Least distance of the nearest plane in the box, relative to the farthest
 _OUTSIDE = -100.0
 """Value of a pixel that a photograph does not show. Interpolation between this and other pixels stays below 0."""
+_FEWEST_ALIKE = 30  # Pixels from which the typical difference of two photographs is taken
 _PROBES = (5, 4)  # Points along each side of a photograph, and depths, at which neighbours are looked for
 _FEWEST_PROBES = 0.1  # Share of these points that a neighbour must see
 _DEPTHS_PER_SPREAD = 2.0 ** np.arange(-6.0, 6.5, 0.5)
@@ -87,7 +100,8 @@ def depths_of(
 
     For each photograph, neighbouring photographs are drawn onto planes parallel to its image, one behind the other, and
     compared with the photograph patch by patch (plane sweep, Collins 1996; normalised cross-correlation): by brightness
-    and, where the same camera measured it, temperature. Low correlation is a cost. Costs are added up along paths
+    and, where the same camera measured it, temperature. Low correlation is a cost, and so is a difference of the pixels
+    themselves beyond what the two photographs differ by where they correlate. Costs are added up along paths
     through the photograph (semi-global matching, Hirschmueller 2008), so that a pixel without texture takes the depth
     of similar pixels beside it. The plane of least cost gives the depth of a pixel if it beats the planes farther away
     by `MARGIN`. A depth is sure if enough other photographs have found a depth at the same point, and few photographs
@@ -308,40 +322,58 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
     farthest = 0.5 * inverse_depths[0] / max(1, beyond)
     inverse_depths = np.concatenate((np.linspace(farthest, inverse_depths[0], beyond, endpoint=False), inverse_depths))
     patches = _Patches.of(view)
-    agreement = np.empty((*view.shape, len(inverse_depths)), dtype=np.float32)
+    cost = np.empty((*view.shape, len(inverse_depths)), dtype=np.float32)
     moved = np.empty((len(others), *view.channels.shape), dtype=np.float32)
+    half, best_yet, likest = -(-len(others) // 2), np.full(view.shape, LEAST_CORRELATION), np.full_like(moved, _OUTSIDE)
     for plane, inverse_depth in enumerate(inverse_depths):
         for number, other in enumerate(others):
             _warped(other, view, 1.0 / inverse_depth, moved[number])
-        half = -(-len(others) // 2)
-        correlate(
-            view.channels,
-            moved,
-            RADIUS,
-            patches.weights,
-            patches.means,
-            patches.variances,
-            view.noise,
-            half,
-            plane,
-            agreement,
-        )
-    plain = (patches.variances == 0.0).all(axis=0)
-    agreement *= -0.5
-    agreement += 0.5
-    agreement[plain] = 0.5  # nothing but noise: no plane is better than another
-    total = np.empty_like(agreement)
-    aggregate(agreement, view.features, *(np.float32(value) for value in (STEP, JUMP, EDGE)), total)
+        weighed = patches.weights, patches.means, patches.variances
+        correlate(view.channels, moved, RADIUS, *weighed, view.noise, half, plane, cost)
+        better = cost[..., plane] >= best_yet
+        best_yet[better] = cost[better, plane]
+        likest[:, :, better] = moved[:, :, better]
+    cost[(patches.variances == 0.0).all(axis=0)] = 0.0  # nothing but noise: no plane correlates better than another
+    cost *= -0.5
+    cost += 0.5
+    expected, limit = _differences(view, likest)
+    for plane, inverse_depth in enumerate(inverse_depths):
+        for number, other in enumerate(others):
+            _warped(other, view, 1.0 / inverse_depth, moved[number])
+        add_differences(moved, expected, limit, np.float32(DIFFERENCE), half, plane, cost)
+    total = np.empty_like(cost)
+    aggregate(cost, view.features, *(np.float32(value) for value in (STEP, JUMP, EDGE)), total)
     best = total.argmin(-1)
     away = np.abs(np.arange(total.shape[-1]) - best[..., None]) > 2
     elsewhere = np.where(away, total, np.inf).min(-1)
     sure = elsewhere - np.take_along_axis(total, best[..., None], -1)[..., 0] >= MARGIN
     sure &= (best < total.shape[-1] - 1) & (view.channels[0] >= 0.0)
     # Everything behind the farthest plane is matched there, so a depth on it is sure only where patches agree well.
-    sure &= (best > 0) | ((beyond > 0) & (agreement[..., 0] <= 0.5 * (1.0 - LEAST_CORRELATION)))
+    sure &= (best > 0) | ((beyond > 0) & (cost[..., 0] <= 0.5 * (1.0 - LEAST_CORRELATION)))
     apart = np.diff(inverse_depths, append=2.0 * inverse_depths[-1] - inverse_depths[-2])[best]
     found = 1.0 / np.maximum(inverse_depths[best] + _between(total, best) * apart, inverse_depths[0])
     return np.where(sure, found, np.nan).ravel(), (found * found * apart).ravel()
+
+
+def _differences(view: _View, likest: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Return the values that other photographs are expected to show, shape of `likest`, and by how much they may
+    differ, (photographs, c, 1, 1); an infinite limit where too few pixels tell.
+
+    `likest` (photographs, c, h, w) is what others show on the plane where patches correlate best, else `_OUTSIDE`.
+    """
+    expected = np.broadcast_to(view.channels, likest.shape).copy()
+    limit = np.full((*likest.shape[:2], 1, 1), np.inf, np.float32)
+    for number, channel in np.ndindex(*likest.shape[:2]):
+        shown, own = likest[number, channel], view.channels[channel]
+        told = (shown >= 0.0) & (own > 0.0)
+        if told.sum() >= _FEWEST_ALIKE:
+            if channel == 0:  # cameras differ in exposure, and their temperatures by an offset
+                expected[number, channel] *= np.median(shown[told] / own[told])
+            else:
+                expected[number, channel] += np.median(shown[told] - own[told])
+            off = np.median(np.abs(shown - expected[number, channel])[told])
+            limit[number, channel] = ALIKE * max(1.48 * off, NOISE[channel])  # 1.48: from a median to a deviation
+    return expected, limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,13 +394,16 @@ class _Patches:
 
 
 def _neighbours_agree(depth: Float32Array, error: Float32Array) -> BoolArray:
-    """Return which pixels have `FEWEST_AROUND` neighbours with the same depth to within `error`, shape (h, w)."""
+    """Return which pixels lie in line with `PAIRS_IN_LINE` pairs of opposite neighbours, of four, shape (h, w).
+
+    On a plane, inverse depth is linear in the image. It may be off by the distance of two planes of the sweep, `error`.
+    """
     height, width = depth.shape
-    framed, count = np.pad(depth, 1, constant_values=np.nan), np.zeros(depth.shape, dtype=np.int64)
-    for row in range(3):
-        for column in range(3):
-            count += np.abs(framed[row : row + height, column : column + width] - depth) <= error
-    return count > FEWEST_AROUND  # the pixel itself is one of them
+    framed, count = 1.0 / np.pad(depth, 1, constant_values=np.nan), np.zeros(depth.shape, dtype=np.int64)
+    for row, column in ((0, 0), (0, 1), (0, 2), (1, 0)):
+        one, other = (framed[r : r + height, c : c + width] for r, c in ((row, column), (2 - row, 2 - column)))
+        count += np.abs(one + other - 2.0 / depth) <= 2.0 * error / depth**2
+    return count >= PAIRS_IN_LINE
 
 
 def _num_planes(view: _View, others: list[_View], near: float, far: float) -> int:

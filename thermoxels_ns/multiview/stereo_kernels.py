@@ -142,6 +142,30 @@ def correlate(channels, others, radius, weights, means, variances, noise, count,
 
 
 @kernel(fastmath={"contract"})
+def add_differences(others, expected, limit, weight, count, plane, cost):
+    """Add to ``cost[row, column, plane]`` how far the best `count` of `others` are from what is expected of them.
+
+    The difference of a pixel of `others` (photographs, c, h, w) from `expected`, of the same shape, is relative to
+    `limit` (photographs, c, 1, 1), at most 1, and averaged over channels and photographs. It is multiplied by `weight`.
+    """
+    total, kinds, height, width = others.shape
+    best = np.empty(count, np.float32)
+    for row in range(height):
+        for column in range(width):
+            best[:] = 1.0
+            for number in range(total):
+                off = np.float32(0.0)
+                for channel in range(kinds):
+                    difference = abs(others[number, channel, row, column] - expected[number, channel, row, column])
+                    off += min(difference / limit[number, channel, 0, 0], np.float32(1.0))
+                off /= kinds
+                for place in range(count):
+                    if off < best[place]:
+                        best[place], off = off, best[place]
+            cost[row, column, plane] += weight * best.sum() / count
+
+
+@kernel(fastmath={"contract"})
 def aggregate(cost, features, small, large, edge, total):
     """Fill `total` with the mean of the least costs of paths from eight directions (Hirschmueller 2008, eq. 13).
 
