@@ -36,22 +36,25 @@ LEAST_WEIGHT = 0.05  # A smaller weight, of 1, is set to 0
 PLANES = (24, 128)
 """Least and most planes per photograph. Within, the picture moves by about a pixel from one plane to the next."""
 NOISE = (1.5 / 255.0, 1.0 / 255.0)
-"""Standard deviations of noise within a patch: of brightness, of 1, and of temperature, of the scene's range."""
+"""Standard deviations of noise within a patch, and least ones of pixels of two photographs from each other: of
+brightness, of 1, and of temperature, of the scene's range."""
 DIFFERENCE, ALIKE = 0.4, 2.0
 """Cost of a pixel that differs by at least `ALIKE` standard deviations from what another photograph shows on a plane; a
-smaller difference costs in proportion. The deviations are those of pixels whose patches correlate. Correlation cannot
-tell apart places along a shallow ramp, nor say where an even area ends: pixels of the body with a depth rise from 37,
-55, 35 and 52 % to 61, 66, 49 and 54 % with this (wild-7, courtyard, white house, saharov32), and the wrong ones among
-them fall to half. Costs of 0.1 to 0.8 and limits of 2 to 6 were tried, with margins of 0.03 to 0.1."""
+smaller difference costs in proportion. The deviations are those on the planes on which patches correlate best, which on
+a ramp may be wrong ones; taking them from sure depths alone found no more. Correlation cannot tell apart places along a
+shallow ramp, nor say where an even area ends: pixels of the body with a depth rise from 37, 55, 35 and 52 % to 61, 66,
+49 and 54 % with this (wild-7, courtyard, white house, saharov32), and the wrong ones among them fall to half. Costs of
+0.1 to 0.8 and limits of 2 to 6 were tried, with margins of 0.03 to 0.1."""
 STEP, JUMP = 0.05, 0.6
 """Costs of a change of one plane, and of several planes, between pixels side by side. The cost of a correlation r is
-(1 - r) / 2. Steps of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes."""
+(1 - r) / 2. Steps of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes, before `DIFFERENCE`."""
 EDGE = 0.02  # Difference of two pixels, of 1, at which a jump between them costs half
 MARGIN = 0.06  # Least cost by which the best plane must beat every plane more than two planes away
 TOLERANCE = 0.3  # Depths of two photographs agree if they differ by this share of the sum of their planes' distances
 FEWEST_VIEWS = 2  # Other photographs whose own depths must agree with a sure depth
 VIEWS_PER_CONTRADICTION = 2  # Other photographs that must agree for each photograph that looks through the point
 VIEWS_TO_CONTRADICT = 3  # A depth may contradict others only if so many other photographs agree with it
+STEEPEST = 4.0  # Steepest surface, [spacings of planes per pixel]; floors seen at 65 degrees have 0.4 to 0.9
 PAIRS_IN_LINE = 3  # Of the four pairs of pixels around a sure one, those that lie in line with it; outlines have fewer
 REFINED_RADIUS, REFINED_LIKENESS = 3, 0.06
 """`RADIUS` and `LIKENESS` of refinement in larger photographs. Radii of 2 to 4 and a likeness of 0.025 to 10 were tried
@@ -101,12 +104,12 @@ def depths_of(
     For each photograph, neighbouring photographs are drawn onto planes parallel to its image, one behind the other, and
     compared with the photograph patch by patch (plane sweep, Collins 1996; normalised cross-correlation): by brightness
     and, where the same camera measured it, temperature. Low correlation is a cost, and so is a difference of the pixels
-    themselves beyond what the two photographs differ by where they correlate. Costs are added up along paths
+    themselves, relative to what the two photographs differ by where they correlate. Costs are added up along paths
     through the photograph (semi-global matching, Hirschmueller 2008), so that a pixel without texture takes the depth
     of similar pixels beside it. The plane of least cost gives the depth of a pixel if it beats the planes farther away
-    by `MARGIN`. A depth is sure if enough other photographs have found a depth at the same point, and few photographs
-    look through the point. Within a patch only pixels that look like the middle one count: else pixels beside an
-    outline would take the outline's depth.
+    by `MARGIN`. A depth is sure if enough other photographs have found a depth at the same point, few photographs look
+    through the point, and the pixels around lie in line with it. Within a patch only pixels that look like the middle
+    one count: else pixels beside an outline would take the outline's depth.
 
     Args:
         photographs: Pinhole photographs, best some 160 pixels wide: time grows with the third power of their size.
@@ -336,7 +339,8 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
     cost[(patches.variances == 0.0).all(axis=0)] = 0.0  # nothing but noise: no plane correlates better than another
     cost *= -0.5
     cost += 0.5
-    expected, limit = _differences(view, likest)
+    correlates = cost[..., 0] <= 0.5 * (1.0 - LEAST_CORRELATION)
+    expected, limit = _expected_pixels(view, likest)
     for plane, inverse_depth in enumerate(inverse_depths):
         for number, other in enumerate(others):
             _warped(other, view, 1.0 / inverse_depth, moved[number])
@@ -349,17 +353,19 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
     sure = elsewhere - np.take_along_axis(total, best[..., None], -1)[..., 0] >= MARGIN
     sure &= (best < total.shape[-1] - 1) & (view.channels[0] >= 0.0)
     # Everything behind the farthest plane is matched there, so a depth on it is sure only where patches agree well.
-    sure &= (best > 0) | ((beyond > 0) & (cost[..., 0] <= 0.5 * (1.0 - LEAST_CORRELATION)))
+    sure &= (best > 0) | ((beyond > 0) & correlates)
     apart = np.diff(inverse_depths, append=2.0 * inverse_depths[-1] - inverse_depths[-2])[best]
     found = 1.0 / np.maximum(inverse_depths[best] + _between(total, best) * apart, inverse_depths[0])
     return np.where(sure, found, np.nan).ravel(), (found * found * apart).ravel()
 
 
-def _differences(view: _View, likest: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Return the values that other photographs are expected to show, shape of `likest`, and by how much they may
-    differ, (photographs, c, 1, 1); an infinite limit where too few pixels tell.
+def _expected_pixels(view: _View, likest: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Return what other photographs are expected to show, shape of `likest`, and by how much they may differ from it.
 
-    `likest` (photographs, c, h, w) is what others show on the plane where patches correlate best, else `_OUTSIDE`.
+    The first is the photograph's own brightness times the median ratio, or its temperature plus the median difference,
+    over all pixels of `likest` (photographs, c, h, w): what others show on the plane where patches correlate best (by
+    at least `LEAST_CORRELATION`, else `_OUTSIDE`). The second, (photographs, c, 1, 1), is `ALIKE` standard deviations
+    of the same pixels from what is expected, infinite where too few pixels tell. Masked pixels stay `_OUTSIDE`.
     """
     expected = np.broadcast_to(view.channels, likest.shape).copy()
     limit = np.full((*likest.shape[:2], 1, 1), np.inf, np.float32)
@@ -371,6 +377,7 @@ def _differences(view: _View, likest: Float32Array) -> tuple[Float32Array, Float
                 expected[number, channel] *= np.median(shown[told] / own[told])
             else:
                 expected[number, channel] += np.median(shown[told] - own[told])
+            expected[number, channel, own < 0.0] = _OUTSIDE
             off = np.median(np.abs(shown - expected[number, channel])[told])
             limit[number, channel] = ALIKE * max(1.48 * off, NOISE[channel])  # 1.48: from a median to a deviation
     return expected, limit
@@ -396,13 +403,16 @@ class _Patches:
 def _neighbours_agree(depth: Float32Array, error: Float32Array) -> BoolArray:
     """Return which pixels lie in line with `PAIRS_IN_LINE` pairs of opposite neighbours, of four, shape (h, w).
 
-    On a plane, inverse depth is linear in the image. It may be off by the distance of two planes of the sweep, `error`.
+    On a plane, inverse depth is linear in the image. The pixel may be off the middle of a pair by one spacing of planes
+    of the sweep, `error`, and inverse depth may change by at most `STEEPEST` spacings per pixel: a wrong depth halfway
+    across an outline is in line, too.
     """
     height, width = depth.shape
     framed, count = 1.0 / np.pad(depth, 1, constant_values=np.nan), np.zeros(depth.shape, dtype=np.int64)
     for row, column in ((0, 0), (0, 1), (0, 2), (1, 0)):
         one, other = (framed[r : r + height, c : c + width] for r, c in ((row, column), (2 - row, 2 - column)))
-        count += np.abs(one + other - 2.0 / depth) <= 2.0 * error / depth**2
+        spacing = 2.0 * error / depth**2
+        count += (np.abs(one + other - 2.0 / depth) <= spacing) & (np.abs(one - other) <= STEEPEST * spacing)
     return count >= PAIRS_IN_LINE
 
 
@@ -426,6 +436,7 @@ def _warped(other: _View, view: _View, depth: float, warped: Float32Array) -> No
     height, width = view.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     to_other = np.linalg.inv(half) @ turn @ half
+    warped[len(other.channels) :] = _OUTSIDE  # a photograph without temperatures
     for channel, picture in zip(warped, other.channels):
         cv2.warpPerspective(picture, to_other, (width, height), channel, flags, cv2.BORDER_CONSTANT, (_OUTSIDE,))
     # Points behind the other camera would be drawn upside down. Depth in that camera is linear over the picture.

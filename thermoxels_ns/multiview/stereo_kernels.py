@@ -1,4 +1,4 @@
-"""Compiled loops of stereo: weights and correlation of patches, costs along paths, and refinement of depths."""
+"""Compiled loops of stereo: correlation of patches, differences of pixels, costs along paths, refined depths."""
 
 from __future__ import annotations
 
@@ -147,6 +147,8 @@ def add_differences(others, expected, limit, weight, count, plane, cost):
 
     The difference of a pixel of `others` (photographs, c, h, w) from `expected`, of the same shape, is relative to
     `limit` (photographs, c, 1, 1), at most 1, and averaged over channels and photographs. It is multiplied by `weight`.
+    A channel is left out where its limit is infinite, or where `expected` or, unlike brightness, the other photograph
+    is masked (below -1 and below 0). A photograph that is masked itself, or without a channel left, differs by 1.
     """
     total, kinds, height, width = others.shape
     best = np.empty(count, np.float32)
@@ -154,11 +156,14 @@ def add_differences(others, expected, limit, weight, count, plane, cost):
         for column in range(width):
             best[:] = 1.0
             for number in range(total):
-                off = np.float32(0.0)
-                for channel in range(kinds):
-                    difference = abs(others[number, channel, row, column] - expected[number, channel, row, column])
-                    off += min(difference / limit[number, channel, 0, 0], np.float32(1.0))
-                off /= kinds
+                off, told = np.float32(0.0), 0
+                for channel in range(kinds if others[number, 0, row, column] >= 0.0 else 0):
+                    here, own = others[number, channel, row, column], expected[number, channel, row, column]
+                    most = limit[number, channel, 0, 0]
+                    if here >= 0.0 and own > -1.0 and most < np.inf:
+                        off += min(abs(here - own) / most, np.float32(1.0))
+                        told += 1
+                off = off / told if told else np.float32(1.0)
                 for place in range(count):
                     if off < best[place]:
                         best[place], off = off, best[place]
