@@ -127,7 +127,8 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
         mask, camera = None if shown is None else np.array(shown) > 0, frame.intrinsics.resized(*picture.size)
         pinholes.append(photographs.pinhole(np.array(picture), mask, camera, frame.pose, _STEREO_SIDE))
     seen = photographs.gathered(pinholes, [frame.pose[:3, 3] for frame in frames])
-    depths = stereo.depths_of(seen, views_to_contradict=0)  # a wrong depth harms the box more than a missing one
+    # A wrong depth harms the box more than a missing one.
+    depths = stereo.depths_of(seen, views_to_contradict=0, difference=0.0)
     depths = stereo.depths_before_backdrop(depths)[0]
     return stereo.feature_rays_to_depths(depths).points, len(frames)
 
