@@ -23,6 +23,7 @@ from thermoxels_ns.core.yaml_records import as_record, raising
 _DRAWS = 4000  # Ends of intervals scatter by about 1 % of the width
 _NEAR_M = 0.3  # Surface moves by less: insulation is thinner, and reconstructions err by less, [m]
 _FACES = 0.7  # Least cosine between normals of the same surface
+_POSE_TOGETHER = "Compare surveys of the same building in metres, or pose the photographs of both together."
 _FITS_M, _UNMATCHED_M = 0.2, 1.0  # Largest median distance of meshes that fit; distance of points without a partner
 _TURN_DEG = 15.0  # Step between the directions in which an alignment starts
 _ALIGN_STEPS = 25  # Steps of each alignment
@@ -139,6 +140,9 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
     new = _Survey(after, later, _partners(len(there.counted), counted[1], at_new, counted[0], at_old))
     elements, only_after = new.elements(old)
     if not elements:
+        if moved:  # a wall slides along a larger one: how far apart they are does not tell that they do not fit
+            got = "no surface in common where they fit best"
+            raise AuditError("compare", expected="two meshes that fit each other", got=got, remedy=_POSE_TOGETHER)
         expected, remedy = "surface that both surveys saw", "Compare surveys that show the same walls."
         raise AuditError("compare", expected=expected, got="none", remedy=remedy)
     bridges, parts = _matched(old, new), list(elements.values())
@@ -375,8 +379,7 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
         return as_given, given, False
     if median > _FITS_M:
         got = f"meshes {median:.2f} m apart (median) where they fit best, {given:.2f} m as they are"
-        remedy = "Compare surveys of the same building in metres, or pose the photographs of both together."
-        raise AuditError("compare", expected="two meshes that fit each other", got=got, remedy=remedy)
+        raise AuditError("compare", expected="two meshes that fit each other", got=got, remedy=_POSE_TOGETHER)
     other = next((one for one in tried if _turned_deg(pose, one[2]) > _TURN_DEG), None)
     if other is not None and other[0] <= _LIKE_BEST * best + 0.1 * edge:
         got = f"two positions {_turned_deg(pose, other[2]):.0f} degrees apart, {best:.2f} and {other[0]:.2f} m off"

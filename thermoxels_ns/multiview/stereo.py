@@ -36,15 +36,16 @@ LEAST_WEIGHT = 0.05  # A smaller weight, of 1, is set to 0
 PLANES = (24, 128)
 """Least and most planes per photograph. Within, the picture moves by about a pixel from one plane to the next."""
 NOISE = (1.5 / 255.0, 1.0 / 255.0)
-"""Standard deviations of noise within a patch, and least ones of pixels of two photographs from each other: of
-brightness, of 1, and of temperature, of the scene's range."""
+"""Standard deviations of noise: of brightness, of 1, and of temperature, of the scene's range. Differences between two
+photographs are taken to deviate by at least as much."""
 DIFFERENCE, ALIKE = 0.4, 2.0
 """Cost of a pixel that differs by at least `ALIKE` standard deviations from what another photograph shows on a plane; a
 smaller difference costs in proportion. The deviations are those on the planes on which patches correlate best, which on
 a ramp may be wrong ones; taking them from sure depths alone found no more. Correlation cannot tell apart places along a
 shallow ramp, nor say where an even area ends: pixels of the body with a depth rise from 37, 55, 35 and 52 % to 61, 66,
-49 and 54 % with this (wild-7, courtyard, white house, saharov32), and the wrong ones among them fall to half. Costs of
-0.1 to 0.8 and limits of 2 to 6 were tried, with margins of 0.03 to 0.1."""
+49 and 54 % with this and `PAIRS_IN_LINE` (wild-7, courtyard, white house, saharov32), and the wrong ones among them
+fall to half or less. Costs of 0.1 to 0.6 and limits of 2 to 6 were tried, with margins of 0.03 to 0.1. Where texture is
+as fine as pixels, differences are noise: a drawn block before far walls of random pixels loses 12 % of its depths."""
 STEP, JUMP = 0.05, 0.6
 """Costs of a change of one plane, and of several planes, between pixels side by side. The cost of a correlation r is
 (1 - r) / 2. Steps of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes, before `DIFFERENCE`."""
@@ -331,7 +332,11 @@ def _sweep(
     patches = _Patches.of(view)
     cost = np.empty((*view.shape, len(inverse_depths)), dtype=np.float32)
     moved = np.empty((len(others), *view.channels.shape), dtype=np.float32)
-    half, best_yet, likest = -(-len(others) // 2), np.full(view.shape, LEAST_CORRELATION), np.full_like(moved, _OUTSIDE)
+    half, best_yet, at_best = (
+        -(-len(others) // 2),
+        np.full(view.shape, LEAST_CORRELATION),
+        np.full_like(moved, _OUTSIDE),
+    )
     for plane, inverse_depth in enumerate(inverse_depths):
         for number, other in enumerate(others):
             _warped(other, view, 1.0 / inverse_depth, moved[number])
@@ -339,13 +344,13 @@ def _sweep(
         correlate(view.channels, moved, RADIUS, *weighed, view.noise, half, plane, cost)
         better = cost[..., plane] >= best_yet
         best_yet[better] = cost[better, plane]
-        likest[:, :, better] = moved[:, :, better]
+        at_best[:, :, better] = moved[:, :, better]
     cost[(patches.variances == 0.0).all(axis=0)] = 0.0  # nothing but noise: no plane correlates better than another
     cost *= -0.5
     cost += 0.5
     correlates = cost[..., 0] <= 0.5 * (1.0 - LEAST_CORRELATION)
-    expected, limit = _expected_pixels(view, likest)
-    for plane, inverse_depth in enumerate(inverse_depths):
+    expected, limit = _expected_pixels(view, at_best)
+    for plane, inverse_depth in enumerate(inverse_depths if difference > 0.0 else []):
         for number, other in enumerate(others):
             _warped(other, view, 1.0 / inverse_depth, moved[number])
         add_differences(moved, expected, limit, np.float32(difference), half, plane, cost)
@@ -363,18 +368,18 @@ def _sweep(
     return np.where(sure, found, np.nan).ravel(), (found * found * apart).ravel()
 
 
-def _expected_pixels(view: _View, likest: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Return what other photographs are expected to show, shape of `likest`, and by how much they may differ from it.
+def _expected_pixels(view: _View, at_best: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Return what other photographs are expected to show, shape of `at_best`, and by how much they may differ from it.
 
     The first is the photograph's own brightness times the median ratio, or its temperature plus the median difference,
-    over all pixels of `likest` (photographs, c, h, w): what others show on the plane where patches correlate best (by
+    over all pixels of `at_best` (photographs, c, h, w): what others show on the plane where patches correlate best (by
     at least `LEAST_CORRELATION`, else `_OUTSIDE`). The second, (photographs, c, 1, 1), is `ALIKE` standard deviations
     of the same pixels from what is expected, infinite where too few pixels tell. Masked pixels stay `_OUTSIDE`.
     """
-    expected = np.broadcast_to(view.channels, likest.shape).copy()
-    limit = np.full((*likest.shape[:2], 1, 1), np.inf, np.float32)
-    for number, channel in np.ndindex(*likest.shape[:2]):
-        shown, own = likest[number, channel], view.channels[channel]
+    expected = np.broadcast_to(view.channels, at_best.shape).copy()
+    limit = np.full((*at_best.shape[:2], 1, 1), np.inf, np.float32)
+    for number, channel in np.ndindex(*at_best.shape[:2]):
+        shown, own = at_best[number, channel], view.channels[channel]
         told = (shown >= 0.0) & (own > 0.0)
         if told.sum() >= _FEWEST_ALIKE:
             if channel == 0:  # cameras differ in exposure, and their temperatures by an offset

@@ -147,8 +147,8 @@ def add_differences(others, expected, limit, weight, count, plane, cost):
 
     The difference of a pixel of `others` (photographs, c, h, w) from `expected`, of the same shape, is relative to
     `limit` (photographs, c, 1, 1), at most 1, and averaged over channels and photographs. It is multiplied by `weight`.
-    A channel is left out where its limit is infinite, or where `expected` or, unlike brightness, the other photograph
-    is masked (below -1 and below 0). A photograph that is masked itself, or without a channel left, differs by 1.
+    A channel is left out where its limit is infinite, where `expected` is masked (below -1), or where the other
+    photograph has no temperature (below 0). One that shows no brightness, or has no channel left, differs by 1.
     """
     total, kinds, height, width = others.shape
     best = np.empty(count, np.float32)
