@@ -277,7 +277,7 @@ def test_what_is_endlessly_far_has_depths_far_behind_the_box():
     moved = photographs()
     seen = replace(seen, matrices=moved.matrices, centres=moved.centres)
     found = depths(replace(seen, colours=seen.colours + draw.normal(0.0, 0.006, seen.colours.shape).astype(np.float32)))
-    assert found.share > 0.5
+    assert found.share > 0.8  # 0.67 if differences count for what is matched at infinity
     assert np.nanmin(found.depth) > 2.0 * (1.6 + 0.5)
 
 

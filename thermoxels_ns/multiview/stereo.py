@@ -374,7 +374,7 @@ def _expected_pixels(view: _View, at_best: Float32Array) -> tuple[Float32Array, 
     The first is the photograph's own brightness times the median ratio, or its temperature plus the median difference,
     over all pixels of `at_best` (photographs, c, h, w): what others show on the plane where patches correlate best (by
     at least `LEAST_CORRELATION`, else `_OUTSIDE`). The second, (photographs, c, 1, 1), is `ALIKE` standard deviations
-    of the same pixels from what is expected, infinite where too few pixels tell. Masked pixels stay `_OUTSIDE`.
+    of the same pixels from what is expected, infinite where too few pixels tell. Masked pixels stay far below 0.
     """
     expected = np.broadcast_to(view.channels, at_best.shape).copy()
     limit = np.full((*at_best.shape[:2], 1, 1), np.inf, np.float32)
@@ -386,7 +386,6 @@ def _expected_pixels(view: _View, at_best: Float32Array) -> tuple[Float32Array, 
                 expected[number, channel] *= np.median(shown[told] / own[told])
             else:
                 expected[number, channel] += np.median(shown[told] - own[told])
-            expected[number, channel, own < 0.0] = _OUTSIDE
             off = np.median(np.abs(shown - expected[number, channel])[told])
             limit[number, channel] = ALIKE * max(1.48 * off, NOISE[channel])  # 1.48: from a median to a deviation
     return expected, limit
