@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.support.looking_cameras import looking_at
-from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
+from thermoxels_ns.core.feature_rays import MARGIN_ERRORS, MARGIN_VOXELS, FeatureRays, agrees_with_neighbours
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.boundary.visibility import FacetViews, facet_views
@@ -15,7 +15,6 @@ from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import Depths, depths_of
 from thermoxels_ns.multiview.votes import (
     FEWEST_POINTS,
-    MARGIN_VOXELS,
     air_voxels,
     around_cameras,
     supporting_photographs,
@@ -75,7 +74,7 @@ def test_what_is_carved_ends_before_the_points_by_the_margin_and_the_uncertainty
     sight = lines([-0.95, 0.05, 0.05], [[0.87, 0.05, 0.05], [0.88, 0.05, 0.05]], uncertainty)
     carved = np.flatnonzero(empty_voxels(BOX, sight)[:, 10, 10])
     ends = BOX.index_to_world([[carved.max() + 1, 0, 0]])[0, 0]
-    limit = 0.87 - MARGIN_VOXELS * BOX.voxel_size - 3.0 * uncertainty
+    limit = 0.87 - MARGIN_VOXELS * BOX.voxel_size - MARGIN_ERRORS * uncertainty
     assert carved.tolist() == list(range(carved.max() + 1))
     assert limit - BOX.voxel_size < ends <= limit + 1e-9
 

@@ -8,7 +8,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
-from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.core.feature_rays import MARGIN_ERRORS, MARGIN_VOXELS, FeatureRays
 from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
@@ -18,13 +18,9 @@ from thermoxels_ns.multiview.stereo import ERROR_PLANES, Depths
 CountArray = npt.NDArray[np.int32]
 
 FEWEST_POINTS = 2  # Points whose rays must cross a voxel before it counts as free: a single point may be wrong
-MARGIN_VOXELS = 1.5  # A ray votes only for voxels at least so far before its point, [voxels]
-MARGIN_ERRORS = 3.0  # Standard errors of the ray's length that are added to this margin
 CLEARANCE = 0.5  # Nothing stands nearer to a camera than this share of the distance to the nearest thing that it shows
 FEWEST_RAYS = 20  # A camera with fewer feature rays is not judged by `around_cameras`
 _NEAREST = 1.0  # Percentile of a camera's ray lengths that is taken as the nearest: a few rays may be wrong
-REACH = 1.5  # A depth or a track's point lies on a surface up to this distance from the surface, [voxels]
-REACH_ERRORS = 2.0  # Standard errors of a depth that are added to this distance
 
 
 def air_voxels(lattice: Lattice, rays: FeatureRays) -> BoolArray:
@@ -117,10 +113,10 @@ def supporting_photographs(
     for number in range(len(photographs)):
         (places,) = np.nonzero(seen[:, number])
         pixel, depth, shown = photographs.shown(number, middle[places])
-        reach = REACH * voxel_size + REACH_ERRORS * ERROR_PLANES * depths.error[pixel]
+        reach = MARGIN_VOXELS * voxel_size + MARGIN_ERRORS * ERROR_PLANES * depths.error[pixel]
         result[places, number] = shown & (np.abs(depths.depth[pixel] - depth) <= reach)  # false where it is NaN
     if tracks is not None and len(tracks.point) and len(middle):
-        result |= _by_tracks(tracks, photographs.centres, middle, REACH * voxel_size)
+        result |= _by_tracks(tracks, photographs.centres, middle, MARGIN_VOXELS * voxel_size)
     return result & seen
 
 
