@@ -313,7 +313,7 @@ def _row(folder: Path, name: str, building: Building) -> dict[str, Any]:
         **{"name": name, "finished": len(costs) == len(plan), "failed": bool(said)},
         "why": why or [f"{stage}: not run" for stage in plan if stage not in costs],
         "logs": [f"{name}/logs/{stage}.log" for stage in said],
-        "psnr": _read(own / "eval.json").get("results", {}).get("psnr") if "scores" in costs else None,
+        "scores": _read(own / "eval.json").get("results", {}) if "scores" in costs else {},
         "seconds": {stage: cost["seconds"] for stage, cost in costs.items()},
         "peak_gb": max(memory, default=None),
         "loss_w": answers.get("whole", {}).get("loss_w"),
