@@ -162,7 +162,7 @@ def true_u_of_patches(rules: Path) -> dict[str, float]:
 
 def audit_target(compared: Sequence[Compared]) -> Target:
     """Return the share of figures whose true value lies in the interval, with the target 100 %."""
-    share = sum(one.held for one in compared) / len(compared) if compared else math.nan
+    share = sum(one.held for one in compared) / len(compared)
     return Target(
         *("Audit: true U-values and psi in their intervals", 100.0 * share, 100.0, True, "{:.0f} %"),
         "The audit's answers beside what the house was drawn with; its intervals are to hold 90 % in the long run.",
@@ -171,7 +171,6 @@ def audit_target(compared: Sequence[Compared]) -> Target:
 
 def demo_page(
     folder: Path,
-    scene: str,
     targets: Iterable[Target],
     others: Sequence[tuple[str, str]],
     compared: Sequence[Compared],
@@ -182,7 +181,6 @@ def demo_page(
 
     `others`: names and texts of figures; `seconds`: names and durations of steps.
     """
-    night = folder / "heat" / "surface-end.png"
     export, renders, drawn = folder / "export", folder / "renders" / "test", folder / "scene"
     photographs = sorted((drawn / "images").glob("frame_train_*"))
     held_out = sorted(path.stem for path in (drawn / "images").glob("frame_eval_*"))
@@ -197,7 +195,6 @@ def demo_page(
         kinds = ("gt-rgb", "rgb", "gt-thermal", "thermal")
         return build_page(
             "demo.html.j2",
-            scene=scene,
             photographs=len(photographs),
             targets=targets,
             others=others,
@@ -206,7 +203,7 @@ def demo_page(
             views=[(name, [(renders / of / f"{name}.png").read_bytes() for of in kinds]) for name in held_out],
             gradient=gradient(),
             ends_c=[float(bounds[f"absolute_{end}_temperature"]) for end in ("min", "max")],
-            night=night.read_bytes() if compared and night.is_file() else b"",
+            night=(folder / "heat" / "surface-end.png").read_bytes(),
             heat=_panels(export / "heat.png", 3),
             mesh=(export / "mesh.png").read_bytes(),
             measured=(export / "mesh-measured.png").read_bytes(),
