@@ -30,9 +30,7 @@ FLAWS = {
     "walk": Imperfections(pose_error_deg=0.15, pose_correlation=0.95),
     "focal": Imperfections(focal_error=0.005),
     "thermal": THERMAL,
-    "vignetting": Imperfections(vignetting=0.3, thermal_vignetting_k=1.0),
-    "motion": Imperfections(motion_blur_px=2.0, rolling_shutter_px=2.0),
-    "pixels": Imperfections(fixed_pattern_k=0.1, dead_pixels=0.002),
+    "pixels": Imperfections(dead_pixels=0.002),
     "passers-by": Imperfections(passers_by=0.2),
     "all": replace(EXPOSURE, pose_error_deg=0.15, thermal_blur_px=1.5, drift_k=1.0, noise_k=0.1),
 }
