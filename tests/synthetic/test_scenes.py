@@ -149,15 +149,6 @@ def test_sphere_depth_and_temperature_are_analytic() -> None:
     np.testing.assert_allclose(view.temperature_c, np.where(view.hit, 30.0 + 20.0 * z, 10.0), atol=1e-9)
 
 
-def test_a_camera_inside_the_solid_is_an_error() -> None:
-    scene = make_scene("house-corner")
-    pose = look_at((0.0, 0.0, 1.0), (3.0, 0.0, 1.5))
-    with pytest.raises(SceneError):
-        render_view(scene, pose, scene.camera(8, 6))
-    with pytest.raises(SceneError):
-        visible_surface_points(scene, [pose], scene.camera(8, 6), *scene.solid.surface_points(10))
-
-
 def test_names_say_what_stands_behind() -> None:
     scene = make_scene("house-corner+sky=0.55,0.57,0.60+street")
     assert scene.name == "house-corner+sky=0.55,0.57,0.60+street" and scene.around is not None

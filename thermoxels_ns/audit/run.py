@@ -224,8 +224,7 @@ def audit_mesh(
     if not isinstance(conditions, Conditions):
         conditions = load_conditions(conditions)
     body, about = any_mesh(mesh, up)
-    towards = check_direction("up", about.get("up") or (0.0, 0.0, 1.0), "Pass up=(0, 0, 1).", AuditError)
-    x, y, z = (towards / float(np.linalg.norm(towards))).tolist()
+    x, y, z = check_direction("up", about.get("up") or (0.0, 0.0, 1.0), "Pass up=(0, 0, 1).", AuditError).tolist()
     with threadpool_limits(1, "blas"):  # with more, the last bits would depend on the number of threads
         return audit(body, conditions, (x, y, z))
 

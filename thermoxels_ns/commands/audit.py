@@ -25,6 +25,7 @@ from thermoxels_ns.core.checks import (
     writable_folder,
 )
 from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.core.json_values import plain_values, write_json
 from thermoxels_ns.data.layouts import LayoutName
 
 if TYPE_CHECKING:
@@ -381,7 +382,7 @@ def _write(
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     from thermoxels_ns.audit.envelope import hbjson
-    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtk
+    from thermoxels_ns.mesh.files.vtu import write_vtk
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit, gbxml
     from thermoxels_ns.reports.page import identify, why_no_pdf, write_page, write_pdf
 
@@ -401,7 +402,7 @@ def _write(
     )
     answers = answers_of(options, found, envelope, shown["compared"])
     answers |= {"report": asdict(report), "impossible": shown["impossible"]}
-    summary_text(answers)  # raises if json cannot hold the answers
+    plain_values(answers, "answers", AuditError)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
     write_vtk(vtkXMLPolyDataWriter(), folder / SURFACE, found.to_pyvista())
     title = found.conditions.title
@@ -409,7 +410,7 @@ def _write(
         if envelope is None or kind not in options.envelope:
             remove_file(folder / name)
         elif kind == "hbjson":
-            write_summary(folder / name, hbjson(envelope, title))
+            write_json(folder / name, hbjson(envelope, title))
         else:
             write_page(folder / name, gbxml(envelope, title))
     pictures = draw_audit(found) if options.pictures else None
@@ -421,5 +422,5 @@ def _write(
     remove_file(folder / DOCUMENT)
     if document:
         write_pdf(folder / DOCUMENT, audit_page(*about, report=report, **shown, paper=True))
-    write_summary(folder / ANSWERS, answers)
+    write_json(folder / ANSWERS, answers)
     return files

@@ -17,7 +17,7 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import check_direction, remove_file, result_folder
 from thermoxels_ns.core.config_loader import check_run
 from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, SceneError, ThermoxelsError, exit_status
-from thermoxels_ns.core.json_values import read_json_object
+from thermoxels_ns.core.json_values import plain_values, read_json_object, write_json
 from thermoxels_ns.core.lattice import Lattice, input_from_world
 from thermoxels_ns.data.scene_scale import (
     SceneScale,
@@ -151,7 +151,7 @@ class CheckedOptions(NamedTuple):
     rules: PatchRules
     distance: SceneScale | None  # Scale that follows from the known distance; None without a known distance
     scene: HeatScene  # Heat scene of the preset, with the changes that options make
-    material: Material  # Material of `scene`
+    material: Material  # The only material of `scene`
     time: TimeSteps  # Time steps of `scene`
 
 
@@ -356,7 +356,6 @@ def export_snapshot(
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
     from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
     from thermoxels_ns.mesh.files.surface import check_stl
-    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
     from thermoxels_ns.mesh.quality.report import check_mesh, picture_of_quality
     from thermoxels_ns.mesh.tetrahedra import support_of_facets
     from thermoxels_ns.reports import mesh_pictures
@@ -424,7 +423,7 @@ def export_snapshot(
         "up": up,
         "up_source": up_source,
         "region": region,
-        "mesh": export_summary.mesh_summary(built, report, checked.selection, scale, voxel_size),
+        "mesh": export_summary.mesh_summary(built, report, scale, voxel_size),
         "heat": {"computed": False, "reason": skipped}
         if solution is None
         else export_summary.heat_summary(material, time, solution),
@@ -432,10 +431,10 @@ def export_snapshot(
         **({} if truth is None else {"truth": truth}),
         "files": [*files, _SUMMARY],
     }
-    summary_text(summary)  # raises if json cannot hold the summary
+    plain_values(summary, "summary", MeshError)  # raises if json cannot hold the summary
 
     remove_file(folder / _SUMMARY)
-    write_summary(folder / _QUALITY, report.as_mapping())  # first: marks the folder as an export's for `prepare_folder`
+    write_json(folder / _QUALITY, report.as_mapping())  # first: marks the folder as an export's for `prepare_folder`
     for name in {*_mesh_files(MESH_FORMATS), *_MESH_PICTURES, _HEAT_PICTURE} - set(files):
         remove_file(folder / name)
     if solution is None:
@@ -461,7 +460,7 @@ def export_snapshot(
         mesh_pictures.write_picture(folder / _MESH_PICTURES[3], mesh_pictures.image_of_mesh(mesh, **beside))
         if solution is not None:
             mesh_pictures.draw_heat(folder / _HEAT_PICTURE, mesh, solution, look)
-    write_summary(folder / _SUMMARY, summary)
+    write_json(folder / _SUMMARY, summary)
     say(f"Written to {folder}: {', '.join(name for name in summary['files'] if '/' not in name)}")
     return summary
 

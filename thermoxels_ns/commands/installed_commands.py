@@ -5,7 +5,6 @@ from __future__ import annotations
 import codecs
 import math
 import os
-import re
 import shlex
 import shutil
 import subprocess
@@ -36,8 +35,8 @@ class ProcessCost(NamedTuple):
 
     seconds: float  # Wall time, [s]
     peak_memory_gb: float
-    """Largest resident memory of the process, [1e9 bytes]; NaN if the system has no `wait4`, or if the process took no
-    more memory than the process that started it."""
+    """Largest resident memory of the process, [1e9 bytes]; NaN if the system has no `wait4`. Linux reports no less than
+    the memory of the process that started it."""
 
 
 class CommandFailed(ThermoxelsError):
@@ -136,9 +135,4 @@ def _ended(process: subprocess.Popen[bytes]) -> tuple[bool, float]:
     if pid != process.pid:
         return False, math.nan
     process.returncode = os.waitstatus_to_exitcode(status)
-    # Linux reports at least the peak of the process that started the command: such a figure tells nothing.
-    own = Path("/proc/self/status")
-    found = re.search(r"^VmHWM:\s*(\d+) kB", own.read_text(), re.MULTILINE) if own.is_file() else None
-    if found and usage.ru_maxrss <= int(found[1]):
-        return True, math.nan
     return True, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9

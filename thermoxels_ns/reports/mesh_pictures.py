@@ -219,8 +219,7 @@ def _towards_camera(up: Sequence[float], view_direction: Sequence[float] | None)
 
 
 def _unit(name: str, vector: npt.ArrayLike) -> FloatArray:
-    array = check_direction(name, vector, "Pass for instance (0, 0, 1).", MeshError)
-    return array / float(np.linalg.norm(array))
+    return check_direction(name, vector, "Pass for instance (0, 0, 1).", MeshError)
 
 
 def _frame(plotter: pv.Plotter, points: FloatArray, up: FloatArray, towards_camera: FloatArray) -> None:

@@ -87,13 +87,6 @@ def write_scene(
         SceneError: An option is out of range, or the folder contains a scene that is not synthetic.
         OutputError: The folder cannot be written to.
     """
-    for name, word, known in (
-        ("layout", layout, _FOLDERS),
-        ("photo_format", photo_format, _PHOTO_SUFFIXES),
-        ("thermal_format", thermal_format, _SUFFIXES),
-    ):
-        if word not in known:
-            raise SceneError(name, expected=f"one of {', '.join(known)}", got=repr(word), remedy="Choose one of these.")
     thermal_camera, offset = _thermal_camera(scene, width, height, thermal_width, own_thermal_camera)
     photographs, thermals, model = _FOLDERS[layout]
     if own_thermal_camera and (model or not thermals):
