@@ -9,7 +9,7 @@ import pytest
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.catalogue import DEVELOPMENT_NAMES, SCENE_NAMES, make_scene
+from thermoxels_ns.synthetic.drawn_scenes import DEVELOPMENT_NAMES, SCENE_NAMES, make_scene
 from thermoxels_ns.synthetic.random_plan import SMALLEST, Plan
 from thermoxels_ns.synthetic.random_scene import FAMILIES
 from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points

@@ -18,7 +18,7 @@ from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import check_ranges, remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object, write_json
-from thermoxels_ns.synthetic.catalogue import make_scene
+from thermoxels_ns.synthetic.drawn_scenes import make_scene
 from thermoxels_ns.synthetic.imperfections import PERFECT, DrawnFlaws, Imperfections
 from thermoxels_ns.synthetic.raycast import first_surface, render_view
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
