@@ -41,11 +41,6 @@ class Imperfections:
     """Standard deviation of the temperature offset of each thermal image, [K], as uncooled cameras have it."""
     thermal_blur_px: float = 0.0
     """Standard deviation of the thermal camera's Gaussian point spread, [thermal pixels]."""
-    dead_pixels: float = 0.0
-    """Share of the thermal pixels that always read the same value."""
-    rig_error_deg: float = 0.0
-    """Standard deviation of the angle, about each axis, by which the given poses of a separate thermal camera are
-    turned against those of the photographs, [degrees], by the same angles in all poses."""
     passers_by: float = 0.0
     """Share of the pairs of images in which a person, 31 C warm, walks before the scene."""
 
@@ -56,8 +51,8 @@ class Imperfections:
             ThermoxelsError: An option is out of range; the message has its name, range and value.
         """
         limits = {field.name: (0.0, 1e6, "a finite number of at least 0") for field in fields(self)}
-        limits |= dict.fromkeys(("dead_pixels", "passers_by"), (0.0, 1.0, "from 0 to 1"))
-        limits |= {"pose_correlation": (0.0, 0.999, "from 0 to 0.999"), "focal_error": (-0.5, 1.0, "from -0.5 to 1")}
+        limits |= {"passers_by": (0.0, 1.0, "from 0 to 1"), "pose_correlation": (0.0, 0.999, "from 0 to 0.999")}
+        limits |= {"focal_error": (-0.5, 1.0, "from -0.5 to 1")}
         limits |= {"jpeg_quality": (1, 95, "from 1 to 95"), "white_balance": (0.0, 0.3, "from 0 to 0.3")}
         check_ranges("--", {name: (getattr(self, name), *limit) for name, limit in limits.items()})
 
@@ -73,18 +68,10 @@ class DrawnFlaws:
         seed: Seed of all random numbers.
         poses: True poses of the photographs (n, 4, 4), camera to world.
         middle: Middle of the scene (3,) [m]; errors of position are proportional to the distance to it.
-        range_c: Lowest and highest reading of dead thermal pixels [degrees Celsius].
     """
 
-    def __init__(
-        self,
-        flaws: Imperfections,
-        seed: int,
-        poses: FloatArray,
-        middle: npt.ArrayLike,
-        range_c: tuple[float, float],
-    ):
-        self.flaws, self._seed, self._poses, self._range_c = flaws, seed, poses, range_c
+    def __init__(self, flaws: Imperfections, seed: int, poses: FloatArray, middle: npt.ArrayLike):
+        self.flaws, self._seed, self._poses = flaws, seed, poses
         count, keep = len(poses), flaws.pose_correlation
         stops, balance = self._normal(count, 1, stream=2), self._normal(count, 3, stream=3)
         self.gains = 2.0 ** (flaws.exposure_stops * stops) * (1.0 + flaws.white_balance * balance)  # (n, 3)
@@ -95,7 +82,6 @@ class DrawnFlaws:
         errors *= np.deg2rad(flaws.pose_error_deg)
         far = np.linalg.norm(poses[:, :3, 3] - np.asarray(middle, dtype=np.float64), axis=1)
         self.turns_rad, self._moves = errors[:, :3], errors[:, 3:] * far[:, None]  # about, and along, each axis
-        self._rig_turn_rad = np.deg2rad(flaws.rig_error_deg) * self._normal(3, stream=5)
         self._passing: BoolArray = np.random.default_rng([seed, 6]).random(count) < flaws.passers_by
 
     def _normal(self, *shape: int, stream: int, number: int | None = None) -> FloatArray:
@@ -110,12 +96,6 @@ class DrawnFlaws:
         given[:, :3, :3] = given[:, :3, :3] @ _turned(self.turns_rad)
         given[:, :3, 3] += self._moves
         return given
-
-    def given_rig_turn(self) -> FloatArray:
-        """Return the transform (4, 4) by which the given poses of a separate thermal camera are wrong."""
-        turn = np.eye(4)
-        turn[:3, :3] = _turned(self._rig_turn_rad)
-        return turn
 
     def bounds_c(self, lowest_c: float, highest_c: float) -> tuple[float, float]:
         """Return the lowest and highest reading of thermal images of a scene of `lowest_c` to `highest_c`, [C]."""
@@ -147,8 +127,7 @@ class DrawnFlaws:
             seen[_passer_by(shape, place)] = _PASSER_BY[1]
         seen = ndimage.gaussian_filter(seen, flaws.thermal_blur_px, mode="nearest") + self.drifts_k[number]
         seen += flaws.noise_k * self._normal(*shape, stream=1, number=number)
-        draw = np.random.default_rng([self._seed, 9])
-        return np.where(draw.random(shape) < flaws.dead_pixels, draw.uniform(*self._range_c, shape), seen)
+        return seen
 
     def truth(self) -> dict[str, object]:
         """Return the entries of ``truth.json`` by name: sizes of the flaws, drawn values, and the true poses."""
@@ -156,7 +135,6 @@ class DrawnFlaws:
             "imperfections": vars(self.flaws),
             "gains": self.gains.tolist(),
             "drift_k": self.drifts_k.tolist(),
-            "rig_turn_deg": np.rad2deg(self._rig_turn_rad).tolist(),
             "passers_by": np.flatnonzero(self._passing).tolist(),
             "poses": self._poses.tolist(),
         }

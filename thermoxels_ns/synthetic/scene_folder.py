@@ -100,8 +100,8 @@ def write_scene(
     train, held_out = scene.poses(num_train, num_eval)
     names = [f"frame_{kind}_{i + 1:05d}" for kind, n in (("train", num_train), ("eval", num_eval)) for i in range(n)]
     poses = np.concatenate([train, held_out])
-    flaws = DrawnFlaws(imperfections, seed, poses, np.mean(scene.scene_box, axis=0), scene.temperature_bounds_c)
-    given_poses, given_offset = flaws.given_poses(), offset @ flaws.given_rig_turn()
+    flaws = DrawnFlaws(imperfections, seed, poses, np.mean(scene.scene_box, axis=0))
+    given_poses = flaws.given_poses()
     bounds = flaws.bounds_c(*scene.temperature_bounds_c)
     # Temperature [C] = count * celsius_per_count + celsius_offset.
     unit = {"celsius_per_count": (bounds[1] - bounds[0]) / _LARGEST_COUNT, "celsius_offset": bounds[0]}
@@ -122,7 +122,7 @@ def write_scene(
             "transform_matrix": given_poses[number].tolist(),
         }
         if own_thermal_camera:
-            frame["thermal_transform_matrix"] = (given_poses[number] @ given_offset).tolist()
+            frame["thermal_transform_matrix"] = (given_poses[number] @ offset).tolist()
         with replace_when_done(target / frame["file_path"]) as path:
             Image.fromarray(flaws.photograph(number, view.rgb)).save(path, quality=imperfections.jpeg_quality)
         frames.append(frame)
