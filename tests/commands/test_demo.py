@@ -132,7 +132,7 @@ def test_the_whole_demo_leaves_a_page(quick_demo, tmp_path, capfd):
         assert f"$ {word} " in out
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "Thermoxels demo: house-corner" in page
-    assert page.count("<img") == 3 + 2 * 6 + 4 * 2 + 4 + 1
+    assert page.count("<img") == 3 + 2 * 6 + 4 * 2 + 2 + 1
     assert ">-20.0<" in page and ">15.0\xa0°C<" in page  # the bounds of the house's temperatures
     assert page.count(">yes<") == 5 + len(true_u_of_patches(PATCHES)) + 1 and ">no<" not in page
     assert page.index(">Result<") < page.index("Audit: the truth beside the answer") < page.index("What went in")

@@ -113,7 +113,7 @@ def shown() -> dict[str, Any]:
         "views": [(f"frame_eval_{n}", [picture(c) for c in ("red", "green", "blue", "yellow")]) for n in (1, 2)],
         "gradient": ["#000004", "#fcffa4"],
         "ends_c": [10.0, 30.0],
-        "heat": [picture(colour) for colour in ("grey", "orange", "pink")],
+        "heat": picture("grey"),
         "night": picture("navy"),
         "mesh": picture("brown"),
         "measured": picture("purple"),
@@ -152,7 +152,7 @@ def test_every_picture_is_embedded_in_the_order_of_its_place(shown) -> None:
     contents = [base64.b64decode(str(image["src"]).split("base64,")[1]) for image in images]
     expected = [*shown["inputs"][0], shown["mesh"], *shown["inputs"][0]]
     expected += [image for _, pictures in shown["views"] for image in pictures]
-    expected += [*shown["heat"], shown["measured"], shown["night"]]
+    expected += [shown["heat"], shown["measured"], shown["night"]]
     assert contents == expected and all(image["alt"] for image in images)
 
 

@@ -291,15 +291,10 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
         check_positive("--compare-difference", difference_k, "Pass --compare-difference 20.", AuditError)
     again = "Pass the answers.json that thermoxels audit wrote, with its surface.vtp beside it."
     content = read_json_object(path, again, AuditError)
-    kinds = {"conditions": dict, "up": list}
-    missing = [key for key, kind in kinds.items() if not isinstance(content.get(key), kind)]
-    if "up" not in missing and not all(map(is_number, content["up"])):
-        missing.append("up")
-    if missing:
-        got = f"one without {' and '.join(missing)}"
-        raise AuditError(
-            str(path), expected="the answers.json of an audit", got=got, remedy=f"{again} Audit again first."
-        )
+    missing = [key for key in ("conditions", "up") if not content.get(key)]
+    if missing or not all(map(is_number, content["up"])):
+        got, remedy = f"one without {' and '.join(missing) or 'up'}", f"{again} Audit again first."
+        raise AuditError(str(path), expected="the answers.json of an audit", got=got, remedy=remedy)
     conditions, mesh = earlier_conditions(path.name, content["conditions"]), read_surface(path.with_name(SURFACE))
     x, y, z = check_direction(f"{path}: up", content["up"], again, AuditError).tolist()
     least_w = content.get("least_bridge_w")

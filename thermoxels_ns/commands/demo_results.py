@@ -189,7 +189,7 @@ def demo_page(
             gradient=gradient(),
             ends_c=[float(bounds[f"absolute_{end}_temperature"]) for end in ("min", "max")],
             night=(folder / "heat" / "surface-end.png").read_bytes(),
-            heat=_panels(export / "heat.png", 3),
+            heat=(export / "heat.png").read_bytes(),
             mesh=(export / "mesh.png").read_bytes(),
             measured=(export / "mesh-measured.png").read_bytes(),
             seconds=seconds,
@@ -197,9 +197,3 @@ def demo_page(
             config=shlex.quote(str(folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml")),
             exported=shlex.quote(str(export / "mesh.vtu")),
         )
-
-
-def _panels(path: Path, count: int) -> list[bytes]:
-    """Cut a picture into `count` panels side by side; return each panel as a PNG file, for narrow screens."""
-    with Image.open(path) as whole:
-        return [image_file(panel, "PNG") for panel in np.array_split(np.asarray(whole.convert("RGB")), count, axis=1)]

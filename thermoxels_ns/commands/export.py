@@ -546,8 +546,13 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
     def check(config: TrainerConfig) -> TrainerConfig:
         if isinstance(config, ThermoxelsTrainerConfig):
             config.moved_to(load_config.parent)
-        _check_config(config)
-        manager: Any = config.pipeline.datamanager
+        pipeline: Any = config.pipeline
+        if not callable(getattr(pipeline._target, "grid_snapshot", None)):
+            expected = "a model trained with a Thermoxels method"
+            got = f"the checkpoint of another method ({config.method_name})"
+            remedy = "Train with ns-train thermoxels, or choose another subcommand of ns-export."
+            raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
+        manager: Any = pipeline.datamanager
         told = getattr(manager, "data", None)  # with --data of ns-train, else with the dataparser's own --data
         check_scene(Path(manager.dataparser.data if told is None else told))
         return config
@@ -603,13 +608,3 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
         level /= np.linalg.norm(level)
         direction = tuple(float(v) for v in level + 0.35 * np.cross(up, level) - 0.35 * up)
     return Viewpoint(tuple(float(v) for v in up), source, direction)  # type: ignore[arg-type]
-
-
-def _check_config(config: TrainerConfig) -> None:
-    """Raise `CheckpointError` for a run of another method."""
-    pipeline: Any = config.pipeline
-    if not callable(getattr(pipeline._target, "grid_snapshot", None)):
-        expected = "a model trained with a Thermoxels method"
-        got = f"the checkpoint of another method ({config.method_name})"
-        remedy = "Train with ns-train thermoxels, or choose another subcommand of ns-export."
-        raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
