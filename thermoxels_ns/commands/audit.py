@@ -291,7 +291,7 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
         check_positive("--compare-difference", difference_k, "Pass --compare-difference 20.", AuditError)
     again = "Pass the answers.json that thermoxels audit wrote, with its surface.vtp beside it."
     content = read_json_object(path, again, AuditError)
-    missing = [key for key in ("conditions", "up") if not content.get(key)]
+    missing = [key for key, kind in (("conditions", dict), ("up", list)) if not isinstance(content.get(key), kind)]
     if missing or not all(map(is_number, content["up"])):
         got, remedy = f"one without {' and '.join(missing) or 'up'}", f"{again} Audit again first."
         raise AuditError(str(path), expected="the answers.json of an audit", got=got, remedy=remedy)

@@ -123,14 +123,8 @@ def run_batch(batch: Batch, console: Any) -> None:
         if not batch.dry_run:
             _forget_what_changed(folder, buildings)
         command = [
-            *(
-                sys.executable,
-                "-m",
-                "snakemake",
-                "--snakefile",
-                str(Path(__file__).parents[1] / "workflow" / "Snakefile"),
-            ),
-            *("--directory", str(folder)),
+            *(sys.executable, "-m", "snakemake", "--directory", str(folder)),
+            *("--snakefile", str(Path(__file__).parents[1] / "workflow" / "Snakefile")),
             *("--cores" if not batch.executor else "--jobs", str(batch.cores)),
             *("--keep-going", "--rerun-incomplete", "--rerun-triggers", "mtime", "--nolock"),
             *(() if batch.memory_gb is None else ("--resources", f"mem_mb={int(1e3 * batch.memory_gb)}")),

@@ -134,24 +134,12 @@ def demo_commands(folder: Path) -> dict[str, list[str]]:
             *("--output-path", str(folder / "renders")),
         ],
         "Export the mesh and let heat flow": [
-            *export,
-            "--output-dir",
-            str(folder / "export"),
-            "--metres-per-unit",
-            "1",
+            *(*export, "--metres-per-unit", "1", "--output-dir", str(folder / "export")),
         ],
         "Audit the house": [
             *("thermoxels", "audit", str(folder / "export" / "mesh.vtu")),
-            *(
-                "--conditions",
-                str(survey / "conditions.yaml"),
-                "--scene",
-                scene,
-                "--output-dir",
-                audited,
-                "--pdf",
-                "True",
-            ),
+            *("--conditions", str(survey / "conditions.yaml"), "--scene", scene),
+            *("--output-dir", audited, "--pdf", "True"),
         ],
         "Export the house with rooms": [
             *(*export, "--output-dir", str(folder / "walls"), "--metres-per-unit", "1", "--steps", "1"),

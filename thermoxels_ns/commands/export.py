@@ -151,7 +151,7 @@ class CheckedOptions(NamedTuple):
     rules: PatchRules
     distance: SceneScale | None  # Scale that follows from the known distance; None without a known distance
     scene: HeatScene  # Heat scene of the preset, with the changes that options make
-    material: Material  # The only material of `scene`
+    material: Material  # Material of `scene`
     time: TimeSteps  # Time steps of `scene`
 
 
