@@ -67,7 +67,7 @@ With other seeds the F-score differs by 0.02."""
 
 
 def read_demo(folder: Path) -> Figures:
-    """Return the figures of a finished demo; raises `ThermoxelsError` where one is missing."""
+    """Return the figures of a finished demo; raises `KeyError` where one is missing."""
     from thermoxels_ns.commands.demo_results import compare, numbers_of
 
     image = numbers_of(folder / "eval.json", "results")

@@ -37,7 +37,6 @@ from thermoxels_ns.audit.exchange import (
 )
 from thermoxels_ns.audit.heat_flow import SIMPLE, temperature_factor
 from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
-from thermoxels_ns.audit.weather import remembered_share
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import AuditError
@@ -119,7 +118,6 @@ class Defect:
     departure_k: float  # Absolute difference between `spot_c` and `undisturbed_c`, [K]
     spot_c: Interval  # Mean temperature of the square decimetre that departs most, [degrees Celsius]
     undisturbed_c: float  # Mean temperature of the undisturbed surface near by, [degrees Celsius]
-    incidence: Interval | None  # I_tb, the result of `incidence_factor`, which may be None
     extra_w: Interval  # Extra heat flow from inside to outside, [W]
     coefficient: Interval
     """Of a line psi, [W/(m K)]; of a point chi, [W/K]; of an area its extra heat flow per kelvin, [W/K]."""
@@ -170,7 +168,6 @@ class Audit(HasTables):
     """By cause, largest first, by how much the interval of `whole.loss_w` would be narrower if it were exact, [W]."""
     draws: int  # Number of draws behind each interval
     failing_models: tuple[str, ...]  # Of `SIMPLE`, those by which `whole` has a U-value of 0 or less, not the balance
-    remembered: Interval | None  # `remembered_share` over the stated ranges; None if no time constant is stated
     not_counted_m2: Mapping[str, float]  # Area of triangles that do not count, by the texts of `WHY_NOT`
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
@@ -225,8 +222,7 @@ def audit_mesh(
     if not isinstance(conditions, Conditions):
         conditions = load_conditions(conditions)
     body, about = any_mesh(mesh, up)
-    towards = check_direction("up", about.get("up") or (0.0, 0.0, 1.0), "Pass up=(0, 0, 1).", AuditError)
-    x, y, z = (towards / float(np.linalg.norm(towards))).tolist()
+    x, y, z = check_direction("up", about.get("up") or (0.0, 0.0, 1.0), "Pass up=(0, 0, 1).", AuditError).tolist()
     with threadpool_limits(1, "blas"):  # with more, the last bits would depend on the number of threads
         return audit(body, conditions, (x, y, z))
 
@@ -289,7 +285,7 @@ def audit(
         defects = [replace(one, not_counted=why) if drop else one for one, drop in zip(defects, slight)]
     order = sorted(range(len(found)), key=lambda n: (bool(defects[n].not_counted), -defects[n].extra_w.value))
     found, defects = [found[n] for n in order], [defects[n] for n in order]
-    last, check, (remembered, told) = len(parts) - 2, check_survey(conditions), _remembered(conditions)
+    last, check = len(parts) - 2, check_survey(conditions)
     factors = work.temperature_factors(last, work.own_error_k(last))
     loss = work.totals.flow_w[-1] + own[-1]
     drawn = [(one.name, work.u(row, own[row], own_m2[row])) for row, one in enumerate(elements[: len(patches)])]
@@ -301,7 +297,7 @@ def audit(
     return Audit(
         conditions=conditions,
         surface=surface,
-        check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, draws), *told)),
+        check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, draws))),
         patches=tuple(elements[: len(patches)]),
         storeys=tuple(elements[len(patches) : -1]),
         whole=whole,
@@ -314,7 +310,6 @@ def audit(
         budget=budget,
         draws=draws.count - 1,
         failing_models=failing,
-        remembered=remembered,
         not_counted_m2={why: area for why, area in left.items() if area > 0.0},
         triangle_surface_c=surface_c,
         triangle_flow_w_m2=flow,
@@ -479,7 +474,6 @@ class _Parts:
         per_kelvin = extra / self.draws.difference_k / (one.length_m if one.kind == "line" else 1.0)
         self.coefficients[zone] = per_kelvin
         extra_w, f_rsi = interval_of(extra), tuple(map(interval_of, self.temperature_factors(spot, off_k)))
-        air_c = self.draws["inside air" if self.conditions.side == "inside" else "outside air"]
         around_c = float(totals.surface_c[calm, 0])
         area, spot_c = surface.area_m2[one.core], interval_of(totals.surface_c[spot] + off_k)
         x, y, z = np.average(surface.centroid_m[one.core], axis=0, weights=area).tolist()
@@ -494,25 +488,12 @@ class _Parts:
             departure_k=abs(spot_c.value - around_c),
             spot_c=spot_c,
             undisturbed_c=around_c,
-            incidence=incidence_factor(totals.surface_c[zone] + off_k, totals.surface_c[calm], air_c),
             extra_w=extra_w,
             coefficient=interval_of(per_kelvin),
             f_rsi=f_rsi,
             severity=_severity(self.conditions, extra_w, f_rsi, whole_w),
             not_counted=one.not_counted,
         )
-
-
-def incidence_factor(bridge_c: FloatArray, undisturbed_c: FloatArray, air_c: FloatArray) -> Interval | None:
-    """Return I_tb = (Ta - Tp) / (Ta - T1D) of a thermal bridge (Asdrubali and others); inputs have shape (k,).
-
-    Tp is the mean surface temperature of the bridge, T1D of the undisturbed surface, and Ta the temperature of the air
-    on the seen side. None if the undisturbed surface is colder than the air in some draws and warmer in others.
-    """
-    undisturbed = undisturbed_c - air_c
-    if undisturbed.min() <= 0.0 <= undisturbed.max():
-        return None
-    return interval_of((bridge_c - air_c) / undisturbed)
 
 
 def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ...], whole_w: float) -> Severity:
@@ -644,39 +625,6 @@ def _doubts(conditions: Conditions) -> tuple[str, ...]:
     if conditions.side == "inside" and conditions.outside_known:
         found.append("U-values hold where the open air is behind the surface; the mesh does not say where that is.")
     return tuple(found)
-
-
-def _remembered(conditions: Conditions) -> tuple[Interval | None, tuple[str, ...]]:
-    """Return `Audit.remembered` with sentences on it; raises `AuditError` if the weather file is unfit."""
-    weather = conditions.weather
-    if weather is None or weather.time_constant is None:
-        return None, ()
-    series, constant, taken = conditions.history(), weather.time_constant, weather.absorptance
-    if "outside_c" not in series or not conditions.outside_known:
-        remedy = "Add the column outside_c to the weather file, and outside: {air: weather +- 0.5 C}."
-        raise AuditError("weather: time_constant", expected="the air outside", got="none", remedy=remedy)
-
-    def share(hours: float, absorptance: float, *earlier_c: float) -> float:
-        before = {name: np.append([values[0]] * len(earlier_c), values) for name, values in series.items()}
-        for air_c in earlier_c:  # the air before the file begins
-            before["hours"][0], before["outside_c"][0] = series["hours"][0] - 0.1, air_c
-        return remembered_share(before, conditions.difference_k, hours, absorptance, conditions.side == "inside")
-
-    value, air = share(constant.value, taken.value), series["outside_c"]
-    ends = [share(hours, part) for hours in (constant.low, constant.high) for part in (taken.low, taken.high)]
-    open_share = max(abs(share(constant.value, taken.value, float(one)) - value) for one in (air.min(), air.max()))
-    low, high = min(value, *ends), max(value, *ends)
-    sentences = [
-        f"A uniform wall that forgets within {constant.value:g} h stores heat: at the survey the heat flow through its "
-        f"surface is {100.0 * low:+.0f} to {100.0 * high:+.0f} % off the steady one. U-values of such walls are off by "
-        "as much, which their intervals do not hold."
-    ]
-    if open_share >= 0.01:
-        sentences.append(
-            f"The weather file begins {-series['hours'][0]:g} h before the survey, too late for such a wall: what was "
-            f"before may change that by {100.0 * open_share:.0f} %."
-        )
-    return Interval(value, low, high), tuple(sentences)
 
 
 def _missing(conditions: Conditions) -> tuple[str, ...]:
