@@ -284,6 +284,8 @@ class Weather:
     file: str
     """File beside the conditions: csv, whose first line names hours (0: the survey) and columns of `COLUMNS`, or .epw
     of the year of the survey, whose date has to be stated."""
+    time_constant: Annotated[Measured, Unit("h", 0.0, above=True)] | None = None
+    """Time in which a change of the air fades in the walls, [h]; the audit then says what they still remember."""
     absorptance: Annotated[Measured, Unit("1", 0.0, 1.0)] = Measured(0.6, 0.2)  # Of the walls for sunlight
     facing: Annotated[Measured, Unit("degrees")] | None = None
     """Direction that the walls face, clockwise from north, for the sunlight of an .epw file; None: all around."""

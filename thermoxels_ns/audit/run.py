@@ -37,6 +37,7 @@ from thermoxels_ns.audit.exchange import (
 )
 from thermoxels_ns.audit.heat_flow import SIMPLE, temperature_factor
 from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
+from thermoxels_ns.audit.weather import remembered_share
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import AuditError
@@ -168,6 +169,7 @@ class Audit(HasTables):
     """By cause, largest first, by how much the interval of `whole.loss_w` would be narrower if it were exact, [W]."""
     draws: int  # Number of draws behind each interval
     failing_models: tuple[str, ...]  # Of `SIMPLE`, those by which `whole` has a U-value of 0 or less, not the balance
+    remembered: Interval | None  # `remembered_share` over the stated ranges; None if no time constant is stated
     not_counted_m2: Mapping[str, float]  # Area of triangles that do not count, by the texts of `WHY_NOT`
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
@@ -285,7 +287,7 @@ def audit(
         defects = [replace(one, not_counted=why) if drop else one for one, drop in zip(defects, slight)]
     order = sorted(range(len(found)), key=lambda n: (bool(defects[n].not_counted), -defects[n].extra_w.value))
     found, defects = [found[n] for n in order], [defects[n] for n in order]
-    last, check = len(parts) - 2, check_survey(conditions)
+    last, check, (remembered, told) = len(parts) - 2, check_survey(conditions), _remembered(conditions)
     factors = work.temperature_factors(last, work.own_error_k(last))
     loss = work.totals.flow_w[-1] + own[-1]
     drawn = [(one.name, work.u(row, own[row], own_m2[row])) for row, one in enumerate(elements[: len(patches)])]
@@ -297,7 +299,7 @@ def audit(
     return Audit(
         conditions=conditions,
         surface=surface,
-        check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, draws))),
+        check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, draws), *told)),
         patches=tuple(elements[: len(patches)]),
         storeys=tuple(elements[len(patches) : -1]),
         whole=whole,
@@ -310,6 +312,7 @@ def audit(
         budget=budget,
         draws=draws.count - 1,
         failing_models=failing,
+        remembered=remembered,
         not_counted_m2={why: area for why, area in left.items() if area > 0.0},
         triangle_surface_c=surface_c,
         triangle_flow_w_m2=flow,
@@ -625,6 +628,39 @@ def _doubts(conditions: Conditions) -> tuple[str, ...]:
     if conditions.side == "inside" and conditions.outside_known:
         found.append("U-values hold where the open air is behind the surface; the mesh does not say where that is.")
     return tuple(found)
+
+
+def _remembered(conditions: Conditions) -> tuple[Interval | None, tuple[str, ...]]:
+    """Return `Audit.remembered` with sentences on it; raises `AuditError` if the weather file is unfit."""
+    weather = conditions.weather
+    if weather is None or weather.time_constant is None:
+        return None, ()
+    series, constant, taken = conditions.history(), weather.time_constant, weather.absorptance
+    if "outside_c" not in series or not conditions.outside_known:
+        remedy = "Add the column outside_c to the weather file, and outside: {air: weather +- 0.5 C}."
+        raise AuditError("weather: time_constant", expected="the air outside", got="none", remedy=remedy)
+
+    def share(hours: float, absorptance: float, *earlier_c: float) -> float:
+        before = {name: np.append([values[0]] * len(earlier_c), values) for name, values in series.items()}
+        for air_c in earlier_c:  # the air before the file begins
+            before["hours"][0], before["outside_c"][0] = series["hours"][0] - 0.1, air_c
+        return remembered_share(before, conditions.difference_k, hours, absorptance, conditions.side == "inside")
+
+    value, air = share(constant.value, taken.value), series["outside_c"]
+    ends = [share(hours, part) for hours in (constant.low, constant.high) for part in (taken.low, taken.high)]
+    open_share = max(abs(share(constant.value, taken.value, float(one)) - value) for one in (air.min(), air.max()))
+    low, high = min(value, *ends), max(value, *ends)
+    sentences = [
+        f"A uniform wall that forgets within {constant.value:g} h stores heat: at the survey the heat flow through its "
+        f"surface is {100.0 * low:+.0f} to {100.0 * high:+.0f} % off the steady one. U-values of such walls are off by "
+        "as much, which their intervals do not hold."
+    ]
+    if open_share >= 0.01:
+        sentences.append(
+            f"The weather file begins {-series['hours'][0]:g} h before the survey, too late for such a wall: what was "
+            f"before may change that by {100.0 * open_share:.0f} %."
+        )
+    return Interval(value, low, high), tuple(sentences)
 
 
 def _missing(conditions: Conditions) -> tuple[str, ...]:

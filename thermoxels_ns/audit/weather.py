@@ -1,4 +1,4 @@
-"""The weather before a survey, from a file beside the conditions."""
+"""The weather before a survey, and what a wall still remembers of it."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ _TAKEN = {
     ("surroundings", "sky", "dew_point"): ("dew_point_c", "C"),
 }
 """Entries of conditions that may say "weather", with the column and the unit that then stand for them."""
+_OUTER, _WALL, _INNER, _CELLS = 0.04, 1.0, 0.13, 60  # Resistances of films and wall, [m2 K / W]; layers of the wall
 
 
 def survey_weather(
@@ -91,3 +92,30 @@ def with_weather(content: dict[str, Any], folder: Path) -> dict[str, Any]:
     if len(shone) and isinstance(content.setdefault("survey", {}), dict):
         content["survey"].setdefault("hours_since_sun", f"{abs(series['hours'][shone[-1]]):.9g} h")
     return content
+
+
+def remembered_share(
+    series: dict[str, FloatArray], difference_k: float, time_constant_h: float, absorptance: float, inside: bool
+) -> float:
+    """Return by what share heat flow through a surface differs from the steady one, because a wall stores heat.
+
+    The wall is uniform, with films of ISO 6946; its slowest mode decays within `time_constant_h`. Its temperature is
+    that of the steady state of each moment minus, for each mode, what has not yet decayed of the changes of the airs
+    (Carslaw and Jaeger 1959, Duhamel's theorem). Before the first line of `series` all was as in that line; sun on the
+    wall, [W/m2], warms its air by absorptance / 25. `difference_k` is that of the airs at the survey, above 0.
+    """
+    between = np.full(_CELLS - 1, _CELLS / _WALL)
+    ends = [1.0 / (film + 0.5 * _WALL / _CELLS) for film in (_OUTER, _INNER)]
+    drop = np.append(between, 0.0) + np.append(0.0, between)
+    drop[[0, -1]] += ends
+    rates, modes = np.linalg.eigh(np.diag(drop) - np.diag(between, 1) - np.diag(between, -1))
+    decay = rates / rates[0] / time_constant_h  # [1/h]
+    hours = series["hours"]
+    outer = series["outside_c"] + absorptance * _OUTER * series.get("sun_w_m2", 0.0 * hours)
+    airs = outer, series.get("inside_c", 0.0 * hours)
+    begun = np.exp(np.outer(decay, hours))  # What is left at 0 of a change at each time, shape (modes, k)
+    held = np.diff(begun, axis=1) / decay[:, None] / np.diff(hours)
+    lag = sum(end * modes[at][:, None] * (held @ np.diff(air))[:, None] for end, at, air in zip(ends, (0, -1), airs))
+    here = -1 if inside else 0
+    stored = -ends[here] * float((modes[here] / rates) @ np.ravel(lag))
+    return (-stored if inside else stored) * (_OUTER + _WALL + _INNER) / difference_k

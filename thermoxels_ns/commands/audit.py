@@ -358,7 +358,7 @@ def answers_of(
         "missing_for_en_13187": found.check.missing,
         "asked_of_survey": found.check.asked,
         "loss_narrower_by_w": found.budget,
-        **{name: getattr(found, name) for name in ("draws", "failing_models")},
+        **{name: getattr(found, name) for name in ("draws", "failing_models", "remembered")},
         **({} if envelope is None else {"envelope": envelope.figures()}),
         **({} if compared is None else {"compared": compared}),
     }
