@@ -17,6 +17,7 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import HeatProblem, Term, effect_labels
+from thermoxels_ns.fem.quantities import in_time, values_at
 from thermoxels_ns.fem.space import Space, sums_by_number
 
 Vector = FloatArray
@@ -56,7 +57,7 @@ class _Boundary(ABC):
         selection, facets = space.selection, term.parts
         self.effect, self.kind, self.facets, self._reference_c = effect, term.kind, facets, reference_c
         self.quantities, self._factor = term.quantities, term.factor
-        self.load_in_time = any(quantity.in_time for quantity in term.quantities)
+        self.load_in_time = any(map(in_time, term.quantities))
         """True if the heat flow changes with time even while the body's temperatures stay constant."""
         self.basis = space.surface(facets)
         self.nodes = space.facet_nodes(facets)
@@ -71,7 +72,8 @@ class _Boundary(ABC):
     def at(self, number: int, time_s: float) -> Vector:
         """Return entry `number` of `Term.quantities`, evaluated at the centroid of each triangle, shape (k, 1)."""
         quantity, kept = self.quantities[number], self._kept.setdefault(number, {})
-        return at_time(kept, time_s if quantity.in_time else 0.0, lambda t: quantity.at(self.places, t)[:, None])
+        time_s = time_s if in_time(quantity) else 0.0
+        return at_time(kept, time_s, lambda t: values_at(quantity, self.places, t)[:, None])
 
     def surface_k(self, relative_k: Vector) -> Vector:
         """Return temperatures at the q points of integration per triangle, (k, q), from those of all nodes, (n,)."""
@@ -129,7 +131,7 @@ class ConvectionForm(_Exchange):
     @property
     def matrix_in_time(self) -> bool:
         """True if h, and with it the matrix, changes with time."""
-        return self.quantities[0].in_time
+        return in_time(self.quantities[0])
 
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix:
         """Return integral(h phi_i phi_j), shape (n, n), [W / K]: heat that nodes lose per kelvin."""
@@ -167,7 +169,7 @@ class SourceForm:
         used, group = np.unique(mesh.region[term.parts], return_inverse=True)
         self._group = np.repeat(group, len(self._places) // len(term.parts))
         self.groups = tuple(mesh.region_names[number] for number in used)
-        self.load_in_time = self._source.in_time
+        self.load_in_time = in_time(self._source)
 
     def load(self, time_s: float) -> Vector:
         """Return integral(s phi_i) for each node i, shape (n,), [W]."""
@@ -175,7 +177,7 @@ class SourceForm:
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the heat set free at each of the `Space.source_points`, [W]; `relative_k` has no influence."""
-        return self._source.at(self._places, time_s) * self._volumes
+        return values_at(self._source, self._places, time_s) * self._volumes
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the heat set free in each region named in `groups`, (g,), [W]; `relative_k` has no influence."""
@@ -225,7 +227,7 @@ class FixedForm:
 
     def surroundings_k(self, time_s: float) -> Vector:
         """Return the given temperatures of `nodes`, relative to the reference, shape (len(nodes),), [K]."""
-        return self._temperature.at(self._places, time_s) - self.reference_c
+        return values_at(self._temperature, self._places, time_s) - self.reference_c
 
 
 class FixedNodes:

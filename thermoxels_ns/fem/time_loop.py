@@ -312,17 +312,8 @@ def _fitted(wished_s: float, left_s: float) -> float:
 
 
 def _skips(problem: HeatProblem, time: Steps) -> str:
-    """Return a sentence if steps may be too long to see how an effect changes, else ""."""
-    if not isinstance(time, TimeSteps):
-        labelled = zip(effect_labels(problem), problem.effects)
-        names = [label for label, effect in labelled if any(effect.bounded(name).unresolved for name in effect.bounds)]
-        if not names:
-            return ""
-        return (
-            f" Nothing says how fast {', '.join(names)} may change with time: what happens between two steps is "
-            "missed. Give the Varying its resolution_s, or use tabulated."
-        )
-    if time.step_seconds <= problem.resolution_s:
+    """Return a sentence if equal steps are too long to see how an effect changes, else ""."""
+    if not isinstance(time, TimeSteps) or time.step_seconds <= problem.resolution_s:
         return ""
     return (
         f" Steps of {time.step_seconds:g} s are longer than the {problem.resolution_s:g} s by which effects that "
