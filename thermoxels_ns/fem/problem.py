@@ -79,26 +79,24 @@ class AdaptiveSteps:
 
 @dataclass(frozen=True)
 class GivenSteps:
-    """Time steps of given lengths, such as the halved steps of an adaptive computation.
+    """Time steps of given lengths; temperatures are kept at the start and at the end."""
 
-    >>> GivenSteps(6.0, (np.array([1.0, 2.0]), np.array([3.0]))).halved().lengths_s[0].tolist()
-    [0.5, 0.5, 1.0, 1.0]
-    """
+    lengths: FloatArray  # Lengths of the steps, shape (k,), [s]
 
-    duration_s: float  # Time over which to follow the body, [s]
-    lengths_s: tuple[FloatArray, ...]
-    """Lengths of the steps in each interval, [s]; temperatures are kept at the ends of the (equal) intervals."""
-
-    def halved(self, times: int = 1) -> GivenSteps:
-        """Return these steps with every step halved `times` times."""
-        parts = 2**times
-        lengths_s = tuple(np.repeat(interval_s / parts, parts) for interval_s in self.lengths_s)
-        return GivenSteps(self.duration_s, lengths_s)
+    @property
+    def duration_s(self) -> float:
+        """Time over which the body is followed, [s]."""
+        return float(self.lengths.sum())
 
     @property
     def times_s(self) -> FloatArray:
-        """Time 0, then the end of every interval, shape (len(lengths_s) + 1,), [s]."""
-        return np.linspace(0.0, self.duration_s, len(self.lengths_s) + 1)
+        """Time 0 and the end, shape (2,), [s]."""
+        return np.array([0.0, self.duration_s])
+
+    @property
+    def lengths_s(self) -> tuple[FloatArray, ...]:
+        """Lengths of the steps in the one interval, [s]."""
+        return (self.lengths,)
 
 
 @dataclass(frozen=True)

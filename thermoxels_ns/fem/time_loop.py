@@ -53,8 +53,8 @@ def solve_heat(
     Args:
         problem: Body, materials, initial temperatures and effects; without effects the boundary is insulated.
         time: Equal steps, steps as long as a tolerance allows, or steps of given lengths.
-        scheme: The scheme in time; None: backward Euler for equal steps, otherwise SDIRK2. Adaptive steps need a scheme
-            with an estimate.
+        scheme: The scheme in time; None: SDIRK2 for adaptive steps, which need a scheme with an estimate, otherwise
+            backward Euler.
         relative_tolerance: Relative tolerance of the linear solver in each step.
         estimate_steps: Estimate the error of equal steps (`time_error_k`), too, by solving again with steps of twice
             the length, which takes half as long again. Adaptive steps always have an estimate, given steps never.
@@ -75,7 +75,7 @@ def solve_heat(
         expected = "one with an error estimate for adaptive steps"
         raise HeatError("scheme", expected=expected, got=scheme.name, remedy="Use SDIRK2, or equal steps.")
     if scheme is None:
-        scheme = BACKWARD_EULER if isinstance(time, TimeSteps) else SDIRK2
+        scheme = SDIRK2 if adaptive else BACKWARD_EULER
     loop = _TimeLoop(system, scheme, time, relative_tolerance)
     for taken in loop.steps(states[0]):
         refuse_too_cold(system, taken.step.relative_k)
@@ -211,7 +211,6 @@ class HeatBalance:
         self._exchanged_j = np.zeros(len(times_s) - 1)
         self._iterations = np.zeros((len(times_s) - 1, 2), dtype=np.int64)
         self._error_k = 0.0
-        self._lengths_s: list[list[float]] = [[] for _ in times_s[1:]]
         self._range_k = float(states_k[0].min()), float(states_k[0].max())
         self._overshoot_k, self._overshooting = 0.0, 0
         self._unbalanced_w = 0.0
@@ -224,7 +223,6 @@ class HeatBalance:
     def add(self, step: Step, step_s: float, *, ends_interval: bool) -> None:
         """Add a step of length `step_s`, [s], to the account; if it ends an interval, keep its temperatures."""
         row = self._done
-        self._lengths_s[row].append(step_s)
         self._heat_j[row] += step_s * step.group_heat_w
         self._iterations[row] += step.iterations, step.newton_iterations
         self._most_iterations = max(self._most_iterations, step.iterations)
@@ -286,7 +284,6 @@ class HeatBalance:
             effects=heat_by_effect(effect_labels(system.problem), system.groups, heat_j / lengths[:, None]),
             newton_iterations=self._iterations[:, 1],
             steps=self._steps,
-            step_lengths_s=tuple(np.array(lengths) for lengths in self._lengths_s),
             time_error_k=self._error_k if adaptive else float("nan"),
             unbalanced_w=self._unbalanced_w,
             last_facet_heat=last_facet_heat,
