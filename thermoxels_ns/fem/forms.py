@@ -47,15 +47,15 @@ def heat_transfer(u, v, w):
 
 
 class _Boundary(ABC):
-    """The k boundary triangles on which a term acts: integrals over the triangles, and their grouping by patch.
+    """The k boundary triangles on which a term acts, and integrals over the triangles.
 
     Temperatures are relative to a reference, so that round-off is relative to their differences. Every form returns
-    heat flows per patch, evaluated as in the equations, so that balances close to round-off.
+    heat flows per triangle, evaluated as in the equations, so that balances close to round-off.
     """
 
     def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
         selection, facets = space.selection, term.parts
-        self.effect, self.kind, self.facets, self._reference_c = effect, term.kind, facets, reference_c
+        self.effect, self.kind, self.parts, self._reference_c = effect, term.kind, facets, reference_c
         self.quantities, self._factor = term.quantities, term.factor
         self.load_in_time = any(map(in_time, term.quantities))
         """True if the heat flow changes with time even while the body's temperatures stay constant."""
@@ -65,8 +65,6 @@ class _Boundary(ABC):
         # Values only: `basis.interpolate` would compute gradients, too.
         self._shapes = np.stack([np.asarray(field)[0] for (field,) in self.basis.basis])
         self.places = selection.facet_places(facets)
-        used, self.group = np.unique(selection.facet_patch[facets], return_inverse=True)
-        self.groups = tuple(selection.patch_names[number] for number in used)
         self._kept: dict[int, dict[float, Vector]] = {}
 
     def at(self, number: int, time_s: float) -> Vector:
@@ -103,10 +101,6 @@ class _Boundary(ABC):
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the heat flow into the body through each triangle, shape (k,), [W]."""
         return (self.flux_w_m2(relative_k, time_s) * self.basis.dx).sum(axis=1)
-
-    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat flow into the body through each of the patches named in `groups`, shape (g,), [W]."""
-        return sums_by_number(self.group, self.part_heat_w(relative_k, time_s), len(self.groups))
 
 
 class _Exchange(_Boundary):
@@ -162,26 +156,22 @@ class SourceForm:
     """A given heat source s in tetrahedra, [W / m3]: a load."""
 
     def __init__(self, effect: str, term: Term, space: Space, _: float) -> None:
-        self.effect, self.kind, self._tets, self._space = effect, term.kind, term.parts, space
+        self.effect, self.kind, self.parts, self._space = effect, term.kind, term.parts, space
         self._source = term.quantities[0]
         self._places, self._volumes = space.source_points(term.parts)
-        mesh = space.selection.mesh
-        used, group = np.unique(mesh.region[term.parts], return_inverse=True)
-        self._group = np.repeat(group, len(self._places) // len(term.parts))
-        self.groups = tuple(mesh.region_names[number] for number in used)
         self.load_in_time = in_time(self._source)
 
     def load(self, time_s: float) -> Vector:
         """Return integral(s phi_i) for each node i, shape (n,), [W]."""
-        return self._space.source_load(self._tets, self.part_heat_w(np.zeros(0), time_s))
+        return self._space.source_load(self.parts, self._point_w(time_s))
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat set free at each of the `Space.source_points`, [W]; `relative_k` has no influence."""
-        return values_at(self._source, self._places, time_s) * self._volumes
+        """Return the heat set free in each tetrahedron, shape (k,), [W]; `relative_k` has no influence."""
+        return self._point_w(time_s).reshape(len(self.parts), -1).sum(axis=1)
 
-    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat set free in each region named in `groups`, (g,), [W]; `relative_k` has no influence."""
-        return sums_by_number(self._group, self.part_heat_w(np.zeros(0), time_s), len(self.groups))
+    def _point_w(self, time_s: float) -> Vector:
+        """Return the heat set free at each of the `Space.source_points`, [W]."""
+        return values_at(self._source, self._places, time_s) * self._volumes
 
 
 class RadiationForm(_Exchange):
@@ -215,13 +205,11 @@ class FixedForm:
 
     def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
         selection = space.selection
-        self.effect, self.kind, self.facets, self.reference_c = effect, term.kind, term.parts, reference_c
+        self.effect, self.kind, self.parts, self.reference_c = effect, term.kind, term.parts, reference_c
         self.owners: IntArray = space.facet_nodes(term.parts)
         """Nodes of each triangle, shape (k, m)."""
         self.nodes = np.unique(self.owners)
         self._places, self._temperature = space.node_places(self.nodes), term.quantities[0]
-        used, self.group = np.unique(selection.facet_patch[term.parts], return_inverse=True)
-        self.groups = tuple(selection.patch_names[number] for number in used)
         self.area_m2: Vector = selection.facet_area_m2[term.parts]
         """Area of each triangle, shape (k,), [m2], by which a node's heat is shared among triangles."""
 
@@ -231,16 +219,12 @@ class FixedForm:
 
 
 class FixedNodes:
-    """All d nodes whose temperature any effect fixes, and how their heat is shared among triangles and patches."""
+    """All d nodes whose temperature any effect fixes, and how their heat is shared among triangles."""
 
     def __init__(self, forms: Sequence[FixedForm], num_nodes: int) -> None:
         self._forms = tuple(forms)
         self.nodes: IntArray = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.nodes for f in forms)]))
         """Numbers of the fixed nodes, ascending, shape (d,)."""
-        self.groups: tuple[tuple[str, str], ...] = tuple(
-            (form.effect, patch) for form in forms for patch in form.groups
-        )
-        """Effect and patch of each row of `shares`."""
         self._num_nodes = num_nodes
         self._kept: dict[float, Vector] = {}
 
@@ -255,25 +239,6 @@ class FixedNodes:
         share = area / np.bincount(column, area, len(self.nodes))[column]
         begins = width * np.arange(len(owners) + 1)
         return sparse.csr_matrix((share, column, begins), (len(owners), len(self.nodes)))
-
-    @cached_property
-    def shares(self) -> sparse.csr_matrix:
-        """Share of each fixed node's heat (column) that each effect and patch in `groups` gets (row), shape (g, d)."""
-        if not self._forms:
-            return sparse.csr_matrix((0, 0))
-        counts = np.cumsum([0, *(len(form.groups) for form in self._forms)])
-        group = np.concatenate([before + form.group for before, form in zip(counts, self._forms)])
-        ones = np.ones(len(group))
-        sums = sparse.csr_matrix((ones, (group, np.arange(len(group)))), (int(counts[-1]), len(group)))
-        return sparse.csr_matrix(sums @ self.facet_shares)
-
-    def facet_heat_w(self, kept_w: Vector) -> list[tuple[str, IntArray, Vector]]:
-        """Share out `kept_w`, heat flows into `nodes`, (d,), [W]; return effect, triangles, flows for each effect."""
-        heat_w, begin, found = self.facet_shares @ kept_w, 0, []
-        for form in self._forms:
-            found.append((form.effect, form.facets, heat_w[begin : begin + len(form.owners)]))
-            begin += len(form.owners)
-        return found
 
     @cached_property
     def free(self) -> IntArray:

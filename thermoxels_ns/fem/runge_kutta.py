@@ -119,16 +119,16 @@ class RungeKutta:
 
     def _heat(self, start_k: Vector, states: list[Vector], time_s: float, step_s: float) -> Vector:
         """Return each group's mean heat flow, [W]; fixed nodes get the heat that balances storage and other flows."""
-        system, scheme = self._system, self.scheme
+        system, scheme, fixed = self._system, self.scheme, self._system.fixed
         if not system.groups:
             return np.zeros(0)
-        flows, fixed = np.zeros(len(system.groups) - len(system.fixed.groups)), system.fixed
         kept_w = (system.nodal_mass_j_k * (states[-1] - start_k))[fixed.nodes] / step_s
+        parts_w: Vector | float = 0.0
         for weight, node, state in zip(scheme.ends, scheme.nodes, states):
             if weight != 0.0:
-                flows += weight * system.group_heat_w(state, time_s + node * step_s)
+                parts_w = parts_w + weight * system.part_heat_w(state, time_s + node * step_s)
                 kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s)
-        return np.concatenate([flows, fixed.shares @ kept_w])
+        return system.by_group(np.concatenate([parts_w, fixed.facet_shares @ kept_w]))
 
     def _error(self, start_k: Vector, inner_w: list[Vector], time_s: float, step_s: float) -> float:
         """Return the largest error, [K], from the scheme of the next order; sums over pieces leave conduction out."""
