@@ -11,7 +11,6 @@ from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, Effect, HeatProblem, TimeSteps
-from thermoxels_ns.fem.runge_kutta import CRANK_NICOLSON
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.time_loop import solve_heat
@@ -57,7 +56,6 @@ STEPS: Refused = [
     ("duration_s", lambda: AdaptiveSteps(0.0)),
     ("tolerance_k", lambda: AdaptiveSteps(60.0, -1.0)),
     *(("outputs", lambda n=n: AdaptiveSteps(60.0, outputs=n)) for n in (0, 1.5)),
-    ("scheme", lambda: solve_heat(body(), AdaptiveSteps(3600.0), scheme=CRANK_NICOLSON)),
     *(
         ("heat capacity", lambda t=t: solve_heat(HeatProblem(BOX, EMPTY), t))
         for t in (TimeSteps(3, 1.0), AdaptiveSteps(9.0))

@@ -29,11 +29,16 @@ class Scheme:
 
     name: str  # Name of the scheme, for messages
     order: int  # Order p: at a given time the error is proportional to the step length to the power p
-    nodes: tuple[float, ...]  # c: time of each stage as a share of the step
     weights: tuple[tuple[float, ...], ...]
-    """The lower triangular matrix a, a row per stage; its last row is b. A row of zeros stands for the step's start."""
+    """The lower triangular matrix a, a row per stage; its last row is b. Sums of rows are the times of the stages as shares
+    of the step; all entries on the diagonal are equal, so that stages share a matrix."""
     estimate: tuple[float, ...] | None = None
     """Weights of a scheme one order higher for the flows at the start and in each stage; None: no error estimate."""
+
+    @property
+    def nodes(self) -> tuple[float, ...]:
+        """c: time of each stage as a share of the step."""
+        return tuple(map(math.fsum, self.weights))
 
     @property
     def ends(self) -> tuple[float, ...]:
@@ -51,15 +56,12 @@ def _sdirk2() -> Scheme:
     first_weight = (1.0 / 6.0 - 0.5 * second) / (gamma * gamma - gamma * second)
     second_weight = 0.5 - gamma * first_weight
     estimate = (1.0 - first_weight - second_weight, first_weight, second_weight)
-    return Scheme("SDIRK2", 2, (gamma, 1.0), ((gamma, 0.0), (1.0 - gamma, gamma)), estimate)
+    return Scheme("SDIRK2", 2, ((gamma, 0.0), (1.0 - gamma, gamma)), estimate)
 
 
-BACKWARD_EULER = Scheme("backward Euler", 1, (1.0,), ((1.0,),))
+BACKWARD_EULER = Scheme("backward Euler", 1, ((1.0,),))
 """Scheme of first order. With lumped masses and non-obtuse tetrahedra no temperature leaves the range of the start and
 of the surroundings, however long the step."""
-CRANK_NICOLSON = Scheme("Crank-Nicolson", 2, (0.0, 1.0), ((0.0, 0.0), (0.5, 0.5)))
-"""Scheme of second order without damping: after a jump, long steps overshoot by up to the jump itself. No command uses
-this scheme; tests compare it with the published NAFEMS benchmark T3."""
 SDIRK2 = _sdirk2()
 """Scheme of second order, L-stable: changes too fast for the step length are damped. Very long steps may overshoot by
 1 or 2 % of a jump."""
@@ -96,10 +98,6 @@ class RungeKutta:
         unbalanced_w, status = 0.0, ""
         for number, (row, node) in enumerate(zip(scheme.weights, scheme.nodes)):
             now_s, implicit = time_s + node * step_s, row[number]
-            if implicit == 0.0:
-                states.append(start_k)
-                inner_w.append(system.net_heat(start_k, now_s))
-                continue
             given_w = _weighted([weight / implicit for weight in row[:number]], inner_w)
             solution = self._equation(now_s, implicit * step_s).solve(start_k, now_s, given_w)
             iterations += solution.iterations
@@ -125,9 +123,8 @@ class RungeKutta:
         kept_w = (system.nodal_mass_j_k * (states[-1] - start_k))[fixed.nodes] / step_s
         parts_w: Vector | float = 0.0
         for weight, node, state in zip(scheme.ends, scheme.nodes, states):
-            if weight != 0.0:
-                parts_w = parts_w + weight * system.part_heat_w(state, time_s + node * step_s)
-                kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s)
+            parts_w = parts_w + weight * system.part_heat_w(state, time_s + node * step_s)
+            kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s)
         return system.by_group(np.concatenate([parts_w, fixed.facet_shares @ kept_w]))
 
     def _error(self, start_k: Vector, inner_w: list[Vector], time_s: float, step_s: float) -> float:

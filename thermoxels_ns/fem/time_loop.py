@@ -39,7 +39,7 @@ def solve_heat(
     problem: HeatProblem,
     time: Steps,
     *,
-    scheme: Scheme | None = None,
+    scheme: Scheme = BACKWARD_EULER,
     relative_tolerance: float = 1e-12,
     estimate_steps: bool = False,
     progress: Callable[[float, int], None] | None = None,
@@ -53,8 +53,7 @@ def solve_heat(
     Args:
         problem: Body, materials, initial temperatures and effects; without effects the boundary is insulated.
         time: Equal steps, steps as long as a tolerance allows, or steps of given lengths.
-        scheme: The scheme in time; None: SDIRK2 for adaptive steps, which need a scheme with an estimate, otherwise
-            backward Euler.
+        scheme: The scheme of equal or given steps. Adaptive steps are always those of SDIRK2.
         relative_tolerance: Relative tolerance of the linear solver in each step.
         estimate_steps: Estimate the error of equal steps (`time_error_k`), too, by solving again with steps of twice
             the length, which takes half as long again. Adaptive steps always have an estimate, given steps never.
@@ -71,12 +70,7 @@ def solve_heat(
     if len(system.fixed.nodes):
         states[0, system.fixed.nodes] = system.fixed.temperature_k(0.0)
     balance, adaptive = HeatBalance(system, states, time.times_s), isinstance(time, AdaptiveSteps)
-    if adaptive and scheme is not None and scheme.estimate is None:
-        expected = "one with an error estimate for adaptive steps"
-        raise HeatError("scheme", expected=expected, got=scheme.name, remedy="Use SDIRK2, or equal steps.")
-    if scheme is None:
-        scheme = SDIRK2 if adaptive else BACKWARD_EULER
-    loop = _TimeLoop(system, scheme, time, relative_tolerance)
+    loop = _TimeLoop(system, SDIRK2 if adaptive else scheme, time, relative_tolerance)
     for taken in loop.steps(states[0]):
         refuse_too_cold(system, taken.step.relative_k)
         balance.add(taken.step, taken.step_s, ends_interval=taken.ends_interval)
