@@ -32,14 +32,6 @@ def test_failure_to_converge_raises(random_body, concrete, monkeypatch) -> None:
         solve_heat(HeatProblem(random_body, concrete), PAPER)
 
 
-def test_states_that_do_not_fit_into_memory_are_refused(random_body, concrete, monkeypatch) -> None:
-    nodes = len(random_body.points_m)
-    monkeypatch.setattr("thermoxels_ns.fem.time_loop.MAX_STATE_BYTES", 11 * nodes * 8)
-    assert len(solve_heat(HeatProblem(random_body, concrete), PAPER).times_s) == 11
-    with pytest.raises(HeatError, match="Take at most 10 steps,"):
-        solve_heat(HeatProblem(random_body, concrete), TimeSteps(11, 60.0))
-
-
 @pytest.mark.parametrize("outputs", [1, 10])
 def test_a_body_at_rest_in_the_dark_still_sees_the_sun_rise(concrete, outputs: int) -> None:
     """Nothing flows at midnight; a step as long as an interval would end at midnight again."""

@@ -30,8 +30,8 @@ class Scheme:
     name: str  # Name of the scheme, for messages
     order: int  # Order p: at a given time the error is proportional to the step length to the power p
     weights: tuple[tuple[float, ...], ...]
-    """The lower triangular matrix a, a row per stage; its last row is b. Sums of rows are the times of the stages as shares
-    of the step; all entries on the diagonal are equal, so that stages share a matrix."""
+    """The lower triangular matrix a, a row per stage; its last row is b. Sums of rows are the times of the stages as
+    shares of the step; all entries on the diagonal are equal, so that stages share a matrix."""
     estimate: tuple[float, ...] | None = None
     """Weights of a scheme one order higher for the flows at the start and in each stage; None: no error estimate."""
 
@@ -86,12 +86,12 @@ class RungeKutta:
     """Takes single steps of any length with a scheme; matrices of the last used lengths are kept."""
 
     def __init__(self, system: HeatSystem, scheme: Scheme, *, relative_tolerance: float) -> None:
-        self.scheme, self._system, self._relative_tolerance = scheme, system, relative_tolerance
+        self.scheme, self.system, self._relative_tolerance = scheme, system, relative_tolerance
         self._equations: dict[tuple[float, float], ImplicitEquation] = {}
 
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
         """Take one step from `start_k`, (n,), [K], relative to the reference; `Step.converged` tells if that worked."""
-        system, scheme = self._system, self.scheme
+        system, scheme = self.system, self.scheme
         states: list[Vector] = []
         inner_w: list[Vector] = []
         iterations = newton_iterations = 0
@@ -117,7 +117,7 @@ class RungeKutta:
 
     def _heat(self, start_k: Vector, states: list[Vector], time_s: float, step_s: float) -> Vector:
         """Return each group's mean heat flow, [W]; fixed nodes get the heat that balances storage and other flows."""
-        system, scheme, fixed = self._system, self.scheme, self._system.fixed
+        system, scheme, fixed = self.system, self.scheme, self.system.fixed
         if not system.groups:
             return np.zeros(0)
         kept_w = (system.nodal_mass_j_k * (states[-1] - start_k))[fixed.nodes] / step_s
@@ -129,7 +129,7 @@ class RungeKutta:
 
     def _error(self, start_k: Vector, inner_w: list[Vector], time_s: float, step_s: float) -> float:
         """Return the largest error, [K], from the scheme of the next order; sums over pieces leave conduction out."""
-        system, scheme = self._system, self.scheme
+        system, scheme = self.system, self.scheme
         assert scheme.estimate is not None
         implicit = scheme.weights[-1][-1]
         more = [float(part) / implicit for part in np.array(scheme.estimate) - np.array([0.0, *scheme.ends])]
@@ -143,7 +143,7 @@ class RungeKutta:
         return float(np.max(np.abs(error)))
 
     def _equation(self, time_s: float, step_s: float) -> ImplicitEquation:
-        time_s = time_s if self._system.matrix_in_time else 0.0
+        time_s = time_s if self.system.matrix_in_time else 0.0
         # Lengths computed as differences of times differ in the last digits.
         alike = (
             key for key in self._equations if key[0] == time_s and math.isclose(key[1], step_s, rel_tol=_SAME_LENGTH)
@@ -151,7 +151,7 @@ class RungeKutta:
         key = next(alike, (time_s, step_s))
         equation = self._equations.pop(key, None)
         if equation is None:
-            equation = ImplicitEquation(self._system, time_s, step_s, relative_tolerance=self._relative_tolerance)
+            equation = ImplicitEquation(self.system, time_s, step_s, relative_tolerance=self._relative_tolerance)
         self._equations[key] = equation
         while len(self._equations) > _KEPT_EQUATIONS:
             del self._equations[next(iter(self._equations))]

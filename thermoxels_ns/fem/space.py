@@ -18,6 +18,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.linear_tets import FACET_EDGES, TET_EDGES, MeshEdges, mesh_edges, stiffness_matrix
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 
 Vector = FloatArray
 Numbers = IntArray
@@ -136,11 +137,11 @@ class Space:
 
     def source_points(self, tets: Numbers) -> tuple[Places, Vector]:
         """Return the places where sources are evaluated, q per tetrahedron, and their volumes, shape (k q,), [m3]."""
-        points, weights = self._source_rule
+        (points, weights), mesh = self._source_rule, self.selection.mesh
         barycentric = np.concatenate([1.0 - points.sum(axis=0, keepdims=True), points])
-        corners = self.selection.mesh.points_m[self.selection.mesh.tets[tets]]
+        corners = mesh.points_m[mesh.tets[tets]]
         places = np.einsum("aq,tai->tqi", barycentric, corners).reshape(-1, 3)
-        volumes = (6.0 * self.tet_volumes_m3(tets)[:, None] * weights).ravel()
+        volumes = (6.0 * signed_volumes(mesh.points_m, mesh.tets[tets])[:, None] * weights).ravel()
         return Places(places, np.zeros_like(places), self.selection.up), volumes
 
     def source_load(self, tets: Numbers, point_w: Vector) -> Vector:
@@ -155,12 +156,6 @@ class Space:
     def _source_rule(self) -> tuple[Vector, Vector]:
         """Points and weights in the reference tetrahedron that are exact for polynomials of degree `order`."""
         return get_quadrature(RefTet, self.order)
-
-    def tet_volumes_m3(self, tets: Numbers) -> Vector:
-        """Return the volumes of k tetrahedra, shape (k,), [m3]."""
-        corner = self.selection.mesh.points_m[self.selection.mesh.tets[tets]]
-        side = corner[:, 1:] - corner[:, :1]
-        return np.einsum("ti,ti->t", side[:, 0], np.cross(side[:, 1], side[:, 2])) / 6.0
 
     def node_places(self, nodes: Numbers) -> Places:
         """Return the positions of nodes, each with the mean normal of the boundary around the node (0 inside)."""

@@ -8,13 +8,11 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 from pydantic import Field
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.core.units import STEFAN_BOLTZMANN_W_M2K4, ZERO_CELSIUS_K
 from thermoxels_ns.core.yaml_records import record
 from thermoxels_ns.fem.problem import Effect, Term
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
-
-STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8  # Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]
 
 HOTTEST_C = 10_000.0
 """Highest temperature that is accepted, [degrees Celsius]; above it a unit is wrong: the sun's surface has 5500."""
