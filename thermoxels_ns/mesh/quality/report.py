@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -47,7 +46,7 @@ _CRITERIA = {
 }
 """Quality criteria, sentence by name. The last one is for voxel meshes only, because no conforming mesh meets it. A
 boundary may touch itself, because bodies may."""
-_BINS_WITHIN_BOUNDS: dict[BoundaryMode, int] = {"voxel": 10, "conforming": 30}
+ANGLE_EDGES_DEG = np.linspace(0.0, 180.0, 37)  # edges of the bins of `dihedral_counts`
 
 
 @dataclass(frozen=True)
@@ -59,20 +58,6 @@ class Criterion:
     kept: bool  # True if the mesh meets the criterion
     figure: float  # number by which the criterion is met or not; its unit depends on the criterion
     found: str  # what was found, in words
-
-
-def angle_edges(boundary_mode: BoundaryMode) -> FloatArray:
-    """Return the edges of the angle histogram's bins, [degrees]; they cover 0 to 180, and the angle bounds are edges.
-
-    >>> angle_edges("voxel")[[0, 1, -1]].round(2)
-    array([ -0. ,   4.5, 180. ])
-    """
-    low, high = DIHEDRAL_BOUNDS_DEG[boundary_mode]
-    low, high = low - ANGLE_TOLERANCE_DEG, high + ANGLE_TOLERANCE_DEG
-    within = _BINS_WITHIN_BOUNDS[boundary_mode]
-    width = (high - low) / within
-    below, above = math.ceil(low / width), math.ceil((180.0 - high) / width)
-    return low + width * np.arange(-below, within + above + 1)
 
 
 def in_percent(share: float) -> str:
@@ -97,7 +82,7 @@ class QualityReport:
     area_m2: float  # sum of the boundary triangles' areas, [m^2]
     edge_length_m: tuple[float, float, float]  # shortest, mean and longest edge, [m]
     dihedral_range_deg: tuple[float, float]  # smallest and largest angle between two faces of a tetrahedron, [degrees]
-    dihedral_counts: tuple[int, ...]  # numbers of angles, six per tetrahedron, in the bins of `angle_edges`
+    dihedral_counts: tuple[int, ...]  # numbers of angles, six per tetrahedron, between the `ANGLE_EDGES_DEG`
     share_obtuse: float  # share of tetrahedra with an obtuse angle between two faces, 0 to 1
     bodies_by_node: int  # number of parts of the mesh that share no node
     bodies_by_face: int  # number of parts that share no face, so that no heat is conducted between them
@@ -114,10 +99,8 @@ class QualityReport:
     def as_mapping(self) -> dict[str, Any]:
         """Return the report as a dictionary for json."""
         mapping = asdict(self)
-        edges = angle_edges(self.boundary_mode)
-        width = float(edges[1] - edges[0])
-        first, counts = float(edges[0]) + 0.5 * width, list(self.dihedral_counts)
-        mapping["dihedral_counts"] = {"first_centre": first, "bin_width": width, "counts": counts}
+        width, counts = float(ANGLE_EDGES_DEG[1]), list(self.dihedral_counts)
+        mapping["dihedral_counts"] = {"first_centre": 0.5 * width, "bin_width": width, "counts": counts}
         mapping["dihedral_range_deg"] = dict(zip(("min", "max"), self.dihedral_range_deg))
         mapping["edge_length_m"] = dict(zip(("min", "mean", "max"), self.edge_length_m))
         mapping["promises"] = list(mapping.pop("criteria"))
@@ -169,7 +152,7 @@ def quality_report(
         temperature = np.zeros(len(points))
     observed_c = temperature[mesh.observed] if mesh.observed.any() else temperature
     low_c, high_c = observed_range_c or (float(observed_c.min()), float(observed_c.max()))
-    figures, volumes = _measure_shapes(mesh, angle_edges(boundary_mode))
+    figures, volumes = _measure_shapes(mesh)
     ends = tets[:, TET_EDGES].reshape(-1, 2).T
     place = np.minimum(*ends), np.maximum(*ends)
     links = sparse.coo_array((np.ones(len(place[0])), place), (len(points),) * 2).tocsr()
@@ -238,16 +221,16 @@ def _criteria(
     return tuple(criteria)[: None if mode == "voxel" else 5]
 
 
-def _measure_shapes(mesh: TetMesh, edges_deg: FloatArray) -> tuple[dict[str, Any], FloatArray]:
+def _measure_shapes(mesh: TetMesh) -> tuple[dict[str, Any], FloatArray]:
     """Return the shape figures by their names in `QualityReport`, and the volumes, shape (t,)."""
     num = len(mesh.tets)
     volumes = np.empty(num)
-    angle_counts = np.zeros(len(edges_deg) - 1, dtype=np.int64)
+    angle_counts = np.zeros(len(ANGLE_EDGES_DEG) - 1, dtype=np.int64)
     smallest, largest, obtuse = 180.0, 0.0, 0
     for which, shapes in shapes_in_chunks(mesh.points_m, mesh.tets):
         cosines = shapes.dihedral_cosines()
         angles = np.degrees(np.arccos(cosines))
-        angle_counts += np.histogram(angles, len(angle_counts), (edges_deg[0], edges_deg[-1]))[0]
+        angle_counts += np.histogram(angles, len(angle_counts), (0.0, 180.0))[0]
         smallest, largest = min(smallest, float(angles.min())), max(largest, float(angles.max()))
         obtuse += int(np.count_nonzero(cosines.min(axis=0) < 0.0))
         volumes[which] = shapes.volumes
@@ -271,7 +254,7 @@ def picture_of_quality(path: Path | str, report: QualityReport) -> None:
     grid = figure.add_gridspec(2, 2, height_ratios=(1.0, 1.05))
     angles, figures, criteria = (figure.add_subplot(grid[place]) for place in ((0, slice(None)), (1, 0), (1, 1)))
 
-    edges, counts = angle_edges(report.boundary_mode), report.dihedral_counts
+    edges, counts = ANGLE_EDGES_DEG, report.dihedral_counts
     angles.bar(edges[:-1], counts, np.diff(edges), align="edge", color=_BARS, edgecolor="white", linewidth=0.6)
     # The axis is logarithmic, because a solver stumbles over the few worst tetrahedra.
     angles.set(yscale="log", ylim=(0.7, 4.0 * max(counts)), axisbelow=True)
