@@ -52,9 +52,9 @@ class TimeSteps:
         return np.arange(self.steps + 1, dtype=np.float64) * self.step_seconds
 
     @property
-    def lengths_s(self) -> tuple[FloatArray, ...]:
-        """Lengths of the steps in each interval, [s]: one step each, because temperatures are kept after every step."""
-        return (np.array([self.step_seconds]),) * self.steps
+    def lengths_s(self) -> FloatArray:
+        """Lengths of the steps, shape (steps,), [s]."""
+        return np.full(self.steps, self.step_seconds)
 
 
 @record(HeatError)
@@ -79,24 +79,19 @@ class AdaptiveSteps:
 
 @dataclass(frozen=True)
 class GivenSteps:
-    """Time steps of given lengths; temperatures are kept at the start and at the end."""
+    """Time steps of given lengths."""
 
-    lengths: FloatArray  # Lengths of the steps, shape (k,), [s]
+    lengths_s: FloatArray  # Lengths of the steps, shape (k,), [s]
 
     @property
     def duration_s(self) -> float:
         """Time over which the body is followed, [s]."""
-        return float(self.lengths.sum())
+        return float(self.lengths_s.sum())
 
     @property
     def times_s(self) -> FloatArray:
-        """Time 0 and the end, shape (2,), [s]."""
-        return np.array([0.0, self.duration_s])
-
-    @property
-    def lengths_s(self) -> tuple[FloatArray, ...]:
-        """Lengths of the steps in the one interval, [s]."""
-        return (self.lengths,)
+        """Time 0, then the end of every step, shape (k + 1,), [s]."""
+        return np.append(0.0, np.cumsum(self.lengths_s))
 
 
 @dataclass(frozen=True)

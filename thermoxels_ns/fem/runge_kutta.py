@@ -92,13 +92,12 @@ class RungeKutta:
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
         """Take one step from `start_k`, (n,), [K], relative to the reference; `Step.converged` tells if that worked."""
         system, scheme = self.system, self.scheme
-        states: list[Vector] = []
-        inner_w: list[Vector] = []
+        states, inner_w, nothing_w = list[Vector](), list[Vector](), np.zeros(system.num_nodes)
         iterations = newton_iterations = 0
         unbalanced_w, status = 0.0, ""
         for number, (row, node) in enumerate(zip(scheme.weights, scheme.nodes)):
             now_s, implicit = time_s + node * step_s, row[number]
-            given_w = _weighted([weight / implicit for weight in row[:number]], inner_w)
+            given_w = sum((weight / implicit * flow_w for weight, flow_w in zip(row, inner_w)), nothing_w)
             solution = self._equation(now_s, implicit * step_s).solve(start_k, now_s, given_w)
             iterations += solution.iterations
             newton_iterations += solution.newton_iterations
@@ -110,7 +109,7 @@ class RungeKutta:
                 return Step(solution.relative_k, unknown, iterations, newton_iterations, np.nan, False, status)
             if estimate or number + 1 < len(scheme.nodes):
                 stored_w = system.nodal_mass_j_k * solution.change_k / (implicit * step_s)
-                inner_w.append(stored_w if given_w is None else stored_w - given_w)
+                inner_w.append(stored_w - given_w)
         heat_w = self._heat(start_k, states, time_s, step_s)
         error_k = self._error(start_k, inner_w, time_s, step_s) if estimate and scheme.estimate else np.nan
         return Step(states[-1], heat_w, iterations, newton_iterations, error_k, True, status, unbalanced_w)
@@ -134,8 +133,7 @@ class RungeKutta:
         implicit = scheme.weights[-1][-1]
         more = [float(part) / implicit for part in np.array(scheme.estimate) - np.array([0.0, *scheme.ends])]
         exchanged_w = system.exchanged_heat(start_k, time_s)
-        exchange_w = _weighted(more, [exchanged_w, *inner_w])
-        assert exchange_w is not None
+        exchange_w = sum((part * flow_w for part, flow_w in zip(more[1:], inner_w)), more[0] * exchanged_w)
         difference_w = exchange_w - more[0] * system.conducted_heat(start_k)
         end_s = time_s + scheme.nodes[-1] * step_s
         equation = self._equation(end_s, implicit * step_s)
@@ -156,11 +154,3 @@ class RungeKutta:
         while len(self._equations) > _KEPT_EQUATIONS:
             del self._equations[next(iter(self._equations))]
         return equation
-
-
-def _weighted(weights: list[float], vectors: list[Vector]) -> Vector | None:
-    """Return the weighted sum of vectors; None if there are none."""
-    total: Vector | None = None
-    for weight, vector in zip(weights, vectors):
-        total = weight * vector if total is None else total + weight * vector
-    return total

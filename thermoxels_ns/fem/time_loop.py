@@ -115,16 +115,14 @@ def _given_steps(
 
     Raises `HeatError` if a step's solver does not converge.
     """
-    relative_k, count, total = start_k, 0, sum(map(len, time.lengths_s))
-    for now_s, lengths_s in zip(time.times_s.tolist(), time.lengths_s):
-        for number, step_s in enumerate(lengths_s, start=1):
-            count += 1
-            step = kutta.step(relative_k, now_s, step_s)
-            if not step.converged:
-                remedy = "Use shorter steps or check the mesh's quality."
-                raise HeatError(f"Step {count} of {total} failed. {step.status} {remedy}")
-            yield step, step_s, number == len(lengths_s)
-            relative_k, now_s = step.relative_k, now_s + step_s
+    relative_k = start_k
+    for number, (now_s, step_s) in enumerate(zip(time.times_s.tolist(), time.lengths_s.tolist()), start=1):
+        step = kutta.step(relative_k, now_s, step_s)
+        if not step.converged:
+            remedy = "Use shorter steps or check the mesh's quality."
+            raise HeatError(f"Step {number} of {len(time.lengths_s)} failed. {step.status} {remedy}")
+        yield step, step_s, True
+        relative_k = step.relative_k
 
 
 def _adaptive_steps(
