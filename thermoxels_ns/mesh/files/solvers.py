@@ -16,7 +16,7 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.units import STEFAN_BOLTZMANN_W_M2K4, ZERO_CELSIUS_K
-from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays
+from thermoxels_ns.mesh.files.content import checked_tags, node_arrays
 from thermoxels_ns.mesh.quality.checks import facet_owners
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_areas
 
@@ -65,7 +65,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     if path == heavy_data_path(path):
         remedy = "Name the .xdmf; the .h5 beside it is written with it."
         raise OutputError(str(path), expected="a name that ends in .xdmf", got=path.suffix, remedy=remedy)
-    mesh, tags = checked_mesh(mesh)
+    tags = checked_tags(mesh)
     arrays: dict[str, npt.NDArray] = {
         "points_m": mesh.points_m,
         "tets": mesh.tets.astype(np.int64),
@@ -138,10 +138,10 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
     Layout: "MSH file format", Gmsh reference manual, version 4.1; meshio cannot write a patch named like a region.
 
     Raises:
-        MeshError: A name is too long for Gmsh, or what `checked_mesh` and `facet_owners` raise.
+        MeshError: A name is too long for Gmsh, or what `TetMesh.check` and `facet_owners` raise.
     """
     path = Path(path)
-    mesh, tags = checked_mesh(mesh)
+    tags = checked_tags(mesh)
     for name in (*mesh.region_names, *tags.patch_names):
         if len(name.encode()) > _LONGEST_GMSH_NAME:
             expected = f"at most {_LONGEST_GMSH_NAME} bytes, which is what Gmsh reads"
@@ -279,7 +279,7 @@ def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep) -> None:
     and patches are left out, because an empty set stops a solver. Raises `MeshError` if the mesh has no temperatures.
     """
     path = Path(path)
-    mesh, tags = checked_mesh(mesh)
+    tags = checked_tags(mesh)
     check_start(mesh)
     regions = _set_names("region_names", mesh.region_names)
     patches = _set_names("boundary.patch_names", tags.patch_names)
