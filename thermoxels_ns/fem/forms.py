@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 from scipy import sparse
-from skfem import BilinearForm
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
@@ -40,12 +39,6 @@ def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], 
     return kept[time_s]
 
 
-@BilinearForm
-def heat_transfer(u, v, w):
-    """Return the integrand h u v of a convection matrix or of the slope of radiation; `w.coefficient` is h."""
-    return w.coefficient * u * v
-
-
 class _Boundary(ABC):
     """The k boundary triangles on which a term acts, and integrals over the triangles.
 
@@ -59,11 +52,9 @@ class _Boundary(ABC):
         self.quantities, self._factor = term.quantities, term.factor
         self.load_in_time = any(map(in_time, term.quantities))
         """True if the heat flow changes with time even while the body's temperatures stay constant."""
-        self.basis = space.surface(facets)
         self.nodes = space.facet_nodes(facets)
         self._numbers, self._space = self.nodes.T.ravel(), space
-        # Values only: `basis.interpolate` would compute gradients, too.
-        self._shapes = np.stack([np.asarray(field)[0] for (field,) in self.basis.basis])
+        self._shapes, self._area_m2 = space.facet_rule(facets)
         self.places = selection.facet_places(facets)
         self._kept: dict[int, dict[float, Vector]] = {}
 
@@ -80,7 +71,7 @@ class _Boundary(ABC):
 
     def vector(self, flux_w_m2: Vector) -> Vector:
         """Return integral(q phi_i) for each node i, shape (n,), [W]; the flux q has shape (k, q) or (k, 1)."""
-        heat_w = flux_w_m2 * self.basis.dx
+        heat_w = flux_w_m2 * self._area_m2
         shares = heat_w.T if self._space.order == 1 else np.einsum("kq,aq->ak", heat_w, self._shapes)
         return sums_by_number(self._numbers, shares.ravel(), self._space.num_nodes)
 
@@ -89,8 +80,10 @@ class _Boundary(ABC):
         if self._space.order == 1:
             matrix = sparse.csr_matrix(sparse.diags(self.vector(coefficient_w_m2k), format="csr"))
         else:
-            coefficient = np.broadcast_to(coefficient_w_m2k, self.basis.dx.shape)
-            matrix = sparse.csr_matrix(heat_transfer.assemble(self.basis, coefficient=coefficient))
+            local = np.einsum("kq,aq,bq->kab", coefficient_w_m2k * self._area_m2, self._shapes, self._shapes)
+            rows, columns = np.broadcast_arrays(self.nodes[:, :, None], self.nodes[:, None, :])
+            entries = local.ravel(), (rows.ravel(), columns.ravel())
+            matrix = sparse.csr_matrix(entries, shape=(self._space.num_nodes,) * 2)
         matrix.eliminate_zeros()
         return matrix
 
@@ -100,7 +93,7 @@ class _Boundary(ABC):
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the heat flow into the body through each triangle, shape (k,), [W]."""
-        return (self.flux_w_m2(relative_k, time_s) * self.basis.dx).sum(axis=1)
+        return (self.flux_w_m2(relative_k, time_s) * self._area_m2).sum(axis=1)
 
 
 class _Exchange(_Boundary):

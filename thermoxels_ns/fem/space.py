@@ -7,8 +7,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from skfem import Basis, BilinearForm, Dofs, ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2, MeshTet, MeshTri
-from skfem.element import DiscreteField
+from skfem import Basis, BilinearForm, Dofs, ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2, MeshTet
 from skfem.helpers import dot
 from skfem.quadrature import get_quadrature
 from skfem.refdom import RefTet, RefTri
@@ -105,7 +104,8 @@ class Space:
             corners = points_m[tets[block]].reshape(-1, 3)
             mesh = MeshTet(corners.T.copy(), np.arange(len(corners)).reshape(-1, 4).T.copy(), validate=False)
             used, local = np.unique(nodes[block], return_inverse=True)
-            dofs = _dofs(mesh, ElementTetP1(), local.reshape(len(mesh.t.T), -1), len(used))
+            dofs = Dofs(mesh, ElementTetP1())  # our numbers of unknowns: its own search for edges is ten times slower
+            dofs.element_dofs, dofs.N = np.ascontiguousarray(local.reshape(len(mesh.t.T), -1).T, np.int32), len(used)
             basis = Basis(mesh, self.element, dofs=dofs, intorder=degree, disable_doflocs=True)
             parameters = {
                 name: np.broadcast_to(value[block, None], basis.dx.shape) for name, value in tet_values.items()
@@ -118,22 +118,12 @@ class Space:
         del data, rows, columns
         return sparse.csr_matrix(upper + sparse.triu(upper, 1, format="csr").T)
 
-    def surface(self, facets: Numbers) -> Basis:
-        """Return a scikit-fem basis on boundary triangles, whose unknowns are those of the body.
-
-        Only values are integrated over this basis, never gradients. So each triangle may be replaced by a right
-        triangle of the same area in a plane of its own.
-        """
-        leg = np.sqrt(2.0 * np.maximum(self.selection.facet_area_m2[facets], np.finfo(np.float64).tiny))
-        none = np.zeros_like(leg)
-        points = np.stack([np.stack([none, leg, none], axis=1), np.stack([none, none, leg], axis=1)]).reshape(2, -1)
-        mesh = MeshTri(points, np.arange(3 * len(facets)).reshape(-1, 3).T.copy(), validate=False)
+    def facet_rule(self, facets: Numbers) -> tuple[Vector, Vector]:
+        """Return the m shape functions at the q points of integration, (m, q), and the points' areas, (k, q), [m2]."""
+        points, weights = _CORNERS if self.order == 1 else get_quadrature(RefTri, _EXACT)
         element = ElementTriP1() if self.order == 1 else ElementTriP2()
-        dofs = _dofs(mesh, ElementTriP1(), self.facet_nodes(facets), self.num_nodes)
-        rule = _CORNERS if self.order == 1 else get_quadrature(RefTri, _EXACT)
-        basis = Basis(mesh, element, dofs=dofs, quadrature=rule, disable_doflocs=True)
-        basis.basis = [(DiscreteField(np.asarray(field)),) for (field,) in basis.basis]
-        return basis
+        shapes = np.stack([element.lbasis(points, i)[0] * np.ones(len(weights)) for i in range(3 * self.order)])
+        return shapes, 2.0 * self.selection.facet_area_m2[facets][:, None] * weights
 
     def source_points(self, tets: Numbers) -> tuple[Places, Vector]:
         """Return the places where sources are evaluated, q per tetrahedron, and their volumes, shape (k q,), [m3]."""
@@ -171,13 +161,6 @@ class Space:
         owners = self.facet_nodes(np.arange(len(selection.mesh.facets)))
         weighted = np.repeat(selection.facet_normal * selection.facet_area_m2[:, None], owners.shape[1], axis=0)
         return np.stack([sums_by_number(owners.ravel(), part, self.num_nodes) for part in weighted.T], axis=1)
-
-
-def _dofs(mesh: MeshTet | MeshTri, linear: ElementTetP1 | ElementTriP1, nodes: Numbers, count: int) -> Dofs:
-    """Return our numbers of unknowns, `nodes`, as scikit-fem's `Dofs`: its own search for edges is ten times slower."""
-    dofs = Dofs(mesh, linear)
-    dofs.element_dofs, dofs.N = np.ascontiguousarray(nodes.T, dtype=np.int32), count
-    return dofs
 
 
 def sums_by_number(numbers: Numbers, values: npt.NDArray, count: int) -> Vector:
