@@ -172,7 +172,9 @@ class HeatBalance:
     def __init__(self, system: HeatSystem, states_k: Vector, times_s: Vector) -> None:
         """Begin the account; `states_k`, (s + 1, n), [K], holds the start and room for the states at `times_s`, [s]."""
         self._system, self._states, self._times = system, states_k, times_s
-        self._done = self._steps = self._most_iterations = 0
+        self._done = self._most_iterations = 0
+        self.steps = 0
+        """Number of steps that were added so far."""
         self.repeated = 0
         """Number of steps that were repeated with a shorter length."""
         self.followed_s = 0.0
@@ -185,11 +187,6 @@ class HeatBalance:
         self._overshoot_k, self._overshooting = 0.0, 0
         self._unbalanced_w = 0.0
 
-    @property
-    def steps(self) -> int:
-        """Number of steps that were added so far."""
-        return self._steps
-
     def add(self, step: Step, step_s: float, *, ends_interval: bool) -> None:
         """Add a step of length `step_s`, [s], to the account; if it ends an interval, keep its temperatures."""
         row = self._done
@@ -197,7 +194,7 @@ class HeatBalance:
         self._iterations[row] += step.iterations, step.newton_iterations
         self._most_iterations = max(self._most_iterations, step.iterations)
         self._error_k += step.error_k
-        self._steps += 1
+        self.steps += 1
         self._exchanged_j[row] += step_s * float(np.abs(step.group_heat_w).sum())
         self._unbalanced_w = max(self._unbalanced_w, step.unbalanced_w)
         overshoot_k = self._overshoot_of(step.relative_k, step_s)
@@ -216,7 +213,7 @@ class HeatBalance:
 
     def success(self) -> str:
         """Return sentences on convergence, on the number of repeated steps, and on temperatures out of range."""
-        sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
+        sentence = f"All {self.steps} steps converged, in {self._most_iterations} iterations at most."
         sentence += f" {self.repeated} more were repeated with a shorter length." if self.repeated else ""
         if self._overshooting:
             sentence += (
@@ -253,7 +250,7 @@ class HeatBalance:
             iterations=self._iterations[:, 0],
             effects=heat_by_effect(effect_labels(system.problem), system.groups, heat_j / lengths[:, None]),
             newton_iterations=self._iterations[:, 1],
-            steps=self._steps,
+            steps=self.steps,
             time_error_k=self._error_k if adaptive else float("nan"),
             unbalanced_w=self._unbalanced_w,
             last_facet_heat=last_facet_heat,

@@ -137,10 +137,7 @@ def solve_to_tolerance(
         run = _Run(problem, tolerance, memory_bytes, log)
         return run.close(_refine(run, solve_state, 2, 0), allow_unmet)
     allowed_k = tolerance.temperature_k
-    if allowed_k is None:
-        raise HeatError(
-            "tolerance", expected="kelvins, by which steps in time are chosen", got="none", remedy="Give 0.1."
-        )
+    assert allowed_k is not None, "steps in time are chosen by it"
     steps = AdaptiveSteps(duration_s, allowed_k, outputs=outputs)
 
     def solve_in_time(problem: HeatProblem, _: int) -> Solution:
