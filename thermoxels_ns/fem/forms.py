@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -265,40 +264,23 @@ class FixedNodes:
         return known
 
 
-@dataclass(frozen=True)
-class EffectForms:
-    """The forms of a problem by their part in the heat equation, each in the order of the effects."""
-
-    convection: tuple[ConvectionForm, ...]
-    loads: tuple[FluxForm | SourceForm, ...]  # Heat that does not depend on the temperature
-    radiation: tuple[RadiationForm, ...]
-    fixed: tuple[FixedForm, ...]
-
-    @property
-    def exchanging(self) -> tuple[ConvectionForm | FluxForm | SourceForm | RadiationForm, ...]:
-        """All forms but the fixed temperatures: convection, then loads, then radiation."""
-        return (*self.convection, *self.loads, *self.radiation)
+Form: TypeAlias = ConvectionForm | FluxForm | SourceForm | RadiationForm | FixedForm
+_FORMS: dict[str, type[Form]] = {
+    "convection": ConvectionForm,
+    "flux": FluxForm,
+    "source": SourceForm,
+    "radiation": RadiationForm,
+    "fixed": FixedForm,
+}
 
 
-def effect_forms(problem: HeatProblem, space: Space, reference_c: float) -> EffectForms:
-    """Return the forms of a problem's effects; an effect that acts on no triangle or tetrahedron gets no form.
+def effect_forms(problem: HeatProblem, space: Space, reference_c: float) -> tuple[Form, ...]:
+    """Return the forms of a problem's effects, sorted by kind: convection, fluxes, sources, radiation, fixed nodes.
 
-    Temperatures are relative to `reference_c`. Raises `HeatError` if the mesh lacks a patch or region of an effect.
+    An effect that acts on no triangle or tetrahedron gets no form. Temperatures are relative to `reference_c`. Raises
+    `HeatError` if the mesh lacks a patch or region of an effect.
     """
-    made = {
-        "convection": ConvectionForm,
-        "flux": FluxForm,
-        "source": SourceForm,
-        "radiation": RadiationForm,
-        "fixed": FixedForm,
-    }
-    forms: list[Any] = []
-    for label, effect in zip(effect_labels(problem), problem.effects):
-        term = effect.term(space.selection)
-        if len(term.parts):
-            forms.append(made[term.kind](label, term, space, reference_c))
-
-    def of(*kinds: str) -> tuple[Any, ...]:
-        return tuple(form for form in forms if form.kind in kinds)
-
-    return EffectForms(of("convection"), of("flux", "source"), of("radiation"), of("fixed"))
+    terms = [(label, effect.term(space.selection)) for label, effect in zip(effect_labels(problem), problem.effects)]
+    acting = [(label, term) for label, term in terms if len(term.parts)]
+    acting.sort(key=lambda labelled: list(_FORMS).index(labelled[1].kind))
+    return tuple(_FORMS[term.kind](label, term, space, reference_c) for label, term in acting)

@@ -16,6 +16,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.forms import (
     ConvectionForm,
+    FixedForm,
     FixedNodes,
     FluxForm,
     RadiationForm,
@@ -97,12 +98,16 @@ class HeatSystem:
         self.num_nodes: int = self.space.num_nodes
         """Number of nodes; with quadratic tetrahedra the mesh's nodes come first, then the middles of its edges."""
         forms = effect_forms(problem, self.space, self.reference_c)
-        self._convection, self._loads, self._radiation = forms.convection, forms.loads, forms.radiation
-        self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*forms.convection, *forms.radiation)
+        self._convection = tuple(form for form in forms if isinstance(form, ConvectionForm))
+        self._loads = tuple(form for form in forms if isinstance(form, (FluxForm, SourceForm)))
+        self._radiation = tuple(form for form in forms if isinstance(form, RadiationForm))
+        self._exchanging, self._every_form = (*self._convection, *self._loads, *self._radiation), forms
+        self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*self._convection, *self._radiation)
         """Convection and radiation: the forms whose heat flow depends on the temperature of the surface."""
-        self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
+        fixed = tuple(form for form in forms if isinstance(form, FixedForm))
+        self.fixed: FixedNodes = FixedNodes(fixed, self.num_nodes)
         """Nodes whose temperature is given."""
-        self.assembled.update({"fixed": len(forms.fixed)} if forms.fixed else {})
+        self.assembled.update({"fixed": len(fixed)} if fixed else {})
         self.assembled["stiffness"] += 1
         self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
         """Stiffness K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
@@ -112,9 +117,8 @@ class HeatSystem:
         """True if the convection matrix R changes with time."""
         self.nonlinear: bool = bool(self._radiation)
         """True if there is radiation."""
-        self.exchanges: bool = bool(forms.exchanging)
+        self.exchanges: bool = bool(self._exchanging)
         """True if there is convection, radiation, a flux or a source."""
-        self._exchanging, self._every_form = forms.exchanging, (*forms.exchanging, *forms.fixed)
         groups, numbers = list[tuple[str, str]](), [np.zeros(0, np.int64)]
         for form in self._every_form:
             names, of_part = problem.mesh.region_names, problem.mesh.region

@@ -14,7 +14,7 @@ from pydantic import Field
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError, HeatMemoryError
 from thermoxels_ns.core.yaml_records import record
-from thermoxels_ns.fem.forms import FixedForm, effect_forms
+from thermoxels_ns.fem.forms import FixedForm, FluxForm, SourceForm, effect_forms
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.solution import Solution, SteadySolution, mean_flows_w
 from thermoxels_ns.fem.space import Space
@@ -160,7 +160,7 @@ def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
     if time is not None and any(effect.changing for effect in problem.effects):
         return []
     forms = effect_forms(problem, Space(problem.selection), 0.0)
-    around_c = [form.surroundings_k(0.0).ravel() for form in (*forms.convection, *forms.radiation, *forms.fixed)]
+    around_c = [form.surroundings_k(0.0).ravel() for form in forms if not isinstance(form, (FluxForm, SourceForm))]
     every_c = np.concatenate([np.zeros(0) if time is None else problem.start_c, *around_c])
     ends_c = [every_c.min(), every_c.max()] if len(every_c) else [0.0]
     states_c = np.repeat(np.array(ends_c)[:, None], len(problem.mesh.points_m), axis=1)
@@ -184,7 +184,7 @@ def _largest_w(problem: HeatProblem, chosen: Sequence[int], states_c: FloatArray
     forms = effect_forms(problem, Space(problem.selection), reference_c)
     numbers = {label: number for number, label in enumerate(effect_labels(problem))}
     largest = dict.fromkeys(chosen, 0.0)
-    for form in (*forms.exchanging, *forms.fixed):
+    for form in forms:
         number = numbers[form.effect]
         if number in largest:
             effect = problem.effects[number]

@@ -86,7 +86,7 @@ def build_mesh(
     Raises:
         MeshError: `select_solid` fails, or no node of the mesh was measured.
     """
-    transform = world_to_metres
+    transform = np.asarray(world_to_metres, dtype=np.float64)
     scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
     solid = select_solid(snapshot, selection, scale, transform[:3] / metres_per_unit)
     if voxel:
