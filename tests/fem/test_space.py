@@ -67,7 +67,7 @@ def test_heat_of_the_nodes_is_heat_of_the_patches(box, concrete, order) -> None:
     system = HeatSystem(HeatProblem(box, concrete, effects=ALL), order=order)
     relative = system.start_k
     heat = system.net_heat(relative, 0.0)
-    flows = system.group_heat_w(relative, 0.0)
+    flows = system.by_group(system.part_heat_w(relative, 0.0))
     assert len(flows) == len(system.groups) == 8
     assert heat.sum() == pytest.approx(flows.sum(), abs=1e-12 * np.abs(heat).sum())
     assert np.abs(heat - np.roll(heat, 1)).max() > 1e-3
@@ -106,5 +106,5 @@ def test_radiation_over_the_triangles_is_exact_for_linear_temperatures(box, conc
         replace(box, temperature_c=start), concrete, effects=(Radiation(("x1",), 1.0, -273.15, 1e-8),)
     )
     system = HeatSystem(problem, order=2)
-    heat = system.group_heat_w(system.start_k, 0.0)[0]
+    heat = system.by_group(system.part_heat_w(system.start_k, 0.0))[0]
     assert heat == pytest.approx(-1e-8 * 0.2 * (330.0**5 - 300.0**5) / 500.0, rel=1e-12)

@@ -9,7 +9,7 @@ from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Places, Quantity, Varying, tabulated
-from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, HeatFlux, Radiation
@@ -30,14 +30,6 @@ def test_failure_to_converge_raises(random_body, concrete, monkeypatch) -> None:
     monkeypatch.setattr("thermoxels_ns.fem.implicit_equation.MOST_UNBALANCED", 0.0)
     with pytest.raises(HeatError, match=r"Step 1 of 10 failed.*are not balanced"):
         solve_heat(HeatProblem(random_body, concrete), PAPER)
-
-
-def test_states_that_do_not_fit_into_memory_are_refused(random_body, concrete, monkeypatch) -> None:
-    nodes = len(random_body.points_m)
-    monkeypatch.setattr("thermoxels_ns.fem.time_loop.MAX_STATE_BYTES", 11 * nodes * 8)
-    assert len(solve_heat(HeatProblem(random_body, concrete), PAPER).times_s) == 11
-    with pytest.raises(HeatError, match="Take at most 10 steps,"):
-        solve_heat(HeatProblem(random_body, concrete), TimeSteps(11, 60.0))
 
 
 @pytest.mark.parametrize("outputs", [1, 10])
@@ -75,7 +67,7 @@ def test_equal_steps_tell_their_error(radiates) -> None:
     assert "takes two of them" in solve_heat(problem, TimeSteps(1, 1200.0), estimate_steps=True).status
 
 
-@pytest.mark.parametrize("scheme", [BACKWARD_EULER, CRANK_NICOLSON, SDIRK2])
+@pytest.mark.parametrize("scheme", [BACKWARD_EULER, SDIRK2])
 @pytest.mark.parametrize("step_s", [1e-9, 1e-6, 1e-3])
 def test_newton_takes_few_steps_however_short_the_time_step(concrete, scheme, step_s) -> None:
     """Of two plates that do not touch, at 20 and 60 C."""
@@ -104,8 +96,8 @@ def test_newton_ends_near_a_steady_state_and_after_it(concrete) -> None:
 
 
 HOUR_S = 3600.0
-TIMES_S = [0.0, 100.0 * HOUR_S, 101.0 * HOUR_S, 102.0 * HOUR_S, 200.0 * HOUR_S]
-FLASH = [0.0, 0.0, 500.0, 0.0, 0.0]
+TIMES_S = np.array([0.0, 100.0, 101.0, 102.0, 200.0]) * HOUR_S
+FLASH = np.array([0.0, 0.0, 500.0, 0.0, 0.0])
 
 
 def warmed(flux: Quantity, time: TimeSteps | AdaptiveSteps):
@@ -114,7 +106,10 @@ def warmed(flux: Quantity, time: TimeSteps | AdaptiveSteps):
 
 
 def test_a_table_is_straight_from_entry_to_entry_and_held_outside() -> None:
-    table, nowhere = tabulated([10.0, 20.0, 50.0], [1.0, 3.0, 0.0]), Places(np.zeros((1, 3)), np.zeros((1, 3)))
+    table, nowhere = (
+        tabulated(np.array([10.0, 20.0, 50.0]), np.array([1.0, 3.0, 0.0])),
+        Places(np.zeros((1, 3)), np.zeros((1, 3))),
+    )
     assert [table.function(nowhere, time_s) for time_s in (0.0, 10.0, 15.0, 35.0, 99.0)] == [1.0, 1.0, 2.0, 1.5, 0.0]
     assert table.resolution_s == 10.0 and table.in_time
 
@@ -124,16 +119,3 @@ def test_adaptive_steps_do_not_step_over_a_table() -> None:
     solution = warmed(tabulated(TIMES_S, FLASH), AdaptiveSteps(TIMES_S[-1], 0.5, outputs=1))
     brought_j = float(solution.heat_w[0]) * TIMES_S[-1]
     assert brought_j == pytest.approx(500.0 * HOUR_S * 0.01, rel=0.05)
-    assert "Nothing says" not in solution.status
-
-
-def test_what_may_be_stepped_over_is_said() -> None:
-    def flash(_, time_s: float) -> float:
-        return float(np.interp(time_s, TIMES_S, FLASH))
-
-    missed = warmed(Varying(flash), AdaptiveSteps(TIMES_S[-1], 0.5, outputs=1))
-    assert float(missed.heat_w[0]) == 0.0
-    assert "Nothing says how fast heat flux on x1 may change with time" in missed.status
-    assert "resolution_s" in missed.status and "tabulated" in missed.status
-    seen = warmed(Varying(flash, resolution_s=HOUR_S), AdaptiveSteps(TIMES_S[-1], 0.5, outputs=1))
-    assert float(seen.heat_w[0]) > 0.0 and "Nothing says" not in seen.status

@@ -7,7 +7,7 @@ import pytest
 from tests.support.scene_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import TimeSteps
-from thermoxels_ns.fem.quantities import Places, Varying
+from thermoxels_ns.fem.quantities import Places, Varying, values_at
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Effect, GroundContact, Radiation
@@ -87,7 +87,7 @@ def test_inside_air_by_orientation(air: InsideAir, ceiling_wall_floor: list[floa
     for patch, h in zip(("interior-down", "interior-side", "interior-up"), ceiling_wall_floor):
         places = selection.facet_places(selection.facets((patch,)))
         assert len(places) == 8 * (4 if patch == "interior-side" else 1)
-        np.testing.assert_allclose(effect.bounded("coefficient_w_m2k").at(places, 0.0), h, rtol=1e-4)
+        np.testing.assert_allclose(values_at(effect.coefficient_w_m2k, places, 0.0), h, rtol=1e-4)
 
 
 def test_surfaces_radiate_to_sky_and_ground_the_later_entry_holds() -> None:
@@ -99,7 +99,7 @@ def test_surfaces_radiate_to_sky_and_ground_the_later_entry_holds() -> None:
     assert radiation[("exterior-up",)].emissivity == 0.2
     selection = Selection(mesh)
     places = selection.facet_places(selection.facets(("exterior-side", "exterior-down")))
-    around = radiation[("exterior-side", "exterior-down")].bounded("surroundings_c").at(places, 0.0) + 273.15
+    around = values_at(radiation[("exterior-side", "exterior-down")].surroundings_c, places, 0.0) + 273.15
     expected = np.where(places.normals[:, 2] < -0.5, 278.15**4, 0.5 * (278.15**4 + 267.15**4)) ** 0.25
     np.testing.assert_allclose(around, expected)
 
@@ -127,7 +127,7 @@ def test_sunlight_on_surfaces_that_absorb() -> None:
     for effect, parts in zip(found, ({"exterior-up": 800.0, "exterior-down": 400.0}, {"exterior-side": 200.0})):
         for patch, expected in parts.items():
             places = selection.facet_places(selection.facets((patch,)))
-            np.testing.assert_allclose(effect.bounded("irradiance_w_m2").at(places, 0.0), expected)
+            np.testing.assert_allclose(values_at(effect.irradiance_w_m2, places, 0.0), expected)
 
 
 def test_every_patch_is_spoken_of() -> None:

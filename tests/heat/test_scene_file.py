@@ -11,7 +11,7 @@ from tests.support.scene_bodies import room
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
-from thermoxels_ns.fem.quantities import Places, Varying
+from thermoxels_ns.fem.quantities import Places, Varying, values_at
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
@@ -190,10 +190,12 @@ def test_air_follows_the_file_beside_the_scene_and_the_sky_follows_the_air(tmp_p
     selection = Selection(mesh)
     places = selection.facet_places(selection.facets(("exterior-up",)))
     for hours, air_c in ((0.0, -4.0), (1.0, 1.0), (2.0, 6.0), (20.0, 6.0)):
-        assert outside.bounded("air_c").at(places, 3600.0 * hours) == pytest.approx(air_c)
-        assert sky.bounded("surroundings_c").at(places, 3600.0 * hours) == pytest.approx(air_c - 20.0)
-    varying = outside.bounded("air_c")
-    assert varying.in_time and varying.resolution_s == 7200.0  # no step is longer than the file's shortest interval
+        assert values_at(outside.air_c, places, 3600.0 * hours) == pytest.approx(air_c)
+        assert values_at(sky.surroundings_c, places, 3600.0 * hours) == pytest.approx(air_c - 20.0)
+    varying = outside.air_c
+    assert (
+        isinstance(varying, Varying) and varying.in_time and varying.resolution_s == 7200.0
+    )  # no step is longer than the file's shortest interval
 
 
 @pytest.mark.parametrize(("year", "day"), [(2026, 0), (2024, 1)])
@@ -204,7 +206,7 @@ def test_air_follows_an_epw_file_over_the_end_of_its_year(tmp_path, year, day) -
     outside = with_series(tmp_path, "", series=series).effects(room())[1]
     for hours, air_c in ((0.0, 8.748 + 0.024 * day), (6.5, 8.7545 + 0.024 * day), (15.0, 0.003)):
         places = Places(np.zeros((1, 3)), np.zeros((1, 3)))
-        assert outside.bounded("air_c").at(places, 3600.0 * hours) == pytest.approx(air_c, abs=1e-3)
+        assert values_at(outside.air_c, places, 3600.0 * hours) == pytest.approx(air_c, abs=1e-3)
     for wrong in ("outside.epw", "outside.csv, air_start: 2031-12-31T12:00:00+01:00"):
         with pytest.raises(HeatError, match="outside_air: air_start: expected a date"):
             with_series(tmp_path, "hours,outside_c\n0,1\n1,2\n", series=wrong)
@@ -219,7 +221,7 @@ def test_air_follows_an_epw_file_over_the_end_of_its_year(tmp_path, year, day) -
         ("hours,outside_c\n0,cold\n1,2\n", "air_series"),
         ("hours,outside_c\n0,1,2\n1,2,3\n", "air_series"),
         ("hours,outside_c\n0,1\n", "air_series: .*outside.csv"),
-        ("hours,outside_c\n0,1\n1,-300\n", "air_c"),
+        ("hours,outside_c\n0,1\n1,-300\n", "air_series: .*outside.csv: expected temperatures"),
     ],
 )
 def test_a_series_that_cannot_be_used_is_refused(tmp_path, series, named) -> None:

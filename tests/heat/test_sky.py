@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.quantities import Places
+from thermoxels_ns.fem.quantities import Places, Varying, values_at
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4, AbsorbedSolar, Radiation
 from thermoxels_ns.heat.sky import (
     Sunlight,
@@ -96,11 +96,11 @@ def test_a_sun_that_moves() -> None:
     """Walls get the sun in turn, and as much over a day in the east as in the west."""
     start = datetime(2025, 6, 21, tzinfo=UTC)
     effect = AbsorbedSolar(("*",), 0.5, moving_sun(start, 47.0, 0.0, NORTH))
-    irradiance = effect.bounded("irradiance_w_m2")
-    assert irradiance.in_time
+    irradiance = effect.irradiance_w_m2
+    assert isinstance(irradiance, Varying) and irradiance.in_time
     walls = Places(np.zeros((2, 3)), np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), Z_UP)
     hours = np.arange(0.0, 24.0, 0.1)
-    day = np.array([irradiance.at(walls, 3600.0 * hour) for hour in hours])
+    day = np.array([values_at(irradiance, walls, 3600.0 * hour) for hour in hours])
     assert day[np.searchsorted(hours, 8.0), 0] > 3.0 * day[np.searchsorted(hours, 8.0), 1] > 0.0
     assert day[:20].max() == 0.0
     east, west = day.sum(axis=0)
@@ -118,8 +118,8 @@ def test_swinbank_at_300_kelvin() -> None:
 
 def loss_w_m2(surface_k: float, places: Places, **temperatures: float) -> np.ndarray:
     effect = Radiation(("*",), *outdoor_radiation(0.8, **temperatures))
-    emissivity = effect.bounded("emissivity").at(places, 0.0)
-    around_k = effect.bounded("surroundings_c").at(places, 0.0) + 273.15
+    emissivity = values_at(effect.emissivity, places, 0.0)
+    around_k = values_at(effect.surroundings_c, places, 0.0) + 273.15
     return STEFAN_BOLTZMANN_W_M2K4 * emissivity * (surface_k**4 - around_k**4)
 
 

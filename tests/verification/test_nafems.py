@@ -8,7 +8,7 @@ import pytest
 from tests.support.heat_bodies import nafems_t3
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme
+from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2, Scheme
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, Radiation
@@ -34,17 +34,16 @@ T3_C = 36.60312
 """Exact temperature at x = 0.08 m after 32 s of T3, a rod with a swinging end; the printed target is 36.60."""
 
 
-def t3_errors(parts: int, scheme: Scheme | None, time: TimeSteps | AdaptiveSteps = HALF_SECONDS) -> float:
+def t3_errors(parts: int, scheme: Scheme = BACKWARD_EULER, time: TimeSteps | AdaptiveSteps = HALF_SECONDS) -> float:
     problem = nafems_t3(parts)
     end = solve_heat(problem, time, scheme=scheme).temperature_c[-1, np.isclose(problem.mesh.points_m[:, 0], 0.08)]
     assert np.ptp(end) < 1e-9
     return float(end[0]) - T3_C
 
 
-@pytest.mark.parametrize("scheme", [CRANK_NICOLSON, SDIRK2], ids=lambda scheme: scheme.name)
-def test_t3_rod_with_a_swinging_end(scheme) -> None:
+def test_t3_rod_with_a_swinging_end() -> None:
     """The error falls by four with each refinement and is within 0.1 K at 40 elements."""
-    errors = [abs(t3_errors(parts, scheme)) for parts in (10, 20, 40)]
+    errors = [abs(t3_errors(parts, SDIRK2)) for parts in (10, 20, 40)]
     assert errors[2] < 0.1, errors
     assert 3.2 < errors[0] / errors[1] < 4.8 and 3.2 < errors[1] / errors[2] < 4.8, errors
 
@@ -55,7 +54,7 @@ def test_t3_with_backward_euler() -> None:
 
 
 def test_t3_with_a_tolerance() -> None:
-    error, fine = t3_errors(40, None, AdaptiveSteps(32.0, 0.02, outputs=1)), t3_errors(40, SDIRK2, TimeSteps(320, 0.1))
+    error, fine = t3_errors(40, time=AdaptiveSteps(32.0, 0.02, outputs=1)), t3_errors(40, SDIRK2, TimeSteps(320, 0.1))
     assert error == pytest.approx(fine, abs=0.02) and abs(error) < 0.1
 
 

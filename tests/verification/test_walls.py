@@ -119,8 +119,7 @@ def test_slab_with_convection(biot, fourier, centre, surface) -> None:
     problem = HeatProblem(mesh, CONCRETE, effects=effects)
     x = mesh.points_m[:, 0]
     for time in (TimeSteps(200, duration / 200), AdaptiveSteps(duration, 1e-3)):
-        scheme = SDIRK2 if isinstance(time, TimeSteps) else None
-        solution = solve_heat(problem, time, scheme=scheme)
+        solution = solve_heat(problem, time, scheme=SDIRK2)
         end = solution.temperature_c[-1]
         np.testing.assert_allclose(end[x == 0.0], centre, atol=5e-4)
         np.testing.assert_allclose(end[x == half], surface, atol=5e-4)

@@ -27,7 +27,6 @@ from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.fem.problem import GivenSteps
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER
 from thermoxels_ns.fem.selection import matching_names
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
@@ -225,9 +224,8 @@ class _Wall:
         airs = partial(_at, ends_s, air_c[:, None] + near), partial(_at, ends_s, far_air_c + beyond)
         problem = scene(*map(Varying, airs)).problem(mesh, up=up)
         start_c = solve_steady(problem).temperature_c
-        steps = GivenSteps(float(ends_s[-1]), (np.diff(ends_s),))
         problem = replace(problem, initial_temperature_c=start_c)
-        found = solve_heat(problem, steps, scheme=BACKWARD_EULER, relative_tolerance=_LINEAR)
+        found = solve_heat(problem, GivenSteps(np.diff(ends_s)), relative_tolerance=_LINEAR)
         return found.temperature_c[-1][facets].mean(axis=1)
 
     def _photographed_side(self, draws: Draws, at_c: FloatArray) -> tuple[FloatArray, FloatArray]:

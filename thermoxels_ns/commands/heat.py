@@ -237,7 +237,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
         remove_file(folder / name)
     if isinstance(run.solution, SteadySolution):
         remove_heat_series(folder / THROUGH_TIME)
-        write_vtu(folder / STEADY, shown.mesh, temperature_c=shown.states_c[-1])
+        write_vtu(folder / STEADY, replace(shown.mesh, temperature_c=shown.states_c[-1]))
     else:
         states = shown_states(run.solution.times_s, options.vtk_times)
         write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution, states)

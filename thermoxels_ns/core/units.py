@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import torch
 
 ZERO_CELSIUS_K = 273.15  # 0 degrees Celsius in kelvin (exact, BIPM)
+STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8  # Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]
 
 _SMALLEST_SPAN_K = 1e-3  # Least width of a range
 _CONSTANT_SCENE_SPAN_K = 1.0  # Width of the range of a scene whose temperatures are all the same

@@ -18,7 +18,7 @@ from thermoxels_ns.core.errors import MeshError, SceneError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
 from thermoxels_ns.data.scene_file import read_scene_file
-from thermoxels_ns.mesh.build import apply_transform, check_similarity
+from thermoxels_ns.mesh.build import apply_transform
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import fill_enclosed
@@ -87,7 +87,7 @@ def surface_fscore(
         within: Voxels of the region that was reconstructed, shape `lattice.cell_shape`; None: all voxels.
     """
     cells = check_shape("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
-    transform = check_similarity("world_to_truth", world_to_truth)
+    transform = np.asarray(world_to_truth, dtype=np.float64)
     solid = fill_enclosed(cells)
     corners, empty, on_border = _boundary_samples(solid, np.ones_like(solid) if within is None else within)
     if len(corners) == 0:
@@ -277,12 +277,12 @@ def compare_with_truth(
 
     Raises:
         SceneError: The scene folder cannot be used, or no true point is seen by enough training cameras.
-        MeshError: `cells` does not fit the lattice, or the 4x4 is no similarity.
+        MeshError: `cells` does not fit the lattice.
     """
     known = truth if isinstance(truth, KnownTruth) else load_known_truth(truth)
     if known is None:
         return None
-    transform = check_similarity("world_to_truth", world_to_truth)
+    transform = np.asarray(world_to_truth, dtype=np.float64)
     voxel_m = lattice.voxel_size * _scale_of(transform)
     tolerance_m = TOLERANCE_VOXELS * voxel_m
     score, of_seen = known.score(cells, lattice, transform, tolerance_m, within)
@@ -365,7 +365,7 @@ def depth_metrics(
         pass the solid and end outside the box, the share that the model ends inside it. Figures without rays are
         left out.
     """
-    transform = check_similarity("world_to_input", world_to_input)
+    transform = np.asarray(world_to_input, dtype=np.float64)
     scale = _scale_of(transform)
     errors, filled = [np.zeros(0)], [np.zeros(0, dtype=bool)]
     for rays in frames:

@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from scipy import sparse
-from skfem import BilinearForm
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import HeatProblem, Term, effect_labels
+from thermoxels_ns.fem.quantities import in_time, values_at
 from thermoxels_ns.fem.space import Space, sums_by_number
 
 Vector = FloatArray
@@ -39,39 +38,30 @@ def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], 
     return kept[time_s]
 
 
-@BilinearForm
-def heat_transfer(u, v, w):
-    """Return the integrand h u v of a convection matrix or of the slope of radiation; `w.coefficient` is h."""
-    return w.coefficient * u * v
-
-
 class _Boundary(ABC):
-    """The k boundary triangles on which a term acts: integrals over the triangles, and their grouping by patch.
+    """The k boundary triangles on which a term acts, and integrals over the triangles.
 
     Temperatures are relative to a reference, so that round-off is relative to their differences. Every form returns
-    heat flows per patch, evaluated as in the equations, so that balances close to round-off.
+    heat flows per triangle, evaluated as in the equations, so that balances close to round-off.
     """
 
     def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
         selection, facets = space.selection, term.parts
-        self.effect, self.kind, self.facets, self._reference_c = effect, term.kind, facets, reference_c
+        self.effect, self.kind, self.parts, self._reference_c = effect, term.kind, facets, reference_c
         self.quantities, self._factor = term.quantities, term.factor
-        self.load_in_time = any(quantity.in_time for quantity in term.quantities)
+        self.load_in_time = any(map(in_time, term.quantities))
         """True if the heat flow changes with time even while the body's temperatures stay constant."""
-        self.basis = space.surface(facets)
         self.nodes = space.facet_nodes(facets)
         self._numbers, self._space = self.nodes.T.ravel(), space
-        # Values only: `basis.interpolate` would compute gradients, too.
-        self._shapes = np.stack([np.asarray(field)[0] for (field,) in self.basis.basis])
+        self._shapes, self._area_m2 = space.facet_rule(facets)
         self.places = selection.facet_places(facets)
-        used, self.group = np.unique(selection.facet_patch[facets], return_inverse=True)
-        self.groups = tuple(selection.patch_names[number] for number in used)
         self._kept: dict[int, dict[float, Vector]] = {}
 
     def at(self, number: int, time_s: float) -> Vector:
         """Return entry `number` of `Term.quantities`, evaluated at the centroid of each triangle, shape (k, 1)."""
         quantity, kept = self.quantities[number], self._kept.setdefault(number, {})
-        return at_time(kept, time_s if quantity.in_time else 0.0, lambda t: quantity.at(self.places, t)[:, None])
+        time_s = time_s if in_time(quantity) else 0.0
+        return at_time(kept, time_s, lambda t: values_at(quantity, self.places, t)[:, None])
 
     def surface_k(self, relative_k: Vector) -> Vector:
         """Return temperatures at the q points of integration per triangle, (k, q), from those of all nodes, (n,)."""
@@ -80,7 +70,7 @@ class _Boundary(ABC):
 
     def vector(self, flux_w_m2: Vector) -> Vector:
         """Return integral(q phi_i) for each node i, shape (n,), [W]; the flux q has shape (k, q) or (k, 1)."""
-        heat_w = flux_w_m2 * self.basis.dx
+        heat_w = flux_w_m2 * self._area_m2
         shares = heat_w.T if self._space.order == 1 else np.einsum("kq,aq->ak", heat_w, self._shapes)
         return sums_by_number(self._numbers, shares.ravel(), self._space.num_nodes)
 
@@ -89,8 +79,10 @@ class _Boundary(ABC):
         if self._space.order == 1:
             matrix = sparse.csr_matrix(sparse.diags(self.vector(coefficient_w_m2k), format="csr"))
         else:
-            coefficient = np.broadcast_to(coefficient_w_m2k, self.basis.dx.shape)
-            matrix = sparse.csr_matrix(heat_transfer.assemble(self.basis, coefficient=coefficient))
+            local = np.einsum("kq,aq,bq->kab", coefficient_w_m2k * self._area_m2, self._shapes, self._shapes)
+            rows, columns = np.broadcast_arrays(self.nodes[:, :, None], self.nodes[:, None, :])
+            entries = local.ravel(), (rows.ravel(), columns.ravel())
+            matrix = sparse.csr_matrix(entries, shape=(self._space.num_nodes,) * 2)
         matrix.eliminate_zeros()
         return matrix
 
@@ -100,11 +92,7 @@ class _Boundary(ABC):
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the heat flow into the body through each triangle, shape (k,), [W]."""
-        return (self.flux_w_m2(relative_k, time_s) * self.basis.dx).sum(axis=1)
-
-    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat flow into the body through each of the patches named in `groups`, shape (g,), [W]."""
-        return sums_by_number(self.group, self.part_heat_w(relative_k, time_s), len(self.groups))
+        return (self.flux_w_m2(relative_k, time_s) * self._area_m2).sum(axis=1)
 
 
 class _Exchange(_Boundary):
@@ -129,7 +117,7 @@ class ConvectionForm(_Exchange):
     @property
     def matrix_in_time(self) -> bool:
         """True if h, and with it the matrix, changes with time."""
-        return self.quantities[0].in_time
+        return in_time(self.quantities[0])
 
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix:
         """Return integral(h phi_i phi_j), shape (n, n), [W / K]: heat that nodes lose per kelvin."""
@@ -160,26 +148,22 @@ class SourceForm:
     """A given heat source s in tetrahedra, [W / m3]: a load."""
 
     def __init__(self, effect: str, term: Term, space: Space, _: float) -> None:
-        self.effect, self.kind, self._tets, self._space = effect, term.kind, term.parts, space
+        self.effect, self.kind, self.parts, self._space = effect, term.kind, term.parts, space
         self._source = term.quantities[0]
         self._places, self._volumes = space.source_points(term.parts)
-        mesh = space.selection.mesh
-        used, group = np.unique(mesh.region[term.parts], return_inverse=True)
-        self._group = np.repeat(group, len(self._places) // len(term.parts))
-        self.groups = tuple(mesh.region_names[number] for number in used)
-        self.load_in_time = self._source.in_time
+        self.load_in_time = in_time(self._source)
 
     def load(self, time_s: float) -> Vector:
         """Return integral(s phi_i) for each node i, shape (n,), [W]."""
-        return self._space.source_load(self._tets, self.part_heat_w(np.zeros(0), time_s))
+        return self._space.source_load(self.parts, self._point_w(time_s))
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat set free at each of the `Space.source_points`, [W]; `relative_k` has no influence."""
-        return self._source.at(self._places, time_s) * self._volumes
+        """Return the heat set free in each tetrahedron, shape (k,), [W]; `relative_k` has no influence."""
+        return self._point_w(time_s).reshape(len(self.parts), -1).sum(axis=1)
 
-    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat set free in each region named in `groups`, (g,), [W]; `relative_k` has no influence."""
-        return sums_by_number(self._group, self.part_heat_w(np.zeros(0), time_s), len(self.groups))
+    def _point_w(self, time_s: float) -> Vector:
+        """Return the heat set free at each of the `Space.source_points`, [W]."""
+        return values_at(self._source, self._places, time_s) * self._volumes
 
 
 class RadiationForm(_Exchange):
@@ -213,32 +197,26 @@ class FixedForm:
 
     def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
         selection = space.selection
-        self.effect, self.kind, self.facets, self.reference_c = effect, term.kind, term.parts, reference_c
+        self.effect, self.kind, self.parts, self.reference_c = effect, term.kind, term.parts, reference_c
         self.owners: IntArray = space.facet_nodes(term.parts)
         """Nodes of each triangle, shape (k, m)."""
         self.nodes = np.unique(self.owners)
         self._places, self._temperature = space.node_places(self.nodes), term.quantities[0]
-        used, self.group = np.unique(selection.facet_patch[term.parts], return_inverse=True)
-        self.groups = tuple(selection.patch_names[number] for number in used)
         self.area_m2: Vector = selection.facet_area_m2[term.parts]
         """Area of each triangle, shape (k,), [m2], by which a node's heat is shared among triangles."""
 
     def surroundings_k(self, time_s: float) -> Vector:
         """Return the given temperatures of `nodes`, relative to the reference, shape (len(nodes),), [K]."""
-        return self._temperature.at(self._places, time_s) - self.reference_c
+        return values_at(self._temperature, self._places, time_s) - self.reference_c
 
 
 class FixedNodes:
-    """All d nodes whose temperature any effect fixes, and how their heat is shared among triangles and patches."""
+    """All d nodes whose temperature any effect fixes, and how their heat is shared among triangles."""
 
     def __init__(self, forms: Sequence[FixedForm], num_nodes: int) -> None:
         self._forms = tuple(forms)
         self.nodes: IntArray = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.nodes for f in forms)]))
         """Numbers of the fixed nodes, ascending, shape (d,)."""
-        self.groups: tuple[tuple[str, str], ...] = tuple(
-            (form.effect, patch) for form in forms for patch in form.groups
-        )
-        """Effect and patch of each row of `shares`."""
         self._num_nodes = num_nodes
         self._kept: dict[float, Vector] = {}
 
@@ -253,25 +231,6 @@ class FixedNodes:
         share = area / np.bincount(column, area, len(self.nodes))[column]
         begins = width * np.arange(len(owners) + 1)
         return sparse.csr_matrix((share, column, begins), (len(owners), len(self.nodes)))
-
-    @cached_property
-    def shares(self) -> sparse.csr_matrix:
-        """Share of each fixed node's heat (column) that each effect and patch in `groups` gets (row), shape (g, d)."""
-        if not self._forms:
-            return sparse.csr_matrix((0, 0))
-        counts = np.cumsum([0, *(len(form.groups) for form in self._forms)])
-        group = np.concatenate([before + form.group for before, form in zip(counts, self._forms)])
-        ones = np.ones(len(group))
-        sums = sparse.csr_matrix((ones, (group, np.arange(len(group)))), (int(counts[-1]), len(group)))
-        return sparse.csr_matrix(sums @ self.facet_shares)
-
-    def facet_heat_w(self, kept_w: Vector) -> list[tuple[str, IntArray, Vector]]:
-        """Share out `kept_w`, heat flows into `nodes`, (d,), [W]; return effect, triangles, flows for each effect."""
-        heat_w, begin, found = self.facet_shares @ kept_w, 0, []
-        for form in self._forms:
-            found.append((form.effect, form.facets, heat_w[begin : begin + len(form.owners)]))
-            begin += len(form.owners)
-        return found
 
     @cached_property
     def free(self) -> IntArray:
@@ -305,40 +264,23 @@ class FixedNodes:
         return known
 
 
-@dataclass(frozen=True)
-class EffectForms:
-    """The forms of a problem by their part in the heat equation, each in the order of the effects."""
-
-    convection: tuple[ConvectionForm, ...]
-    loads: tuple[FluxForm | SourceForm, ...]  # Heat that does not depend on the temperature
-    radiation: tuple[RadiationForm, ...]
-    fixed: tuple[FixedForm, ...]
-
-    @property
-    def exchanging(self) -> tuple[ConvectionForm | FluxForm | SourceForm | RadiationForm, ...]:
-        """All forms but the fixed temperatures: convection, then loads, then radiation."""
-        return (*self.convection, *self.loads, *self.radiation)
+Form: TypeAlias = ConvectionForm | FluxForm | SourceForm | RadiationForm | FixedForm
+_FORMS: dict[str, type[Form]] = {
+    "convection": ConvectionForm,
+    "flux": FluxForm,
+    "source": SourceForm,
+    "radiation": RadiationForm,
+    "fixed": FixedForm,
+}
 
 
-def effect_forms(problem: HeatProblem, space: Space, reference_c: float) -> EffectForms:
-    """Return the forms of a problem's effects; an effect that acts on no triangle or tetrahedron gets no form.
+def effect_forms(problem: HeatProblem, space: Space, reference_c: float) -> tuple[Form, ...]:
+    """Return the forms of a problem's effects, sorted by kind: convection, fluxes, sources, radiation, fixed nodes.
 
-    Temperatures are relative to `reference_c`. Raises `HeatError` if the mesh lacks a patch or region of an effect.
+    An effect that acts on no triangle or tetrahedron gets no form. Temperatures are relative to `reference_c`. Raises
+    `HeatError` if the mesh lacks a patch or region of an effect.
     """
-    made = {
-        "convection": ConvectionForm,
-        "flux": FluxForm,
-        "source": SourceForm,
-        "radiation": RadiationForm,
-        "fixed": FixedForm,
-    }
-    forms: list[Any] = []
-    for label, effect in zip(effect_labels(problem), problem.effects):
-        term = effect.term(space.selection)
-        if len(term.parts):
-            forms.append(made[term.kind](label, term, space, reference_c))
-
-    def of(*kinds: str) -> tuple[Any, ...]:
-        return tuple(form for form in forms if form.kind in kinds)
-
-    return EffectForms(of("convection"), of("flux", "source"), of("radiation"), of("fixed"))
+    terms = [(label, effect.term(space.selection)) for label, effect in zip(effect_labels(problem), problem.effects)]
+    acting = [(label, term) for label, term in terms if len(term.parts)]
+    acting.sort(key=lambda labelled: list(_FORMS).index(labelled[1].kind))
+    return tuple(_FORMS[term.kind](label, term, space, reference_c) for label, term in acting)

@@ -255,7 +255,7 @@ class ImplicitEquation:
         now_k, uncertain_w, flows_w = start_k + change_k, rest.unbalanced_w + rest.round_off_w, rest.flows_w
         if not uncertain_w <= MOST_UNBALANCED * flows_w:
             # The sum over nodes misses heat that one effect brings to a node and another effect takes from this node.
-            groups_w = self._system.group_heat_w(now_k, time_s)
+            groups_w = self._system.by_group(self._system.part_heat_w(now_k, time_s))
             flows_w = max(flows_w, 0.5 * float(np.sum(np.abs(groups_w))))
         balances = rest.is_round_off or uncertain_w <= MOST_UNBALANCED * flows_w or self._is_still(now_k, rest, time_s)
         if settled and not balances:

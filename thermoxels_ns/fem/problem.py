@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import math
-import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Literal, Protocol, runtime_checkable
+from typing import Annotated, ClassVar, Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
+from pydantic import Field
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
+from thermoxels_ns.core.checks import check_direction, check_finite, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.core.yaml_records import raising
+from thermoxels_ns.core.yaml_records import raising, record
 from thermoxels_ns.fem.linear_tets import refuse_flat_tets
-from thermoxels_ns.fem.quantities import Bounded, Bounds
+from thermoxels_ns.fem.quantities import Quantity, Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 MOST_CONTRAST = 1e9
 """Most that the largest conductivity of a body may be over the smallest; above it, round-off swamps the smaller one."""
-_MOST = 10_000_000  # Most steps or kept times: nineteen years in steps of a minute
 
 
-@dataclass(frozen=True)
+Count: TypeAlias = Annotated[int, Field(ge=1, le=10_000_000)]  # Steps, or kept times: nineteen years of minutes
+Seconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1e300)]
+
+
+@record(HeatError)
 class TimeSteps:
     """Equal time steps.
 
@@ -35,15 +38,8 @@ class TimeSteps:
     [0.0, 20.0, 40.0, 60.0]
     """
 
-    steps: int  # Number of steps, at least 1
-    step_seconds: float  # Length of a step, [s], above 0
-
-    def __post_init__(self) -> None:
-        _check_count("steps", self.steps, "Give 10, for example: steps in a scene, --steps in an export.")
-        remedy = "Give 60, for example: step_seconds in a scene, --step-seconds in an export."
-        seconds = check_positive("step_seconds", self.step_seconds, remedy, HeatError)
-        object.__setattr__(self, "step_seconds", seconds)
-        check_positive("steps times step_seconds", self.steps * seconds, "Give shorter steps.", HeatError)
+    steps: Count  # Number of steps, at least 1
+    step_seconds: Seconds  # Length of a step, [s], above 0
 
     @property
     def duration_s(self) -> float:
@@ -56,12 +52,12 @@ class TimeSteps:
         return np.arange(self.steps + 1, dtype=np.float64) * self.step_seconds
 
     @property
-    def lengths_s(self) -> tuple[FloatArray, ...]:
-        """Lengths of the steps in each interval, [s]: one step each, because temperatures are kept after every step."""
-        return (np.array([self.step_seconds]),) * self.steps
+    def lengths_s(self) -> FloatArray:
+        """Lengths of the steps, shape (steps,), [s]."""
+        return np.full(self.steps, self.step_seconds)
 
 
-@dataclass(frozen=True)
+@record(HeatError)
 class AdaptiveSteps:
     """Time steps as long as a tolerance allows.
 
@@ -69,16 +65,11 @@ class AdaptiveSteps:
     [0.0, 1200.0, 2400.0, 3600.0]
     """
 
-    duration_s: float  # Time over which to follow the body, [s], above 0
-    tolerance_k: float = 0.05
+    duration_s: Seconds  # Time over which to follow the body, [s], above 0
+    tolerance_k: Annotated[float, Field(gt=0.0)] = 0.05
     """Largest error of any temperature that the steps may make, by the estimate of the scheme, [K]. The default is half
     of the error that building physics allows (ISO 10211: 0.1 K)."""
-    outputs: int = 10  # Number of equal intervals at whose ends temperatures are kept
-
-    def __post_init__(self) -> None:
-        for name, remedy in (("duration_s", "Give a time in seconds."), ("tolerance_k", "Give a tolerance in kelvin.")):
-            object.__setattr__(self, name, check_positive(name, getattr(self, name), remedy, HeatError))
-        _check_count("outputs", self.outputs, "Give the number of intervals, such as 10.")
+    outputs: Count = 10  # Number of equal intervals at whose ends temperatures are kept
 
     @property
     def times_s(self) -> FloatArray:
@@ -88,31 +79,19 @@ class AdaptiveSteps:
 
 @dataclass(frozen=True)
 class GivenSteps:
-    """Time steps of given lengths, such as the halved steps of an adaptive computation.
+    """Time steps of given lengths."""
 
-    >>> GivenSteps(6.0, (np.array([1.0, 2.0]), np.array([3.0]))).halved().lengths_s[0].tolist()
-    [0.5, 0.5, 1.0, 1.0]
-    """
+    lengths_s: FloatArray  # Lengths of the steps, shape (k,), [s]
 
-    duration_s: float  # Time over which to follow the body, [s]
-    lengths_s: tuple[FloatArray, ...]
-    """Lengths of the steps in each interval, [s]; temperatures are kept at the ends of the (equal) intervals."""
-
-    def halved(self, times: int = 1) -> GivenSteps:
-        """Return these steps with every step halved `times` times."""
-        parts = 2**times
-        lengths_s = tuple(np.repeat(interval_s / parts, parts) for interval_s in self.lengths_s)
-        return GivenSteps(self.duration_s, lengths_s)
+    @property
+    def duration_s(self) -> float:
+        """Time over which the body is followed, [s]."""
+        return float(self.lengths_s.sum())
 
     @property
     def times_s(self) -> FloatArray:
-        """Time 0, then the end of every interval, shape (len(lengths_s) + 1,), [s]."""
-        return np.linspace(0.0, self.duration_s, len(self.lengths_s) + 1)
-
-
-def _check_count(name: str, value: int, remedy: str) -> None:
-    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not 1 <= value <= _MOST:
-        raise HeatError(name, expected=f"a whole number from 1 to {_MOST:,}", got=repr(value), remedy=remedy)
+        """Time 0, then the end of every step, shape (k + 1,), [s]."""
+        return np.append(0.0, np.cumsum(self.lengths_s))
 
 
 @dataclass(frozen=True)
@@ -121,7 +100,7 @@ class Term:
 
     kind: Literal["convection", "flux", "radiation", "source", "fixed"]
     parts: IntArray  # Numbers of the boundary triangles, for a source the tetrahedra, where the term acts, (k,)
-    quantities: tuple[Bounded, ...]
+    quantities: tuple[Quantity, ...]
     """convection: h, T_ambient of the flux h (T_ambient - T); flux: the factors whose product is the flux; radiation:
     eps, T_s of the flux factor eps (T_s^4 - T^4); source: heat, [W / m3]; fixed: temperature of the nodes. Quantities
     hold temperatures in degrees Celsius."""
@@ -135,14 +114,6 @@ class Effect(ABC):
     """
 
     kind: ClassVar[str]  # Name of this kind of effect in reports
-    bounds: ClassVar[dict[str, Bounds]]  # Names of the fields that are quantities, each with the range of its values
-
-    def __post_init__(self) -> None:
-        for name in ("patches", "regions"):
-            if hasattr(self, name):
-                object.__setattr__(self, name, _checked_names(name, getattr(self, name)))
-        for name, bounds in self.bounds.items():
-            object.__setattr__(self, name, bounds.check_quantity(getattr(self, name)))
 
     @property
     def where(self) -> tuple[str, ...]:
@@ -154,22 +125,14 @@ class Effect(ABC):
         """Name of the effect in reports: its kind and `where`, such as "convection on exterior-*"."""
         return f"{self.kind} on {', '.join(self.where)}"
 
-    def bounded(self, name: str) -> Bounded:
-        """Return the quantity in the field `name` with its range."""
-        return Bounded(getattr(self, name), self.bounds[name])
+    @property
+    def changing(self) -> tuple[Varying, ...]:
+        """The quantities that change with time."""
+        return tuple(one for one in vars(self).values() if isinstance(one, Varying) and one.in_time)
 
     @abstractmethod
     def term(self, selection: Selection) -> Term:
         """Return the effect's term in the heat equation; raise `HeatError` if the mesh lacks what `where` names."""
-
-
-def _checked_names(field: str, names: object) -> tuple[str, ...]:
-    """Return names as a tuple; raise `HeatError` for a single text, whose letters would be taken for names."""
-    listed = tuple(names) if isinstance(names, (tuple, list)) else ()
-    if not listed or not all(isinstance(name, str) and name.strip() for name in listed):
-        remedy = f'Write {field}=("name",), for example.'
-        raise HeatError(field, expected="a tuple of names", got=repr(names), remedy=remedy)
-    return listed
 
 
 @runtime_checkable
@@ -215,8 +178,9 @@ class HeatProblem:
             remedy = "Remove the unused nodes; they have no heat capacity."
             raise HeatError("mesh points", expected=expected, got=got, remedy=remedy)
         self._check_temperatures()
-        self._check_effects()
         self._check_materials()
+        x, y, z = check_direction("up", self.up, "Give three numbers, such as (0, 0, 1).", HeatError).tolist()
+        object.__setattr__(self, "up", (x, y, z))
 
     @cached_property
     def selection(self) -> Selection:
@@ -226,7 +190,7 @@ class HeatProblem:
     @property
     def resolution_s(self) -> float:
         """Longest time between two evaluations at which no effect's change is missed, [s]; inf if unknown."""
-        return min((e.bounded(name).resolution_s for e in self.effects for name in e.bounds), default=math.inf)
+        return min((one.resolution_s for effect in self.effects for one in effect.changing), default=math.inf)
 
     @property
     def start_c(self) -> FloatArray:
@@ -254,21 +218,7 @@ class HeatProblem:
     def _check_materials(self) -> None:
         if isinstance(self.material, Conductor):
             return
-        remedy, names = "Give one Material, or one per region: {name of region: Material}.", self.mesh.region_names
-        if not isinstance(self.material, Mapping):
-            got = repr(self.material)
-            raise HeatError("material", expected="a Material or a mapping", got=got, remedy=remedy)
-        used = {names[number] for number in np.unique(self.mesh.region)}
-        given = {name for name, material in self.material.items() if isinstance(material, Conductor)}
-        wrong = {
-            "none for": used - set(self.material),
-            "no Material for": set(self.material) - given,
-            "unknown": given - set(names),
-        }
-        if any(wrong.values()):
-            got = "; ".join(f"{what}: {', '.join(sorted(which))}" for what, which in wrong.items() if which)
-            expected = f"a Material for each of the regions {', '.join(sorted(used))}"
-            raise HeatError("material", expected=expected, got=got, remedy=remedy)
+        used = {self.mesh.region_names[number] for number in np.unique(self.mesh.region)}
         conductivities = {name: self.material[name].conductivity_w_mk for name in used}
         least, most = (choose(conductivities, key=conductivities.__getitem__) for choose in (min, max))
         if conductivities[most] > MOST_CONTRAST * conductivities[least]:
@@ -276,18 +226,6 @@ class HeatProblem:
             expected = f"conductivities no more than {MOST_CONTRAST:g} times apart"
             remedy = "Leave out what conducts next to nothing, or correct the unit of one."
             raise HeatError("material", expected=expected, got=got, remedy=remedy)
-
-    def _check_effects(self) -> None:
-        wrong = [type(effect).__name__ for effect in self.effects if not isinstance(effect, Effect)]
-        if wrong or not isinstance(self.effects, tuple):
-            got = ", ".join(wrong) or type(self.effects).__name__
-            remedy = "Use the effects of thermoxels_ns.heat.effects."
-            raise HeatError("effects", expected="a tuple of effects", got=got, remedy=remedy)
-        length = math.hypot(*self.up) if len(self.up) == 3 else math.nan
-        if not (math.isfinite(length) and length > 0.0):
-            expected, remedy = "a direction", "Give three numbers, such as (0, 0, 1)."
-            raise HeatError("up", expected=expected, got=repr(self.up), remedy=remedy)
-        object.__setattr__(self, "up", tuple(float(part) / length for part in self.up))
 
     def _check_temperatures(self) -> None:
         name = "mesh temperature_c" if self.initial_temperature_c is None else "initial_temperature_c"

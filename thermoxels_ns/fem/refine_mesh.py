@@ -14,9 +14,9 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 def refine_mesh(mesh: TetMesh) -> TetMesh:
     """Return a conforming mesh of the same body with all edges halved: each tetrahedron becomes eight.
 
-    Cutting off its four corners makes a tetrahedron into four children of the same shape and an octahedron. The
-    octahedron has three diagonals and is cut into four along the one that makes the largest angle between faces
-    smallest. Children of the six tetrahedra of a cube (Kuhn) are such tetrahedra again, so no angle becomes obtuse.
+    Cutting off its four corners makes a tetrahedron into four children of the same shape and an octahedron, which is
+    cut into four along the shortest of its three diagonals, as scikit-fem does. Children of the six tetrahedra of a
+    cube (Kuhn) are such tetrahedra again, so no angle becomes obtuse.
 
     Nodes keep their numbers; the middles of the edges follow in the order of `mesh_edges`. Children inherit regions,
     tags and patches and stand in the order of their parents. Temperatures and colours of new nodes are means, and a new
@@ -76,28 +76,14 @@ def _children() -> IntArray:
 _CHILDREN = _children()
 _FACET_CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 """Local nodes of a triangle's children: 0 to 2 are the corners and 3 to 5 the middles of `FACET_EDGES`."""
-_AT_ONCE = 1 << 15  # Tetrahedra whose angles are computed at once, each of which takes 2 kB
-_TIE = 1e-9  # Cosines that differ by at most this count as equal
+_TIE = 1.0 - 1e-9  # Diagonals shorter than the others by less than this factor count as equal: the first one is taken
 
 
 def _diagonals(points: FloatArray, local: IntArray) -> IntArray:
-    """Return for each tetrahedron the diagonal for which the largest angle between faces is smallest, shape (t,)."""
-    starts = range(0, len(local), _AT_ONCE)
-    return np.concatenate([np.zeros(0, np.int64), *(_best_diagonals(points, local[n : n + _AT_ONCE]) for n in starts)])
-
-
-def _best_diagonals(points: FloatArray, local: IntArray) -> IntArray:
-    best, chosen = np.full(len(local), -2.0), np.zeros(len(local), np.int64)
-    one, other = np.triu_indices(4, 1)
-    for option in range(3):
-        corner = points[local[:, _CHILDREN[option, 4:]]]  # the four tetrahedra around the diagonal, (t, 4, 4, 3)
-        a, b, c = (corner[:, :, n] - corner[:, :, 0] for n in (1, 2, 3))
-        inward = [np.cross(b, c), np.cross(c, a), np.cross(a, b)]
-        inward = np.stack([-sum(inward), *inward], axis=2)
-        inward /= np.linalg.norm(inward, axis=3, keepdims=True)
-        # The angle between two faces is 180 degrees less the angle between their inward normals.
-        cosines = -(inward @ np.swapaxes(inward, 2, 3))[:, :, one, other]
-        worst = cosines.min(axis=(1, 2))
-        better = worst > best + _TIE
-        best[better], chosen[better] = worst[better], option
+    """Return for each tetrahedron the number of the shortest diagonal of its octahedron, shape (t,)."""
+    lengths = [np.linalg.norm(points[local[:, a]] - points[local[:, b]], axis=1) for a, b in _OPPOSITE]
+    chosen, best = np.zeros(len(local), np.int64), lengths[0]
+    for option in (1, 2):
+        shorter = lengths[option] < _TIE * best
+        chosen, best = np.where(shorter, option, chosen), np.where(shorter, lengths[option], best)
     return chosen

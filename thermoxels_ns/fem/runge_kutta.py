@@ -29,11 +29,16 @@ class Scheme:
 
     name: str  # Name of the scheme, for messages
     order: int  # Order p: at a given time the error is proportional to the step length to the power p
-    nodes: tuple[float, ...]  # c: time of each stage as a share of the step
     weights: tuple[tuple[float, ...], ...]
-    """The lower triangular matrix a, a row per stage; its last row is b. A row of zeros stands for the step's start."""
+    """The lower triangular matrix a, a row per stage; its last row is b. Sums of rows are the times of the stages as
+    shares of the step; all entries on the diagonal are equal, so that stages share a matrix."""
     estimate: tuple[float, ...] | None = None
     """Weights of a scheme one order higher for the flows at the start and in each stage; None: no error estimate."""
+
+    @property
+    def nodes(self) -> tuple[float, ...]:
+        """c: time of each stage as a share of the step."""
+        return tuple(map(math.fsum, self.weights))
 
     @property
     def ends(self) -> tuple[float, ...]:
@@ -51,15 +56,12 @@ def _sdirk2() -> Scheme:
     first_weight = (1.0 / 6.0 - 0.5 * second) / (gamma * gamma - gamma * second)
     second_weight = 0.5 - gamma * first_weight
     estimate = (1.0 - first_weight - second_weight, first_weight, second_weight)
-    return Scheme("SDIRK2", 2, (gamma, 1.0), ((gamma, 0.0), (1.0 - gamma, gamma)), estimate)
+    return Scheme("SDIRK2", 2, ((gamma, 0.0), (1.0 - gamma, gamma)), estimate)
 
 
-BACKWARD_EULER = Scheme("backward Euler", 1, (1.0,), ((1.0,),))
+BACKWARD_EULER = Scheme("backward Euler", 1, ((1.0,),))
 """Scheme of first order. With lumped masses and non-obtuse tetrahedra no temperature leaves the range of the start and
 of the surroundings, however long the step."""
-CRANK_NICOLSON = Scheme("Crank-Nicolson", 2, (0.0, 1.0), ((0.0, 0.0), (0.5, 0.5)))
-"""Scheme of second order without damping: after a jump, long steps overshoot by up to the jump itself. No command uses
-this scheme; tests compare it with the published NAFEMS benchmark T3."""
 SDIRK2 = _sdirk2()
 """Scheme of second order, L-stable: changes too fast for the step length are damped. Very long steps may overshoot by
 1 or 2 % of a jump."""
@@ -84,23 +86,18 @@ class RungeKutta:
     """Takes single steps of any length with a scheme; matrices of the last used lengths are kept."""
 
     def __init__(self, system: HeatSystem, scheme: Scheme, *, relative_tolerance: float) -> None:
-        self.scheme, self._system, self._relative_tolerance = scheme, system, relative_tolerance
+        self.scheme, self.system, self._relative_tolerance = scheme, system, relative_tolerance
         self._equations: dict[tuple[float, float], ImplicitEquation] = {}
 
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
         """Take one step from `start_k`, (n,), [K], relative to the reference; `Step.converged` tells if that worked."""
-        system, scheme = self._system, self.scheme
-        states: list[Vector] = []
-        inner_w: list[Vector] = []
+        system, scheme = self.system, self.scheme
+        states, inner_w, nothing_w = list[Vector](), list[Vector](), np.zeros(system.num_nodes)
         iterations = newton_iterations = 0
         unbalanced_w, status = 0.0, ""
         for number, (row, node) in enumerate(zip(scheme.weights, scheme.nodes)):
             now_s, implicit = time_s + node * step_s, row[number]
-            if implicit == 0.0:
-                states.append(start_k)
-                inner_w.append(system.net_heat(start_k, now_s))
-                continue
-            given_w = _weighted([weight / implicit for weight in row[:number]], inner_w)
+            given_w = sum((weight / implicit * flow_w for weight, flow_w in zip(row, inner_w)), nothing_w)
             solution = self._equation(now_s, implicit * step_s).solve(start_k, now_s, given_w)
             iterations += solution.iterations
             newton_iterations += solution.newton_iterations
@@ -112,33 +109,31 @@ class RungeKutta:
                 return Step(solution.relative_k, unknown, iterations, newton_iterations, np.nan, False, status)
             if estimate or number + 1 < len(scheme.nodes):
                 stored_w = system.nodal_mass_j_k * solution.change_k / (implicit * step_s)
-                inner_w.append(stored_w if given_w is None else stored_w - given_w)
+                inner_w.append(stored_w - given_w)
         heat_w = self._heat(start_k, states, time_s, step_s)
         error_k = self._error(start_k, inner_w, time_s, step_s) if estimate and scheme.estimate else np.nan
         return Step(states[-1], heat_w, iterations, newton_iterations, error_k, True, status, unbalanced_w)
 
     def _heat(self, start_k: Vector, states: list[Vector], time_s: float, step_s: float) -> Vector:
         """Return each group's mean heat flow, [W]; fixed nodes get the heat that balances storage and other flows."""
-        system, scheme = self._system, self.scheme
+        system, scheme, fixed = self.system, self.scheme, self.system.fixed
         if not system.groups:
             return np.zeros(0)
-        flows, fixed = np.zeros(len(system.groups) - len(system.fixed.groups)), system.fixed
         kept_w = (system.nodal_mass_j_k * (states[-1] - start_k))[fixed.nodes] / step_s
+        parts_w: Vector | float = 0.0
         for weight, node, state in zip(scheme.ends, scheme.nodes, states):
-            if weight != 0.0:
-                flows += weight * system.group_heat_w(state, time_s + node * step_s)
-                kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s)
-        return np.concatenate([flows, fixed.shares @ kept_w])
+            parts_w = parts_w + weight * system.part_heat_w(state, time_s + node * step_s)
+            kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s)
+        return system.by_group(np.concatenate([parts_w, fixed.facet_shares @ kept_w]))
 
     def _error(self, start_k: Vector, inner_w: list[Vector], time_s: float, step_s: float) -> float:
         """Return the largest error, [K], from the scheme of the next order; sums over pieces leave conduction out."""
-        system, scheme = self._system, self.scheme
+        system, scheme = self.system, self.scheme
         assert scheme.estimate is not None
         implicit = scheme.weights[-1][-1]
         more = [float(part) / implicit for part in np.array(scheme.estimate) - np.array([0.0, *scheme.ends])]
         exchanged_w = system.exchanged_heat(start_k, time_s)
-        exchange_w = _weighted(more, [exchanged_w, *inner_w])
-        assert exchange_w is not None
+        exchange_w = sum((part * flow_w for part, flow_w in zip(more[1:], inner_w)), more[0] * exchanged_w)
         difference_w = exchange_w - more[0] * system.conducted_heat(start_k)
         end_s = time_s + scheme.nodes[-1] * step_s
         equation = self._equation(end_s, implicit * step_s)
@@ -146,7 +141,7 @@ class RungeKutta:
         return float(np.max(np.abs(error)))
 
     def _equation(self, time_s: float, step_s: float) -> ImplicitEquation:
-        time_s = time_s if self._system.matrix_in_time else 0.0
+        time_s = time_s if self.system.matrix_in_time else 0.0
         # Lengths computed as differences of times differ in the last digits.
         alike = (
             key for key in self._equations if key[0] == time_s and math.isclose(key[1], step_s, rel_tol=_SAME_LENGTH)
@@ -154,16 +149,8 @@ class RungeKutta:
         key = next(alike, (time_s, step_s))
         equation = self._equations.pop(key, None)
         if equation is None:
-            equation = ImplicitEquation(self._system, time_s, step_s, relative_tolerance=self._relative_tolerance)
+            equation = ImplicitEquation(self.system, time_s, step_s, relative_tolerance=self._relative_tolerance)
         self._equations[key] = equation
         while len(self._equations) > _KEPT_EQUATIONS:
             del self._equations[next(iter(self._equations))]
         return equation
-
-
-def _weighted(weights: list[float], vectors: list[Vector]) -> Vector | None:
-    """Return the weighted sum of vectors; None if there are none."""
-    total: Vector | None = None
-    for weight, vector in zip(weights, vectors):
-        total = weight * vector if total is None else total + weight * vector
-    return total

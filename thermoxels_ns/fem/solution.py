@@ -79,7 +79,6 @@ class HeatSolution:
     newton_iterations: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
     steps: int = 0  # Number of steps
-    step_lengths_s: tuple[FloatArray, ...] = ()  # Lengths of the steps in each interval, [s]
     time_error_k: float = float("nan")
     """Estimated largest error that the steps make in any temperature, [K]. Adaptive steps: the sum of their estimates;
     equal steps: from steps of twice the length, if asked for; else NaN."""

@@ -7,8 +7,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from skfem import Basis, BilinearForm, Dofs, ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2, MeshTet, MeshTri
-from skfem.element import DiscreteField
+from skfem import Basis, BilinearForm, Dofs, ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2, MeshTet
 from skfem.helpers import dot
 from skfem.quadrature import get_quadrature
 from skfem.refdom import RefTet, RefTri
@@ -18,6 +17,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.linear_tets import FACET_EDGES, TET_EDGES, MeshEdges, mesh_edges, stiffness_matrix
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 
 Vector = FloatArray
 Numbers = IntArray
@@ -104,7 +104,8 @@ class Space:
             corners = points_m[tets[block]].reshape(-1, 3)
             mesh = MeshTet(corners.T.copy(), np.arange(len(corners)).reshape(-1, 4).T.copy(), validate=False)
             used, local = np.unique(nodes[block], return_inverse=True)
-            dofs = _dofs(mesh, ElementTetP1(), local.reshape(len(mesh.t.T), -1), len(used))
+            dofs = Dofs(mesh, ElementTetP1())  # our numbers of unknowns: its own search for edges is ten times slower
+            dofs.element_dofs, dofs.N = np.ascontiguousarray(local.reshape(len(mesh.t.T), -1).T, np.int32), len(used)
             basis = Basis(mesh, self.element, dofs=dofs, intorder=degree, disable_doflocs=True)
             parameters = {
                 name: np.broadcast_to(value[block, None], basis.dx.shape) for name, value in tet_values.items()
@@ -117,30 +118,20 @@ class Space:
         del data, rows, columns
         return sparse.csr_matrix(upper + sparse.triu(upper, 1, format="csr").T)
 
-    def surface(self, facets: Numbers) -> Basis:
-        """Return a scikit-fem basis on boundary triangles, whose unknowns are those of the body.
-
-        Only values are integrated over this basis, never gradients. So each triangle may be replaced by a right
-        triangle of the same area in a plane of its own.
-        """
-        leg = np.sqrt(2.0 * np.maximum(self.selection.facet_area_m2[facets], np.finfo(np.float64).tiny))
-        none = np.zeros_like(leg)
-        points = np.stack([np.stack([none, leg, none], axis=1), np.stack([none, none, leg], axis=1)]).reshape(2, -1)
-        mesh = MeshTri(points, np.arange(3 * len(facets)).reshape(-1, 3).T.copy(), validate=False)
+    def facet_rule(self, facets: Numbers) -> tuple[Vector, Vector]:
+        """Return the m shape functions at the q points of integration, (m, q), and the points' areas, (k, q), [m2]."""
+        points, weights = _CORNERS if self.order == 1 else get_quadrature(RefTri, _EXACT)
         element = ElementTriP1() if self.order == 1 else ElementTriP2()
-        dofs = _dofs(mesh, ElementTriP1(), self.facet_nodes(facets), self.num_nodes)
-        rule = _CORNERS if self.order == 1 else get_quadrature(RefTri, _EXACT)
-        basis = Basis(mesh, element, dofs=dofs, quadrature=rule, disable_doflocs=True)
-        basis.basis = [(DiscreteField(np.asarray(field)),) for (field,) in basis.basis]
-        return basis
+        shapes = np.stack([element.lbasis(points, i)[0] * np.ones(len(weights)) for i in range(3 * self.order)])
+        return shapes, 2.0 * self.selection.facet_area_m2[facets][:, None] * weights
 
     def source_points(self, tets: Numbers) -> tuple[Places, Vector]:
         """Return the places where sources are evaluated, q per tetrahedron, and their volumes, shape (k q,), [m3]."""
-        points, weights = self._source_rule
+        (points, weights), mesh = self._source_rule, self.selection.mesh
         barycentric = np.concatenate([1.0 - points.sum(axis=0, keepdims=True), points])
-        corners = self.selection.mesh.points_m[self.selection.mesh.tets[tets]]
+        corners = mesh.points_m[mesh.tets[tets]]
         places = np.einsum("aq,tai->tqi", barycentric, corners).reshape(-1, 3)
-        volumes = (6.0 * self.tet_volumes_m3(tets)[:, None] * weights).ravel()
+        volumes = (6.0 * signed_volumes(mesh.points_m, mesh.tets[tets])[:, None] * weights).ravel()
         return Places(places, np.zeros_like(places), self.selection.up), volumes
 
     def source_load(self, tets: Numbers, point_w: Vector) -> Vector:
@@ -156,12 +147,6 @@ class Space:
         """Points and weights in the reference tetrahedron that are exact for polynomials of degree `order`."""
         return get_quadrature(RefTet, self.order)
 
-    def tet_volumes_m3(self, tets: Numbers) -> Vector:
-        """Return the volumes of k tetrahedra, shape (k,), [m3]."""
-        corner = self.selection.mesh.points_m[self.selection.mesh.tets[tets]]
-        side = corner[:, 1:] - corner[:, :1]
-        return np.einsum("ti,ti->t", side[:, 0], np.cross(side[:, 1], side[:, 2])) / 6.0
-
     def node_places(self, nodes: Numbers) -> Places:
         """Return the positions of nodes, each with the mean normal of the boundary around the node (0 inside)."""
         total = self._normals[nodes]
@@ -176,13 +161,6 @@ class Space:
         owners = self.facet_nodes(np.arange(len(selection.mesh.facets)))
         weighted = np.repeat(selection.facet_normal * selection.facet_area_m2[:, None], owners.shape[1], axis=0)
         return np.stack([sums_by_number(owners.ravel(), part, self.num_nodes) for part in weighted.T], axis=1)
-
-
-def _dofs(mesh: MeshTet | MeshTri, linear: ElementTetP1 | ElementTriP1, nodes: Numbers, count: int) -> Dofs:
-    """Return our numbers of unknowns, `nodes`, as scikit-fem's `Dofs`: its own search for edges is ten times slower."""
-    dofs = Dofs(mesh, linear)
-    dofs.element_dofs, dofs.N = np.ascontiguousarray(nodes.T, dtype=np.int32), count
-    return dofs
 
 
 def sums_by_number(numbers: Numbers, values: npt.NDArray, count: int) -> Vector:

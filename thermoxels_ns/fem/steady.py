@@ -82,8 +82,7 @@ def _overshoot(system: HeatSystem, relative_k: Vector) -> tuple[float, str]:
 
 def heat_of_groups_w(system: HeatSystem, relative_k: Vector) -> Vector:
     """Return the heat flow into the body of each of the system's `groups` in a steady state, shape (g,), [W]."""
-    kept_w = -system.net_heat_at_fixed(relative_k, 0.0)
-    return np.concatenate([system.group_heat_w(relative_k, 0.0), system.fixed.shares @ kept_w])
+    return system.by_group(system.every_part_heat_w(relative_k, 0.0))
 
 
 def refuse_too_cold(system: HeatSystem, relative_k: Vector) -> None:

@@ -16,6 +16,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.forms import (
     ConvectionForm,
+    FixedForm,
     FixedNodes,
     FluxForm,
     RadiationForm,
@@ -26,7 +27,7 @@ from thermoxels_ns.fem.forms import (
 from thermoxels_ns.fem.linear_tets import lumped_mass
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import FacetHeat
-from thermoxels_ns.fem.space import Space
+from thermoxels_ns.fem.space import Space, sums_by_number
 
 Vector = FloatArray
 
@@ -97,12 +98,16 @@ class HeatSystem:
         self.num_nodes: int = self.space.num_nodes
         """Number of nodes; with quadratic tetrahedra the mesh's nodes come first, then the middles of its edges."""
         forms = effect_forms(problem, self.space, self.reference_c)
-        self._convection, self._loads, self._radiation = forms.convection, forms.loads, forms.radiation
-        self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*forms.convection, *forms.radiation)
+        self._convection = tuple(form for form in forms if isinstance(form, ConvectionForm))
+        self._loads = tuple(form for form in forms if isinstance(form, (FluxForm, SourceForm)))
+        self._radiation = tuple(form for form in forms if isinstance(form, RadiationForm))
+        self._exchanging, self._every_form = (*self._convection, *self._loads, *self._radiation), forms
+        self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*self._convection, *self._radiation)
         """Convection and radiation: the forms whose heat flow depends on the temperature of the surface."""
-        self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
+        fixed = tuple(form for form in forms if isinstance(form, FixedForm))
+        self.fixed: FixedNodes = FixedNodes(fixed, self.num_nodes)
         """Nodes whose temperature is given."""
-        self.assembled.update({"fixed": len(forms.fixed)} if forms.fixed else {})
+        self.assembled.update({"fixed": len(fixed)} if fixed else {})
         self.assembled["stiffness"] += 1
         self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
         """Stiffness K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
@@ -112,13 +117,19 @@ class HeatSystem:
         """True if the convection matrix R changes with time."""
         self.nonlinear: bool = bool(self._radiation)
         """True if there is radiation."""
-        self.exchanges: bool = bool(forms.exchanging)
+        self.exchanges: bool = bool(self._exchanging)
         """True if there is convection, radiation, a flux or a source."""
-        self.groups: tuple[tuple[str, str], ...] = (
-            *((form.effect, group) for form in forms.exchanging for group in form.groups),
-            *self.fixed.groups,
-        )
-        """Effect and patch or region of each heat flow of `group_heat_w`, then effect and patch of `fixed.groups`."""
+        groups, numbers = list[tuple[str, str]](), [np.zeros(0, np.int64)]
+        for form in self._every_form:
+            names, of_part = problem.mesh.region_names, problem.mesh.region
+            if form.kind != "source":
+                names, of_part = problem.selection.patch_names, problem.selection.facet_patch
+            used, number = np.unique(of_part[form.parts], return_inverse=True)
+            numbers.append(len(groups) + number)
+            groups += [(form.effect, names[n]) for n in used]
+        self.groups: tuple[tuple[str, str], ...] = tuple(groups)
+        """Effect and patch or region of each heat flow of `by_group`."""
+        self._group: IntArray = np.concatenate(numbers)
         self._convection_at: dict[float, sparse.csr_matrix | None] = {}
         self._loads_at: dict[float, Vector] = {}
         self._ambient_at: dict[float, Vector] = {}
@@ -231,19 +242,28 @@ class HeatSystem:
             return np.zeros(0)
         return self.exchanged_heat(relative_k, time_s)[nodes] - self._fixed_rows @ self.pieces.without_means(relative_k)
 
-    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Return the heat flow into the body, [W], for each entry of `groups` before the last ones, `fixed.groups`."""
-        forms = (*self._convection, *self._loads, *self._radiation)
-        return np.concatenate([np.zeros(0), *(form.group_heat_w(relative_k, time_s) for form in forms)])
+    def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
+        """Return the heat into each triangle or tetrahedron of every effect but fixed temperatures, [W]."""
+        return np.concatenate([np.zeros(0), *(form.part_heat_w(relative_k, time_s) for form in self._exchanging)])
+
+    def every_part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
+        """Return `part_heat_w`, then the heat of fixed temperatures per triangle, as if fixed nodes stored nothing."""
+        kept_w = -self.net_heat_at_fixed(relative_k, time_s)
+        return np.concatenate([self.part_heat_w(relative_k, time_s), self.fixed.facet_shares @ kept_w])
+
+    def by_group(self, heat_w: Vector) -> Vector:
+        """Sum heat flows, in the order of `every_part_heat_w`, over each entry of `groups`, shape (g,), [W]."""
+        return sums_by_number(self._group[: len(heat_w)], heat_w, len(self.groups))
 
     def facet_heat(self, relative_k: Vector, time_s: float) -> tuple[FacetHeat, ...]:
         """Return the heat flow of each effect but sources through its triangles, as if fixed nodes stored nothing."""
-        forms = [
-            form for form in (*self._convection, *self._loads, *self._radiation) if not isinstance(form, SourceForm)
-        ]
-        found = [FacetHeat(form.effect, form.facets, form.part_heat_w(relative_k, time_s)) for form in forms]
-        kept_w = -self.net_heat_at_fixed(relative_k, time_s)
-        return (*found, *(FacetHeat(*part) for part in self.fixed.facet_heat_w(kept_w)))
+        ends = np.cumsum([len(form.parts) for form in self._every_form])
+        parts = np.split(self.every_part_heat_w(relative_k, time_s), ends[:-1])
+        return tuple(
+            FacetHeat(form.effect, form.parts, heat_w)
+            for form, heat_w in zip(self._every_form, parts)
+            if form.kind != "source"
+        )
 
     def exchanging_pieces(self, time_s: float) -> BoolArray:
         """Return True for each piece whose temperature convection, radiation or fixed nodes determine, shape (p,)."""

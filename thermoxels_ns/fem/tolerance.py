@@ -1,27 +1,23 @@
-"""Solving a heat problem to a tolerance: solve, halve the mesh size or the steps, and compare (Richardson)."""
+"""Solving a heat problem to a tolerance: solve, halve the mesh size, and compare (Richardson)."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
-from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
-from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, Solution, SteadySolution, mean_flows_w, share_of_heat
+from thermoxels_ns.fem.solution import ErrorSize, Solution, SteadySolution, mean_flows_w, share_of_heat
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 
-Vector = FloatArray
-
 DEFAULT_MEMORY_BYTES = 4 * 2**30  # Most memory that a solution may need, [bytes]
 HALVED = 0.3
-"""Share of an error that is left after the mesh size or the steps are halved. Theory says 1/4 where temperatures are
+"""Share of an error that is left after the mesh size is halved. Theory says 1/4 where temperatures are
 smooth, and 0.4 at the edges of a notch of a right angle, where temperatures behave as r^(2/3)."""
 _LEFT = {1: ErrorSize(HALVED, HALVED), 2: ErrorSize(0.2, 0.2)}
 """Share of an error left after halving, by order of the tetrahedra; for order 2 theory says 1/8, and 0.4 at a notch."""
@@ -33,19 +29,16 @@ MARGIN = 1.3
 insulates 1e8 times better than the one beside it along the flow. Temperatures were off by 0.66 to 0.92 of estimates."""
 _STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
 """Relative tolerances of the linear solver for steady states and for steps: its error is far below any estimate."""
-_STEPS_OVER_ERROR = 6.0
-"""Tolerance of the first, adaptive steps over the allowed error: steps controlled to 1 K make an error of 0.03 to
-0.07 K in all, because conduction damps the errors of earlier steps."""
-_AIM = 0.95  # Share of the allowed error that the next choice of mesh and steps may be expected to make
-_MOST_HALVINGS = 8  # Most halvings of the mesh size, and most of the steps, that are tried
-_MESH_COST, _STEP_COST = 10.0, 2.0  # Factors by which halving the mesh size, and halving the steps, raise the cost
+_STEPS_ERROR = 0.07
+"""Share of their tolerance that adaptive steps count as error: steps controlled to 1 K make an error of 0.03 to 0.07 K
+in all, because conduction damps the errors of earlier steps."""
 _BYTES_PER_TET, _BYTES_PER_FACET = {1: 400.0, 2: 2600.0}, {1: 600.0, 2: 4000.0}
 """Most memory by order of the tetrahedra, [bytes], measured with convection and radiation; about half without both."""
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Errors that a user allows, above 0; None: any error. `HeatError` if both are None or one is not above 0."""
+    """Errors that a user allows, above 0; None: any error. At least one of the two is given."""
 
     temperature_k: float | None = 0.05
     """Largest error of the temperature at any node of the mesh, [K]. The default is half of the error that building
@@ -53,12 +46,6 @@ class Tolerance:
     heat_flow: float | None = None
     """Largest error of the mean heat flow that any effect brings, as a share of all heat that flows through the body;
     building physics allows 0.01 (ISO 10211)."""
-
-    def __post_init__(self) -> None:
-        given = [value for value in (self.temperature_k, self.heat_flow) if value is not None]
-        if not given or not all(0.0 < value < np.inf for value in given):
-            got, remedy = f"{self.temperature_k} and {self.heat_flow}", "Give kelvins, or a share such as 0.01."
-            raise HeatError("tolerance", expected="temperature_k, heat_flow or both, above 0", got=got, remedy=remedy)
 
     def excess(self, error: ErrorSize) -> float:
         """Return the larger ratio of an error, that of heat flow times `MARGIN`, to its allowed value; met up to 1."""
@@ -125,9 +112,9 @@ def solve_to_tolerance(
 
     A steady state is solved with linear and then with quadratic tetrahedra on the given mesh; while the error is too
     large, quadratic ones of half the size follow, or linear ones if the solver fails on quadratic ones. Through time
-    tetrahedra stay linear. Three solutions, on the given mesh, with all steps halved, and on a mesh of half the size,
-    tell the errors of mesh and steps, which are added with their signs node by node; then both are made as fine as the
-    tolerance asks for. The area that flat facets miss of a round body is not estimated.
+    tetrahedra stay linear, the second solution is on a mesh of half the size, and adaptive steps are controlled to
+    the allowed error, of which they make a fifteenth. The area that flat facets miss of a round body is not
+    estimated.
 
     Args:
         problem: Body, materials, initial temperatures and effects.
@@ -142,15 +129,23 @@ def solve_to_tolerance(
     Raises:
         HeatError: The tolerance cannot be met within the memory, or a solution fails.
     """
-    run = _Run(problem, tolerance, memory_bytes, log)
     if duration_s is None:
-        return run.close(_solve_steady(run), allow_unmet)
-    if tolerance.temperature_k is None:
-        raise HeatError(
-            "tolerance", expected="kelvins, by which steps in time are chosen", got="none", remedy="Give 0.1."
-        )
-    steps = AdaptiveSteps(duration_s, _STEPS_OVER_ERROR * tolerance.temperature_k, outputs=outputs)
-    return run.close(_solve_in_time(run, steps, progress), allow_unmet)
+
+        def solve_state(problem: HeatProblem, order: int) -> Solution:
+            return solve_steady(problem, order=order, relative_tolerance=_STEADY_TOLERANCE)
+
+        run = _Run(problem, tolerance, memory_bytes, log)
+        return run.close(_refine(run, solve_state, 2, 0), allow_unmet)
+    allowed_k = tolerance.temperature_k
+    assert allowed_k is not None, "steps in time are chosen by it"
+    steps = AdaptiveSteps(duration_s, allowed_k, outputs=outputs)
+
+    def solve_in_time(problem: HeatProblem, _: int) -> Solution:
+        found = solve_heat(problem, steps, relative_tolerance=_STEP_TOLERANCE, progress=progress)
+        return replace(found, time_error_k=_STEPS_ERROR * allowed_k)
+
+    run = _Run(problem, tolerance, memory_bytes, log, times=outputs + 1)
+    return run.close(_refine(run, solve_in_time, 1, 1), allow_unmet)
 
 
 def steady_error(problem: HeatProblem, solution: SteadySolution) -> ErrorSize:
@@ -177,20 +172,10 @@ def richardson(apart: ErrorSize, left: ErrorSize) -> tuple[ErrorSize, ErrorSize]
 
 def difference_between(coarse: Solution, fine: Solution, num_nodes: int) -> ErrorSize:
     """Return the largest differences between two solutions with equal times and the same first `num_nodes` nodes."""
-    return _error_size(_compared(fine, num_nodes) - _compared(coarse, num_nodes), fine)
-
-
-def _compared(solution: Solution, num_nodes: int) -> Vector:
-    """Return the temperatures of the first `num_nodes` nodes at all times, then each effect's mean heat flow, flat."""
-    flows_w = np.array(list(mean_flows_w(solution).values()))
-    return np.concatenate([solution.temperature_c[..., :num_nodes].ravel(), flows_w])
-
-
-def _error_size(error: Vector, solution: Solution) -> ErrorSize:
-    """Return the largest errors of a solution from the errors of its `_compared` values."""
-    errors, first_flow = np.abs(error), len(error) - len(solution.effects)
-    largest_w = float(np.max(errors[first_flow:], initial=0.0))
-    return ErrorSize(float(np.max(errors[:first_flow])), share_of_heat(largest_w, solution))
+    apart_k = np.abs(fine.temperature_c[..., :num_nodes] - coarse.temperature_c[..., :num_nodes])
+    before_w, after_w = mean_flows_w(coarse), mean_flows_w(fine)
+    largest_w = max((abs(after_w[effect] - before_w[effect]) for effect in after_w), default=0.0)
+    return ErrorSize(float(apart_k.max()), share_of_heat(largest_w, fine))
 
 
 def peak_bytes(problem: HeatProblem, *, order: int = 1, refinements: int = 0, times: int = 1) -> float:
@@ -216,8 +201,11 @@ def describe_bytes(amount: float) -> str:
 class _Run:
     """The course of one `solve_to_tolerance`: the solutions so far, and the choice among them."""
 
-    def __init__(self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable) -> None:
+    def __init__(
+        self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable, times: int = 1
+    ) -> None:
         self.given, self.tolerance, self._memory_bytes, self.say = problem, tolerance, memory_bytes, log
+        self._times = times
         self.solved: list[tuple[Level, HeatProblem, Solution]] = []
         self._begin_s = time.perf_counter()
 
@@ -227,17 +215,18 @@ class _Run:
         return any(self.tolerance.excess(level.error) <= 1.0 for level, _, _ in self.solved)
 
     def add(self, problem: HeatProblem, solution: Solution, seconds: float, error: ErrorSize, refinements: int) -> None:
-        """Keep a solution with its estimated errors; `refinements` is how often the mesh size was halved for it."""
+        """Keep a solution with the `error` of its mesh; `refinements` is how often the mesh size was halved for it."""
         steady = isinstance(solution, SteadySolution)
         edges = len(solution.edge_temperature_c) if steady else 0
         nodes, steps_k = solution.temperature_c.shape[-1] + edges, None if steady else solution.time_error_k
+        error = replace(error, temperature_k=error.temperature_k + (steps_k or 0.0))
         level = Level(2 if edges else 1, refinements, steps_k, nodes, error, seconds)
         self.solved.append((level, problem, solution))
         self.say(level.describe())
 
-    def lacks_memory(self, order: int, refinements: int, times: int = 1) -> str:
+    def lacks_memory(self, order: int, refinements: int) -> str:
         """Return why a solution with the mesh size halved `refinements` times does not fit in memory, "" if it does."""
-        needed = peak_bytes(self.given, order=order, refinements=refinements, times=times)
+        needed = peak_bytes(self.given, order=order, refinements=refinements, times=self._times)
         where = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
         what = f"P{order} on {where} needs about {describe_bytes(needed)}"
         if needed <= self._memory_bytes:
@@ -282,22 +271,26 @@ def _halved(problem: HeatProblem, start: Solution | None = None) -> HeatProblem:
     return replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
 
 
-def _solve_steady(run: _Run) -> str:
-    """Add steady solutions to `run` until one is within the tolerance; return why none can be, or ""."""
+def _refine(run: _Run, solve: Callable[[HeatProblem, int], Solution], order: int, refinements: int) -> str:
+    """Add finer and finer solutions to `run` until one is within the tolerance; return why none can be, or "".
 
-    def solve(problem: HeatProblem, order: int) -> tuple[SteadySolution, float]:
+    `solve` takes a problem and the order of its tetrahedra. The first solution has linear ones on the given mesh, the
+    second has the `order` and `refinements` of the arguments.
+    """
+
+    def timed(problem: HeatProblem, order: int) -> tuple[Solution, float]:
         begin_s = time.perf_counter()
-        solution = solve_steady(problem, order=order, relative_tolerance=_STEADY_TOLERANCE)
-        return solution, time.perf_counter() - begin_s
+        return solve(problem, order), time.perf_counter() - begin_s
 
-    failure = run.lacks_memory(2, 0)
+    failure = run.lacks_memory(order, refinements)
     if failure:
         return failure
-    order, refinements, (before, first_seconds) = 2, 0, solve(run.given, 1)
-    problem = replace(run.given, initial_temperature_c=before.temperature_c)
+    before, first_seconds = timed(run.given, 1)
+    steady = isinstance(before, SteadySolution)
+    problem = replace(run.given, initial_temperature_c=before.temperature_c) if steady else _halved(run.given)
     while True:
         try:
-            solution, seconds = solve(problem, order)
+            solution, seconds = timed(problem, order)
         except HeatError as refusal:
             if order == 1 or refinements:
                 return str(refusal)
@@ -316,62 +309,4 @@ def _solve_steady(run: _Run) -> str:
         failure = run.lacks_memory(order, refinements)
         if failure:
             return failure
-        problem = _halved(problem, before)
-
-
-def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, int], None] | None) -> str:
-    """Add solutions through time to `run` until one is within the tolerance; return why none can be, or "".
-
-    After m halvings of the mesh size and j of the steps the error is of_mesh * HALVED^m + of_steps * HALVED^j.
-    """
-    failure = run.lacks_memory(1, 1, len(steps.times_s))
-    if failure:
-        return failure
-    problems, num_nodes = [run.given], len(run.given.mesh.points_m)
-    solved: dict[tuple[int, int], Vector] = {}
-    lengths_s: tuple[Vector, ...] = ()
-    of_mesh = of_steps = np.zeros(0)
-
-    def error(choice: tuple[int, int]) -> Vector:
-        return of_mesh * HALVED ** choice[0] + of_steps * HALVED ** choice[1]
-
-    def solve(choice: tuple[int, int]) -> tuple[HeatProblem, HeatSolution, float]:
-        begin_s = time.perf_counter()
-        while len(problems) <= choice[0]:
-            problems.append(_halved(problems[-1]))
-        given = GivenSteps(steps.duration_s, lengths_s).halved(choice[1]) if lengths_s else steps
-        problem = problems[choice[0]]
-        solution = solve_heat(problem, given, relative_tolerance=_STEP_TOLERANCE, progress=progress)
-        solved[choice] = _compared(solution, num_nodes)
-        return problem, solution, time.perf_counter() - begin_s
-
-    def keep(choice: tuple[int, int], problem: HeatProblem, solution: HeatSolution, seconds: float) -> None:
-        of_halved = HALVED ** choice[1] * of_steps[: len(of_steps) - len(solution.effects)]
-        solution = replace(solution, time_error_k=float(np.max(np.abs(of_halved))))
-        run.add(problem, solution, seconds, _error_size(error(choice), solution), choice[0])
-
-    first = solve((0, 0))
-    lengths_s = first[1].step_lengths_s
-    begun = {(0, 0): first, (0, 1): solve((0, 1)), (1, 0): solve((1, 0))}
-    coarsest = solved[0, 0]
-    of_steps, of_mesh = ((coarsest - solved[finer]) / (1.0 - HALVED) for finer in ((0, 1), (1, 0)))
-    for choice, found in begun.items():
-        keep(choice, *found)
-    halvings = range(_MOST_HALVINGS + 1)
-    choices = sorted(product(halvings, halvings), key=lambda choice: _MESH_COST ** choice[0] * _STEP_COST ** choice[1])
-    while not run.met:
-        within = (c for c in choices if run.tolerance.excess(_error_size(error(c), first[1])) <= _AIM)
-        choice = next((choice for choice in within if choice not in solved), None)
-        if choice is None:
-            return f"It would take more than {_MOST_HALVINGS} halvings of the mesh size or of the steps"
-        failure = run.lacks_memory(1, choice[0], len(steps.times_s))
-        if failure:
-            return failure
-        found = solve(choice)
-        change, (mesh_gain, steps_gain) = coarsest - solved[choice], (1.0 - HALVED**number for number in choice)
-        if choice[0] > 0:
-            of_mesh = (change - of_steps * steps_gain) / mesh_gain
-        else:
-            of_steps = change / steps_gain
-        keep(choice, *found)
-    return ""
+        problem = _halved(problem, before if steady else None)

@@ -29,6 +29,7 @@ from thermoxels_ns.fem.quantities import Places, Quantity, Varying
 from thermoxels_ns.fem.selection import Selection, chosen_names, matching_names
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
+    Celsius,
     Convection,
     Effect,
     FixedTemperature,
@@ -42,7 +43,6 @@ from thermoxels_ns.heat.scene_fields import (
     INSIDE,
     OUTSIDE,
     WITH_RADIATION,
-    Celsius,
     Direction,
     Ground,
     InsideAir,
@@ -343,6 +343,11 @@ _UNIT_OF_KEY = {
 """Unit of a number by the end of its key; the first end that fits counts."""
 
 
+def unit_of(key: str) -> str | None:
+    """Return the unit of the number under a key, such as W/m2 for ``flux_w_m2``; None if the key does not tell."""
+    return next((unit for end, unit in _UNIT_OF_KEY.items() if key.endswith(end)), None)
+
+
 def _without_units(name: str, content: Any) -> Any:
     """Return the content of a file with texts such as ``20.5 C`` or ``24 h`` as numbers in the units of their keys."""
     if isinstance(content, list):
@@ -351,7 +356,7 @@ def _without_units(name: str, content: Any) -> Any:
         return content
     found = {}
     for key, value in content.items():
-        unit = next((unit for end, unit in _UNIT_OF_KEY.items() if key.endswith(end)), None)
+        unit = unit_of(key)
         found[key] = value = _without_units(f"{name}: {key}", value)
         if unit is not None and isinstance(value, str) and value.lstrip(" +-.,\N{MINUS SIGN}")[:1].isdigit():
             measured = read_measured(f"{name}: {key}", value, unit, bare=True)

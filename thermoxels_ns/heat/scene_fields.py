@@ -16,8 +16,16 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
 from thermoxels_ns.core.yaml_records import raising, record
-from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying, tabulated
-from thermoxels_ns.heat.effects import HOTTEST_C, STEFAN_BOLTZMANN_W_M2K4, Convection
+from thermoxels_ns.fem.quantities import Places, Quantity, Varying, tabulated
+from thermoxels_ns.heat.effects import (
+    HOTTEST_C,
+    STEFAN_BOLTZMANN_W_M2K4,
+    AtLeastZero,
+    Celsius,
+    Convection,
+    Fraction,
+    Names,
+)
 from thermoxels_ns.heat.sky import Vector
 from thermoxels_ns.heat.weather_file import read_weather
 
@@ -66,11 +74,7 @@ def _direction(vector: Vector) -> Vector:
     return vector
 
 
-Celsius: TypeAlias = Annotated[float, Field(ge=-ZERO_CELSIUS_K, le=HOTTEST_C)]
-AtLeastZero: TypeAlias = Annotated[float, Field(ge=0.0)]
-Fraction: TypeAlias = Annotated[float, Field(ge=0.0, le=1.0)]
 Direction: TypeAlias = Annotated[Vector, AfterValidator(_direction)]
-Patches: TypeAlias = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
 @record(HeatError)
@@ -103,7 +107,12 @@ class _Air:
         if self.air_series is None:
             return self.air_c
         hours, air_c = self.series()
-        Bounds("air_c", "degrees Celsius", -ZERO_CELSIUS_K, HOTTEST_C).check(air_c)
+        if air_c.min() < -ZERO_CELSIUS_K or air_c.max() > HOTTEST_C:
+            expected, got = (
+                f"temperatures from {-ZERO_CELSIUS_K} to {HOTTEST_C:g} C",
+                f"{air_c.min():g} to {air_c.max():g}",
+            )
+            raise unclear(f"air_series: {self.air_series}", expected, got, "Correct the file.")
         return tabulated(3600.0 * hours, air_c)
 
     def series(self) -> tuple[FloatArray, FloatArray]:
@@ -131,7 +140,7 @@ class InsideAir(_Air):
     heat_flow: HeatFlow = "into-body"
     """into-body: the air is warmer than the surfaces, as in a heated room, and loses most to the ceiling; out-of-body:
     the air is colder. Named coefficients depend on this field."""
-    patches: Patches = INSIDE  # Patches that the air acts on, by name or pattern
+    patches: Names = INSIDE  # Patches that the air acts on, by name or pattern
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -162,7 +171,7 @@ class OutsideAir(_Air):
     wind_m_s: AtLeastZero | None = None
     """Wind speed v beside the surfaces, [m / s]; needed by all named coefficients but iso-6946-combined."""
     emissivity: Fraction | None = None  # Emissivity of the surfaces, 0 to 1, needed by iso-6946-separate alone
-    patches: Patches = OUTSIDE  # Patches that the air acts on, by name or pattern
+    patches: Names = OUTSIDE  # Patches that the air acts on, by name or pattern
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -189,7 +198,7 @@ class Surface:
     emissivity: Fraction | None = None
     """Emissivity for long-wave radiation, 0 to 1; None: the patches exchange no radiation with sky and ground."""
     absorptivity: Fraction | None = None  # Share of the sunlight that the patches absorb, 0 to 1; None: no sunlight
-    patches: Patches = OUTSIDE
+    patches: Names = OUTSIDE
     """Patches, by name or pattern; if several entries give a property of one patch, the last one holds."""
 
     def __post_init__(self) -> None:
@@ -252,7 +261,7 @@ class Sun:
     """Direct light on a surface that faces the sun, [W / m2], at least 0, as long as the sun is up."""
     diffuse_w_m2: AtLeastZero = 0.0
     """Light from the sky on a surface that faces up, [W / m2], at least 0, as long as the sun is up."""
-    patches: Patches = OUTSIDE  # Patches that sunlight may reach, by name or pattern
+    patches: Names = OUTSIDE  # Patches that sunlight may reach, by name or pattern
 
     def __post_init__(self) -> None:
         check_one(start=self.start, towards=self.towards)

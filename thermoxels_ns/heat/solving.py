@@ -6,14 +6,16 @@ import time as clock
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError, HeatMemoryError
-from thermoxels_ns.fem.forms import FixedForm, effect_forms
+from thermoxels_ns.core.yaml_records import record
+from thermoxels_ns.fem.forms import FixedForm, FluxForm, SourceForm, effect_forms
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
-from thermoxels_ns.fem.quantities import Bounds
 from thermoxels_ns.fem.solution import Solution, SteadySolution, mean_flows_w
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.steady import solve_steady
@@ -26,6 +28,7 @@ from thermoxels_ns.fem.tolerance import (
     solve_to_tolerance,
     steady_error,
 )
+from thermoxels_ns.heat.effects import AboveZero, Fraction
 
 Say = Callable[[str], None]
 Time = TimeSteps | AdaptiveSteps | None  # Time steps in which a body is followed; None: its steady state
@@ -38,37 +41,23 @@ MOST_ESTIMATED = 300_000
 quadratic tetrahedra, which take 60 times as long as linear ones (131,712 tetrahedra: 5.4 s instead of 0.09 s)."""
 SAY_EVERY_S = 10.0  # Least time between two lines of progress, [s]
 
-_BOUNDS = {
-    "tolerance_k": Bounds("tolerance", "K", 0.0, above_low=True, remedy="Pass --tolerance 0.05."),
-    "flow_tolerance": Bounds(
-        "flow-tolerance", "share of the heat flow", 0.0, 1.0, above_low=True, remedy="Pass --flow-tolerance 0.01."
-    ),
-    "leave_out_below": Bounds(
-        "leave-out-below", "share of the heat flow", 0.0, 1.0, remedy="Pass --leave-out-below 0.005."
-    ),
-    "memory_gb": Bounds("memory-gb", "GiB", 0.0, above_low=True, remedy="Pass --memory-gb 4."),
-}
 
-
-@dataclass(frozen=True)
+@record(HeatError)
 class Goals:
     """The errors and the memory that a solution may have; raises `HeatError` if numbers are out of range or clash."""
 
-    tolerance_k: float | None = None  # Largest allowed error of any temperature, [K]; None: any error
-    flow_tolerance: float | None = None
+    tolerance_k: AboveZero | None = None  # Largest allowed error of any temperature, [K]; None: any error
+    flow_tolerance: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
     """Largest allowed error of the mean heat flow of any effect, as a share of all heat; None: any error."""
-    leave_out_below: float | None = None
+    leave_out_below: Fraction | None = None
     """Share of all heat that effects left out may bring together; None: `LEAVE_OUT_BELOW`, or 0 beside a tolerance."""
-    memory_gb: float | None = 4.0  # Most memory that solving may take, [GiB]; None: any amount
+    memory_gb: AboveZero | None = 4.0  # Most memory that solving may take, [GiB]; None: any amount
     allow_unmet: bool = False  # True: if a tolerance cannot be met, return the best solution that fits into memory
 
     def __post_init__(self) -> None:
-        for name, bounds in _BOUNDS.items():
-            if getattr(self, name) is not None:
-                bounds.check(getattr(self, name))
         if self.estimated and self.leave_out_below:
             expected, remedy = "0 or nothing beside a tolerance", "Remove one of the two."
-            raise HeatError("leave-out-below", expected=expected, got=f"{self.leave_out_below:g}", remedy=remedy)
+            raise HeatError("leave_out_below", expected=expected, got=f"{self.leave_out_below:g}", remedy=remedy)
 
     @property
     def estimated(self) -> bool:
@@ -92,7 +81,7 @@ class Goals:
         if time is not None and self.flow_tolerance is not None and self.tolerance_k is None:
             expected = "--tolerance beside it if the scene has a duration"
             remedy = "Pass --tolerance too: steps in time are chosen by it."
-            raise HeatError("flow-tolerance", expected=expected, got="none", remedy=remedy)
+            raise HeatError("flow_tolerance", expected=expected, got="none", remedy=remedy)
 
 
 @dataclass(frozen=True)
@@ -168,10 +157,10 @@ def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
     An effect's power is its heat flow at the coldest and the warmest temperature of start and surroundings. Where any
     effect changes with time, all are kept: what they bring between kept times is not known.
     """
-    if time is not None and any(one.bounded(name).in_time for one in problem.effects for name in one.bounds):
+    if time is not None and any(effect.changing for effect in problem.effects):
         return []
     forms = effect_forms(problem, Space(problem.selection), 0.0)
-    around_c = [form.surroundings_k(0.0).ravel() for form in (*forms.convection, *forms.radiation, *forms.fixed)]
+    around_c = [form.surroundings_k(0.0).ravel() for form in forms if not isinstance(form, (FluxForm, SourceForm))]
     every_c = np.concatenate([np.zeros(0) if time is None else problem.start_c, *around_c])
     ends_c = [every_c.min(), every_c.max()] if len(every_c) else [0.0]
     states_c = np.repeat(np.array(ends_c)[:, None], len(problem.mesh.points_m), axis=1)
@@ -195,11 +184,11 @@ def _largest_w(problem: HeatProblem, chosen: Sequence[int], states_c: FloatArray
     forms = effect_forms(problem, Space(problem.selection), reference_c)
     numbers = {label: number for number, label in enumerate(effect_labels(problem))}
     largest = dict.fromkeys(chosen, 0.0)
-    for form in (*forms.exchanging, *forms.fixed):
+    for form in forms:
         number = numbers[form.effect]
         if number in largest:
             effect = problem.effects[number]
-            if isinstance(form, FixedForm) or any(effect.bounded(name).in_time for name in effect.bounds):
+            if isinstance(form, FixedForm) or effect.changing:
                 largest[number] = np.inf
             else:
                 flows_w = (np.abs(form.part_heat_w(one - reference_c, 0.0)) for one in states_c[:, :num_nodes])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
@@ -40,7 +41,7 @@ def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution, st
     folder = writable_folder(pvd.with_suffix(""))
     steps = heat_series_paths(pvd, len(states))[1:]
     for path, state in zip(steps, states):
-        write_vtu(path, mesh, temperature_c=solution.temperature_c[state])
+        write_vtu(path, replace(mesh, temperature_c=solution.temperature_c[state]))
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
     collection = ElementTree.SubElement(root, "Collection")
     for path, time_s in zip(steps, solution.times_s[states]):

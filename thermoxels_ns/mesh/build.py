@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_patches, apply_regions
@@ -86,9 +84,9 @@ def build_mesh(
         metres_per_unit: Length, [m], of the unit of the input poses, in which the region's box or point is given.
 
     Raises:
-        MeshError: `select_solid` fails, `world_to_metres` is no similarity, or no node of the mesh was measured.
+        MeshError: `select_solid` fails, or no node of the mesh was measured.
     """
-    transform = check_similarity("world_to_metres", world_to_metres)
+    transform = np.asarray(world_to_metres, dtype=np.float64)
     scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
     solid = select_solid(snapshot, selection, scale, transform[:3] / metres_per_unit)
     if voxel:
@@ -207,20 +205,6 @@ def _tagged(
         colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),
     )
     return Boundary(seen=seen, patch=patch, patch_names=names), idle
-
-
-def check_similarity(name: str, matrix: npt.ArrayLike) -> FloatArray:
-    """Return `matrix` (4, 4) as float64. Raise `MeshError` about `name` if it is no similarity, reflected or not."""
-    remedy = "Pass a 4x4 matrix made of a rotation, one scale above 0 and a shift, with last row 0 0 0 1."
-    transform = check_shape(name, np.asarray(matrix, dtype=np.float64), (4, 4), remedy, MeshError)
-    check_finite(name, transform, remedy, MeshError)
-    linear = transform[:3, :3]
-    squared = linear.T @ linear
-    scale = np.trace(squared) / 3.0
-    similar = scale > 0.0 and np.allclose(squared, scale * np.eye(3), rtol=0.0, atol=1e-5 * scale)
-    if not similar or not np.array_equal(transform[3], [0.0, 0.0, 0.0, 1.0]):
-        raise MeshError(name, expected="a similarity", got=transform.tolist(), remedy=remedy)
-    return transform
 
 
 def apply_transform(matrix: FloatArray, points: FloatArray) -> FloatArray:

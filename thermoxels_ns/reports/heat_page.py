@@ -8,12 +8,13 @@ from dataclasses import fields
 import numpy as np
 
 from thermoxels_ns.fem.problem import effect_labels
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.quantities import Varying, values_at
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.heat.effects import Effect, FixedTemperature, InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.run import HeatRun, mesh_error_in_words
+from thermoxels_ns.heat.scene import unit_of
 from thermoxels_ns.reports.charts import plot_over_time
 from thermoxels_ns.reports.numbers import point_text, unit_signs
 from thermoxels_ns.reports.page import Report, build_page
@@ -58,12 +59,12 @@ def heat_page(
 def _values(effect: Effect, selection: Selection) -> str:
     """Return the quantities of an effect as text with units, without quantities at their default."""
     shown = []
-    for field in fields(effect):  # type: ignore[arg-type]
-        if field.name not in effect.bounds or getattr(effect, field.name) == field.default:
+    for field in fields(effect)[1:]:  # type: ignore[arg-type]
+        value, unit = getattr(effect, field.name), unit_of(field.name) or "1"
+        if value == field.default:
             continue
-        value, unit = getattr(effect, field.name), effect.bounds[field.name].unit
         name = field.name.rsplit("_w_m", 1)[0].removesuffix("_c").removesuffix("_m2k").replace("_", " ")
-        unit = {"1": "", "degrees Celsius": " °C"}.get(unit, f" {unit_signs(unit)}")
+        unit = {"1": "", "C": " °C"}.get(unit, f" {unit_signs(unit)}")
         if not isinstance(value, Varying):
             shown.append(f"{name} {value:g}{unit}")
         elif isinstance(effect, FixedTemperature):
@@ -73,7 +74,7 @@ def _values(effect: Effect, selection: Selection) -> str:
                 places = selection.tet_places(selection.tets(effect.where))
             else:
                 places = selection.facet_places(selection.facets(effect.where))
-            values = effect.bounded(field.name).at(places, 0.0)
+            values = values_at(value, places, 0.0)
             changes = ", changes with time" if value.in_time else ""
             ends = dict.fromkeys(f"{end:.3g}" for end in (values.min(), values.max())) if len(values) else ("nowhere",)
             shown.append(f"{name} {' to '.join(ends)}{unit}{changes}")

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from thermoxels_ns.core.errors import MeshError, OutputError
-from thermoxels_ns.mesh.files.content import checked_mesh, surface_of
+from thermoxels_ns.mesh.files.content import checked_tags, nodes_and_triangles
 from thermoxels_ns.mesh.files.formats import MESH_FORMATS, mesh_file_paths, write_mesh
 from thermoxels_ns.mesh.files.solvers import HeatStep
 from thermoxels_ns.mesh.files.surface import write_glb, write_ply, write_stl
@@ -43,7 +43,7 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
 def test_a_damaged_mesh_is_refused(tagged_mesh, field, change):
     damaged = dataclasses.replace(tagged_mesh, **{field: change(getattr(tagged_mesh, field))})
     with pytest.raises(MeshError, match=f"^mesh {field}: expected"):
-        checked_mesh(damaged)
+        checked_tags(damaged)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -100,19 +100,19 @@ def test_stl_far_from_the_origin_is_refused_and_ply_holds_it(tmp_path, tagged_me
         write_mesh(tmp_path / "far.stl", far)
     assert not list(tmp_path.iterdir())
     write_ply(tmp_path / "far.ply", far)
-    assert np.array_equal(meshio.read(tmp_path / "far.ply").points, surface_of(far.points_m, far.facets).points_m)
+    assert np.array_equal(meshio.read(tmp_path / "far.ply").points, far.points_m[nodes_and_triangles(far.facets)[0]])
 
 
 def test_ply_holds_colours_of_the_photographs_and_temperatures(tmp_path, tagged_mesh):
     write_ply(tmp_path / "house.ply", tagged_mesh)
     read = meshio.read(tmp_path / "house.ply")
-    surface = surface_of(tagged_mesh.points_m, tagged_mesh.facets)
-    assert np.array_equal(read.points, surface.points_m)
-    assert np.array_equal(surface.nodes[read.cells_dict["triangle"]], tagged_mesh.facets)
-    assert read.point_data["temperature_c"] == pytest.approx(tagged_mesh.temperature_c[surface.nodes], rel=1e-6)
-    assert np.array_equal(read.point_data["observed"], tagged_mesh.observed[surface.nodes])
+    nodes, _ = nodes_and_triangles(tagged_mesh.facets)
+    assert np.array_equal(read.points, tagged_mesh.points_m[nodes])
+    assert np.array_equal(nodes[read.cells_dict["triangle"]], tagged_mesh.facets)
+    assert read.point_data["temperature_c"] == pytest.approx(tagged_mesh.temperature_c[nodes], rel=1e-6)
+    assert np.array_equal(read.point_data["observed"], tagged_mesh.observed[nodes])
     rgb = colours(read)
-    assert np.abs(rgb / 255.0 - tagged_mesh.colour[surface.nodes]).max() <= 0.5 / 255.0 + 1e-6
+    assert np.abs(rgb / 255.0 - tagged_mesh.colour[nodes]).max() <= 0.5 / 255.0 + 1e-6
     assert b"comment colours: photographs\n" in (tmp_path / "house.ply").read_bytes()
 
 
@@ -139,17 +139,17 @@ def read_glb(path: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
 def test_trimesh_reads_a_closed_body_that_stands_upright_with_its_temperatures(tmp_path, tagged_mesh):
     write_glb(tmp_path / "house.glb", tagged_mesh)
     stored, matrix = read_glb(tmp_path / "house.glb")
-    surface = surface_of(tagged_mesh.points_m, tagged_mesh.facets)
-    assert np.array_equal(stored.vertices, surface.points_m.astype("<f4"))
-    assert np.array_equal(stored.faces, surface.triangles)
-    temperature = tagged_mesh.temperature_c[surface.nodes]
+    nodes, triangles = nodes_and_triangles(tagged_mesh.facets)
+    assert np.array_equal(stored.vertices, tagged_mesh.points_m[nodes].astype("<f4"))
+    assert np.array_equal(stored.faces, triangles)
+    temperature = tagged_mesh.temperature_c[nodes]
     assert np.array_equal(stored.vertex_attributes["_TEMPERATURE_C"].ravel(), temperature.astype("<f4"))
     extras = {"colours": "temperature", "lowest_c": temperature.min(), "highest_c": temperature.max()}
     assert extras.items() <= stored.metadata.items()
     placed = stored.copy().apply_transform(matrix)
     assert placed.is_watertight
     assert placed.volume == pytest.approx(signed_volumes(tagged_mesh.points_m, tagged_mesh.tets).sum(), rel=1e-5)
-    x, y, z = surface.points_m.T
+    x, y, z = tagged_mesh.points_m[nodes].T
     assert placed.vertices == pytest.approx(np.column_stack([x, z, -y]), abs=1e-5)
 
 

@@ -1,7 +1,6 @@
 import itertools
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,15 +14,12 @@ from tests.support.heat_meshes import mesh_from
 from tests.support.small_fields import crossed_diagonals
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import (
-    SurfaceComponent,
     boundary_facets,
-    count_open_edges,
     count_overlaps,
     group_sides,
-    surface_topology,
+    surface_components,
 )
 from thermoxels_ns.mesh.quality.report import (
-    angle_edges,
     check_mesh,
     picture_of_quality,
     quality_report,
@@ -104,47 +100,23 @@ def test_triangles_at_an_edge_that_lie_on_each_other_are_found_in_any_order(face
         assert count_overlaps(POINTS, np.array(order), group_sides(np.array(order))) == overlaps
 
 
-def topology_of(cells: np.ndarray):
-    corners, tets = kuhn_tets(cells)
-    facets = boundary_facets(tets)
-    assert count_open_edges(facets, group_sides(facets)) == 0
-    return SimpleNamespace(**surface_topology(corners.astype(float), facets, group_sides(facets)))
-
-
-@pytest.mark.parametrize("holes", [0, 1, 2, 5])
-def test_a_plate_with_holes_has_as_many_handles(holes):
-    cells = np.ones((2 * holes + 1, 3, 1), dtype=bool)
-    cells[1::2, 1] = False
-    found = topology_of(cells)
-    assert [component.genus for component in found.components] == [holes]
-    assert found.euler_characteristic == 2 - 2 * holes
-    assert (found.genus, found.num_non_manifold_edges, found.num_non_manifold_vertices) == (holes, 0, 0)
-
-
-def test_a_cavity_is_a_component_of_its_own():
+def test_a_cavity_is_a_component_of_its_own(mesh_of_cells):
     cells = np.ones((5, 4, 4), dtype=bool)
     cells[1:3, 1, 1] = False
-    outside, inside = SurfaceComponent(2 * (4 * 20 + 2 * 16), 2, 0, False), SurfaceComponent(2 * 10, 2, 0, True)
-    assert topology_of(cells).components == (outside, inside)
+    facets = boundary_facets(kuhn_tets(cells)[1])
+    cavity = surface_components(kuhn_tets(cells)[0].astype(float), facets, group_sides(facets))
+    assert sorted(cavity.tolist()) == [False, True]
+    report = quality_report(mesh_of_cells(cells), "voxel")
+    assert (report.num_components, report.num_cavities, report.num_non_manifold_edges) == (2, 1, 0)
 
 
-def test_cubes_that_touch_at_a_point():
-    cells = np.zeros((2, 2, 2), dtype=bool)
-    cells[0, 0, 0] = cells[1, 1, 1] = True
-    found = topology_of(cells)
-    assert found.components == (SurfaceComponent(12, 2, 0, False),) * 2  # each is a sphere
-    assert (found.num_non_manifold_edges, found.num_non_manifold_vertices) == (0, 1)
-    assert found.euler_characteristic == 3  # two spheres share one vertex
-
-
-@pytest.mark.parametrize(("depth", "chain", "edges", "vertices"), [(1, False, 1, 2), (2, True, 0, 1)])
-def test_cubes_that_touch_along_an_edge_and_a_body_pinched_at_a_vertex_have_no_genus(depth, chain, edges, vertices):
-    # The chain of voxels goes around two opposite corners of a cube, which meet at its middle only.
-    cells = np.full((2, 2, depth), chain)
-    cells[0, 0, 0] = cells[1, 1, -1] = not chain
-    found = topology_of(cells)
-    assert (found.num_non_manifold_edges, found.num_non_manifold_vertices) == (edges, vertices)
-    assert [component.genus for component in found.components] == [None] and found.genus is None
+@pytest.mark.parametrize(("depth", "edges"), [(1, 1), (2, 0)])
+def test_edges_where_a_boundary_touches_itself_are_counted(mesh_of_cells, depth, edges):
+    """Two cubes that share an edge, or a corner alone."""
+    cells = np.zeros((2, 2, depth), dtype=bool)
+    cells[0, 0, 0] = cells[1, 1, -1] = True
+    report = quality_report(mesh_of_cells(cells), "voxel")
+    assert (report.num_components, report.num_non_manifold_edges) == (2 - edges, edges)
 
 
 NAMES = ("volumes_positive", "conforming", "boundary_closed", "dihedral_within_bounds", "temperatures_in_range")
@@ -159,22 +131,15 @@ def test_a_voxel_mesh_meets_every_criterion(box_mesh):
     assert (report.num_nodes, report.num_tets, report.num_edges) == (60, 144, 133 + 98 + 24)
     assert report.volume_m3 == pytest.approx(3.0) and report.area_m2 == pytest.approx(13.0)
     assert report.edge_length_m[0] == 0.5 and report.edge_length_m[2] == pytest.approx(0.5 * np.sqrt(3))
-    assert (report.bodies_by_node, report.bodies_by_face, report.genus, report.euler_characteristic) == (1, 1, 0, 2)
-    assert (len(report.components), report.num_cavities) == (1, 0)
+    assert (report.bodies_by_node, report.bodies_by_face) == (1, 1)
+    assert (report.num_components, report.num_cavities) == (1, 0)
 
 
-def test_histograms_of_a_voxel_mesh_by_hand(box_mesh):
-    report = quality_report(box_mesh, "voxel")
-    angles = {number: count for number, count in enumerate(report.dihedral_counts) if count}
-    # Of each tetrahedron; 45 and 90 degrees are the bounds, and lie within.
-    assert angles == {10: 2 * 144, 13: 144, 19: 3 * 144}
-    assert (np.searchsorted(angle_edges("voxel"), [45, 60, 90]) - 1).tolist() == [10, 13, 19]
-    # Legs a, a, a at right angles in a row: r = 6 V / (2 A) with V = a^3 / 6, A = (1 + sqrt 2) a^2; R = sqrt(3) a / 2.
-    ratio = 3 * (1 / (2 * (1 + np.sqrt(2)))) / (np.sqrt(3) / 2)
-    assert report.radius_ratio_range == pytest.approx((ratio, ratio))
-    assert np.flatnonzero(report.radius_ratio_counts).tolist() == [int(ratio / 0.05)]
-    assert len(report.dihedral_counts) == 40 and len(report.radius_ratio_counts) == 20
-    assert sum(report.dihedral_counts) == 6 * 144 and sum(report.radius_ratio_counts) == 144
+def test_the_histogram_of_a_voxel_mesh_by_hand(box_mesh):
+    """Two angles of 45, one of 60 and three of 90 degrees in each tetrahedron; rounding decides about edges of bins."""
+    counts = np.array(quality_report(box_mesh, "voxel").dihedral_counts)
+    assert len(counts) == 36 and counts.sum() == 6 * 144
+    assert (counts[8:10].sum(), counts[11:13].sum(), counts[17:19].sum()) == (2 * 144, 144, 3 * 144)
 
 
 @pytest.mark.parametrize(("degrees", "broken"), [(10.8, False), (10.6, True)])
@@ -230,11 +195,9 @@ def test_mapping_is_json_and_complete(mesh_of_cells):
     cells[::2] = True  # 30 bodies
     report = quality_report(mesh_of_cells(cells), "voxel", length_unit="input unit")
     mapping = json.loads(json.dumps(report.as_mapping(), allow_nan=False))
-    assert len(mapping["largest_components"]) == 20 and mapping["num_components"] == 30
-    assert mapping["largest_components"][0]["num_triangles"] == 12
+    assert mapping["num_components"] == 30 and mapping["num_cavities"] == 0
     angles = mapping["dihedral_counts"]
-    assert angles["bin_width"] == pytest.approx(4.5, rel=1e-4) and sum(angles["counts"]) == 6 * 180
-    assert angles["first_centre"] == pytest.approx(2.25, abs=1e-3)
+    assert (angles["bin_width"], angles["first_centre"], sum(angles["counts"])) == (5.0, 2.5, 6 * 180)
     assert mapping["dihedral_range_deg"] == pytest.approx({"min": 45.0, "max": 90.0})
     assert [criterion["name"] for criterion in mapping["promises"]] == list(VOXEL_NAMES)
     assert set(mapping["promises"][0]) == {"name", "sentence", "kept", "figure", "found"}
@@ -280,7 +243,6 @@ def test_regular_tetrahedron():
     cosines = shapes.dihedral_cosines()
     assert cosines[:, 0] == pytest.approx([1 / 3] * 6)
     assert shapes.volumes.tolist() == pytest.approx([8 / 3])
-    assert shapes.radius_ratios() == pytest.approx([1.0], abs=1e-14)
     # Edge length l: each edge adds -cot(angle) l / 6 = -l / (6 sqrt 8).
     assert shapes.stiffness()[:, 0] == pytest.approx([-np.sqrt(8) / (6 * np.sqrt(8))] * 6)
 

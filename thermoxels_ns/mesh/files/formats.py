@@ -51,8 +51,8 @@ def write_mesh(
         The paths of all files written, `path` first.
 
     Raises:
-        MeshError: An array does not fit the mesh or is not finite; or `heat_step` is missing for .inp, `up` is no
-            direction, the mesh is too far from the origin for .stl, or names are too long or alike for the format.
+        MeshError: An array does not fit the mesh or is not finite; or `up` is no direction, the mesh is too
+            far from the origin for .stl, or names are too long or alike for the format.
         OutputError: No format has this ending, or a file cannot be written.
     """
     path, written = Path(path), mesh_file_paths(path)
@@ -60,6 +60,7 @@ def write_mesh(
         write_boundary_vtp(boundary_path(path), mesh)
         write_vtu(path, mesh)
     elif path.suffix == ".inp":
+        assert heat_step is not None, "an .inp file computes heat"
         write_inp(path, mesh, heat_step)
     elif path.suffix == ".glb":
         write_glb(path, mesh, up=up)

@@ -13,15 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_positive, remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
-from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays
+from thermoxels_ns.core.units import STEFAN_BOLTZMANN_W_M2K4, ZERO_CELSIUS_K
+from thermoxels_ns.mesh.files.content import checked_tags, node_arrays
 from thermoxels_ns.mesh.quality.checks import facet_owners
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_areas
 
-STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
-"""Stefan-Boltzmann constant (CODATA 2018, exact to the digits given), [W / (m2 K4)]."""
 BODY_GRID, FACET_GRID = "mesh", "facets"
 """Names of the two grids in .xdmf files, of tetrahedra and of boundary triangles; "mesh" is the default in FEniCSx."""
 TEMPERATURE_VIEW = "temperature_c"  # name of the view of nodal temperatures in .msh files, [degrees Celsius]
@@ -67,7 +65,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     if path == heavy_data_path(path):
         remedy = "Name the .xdmf; the .h5 beside it is written with it."
         raise OutputError(str(path), expected="a name that ends in .xdmf", got=path.suffix, remedy=remedy)
-    mesh, tags = checked_mesh(mesh)
+    tags = checked_tags(mesh)
     arrays: dict[str, npt.NDArray] = {
         "points_m": mesh.points_m,
         "tets": mesh.tets.astype(np.int64),
@@ -140,10 +138,10 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
     Layout: "MSH file format", Gmsh reference manual, version 4.1; meshio cannot write a patch named like a region.
 
     Raises:
-        MeshError: A name is too long for Gmsh, or what `checked_mesh` and `facet_owners` raise.
+        MeshError: A name is too long for Gmsh, or what `TetMesh.check` and `facet_owners` raise.
     """
     path = Path(path)
-    mesh, tags = checked_mesh(mesh)
+    tags = checked_tags(mesh)
     for name in (*mesh.region_names, *tags.patch_names):
         if len(name.encode()) > _LONGEST_GMSH_NAME:
             expected = f"at most {_LONGEST_GMSH_NAME} bytes, which is what Gmsh reads"
@@ -264,12 +262,8 @@ class HeatStep:
     steps: int  # Number of steps, at least 1
     step_seconds: float  # Length of a step, [s], above 0
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            check_positive(name, value, "Pass a number above 0.", MeshError)
 
-
-def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> None:
+def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep) -> None:
     """Write a mesh as an input file of CalculiX and Abaqus that runs as it is: ``ccx NAME`` for ``NAME.inp``.
 
     Units are metres, kilograms, seconds and degrees Celsius; node k and tetrahedron k get the number k + 1. Contents:
@@ -282,15 +276,10 @@ def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> No
     - Initial temperatures, and a heat transfer step without boundary conditions that prints temperatures (``NT``).
 
     Names are in capitals, and other characters than letters, digits and underscores become underscores. Empty regions
-    and patches are left out, because an empty set stops a solver. Raises `MeshError` if `heat_step` is None or the mesh
-    has no temperatures.
+    and patches are left out, because an empty set stops a solver. Raises `MeshError` if the mesh has no temperatures.
     """
     path = Path(path)
-    if heat_step is None:
-        expected = "material and times, which an .inp file runs with"
-        remedy = "Pass heat_step=HeatStep(...), or choose another format."
-        raise MeshError("heat_step", expected=expected, got=None, remedy=remedy)
-    mesh, tags = checked_mesh(mesh)
+    tags = checked_tags(mesh)
     check_start(mesh)
     regions = _set_names("region_names", mesh.region_names)
     patches = _set_names("boundary.patch_names", tags.patch_names)

@@ -12,7 +12,7 @@ import numpy as np
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.files.content import checked_mesh, colour_bytes, surface_of, write_bytes
+from thermoxels_ns.mesh.files.content import colour_bytes, nodes_and_triangles, write_bytes
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas
 
 _ROUNDING_NOTICED = 0.01  # largest move of a node by rounding, as a share of a triangle's side
@@ -59,28 +59,28 @@ def write_ply(path: Path | str, mesh: TetMesh) -> None:
     Positions have double precision, which trimesh and VTK do not write.
     """
     path = Path(path)
-    mesh, _ = checked_mesh(mesh)
-    surface = surface_of(mesh.points_m, mesh.facets)
-    temperature_c = mesh.temperature_c[surface.nodes]
+    mesh.check()
+    nodes, triangles = nodes_and_triangles(mesh.facets)
+    points, temperature_c = mesh.points_m[nodes], mesh.temperature_c[nodes]
     if mesh.colour is None and mesh.has_temperatures:
         low, high = _range_c(temperature_c)
         shown = f"{_COLOUR_MAP} from {low:.6g} to {high:.6g} degrees Celsius"
         colours = colour_bytes(_temperature_colours(temperature_c))
     else:
-        shown, colours = "photographs", colour_bytes(_photographed_colours(mesh)[surface.nodes])
+        shown, colours = "photographs", colour_bytes(_photographed_colours(mesh)[nodes])
     columns = {
-        **{name: ("double", "<f8", values) for name, values in zip("xyz", surface.points_m.T)},
+        **{name: ("double", "<f8", values) for name, values in zip("xyz", points.T)},
         **{name: ("uchar", "u1", values) for name, values in zip(("red", "green", "blue"), colours.T)},
     }
     if mesh.has_temperatures:
         columns["temperature_c"] = ("float", "<f4", temperature_c)
-        columns["observed"] = ("uchar", "u1", mesh.observed[surface.nodes])
-    vertices = np.empty(len(surface.nodes), dtype=[(name, kind) for name, (_, kind, _) in columns.items()])
+        columns["observed"] = ("uchar", "u1", mesh.observed[nodes])
+    vertices = np.empty(len(nodes), dtype=[(name, kind) for name, (_, kind, _) in columns.items()])
     for name, (_, _, values) in columns.items():
         vertices[name] = values
-    faces = np.empty(len(surface.triangles), dtype=[("count", "u1"), ("nodes", "<i4", 3)])
+    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("nodes", "<i4", 3)])
     faces["count"] = 3
-    faces["nodes"] = surface.triangles
+    faces["nodes"] = triangles
 
     header = [
         "ply",
@@ -109,10 +109,10 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
     from trimesh.exchange.gltf import export_glb
 
     path = Path(path)
-    mesh, _ = checked_mesh(mesh)
-    surface = surface_of(mesh.points_m, mesh.facets)
-    temperature_c = mesh.temperature_c[surface.nodes]
-    if not len(surface.triangles):
+    mesh.check()
+    nodes, triangles = nodes_and_triangles(mesh.facets)
+    points, temperature_c = mesh.points_m[nodes], mesh.temperature_c[nodes]
+    if not len(triangles):
         remedy = "Build the mesh with its boundary."
         raise MeshError("facets", expected="at least one triangle", got="none", remedy=remedy)
     x, y, z = check_direction("up", up, "Pass for instance (0, 0, 1).", MeshError).tolist()
@@ -120,25 +120,25 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
     level = math.hypot(x, z)
     turn = trimesh.transformations.rotation_matrix(math.atan2(level, y), (-z, 0.0, x) if level else (1.0, 0.0, 0.0))
     # At five million metres from the origin, single precision has steps of half a metre.
-    lower, upper = surface.points_m.min(axis=0), surface.points_m.max(axis=0)
-    far = np.abs(surface.points_m).max() > _FAR_SIZES * (upper - lower).max()
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    far = np.abs(points).max() > _FAR_SIZES * (upper - lower).max()
     origin = np.round(0.5 * (lower + upper)) if far else np.zeros(3)
     turn = turn @ trimesh.transformations.translation_matrix(origin)
     meaning: dict[str, Any] = {"colours": "photographs"}
-    attributes: dict[str, Any] = {"_COLOR_0": _light(_photographed_colours(mesh)[surface.nodes])}
+    attributes: dict[str, Any] = {"_COLOR_0": _light(_photographed_colours(mesh)[nodes])}
     if mesh.has_temperatures:
         meaning = dict(zip(("colours", "lowest_c", "highest_c"), ("temperature", *_range_c(temperature_c))))
         attributes["_COLOR_0"] = _light(_temperature_colours(temperature_c))
         attributes["_TEMPERATURE_C"] = temperature_c.astype(np.float32)
-    triangles = trimesh.Trimesh(
-        surface.points_m - origin,
-        surface.triangles,
+    shown = trimesh.Trimesh(
+        points - origin,
+        triangles,
         process=False,
         metadata=meaning,
         vertex_attributes=attributes,
     )
     scene = trimesh.Scene()
-    scene.add_geometry(triangles, node_name="surface", geom_name="surface", transform=turn)
+    scene.add_geometry(shown, node_name="surface", geom_name="surface", transform=turn)
     write_bytes(path, [export_glb(scene, tree_postprocessor=_finish)])
 
 

@@ -21,7 +21,7 @@ from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_whe
 from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values, read_json_object
 from thermoxels_ns.mesh.boundary.patches import DEFAULT_REGION, default_patches
-from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays, surface_of
+from thermoxels_ns.mesh.files.content import checked_tags, node_arrays, nodes_and_triangles
 from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of, count_wrong_facets, group_faces
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import (
@@ -45,14 +45,12 @@ _DISK_IS_FULL = 20007  # VTK's error code
 _MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and a margin
 
 
-def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None) -> None:
+def write_vtu(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as a VTK unstructured grid (.vtu, read by ParaView, pyvista and meshio).
 
     Point arrays are `temperature_c` [degrees Celsius], `temperature_k` [K] and `observed` (1: measured, 0: extended)
     where temperatures are known, and `colour` (red, green, blue as bytes) where colours are. The cell array is
-    `region`; field arrays `region:NAME` hold the number of each region, from 1 as in every format. The argument
-    `temperature_c`, if given,
-    replaces the mesh's own.
+    `region`; field arrays `region:NAME` hold the number of each region, from 1 as in every format.
 
     Raises:
         MeshError: An array does not fit the mesh or is not finite.
@@ -60,7 +58,7 @@ def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
     """
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-    write_vtk(vtkXMLUnstructuredGridWriter(), Path(path), body_grid(mesh, temperature_c))
+    write_vtk(vtkXMLUnstructuredGridWriter(), Path(path), body_grid(mesh))
 
 
 def write_vtk(writer: Any, path: Path, data: Any) -> None:
@@ -271,11 +269,11 @@ def blocks_of(mesh: TetMesh, about: Mapping[str, Any]) -> pv.MultiBlock:
     return blocks
 
 
-def body_grid(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None = None) -> pv.UnstructuredGrid:
+def body_grid(mesh: TetMesh) -> pv.UnstructuredGrid:
     """Return the tetrahedra with the arrays that `vtu.write_vtu` names."""
     import pyvista as pv
 
-    mesh, _ = checked_mesh(mesh, temperature_c)
+    mesh.check()
     grid = pv.UnstructuredGrid({pv.CellType.TETRA: mesh.tets}, mesh.points_m)
     for name, values in node_arrays(mesh).items():
         grid.point_data[name] = values
@@ -293,8 +291,7 @@ def boundary_surface(mesh: TetMesh) -> pv.PolyData:
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkStringArray
 
-    mesh, tags = checked_mesh(mesh)
-    surface = surface_of(mesh.points_m, mesh.facets)
+    tags, (nodes, triangles) = checked_tags(mesh), nodes_and_triangles(mesh.facets)
     arrays: dict[str, npt.NDArray] = {
         "area_m2": facet_areas(mesh.points_m, mesh.facets),
         "normal": facet_normals(mesh.points_m, mesh.facets),
@@ -306,11 +303,11 @@ def boundary_surface(mesh: TetMesh) -> pv.PolyData:
     if tags.photographs is not None:
         arrays["photographs_seen"], arrays["photographs_supporting"] = tags.photographs.T.astype(np.int32)
 
-    data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
-    data.point_data["node"] = surface.nodes
+    data = pv.PolyData.from_regular_faces(mesh.points_m[nodes], triangles)
+    data.point_data["node"] = nodes
     for name, values in node_arrays(mesh).items():
         if name != "temperature_k":
-            data.point_data[name] = values[surface.nodes]
+            data.point_data[name] = values[nodes]
     for name, values in arrays.items():
         data.cell_data[name] = values
     names = vtkStringArray()  # pyvista's own way takes ASCII names only

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_normals
 
@@ -185,66 +184,17 @@ def count_tets_in_other_bodies(mesh: TetMesh) -> int:
     return found
 
 
-@dataclass(frozen=True)
-class SurfaceComponent:
-    """One component of the boundary: triangles that are connected by shared edges."""
+def surface_components(points: FloatArray, facets: IntArray, sides: Groups) -> BoolArray:
+    """Return for each part of a surface, joined by edges, whether it bounds a hole inside a body, shape (parts,).
 
-    num_triangles: int
-    euler_characteristic: int  # vertices - edges + triangles
-    genus: int | None
-    """Number of handles, (2 - Euler characteristic) / 2; None where the component is not a closed manifold."""
-    is_cavity: bool
-    """True if the component bounds a hole inside a body: the component is closed and its signed volume is negative."""
-
-
-def surface_topology(points: FloatArray, facets: IntArray, sides: Groups) -> dict[str, Any]:
-    """Return the components, handles and non-manifold edges and vertices of a triangulated surface.
-
-    The keys are names of fields of `report.QualityReport`. `sides` is `group_sides(facets)`.
+    Such a part is closed, and its normals point inwards, so that its signed volume is negative. `sides` is
+    `group_sides(facets)`.
     """
-    uses, (left, right) = sides.sizes, sides.pairs()
-    node, row = facets.ravel(), np.arange(facets.size)
-    following = row - row % 3 + (row + 1) % 3
+    left, right = sides.pairs()
     component = component_of(len(facets), left // 3, right // 3)
-    # Row 3 f + s also stands for the corner of triangle f at its node s. Two corners at one node belong to one fan if
-    # an edge of exactly two triangles lies between the corners.
-    of_two = np.zeros(len(row), dtype=bool)
-    of_two[sides.order] = np.repeat(uses == 2, uses)
-    left, right = left[of_two[left]], right[of_two[left]]
-    upwards = node < node[following]
-    low, high = np.where(upwards, row, following), np.where(upwards, following, row)
-    fan = component_of(len(row), np.concatenate([low[left], high[left]]), np.concatenate([low[right], high[right]]))
-    corner_of_fan = np.unique(fan, return_index=True)[1]
-    fans_at_node = np.bincount(node[corner_of_fan], minlength=1)
-
     count = int(component.max(initial=-1)) + 1
-
-    def per_component(rows: IntArray, weights: npt.NDArray | None = None) -> npt.NDArray:
-        return np.bincount(component[rows // 3], weights, minlength=count)
-
-    triangles, vertices = per_component(row[::3]), per_component(group_pairs(component[row // 3], node).first)
-    euler = vertices - per_component(sides.first) + triangles
-    closed = (per_component(sides.first, uses != 2) == 0) & (per_component(corner_of_fan) == vertices)
+    closed = np.bincount(component[sides.first // 3], sides.sizes % 2, count) == 0
     # Signed volumes of the cones from the mean of the nodes to the triangles.
     corner = (points - points.mean(axis=0))[facets]
     cones = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6.0
-    cavity = (per_component(sides.first, uses % 2) == 0) & (per_component(row[::3], cones) < 0.0)
-    components = tuple(
-        SurfaceComponent(
-            int(triangles[n]), int(euler[n]), (2 - int(euler[n])) // 2 if closed[n] else None, bool(cavity[n])
-        )
-        for n in np.argsort(-triangles, kind="stable")
-    )
-    return {
-        "num_non_manifold_edges": int(np.count_nonzero(uses > 2)),
-        "num_non_manifold_vertices": int(np.count_nonzero(fans_at_node > 1)),
-        "euler_characteristic": int(np.count_nonzero(fans_at_node)) - len(uses) + len(facets),
-        "genus": sum(one.genus or 0 for one in components) if closed.all() else None,
-        "components": components,
-    }
-
-
-def count_open_edges(facets: IntArray, sides: Groups) -> int:
-    """Return the number of edges that triangles pass more often in one direction than back; 0 for a closed surface."""
-    upwards = facets < np.roll(facets, -1, axis=1)
-    return int(np.count_nonzero(sides.sums(np.where(upwards.ravel(), 1, -1))))
+    return closed & (np.bincount(component, cones, count) < 0.0)

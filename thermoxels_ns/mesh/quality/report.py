@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,15 +14,13 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import (
-    SurfaceComponent,
     component_of,
-    count_open_edges,
     count_overlaps,
     count_twin_nodes,
     count_wrong_facets,
     group_faces,
     group_sides,
-    surface_topology,
+    surface_components,
 )
 from thermoxels_ns.mesh.quality.tet_shapes import TET_EDGES, shapes_in_chunks
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_areas
@@ -38,7 +35,6 @@ DIHEDRAL_BOUNDS_DEG: dict[BoundaryMode, tuple[float, float]] = {"voxel": (45.0, 
 60 and 90 degrees; for the angles of isosurface stuffing see Labelle and Shewchuk (2007)."""
 ANGLE_TOLERANCE_DEG = 1e-4  # error of an angle that rounding of the nodes may cause, [degrees]
 TEMPERATURE_TOLERANCE_K = 1e-6  # error of a temperature that rounding may cause, [K]
-RATIO_EDGES = np.linspace(0.0, 1.0, 21)  # edges of the bins of `radius_ratio_counts`
 
 _CRITERIA = {
     "volumes_positive": "Every tetrahedron has a volume above 0.",
@@ -50,8 +46,7 @@ _CRITERIA = {
 }
 """Quality criteria, sentence by name. The last one is for voxel meshes only, because no conforming mesh meets it. A
 boundary may touch itself, because bodies may."""
-_BINS_WITHIN_BOUNDS: dict[BoundaryMode, int] = {"voxel": 10, "conforming": 30}
-_MOST_COMPONENTS = 20
+ANGLE_EDGES_DEG = np.linspace(0.0, 180.0, 37)  # edges of the bins of `dihedral_counts`
 
 
 @dataclass(frozen=True)
@@ -63,20 +58,6 @@ class Criterion:
     kept: bool  # True if the mesh meets the criterion
     figure: float  # number by which the criterion is met or not; its unit depends on the criterion
     found: str  # what was found, in words
-
-
-def angle_edges(boundary_mode: BoundaryMode) -> FloatArray:
-    """Return the edges of the angle histogram's bins, [degrees]; they cover 0 to 180, and the angle bounds are edges.
-
-    >>> angle_edges("voxel")[[0, 1, -1]].round(2)
-    array([ -0. ,   4.5, 180. ])
-    """
-    low, high = DIHEDRAL_BOUNDS_DEG[boundary_mode]
-    low, high = low - ANGLE_TOLERANCE_DEG, high + ANGLE_TOLERANCE_DEG
-    within = _BINS_WITHIN_BOUNDS[boundary_mode]
-    width = (high - low) / within
-    below, above = math.ceil(low / width), math.ceil((180.0 - high) / width)
-    return low + width * np.arange(-below, within + above + 1)
 
 
 def in_percent(share: float) -> str:
@@ -101,24 +82,14 @@ class QualityReport:
     area_m2: float  # sum of the boundary triangles' areas, [m^2]
     edge_length_m: tuple[float, float, float]  # shortest, mean and longest edge, [m]
     dihedral_range_deg: tuple[float, float]  # smallest and largest angle between two faces of a tetrahedron, [degrees]
-    dihedral_counts: tuple[int, ...]  # numbers of angles, six per tetrahedron, in the bins of `angle_edges`
-    radius_ratio_range: tuple[float, float]  # smallest and largest of `TetShapes.radius_ratios`; 1 is best
-    radius_ratio_mean: float
-    radius_ratio_counts: tuple[int, ...]  # numbers of tetrahedra in the radius-ratio bins `RATIO_EDGES`
+    dihedral_counts: tuple[int, ...]  # numbers of angles, six per tetrahedron, between the `ANGLE_EDGES_DEG`
     share_obtuse: float  # share of tetrahedra with an obtuse angle between two faces, 0 to 1
     bodies_by_node: int  # number of parts of the mesh that share no node
     bodies_by_face: int  # number of parts that share no face, so that no heat is conducted between them
-    euler_characteristic: int  # vertices - edges + triangles of the boundary
-    genus: int | None  # handles of all boundary components; None if one component is not a closed manifold
-    components: tuple[SurfaceComponent, ...]  # boundary components, joined by edges, largest first
+    num_components: int  # number of parts of the boundary that are joined by edges
+    num_cavities: int  # number of these parts that bound a hole inside a body
     num_non_manifold_edges: int  # number of boundary edges with more than two boundary triangles
-    num_non_manifold_vertices: int  # number of boundary vertices whose triangles form more than one fan
     criteria: tuple[Criterion, ...]  # the criteria for this `boundary_mode`, each with the mesh's result
-
-    @property
-    def num_cavities(self) -> int:
-        """Return the number of boundary components that bound a hole inside a body."""
-        return sum(component.is_cavity for component in self.components)
 
     @property
     def unmet(self) -> tuple[str, ...]:
@@ -126,20 +97,13 @@ class QualityReport:
         return tuple(criterion.name for criterion in self.criteria if not criterion.kept)
 
     def as_mapping(self) -> dict[str, Any]:
-        """Return the report as a dictionary for json; of the boundary components only the 20 largest are listed."""
+        """Return the report as a dictionary for json."""
         mapping = asdict(self)
-        listed, criteria = mapping.pop("components"), mapping.pop("criteria")
-        bins = {"dihedral_counts": angle_edges(self.boundary_mode), "radius_ratio_counts": RATIO_EDGES}
-        for name, edges in bins.items():
-            width, counts = float(edges[1] - edges[0]), list(mapping[name])
-            mapping[name] = {"first_centre": float(edges[0]) + 0.5 * width, "bin_width": width, "counts": counts}
-        for name in ("dihedral_range_deg", "radius_ratio_range"):
-            mapping[name] = dict(zip(("min", "max"), mapping[name]))
-        mapping["edge_length_m"] = dict(zip(("min", "mean", "max"), mapping["edge_length_m"]))
-        mapping["num_components"] = len(self.components)
-        mapping["num_cavities"] = self.num_cavities
-        mapping["largest_components"] = list(listed[:_MOST_COMPONENTS])
-        mapping["promises"] = list(criteria)
+        width, counts = float(ANGLE_EDGES_DEG[1]), list(self.dihedral_counts)
+        mapping["dihedral_counts"] = {"first_centre": 0.5 * width, "bin_width": width, "counts": counts}
+        mapping["dihedral_range_deg"] = dict(zip(("min", "max"), self.dihedral_range_deg))
+        mapping["edge_length_m"] = dict(zip(("min", "mean", "max"), self.edge_length_m))
+        mapping["promises"] = list(mapping.pop("criteria"))
         return mapping
 
 
@@ -188,14 +152,14 @@ def quality_report(
         temperature = np.zeros(len(points))
     observed_c = temperature[mesh.observed] if mesh.observed.any() else temperature
     low_c, high_c = observed_range_c or (float(observed_c.min()), float(observed_c.max()))
-    figures, volumes = _measure_shapes(mesh, angle_edges(boundary_mode))
+    figures, volumes = _measure_shapes(mesh)
     ends = tets[:, TET_EDGES].reshape(-1, 2).T
     place = np.minimum(*ends), np.maximum(*ends)
     links = sparse.coo_array((np.ones(len(place[0])), place), (len(points),) * 2).tocsr()
     edges = links.tocoo()
     lengths = np.linalg.norm(points[edges.row] - points[edges.col], axis=1)
     faces, sides = group_faces(tets), group_sides(mesh.facets)
-    areas = facet_areas(points, mesh.facets)
+    areas, cavity = facet_areas(points, mesh.facets), surface_components(points, mesh.facets, sides)
     unused = len(points) - np.count_nonzero(np.bincount(tets.ravel()))
     mismatches = int(np.count_nonzero(faces.sizes > 2)) + count_overlaps(points, mesh.facets, sides)
     criteria = _criteria(
@@ -205,7 +169,6 @@ def quality_report(
         int(np.count_nonzero(~(volumes > 0.0))),
         length_unit,
         mismatches=mismatches + count_twin_nodes(points) + unused,
-        open_edges=count_open_edges(mesh.facets, sides),
         wrong_facets=count_wrong_facets(mesh, faces),
         excess_k=float(max(low_c - temperature.min(), temperature.max() - high_c, 0.0)),
     )
@@ -223,7 +186,9 @@ def quality_report(
         # Nodes without a tetrahedron do not count as bodies.
         bodies_by_node=int(connected_components(links, directed=False)[0]) - unused,
         bodies_by_face=int(component_of(len(tets), *(rows // 4 for rows in faces.pairs())).max()) + 1,
-        **surface_topology(points, mesh.facets, sides),
+        num_components=len(cavity),
+        num_cavities=int(np.count_nonzero(cavity)),
+        num_non_manifold_edges=int(np.count_nonzero(sides.sizes > 2)),
         criteria=criteria,
     )
 
@@ -236,19 +201,18 @@ def _criteria(
     unit: str,
     *,
     mismatches: int,
-    open_edges: int,
     wrong_facets: int,
     excess_k: float,
 ) -> tuple[Criterion, ...]:
     """Return all criteria of a boundary mode; `turned` counts tetrahedra whose volume is not above 0."""
     (smallest, largest), (low, high) = figures["dihedral_range_deg"], DIHEDRAL_BOUNDS_DEG[mode]
-    inside, bad = min(smallest - low, high - largest), open_edges + wrong_facets
+    inside = min(smallest - low, high - largest)
     obtuse, warm = figures["share_obtuse"], excess_k > TEMPERATURE_TOLERANCE_K
     smallest_volume = f"{turned:,} at or below 0" if turned else f"smallest {smallest_m3:.3g} {unit}³"
     found = (
         (turned == 0, smallest_m3, smallest_volume),
         (mismatches == 0, float(mismatches), f"{mismatches:,} mismatches"),
-        (bad == 0, float(bad), f"{open_edges:,} open edges, {wrong_facets:,} triangles wrong"),
+        (wrong_facets == 0, float(wrong_facets), f"{wrong_facets:,} triangles wrong or missing"),
         (inside >= -ANGLE_TOLERANCE_DEG, inside, f"{smallest:.2f}° to {largest:.2f}°"),
         (not warm, excess_k, f"{excess_k:.2g} K outside" if warm else "none outside"),
         (obtuse == 0.0, obtuse, f"{in_percent(obtuse)} of tetrahedra obtuse"),
@@ -257,33 +221,30 @@ def _criteria(
     return tuple(criteria)[: None if mode == "voxel" else 5]
 
 
-def _measure_shapes(mesh: TetMesh, edges_deg: FloatArray) -> tuple[dict[str, Any], FloatArray]:
+def _measure_shapes(mesh: TetMesh) -> tuple[dict[str, Any], FloatArray]:
     """Return the shape figures by their names in `QualityReport`, and the volumes, shape (t,)."""
     num = len(mesh.tets)
-    volumes, ratios = np.empty(num), np.empty(num)
-    angle_counts = np.zeros(len(edges_deg) - 1, dtype=np.int64)
+    volumes = np.empty(num)
+    angle_counts = np.zeros(len(ANGLE_EDGES_DEG) - 1, dtype=np.int64)
     smallest, largest, obtuse = 180.0, 0.0, 0
     for which, shapes in shapes_in_chunks(mesh.points_m, mesh.tets):
         cosines = shapes.dihedral_cosines()
         angles = np.degrees(np.arccos(cosines))
-        angle_counts += np.histogram(angles, len(angle_counts), (edges_deg[0], edges_deg[-1]))[0]
+        angle_counts += np.histogram(angles, len(angle_counts), (0.0, 180.0))[0]
         smallest, largest = min(smallest, float(angles.min())), max(largest, float(angles.max()))
         obtuse += int(np.count_nonzero(cosines.min(axis=0) < 0.0))
-        volumes[which], ratios[which] = shapes.volumes, shapes.radius_ratios()
+        volumes[which] = shapes.volumes
     figures = {
         "volume_m3": float(volumes.sum()),
         "share_obtuse": obtuse / num,
         "dihedral_range_deg": (smallest, largest),
         "dihedral_counts": tuple(angle_counts.tolist()),
-        "radius_ratio_range": (float(ratios.min()), float(ratios.max())),
-        "radius_ratio_mean": float(ratios.mean()),
-        "radius_ratio_counts": tuple(np.histogram(ratios, RATIO_EDGES)[0].tolist()),
     }
     return figures, volumes
 
 
 def picture_of_quality(path: Path | str, report: QualityReport) -> None:
-    """Draw a report as a PNG file: two histograms above, figures and criteria below."""
+    """Draw a report as a PNG file: a histogram of the angles above, figures and criteria below."""
     from matplotlib.figure import Figure
 
     path = Path(path)
@@ -291,9 +252,14 @@ def picture_of_quality(path: Path | str, report: QualityReport) -> None:
     title = f"Mesh quality, {report.boundary_mode} boundary: {report.num_tets:,} tetrahedra"
     figure.suptitle(title, fontsize=14, color=_INK)
     grid = figure.add_gridspec(2, 2, height_ratios=(1.0, 1.05))
-    angles, ratios, figures, criteria = (figure.add_subplot(grid[row, column]) for row in (0, 1) for column in (0, 1))
+    angles, figures, criteria = (figure.add_subplot(grid[place]) for place in ((0, slice(None)), (1, 0), (1, 1)))
 
-    _draw_bars(angles, report.dihedral_counts, angle_edges(report.boundary_mode))
+    edges, counts = ANGLE_EDGES_DEG, report.dihedral_counts
+    angles.bar(edges[:-1], counts, np.diff(edges), align="edge", color=_BARS, edgecolor="white", linewidth=0.6)
+    # The axis is logarithmic, because a solver stumbles over the few worst tetrahedra.
+    angles.set(yscale="log", ylim=(0.7, 4.0 * max(counts)), axisbelow=True)
+    angles.grid(axis="y", alpha=0.3)
+    angles.spines[["top", "right"]].set_visible(False)
     for bound, side, shift in zip(DIHEDRAL_BOUNDS_DEG[report.boundary_mode], ("left", "right"), (4, -4)):
         angles.axvline(bound, color=_BOUND, linestyle="--", linewidth=1.3)
         place = {"xycoords": angles.get_xaxis_transform(), "textcoords": "offset points"}
@@ -303,13 +269,6 @@ def picture_of_quality(path: Path | str, report: QualityReport) -> None:
     angles.set(xlim=(0.0, 180.0), xticks=range(0, 181, 30), ylabel="angles")
     angles.set_xlabel(f"angle between two faces of a tetrahedron [degrees]; found {smallest:.1f} to {largest:.1f}")
     angles.set_title("Dihedral angles, and their bounds", fontsize=11)
-
-    _draw_bars(ratios, report.radius_ratio_counts, RATIO_EDGES)
-    worst, mean = report.radius_ratio_range[0], report.radius_ratio_mean
-    ratios.axvline(mean, color=_PALE, linestyle=":", linewidth=1.3)
-    ratios.set(xlim=(0.0, 1.0), ylabel="tetrahedra")
-    ratios.set_xlabel(f"3 r / R (1: regular, 0: flat); worst {worst:.3f}, mean {mean:.3f} (dotted)")
-    ratios.set_title("Inscribed over circumscribed radius", fontsize=11)
 
     _write(figures, 0.0, 0.98, "Figures", _INK, size=12.0, weight="bold")
     for number, (name, value) in enumerate(_figures(report).items()):
@@ -331,14 +290,6 @@ def picture_of_quality(path: Path | str, report: QualityReport) -> None:
 _BARS, _BOUND, _INK, _PALE = "#4a78b0", "#b8571b", "#202020", "#606060"
 
 
-def _draw_bars(axis: Axes, counts: tuple[int, ...], edges: FloatArray) -> None:
-    """Draw a histogram on a logarithmic axis, because a solver stumbles over the few worst tetrahedra."""
-    axis.bar(edges[:-1], counts, np.diff(edges), align="edge", color=_BARS, edgecolor="white", linewidth=0.6)
-    axis.set(yscale="log", ylim=(0.7, 4.0 * max(counts)), axisbelow=True)
-    axis.grid(axis="y", alpha=0.3)
-    axis.spines[["top", "right"]].set_visible(False)
-
-
 def _write(axis: Axes, x: float, y: float, words: str, colour: str, size: float = 10.0, weight: str = "normal") -> None:
     """Write a line of text that takes no room from the histograms, however long the line is."""
     axis.set_axis_off()
@@ -357,11 +308,7 @@ def _figures(report: QualityReport) -> dict[str, str]:
         "area": f"{report.area_m2:.6g} {unit}²",
         "edge length: shortest, mean, longest": f"{shortest:.4g}, {mean:.4g}, {longest:.4g} {unit}",
         "bodies: sharing faces; sharing nodes": f"{report.bodies_by_face:,}; {report.bodies_by_node:,}",
-        "boundary components; cavities": f"{len(report.components):,}; {report.num_cavities:,}",
-        "genus (handles)": "none: not a manifold" if report.genus is None else f"{report.genus:,}",
-        "Euler characteristic of the boundary": f"{report.euler_characteristic:,}",
-        "edges, points where it touches itself": (
-            f"{report.num_non_manifold_edges:,}, {report.num_non_manifold_vertices:,}"
-        ),
+        "boundary components; cavities": f"{report.num_components:,}; {report.num_cavities:,}",
+        "edges where the boundary touches itself": f"{report.num_non_manifold_edges:,}",
         "tetrahedra with an obtuse angle": in_percent(report.share_obtuse),
     }

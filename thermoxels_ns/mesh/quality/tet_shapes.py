@@ -1,4 +1,4 @@
-"""Shapes of tetrahedra: volumes, dihedral angles, radius ratios and stiffness entries."""
+"""Shapes of tetrahedra: volumes, dihedral angles and stiffness entries."""
 
 from __future__ import annotations
 
@@ -50,19 +50,6 @@ class TetShapes:
             cosine[scale == 0.0] = 1.0
         cosines[np.abs(cosines) < _RIGHT_ANGLE] = 0.0
         return np.clip(cosines, -1.0, 1.0, out=cosines)
-
-    def radius_ratios(self) -> FloatArray:
-        """Return three times the radius of the inscribed over that of the circumscribed sphere, shape (t,).
-
-        The ratio is 1 for a regular tetrahedron, and 0 where the volume V is not above 0. The radii are r = 3 V / A and
-        R = | |a|^2 b x c + |b|^2 c x a + |c|^2 a x b | / (12 V), with `sides` a, b, c and the area A of all faces.
-        """
-        double_areas = np.sum([np.sqrt(_dot(normal, normal)) for normal in self.normals], axis=0)
-        centre = np.sum([_dot(side, side) * normal for side, normal in zip(self.sides, self.normals[1:])], axis=0)
-        scale = double_areas * np.sqrt(_dot(centre, centre))
-        ratios = np.zeros_like(self.six_volumes)
-        np.divide(6.0 * self.six_volumes**2, scale, out=ratios, where=(self.six_volumes > 0.0) & (scale > 0.0))
-        return np.minimum(ratios, 1.0, out=ratios)
 
     @property
     def flatness(self) -> FloatArray:

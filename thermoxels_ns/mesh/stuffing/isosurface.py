@@ -11,8 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite
-from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import boundary_facets
 from thermoxels_ns.mesh.stuffing.lattice import (
     DIRECTIONS,
@@ -73,15 +71,13 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
     voxel wide. Solid voxels that share a face stay in one piece; walls and gaps of one voxel get no holes.
 
     Args:
-        level: Levels at the voxel centres, above 0 in solid voxels, shape (cx, cy, cz). Only their ratios matter.
+        level: Levels at the voxel centres, above 0 in solid voxels, of which there is at least one, shape (cx, cy, cz).
+            Only their ratios matter.
         coarsest: Edge of the largest cells inside the solid, [voxels], a power of two; 1 makes all equal. Larger
             cells than 4 save little, because most tetrahedra are at the surface.
 
     Returns:
         The mesh. Where solid voxels touch the border of the lattice, the mesh ends on the border.
-
-    Raises:
-        MeshError: A level is NaN or infinite, or none is above 0.
 
     >>> solid = stuff(np.ones((1, 1, 1)))
     >>> len(solid.points), len(solid.tets), len(solid.facets), bool(solid.on_box.all())
@@ -89,10 +85,6 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
     >>> [len(stuff(np.ones((30, 30, 30)), coarsest).tets) for coarsest in (1, 2, 4, 8)]
     [334800, 158208, 148848, 148800]
     """
-    check_finite("level", level, "Pass one level for every voxel of the lattice.", MeshError)
-    if not np.any(level > 0.0):
-        expected = "solid voxels, with levels above 0"
-        raise MeshError("level", expected=expected, got="none", remedy="Lower the threshold.")
     lattice = bcc_lattice(level)
     interior = coarse_interior(lattice, coarsest)
     warped = warp(lattice, interior.buried(lattice))
