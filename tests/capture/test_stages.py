@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.support.board_pictures import BOARD, board_pairs, write_board_folder
 from tests.support.camera_card import photograph
 from tests.support.posed_model import ring_model
 from tests.support.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
@@ -20,7 +19,6 @@ from thermoxels_ns.capture.sfm.scale_and_up import Up
 from thermoxels_ns.capture.stage_cache import prepare_output
 from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.scene_scale import SceneScale, scale_from_scene_file, up_from_scene_file
@@ -264,8 +262,8 @@ def test_a_second_run_takes_everything_from_the_first(capture):
     before = (scene / "transforms.json").stat().st_mtime_ns
     said = []
     again = capture_folder(card, scene, settings(skip_bad=True), said.append)
-    assert [line for line in said if "as before" not in line] == ["5/9 board: left out, no --board-photos"]
-    assert [line[:3] for line in said] == [f"{number}/9" for number in range(1, 10)]
+    assert [line for line in said if "as before" not in line] == []
+    assert [line[:3] for line in said] == [f"{number}/8" for number in range(1, 9)]
     assert (scene / "transforms.json").stat().st_mtime_ns == before
     assert again.dropped == first.dropped
     assert np.array_equal(again.scene.rig.visible_to_thermal, first.scene.rig.visible_to_thermal)
@@ -281,35 +279,16 @@ def test_another_scale_runs_only_what_depends_on_it_and_so_does_from_stage(captu
     more["known_distance"] = ("shot2-visible.jpg", 100.0, 100.0, 380.0, 120.0, 2.0)
     result = capture_folder(card, scene, settings(**more), said.append)
     assert [line.split(":")[0] for line in said if "as before" in line] == [
-        "1/9 pairs",
-        "2/9 temperatures",
-        "3/9 poses",
+        "1/8 pairs",
+        "2/8 temperatures",
+        "3/8 poses",
     ]
     assert content(scene)["metres_per_unit"] == result.scene.scale.metres_per_unit
     assert not result.scene.drift.used
     said.clear()
     capture_folder(card, scene, settings(from_stage="scene", **more), said.append)
-    ran = [line for line in said if re.match(r"\d/9", line) and not re.search("as before|left out", line)]
-    assert ran == ["8/9 scene", "9/9 page"]
-
-
-def test_a_board_gives_the_rig_and_a_scale_is_needed_for_it(capture, tmp_path):
-    card, earlier, _, _ = capture
-    scene = tmp_path / "scene"
-    shutil.copytree(earlier, scene)
-    pictures = write_board_folder(tmp_path / "board", board_pairs(VISIBLE, THERMAL, RIG))
-    more = {"skip_bad": True, "board_photos": pictures, "board": "7x5", "board_square_m": BOARD.square_m}
-    with pytest.raises(SceneError, match=r"known scale.*--known-distance"):
-        capture_folder(card, scene, settings(**more), [].append)
-    more["known_distance"] = ("shot2-visible.jpg", 100.0, 100.0, 380.0, 120.0, 2.0)
-    result = capture_folder(card, scene, settings(**more), [].append)
-    assert "checker board" in result.scene.rig.explanation
-    shift_m = result.scene.rig.visible_to_thermal[:3, 3] * result.scene.scale.metres_per_unit
-    assert np.allclose(shift_m, RIG[:3, 3], atol=0.02)
-    assert result.scene.rig.thermal_camera.fl_x == pytest.approx(THERMAL.fl_x, rel=0.02)
-    said = []
-    capture_folder(card, scene, settings(**more), said.append)
-    assert "5/9 board: as before" in said
+    ran = [line for line in said if re.match(r"\d/8", line) and "as before" not in line]
+    assert ran == ["7/8 scene", "8/8 page"]
 
 
 def test_a_given_rig_is_kept(capture, tmp_path):

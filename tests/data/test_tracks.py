@@ -1,11 +1,9 @@
 """Sparse points and who sees them: from a file of tracks, from a COLMAP model, as lines of sight in training."""
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from tests.support.colmap_model import write_colmap_model
 from thermoxels_ns.core.camera import Camera
@@ -19,8 +17,6 @@ from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, feature_rays, wr
 
 TAGS = ["train", "train", "eval", "train", "train", "train"]
 NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]
-SCALE, SHIFT = 2.5, np.array([0.3, -4.0, 1.0])
-TURN = Rotation.from_quat([0.1, -0.7, 0.3, 0.64]).as_matrix()
 LEGACY = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])  # the axes that old versions of ns-process-data swapped
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3))
 
@@ -47,14 +43,13 @@ def frames_of(folder, side=""):
     return [frame for frame in read_scene_file(folder.path).frames if side in frame.name]
 
 
-def add_model(folder, where="colmap/sparse/0", frames=None, names=None, focal_factor=1.0, moved=True, **more) -> None:
+def add_model(folder, where="colmap/sparse/0", frames=None, names=None, focal_factor=1.0, **more) -> None:
     frames = frames_of(folder) if frames is None else frames
     lens, names = frames[0].intrinsics, names or [frame.image.name for frame in frames]
     camera = Camera(lens.width, lens.height, lens.fl_x, lens.fl_y, lens.cx, lens.cy)
     camera = camera.resized(*(round(side * focal_factor) for side in (lens.width, lens.height)))
-    world = {"turn": TURN, "scale": SCALE, "shift": SHIFT} if moved else {}
-    poses, options = [frame.pose for frame in frames], {"lens": "PINHOLE", **world, **more}
-    write_colmap_model(folder.path / where, names, poses, camera, POINTS, **options)
+    poses = [frame.pose for frame in frames]
+    write_colmap_model(folder.path / where, names, poses, camera, POINTS, **{"lens": "PINHOLE", **more})
 
 
 def tracks_of(folder) -> SparseTracks:
@@ -66,28 +61,31 @@ def lines_of(folder, split="train", **options):
 
 
 @pytest.mark.parametrize(
-    ("where", "on_a_line"), [*((where, False) for where in COLMAP_FOLDERS), (COLMAP_FOLDERS[0], True)]
+    ("where", "axes"), [*((where, np.eye(3)) for where in COLMAP_FOLDERS), (COLMAP_FOLDERS[0], LEGACY)]
 )
-def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, on_a_line):
-    if on_a_line:
-        for number, entry in enumerate(scene.meta["frames"]):
-            for row, across in enumerate((1.0, 2.0, 3.0)):
-                entry["transform_matrix"][row][3] = across * (number - 2.5)
-        scene.rewrite()
-    add_model(scene, where)
+def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, axes):
+    add_model(scene, where, turn=axes.T)
     tracks = tracks_of(scene)
     assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
     assert len(tracks.sighting_frame) == 6 * 30
-    if not on_a_line:
-        lines = lines_of(scene).metadata["feature_rays"]
-        assert len(lines.points) == 30 and len(lines.origins) == 5 * 30  # the one that evaluates is left out
+    lines = lines_of(scene).metadata["feature_rays"]
+    assert len(lines.points) == 30 and len(lines.origins) == 5 * 30  # the one that evaluates is left out
+
+
+def test_the_json_says_how_its_world_differs_from_the_models(scene):
+    turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
+    add_model(scene, turn=turn.T, shift=(0.0, 0.0, 1.0))
+    assert lines_of(scene).metadata["feature_rays"] is None
+    scene.meta["applied_transform"] = np.column_stack([turn, -turn @ [0.0, 0.0, 1.0]]).tolist()
+    scene.rewrite()
+    assert np.sort(tracks_of(scene).points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
 
 
 @pytest.mark.parametrize("where", COLMAP_FOLDERS)
 @pytest.mark.parametrize("axes", [np.eye(3), LEGACY])
 def test_the_box_is_found_wherever_a_model_may_lie_and_follows_the_worlds_axes(scene_folder, where, axes):
     scene = scene_folder(frames=len(NAMES), names=NAMES, scene_box=None)
-    add_model(scene, where, moved=False, turn=axes.T)
+    add_model(scene, where, turn=axes.T)
     evidence = find_scene_box(read_scene_file(scene.path), None, range(len(NAMES)))
     box = evidence.box()
     assert evidence.source == f"the points of {where}"
@@ -129,12 +127,6 @@ def test_some_wrong_poses_are_left_out_and_named_and_move_nothing(scene, capsys)
     assert frames[4].name in capsys.readouterr().out.replace("\n", "")
 
 
-def _outside(scene) -> None:
-    add_model(scene)
-    shutil.move(scene.path / "colmap", scene.path.parent / "outside")
-    (scene.path / "colmap").symlink_to(scene.path.parent / "outside")
-
-
 def _changed(scene, name: str, change, **options) -> None:
     add_model(scene, **options)
     path = scene.path / "colmap/sparse/0" / name
@@ -146,14 +138,13 @@ def _changed(scene, name: str, change, **options) -> None:
     [
         (lambda s, f: add_model(s, frames=f[3:] + f[:3], names=[one.image.name for one in f]), "poses are others"),
         (lambda s, f: add_model(s, names=[f"other_{n}.jpg" for n in range(6)]), "no photograph of this scene"),
-        (lambda s, f: add_model(s, frames=f[:2]), "too few"),
-        (lambda s, f: _outside(s), "a file inside"),
+        (lambda s, f: add_model(s, frames=f[:2]), "2 of 2 photographs agree"),
         (lambda s, f: _changed(s, "images.bin", lambda _: b"\x07"), "cannot be read"),
         *(
-            (lambda s, f, name=name, cut=cut: _changed(s, name, cut), f"{name} ends before")
-            for name in ("cameras.bin", "frames.bin", "images.bin", "points3D.bin")
-            for cut in (lambda _: b"", lambda b: b[: int(0.6 * len(b))])
+            (lambda s, f, name=name: _changed(s, name, lambda b: b[: int(0.6 * len(b))]), "cannot be read")
+            for name in ("frames.bin", "images.bin", "points3D.bin")
         ),
+        (lambda s, f: _changed(s, "points3D.bin", lambda _: b""), "points3D.bin ends before its last entry"),
         (lambda s, f: _changed(s, "points3D.bin", lambda b: b[:-1]), "points3D.bin ends before its last entry"),
         (lambda s, f: _changed(s, "cameras.txt", lambda b: b.replace(b"24 18", b"0 0"), text=True), "0 pixels wide"),
     ],
@@ -267,14 +258,4 @@ def test_files_of_tracks_that_cannot_be_used_are_refused(tracked, spoil, named):
     folder, tracks = tracked
     spoil(folder.path / "tracks.npz", tracks)
     with pytest.raises(SceneError, match=rf"tracks\.npz.*{named}"):
-        lines_of(folder)
-
-
-@pytest.mark.parametrize("outside", ["../tracks.npz", "{folder}/../tracks.npz"])
-def test_tracks_outside_the_scene_are_refused(tracked, outside):
-    folder, tracks = tracked
-    write_tracks(folder.path.parent / "tracks.npz", tracks)
-    folder.meta[TRACKS_KEY] = outside.format(folder=folder.path)
-    folder.rewrite()
-    with pytest.raises(SceneError, match=r"tracks_file_path.*tracks\.npz"):
         lines_of(folder)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-StageName = Literal["pairs", "temperatures", "poses", "scale", "board", "rig", "drift", "scene", "page"]
+StageName = Literal["pairs", "temperatures", "poses", "scale", "rig", "drift", "scene", "page"]
 """The stages of a capture in order."""
 LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
@@ -63,12 +63,5 @@ class CaptureSettings:
     rig: Path | None = None
     """transforms.json of an earlier capture with the same camera: its thermal camera and rig are used unchanged, except
     that the rig's lengths are converted where both captures have a scale."""
-    board_photos: Path | None = None
-    """Folder with pictures of a heated (or foil) checker board in at least three places, taken by both cameras: the rig
-    is found from them instead of from the scene. Needs --board, --board-square-m and a known scale."""
-    board: str | None = None
-    """Inner corners of the checker board along both sides, such as 7x5 for 8 x 6 squares."""
-    board_square_m: float | None = None
-    """Side of one square of the checker board, in metres."""
     drift: Literal["auto", "off"] = "auto"
     """Correct vignetting and offsets between thermal images, if this helps at points that the fit does not use."""

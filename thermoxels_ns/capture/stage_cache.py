@@ -88,10 +88,6 @@ class StageCache:
         self.seconds.append((name, took))
         return folder
 
-    def leave_out(self, name: StageName, why: str) -> None:
-        """Report that a stage has nothing to do, so that the stage numbers in the output have no gap."""
-        self.say(f"{_title(name)}: left out, {why}")
-
 
 def _title(name: StageName) -> str:
     return f"{STAGES.index(name) + 1}/{len(STAGES)} {name}"
@@ -115,11 +111,6 @@ def given_fingerprints(paths: Sequence[Path | None]) -> list[tuple[str, int, int
             remedy = "Check the path, or leave it out."
             raise SceneError(str(path), expected="a file", got="nothing there", remedy=remedy)
     return fingerprint(there, Path("/")) if there else []
-
-
-def files_of(path: Path) -> list[Path]:
-    """Return all files in a folder and its subfolders, sorted; for a path that is no folder, that path alone."""
-    return sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
 
 
 def prepare_output(folder: Path) -> Path:

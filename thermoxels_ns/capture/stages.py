@@ -13,7 +13,6 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
 from thermoxels_ns.capture.pairs import Pair, search_pairs
-from thermoxels_ns.capture.rig.board import CheckerBoard, board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.rig.drift import estimate_drift, no_drift
 from thermoxels_ns.capture.rig.search import estimate_rig
 from thermoxels_ns.capture.rig.start import kept_start, read_rig, rig_frames, rig_start
@@ -33,7 +32,6 @@ from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import (
     CACHE_FOLDER,
     StageCache,
-    files_of,
     fingerprint,
     given_fingerprints,
     load,
@@ -93,9 +91,6 @@ def run_capture(
         expected = "another folder than the input, which does not hold it either"
         remedy = "Pass a new folder with --output; the camera's files stay as they are."
         raise SceneError("output", expected=expected, got=output, remedy=remedy)
-    board = board_of(settings)
-    if settings.board_photos is not None and not settings.board_photos.is_dir():
-        scan_folder(settings.board_photos)
     folder = prepare_output(output)
     remedy = "Wait until it ends, or pass another folder with --output."
     lock = hold_folder(folder / CACHE_FOLDER / "lock", remedy, say)
@@ -105,7 +100,7 @@ def run_capture(
         remedy = "Check free space and permissions, and run the command again: finished stages are kept."
         with threadpool_limits(1, "blas"), plain_os_errors(folder, remedy=remedy):
             cache = StageCache(folder, settings.from_stage, say)
-            return _Capture(source, folder, settings, cache, say, board).run(write_page)
+            return _Capture(source, folder, settings, cache, say).run(write_page)
     finally:
         lock.release()
 
@@ -119,7 +114,6 @@ class _Capture:
     settings: CaptureSettings
     cache: StageCache
     say: Callable[[str], None]
-    board: CheckerBoard | None = None  # checker board in the user's pictures; None: the user passes no such pictures
     dropped: dict[str, str] = field(default_factory=dict)
     """Reason by name, for each file and frame that is left out; the stages add to this dictionary."""
 
@@ -131,8 +125,7 @@ class _Capture:
         model, scale, scale_missing, up = self.scale(found, read)
         by_name = {frame.name: frame for frame in read.frames}
         frames = [by_name[name] for name in model.frames]
-        board = self.board_rig(model, read)
-        rig, start = self.rig(model, frames, read, scale, scale_missing, board)
+        rig, start = self.rig(model, frames, read, scale)
         drift = self.drift(model, frames, rig)
         scene = Scene(frames, model, rig, drift, scale, up)
         written = [self.output / name for name in SCENE_CONTENT]
@@ -180,11 +173,7 @@ class _Capture:
         """Return the frames: thermal images in degrees C, and photographs, extracted where one file holds both."""
         settings, options = self.settings, self.radiometry
         library = settings.dji_library if settings.dji_library and settings.dji_library.is_file() else None
-        depends = {
-            "options": options,
-            "library": given_fingerprints([library]),
-            "skip_bad": settings.skip_bad,
-        }
+        depends = {"options": options, "library": given_fingerprints([library]), "skip_bad": settings.skip_bad}
 
         def work(folder: Path) -> None:
             read = read_frames(pairs, self.source, folder, options, settings.skip_bad, self.say)
@@ -199,9 +188,7 @@ class _Capture:
         """Return camera, poses and scene points, which are found from the photographs."""
         settings = self.settings
         names = ("image_size", "max_features", "lens", "seed", "threads")
-        depends = {
-            "options": {name: getattr(settings, name) for name in names},
-        }
+        depends = {"options": {name: getattr(settings, name) for name in names}}
 
         def work(folder: Path) -> None:
             photographs = {frame.name: frame.photograph for frame in read.frames}
@@ -219,10 +206,8 @@ class _Capture:
     def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, SceneScale | None, str, Up]:
         """Return the model turned upright, scale or None, reason for None, and up."""
         settings = self.settings
-        depends = {
-            "known": settings.known_distance,
-            "markers": [settings.marker_side_m, settings.marker_error_m],
-        }
+        markers = [settings.marker_side_m, settings.marker_error_m]
+        depends = {"known": settings.known_distance, "markers": markers}
         by_name = {frame.name: frame for frame in read.frames}
         frames = [by_name[name] for name in found.frames]
 
@@ -256,32 +241,10 @@ class _Capture:
             return scale_from_markers(model, photographs, settings.marker_side_m, settings.marker_error_m)
         return scale_from_gps(model.centres, [frame.gps for frame in frames])
 
-    def board_rig(self, model: SfmModel, read: CaptureFrames) -> RigEstimate | None:
-        """Return the rig, lengths in metres, from the user's pictures of a checker board; None without pictures."""
-        board, pictures, settings = self.board, self.settings.board_photos, self.settings
-        if board is None or pictures is None:
-            self.cache.leave_out("board", "no --board-photos")
-            return None
-        angle = settings.thermal_field_of_view_deg
-        depends = {"board": board, "files": fingerprint(files_of(pictures), pictures), "angle": angle}
-
-        def work(folder: Path) -> None:
-            radiometry, size = self.radiometry, read.thermal_size
-            rig = rig_from_board_photos(pictures, board, model.camera, size, folder, settings, radiometry, self.say)
-            save(folder / "rig.npz", rig)
-
-        return load(self.cache.run("board", depends, work) / "rig.npz", RigEstimate)
-
     def rig(
-        self,
-        model: SfmModel,
-        frames: list[CaptureFrame],
-        read: CaptureFrames,
-        scale: SceneScale | None,
-        scale_missing: str,
-        board: RigEstimate | None,
+        self, model: SfmModel, frames: list[CaptureFrame], read: CaptureFrames, scale: SceneScale | None
     ) -> tuple[RigEstimate, RigEstimate]:
-        """Return the rig (found from the images, or given by the user or the board) and the start of its search."""
+        """Return the rig (found from the images, or given by the user) and the start of its search."""
         settings = self.settings
         angle, metres = settings.thermal_field_of_view_deg, None if scale is None else scale.metres_per_unit
         begin = rig_start(frames, model.camera, read.thermal_size, angle, metres)
@@ -290,8 +253,6 @@ class _Capture:
         def work(folder: Path) -> None:
             if settings.rig is not None:
                 rig = read_rig(settings.rig, read.thermal_size, metres)
-            elif board is not None:
-                rig = in_scene_units(board, scale, scale_missing)
             elif len(model.sighting_frame) < _LEAST_SIGHTINGS:
                 rig = kept_start(begin, "There are no scene points to compare the images at.")
             else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,14 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.transforms_json import read_pose
 
 _PARTS = ("cameras", "images", "points3D")
 COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "colmap_sparse/0", "sparse/0", "sparse")
 """Places of a COLMAP model in a scene's folder; the first that holds a model counts."""
 
-_LEAST_CAMERA_BYTES = 48  # size of a camera with three parameters in cameras.bin; cameras with more are larger
-_LAYOUT = {"frames": (64, "<I", 16), "images": (64, "<Q", 24), "points3D": (43, "<Q", 8)}
-"""Layout of an entry in a .bin file: bytes before the number of its parts (of an image: before its name), the format of
-that number, bytes of each part."""
+_LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""Swap of axes by old versions of ns-process-data, before the json had applied_transform."""
 
 
 def is_model(folder: Path) -> bool:
@@ -48,38 +48,39 @@ def camera_to_world(image: Any) -> FloatArray:
     return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def _incomplete(folder: Path) -> str:
-    """Return which file of a COLMAP model cannot be opened, or ends before the last entry that it announces; or "".
+def worlds_of_json(meta: Mapping[str, Any]) -> list[FloatArray]:
+    """Return the matrices (4, 4) that may bring COLMAP's world to that of the poses in a json, `meta`.
 
-    pycolmap says of an unreadable file that it is no model, and may read a truncated file for ever.
+    That is the json's ``applied_transform``; without one, no change or the swap of axes of old ns-process-data.
+    """
+    if "applied_transform" in meta:
+        return [read_pose(meta["applied_transform"], "applied_transform", turned=False)]
+    return [np.eye(4), _LEGACY_TRANSFORM]
+
+
+def _incomplete(folder: Path) -> str:
+    """Return which file of a COLMAP model cannot be opened, or that points3D.bin ends before its last point; or "".
+
+    pycolmap says of an unreadable file that it is no model, and reads a truncated points3D.bin for ever.
     """
     for name in ("cameras", "frames", "images", "points3D"):
         for path in (folder / f"{name}.txt", folder / f"{name}.bin"):
-            if not path.is_file():
-                continue
             try:
-                with path.open("rb") as file:
-                    whole = path.suffix == ".txt" or _complete(name, file.read())
+                data = path.read_bytes() if path.is_file() else None
             except OSError as problem:
                 return f"{path.name}: {problem.strerror}; check its permissions and the disk"
-            if not whole:
-                return f"{path.name} ends before its last entry, as after an interrupted copy"
+            if data is not None and path.name == "points3D.bin" and not _complete_points(data):
+                return "points3D.bin ends before its last entry, as after an interrupted copy"
     return ""
 
 
-def _complete(name: str, data: bytes) -> bool:
+def _complete_points(data: bytes) -> bool:
+    """Return whether the points that points3D.bin announces are there: 43 bytes, a count, and 8 bytes per sighting."""
     try:
-        (count,) = struct.unpack_from("<Q", data)
-        end = 8
-        if name == "cameras":
-            return len(data) >= end + count * _LEAST_CAMERA_BYTES
-        before, kind, size = _LAYOUT[name]
+        (count,), end = struct.unpack_from("<Q", data), 8
         for _ in range(count):
-            end += before
-            if name == "images":
-                end = data.index(b"\0", end) + 1
-            (parts,) = struct.unpack_from(kind, data, end)
-            end += struct.calcsize(kind) + parts * size
-    except (struct.error, ValueError):  # a number, or the end of a name, lies behind the end of the data
+            (sightings,) = struct.unpack_from("<Q", data, end + 43)
+            end += 51 + 8 * sightings
+    except struct.error:  # a number lies behind the end of the data
         return False
     return end <= len(data)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -135,32 +135,3 @@ def _refuse_odd(camera: Camera, where: str) -> None:
         got = ", ".join(f"{name} {getattr(camera, name):g}" for name in odd)
         remedy = "Correct the json; lengths are in pixels, k1 to k4, p1 and p2 as in OpenCV."
         raise SceneError(where, expected=expected, got=got, remedy=remedy)
-
-
-def path_inside(folder: Path, name: str, where: str) -> Path:
-    """Return the resolved path inside `folder` of a file name found in a json; the file need not exist.
-
-    `where` says in messages where the name stands, such as ``transforms.json: frame 3``. Raises `SceneError` if the
-    name is empty or absolute, has a drive or "..", or leads out of the folder by a link.
-    """
-    windows = PureWindowsPath(name)
-    root = folder.resolve()
-    got = None
-    if not name.strip() or "\0" in name:
-        got = repr(name)
-    elif Path(name).is_absolute() or windows.drive or windows.root:
-        got = f"the absolute path {name!r}"
-    elif ".." in windows.parts:
-        got = f"{name!r}, which climbs out"
-    else:
-        try:
-            path = (root / Path(*windows.parts)).resolve()
-            path.exists()
-        except (OSError, RuntimeError) as problem:  # a link to itself, or a name that is too long
-            got = f"{name[:200]!r} ({problem.strerror if isinstance(problem, OSError) else 'a link to itself'})"
-        else:
-            if path.is_relative_to(root):
-                return path
-            got = f"{name!r}, a link to {path}"
-    remedy = "Copy the file into the folder and name it relative to it."
-    raise SceneError(where, expected=f"a file inside {folder}", got=got, remedy=remedy)

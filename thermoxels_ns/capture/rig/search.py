@@ -31,14 +31,11 @@ _COARSE_BLUR_PX, _FINE_BLUR_PX = 1.5, 1.0
 _ABOVE_CHANCE = 1.5
 _SEARCHED_SIZES = 2
 _FARTHEST_SIGMAS = 5.0
-_WORTH_TRYING = 0.8
 _SMALLEST_ERROR_PX, _LARGEST_ERROR_SHARE = 1.5, 0.005
 _PROBE_STEP = 1e-4
 _REACH_SIGMAS = 2.5
 _STEP_PX = 2.5
 _COARSE_FRAMES = 16
-_CANDIDATES = 4
-_APART_PX = 3.0
 _SMALLEST_OVERLAP = 0.3
 _PADDING = 1.6
 _CHANCE_DRAWS = 3
@@ -86,28 +83,21 @@ def estimate_rig(
 
     if len(chosen) < _FEWEST_FRAMES:
         return kept(f"{len(chosen)} frames are too few to tell; at least {_FEWEST_FRAMES} are needed")
-    candidates: list[_Found] = []
-    chance, level = 0.0, 0
+    value, change, chance, level = 0.0, unchanged, 0.0, 0
     for level, size in enumerate(sizes[:_SEARCHED_SIZES]):  # small things show in the second size only
         say(f"Comparing edges, all directions, {size[0]} x {size[1]} pixels")
         coarse = prepared.score(rig, unchanged, size, _COARSE_BLUR_PX) if level else coarse
         search = CoarseSearch(coarse, sigmas, depth)
-        candidates, chance = search.best(), search.best_by_chance()
-        if candidates[0][0] > _ABOVE_CHANCE * chance:
+        (value, change), chance = search.best(), search.best_by_chance()
+        if value > _ABOVE_CHANCE * chance:
             break
     else:
         return kept(
-            f"the thermal edges agree with those of the photographs no better ({candidates[0][0]:.3f}) than "
+            f"the thermal edges agree with those of the photographs no better ({value:.3f}) than "
             f"chance ({chance:.3f}): the thermal images are too flat or show other things"
         )
-    maxima = []
-    for value, candidate in candidates:
-        if value >= _WORTH_TRYING * candidates[0][0]:
-            around = coarse.around(candidate)
-            change = RigPosterior(around, sigmas, depth).maximum(candidate)
-            maxima.append((around.value(change), change))
-    change = max(maxima, key=lambda found: found[0])[1]
-    score = coarse
+    score = coarse.around(change)
+    change = RigPosterior(score, sigmas, depth).maximum(change)
     for size in sizes[level + 1 :] or sizes[-1:]:
         say(f"Comparing edges, {size[0]} x {size[1]} pixels")
         score = prepared.score(rig, change, size, _FINE_BLUR_PX if size == sizes[-1] else _COARSE_BLUR_PX)
@@ -162,7 +152,7 @@ def _projection_sigma(prepared: PreparedFrames, rig: RigModel, change: FloatArra
 
 
 class CoarseSearch:
-    """Search over focal length, roll and all shifts of the thermal image for the rigs with the best edge scores.
+    """Search over focal length, roll and all shifts of the thermal image for the rig with the best edge score.
 
     A small turn of the thermal camera shifts its image. For one focal length and roll, the scores of all shifts are
     cross-correlations, which Fourier transforms compute at once.
@@ -185,15 +175,9 @@ class CoarseSearch:
         self._focals = _steps(_REACH_SIGMAS * float(sigmas[6]), _STEP_PX / (0.5 * camera.width))
         self._rolls = _steps(_REACH_SIGMAS * float(sigmas[2]), _STEP_PX / corner_px)
 
-    def best(self) -> list[_Found]:
-        """Return score and ten changes of the few best rigs, best first; their turns differ by `_APART_PX` or more."""
-        found = self._found([self._spectra(edges.field, edges.weight) for edges in self._thermal])
-        kept: list[_Found] = []
-        for score, change in sorted(found, key=lambda each: -each[0]):
-            apart = [np.abs((change - other)[:2]).max() * self._rig.camera.fl_x for _, other in kept]
-            if min(apart, default=np.inf) >= _APART_PX:
-                kept.append((score, change))
-        return kept[:_CANDIDATES]
+    def best(self) -> _Found:
+        """Return score and ten changes of the best rig."""
+        return self._best([self._spectra(edges.field, edges.weight) for edges in self._thermal])
 
     def best_by_chance(self) -> float:
         """Return the highest score that the search finds by chance: thermal edges with their phases randomised."""
@@ -205,7 +189,7 @@ class CoarseSearch:
                 phases = np.exp(2j * np.pi * draw.random(edges.field.shape))
                 noise = np.asarray(fft.ifft2(np.asarray(fft.fft2(edges.field)) * phases))
                 spectra.append(self._spectra(noise, edges.weight))
-            highest = max(highest, *(score for score, _ in self._found(spectra)))
+            highest = max(highest, self._best(spectra)[0])
         return highest
 
     def _spectra(self, field: npt.NDArray, weight: npt.NDArray) -> _Spectra:
@@ -213,14 +197,14 @@ class CoarseSearch:
         planes = field * weight, weight, np.abs(field) ** 2 * weight
         return tuple(np.asarray(fft.fft2(plane.astype(np.complex64), s=self._shape)) for plane in planes)
 
-    def _found(self, spectra: Sequence[_Spectra]) -> list[_Found]:
-        """Return the best shifts for every focal length and roll, as scores and ten changes."""
+    def _best(self, spectra: Sequence[_Spectra]) -> _Found:
+        """Return score and ten changes of the best shift for any focal length and roll."""
         found: list[_Found] = []
         for log_focal, roll in product(self._focals, self._rolls):
             change = np.zeros(len(PARAMETERS))
             change[2], change[6] = roll, log_focal
-            found += self._best_shifts(self._surface(spectra, change), change)
-        return found
+            found.append(self._best_shift(self._surface(spectra, change), change))
+        return max(found, key=lambda each: each[0])
 
     def _surface(self, spectra: Sequence[_Spectra], change: FloatArray) -> FloatArray:
         """Return the score for every whole-pixel shift of the thermal image, (rows, columns); shift 0 is at [0, 0]."""
@@ -246,18 +230,15 @@ class CoarseSearch:
         )
         return real + np.complex64(1j) * imaginary, power, count
 
-    def _best_shifts(self, surface: FloatArray, change: FloatArray) -> list[_Found]:
-        """Return the highest scores of one surface within reach, each with `change` turned by its shift."""
+    def _best_shift(self, surface: FloatArray, change: FloatArray) -> _Found:
+        """Return the highest score of one surface within reach, and `change` turned by its shift."""
         across, down = (int(np.ceil(reach)) for reach in self._reach_px)
         window = np.roll(surface, (down, across), axis=(0, 1))[: 2 * down + 1, : 2 * across + 1]
         focal = np.array([self._rig.camera.fl_x, self._rig.camera.fl_y]) * np.exp(change[6])
-        found: list[_Found] = []
-        for place in np.argsort(-window, axis=None, kind="stable")[:_CANDIDATES]:
-            row, column = divmod(int(place), window.shape[1])
-            shifted = change.copy()
-            shifted[:2] = -(row - down) / focal[1], (column - across) / focal[0]
-            found.append((float(window[row, column]), shifted))
-        return found
+        row, column = divmod(int(window.argmax()), window.shape[1])
+        shifted = change.copy()
+        shifted[:2] = -(row - down) / focal[1], (column - across) / focal[0]
+        return float(window[row, column]), shifted
 
 
 def _steps(reach: float, step: float) -> FloatArray:

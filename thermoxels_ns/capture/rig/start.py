@@ -22,7 +22,7 @@ _MOST_ERROR_PX = 4.0
 """Scene points with a larger mean reprojection error are not used, [pixels of the photographs]."""
 _FROM_LENS, _FROM_FLIR, _FROM_ANGLE, _FROM_USER, _GUESSED = 0.03, 0.06, 0.1, 0.05, 0.25
 """Standard deviation of the thermal focal length, as a share of it, for each source of the value."""
-BASELINE_SIGMA_M = 0.1
+_BASELINE_SIGMA_M = 0.1
 """Standard deviation of the thermal lens's place relative to the visible lens, along each axis, [m]."""
 _BELIEVED_DEG = (3.0, 150.0)  # angles of view outside these limits are ignored; some cameras state nonsense
 
@@ -87,7 +87,7 @@ def rig_start(
     else:
         camera = centred(visible.fl_x * width / visible.width)
         sigma, source = _GUESSED, "a guess: the photographs' angle of view"
-    shift = None if metres_per_unit is None else BASELINE_SIGMA_M / metres_per_unit
+    shift = None if metres_per_unit is None else _BASELINE_SIGMA_M / metres_per_unit
     return RigStart(camera, transform, focal_sigma=sigma, translation_sigma=shift, source=source)
 
 

@@ -74,15 +74,11 @@ def find_poses(
     focal = focal_px or _GUESSED_FOCAL * max(size)
     start = Camera(*size, focal, focal, size[0] / 2.0, size[1] / 2.0).resized(*small)
     run_in_process(_find_and_match, (reduced, start, focal_px is not None, settings), folder, say)
-    model, elsewhere = run_in_process(_map, (reduced, settings.seed), folder, say)
+    model = run_in_process(_map, (reduced, settings.seed), folder, say)
     if model is None or len(model.frames) < MIN_FRAMES:
         raise _too_few(0 if model is None else len(model.frames), "photographs that fit together")
-    for name in names:
-        if name in elsewhere:
-            dropped[name] = f"fits only to {elsewhere[name]} others, in a part of its own"
-        elif name not in model.frames:
-            dropped[name] = "too few matches with the other photographs"
-    return model, dropped
+    few = "too few matches with the largest group of photographs that fit together"
+    return model, dropped | {name: few for name in names if name not in model.frames}
 
 
 def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, str]]:
@@ -128,8 +124,8 @@ def _too_few(got: int, what: str) -> SceneError:
     return SceneError("poses", expected=f"at least {MIN_FRAMES} {what}", got=got, remedy=remedy)
 
 
-def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> tuple[SfmModel | None, dict[str, int]]:
-    """Return the model of the largest group of photographs (or None), and the size - 1 of other groups by frame."""
+def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> SfmModel | None:
+    """Return the model of the largest group of photographs that fit together, or None."""
     import pycolmap
 
     found = 2  # COLMAP does not call next_image for the first pair
@@ -146,15 +142,9 @@ def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> 
     given = matched.database, matched.images, folder, _options(seed)
     groups: dict[int, Any] = pycolmap.incremental_mapping(*given, next_image_callback=next_image)
     if not groups:
-        return None, {}
-    largest, *others = sorted(groups.values(), key=lambda group: (-group.num_reg_images(), -len(group.points3D)))
-    elsewhere = {
-        matched.frame_of_image[image.name]: group.num_reg_images() - 1
-        for group in others
-        for image in group.images.values()
-        if image.has_pose
-    }
-    return model_of_colmap(largest, matched.frame_of_image, matched.size), elsewhere
+        return None
+    largest = max(groups.values(), key=lambda group: (group.num_reg_images(), len(group.points3D)))
+    return model_of_colmap(largest, matched.frame_of_image, matched.size)
 
 
 def _options(seed: int) -> Any:
