@@ -13,9 +13,8 @@ from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model, worlds_of_json
 from thermoxels_ns.data.scene_file import Frame, SceneFile
-from thermoxels_ns.data.transforms_json import read_pose
 
 Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 
@@ -34,8 +33,6 @@ _FEW_IN_VIEW = 0.05  # A photograph with fewer points in view, relative to the p
 _MIDDLE = 0.25  # A camera is pointed at what is in view this far from the photograph's edge, of the shorter side
 _NEARER_HALF = 0.25  # Where no points are known, the surface is taken to stand at this quantile of the depths in a box
 _CONVERGING = 0.5  # Cameras look outwards if the place they look at is nearer than this, relative to their spread
-# Swap of axes by old versions of ns-process-data, before the json had applied_transform.
-_LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,15 +259,12 @@ def _read_colmap(folder: str, scene: SceneFile) -> FloatArray:
     centres = {Path(image.name).name: np.asarray(image.projection_center()) for image in model.images.values()}
     known = [(centres[frame.image.name], frame.pose[:3, 3]) for frame in scene.frames if frame.image.name in centres]
     in_colmap, in_json = (np.array(side).reshape(-1, 3) for side in (zip(*known) if known else ([], [])))
-    candidates = [np.eye(4)[:3], _LEGACY_TRANSFORM]
-    if "applied_transform" in scene.meta:
-        candidates = [read_pose(scene.meta["applied_transform"], "applied_transform", turned=False)[:3]]
-    for transform in candidates if known else []:
-        off = np.linalg.norm(in_colmap @ transform[:, :3].T + transform[:, 3] - in_json, axis=1)
+    for transform in worlds_of_json(scene.meta) if known else []:
+        off = np.linalg.norm(in_colmap @ transform[:3, :3].T + transform[:3, 3] - in_json, axis=1)
         spread = np.linalg.norm(in_json - in_json.mean(axis=0), axis=1).max()
         if np.median(off) <= 0.01 * max(spread, 1e-9):
             points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-            return points @ transform[:, :3].T + transform[:, 3]
+            return points @ transform[:3, :3].T + transform[:3, 3]
     remedy = _REMEDY
     got = f"{len(known)} photographs in common, at other places" if known else "no photograph in common"
     raise SceneError(folder, expected="a COLMAP model with the camera centres of the json", got=got, remedy=remedy)
