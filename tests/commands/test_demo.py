@@ -1,6 +1,7 @@
 import json
 import math
 from pathlib import Path
+from runpy import run_path
 
 import pytest
 import tyro
@@ -16,6 +17,7 @@ from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.synthetic.drawn_scenes import BRIDGE_PSI_W_MK
+from thermoxels_ns.training.schedule import QUALITIES
 
 PATCHES = configs_folder() / "house-corner-patches.yaml"
 IMAGES = {
@@ -92,6 +94,19 @@ def test_a_missing_figure_is_named(tmp_path, images, summary, name):
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     with pytest.raises(ThermoxelsError, match=f"{name}: expected"):
         read_results(tmp_path / "eval.json", tmp_path / "summary.json")
+
+
+def test_the_tables_of_the_docs_name_the_sizes_and_the_targets_of_the_demo(tmp_path):
+    (tmp_path / "eval.json").write_text(json.dumps({"results": IMAGES}))
+    (tmp_path / "summary.json").write_text(json.dumps(SUMMARY))
+    targets, _ = read_results(tmp_path / "eval.json", tmp_path / "summary.json")
+    tools = Path(__file__).parents[2] / "tools"
+    stated = [
+        row.target.split() for row in run_path(str(tools / "figures.py"))["ROWS"] if row.target not in ("", "all")
+    ]
+    assert [(float(words[0]), words[-1] == "more") for words in stated] == [(t.bound, t.at_least) for t in targets]
+    pairs = f"{demo._TRAIN_VIEWS} training views of {demo._WIDTH} x {demo._HEIGHT}, {QUALITIES['standard'][0]} voxels"
+    assert pairs in (tools.parent / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture
