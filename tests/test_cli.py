@@ -3,24 +3,17 @@ import os
 import subprocess
 import sys
 import warnings
-from typing import get_args
 
 import pytest
 import torch
 
 from thermoxels_ns import cli
-from thermoxels_ns.commands.demo import SceneName
 from thermoxels_ns.commands.installed_commands import CommandFailed
 from thermoxels_ns.core.errors import HeatMemoryError, MemoryBudgetError, SceneError, exit_status
 from thermoxels_ns.core.quiet_warnings import PROGRAMMERS_WARNINGS, environment_value
-from thermoxels_ns.synthetic.catalogue import SCENE_NAMES
 from thermoxels_ns.synthetic.scene_folder import load_truth
 
 SMALL = ["--num-train", "3", "--num-eval", "1", "--width", "16", "--height", "12"]
-
-
-def test_the_scenes_on_the_command_line_are_those_there_are():
-    assert get_args(SceneName) == SCENE_NAMES
 
 
 def test_help_loads_nothing_heavy():

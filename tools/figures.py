@@ -74,7 +74,7 @@ def version() -> str:
 
 
 def read_demo(folder: Path) -> Figures:
-    """Return the figures of a finished demo; raises `ThermoxelsError` where one is missing."""
+    """Return the figures of a finished demo; raises `KeyError` where one is missing."""
     from thermoxels_ns.commands.demo_results import compare, numbers_of
 
     image = numbers_of(folder / "eval.json", "results")

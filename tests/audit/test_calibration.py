@@ -128,12 +128,6 @@ BOTH = ("conductivity", "insulation"), ("thickness", "insulation")
             0.0,
             "conductivity of wall and thickness of insulation cannot be told apart",
         ),
-        # A wall as warm as the air loses nothing by convection, whatever the coefficient.
-        (
-            {"film": {"facade": Measured(8.0)}, "unknown": (*WALL.unknown, Unknown("film", "facade"))},
-            0.0,
-            "do not tell the film of facade|told apart",
-        ),
         ({}, 25.0, "No conductivity of wall explains the readings: however large"),
     ],
 )
@@ -202,7 +196,6 @@ def test_what_cannot_be_asked_is_said(changes, named) -> None:
         ("plain", {"behind": ("rom",)}, "behind: expected patches out of .*room.*, got 'rom'"),
         ("plain", {"behind": ("room", "facade")}, "behind: expected another side"),
         ("plain", {"layers": {"x": Layer(("facade",), Measured(0.1), Measured(1.0))}}, "layers: x"),
-        ("plain", {"film": {"room": Measured(5.0)}}, "film"),
         ("window", {}, "conductivity: .*got none for glazing"),
     ],
 )

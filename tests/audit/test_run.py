@@ -36,7 +36,7 @@ from thermoxels_ns.audit.conditions import (
 from thermoxels_ns.audit.defects import find_defects, undisturbed_temperature
 from thermoxels_ns.audit.draws import COUNT, FORMULA, GEOMETRY, Interval, draw, interval_of
 from thermoxels_ns.audit.heat_flow import CONVECTION, SIMPLE, net_radiation_w_m2
-from thermoxels_ns.audit.run import Audit, audit, incidence_factor
+from thermoxels_ns.audit.run import Audit, audit
 from thermoxels_ns.audit.surface import audited_surface
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
@@ -526,14 +526,6 @@ def test_two_bridges_stay_two_and_lose_nothing_to_each_other(plate) -> None:
     assert [one.kind for one in found] == ["point", "point"]
     one = audit(painted(plate, spot), STATED, UP).defects[0]
     assert sum(each.extra_w.value for each in found) == pytest.approx(2.0 * one.extra_w.value, rel=0.02)
-
-
-def test_incidence_is_the_published_one() -> None:
-    """Ti 20, T_1D 18.5; equal areas 60 at 18.5, 20 at 18.0, 20 at 17.0 C: 1.26667."""
-    mean, calm = np.full(3, 0.6 * 18.5 + 0.2 * 18.0 + 0.2 * 17.0), np.full(3, 18.5)
-    found = incidence_factor(mean, calm, np.full(3, 20.0))
-    assert found is not None and found.value == pytest.approx(1.26667, abs=5e-6)
-    assert incidence_factor(mean, calm, np.array([18.6, 18.4, 18.6])) is None
 
 
 def test_the_undisturbed_temperature_is_that_of_the_larger_part() -> None:

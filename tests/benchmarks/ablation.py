@@ -44,7 +44,6 @@ from thermoxels_ns.core.errors import ThermoxelsError
 
 _MODEL, _LOSS = "--pipeline.model.", "--pipeline.model.loss-overrides"
 _CALLBACKS = "thermoxels_ns.training.callbacks"
-_BOX = "thermoxels_ns.data.scene_box"
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ MECHANISMS: Mapping[str, Without] = {
     "opaque-neighbours": Without(replaced=((_CALLBACKS, "OPAQUE_DEPTH", math.inf),)),
     "keep-ends": Without(replaced=((_CALLBACKS, "voxel_weights", _without_ends),)),
     "thinning": Without((f"{_MODEL}thin-threshold", "0")),
-    "box-distant-points": Without(replaced=((_BOX, "_worth_keeping", lambda points, *_: np.ones(len(points), bool)),)),
+    "box-shown-well": Without(replaced=(("thermoxels_ns.core.snapshot", "SHOWN_WELL", 0.0),)),
     "surroundings": Without((f"{_MODEL}surroundings", "off")),
     "bend": Without((_LOSS, "bend", "0")),
     "distortion": Without((_LOSS, "distortion", "0")),

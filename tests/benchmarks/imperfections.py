@@ -30,9 +30,6 @@ FLAWS = {
     "walk": Imperfections(pose_error_deg=0.15, pose_correlation=0.95),
     "focal": Imperfections(focal_error=0.005),
     "thermal": THERMAL,
-    "vignetting": Imperfections(vignetting=0.3, thermal_vignetting_k=1.0),
-    "motion": Imperfections(motion_blur_px=2.0, rolling_shutter_px=2.0),
-    "pixels": Imperfections(fixed_pattern_k=0.1, dead_pixels=0.002),
     "passers-by": Imperfections(passers_by=0.2),
     "all": replace(EXPOSURE, pose_error_deg=0.15, thermal_blur_px=1.5, drift_k=1.0, noise_k=0.1),
 }
@@ -43,7 +40,7 @@ _SHOWN = ("psnr", "psnr_box", "psnr_fitted", "thermal_mae_debiased_c", "fscore_1
 
 def doubled(flaws: Imperfections) -> Imperfections:
     """The same flaws, twice as large; shares and JPEG stay."""
-    same = ("jpeg_quality", "pose_correlation", "dead_pixels", "passers_by")
+    same = ("jpeg_quality", "pose_correlation", "passers_by")
     return replace(flaws, **{name: 2.0 * value for name, value in vars(flaws).items() if name not in same})
 
 

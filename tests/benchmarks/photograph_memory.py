@@ -21,7 +21,7 @@ import tyro
 from measuring import print_head, print_row
 from PIL import Image
 
-from thermoxels_ns.synthetic.catalogue import make_scene
+from thermoxels_ns.synthetic.drawn_scenes import make_scene
 from thermoxels_ns.synthetic.scene_folder import write_scene
 
 _SMALL = (320, 240)

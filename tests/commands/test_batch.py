@@ -25,7 +25,7 @@ if [ -s "$ends" ]; then
 fi
 while [ $# -gt 0 ]; do
     case "$1" in
-        --output-path) echo '{"results": {"psnr": 30.5}}' >"$2" ;;
+        --output-path) echo '{"results": {"psnr": 30.5, "fscore_128": 0.875}}' >"$2" ;;
         --output-dir) mkdir -p "$2"; [ "$(basename "$2")" = audit ] && cp "$ANSWERS" "$2/answers.json" ;;
     esac
     shift
@@ -96,7 +96,8 @@ def test_a_batch_goes_on_past_what_fails_and_from_where_it_was(tmp_path, command
     assert (tmp_path / "broken" / "ns-train.ends").read_text() == "1\n"  # a crash is not tried twice
     page = (out / "index.html").read_text()
     assert "2 finished, 2 not" in page and "model: Error: ns-train: what is wrong (input)" in page
-    assert "(crash)" in page and "812" in page and "700 to 950" in page
+    assert "(crash)" in page and "812" in page and "700 to 950" in page and page.count("<td>30.5</td>") == 2
+    assert page.count("<td>0.88</td>") == 2 and page.count("<td></td>") >= 2  # no temperatures in these results
     assert "--quality draft" in (out / "good" / "logs" / "model.log").read_text()
 
     before = {file: file.stat().st_mtime_ns for file in (out / "good").glob("*.json")}

@@ -1,18 +1,20 @@
 import dataclasses
 import importlib
+import json
 import sys
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from nerfstudio.configs.method_configs import all_methods
 
 from thermoxels_ns import config
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.json_values import read_json, write_json
 from thermoxels_ns.core.yaml_records import read_preset, read_yaml, with_overrides
 
 if sys.version_info >= (3, 11):
@@ -129,3 +131,12 @@ def test_a_key_given_twice_is_found_among_many(tmp_path, read):
     (tmp_path / "a").write_text(text)
     with pytest.raises(ThermoxelsError, match=r"a: expected a .*, got the key k7 twice"):
         read(tmp_path / "a")
+
+
+def test_json_keeps_order_and_converts_numpy(tmp_path):
+    figures = {"volume": np.float32(0.5), "counts": {"tets": np.int64(6)}, "bounds": np.eye(2), "run": Path("a/b")}
+    write_json(tmp_path / "summary.json", {**figures, "unit": "°C"})
+    text = (tmp_path / "summary.json").read_text(encoding="utf-8")
+    read = json.loads(text)
+    assert list(read) == [*figures, "unit"] and "°C" in text and '\n "volume": 0.5' in text
+    assert (read["counts"], read["bounds"], read["run"]) == ({"tets": 6}, [[1.0, 0.0], [0.0, 1.0]], "a/b")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.support.boxed_scene import write_boxed_scene
+from tests.support.looking_cameras import looking_at
 from tests.support.short_training import train
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
@@ -66,3 +67,17 @@ def test_a_pipeline_fills_evidence_and_views_from_both_streams(tmp_path):
     lo, hi = np.array(snapshot.lattice.lo), np.array(snapshot.lattice.hi)
     towards = 0.5 * (lo + hi) - views.camera_to_world[:, :, 3]
     assert (np.einsum("ni,ni->n", towards, -views.camera_to_world[:, :, 2]) > 0).all()  # they look at the box
+
+
+def test_what_is_shown_well_ends_where_pixels_per_area_fall_off():
+    """Eight cameras 2 away from a point at which all are pointed; visibility falls with the square of the distance."""
+    angle = 0.25 * np.pi * np.arange(8)
+    views = looking_at((0.0, 0.0, 0.0), 2.0 * np.column_stack((np.cos(angle), np.sin(angle), 0.0 * angle)), focal=200.0)
+    reach = np.full(8, 2.0)
+    places = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.5, 0.0, 0.0), (0.0, 0.0, 3.0)])
+    # At (2.5, 0, 0), seen by three of eight, it is 0.6 / 8; nobody looks up to (0, 0, 3).
+    assert views.shown_well(places, reach).tolist() == [True, True, False, False]
+    one = np.where(np.arange(8) == 0, reach, np.nan)  # of the others it is not known what they are pointed at
+    behind = np.array([(-2.9, 0.0, 0.0), (-3.5, 0.0, 0.0), (2.9, 0.0, 0.0)])
+    assert views.shown_well(behind, one).tolist() == [True, False, False]  # (2 / 4.9)^2 = 0.17, (2 / 5.5)^2 = 0.13
+    assert views.shown_well(places, np.full(8, np.nan)).all()

@@ -27,7 +27,7 @@ def poses() -> np.ndarray:
 
 def off_by(angle_deg: float, seed: int = 0) -> np.ndarray:
     flaws = Imperfections(pose_error_deg=angle_deg)
-    return DrawnFlaws(flaws, seed, poses(), (0.0, 0.0, 0.0), (0.0, 1.0)).given_poses()
+    return DrawnFlaws(flaws, seed, poses(), (0.0, 0.0, 0.0)).given_poses()
 
 
 def tracks(noise_px: float = 0.2, points: int = 400, seed: int = 1) -> Tracks:

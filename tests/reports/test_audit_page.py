@@ -27,7 +27,7 @@ def found():
 
 
 def page_of(found, **more) -> str:
-    pictures = {"temperature": [PNG], "u_value": [PNG], "misfit": [], "defects": [PNG] * len(found.defects)}
+    pictures = {"temperature": [PNG], "u_value": [PNG], "misfit": []}
     about = {"report": Report("0-0-0", "1", (("mesh.vtu", "ab" * 32),)), "range_c": None, "most_u": {}}
     return audit_page.audit_page(
         found, pictures, {}, "mesh.vtu", "thermoxels audit", [], impossible=(), **about, **more
@@ -76,7 +76,7 @@ def test_a_large_surface_is_thinned_where_nothing_counts_first() -> None:
 def test_paper_and_pages_that_would_be_too_large_have_pictures_alone(found, monkeypatch) -> None:
     with_view, paper = page_of(found), page_of(found, paper=True)
     assert "id=view " in with_view and "<script" not in paper and len(paper) < 0.1 * len(with_view)
-    assert "a view" not in paper.lower() and paper.count("data:image/png") == with_view.count("data:image/png") == 3
+    assert "a view" not in paper.lower() and paper.count("data:image/png") == with_view.count("data:image/png") == 2
     assert not re.search(r'(?:src|href)="(?!data:|#)', with_view)
     for number in re.findall(r'href="#(bridge-\d+)"', with_view):
         assert f'id="{number}"' in with_view

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thermoxels_ns.reports.mesh_pictures import change_colours, image_of_mesh, voxel_surface, write_picture
+from thermoxels_ns.reports.mesh_pictures import before_after_change, image_of_mesh, voxel_surface, write_picture
 
 SIZE = (400, 300)
 
@@ -68,12 +68,15 @@ def test_up_points_up_and_the_camera_looks_down_on_the_mesh(box_mesh, up):
 
 
 def test_a_few_large_changes_do_not_make_all_others_grey() -> None:
-    change = np.concatenate([np.linspace(-0.1, 0.1, 999), [-3.4]])
-    colours = change_colours(change)
-    low, high = colours["clim"]
+    def colours(change: np.ndarray) -> dict:
+        states = np.stack([np.zeros_like(change), change])
+        return before_after_change(states, np.array([0.0, 60.0]), np.arange(len(change)))[2][1]
+
+    few = colours(np.concatenate([np.linspace(-0.1, 0.1, 999), [-3.4]]))
+    low, high = few["clim"]
     assert low == -high and 0.09 < high < 0.11
-    assert colours["note"] == "colours: middle 99 %; all: -3.4 to 0.1 K"
-    even = change_colours(np.linspace(-2.0, 1.0, 50))
+    assert few["note"] == "colours: middle 99 %; all: -3.40 to 0.100"
+    even = colours(np.linspace(-2.0, 1.0, 50))
     assert even["clim"] == (-2.0, 2.0) and even["note"] == ""
 
 

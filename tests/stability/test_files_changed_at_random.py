@@ -23,6 +23,7 @@ from thermoxels_ns.audit.conditions import load_conditions
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.commands.audit import Audit, answers_of
 from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.json_values import plain_values
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.fem.problem import HeatProblem
@@ -31,7 +32,7 @@ from thermoxels_ns.heat.scene import load_heat_scene
 from thermoxels_ns.heat.solving import Goals
 from thermoxels_ns.mesh.boundary.patches import load_patch_rules
 from thermoxels_ns.mesh.files.formats import write_mesh
-from thermoxels_ns.mesh.files.vtu import read_mesh, summary_text
+from thermoxels_ns.mesh.files.vtu import read_mesh
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.reports.audit_page import audit_page
 from thermoxels_ns.reports.page import Report
@@ -157,7 +158,7 @@ def solve_scene(path: Path, mesh: TetMesh) -> None:
 def answer(path: Path, mesh: TetMesh) -> None:
     """Down to the page."""
     found = audit(mesh, load_conditions(path))
-    summary_text(answers_of(Audit(path.with_name("mesh.vtu"), path), found))
+    plain_values(answers_of(Audit(path.with_name("mesh.vtu"), path), found))
     assert found.whole.u_w_m2k.low <= found.whole.u_w_m2k.high
     shown = {"report": Report("0", "0", ()), "range_c": None, "most_u": {}, "impossible": ()}
     page = audit_page(found, None, {}, "mesh.vtu", "thermoxels audit", (), **shown)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
+from thermoxels_ns.synthetic.drawn_scenes import SCENE_NAMES, make_scene
 from thermoxels_ns.synthetic.solids import BoxSolid, Cylinder, SolidUnion, Sphere
 
 CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.core.feature_rays import MARGIN_ERRORS, MARGIN_VOXELS, FeatureRays
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
@@ -10,7 +10,7 @@ from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.render.reference import ray_distortion, ray_sparsity, total_variation
 from thermoxels_ns.render.renderers import render_rays
 from thermoxels_ns.training import losses
-from thermoxels_ns.training.losses import MARGIN_ERRORS, MARGIN_VOXELS, FeatureRaySampler, feature_ray_loss
+from thermoxels_ns.training.losses import FeatureRaySampler, feature_ray_loss
 
 
 def voxel_corners(lattice: Lattice, cells=None) -> torch.Tensor:

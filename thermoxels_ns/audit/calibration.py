@@ -16,12 +16,12 @@ from typing import Any, cast
 import numpy as np
 from scipy.optimize import least_squares
 
-from thermoxels_ns.audit.conditions import Calibrate, Conditions, Film
+from thermoxels_ns.audit.conditions import Calibrate, Conditions
 from thermoxels_ns.audit.draws import FORMULA, Draws, Interval, emissivity_name, interval_of
 from thermoxels_ns.audit.exchange import HALF_STEP_K, film_flow_w_m2, radiant_k4, triangle_exchange
 from thermoxels_ns.audit.heat_flow import SIMPLE
 from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface, chosen_names
-from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin
@@ -36,7 +36,7 @@ from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import OUTSIDE_RESISTANCE_M2K_W
 
-_UNITS = {"conductivity": "W/(m K)", "thickness": "m", "film": "W/(m2 K)", "capacity": "kJ/(m3 K)"}
+_UNITS = {"conductivity": "W/(m K)", "thickness": "m", "capacity": "kJ/(m3 K)"}
 _BEFORE, _ABSORPTANCE = "air before the weather file", "absorptance of the walls"  # Uncertain with a history alone
 _LEAST_STEP_H, _STEPS_OF_AN_AGE = 0.125, 4.0  # Shortest time step; longer ones are a quarter of the time to the survey
 _UNSEEN_DAY_K = 10.0  # How far air and sun before a file of less than a day may be off what its first hours say
@@ -128,9 +128,11 @@ class _Wall:
             raise AuditError(
                 "surfaces", expected="an emissivity for every patch", got=f"none for {bare[0]}", remedy=remedy
             )
-        self._layers = {
-            name: self._on(f"layers: {name}", self.behind, one.patches) for name, one in asked.layers.items()
-        }
+        there = tuple(names[n] for n in np.unique(patch[self.behind]))
+        self._layers = dict[str, BoolArray]()  # By name of the layer: on which of `behind` it lies, shape (b,)
+        for name, layer in asked.layers.items():
+            on = chosen_names(f"calibrate: layers: {name}", there, layer.patches)
+            self._layers[name] = np.isin(patch[self.behind], [names.index(one) for one in on])
         regions = surface.mesh.region_names
         made_of = chosen_names("calibrate: conductivity", regions, asked.conductivity, "regions")
         unknown = sorted({regions[n] for n in np.unique(surface.mesh.region)} - made_of)
@@ -138,7 +140,6 @@ class _Wall:
             remedy = f"Add {unknown[0]}: 0.8 W/(m K), or '*' for all others."
             expected = "one for every region of the mesh"
             raise AuditError("calibrate: conductivity", expected=expected, got=f"none for {unknown[0]}", remedy=remedy)
-        self._film = {name: self._on("film", self.seen, (name,)) for name in asked.film}
         self.history = self._history() if asked.heat_capacity else None
         self.stated = asked.stated()
         if self.history is not None:
@@ -194,7 +195,7 @@ class _Wall:
         mesh, names = self.surface.mesh, np.array(self.surface.selection.patch_names)
         start_c = np.full(len(self.surface.counted), float(measured_c.mean()))
         start_c[self.counted] = measured_c
-        coefficient, air_c = self._photographed_side(values, draws, start_c[self.seen])
+        coefficient, air_c = self._photographed_side(draws, start_c[self.seen])
         inside = self.conditions.side == "inside"
         far_air_c = float(draws["outside air" if inside else "inside air"][0])
         far = self._far_side(values)
@@ -229,33 +230,21 @@ class _Wall:
         found = solve_heat(problem, steps, scheme=BACKWARD_EULER, relative_tolerance=_LINEAR)
         return found.temperature_c[-1][facets].mean(axis=1)
 
-    def _photographed_side(
-        self, values: Mapping[str, float], draws: Draws, at_c: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _photographed_side(self, draws: Draws, at_c: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return coefficient and air temperature, (s,) each, with which convection is the film's tangent at `at_c`."""
         surface, upward = self.surface, self.surface.upward[self.seen]
         every = np.stack([draws[emissivity_name(self.conditions, n)] for n in range(len(self.conditions.surfaces))])
         emissivity = every[surface.surface_entry[self.seen]]
         around_k4 = radiant_k4(self.conditions, draws, upward)
 
-        def flow(conditions: Conditions, here: Draws, warmer_k: float) -> FloatArray:
+        def flow(warmer_k: float) -> FloatArray:
             surface_k = celsius_to_kelvin(at_c + warmer_k)[:, None]
-            out = film_flow_w_m2(conditions, here, surface_k, around_k4, emissivity, upward)[:, 0]
+            out = film_flow_w_m2(self.conditions, draws, surface_k, around_k4, emissivity, upward)[:, 0]
             return -out if self.conditions.side == "inside" else out
 
-        def tangent(conditions: Conditions, here: Draws) -> tuple[FloatArray, FloatArray]:
-            low, mean, high = (flow(conditions, here, step) for step in (-HALF_STEP_K, 0.0, HALF_STEP_K))
-            coefficient = np.maximum((high - low) / (2.0 * HALF_STEP_K), 1e-3)
-            return coefficient, at_c - mean / coefficient
-
-        coefficient, air_c = tangent(self.conditions, draws)
-        for name, where in self._film.items():
-            value = values[f"film of {name}"]
-            given = replace(self.conditions, film=Film("given", Measured(1.0), Measured(value)))
-            exact = {"film coefficient": np.full(draws.count, value), "film factor": np.ones(draws.count)}
-            own = tangent(given, replace(draws, values={**draws.values, **exact}))
-            coefficient, air_c = np.where(where, own[0], coefficient), np.where(where, own[1], air_c)
-        return coefficient, air_c
+        low, mean, high = (flow(step) for step in (-HALF_STEP_K, 0.0, HALF_STEP_K))
+        coefficient = np.maximum((high - low) / (2.0 * HALF_STEP_K), 1e-3)
+        return coefficient, at_c - mean / coefficient
 
     def _far_side(self, values: Mapping[str, float]) -> FloatArray:
         """Return the coefficient of film and layers on the side not photographed, shape (b,), [W/(m2 K)]."""
@@ -264,12 +253,6 @@ class _Wall:
         for name, where in self._layers.items():
             resistance = resistance + where * values[f"thickness of {name}"] / values[f"conductivity of {name}"]
         return 1.0 / resistance
-
-    def _on(self, entry: str, facets: IntArray, patterns: tuple[str, ...]) -> BoolArray:
-        """Return which of the triangles `facets` lie on patches that match `patterns`, shape (k,)."""
-        names, patch = self.surface.selection.patch_names, self.surface.selection.facet_patch[facets]
-        there = tuple(names[n] for n in np.unique(patch))
-        return np.isin(patch, [names.index(name) for name in chosen_names(f"calibrate: {entry}", there, patterns)])
 
 
 # Functions of places and time for `Varying`.

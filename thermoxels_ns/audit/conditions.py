@@ -227,8 +227,8 @@ class Layer:
 class Unknown:
     """A property that the calibration searches for, starting from the value stated in `Calibrate`."""
 
-    property: Literal["conductivity", "thickness", "film"]
-    of: str  # Key of the property in `conductivity`, `layers` or `film` of `Calibrate`
+    property: Literal["conductivity", "thickness"]
+    of: str  # Key of the property in `conductivity` or `layers` of `Calibrate`
 
     def name(self) -> str:
         """Return the name that reports use, such as "conductivity of wall"."""
@@ -243,8 +243,6 @@ class Calibrate:
     """Conductivity by name or pattern of regions of the mesh; of several that match a region, the last one holds."""
     unknown: tuple[Unknown, ...]  # One to `MOST_UNKNOWN` properties to search for
     layers: dict[str, Layer] = field(default_factory=dict)
-    film: dict[str, Annotated[Measured, Unit("W/(m2 K)", 0.0, above=True)]] = field(default_factory=dict)
-    """Convection coefficient, beside radiation, by name or pattern of photographed patches; replaces the film model."""
     behind: tuple[str, ...] = ("interior-*",)  # Patches in contact with the air on the side not photographed
     adiabatic: tuple[str, ...] = ("cut",)  # Patches that no heat crosses
     heat_capacity: dict[str, Annotated[Measured, Unit("kJ/(m3 K)", 0.0, above=True)]] = field(default_factory=dict)
@@ -276,7 +274,7 @@ class Calibrate:
         every |= {f"conductivity of {name}": layer.conductivity for name, layer in self.layers.items()}
         every |= {f"thickness of {name}": layer.thickness for name, layer in self.layers.items()}
         every |= {f"capacity of {name}": value for name, value in self.heat_capacity.items()}
-        return every | {f"film of {name}": value for name, value in self.film.items()}
+        return every
 
 
 @record(AuditError)

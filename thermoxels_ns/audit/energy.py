@@ -44,7 +44,6 @@ class EnergyResult:
     elements: tuple[EnergyUse, ...]  # By patch
     whole: EnergyUse
     savings: tuple[EnergyUse, ...]  # By measure
-    after: tuple[EnergyUse, ...]  # By measure: what its patches need when it is done
     leaves_out: str = LEAVES_OUT
 
 
@@ -73,20 +72,18 @@ def year_of(
 
     per_u = {name: area * hours / 1000.0 for name, area, _ in elements}
     heat = {name: u * per_u[name] for name, _, u in elements}
-    savings, after = [], []
+    savings = []
     for name, measure in asked.measures.items():
         chosen = chosen_names(f"energy: measures: {name}", tuple(heat), measure.patches)
         new_u = drawn(measure.u)
         then = sum((new_u * per_u[one] for one in heat if one in chosen), np.zeros(draws.count))
         before = sum((heat[one] for one in heat if one in chosen), np.zeros(draws.count))
         savings.append(use(name, before - then))
-        after.append(use(name, then))
     return EnergyResult(
         degree_hours_kh=interval_of(hours),
         elements=tuple(use(name, one) for name, one in heat.items()),
         whole=use("all that was observed", sum(heat.values(), np.zeros(draws.count))),
         savings=tuple(savings),
-        after=tuple(after),
     )
 
 

@@ -119,7 +119,6 @@ class Defect:
     departure_k: float  # Absolute difference between `spot_c` and `undisturbed_c`, [K]
     spot_c: Interval  # Mean temperature of the square decimetre that departs most, [degrees Celsius]
     undisturbed_c: float  # Mean temperature of the undisturbed surface near by, [degrees Celsius]
-    incidence: Interval | None  # I_tb, the result of `incidence_factor`, which may be None
     extra_w: Interval  # Extra heat flow from inside to outside, [W]
     coefficient: Interval
     """Of a line psi, [W/(m K)]; of a point chi, [W/K]; of an area its extra heat flow per kelvin, [W/K]."""
@@ -225,8 +224,7 @@ def audit_mesh(
     if not isinstance(conditions, Conditions):
         conditions = load_conditions(conditions)
     body, about = any_mesh(mesh, up)
-    towards = check_direction("up", about.get("up") or (0.0, 0.0, 1.0), "Pass up=(0, 0, 1).", AuditError)
-    x, y, z = (towards / float(np.linalg.norm(towards))).tolist()
+    x, y, z = check_direction("up", about.get("up") or (0.0, 0.0, 1.0), "Pass up=(0, 0, 1).", AuditError).tolist()
     with threadpool_limits(1, "blas"):  # with more, the last bits would depend on the number of threads
         return audit(body, conditions, (x, y, z))
 
@@ -479,7 +477,6 @@ class _Parts:
         per_kelvin = extra / self.draws.difference_k / (one.length_m if one.kind == "line" else 1.0)
         self.coefficients[zone] = per_kelvin
         extra_w, f_rsi = interval_of(extra), tuple(map(interval_of, self.temperature_factors(spot, off_k)))
-        air_c = self.draws["inside air" if self.conditions.side == "inside" else "outside air"]
         around_c = float(totals.surface_c[calm, 0])
         area, spot_c = surface.area_m2[one.core], interval_of(totals.surface_c[spot] + off_k)
         x, y, z = np.average(surface.centroid_m[one.core], axis=0, weights=area).tolist()
@@ -494,25 +491,12 @@ class _Parts:
             departure_k=abs(spot_c.value - around_c),
             spot_c=spot_c,
             undisturbed_c=around_c,
-            incidence=incidence_factor(totals.surface_c[zone] + off_k, totals.surface_c[calm], air_c),
             extra_w=extra_w,
             coefficient=interval_of(per_kelvin),
             f_rsi=f_rsi,
             severity=_severity(self.conditions, extra_w, f_rsi, whole_w),
             not_counted=one.not_counted,
         )
-
-
-def incidence_factor(bridge_c: FloatArray, undisturbed_c: FloatArray, air_c: FloatArray) -> Interval | None:
-    """Return I_tb = (Ta - Tp) / (Ta - T1D) of a thermal bridge (Asdrubali and others); inputs have shape (k,).
-
-    Tp is the mean surface temperature of the bridge, T1D of the undisturbed surface, and Ta the temperature of the air
-    on the seen side. None if the undisturbed surface is colder than the air in some draws and warmer in others.
-    """
-    undisturbed = undisturbed_c - air_c
-    if undisturbed.min() <= 0.0 <= undisturbed.max():
-        return None
-    return interval_of((bridge_c - air_c) / undisturbed)
 
 
 def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ...], whole_w: float) -> Severity:

@@ -21,8 +21,9 @@ from typing import Any, NamedTuple, NoReturn
 import tyro
 
 from thermoxels_ns.commands.installed_commands import PLAIN_TRAINING, CommandFailed, run_command
-from thermoxels_ns.core.checks import hold_folder, remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import hold_folder, remove_file, writable_folder
 from thermoxels_ns.core.errors import BAD_DATA, CRASH, LACK_OF_MEMORY, SceneError, ThermoxelsError
+from thermoxels_ns.core.json_values import write_json
 
 BATCH, PAGE = "batch.json", "index.html"
 _ENDED = 137  # Status of a stage that was ended from outside, as by a scheduler's limit of memory or time
@@ -118,11 +119,12 @@ def run_batch(batch: Batch, console: Any) -> None:
         raise ThermoxelsError("snakemake", expected="a package of this Python", got="none", remedy=remedy)
     folder = writable_folder(batch.output_dir).resolve()
     with hold_folder(folder / ".batch.lock", "Wait for it, or pass another --output-dir.", console.print) as lock:
-        _write_json(folder / BATCH, {name: asdict(one) for name, one in buildings.items()})
+        write_json(folder / BATCH, {name: asdict(one) for name, one in buildings.items()})
         if not batch.dry_run:
             _forget_what_changed(folder, buildings)
         command = [
-            *(sys.executable, "-m", "snakemake", "--snakefile", str(_snakefile()), "--directory", str(folder)),
+            *(sys.executable, "-m", "snakemake", "--directory", str(folder)),
+            *("--snakefile", str(Path(__file__).parents[1] / "workflow" / "Snakefile")),
             *("--cores" if not batch.executor else "--jobs", str(batch.cores)),
             *("--keep-going", "--rerun-incomplete", "--rerun-triggers", "mtime", "--nolock"),
             *(() if batch.memory_gb is None else ("--resources", f"mem_mb={int(1e3 * batch.memory_gb)}")),
@@ -281,23 +283,19 @@ def run_stage(name: str, stage: str, attempt: int) -> int:
     earlier = _read(failed).get("status", _ENDED)
     if attempt > 1 and earlier not in _TRIED_AGAIN:
         return earlier
-    _write_json(failed, {"status": _ENDED, "why": "ended from outside, as by a limit of memory or time"})
+    write_json(failed, {"status": _ENDED, "why": "ended from outside, as by a limit of memory or time"})
     command = plan_of(read_batch(Path())[name], Path(name))[stage].command
     try:
         with Path(os.devnull).open("w") as nowhere:  # the log has all
             cost = run_command(command, log, Console(file=nowhere))
         peak = cost.peak_memory_gb if math.isfinite(cost.peak_memory_gb) else None
-        _write_json(folder / f"{stage}.json", {"seconds": cost.seconds, "peak_memory_gb": peak, "command": command})
+        write_json(folder / f"{stage}.json", {"seconds": cost.seconds, "peak_memory_gb": peak, "command": command})
     except (ThermoxelsError, OSError) as problem:
         told = (problem.exit_status, problem.last_line) if isinstance(problem, CommandFailed) else (CRASH, str(problem))
-        _write_json(failed, dict(zip(("status", "why"), told)))
+        write_json(failed, dict(zip(("status", "why"), told)))
         return told[0]
     remove_file(failed)
     return 0
-
-
-def _snakefile() -> Path:
-    return Path(__file__).parents[1] / "workflow" / "Snakefile"
 
 
 def _row(folder: Path, name: str, building: Building) -> dict[str, Any]:
@@ -313,7 +311,7 @@ def _row(folder: Path, name: str, building: Building) -> dict[str, Any]:
         **{"name": name, "finished": len(costs) == len(plan), "failed": bool(said)},
         "why": why or [f"{stage}: not run" for stage in plan if stage not in costs],
         "logs": [f"{name}/logs/{stage}.log" for stage in said],
-        "psnr": _read(own / "eval.json").get("results", {}).get("psnr") if "scores" in costs else None,
+        "scores": _read(own / "eval.json").get("results", {}) if "scores" in costs else {},
         "seconds": {stage: cost["seconds"] for stage, cost in costs.items()},
         "peak_gb": max(memory, default=None),
         "loss_w": answers.get("whole", {}).get("loss_w"),
@@ -332,11 +330,6 @@ def _read(path: Path) -> dict[str, Any]:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-
-
-def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    with replace_when_done(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 def _write_page(path: Path, rows: list[dict[str, Any]]) -> None:

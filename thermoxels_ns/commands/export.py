@@ -17,7 +17,7 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import check_direction, remove_file, result_folder
 from thermoxels_ns.core.config_loader import check_run
 from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, SceneError, ThermoxelsError, exit_status
-from thermoxels_ns.core.json_values import read_json_object
+from thermoxels_ns.core.json_values import plain_values, read_json_object, write_json
 from thermoxels_ns.core.lattice import Lattice, input_from_world
 from thermoxels_ns.data.scene_scale import (
     SceneScale,
@@ -356,7 +356,6 @@ def export_snapshot(
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
     from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
     from thermoxels_ns.mesh.files.surface import check_stl
-    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
     from thermoxels_ns.mesh.quality.report import check_mesh, picture_of_quality
     from thermoxels_ns.mesh.tetrahedra import support_of_facets
     from thermoxels_ns.reports import mesh_pictures
@@ -424,7 +423,7 @@ def export_snapshot(
         "up": up,
         "up_source": up_source,
         "region": region,
-        "mesh": export_summary.mesh_summary(built, report, checked.selection, scale, voxel_size),
+        "mesh": export_summary.mesh_summary(built, report, scale, voxel_size),
         "heat": {"computed": False, "reason": skipped}
         if solution is None
         else export_summary.heat_summary(material, time, solution),
@@ -432,10 +431,10 @@ def export_snapshot(
         **({} if truth is None else {"truth": truth}),
         "files": [*files, _SUMMARY],
     }
-    summary_text(summary)  # raises if json cannot hold the summary
+    plain_values(summary, "summary", MeshError)  # raises if json cannot hold the summary
 
     remove_file(folder / _SUMMARY)
-    write_summary(folder / _QUALITY, report.as_mapping())  # first: marks the folder as an export's for `prepare_folder`
+    write_json(folder / _QUALITY, report.as_mapping())  # first: marks the folder as an export's for `prepare_folder`
     for name in {*_mesh_files(MESH_FORMATS), *_MESH_PICTURES, _HEAT_PICTURE} - set(files):
         remove_file(folder / name)
     if solution is None:
@@ -461,7 +460,7 @@ def export_snapshot(
         mesh_pictures.write_picture(folder / _MESH_PICTURES[3], mesh_pictures.image_of_mesh(mesh, **beside))
         if solution is not None:
             mesh_pictures.draw_heat(folder / _HEAT_PICTURE, mesh, solution, look)
-    write_summary(folder / _SUMMARY, summary)
+    write_json(folder / _SUMMARY, summary)
     say(f"Written to {folder}: {', '.join(name for name in summary['files'] if '/' not in name)}")
     return summary
 
@@ -547,8 +546,13 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
     def check(config: TrainerConfig) -> TrainerConfig:
         if isinstance(config, ThermoxelsTrainerConfig):
             config.moved_to(load_config.parent)
-        _check_config(config)
-        manager: Any = config.pipeline.datamanager
+        pipeline: Any = config.pipeline
+        if not callable(getattr(pipeline._target, "grid_snapshot", None)):
+            expected = "a model trained with a Thermoxels method"
+            got = f"the checkpoint of another method ({config.method_name})"
+            remedy = "Train with ns-train thermoxels, or choose another subcommand of ns-export."
+            raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
+        manager: Any = pipeline.datamanager
         told = getattr(manager, "data", None)  # with --data of ns-train, else with the dataparser's own --data
         check_scene(Path(manager.dataparser.data if told is None else told))
         return config
@@ -604,13 +608,3 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
         level /= np.linalg.norm(level)
         direction = tuple(float(v) for v in level + 0.35 * np.cross(up, level) - 0.35 * up)
     return Viewpoint(tuple(float(v) for v in up), source, direction)  # type: ignore[arg-type]
-
-
-def _check_config(config: TrainerConfig) -> None:
-    """Raise `CheckpointError` for a run of another method."""
-    pipeline: Any = config.pipeline
-    if not callable(getattr(pipeline._target, "grid_snapshot", None)):
-        expected = "a model trained with a Thermoxels method"
-        got = f"the checkpoint of another method ({config.method_name})"
-        remedy = "Train with ns-train thermoxels, or choose another subcommand of ns-export."
-        raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)

@@ -72,7 +72,7 @@ def lines_on_mesh(
 
 
 def mesh_summary(
-    built: BuiltMesh, report: QualityReport, selection: SolidSelection, scale: SceneScale | None, voxel_size: float
+    built: BuiltMesh, report: QualityReport, scale: SceneScale | None, voxel_size: float
 ) -> dict[str, Any]:
     """Return the entry "mesh" of summary.json: counts, sizes and steps; lengths are in the summary's length_unit."""
     mesh, solid = built.mesh, built.solid
@@ -81,12 +81,6 @@ def mesh_summary(
     of_triangles = facet_areas(mesh.points_m, mesh.facets)
     unobserved = of_triangles @ ~mesh.observed[mesh.facets].all(axis=1)
     litres = 1e3 * voxel_size**3
-    asked: dict[str, float] = {}
-    if selection.density_percentile is not None and selection.density_threshold is None:
-        asked = {
-            "share_of_voxels_asked_for": 1.0 - selection.density_percentile / 100.0,
-            "share_of_voxels_kept": _voxels_found(solid) / solid.cells.size,  # before the choice of a region
-        }
     return {
         "boundary": report.boundary_mode,
         "nodes": report.num_nodes,
@@ -103,7 +97,6 @@ def mesh_summary(
         "dihedral_angles_deg": {"min": report.dihedral_range_deg[0], "max": report.dihedral_range_deg[1]},
         "density_threshold_used": solid.threshold,
         "density_threshold_why": solid.explanation,
-        **asked,
         "solid_steps": [
             {"step": step.name, "voxels_added": step.added, "voxels_removed": step.removed}
             | ({} if scale is None else {"litres_added": litres * step.added, "litres_removed": litres * step.removed})

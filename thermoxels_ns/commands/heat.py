@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.commands.installed_commands import command_of
 from thermoxels_ns.core.checks import remove_file, replace_when_done, result_folder
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.core.json_values import read_json_object
+from thermoxels_ns.core.json_values import plain_values, read_json_object, write_json
 
 if TYPE_CHECKING:
     from thermoxels_ns.heat.run import HeatRun
@@ -224,13 +224,12 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     """Write all files of a run into an existing folder, answers.json last; raises `OutputError` if writing fails."""
     from thermoxels_ns.fem.solution import SteadySolution
     from thermoxels_ns.heat.vtk_series import remove_heat_series, shown_states, write_heat_series
-    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtu
+    from thermoxels_ns.mesh.files.vtu import write_vtu
     from thermoxels_ns.reports.heat_page import heat_page
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES, draw_surface
     from thermoxels_ns.reports.page import identify, write_page
 
-    answers = answers_of(options, run)
-    summary_text(answers)  # raises if json cannot hold the answers
+    answers = plain_values(answers_of(options, run), "answers", HeatError)  # raises if json cannot hold the answers
     shown, pictures = run.nodes, list[str]()
     remove_file(folder / ANSWERS)
     _write_series(folder / SERIES, run)  # first: marks the folder as a heat run's for `result_folder`
@@ -251,7 +250,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     inputs = [mesh, mesh.with_name(f"{mesh.stem}-boundary.vtp"), Path(scene), *filter(None, [options.from_audit])]
     report = identify(inputs, scene, options.probes, options.up, options.tolerance, options.flow_tolerance)
     write_page(folder / PAGE, heat_page(run, drawn, mesh.name, command_of("heat", options), files, report))
-    write_summary(folder / ANSWERS, answers)
+    write_json(folder / ANSWERS, answers)
     say(f"Written to {folder}: {', '.join(files)}")
 
 

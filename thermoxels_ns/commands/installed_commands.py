@@ -5,7 +5,6 @@ from __future__ import annotations
 import codecs
 import math
 import os
-import re
 import shlex
 import shutil
 import subprocess
@@ -36,8 +35,8 @@ class ProcessCost(NamedTuple):
 
     seconds: float  # Wall time, [s]
     peak_memory_gb: float
-    """Largest resident memory of the process, [1e9 bytes]; NaN if the system has no `wait4`, or if the process took no
-    more memory than the process that started it."""
+    """Largest resident memory of the process, [1e9 bytes]; NaN if the system has no `wait4`. Linux reports no less than
+    the memory of the process that started it."""
 
 
 class CommandFailed(ThermoxelsError):
@@ -94,13 +93,27 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
     if console.is_terminal:
         environment |= {"FORCE_COLOR": "1", "COLUMNS": str(console.width)}
     console.print(f"$ {command_line(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)
-    start = time.monotonic()
-    with log.open("wb") as file:
-        process = subprocess.Popen(
-            [program, *words[1:]], stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, env=environment
-        )
+    start, peak_memory_gb = time.monotonic(), math.nan
+    decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")  # output so far may end within a character
+    process = subprocess.Popen(
+        [program, *words[1:]],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env=environment,
+    )
+    assert process.stdout is not None
     try:
-        peak_memory_gb = _wait(process, log, console)
+        with log.open("wb", buffering=0) as file, process.stdout as output:
+            while arrived := os.read(output.fileno(), 65536):
+                file.write(arrived)
+                console.file.write(decoder.decode(arrived))
+                console.file.flush()
+        if hasattr(os, "wait4"):  # POSIX; elsewhere memory is not measured
+            _, status, usage = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+            peak_memory_gb = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
+        process.wait()
     finally:
         if process.poll() is None:
             process.terminate()
@@ -111,34 +124,3 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
         lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
         raise CommandFailed(message, process.returncode, lines)
     return ProcessCost(time.monotonic() - start, peak_memory_gb)
-
-
-def _wait(process: subprocess.Popen[bytes], log: Path, console: Console) -> float:
-    """Show the output until a process ends; return its peak memory [1e9 bytes]."""
-    decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")  # output so far may end within a character
-    with log.open("rb") as output:
-        while True:
-            ended, peak_memory_gb = _ended(process)
-            if arrived := output.read():
-                console.file.write(decoder.decode(arrived))
-                console.file.flush()
-            if ended:
-                return peak_memory_gb
-            time.sleep(0.05)
-
-
-def _ended(process: subprocess.Popen[bytes]) -> tuple[bool, float]:
-    """Return whether a process has ended, and its peak memory, [1e9 bytes]; NaN if it runs or memory is not known."""
-    wait4 = getattr(os, "wait4", None)  # POSIX; elsewhere memory is not measured
-    if wait4 is None:
-        return process.poll() is not None, math.nan
-    pid, status, usage = wait4(process.pid, os.WNOHANG)
-    if pid != process.pid:
-        return False, math.nan
-    process.returncode = os.waitstatus_to_exitcode(status)
-    # Linux reports at least the peak of the process that started the command: such a figure tells nothing.
-    own = Path("/proc/self/status")
-    found = re.search(r"^VmHWM:\s*(\d+) kB", own.read_text(), re.MULTILINE) if own.is_file() else None
-    if found and usage.ru_maxrss <= int(found[1]):
-        return True, math.nan
-    return True, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9

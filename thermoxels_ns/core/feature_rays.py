@@ -12,6 +12,9 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 RGB_STREAM = 1  # The ray carries a colour target
 THERMAL_STREAM = 2  # The ray carries a temperature target
 
+MARGIN_VOXELS, MARGIN_ERRORS = 1.5, 2.0
+"""A surface is at a point, and the air before it ends, within so many voxels plus so many standard errors of the length
+of a ray to the point: in the loss of feature rays, in votes on air, and where photographs support a surface."""
 NEIGHBOURS = 8  # Points nearest to a point in a photograph with which the point's distance is compared
 FEWEST_NEIGHBOURS = 4  # A photograph with fewer neighbours of a point does not judge the point
 STEEPEST = 3.0  # Largest slope of a surface against the photograph at which points on it agree: 72 degrees

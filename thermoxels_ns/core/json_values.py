@@ -44,7 +44,7 @@ def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] =
 
 def write_json(path: Path, content: Any, error: type[ThermoxelsError] = ThermoxelsError) -> None:
     """Write `plain_values(content)` to a json file; raises `error` for bad values, `OutputError` if writing fails."""
-    text = json.dumps(plain_values(content, path.stem, error), indent=1, allow_nan=False)
+    text = json.dumps(plain_values(content, path.stem, error), indent=1, ensure_ascii=False, allow_nan=False)
     with replace_when_done(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
+from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.data.transforms_json import read_pose
@@ -19,8 +20,7 @@ from thermoxels_ns.data.transforms_json import read_pose
 Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 
 _REMEDY = "Pass --scene-box with two corners in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax."
-_TAIL_OF_POINTS, _TAIL_OF_DEPTHS = 0.5, 0.1
-"""Points left outside the box at either end of an axis, [%]; sparse points have more strays than depths."""
+_TAIL = 0.5  # Points left outside the box at either end of an axis, [%]: some are wrong
 _MARGIN = 0.08  # Width added on every side, relative to the longest side of the box
 _ROUNDED = 2.0**-8  # Corners are rounded to this share of the longest side, or less
 _MOST_POINTS = 20_000  # About as many of the points are used
@@ -30,11 +30,8 @@ _STEREO_PHOTOGRAPHS, _STEREO_SIDE = 32, 96
 """Photographs whose depths are found, and pixels along their longer side; this takes some seconds."""
 _FEWEST_POINTS = 10  # Sparse points in view that a box needs
 _FEWEST_DEPTHS = 200  # Depths that a box needs; with fewer it is found from the cameras
-_LEAST_SHOWN, _MOST_WITHOUT = 0.15, 0.1
-"""Least share of a photograph's points that must be kept, and share of the photographs that may keep less."""
-_WORTH_LEAVING_OUT = 1.5  # Points are left out if the box then holds at least so many times the points per length
-_NEARLY_BEST = 0.9  # Limits that give this share of the most points per length are as good
 _FEW_IN_VIEW = 0.05  # A photograph with fewer points in view, relative to the photograph with most, tells nothing
+_MIDDLE = 0.25  # A camera is pointed at what is in view this far from the photograph's edge, of the shorter side
 _NEARER_HALF = 0.25  # Where no points are known, the surface is taken to stand at this quantile of the depths in a box
 _CONVERGING = 0.5  # Cameras look outwards if the place they look at is nearer than this, relative to their spread
 # Swap of axes by old versions of ns-process-data, before the json had applied_transform.
@@ -49,7 +46,6 @@ class BoxEvidence:
     frames: Sequence[Frame]
     corners: Box | None = None  # None: not given
     points: FloatArray | None = None  # Points of the scene, shape (n, 3); None: not known
-    tail: float = _TAIL_OF_POINTS  # Points left outside at either end of an axis, [%]
 
     def box(self) -> Box:
         """Return the scene box: `corners`, else `box_of_points`, else `box_of_cameras`.
@@ -60,7 +56,7 @@ class BoxEvidence:
         if self.corners is not None:
             return self.corners
         if self.points is not None:
-            return box_of_points(self.points, self.frames, self.tail)
+            return box_of_points(self.points, self.frames)
         return box_of_cameras(self.frames)
 
     def pixel_size(self, box: Box) -> float:
@@ -110,7 +106,7 @@ def find_scene_box(scene: SceneFile, option: Sequence[Sequence[float]] | None, t
     if len(points) < _FEWEST_DEPTHS:
         return BoxEvidence("the cameras (no scene_box, no sparse points, no depths that photographs agree on)", frames)
     source = f"{len(points)} depths on which {photographs} photographs agree"
-    return BoxEvidence(source, frames, points=points, tail=_TAIL_OF_DEPTHS)
+    return BoxEvidence(source, frames, points=points)
 
 
 def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
@@ -127,39 +123,39 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
         mask, camera = None if shown is None else np.array(shown) > 0, frame.intrinsics.resized(*picture.size)
         pinholes.append(photographs.pinhole(np.array(picture), mask, camera, frame.pose, _STEREO_SIDE))
     seen = photographs.gathered(pinholes, [frame.pose[:3, 3] for frame in frames])
-    # A wrong depth harms the box more than a missing one.
-    depths = stereo.depths_of(seen, views_to_contradict=0, difference=0.0)
+    depths = stereo.depths_of(seen)
     depths = stereo.depths_before_backdrop(depths)[0]
     return stereo.feature_rays_to_depths(depths).points, len(frames)
 
 
-def box_of_points(points: FloatArray, frames: Sequence[Frame], tail: float = _TAIL_OF_POINTS) -> Box:
-    """Return the box around the points (n, 3), in input coordinates, that photographs show close up.
+def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
+    """Return the box around the points (n, 3), in input coordinates, that photographs show well.
 
-    Along each axis the box leaves out `tail` [%] of the points at either end, and is then wider by `_MARGIN` on every
-    side, because parts without texture have no points and a flat scene needs some depth. Points that are not finite or
-    in no photograph's view do not count. Points in view of few photographs, or far behind others, are left out if the
-    box then holds clearly more points per length. If a photograph has hardly any of the remaining points in view, as of
-    a plain wall, the box also holds the point on its optical axis at the median depth of the other photographs.
+    Points count that photographs show about as well as what cameras are pointed at, see `Views.shown_well`, by which
+    the export chooses its region, too. Along each axis the box leaves out `_TAIL` of them at either end, and is then
+    wider by `_MARGIN` on every side, because parts without texture have no points and a flat scene needs some depth. If
+    a photograph has hardly any of these points in view, as of a plain wall, the box also holds the point on its optical
+    axis at the median distance of what the other cameras are pointed at.
     """
     points = points[np.isfinite(points).all(axis=1)]
     points, frames = points[:: max(len(points) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
     depth = _depths_in_view(points, frames)
-    seen = np.isfinite(depth).any(axis=0)
-    points, depth = points[seen], depth[:, seen]
-    for figure in (_rarity, _distance_behind) if len(points) >= _FEWEST_POINTS else ():
-        kept = _worth_keeping(points, depth, figure(depth), tail)
-        points, depth = points[kept], depth[:, kept]
+    seen = np.isfinite(depth)
+    middle = _depths_in_view(points, frames, _MIDDLE)
+    ahead = np.array(
+        [np.median(row[known]) if known.any() else np.nan for row, known in zip(middle, ~np.isnan(middle))]
+    )
+    kept = seen.any(axis=0) & _views(frames).shown_well(points, ahead)
+    points, shown = points[kept], seen[:, kept].sum(axis=1)
     if len(points) < _FEWEST_POINTS:
         expected = f"at least {_FEWEST_POINTS} points in front of the cameras to find the scene box"
         raise SceneError("sparse points", expected=expected, got=len(points), remedy=_REMEDY)
-    low, high = np.percentile(points, (tail, 100.0 - tail), axis=0)
+    low, high = np.percentile(points, (_TAIL, 100.0 - _TAIL), axis=0)
     margin = _MARGIN * (high - low).max()
-    shown = np.isfinite(depth).sum(axis=1)
     few = shown < _FEW_IN_VIEW * shown.max()
     if few.any():
-        ahead = np.median([np.nanmedian(row) for row in depth[~few]])
-        ends = np.stack([f.pose[:3, 3] - ahead * f.pose[:3, 2] for f, blind in zip(frames, few) if blind])
+        typical = np.nanmedian(ahead)
+        ends = np.stack([f.pose[:3, 3] - typical * f.pose[:3, 2] for f, blind in zip(frames, few) if blind])
         low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
     # Rounded outwards, so that other processors, on which a few depths differ, find the same box.
     step = _ROUNDED * 2.0 ** np.floor(np.log2(max((high - low).max(), 1e-300)))
@@ -168,46 +164,30 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame], tail: float = _TA
     return _checked(np.stack([low, high]), "box of the points")
 
 
-def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array:
-    """Return the depth of each point in each photograph, (photographs, points); NaN where the point is not in view."""
+def _views(frames: Sequence[Frame]) -> Views:
+    """Return the frames' cameras as pinholes."""
+    lenses = [frame.intrinsics for frame in frames]
+    return Views(
+        np.stack([frame.pose[:3] for frame in frames]),
+        np.array([(lens.fl_x, lens.fl_y) for lens in lenses]),
+        np.array([(lens.cx, lens.cy) for lens in lenses]),
+        np.array([(lens.width, lens.height) for lens in lenses]),
+    )
+
+
+def _depths_in_view(points: FloatArray, frames: Sequence[Frame], border: float = 0.0) -> Float32Array:
+    """Return the depth of each point in each photograph, (photographs, points); NaN where the point is not in view.
+
+    A point counts as in view at least `border` from the photograph's edge, relative to its shorter side.
+    """
     depth = np.full((len(frames), len(points)), np.nan, dtype=np.float32)
     for row, frame in zip(depth, frames):
         camera, local = frame.intrinsics, (points - frame.pose[:3, 3]) @ frame.pose[:3, :3] * (1.0, -1.0, -1.0)
         shown = local[:, 2] > 0.0
         if camera.lens == "perspective":
-            shown &= camera.contains(camera.project(local))
+            shown &= camera.contains(camera.project(local), border * min(camera.width, camera.height))
         row[shown] = local[shown, 2]
     return depth
-
-
-def _distance_behind(depth: Float32Array) -> Float32Array:
-    """Return the smallest ratio over photographs of a point's depth to the photograph's median depth, (points,)."""
-    depth = depth[np.isfinite(depth).any(axis=1)]
-    return np.nanmin(depth / np.nanmedian(depth, axis=1, keepdims=True), axis=0)
-
-
-def _rarity(depth: Float32Array) -> Float32Array:
-    """Return 1 over the number of photographs that have each point in view, (points,)."""
-    return 1.0 / np.isfinite(depth).sum(axis=0, dtype=np.float32)
-
-
-def _worth_keeping(points: FloatArray, depth: Float32Array, figure: Float32Array, tail: float) -> BoolArray:
-    """Return which points to keep, (points,): those whose `figure` (points,) is at most a limit.
-
-    The limit is the largest that comes near (`_NEARLY_BEST`) to the most points per length of the box, and is used only
-    if it gains `_WORTH_LEAVING_OUT`; else all points are kept. Hardly any photograph may lose most of its points.
-    """
-    seen = np.isfinite(depth)
-    seen = seen[seen.any(axis=1)]
-    limits, worth = np.quantile(figure, np.linspace(0.1, 1.0, 46)), []
-    for limit in limits:
-        kept = figure <= limit
-        low, high = np.percentile(points[kept], (tail, 100.0 - tail), axis=0)
-        fair = np.quantile(seen[:, kept].sum(axis=1) / seen.sum(axis=1), _MOST_WITHOUT) >= _LEAST_SHOWN
-        worth.append(fair * kept.mean() / max((high - low).max(), 1e-12))
-    if max(worth) < _WORTH_LEAVING_OUT * worth[-1]:
-        return np.ones(len(points), dtype=bool)
-    return figure <= limits[np.flatnonzero(np.array(worth) >= _NEARLY_BEST * max(worth))[-1]]
 
 
 def _spread(frames: Sequence[Frame], most: int) -> list[Frame]:

@@ -130,17 +130,6 @@ def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, 
     return points, empty, on_border
 
 
-@dataclass(frozen=True)
-class SurfaceDistances:
-    """Distances between the surface of a mesh and the true surface, [truth units]."""
-
-    chamfer: float
-    """Mean of two mean distances: of points spread evenly over the mesh's surface, and of the true points back."""
-    closest_temperature_c: FloatArray
-    """Temperature of the mesh at its surface point closest to each true point, shape (m,), [degrees Celsius]."""
-    closest_distance: FloatArray  # Distance of each true point to the mesh's surface, shape (m,)
-
-
 def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArray:
     """Return points spread evenly by area over the triangles `facets` (f, 3), the same in each call, (count, 3)."""
     from trimesh import Trimesh
@@ -156,12 +145,16 @@ def surface_distances(
     metres_per_unit: float = 1.0,
     surroundings: Solid | None = None,
     tolerance: float = 0.0,
-) -> SurfaceDistances | None:
-    """Return the distances between a mesh's surface and the true one; None if nothing of the surface can be measured.
+) -> tuple[float, FloatArray, FloatArray] | None:
+    """Compare a mesh's surface with the true one; return None if nothing of the surface can be measured.
 
     Facets on the scene box, which cuts the scene, are left out. Distances from mesh to truth start at 20,000 points of
     the other facets; a point within `tolerance` [truth units] of `surroundings` and not of the truth does not count.
     Distances from truth to mesh go from `true_points` (m, 3), [truth units], to the nearest point of these facets.
+
+    Returns:
+        The mean of both mean distances, [truth units]; the distance of each true point to the mesh, (m,); and the
+        temperature of the mesh at the point nearest to each, (m,), [degrees Celsius].
     """
     import pyvista as pv
     from trimesh.triangles import points_to_barycentric
@@ -181,13 +174,8 @@ def surface_distances(
     inwards = np.linalg.norm(closest - true_points, axis=1)
     triangle = facets[np.asarray(cell)]
     share = np.clip(points_to_barycentric(points[triangle], np.asarray(closest)), 0.0, 1.0)
-    return SurfaceDistances(
-        chamfer=0.5 * float(outwards.mean() + inwards.mean()),
-        closest_temperature_c=np.einsum(
-            "ij,ij->i", share / share.sum(axis=1, keepdims=True), mesh.temperature_c[triangle]
-        ),
-        closest_distance=inwards,
-    )
+    temperature_c = np.einsum("ij,ij->i", share / share.sum(axis=1, keepdims=True), mesh.temperature_c[triangle])
+    return 0.5 * float(outwards.mean() + inwards.mean()), inwards, temperature_c
 
 
 @dataclass(frozen=True, eq=False)
@@ -408,11 +396,12 @@ def _mesh_errors(known: KnownTruth, mesh: TetMesh, voxel_m: float, metres_per_un
     distances = surface_distances(mesh, known.scene.solid, seen, metres_per_unit, known.surroundings, tolerance_m)
     if distances is None:
         return result
-    reached = distances.closest_distance <= tolerance_m
-    error_k = np.abs(distances.closest_temperature_c - known.scene.surface_temperature_c(seen))[reached]
+    chamfer_m, closest_m, temperature_c = distances
+    reached = closest_m <= tolerance_m
+    error_k = np.abs(temperature_c - known.scene.surface_temperature_c(seen))[reached]
     return result | {
-        "chamfer_voxels": distances.chamfer / voxel_m,
-        "chamfer_m": distances.chamfer,
+        "chamfer_voxels": chamfer_m / voxel_m,
+        "chamfer_m": chamfer_m,
         "temperature_seen_mae_c": float(error_k.mean()) if len(error_k) and mesh.has_temperatures else None,
         "share_of_seen_reached": float(reached.mean()),
     }

@@ -97,9 +97,7 @@ def depths_of(
     photographs: Photographs,
     lo: npt.ArrayLike | None = None,
     hi: npt.ArrayLike | None = None,
-    views_to_contradict: int = VIEWS_TO_CONTRADICT,
     larger: Photographs | None = None,
-    difference: float = DIFFERENCE,
 ) -> Depths:
     """Find the depths of the pixels of photographs in a box and behind it, or, without a box, where views overlap.
 
@@ -117,9 +115,7 @@ def depths_of(
         photographs: Pinhole photographs, best some 160 pixels wide: time grows with the third power of their size.
         lo: Lower corner of the box, [world units]. None: no box.
         hi: Upper corner of the box. None: no box.
-        views_to_contradict: Photographs that must agree with a depth before it may contradict other depths.
         larger: The same photographs with more pixels, in which depths are refined; None: depths are not refined.
-        difference: Largest cost of a difference of pixels, see `DIFFERENCE`; 0: correlation alone decides.
 
     Returns:
         Depths, NaN where not sure; all are NaN if no photograph has a neighbour.
@@ -141,10 +137,10 @@ def depths_of(
                 first = int(photographs.firsts[number])
                 pixels = slice(first, first + view.shape[0] * view.shape[1])
                 near = [views[other] for other in neighbours[number]]
-                depth[pixels], error[pixels] = _sweep(view, near, *span, corners is not None, difference)
+                depth[pixels], error[pixels] = _sweep(view, near, *span, corners is not None)
 
     run_ranges(work, len(views), 1)
-    confirmed = other_views(photographs, depth, error)[0] >= views_to_contradict
+    confirmed = other_views(photographs, depth, error)[0] >= VIEWS_TO_CONTRADICT
     agreeing, behind = other_views(photographs, depth, error, confirmed)
     sure = (agreeing >= FEWEST_VIEWS) & (agreeing >= VIEWS_PER_CONTRADICTION * behind)
     depth[~sure] = np.nan
@@ -321,9 +317,7 @@ def _neighbours(photographs: Photographs, number: int, near: float, far: float) 
     return [int(other) for other in best if worth[other] > 0.0]
 
 
-def _sweep(
-    view: _View, others: list[_View], near: float, far: float, endless: bool, difference: float
-) -> tuple[FloatArray, ...]:
+def _sweep(view: _View, others: list[_View], near: float, far: float, endless: bool) -> tuple[FloatArray, ...]:
     """Return depths, NaN where not sure, and distances of planes, (pixels,); if `endless`, with planes behind `far`."""
     inverse_depths = np.linspace(1.0 / far, 1.0 / near, _num_planes(view, others, near, far))
     beyond = min(len(inverse_depths), int(inverse_depths[0] / (inverse_depths[1] - inverse_depths[0]))) * endless
@@ -350,10 +344,10 @@ def _sweep(
     cost += 0.5
     correlates = cost[..., 0] <= 0.5 * (1.0 - LEAST_CORRELATION)
     expected, limit = _expected_pixels(view, at_best)
-    for plane, inverse_depth in enumerate(inverse_depths if difference > 0.0 else []):
+    for plane, inverse_depth in enumerate(inverse_depths):
         for number, other in enumerate(others):
             _warped(other, view, 1.0 / inverse_depth, moved[number])
-        add_differences(moved, expected, limit, np.float32(difference), half, plane, cost)
+        add_differences(moved, expected, limit, np.float32(DIFFERENCE), half, plane, cost)
     total = np.empty_like(cost)
     aggregate(cost, view.features, *(np.float32(value) for value in (STEP, JUMP, EDGE)), total)
     best = total.argmin(-1)

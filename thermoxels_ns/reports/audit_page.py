@@ -1,4 +1,4 @@
-"""Build the page of an audit and draw its pictures: the surface from one or two sides, and each defect."""
+"""Build the page of an audit and draw its pictures: the surface from one or two sides."""
 
 from __future__ import annotations
 
@@ -22,12 +22,11 @@ from thermoxels_ns.reports.page import Picture, Report, build_page, image_file
 
 AuditPictures: TypeAlias = dict[str, list[bytes]]
 """PNG files by name, one for each view: "temperature" with the numbers of defects, "u_value" (heat flow if no outside
-temperature is stated), "misfit" (measured minus computed temperature). "defects" has one file per defect."""
+temperature is stated), "misfit" (measured minus computed temperature)."""
 
-MOST_DEFECTS = 12  # Number of defects that get a picture
+MOST_DEFECTS = 12  # Number of defects that get a section of their own
 MOST_PAGE_BYTES = 15_000_000  # A page that would be larger has no 3-D view
 _ALL_AROUND = 0.35  # If the mean horizontal normal is shorter than this, the building was seen from all around
-_AROUND_DEFECT_M = 0.8  # Least margin around a defect in its picture, [m]
 
 
 def audit_page(
@@ -140,8 +139,6 @@ def draw_audit(audit: Audit) -> AuditPictures:
             look: dict[str, Any] = {"up": up, "clim": (-most, most), "colour_map": "coolwarm"}
             look |= {"bar_title": "difference [K]", "title": "Measured minus computed"}
             pictures["misfit"].append(_picture(audit, facing, off_k, **look, **view))
-    count = min(len(audit.defects), MOST_DEFECTS)
-    pictures["defects"] = [_defect(audit, number, surface_c, temperatures) for number in range(count)]
     return pictures
 
 
@@ -181,31 +178,6 @@ def _views(audit: Audit) -> list[FloatArray]:
     if audit.conditions.side == "inside":  # floor and walls, then ceiling and walls
         return [-(corner + 0.5 * up), corner + 0.5 * up]
     return [-(corner + 0.5 * up), corner - 0.5 * up]
-
-
-def _defect(audit: Audit, number: int, surface_c: FloatArray, same: dict[str, Any]) -> bytes:
-    """Draw a defect and its surroundings, seen obliquely against the mean normal of the defect's zone."""
-    surface, found, defect = audit.surface, audit.found[number], audit.defects[number]
-    low, high = surface.centroid_m[found.core].min(axis=0), surface.centroid_m[found.core].max(axis=0)
-    margin = max(_AROUND_DEFECT_M, 0.25 * float(np.max(high - low)))
-    near = np.all((surface.centroid_m > low - margin) & (surface.centroid_m < high + margin), axis=1)
-    normal = surface.area_m2[found.zone] @ surface.selection.facet_normal[found.zone]
-    if np.linalg.norm(normal) < 1e-9:
-        normal = surface.selection.facet_normal[found.spot[0]]
-    normal = normal / np.linalg.norm(normal)
-    up = np.array(surface.selection.up)
-    towards = normal + 0.2 * np.cross(up, normal) + 0.2 * up
-    facing = near & (surface.selection.facet_normal @ towards > 0.0)
-    return _picture(
-        audit,
-        facing,
-        surface_c,
-        title=f"{number + 1}: surface temperature",
-        view_direction=(-towards).tolist(),
-        labels=[(str(number + 1), defect.centre_m)],
-        window_size=(800, 600),
-        **same,
-    )
 
 
 def _picture(audit: Audit, chosen: BoolArray, values: FloatArray, **look: Any) -> bytes:

@@ -16,7 +16,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, replace_when_done
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, SUPPORT, TetMesh, support_of_facets
-from thermoxels_ns.reports.numbers import duration_text
+from thermoxels_ns.reports.numbers import duration_text, figure
 from thermoxels_ns.reports.page import image_file
 
 if TYPE_CHECKING:
@@ -101,8 +101,7 @@ def image_of_surface(
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # without a display VTK warns that it found no X server
     nodes = np.unique(facets)
     shown = np.asarray(values[nodes], dtype=np.float64)
-    ends = _without_outliers(shown) if clim is None else np.array(clim)
-    low, high = float(ends.min()), float(ends.max())
+    (low, high), note = colour_range(shown) if clim is None else (clim, "")
     if not high - low > 1e-3:  # the colours of a constant temperature span 1 K
         low, high = low - 0.5, high + 0.5
     plain = np.any([which for *_, which in painted], axis=0) if painted else np.zeros(len(facets), dtype=bool)
@@ -110,8 +109,8 @@ def image_of_surface(
         *words,
         textwrap.fill("; ".join(f"{colour}: {what}" for what, colour, which in painted if which.any()), 58),
     ]
-    if clim is None and not plain.all() and (float(shown.min()) < low or float(shown.max()) > high):
-        below.append(f"colours: middle 99 %; all: {float(shown.min()):.1f} to {float(shown.max()):.1f}")
+    if not plain.all():
+        below.append(note)
 
     height = window_size[1]
     plotter = pv.Plotter(off_screen=True, window_size=list(window_size))
@@ -187,28 +186,27 @@ def before_after_change(
     """
     before, after = states_c[0], states_c[-1]
     first, last = duration_text(float(times_s[0])), duration_text(float(times_s[-1]))
-    every = np.concatenate([before[shown], after[shown]])
-    ends = _without_outliers(every)
-    note = "colours: middle 99 %" if len(ends) < len(every) else ""
-    same: dict[str, Any] = {"clim": (float(ends.min()), float(ends.max())), "note": note}
-    change = {"title": f"Change from {first} to {last}", **change_colours((after - before)[shown])}
+    same: dict[str, Any] = dict(zip(("clim", "note"), colour_range(np.concatenate([before[shown], after[shown]]))))
+    ends, note = colour_range((after - before)[shown])
+    end = max(abs(ends[0]), abs(ends[1]), _LEAST_CHANGE_K)
+    change = {"clim": (-end, end), "colour_map": "coolwarm", "bar_title": "change [K]", "note": note}
     return [
         (before, {"title": f"Surface temperature at {first}", **same}),
         (after, {"title": f"Surface temperature at {last}", **same}),
-        (after - before, change),
+        (after - before, {"title": f"Change from {first} to {last}", **change}),
     ]
 
 
-def change_colours(change: npt.NDArray[np.floating]) -> dict[str, Any]:
-    """Return arguments of `image_of_mesh` for changes, [K], above and below 0: colours, and a note below the picture.
+def colour_range(values: npt.NDArray[np.floating]) -> tuple[tuple[float, float], str]:
+    """Return the values at both ends of a colour bar, and a note for below the picture.
 
-    If few nodes changed far more than the rest, colours span the middle 99 %, and the note says so; else it is empty.
+    They are the least and the largest value, and the note is empty. If a few values stretch this range to more than
+    twice that of the middle 99 %, they are the ends of the middle 99 %, and the note gives the least and the largest.
     """
-    shown = _without_outliers(change)
-    end = max(float(np.abs(shown).max()), _LEAST_CHANGE_K)
-    extremes = f"{float(change.min()):.2g} to {float(change.max()):.2g} K"
-    note = f"colours: middle 99 %; all: {extremes}" if len(shown) < len(change) else ""
-    return {"clim": (-end, end), "colour_map": "coolwarm", "bar_title": "change [K]", "note": note}
+    least, low, high, largest = np.quantile(values, (0.0, 0.005, 0.995, 1.0)).tolist()
+    if largest - least > 2.0 * (high - low) > 0.0:
+        return (low, high), f"colours: middle 99 %; all: {figure(least)} to {figure(largest)}"
+    return (least, largest), ""
 
 
 def _towards_camera(up: Sequence[float], view_direction: Sequence[float] | None) -> FloatArray:
@@ -221,15 +219,7 @@ def _towards_camera(up: Sequence[float], view_direction: Sequence[float] | None)
 
 
 def _unit(name: str, vector: npt.ArrayLike) -> FloatArray:
-    array = check_direction(name, vector, "Pass for instance (0, 0, 1).", MeshError)
-    return array / float(np.linalg.norm(array))
-
-
-def _without_outliers(values: FloatArray) -> FloatArray:
-    """Return the values; without the outer 1 % if these stretch the range to more than twice the range of the rest."""
-    low, high = np.quantile(values, (0.005, 0.995))
-    few = np.ptp(values) > 2.0 * (high - low) > 0.0
-    return values[(values >= low) & (values <= high)] if few else values
+    return check_direction(name, vector, "Pass for instance (0, 0, 1).", MeshError)
 
 
 def _frame(plotter: pv.Plotter, points: FloatArray, up: FloatArray, towards_camera: FloatArray) -> None:

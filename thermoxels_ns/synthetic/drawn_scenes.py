@@ -1,14 +1,19 @@
-"""Synthetic scenes that were drawn by hand: some for demonstrations, some that are hard, for development."""
+"""Synthetic scenes that were drawn by hand, some of them hard, for development; and the scene of each name."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
+import zlib
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.appearance import (
     Paint,
     SunLight,
@@ -19,7 +24,15 @@ from thermoxels_ns.synthetic.appearance import (
     sky_temperature_c,
 )
 from thermoxels_ns.synthetic.random_plan import HAIR, Plan, Range, Wall, distance_to
-from thermoxels_ns.synthetic.random_scene import painted_scene, surrounded, warm_scene, with_street
+from thermoxels_ns.synthetic.random_scene import (
+    painted_scene,
+    random_scene,
+    random_seed,
+    surrounded,
+    warm_scene,
+    with_room,
+    with_street,
+)
 from thermoxels_ns.synthetic.scene_truth import CameraRing, CameraWalk, SyntheticScene, rings_around
 from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, Vector
 
@@ -429,3 +442,57 @@ def _balcony(plan: Plan, stone: int, metal: int) -> None:
     rails += [((side, -out, top), (side + thick, 0.0, top + 0.4)) for side in (-x, x - thick)]
     for box in rails + [((bx, by, low), (bx + thick, by + thick, top)) for bx, by in bars]:
         plan.put(box, metal, 0.1)
+
+
+_BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
+    "hot-object": hot_object,
+    HOUSE: house_corner,
+    "sphere": sphere,
+    "courtyard": courtyard,
+    "pipes": pipes,
+    "wall-object": wall_object,
+    "facade": facade,
+    "street": street,
+}
+DEVELOPMENT_NAMES = ("wall-object", "facade", "street")  # names of hand-drawn scenes that are hard, for development
+SCENE_NAMES = tuple(name for name in _BUILDERS if name not in DEVELOPMENT_NAMES)
+"""Names of the other hand-drawn scenes; `make_scene` also knows `DEVELOPMENT_NAMES`, `random-N` and `wild-N`."""
+
+VARIANTS = "+sky=R,G,B, +white, +street, +room"
+"""Endings of a name, in any order: a sky of one colour (0 to 1); white plaster under a white sky (house-corner only);
+houses and trees around the scene; a room around the scene. Street and room exclude each other."""
+_SKY = re.compile(r"sky=((?:0?\.\d+|[01](?:\.0*)?)(?:,(?:0?\.\d+|[01](?:\.0*)?)){2})")
+
+
+@cache
+def make_scene(name: str) -> SyntheticScene:
+    """Return the synthetic scene of a name.
+
+    A name is one of `SCENE_NAMES` or `DEVELOPMENT_NAMES`, or ``random-`` or ``wild-`` and a seed without leading zeros.
+    Some of `VARIANTS` may follow, such as ``sphere+sky=1,1,1`` or ``random-3+street``.
+
+    Raises:
+        SceneError: No scene has this name; the message lists the known names.
+
+    >>> make_scene("sphere").temperature_bounds_c
+    (10.0, 40.0)
+    """
+    base, *variants = name.split("+")
+    kinds, seed = {variant.split("=")[0] for variant in variants}, random_seed(base)
+    known = base in _BUILDERS or seed is not None
+    known &= all(variant in ("white", "street", "room") or _SKY.fullmatch(variant) for variant in variants)
+    if not known or len(kinds) < len(variants) or kinds >= {"street", "room"} or ("white" in kinds and base != HOUSE):
+        every = ", ".join(_BUILDERS)
+        expected = f"random-N or wild-N with a whole number N from 0 on, or one of {every}; with {VARIANTS} if you like"
+        remedy = f"Choose one of these names, or write random-17 or {HOUSE}+sky=0.55,0.57,0.60."
+        raise SceneError("synthetic scene", expected=expected, got=repr(name), remedy=remedy)
+    if seed is None:
+        scene = _BUILDERS[base](**({"white": True} if "white" in variants else {}))
+    else:
+        scene = random_scene(seed, wild=base.startswith("wild"))
+    for variant in sorted(variants):
+        if sky := _SKY.fullmatch(variant):
+            scene = dataclasses.replace(scene, background_rgb=plain([float(c) for c in sky[1].split(",")]))
+        elif variant != "white":
+            scene = (with_street if variant == "street" else with_room)(scene, seed=zlib.crc32(base.encode()))
+    return dataclasses.replace(scene, name=name)

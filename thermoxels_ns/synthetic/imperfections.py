@@ -24,16 +24,10 @@ class Imperfections:
     """Standard deviation of the exposure x of each photograph, [stops]: pixel values are multiplied by 2^x."""
     white_balance: float = 0.0
     """Standard deviation of the gain of each channel of each photograph, relative to 1."""
-    vignetting: float = 0.0
-    """Share of the light that the corners of photographs lose, growing with the squared distance from the middle."""
     noise_counts: float = 0.0
     """Standard deviation of the noise in every pixel of the photographs, [counts of 255]."""
     jpeg_quality: int = 92
     """Quality of JPEG files, 1 to 95."""
-    motion_blur_px: float = 0.0
-    """Length of the line along which pixels are blurred, [pixels]; each photograph has its own direction."""
-    rolling_shutter_px: float = 0.0
-    """Shift of the photograph between its first and last row, [pixels]; the true pose belongs to the middle row."""
     pose_error_deg: float = 0.0
     """Standard deviation of the angle, about each axis, by which given poses are turned, [degrees]. Given positions are
     also moved, along each axis by such an angle in radians times the distance to the scene's middle."""
@@ -47,15 +41,6 @@ class Imperfections:
     """Standard deviation of the temperature offset of each thermal image, [K], as uncooled cameras have it."""
     thermal_blur_px: float = 0.0
     """Standard deviation of the thermal camera's Gaussian point spread, [thermal pixels]."""
-    thermal_vignetting_k: float = 0.0
-    """Error by which the corners of thermal images read too cold, [K], growing with the squared distance."""
-    fixed_pattern_k: float = 0.0
-    """Standard deviation of the offset of each thermal pixel, which is the same in all images, [K]."""
-    dead_pixels: float = 0.0
-    """Share of the thermal pixels that always read the same value."""
-    rig_error_deg: float = 0.0
-    """Standard deviation of the angle, about each axis, by which the given poses of a separate thermal camera are
-    turned against those of the photographs, [degrees], by the same angles in all poses."""
     passers_by: float = 0.0
     """Share of the pairs of images in which a person, 31 C warm, walks before the scene."""
 
@@ -66,8 +51,8 @@ class Imperfections:
             ThermoxelsError: An option is out of range; the message has its name, range and value.
         """
         limits = {field.name: (0.0, 1e6, "a finite number of at least 0") for field in fields(self)}
-        limits |= dict.fromkeys(("vignetting", "dead_pixels", "passers_by"), (0.0, 1.0, "from 0 to 1"))
-        limits |= {"pose_correlation": (0.0, 0.999, "from 0 to 0.999"), "focal_error": (-0.5, 1.0, "from -0.5 to 1")}
+        limits |= {"passers_by": (0.0, 1.0, "from 0 to 1"), "pose_correlation": (0.0, 0.999, "from 0 to 0.999")}
+        limits |= {"focal_error": (-0.5, 1.0, "from -0.5 to 1")}
         limits |= {"jpeg_quality": (1, 95, "from 1 to 95"), "white_balance": (0.0, 0.3, "from 0 to 0.3")}
         check_ranges("--", {name: (getattr(self, name), *limit) for name, limit in limits.items()})
 
@@ -83,18 +68,10 @@ class DrawnFlaws:
         seed: Seed of all random numbers.
         poses: True poses of the photographs (n, 4, 4), camera to world.
         middle: Middle of the scene (3,) [m]; errors of position are proportional to the distance to it.
-        range_c: Lowest and highest reading of dead thermal pixels [degrees Celsius].
     """
 
-    def __init__(
-        self,
-        flaws: Imperfections,
-        seed: int,
-        poses: FloatArray,
-        middle: npt.ArrayLike,
-        range_c: tuple[float, float],
-    ):
-        self.flaws, self._seed, self._poses, self._range_c = flaws, seed, poses, range_c
+    def __init__(self, flaws: Imperfections, seed: int, poses: FloatArray, middle: npt.ArrayLike):
+        self.flaws, self._seed, self._poses = flaws, seed, poses
         count, keep = len(poses), flaws.pose_correlation
         stops, balance = self._normal(count, 1, stream=2), self._normal(count, 3, stream=3)
         self.gains = 2.0 ** (flaws.exposure_stops * stops) * (1.0 + flaws.white_balance * balance)  # (n, 3)
@@ -105,7 +82,6 @@ class DrawnFlaws:
         errors *= np.deg2rad(flaws.pose_error_deg)
         far = np.linalg.norm(poses[:, :3, 3] - np.asarray(middle, dtype=np.float64), axis=1)
         self.turns_rad, self._moves = errors[:, :3], errors[:, 3:] * far[:, None]  # about, and along, each axis
-        self._rig_turn_rad = np.deg2rad(flaws.rig_error_deg) * self._normal(3, stream=5)
         self._passing: BoolArray = np.random.default_rng([seed, 6]).random(count) < flaws.passers_by
 
     def _normal(self, *shape: int, stream: int, number: int | None = None) -> FloatArray:
@@ -121,18 +97,11 @@ class DrawnFlaws:
         given[:, :3, 3] += self._moves
         return given
 
-    def given_rig_turn(self) -> FloatArray:
-        """Return the transform (4, 4) by which the given poses of a separate thermal camera are wrong."""
-        turn = np.eye(4)
-        turn[:3, :3] = _turned(self._rig_turn_rad)
-        return turn
-
     def bounds_c(self, lowest_c: float, highest_c: float) -> tuple[float, float]:
         """Return the lowest and highest reading of thermal images of a scene of `lowest_c` to `highest_c`, [C]."""
-        flaws = self.flaws
-        margin = _NOISE_SIGMAS * float(np.hypot(flaws.noise_k, flaws.fixed_pattern_k))
-        low = min(float(self.drifts_k.min()), 0.0) - margin - flaws.thermal_vignetting_k
-        return lowest_c + low, highest_c + (max(float(self.drifts_k.max()), 0.0) + margin)
+        margin = _NOISE_SIGMAS * self.flaws.noise_k
+        low, high = min(float(self.drifts_k.min()), 0.0), max(float(self.drifts_k.max()), 0.0)
+        return lowest_c + (low - margin), highest_c + (high + margin)
 
     def given_camera(self, camera: Camera) -> Camera:
         """Return the wrong intrinsics that a scene folder contains in place of those of `camera`."""
@@ -142,15 +111,9 @@ class DrawnFlaws:
     def photograph(self, number: int, rgb: Float32Array) -> npt.NDArray[np.uint8]:
         """Return photograph `number`, counts (h, w, 3), taken where a flawless camera sees colours `rgb`, 0 to 1."""
         flaws, draw = self.flaws, np.random.default_rng([self._seed, 7, number])
-        angle, side, place = draw.uniform(0.0, 2.0 * np.pi), draw.random(), draw.random()
-        seen = rgb.astype(np.float64)
+        place, seen = draw.random(3)[2], rgb.astype(np.float64)
         if self._passing[number]:
             seen[_passer_by(seen.shape[:2], place)] = _PASSER_BY[0]
-        if flaws.rolling_shutter_px > 0.0:
-            seen = _sheared(seen, flaws.rolling_shutter_px * (1.0 if side < 0.5 else -1.0))
-        if flaws.motion_blur_px > 0.0:
-            seen = _moved_along(seen, flaws.motion_blur_px, angle)
-        seen *= 1.0 - flaws.vignetting * _corner_distance(seen.shape[:2])[..., None] ** 2
         counts = 255.0 * seen * self.gains[number] + flaws.noise_counts * draw.standard_normal(seen.shape)
         return np.clip(np.round(counts), 0, 255).astype(np.uint8)
 
@@ -163,11 +126,8 @@ class DrawnFlaws:
             place = np.random.default_rng([self._seed, 7, number]).random(3)[2]
             seen[_passer_by(shape, place)] = _PASSER_BY[1]
         seen = ndimage.gaussian_filter(seen, flaws.thermal_blur_px, mode="nearest") + self.drifts_k[number]
-        seen -= flaws.thermal_vignetting_k * _corner_distance(shape) ** 2
         seen += flaws.noise_k * self._normal(*shape, stream=1, number=number)
-        seen += flaws.fixed_pattern_k * self._normal(*shape, stream=8)
-        draw = np.random.default_rng([self._seed, 9])
-        return np.where(draw.random(shape) < flaws.dead_pixels, draw.uniform(*self._range_c, shape), seen)
+        return seen
 
     def truth(self) -> dict[str, object]:
         """Return the entries of ``truth.json`` by name: sizes of the flaws, drawn values, and the true poses."""
@@ -175,7 +135,6 @@ class DrawnFlaws:
             "imperfections": vars(self.flaws),
             "gains": self.gains.tolist(),
             "drift_k": self.drifts_k.tolist(),
-            "rig_turn_deg": np.rad2deg(self._rig_turn_rad).tolist(),
             "passers_by": np.flatnonzero(self._passing).tolist(),
             "poses": self._poses.tolist(),
         }
@@ -188,33 +147,9 @@ def _turned(rotation_vectors: FloatArray) -> FloatArray:
     return Rotation.from_rotvec(rotation_vectors).as_matrix()
 
 
-def _corner_distance(shape: tuple[int, ...]) -> FloatArray:
-    """Return the distance of each pixel from the middle, (h, w), in half sides over sqrt(2): about 1 at the corners."""
-    y, x = (np.linspace(-1.0, 1.0, side + 2)[1:-1] for side in shape)
-    return np.sqrt(0.5 * (y[:, None] ** 2 + x**2))
-
-
 def _passer_by(shape: tuple[int, ...], place: float) -> BoolArray:
     """Return the pixels (h, w) that a passer-by covers: an upright ellipse at a share `place` of the width."""
     height, width = shape
     rows, columns = np.mgrid[:height, :width] + 0.5
     x, y = (columns - place * width) / height, (rows - 0.6 * height) / height
     return (x / _PASSER_BY_SIZE[0]) ** 2 + (y / _PASSER_BY_SIZE[1]) ** 2 <= 1.0
-
-
-def _sheared(image: FloatArray, pixels: float) -> FloatArray:
-    """Return an image (h, w, 3) sheared so that its last row is shifted by `pixels` against its first row."""
-    from scipy import ndimage
-
-    height = len(image)
-    shift = pixels * ((np.arange(height) + 0.5) / height - 0.5)
-    return np.stack([ndimage.shift(row, (by, 0.0), order=1, mode="nearest") for row, by in zip(image, shift)])
-
-
-def _moved_along(image: FloatArray, length: float, angle: float) -> FloatArray:
-    """Return an image (h, w, 3) blurred along a line of `length` pixels at an angle [rad]."""
-    from scipy import ndimage
-
-    steps = 2 * int(np.ceil(length)) + 1
-    shifts = np.linspace(-0.5, 0.5, steps)[:, None] * length * np.array([np.sin(angle), np.cos(angle)])
-    return np.mean([ndimage.shift(image, (*by, 0.0), order=1, mode="nearest") for by in shifts], axis=0)

@@ -9,7 +9,6 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 _VISIBLE_TOLERANCE = 1e-7
@@ -36,12 +35,9 @@ def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samp
     """Return what a camera sees from a camera-to-world pose, shape (3, 4) or (4, 4) [m].
 
     Colour and temperature are means over `samples_per_axis` x `samples_per_axis` rays in each pixel.
-
-    Raises:
-        SceneError: The camera stands inside the scene's solid.
     """
     pose = np.asarray(pose, dtype=np.float64)
-    origin = _position_outside(scene, pose)
+    origin = pose[:3, 3]
     shape = (camera.height, camera.width)
     rgb, temperature_c = _look(scene, origin, camera.directions(pose, samples_per_axis).reshape(-1, 3))
     distance, own = first_surface(scene, origin, camera.directions(pose).reshape(-1, 3))
@@ -70,14 +66,11 @@ def visible_surface_points(
     """Return for each surface point (n, 3) [m] whether at least `min_views` of the cameras (c, 4, 4) see it, (n,).
 
     A camera sees a point that lies in its image, faces the camera, and is what the ray from the camera meets first.
-
-    Raises:
-        SceneError: A camera stands inside the scene's solid.
     """
     points, normals = np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
     views = np.zeros(len(points), dtype=np.int64)
     for pose in np.asarray(poses, dtype=np.float64):
-        origin = _position_outside(scene, pose)
+        origin = pose[:3, 3]
         ray = points - origin
         candidate = camera.contains(camera.project_world(pose, points))
         candidate &= np.einsum("ij,ij->i", ray, normals) < -_GRAZING_COSINE * np.linalg.norm(ray, axis=1)
@@ -125,15 +118,3 @@ def _look(
         rgb[start + missed] = scene.background_rgb(ray[missed])
         temperature_c[start + missed] = scene.background_temperature_c(ray[missed])
     return rgb, temperature_c
-
-
-def _position_outside(scene: SyntheticScene, pose: FloatArray) -> FloatArray:
-    origin = pose[:3, 3]
-    if scene.solid.signed_distance(origin[None])[0] < 0.0:
-        raise SceneError(
-            "camera position",
-            expected=f"a point outside the solid of scene {scene.name}",
-            got=f"{origin.tolist()}, which is inside it",
-            remedy="Move the camera out of the solid.",
-        )
-    return origin

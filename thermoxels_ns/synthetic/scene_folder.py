@@ -18,7 +18,7 @@ from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import check_ranges, remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object, write_json
-from thermoxels_ns.synthetic.catalogue import make_scene
+from thermoxels_ns.synthetic.drawn_scenes import make_scene
 from thermoxels_ns.synthetic.imperfections import PERFECT, DrawnFlaws, Imperfections
 from thermoxels_ns.synthetic.raycast import first_surface, render_view
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
@@ -87,13 +87,6 @@ def write_scene(
         SceneError: An option is out of range, or the folder contains a scene that is not synthetic.
         OutputError: The folder cannot be written to.
     """
-    for name, word, known in (
-        ("layout", layout, _FOLDERS),
-        ("photo_format", photo_format, _PHOTO_SUFFIXES),
-        ("thermal_format", thermal_format, _SUFFIXES),
-    ):
-        if word not in known:
-            raise SceneError(name, expected=f"one of {', '.join(known)}", got=repr(word), remedy="Choose one of these.")
     thermal_camera, offset = _thermal_camera(scene, width, height, thermal_width, own_thermal_camera)
     photographs, thermals, model = _FOLDERS[layout]
     if own_thermal_camera and (model or not thermals):
@@ -107,8 +100,8 @@ def write_scene(
     train, held_out = scene.poses(num_train, num_eval)
     names = [f"frame_{kind}_{i + 1:05d}" for kind, n in (("train", num_train), ("eval", num_eval)) for i in range(n)]
     poses = np.concatenate([train, held_out])
-    flaws = DrawnFlaws(imperfections, seed, poses, np.mean(scene.scene_box, axis=0), scene.temperature_bounds_c)
-    given_poses, given_offset = flaws.given_poses(), offset @ flaws.given_rig_turn()
+    flaws = DrawnFlaws(imperfections, seed, poses, np.mean(scene.scene_box, axis=0))
+    given_poses = flaws.given_poses()
     bounds = flaws.bounds_c(*scene.temperature_bounds_c)
     # Temperature [C] = count * celsius_per_count + celsius_offset.
     unit = {"celsius_per_count": (bounds[1] - bounds[0]) / _LARGEST_COUNT, "celsius_offset": bounds[0]}
@@ -129,7 +122,7 @@ def write_scene(
             "transform_matrix": given_poses[number].tolist(),
         }
         if own_thermal_camera:
-            frame["thermal_transform_matrix"] = (given_poses[number] @ given_offset).tolist()
+            frame["thermal_transform_matrix"] = (given_poses[number] @ offset).tolist()
         with replace_when_done(target / frame["file_path"]) as path:
             Image.fromarray(flaws.photograph(number, view.rgb)).save(path, quality=imperfections.jpeg_quality)
         frames.append(frame)

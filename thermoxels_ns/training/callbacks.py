@@ -21,7 +21,7 @@ from thermoxels_ns.field.refine import RowChange, prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import mean_colours
 from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs, rays_through_backdrop
-from thermoxels_ns.multiview.votes import air_voxels, around_cameras
+from thermoxels_ns.multiview.votes import air_voxels, hardly_shown
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
 from thermoxels_ns.training.plain_areas import PlainAreas
@@ -64,9 +64,11 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         rays = found[0] if len(found) == 1 else found[0].joined_with(found[1])
         air = air_voxels(lattice, rays).reshape(-1)[voxels.cells]
         centres = np.stack(np.unravel_index(voxels.cells, lattice.cell_shape), axis=1) + 0.5
-        air |= around_cameras(lattice.index_to_world(centres), rays, views_of_cameras(dataset.cameras))
+        air |= hardly_shown(lattice.index_to_world(centres), views_of_cameras(dataset.cameras))
         if 0 < air.sum() < len(air):
-            CONSOLE.log(f"step {step}: {air.sum():,} of {len(air):,} voxels are air, crossed by rays to what is seen")
+            CONSOLE.log(
+                f"step {step}: {air.sum():,} of {len(air):,} voxels are air, or in view of fewer than two photographs"
+            )
             old = model.grid.row_parameters()
             follow(old, prune(model.grid, ~air))
 

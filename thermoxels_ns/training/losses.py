@@ -10,13 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.core.feature_rays import MARGIN_ERRORS, MARGIN_VOXELS, FeatureRays
 from thermoxels_ns.render.ray_render import RayRequest
 
-MARGIN_VOXELS = 1.5  # The surface may lie this many voxels, plus `MARGIN_ERRORS`, before or behind a point
 LARGEST_ERROR = 0.25  # A point outside the box counts if `MARGIN_ERRORS` errors are a smaller share of a ray's length
-MARGIN_ERRORS = 2.0  # Standard errors of a ray's length that are added to the margin before and behind its point
-
 COARSE_LIGHT = 0.5
 """Share of the light that may pass a depth found in photographs while the lattice is coarse: an opaque coarse voxel
 reaches beyond the surface in it and hides things beside that surface. Through points of structure from motion no light

@@ -118,8 +118,7 @@ class ThermoxelsModelConfig(ModelConfig):
     carve: Literal["auto", "off"] = "auto"
     """auto: at the start and after every refinement, drop voxels that rays cross on the way to what photographs see:
     points of structure from motion (tracks of thermoxels capture or of a COLMAP model, see the dataparser's tracks),
-    and depths on which photographs agree. Voxels around cameras are dropped too: nearer than half of what a photograph
-    shows, where no two photographs look."""
+    and depths on which photographs agree. Voxels in view of fewer than two photographs are dropped too."""
     photo_depth: Literal["auto", "off", "on"] = "auto"
     """Depth supervision: find depths by comparing each photograph with its neighbours (multi-view stereo, plane sweep),
     and make rays end at these depths, as at points of structure from motion. This keeps opaque floaters from forming

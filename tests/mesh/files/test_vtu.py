@@ -1,8 +1,6 @@
 import dataclasses
-import json
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from tests.support.unreadable import forbid
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import colour_bytes
 from thermoxels_ns.mesh.files.formats import write_mesh
-from thermoxels_ns.mesh.files.vtu import read_mesh, write_boundary_vtp, write_summary
+from thermoxels_ns.mesh.files.vtu import read_mesh, write_boundary_vtp
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, facet_areas, facet_normals
 
 
@@ -43,15 +41,6 @@ def test_tags_come_back_under_their_names(tmp_path, tagged_mesh):
     assert read.cell_data["area_m2"] == pytest.approx(facet_areas(tagged_mesh.points_m, tagged_mesh.facets), rel=1e-14)
     assert np.array_equal(read.cell_data["on_box"], tagged_mesh.facet_tags == FACET_BOX)
     assert names_in(read) == list(tags.patch_names)
-
-
-def test_summary_keeps_order_and_converts_numpy(tmp_path):
-    figures = {"volume": np.float32(0.5), "counts": {"tets": np.int64(6)}, "bounds": np.eye(2), "run": Path("a/b")}
-    write_summary(tmp_path / "summary.json", {**figures, "unit": "°C"})
-    text = (tmp_path / "summary.json").read_text(encoding="utf-8")
-    read = json.loads(text)
-    assert list(read) == [*figures, "unit"] and "°C" in text and '\n  "volume": 0.5' in text
-    assert (read["counts"], read["bounds"], read["run"]) == ({"tets": 6}, [[1.0, 0.0], [0.0, 1.0]], "a/b")
 
 
 def assert_same(read, written) -> None:

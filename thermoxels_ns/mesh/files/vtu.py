@@ -21,7 +21,7 @@ from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_whe
 from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values, read_json_object
 from thermoxels_ns.mesh.boundary.patches import DEFAULT_REGION, default_patches
-from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays, surface_of, write_bytes
+from thermoxels_ns.mesh.files.content import checked_mesh, node_arrays, surface_of
 from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of, count_wrong_facets, group_faces
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import (
@@ -92,20 +92,6 @@ def silent_vtk() -> Iterator[Any]:
             yield catcher
     finally:
         vtkLogger.SetStderrVerbosity(before)
-
-
-def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
-    """Write a nested mapping of figures as indented json, in its order, in a folder that is made if missing.
-
-    Raises:
-        MeshError: A number is NaN or infinite (json has neither), or a value has a type that json lacks.
-    """
-    write_bytes(Path(path), [summary_text(summary).encode()])
-
-
-def summary_text(summary: Mapping[str, Any]) -> str:
-    """Return the json text that `write_summary` writes; raise `MeshError` in the same cases."""
-    return json.dumps(plain_values(summary, "summary", MeshError), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def boundary_path(path: Path | str) -> Path:

@@ -67,19 +67,6 @@ _HELD, _FREE = np.uint16(1), np.uint16(256)
 """Units of the two counts, which share one number: `_HELD` for an image that holds a voxel, `_FREE` for a free line."""
 
 
-def _holds(views: Views, camera: int, direction: FloatArray) -> BoolArray:
-    """Return whether directions (..., 3) from a camera's centre lie in its image, shape (...)."""
-    local = direction @ views.camera_to_world[camera, :, :3]
-    depth = -local[..., 2]
-    ahead = depth > 1e-9
-    scale = 1.0 / np.where(ahead, depth, 1.0)
-    (focal_x, focal_y), (centre_x, centre_y) = views.focal[camera], views.centre[camera]
-    width, height = views.size[camera]
-    x = centre_x + focal_x * local[..., 0] * scale
-    y = centre_y - focal_y * local[..., 1] * scale
-    return ahead & (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
-
-
 def _count_along(
     passes: npt.NDArray[np.uint16],
     blocks: BoolArray,
@@ -110,7 +97,7 @@ def _count_along(
     direction[..., order[0]] = sign
     direction[..., order[1]] = u.slopes[:, None]
     direction[..., order[2]] = v.slopes
-    held = _holds(views, camera, direction)
+    held = views.shows(camera, direction)
     if not held.any():
         return
     now = np.where(held, _HELD + _FREE, np.uint16(0))

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 from scipy import ndimage
 
-from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
@@ -41,13 +41,8 @@ SHARE_THAT_ENDS = 0.5
 The ratio of the two is 1 in a voxel where all rays that enter end, and 0 where light leaked past a surface."""
 LEAST_WEIGHT = 0.5  # with less weight of rays than this in a voxel, [rays], its density alone decides
 FEWEST_RAYS = 100  # least number of rays that end on something for the threshold to be chosen by rays
-LEAST_SHARE = 0.15
-"""A voxel is in the region if photographs show it at least this well, relative to what the cameras were pointed at.
-In nine synthetic scenes with a street or room around, this keeps all of the scene and removes half of what is around;
-in synthetic rooms seen from inside it keeps 99.7 % of what two photographs see."""
 CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # share of an image's sides that counts as its middle, and rays along each side
 NEAREST_SHARE = 0.25  # a camera points at the place at this quantile of the distances to solid along these rays
-FEWEST_CAMERAS = 0.1  # quantile of the visibility of what cameras are pointed at; `LEAST_SHARE` refers to it
 MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` interpolates between blocks of voxels
 
 
@@ -329,13 +324,10 @@ def _region(
 def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> BoolArray:
     """Return the voxels, solid or not, that photographs show about as well as what the cameras were pointed at.
 
-    Rays through the middle of a camera's image end on what the camera was pointed at, at a distance d. Each camera adds
-    1 to the visibility of all places in its image up to the distance d, and (d / distance)^2 beyond, in proportion to
-    the pixels per area; occlusion is ignored. The region is where the sum over all cameras is at least `LEAST_SHARE`
-    of the sum at the places that nearly all cameras look at. Open ground then ends about where the cameras stood.
+    Rays through the middle of a camera's image end on what the camera was pointed at; `Views.shown_well` does the rest.
     """
-    eyes, far = lattice.world_to_index(views.camera_to_world[:, :, 3]), {}
-    count = len(views.focal)
+    eyes, count = lattice.world_to_index(views.camera_to_world[:, :, 3]), len(views.focal)
+    reach = np.full(count, np.nan)
     part = CENTRAL_PART * ((np.arange(CENTRAL_RAYS) + 0.5) / CENTRAL_RAYS - 0.5)
     for camera in np.unique(np.linspace(0, count - 1, min(count, MOST_CAMERAS)).round().astype(np.int64)).tolist():
         across, along = np.meshgrid(*np.outer(views.size[camera] / views.focal[camera], part))
@@ -343,34 +335,16 @@ def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> Bool
         direction = local / np.linalg.norm(local, axis=1, keepdims=True) @ views.camera_to_world[camera, :, :3].T
         met = first_solid(cells, eyes[camera], direction)
         if np.isfinite(met).any():
-            far[camera] = float(np.quantile(met[np.isfinite(met)], NEAREST_SHARE))
-    if not far:
-        return np.ones_like(cells)
-    matrices = views.matrices()
-    matrices[:, :, 3] += matrices[:, :, :3] @ np.asarray(lattice.lo)
-    matrices[:, :, :3] *= lattice.voxel_size
-
-    def seen(at: FloatArray) -> FloatArray:
-        """Return the visibility of places (n, 3), in corner indices, summed over all cameras, shape (n,)."""
-        total = np.zeros(len(at))
-        for camera, distance in far.items():
-            column, row, depth = matrices[camera, :, :3] @ at.T + matrices[camera, :, 3:]
-            width, height = views.size[camera]
-            held = (depth > 0) & (column >= 0) & (column <= width * depth) & (row >= 0) & (row <= height * depth)
-            total += held * np.minimum(1.0, distance**2 / np.maximum(((at - eyes[camera]) ** 2).sum(axis=1), 1e-12))
-        return total
-
-    looked_at = [eyes[c] - (1.0 - 1e-6) * distance * views.camera_to_world[c, :, 2] for c, distance in far.items()]
-    least = LEAST_SHARE * float(np.quantile(seen(np.array(looked_at)), FEWEST_CAMERAS))
+            reach[camera] = lattice.voxel_size * float(np.quantile(met[np.isfinite(met)], NEAREST_SHARE))
     block = 1
     while cells.size > MOST_BLOCKS * block**3:
         block *= 2
     shape = tuple(-(-n // block) for n in cells.shape)
     middles = (np.stack(np.unravel_index(np.arange(math.prod(shape)), shape), axis=1) + 0.5) * block
-    well: Float32Array = seen(middles).reshape(shape).astype(np.float32)
+    well = views.shown_well(lattice.index_to_world(middles), reach).reshape(shape)
     if block > 1:
-        well = np.asarray(ndimage.zoom(well, block, order=1, mode="nearest", grid_mode=True))
-    return well[tuple(slice(n) for n in cells.shape)] >= least
+        well = np.asarray(ndimage.zoom(well.astype(np.float32), block, order=1, mode="nearest", grid_mode=True)) >= 0.5
+    return well[tuple(slice(n) for n in cells.shape)]
 
 
 def _asked_region(
