@@ -4,7 +4,8 @@
     python tools/figures.py --check        # do the pages show docs/figures.json?
     python tools/figures.py --check demo   # and does this demo agree with it, but for noise?
 
-docs/figures.json holds the numbers that are shown. The demo's own code reads and compares what its commands wrote.
+docs/figures.json holds the numbers that are shown, and the version of the package that measured them: another version
+needs a new demo. The demo's own code reads and compares what its commands wrote.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from runpy import run_path
 from typing import NamedTuple
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -64,6 +66,11 @@ NOISE = {
 }
 """By how much figures may differ between machines, versions of PyTorch and seeds; those not named, not in five digits.
 With other seeds the F-score differs by 0.02."""
+
+
+def version() -> str:
+    """Return the version of the package."""
+    return run_path(str(DOCS.parent / "thermoxels_ns" / "core" / "version.py"))["__version__"]
 
 
 def read_demo(folder: Path) -> Figures:
@@ -119,12 +126,14 @@ def main(words: list[str]) -> int:
         return 2
     if not check:
         figures = {name: float(f"{value:.6g}") for name, value in read_demo(folders[0]).items()}
-        KEPT.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+        KEPT.write_text(json.dumps({"version": version()} | figures, indent=1) + "\n", encoding="utf-8")
         for page in PAGES:
             page.write_text(with_table(page.read_text(encoding="utf-8"), figures), encoding="utf-8")
     shown = json.loads(KEPT.read_text(encoding="utf-8"))
-    pages = {page: page.read_text(encoding="utf-8") for page in PAGES}
-    wrong = [
+    measured, pages = shown.pop("version"), {page: page.read_text(encoding="utf-8") for page in PAGES}
+    wrong = [f"docs/figures.json: measured with version {measured}, this is {version()}; run make demo figures"]
+    wrong = [] if measured == version() else wrong
+    wrong += [
         f"{page.name}: its table is not that of docs/figures.json; run make figures"
         for page, text in pages.items()
         if with_table(text, shown) != text

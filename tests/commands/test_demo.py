@@ -1,6 +1,7 @@
 import json
 import math
 from pathlib import Path
+from runpy import run_path
 
 import pytest
 import tyro
@@ -10,12 +11,13 @@ from thermoxels_ns.audit.conditions import load_conditions
 from thermoxels_ns.audit.run import check_survey
 from thermoxels_ns.commands import demo
 from thermoxels_ns.commands.audit import Audit
-from thermoxels_ns.commands.demo_results import audit_target, compare, true_u_of_patches
+from thermoxels_ns.commands.demo_results import audit_target, compare, read_results, true_u_of_patches
 from thermoxels_ns.commands.export import ExportThermoxelsMesh
 from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.synthetic.drawn_scenes import BRIDGE_PSI_W_MK
+from thermoxels_ns.training.schedule import QUALITIES
 
 PATCHES = configs_folder() / "house-corner-patches.yaml"
 IMAGES = {
@@ -73,6 +75,19 @@ def test_the_commands_take_what_the_commands_before_them_wrote():
     assert (night.scene, night.from_audit) == ("winter-night", audit.output_dir / "answers.json")
     assert isinstance(audit, Audit) and audit.mesh == Path("my demo/export/mesh.vtu")
     assert (audit.conditions, audit.scene) == (Path("my demo/survey/conditions.yaml"), Path("my demo/scene"))
+
+
+def test_the_tables_of_the_docs_name_the_sizes_and_the_targets_of_the_demo(tmp_path):
+    (tmp_path / "eval.json").write_text(json.dumps({"results": IMAGES}))
+    (tmp_path / "summary.json").write_text(json.dumps(SUMMARY))
+    targets, _ = read_results(tmp_path / "eval.json", tmp_path / "summary.json")
+    tools = Path(__file__).parents[2] / "tools"
+    stated = [
+        row.target.split() for row in run_path(str(tools / "figures.py"))["ROWS"] if row.target not in ("", "all")
+    ]
+    assert [(float(words[0]), words[-1] == "more") for words in stated] == [(t.bound, t.at_least) for t in targets]
+    pairs = f"{demo._TRAIN_VIEWS} training views of {demo._WIDTH} x {demo._HEIGHT}, {QUALITIES['standard'][0]} voxels"
+    assert pairs in (tools.parent / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture

@@ -1,19 +1,20 @@
-"""Photographs alone, and a public layout with thermal cameras of their own, through the real commands."""
+"""Every layout through the real commands; that of ThermoScenes is the one of most other tests."""
 
 import json
+from typing import get_args
 
 import pytest
 
 from tests.integration.commands import SHORT_TRAINING, fail, succeed
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.mesh.files.vtu import read_mesh
-from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.synthetic.scene_folder import LayoutName, make_scene, write_scene
 
 
-@pytest.mark.parametrize("layout", ["rgb", "thermalnerf"])
+@pytest.mark.parametrize("layout", sorted({*get_args(LayoutName)} - {"thermoscenes"}))
 def test_a_layout_is_trained_evaluated_and_exported(layout, tmp_path):
     scene, folder, warm = make_scene("hot-object"), tmp_path / "scene", layout != "rgb"
-    options = {"photo_format": "png", "progress": False, "own_thermal_camera": warm}
+    options = {"photo_format": "png", "progress": False, "own_thermal_camera": layout == "thermalnerf"}
     write_scene(scene, folder, 10, 2, 64, 48, layout=layout, **options)
     said = succeed(
         *("ns-train", "thermoxels", "--output-dir", str(tmp_path), "--experiment-name", "tiny", "--timestamp", "run"),

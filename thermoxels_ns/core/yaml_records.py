@@ -65,7 +65,7 @@ def raising(error: type[ThermoxelsError], before: str = "") -> Iterator[None]:
     try:
         yield
     except ThermoxelsError as problem:
-        raise error(f"{before}{problem}") from problem
+        raise error(f"{before}{problem}") from problem.__cause__  # the new text holds that of the problem
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -78,10 +78,10 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         dataset = self.train_dataset
         temperatures = dataset.temperature_range
         if temperatures is None:
-            CONSOLE.print(f"Training on {len(dataset)} photographs alone: the mesh will have no temperatures.")
+            CONSOLE.print(f"Training split: {len(dataset)} photographs alone: the mesh will have no temperatures.")
             return
         CONSOLE.print(
-            f"Training on {len(dataset)} pairs ("
+            f"Training split: {len(dataset)} pairs ("
             + ("one ray carries colour and temperature" if dataset.shares_camera else "thermal cameras of their own")
             + f"), {temperatures.min_c:.2f} to {temperatures.max_c:.2f} C; thermal: {dataset.thermal_report()}."
         )
@@ -94,7 +94,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         dataset = self.eval_dataset
         pairs = dataset.temperature_range is not None
         kind = f"pairs; thermal: {dataset.thermal_report()}" if pairs else "photographs"
-        CONSOLE.print(f"Evaluating on {len(dataset)} {kind}.")
+        CONSOLE.print(f"Evaluation split: {len(dataset)} {kind}.")
 
     @cached_property
     def train_rays(self) -> RaySampler:

@@ -225,7 +225,7 @@ def mesh_error_in_words(solution: Solution) -> str:
     """Return in words the estimated mesh error of a solution without tolerance, or that there is no estimate."""
     error = solution.error if isinstance(solution, SteadySolution) else None
     if error is None:
-        return "not estimated; --tolerance estimates it"
+        return "not estimated; --flow-tolerance 0.01 or --tolerance 0.05 estimates it"
     return f"estimated {error.describe()}, usually right to a factor of three"
 
 

@@ -123,7 +123,8 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
     labels, left = effect_labels(problem), _weak(problem, time, goals.left_out_share)
     while True:  # each solution leaves out less than the one before
         kept = replace(problem, effects=tuple(e for n, e in enumerate(problem.effects) if n not in left))
-        say(f"Built: {', '.join(label for n, label in enumerate(labels) if n not in left) or 'nothing'}.")
+        shown = ", ".join(label for n, label in enumerate(labels) if n not in left)
+        say(f"Effects: {shown or 'none, so no heat crosses the surface'}.")
         try:
             found = _solve(kept, time, goals, say)
         except HeatError:

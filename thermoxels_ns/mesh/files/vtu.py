@@ -213,7 +213,8 @@ def _read(path: Path) -> Any:
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
 
     if not path.is_file():
-        raise _wrong(path.name, f"a file at {path}", "none")
+        remedy = "Pass the mesh.vtu in the --output-dir of an export, and leave mesh-boundary.vtp beside it."
+        raise _wrong(path.name, f"a file at {path}", "none", remedy)
     reader: Any = vtkXMLPolyDataReader() if path.suffix == ".vtp" else vtkXMLUnstructuredGridReader()
     reader.SetFileName(str(path))
     data = None
