@@ -63,27 +63,27 @@ NEVER = {
 """Other packages that a room does not import, not even inside a function."""
 
 MOST_LINES = {
-    "audit": 3585,
-    "capture": 4070,
-    "commands": 3085,
+    "audit": 3550,
+    "capture": 3810,
+    "commands": 2900,
     "core": 1860,
-    "data": 2870,
-    "evaluation": 435,
-    "fem": 3310,
+    "data": 2755,
+    "evaluation": 430,
+    "fem": 2935,
     "field": 885,
     "heat": 2590,
-    "mesh": 5635,
+    "mesh": 5405,
     "multiview": 1850,
     "radiometry": 1355,
     "render": 1670,
-    "reports": 1435,
-    "synthetic": 2850,
+    "reports": 1400,
+    "synthetic": 2750,
     "training": 2805,
     "root": 715,
 }
 """Budget of lines of each room, comments and docstrings included: what it had when that was written down and 5 % more.
 Raising one is said in the message of the commit."""
-MOST_TEST_LINES = 29300
+MOST_TEST_LINES = 29000
 
 
 def room_of(module: str) -> str:

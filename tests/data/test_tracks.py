@@ -142,9 +142,10 @@ def _changed(scene, name: str, change, **options) -> None:
         (lambda s, f: _changed(s, "images.bin", lambda _: b"\x07"), "cannot be read"),
         *(
             (lambda s, f, name=name: _changed(s, name, lambda b: b[: int(0.6 * len(b))]), "cannot be read")
-            for name in ("frames.bin", "images.bin", "points3D.bin")
+            for name in ("cameras.bin", "frames.bin", "images.bin", "points3D.bin")
         ),
         (lambda s, f: _changed(s, "points3D.bin", lambda _: b""), "points3D.bin ends before its last entry"),
+        (lambda s, f: _changed(s, "cameras.bin", lambda b: b[:40]), "cameras.bin ends before its last entry"),
         (lambda s, f: _changed(s, "points3D.bin", lambda b: b[:-1]), "points3D.bin ends before its last entry"),
         (lambda s, f: _changed(s, "cameras.txt", lambda b: b.replace(b"24 18", b"0 0"), text=True), "0 pixels wide"),
     ],

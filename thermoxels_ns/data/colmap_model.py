@@ -17,6 +17,7 @@ _PARTS = ("cameras", "images", "points3D")
 COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "colmap_sparse/0", "sparse/0", "sparse")
 """Places of a COLMAP model in a scene's folder; the first that holds a model counts."""
 
+_LEAST_CAMERA_BYTES = 48  # Size of a camera with three parameters in cameras.bin; cameras with more are larger
 _LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """Swap of axes by old versions of ns-process-data, before the json had applied_transform."""
 
@@ -59,9 +60,10 @@ def worlds_of_json(meta: Mapping[str, Any]) -> list[FloatArray]:
 
 
 def _incomplete(folder: Path) -> str:
-    """Return which file of a COLMAP model cannot be opened, or that points3D.bin ends before its last point; or "".
+    """Return which file of a COLMAP model cannot be opened, or ends before its last camera or point; or "".
 
-    pycolmap says of an unreadable file that it is no model, and reads a truncated points3D.bin for ever.
+    pycolmap says of an unreadable file that it is no model, reads a truncated cameras.bin without a word, and a
+    truncated points3D.bin for ever.
     """
     for name in ("cameras", "frames", "images", "points3D"):
         for path in (folder / f"{name}.txt", folder / f"{name}.bin"):
@@ -69,9 +71,15 @@ def _incomplete(folder: Path) -> str:
                 data = path.read_bytes() if path.is_file() else None
             except OSError as problem:
                 return f"{path.name}: {problem.strerror}; check its permissions and the disk"
-            if data is not None and path.name == "points3D.bin" and not _complete_points(data):
-                return "points3D.bin ends before its last entry, as after an interrupted copy"
+            whole = {"points3D.bin": _complete_points, "cameras.bin": _complete_cameras}.get(path.name)
+            if data is not None and whole is not None and not whole(data):
+                return f"{path.name} ends before its last entry, as after an interrupted copy"
     return ""
+
+
+def _complete_cameras(data: bytes) -> bool:
+    """Return whether cameras.bin is long enough for the cameras that it announces, of three parameters at least."""
+    return len(data) >= 8 and len(data) >= 8 + _LEAST_CAMERA_BYTES * struct.unpack_from("<Q", data)[0]
 
 
 def _complete_points(data: bytes) -> bool:
