@@ -25,7 +25,7 @@ from thermoxels_ns.fem.tolerance import (
     solve_to_tolerance,
     steady_error,
 )
-from thermoxels_ns.heat.effects import Convection, FixedTemperature, Radiation
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, Radiation
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 
@@ -192,6 +192,23 @@ def test_radiation_and_changing_coefficients_in_time(effect) -> None:
     assert found.met and found.settings.refinements < 2
     assert true.temperature_k <= 3.0
     assert 1 / WITHIN < found.settings.error.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
+
+
+@pytest.mark.parametrize("tolerance_k", [0.5, 0.05])
+def test_errors_of_steps_that_a_body_does_not_forget_are_in_the_estimate(tolerance_k) -> None:
+    """An insulated cube of steel in the sun of three days keeps the error of each step."""
+    day_s, side = 86_400.0, np.linspace(0.0, 0.02, 2)
+    sun = Varying(lambda _, time_s: max(50.0 * np.sin(2.0 * np.pi * time_s / day_s), 0.0), resolution_s=3600.0)
+    problem = HeatProblem(box_mesh(side, side, side), STEEL, effects=(HeatFlux(("*",), sun),))
+    found = solve_to_tolerance(problem, Tolerance(tolerance_k), duration_s=3.0 * day_s, outputs=6, log=silent)
+    exact = solve_heat(found.problem, AdaptiveSteps(3.0 * day_s, 0.0005, outputs=6))
+    true_k = float(np.abs(found.solution.temperature_c - exact.temperature_c).max())
+    assert found.met and found.settings.step_tolerance_k is not None
+    assert 0.3 * found.settings.step_tolerance_k < true_k < WITHIN * found.settings.step_tolerance_k, (
+        found.settings,
+        true_k,
+    )
+    assert true_k < tolerance_k
 
 
 def test_too_little_memory_is_a_status() -> None:

@@ -29,9 +29,11 @@ MARGIN = 1.3
 insulates 1e8 times better than the one beside it along the flow. Temperatures were off by 0.66 to 0.92 of estimates."""
 _STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
 """Relative tolerances of the linear solver for steady states and for steps: its error is far below any estimate."""
-_STEPS_ERROR = 0.07
-"""Share of their tolerance that adaptive steps count as error: steps controlled to 1 K make an error of 0.03 to 0.07 K
-in all, because conduction damps the errors of earlier steps."""
+_FINER_STEPS, _LEFT_BY_STEPS, _STEPS_SHARE = 0.25, 0.4, 0.5
+"""Tolerance of the steps that tell the error of others, as a share of theirs; the share of the error that these leave
+(0.25^(2/3): errors of single steps, of third order, add up in a body that does not forget them; else 0.25); most of the
+allowed error that steps may make."""
+_MOST_TRIES = 6  # Tolerances of steps that are tried; a larger error than allowed then counts as what it is
 _BYTES_PER_TET, _BYTES_PER_FACET = {1: 400.0, 2: 2600.0}, {1: 600.0, 2: 4000.0}
 """Most memory by order of the tetrahedra, [bytes], measured with convection and radiation; about half without both."""
 
@@ -112,9 +114,9 @@ def solve_to_tolerance(
 
     A steady state is solved with linear and then with quadratic tetrahedra on the given mesh; while the error is too
     large, quadratic ones of half the size follow, or linear ones if the solver fails on quadratic ones. Through time
-    tetrahedra stay linear, the second solution is on a mesh of half the size, and adaptive steps are controlled to
-    the allowed error, of which they make a fifteenth. The area that flat facets miss of a round body is not
-    estimated.
+    tetrahedra stay linear and the second solution is on a mesh of half the size. Steps are those whose error on the
+    given mesh, found by finer steps, is at most half of what is allowed. The area that flat facets miss of a round
+    body is not estimated.
 
     Args:
         problem: Body, materials, initial temperatures and effects.
@@ -136,15 +138,29 @@ def solve_to_tolerance(
 
         run = _Run(problem, tolerance, memory_bytes, log)
         return run.close(_refine(run, solve_state, 2, 0), allow_unmet)
-    allowed_k = tolerance.temperature_k
-    assert allowed_k is not None, "steps in time are chosen by it"
-    steps = AdaptiveSteps(duration_s, allowed_k, outputs=outputs)
+    assert tolerance.temperature_k is not None, "steps in time are chosen by it"
+    run = _Run(problem, tolerance, memory_bytes, log, times=outputs + 1)
+    steps: list[AdaptiveSteps] = []
+
+    def follow(problem: HeatProblem, steps: AdaptiveSteps) -> Solution:
+        return solve_heat(problem, steps, relative_tolerance=_STEP_TOLERANCE, progress=progress)
 
     def solve_in_time(problem: HeatProblem, _: int) -> Solution:
-        found = solve_heat(problem, steps, relative_tolerance=_STEP_TOLERANCE, progress=progress)
-        return replace(found, time_error_k=_STEPS_ERROR * allowed_k)
+        if steps:
+            return follow(problem, steps[0])
+        tried = AdaptiveSteps(duration_s, tolerance.temperature_k, outputs=outputs)
+        found = follow(problem, tried)
+        for _ in range(_MOST_TRIES):
+            finer = replace(tried, tolerance_k=_FINER_STEPS * tried.tolerance_k)
+            better = follow(problem, finer)
+            apart = difference_between(found, better, len(problem.mesh.points_m))
+            run.of_steps = richardson(apart, ErrorSize(_LEFT_BY_STEPS, _LEFT_BY_STEPS))[0]
+            if tolerance.excess(run.of_steps) <= _STEPS_SHARE:
+                break
+            tried, found = finer, better
+        steps.append(tried)
+        return found
 
-    run = _Run(problem, tolerance, memory_bytes, log, times=outputs + 1)
     return run.close(_refine(run, solve_in_time, 1, 1), allow_unmet)
 
 
@@ -206,6 +222,8 @@ class _Run:
     ) -> None:
         self.given, self.tolerance, self._memory_bytes, self.say = problem, tolerance, memory_bytes, log
         self._times = times
+        self.of_steps = ErrorSize(0.0, 0.0)
+        """Error that time steps make; 0 in steady states."""
         self.solved: list[tuple[Level, HeatProblem, Solution]] = []
         self._begin_s = time.perf_counter()
 
@@ -218,8 +236,10 @@ class _Run:
         """Keep a solution with the `error` of its mesh; `refinements` is how often the mesh size was halved for it."""
         steady = isinstance(solution, SteadySolution)
         edges = len(solution.edge_temperature_c) if steady else 0
-        nodes, steps_k = solution.temperature_c.shape[-1] + edges, None if steady else solution.time_error_k
-        error = replace(error, temperature_k=error.temperature_k + (steps_k or 0.0))
+        nodes, steps_k = solution.temperature_c.shape[-1] + edges, None if steady else self.of_steps.temperature_k
+        solution = solution if steady else replace(solution, time_error_k=steps_k)
+        of_steps = self.of_steps
+        error = ErrorSize(error.temperature_k + of_steps.temperature_k, error.heat_flow + of_steps.heat_flow)
         level = Level(2 if edges else 1, refinements, steps_k, nodes, error, seconds)
         self.solved.append((level, problem, solution))
         self.say(level.describe())
