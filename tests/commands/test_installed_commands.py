@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from thermoxels_ns.commands import installed_commands
 from thermoxels_ns.commands.installed_commands import run_command
 from thermoxels_ns.core.errors import ThermoxelsError
 
@@ -126,3 +127,13 @@ def test_systems_that_do_not_tell_memory_still_measure_time(fake_command, tmp_pa
     fake_command("work", "sys.exit(0)")
     cost = run_command(["work"], tmp_path / "log", console)
     assert cost.seconds > 0 and cost.peak_memory_gb != cost.peak_memory_gb
+
+
+def test_a_process_that_a_command_leaves_behind_does_not_hold_it_up(fake_command, tmp_path, console, monkeypatch):
+    monkeypatch.setattr(installed_commands, "_LAST_WORDS_S", 0.5)
+    fake_command(
+        "leave",
+        "import subprocess\nsubprocess.Popen([sys.executable, '-c', 'import time; time.sleep(30)'])\nprint('done')",
+    )
+    took = run_command(["leave"], tmp_path / "leave.log", console)
+    assert took.seconds < 20.0 and shown(console).splitlines()[-1] == "done"

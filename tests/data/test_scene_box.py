@@ -1,11 +1,14 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from tests.support.looking_cameras import looking_at
 from tests.support.scene_folders import look_at_origin
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_box import box_of_points, find_scene_box
 from thermoxels_ns.data.scene_file import Frame, read_scene_file
@@ -136,3 +139,34 @@ def test_a_plain_wall_without_points_is_held_too(tmp_path):
     walls[1:, :, 0] = np.minimum(walls[1:, :, 0], 0.4)
     box = box_of_points(walls.reshape(-1, 3), frames)
     assert 1.4 < box[1, 0] < 2.2 and -2.0 < box[0, 0] < -1.5, box
+
+
+def seen_by(of: Frame, lens: Camera, eye: tuple[float, ...], target: tuple[float, ...]) -> Frame:
+    (view,) = looking_at(target, eye).camera_to_world
+    return replace(of, pose=np.concatenate((view, [[0.0, 0.0, 0.0, 1.0]])), intrinsics=lens)
+
+
+def test_fisheye_lenses_see_to_their_sides(tmp_path):
+    """Two lenses, 95 degrees to each side, at 45 degrees to each other in a room."""
+    draw, lens = np.random.default_rng(0), Camera(400, 400, 120.0, 120.0, 200.0, 200.0, lens="fisheye")
+    walls = draw.uniform(-2.0, 2.0, (20_000, 3))
+    walls[np.arange(20_000), draw.integers(0, 3, 20_000)] = draw.choice([-2.0, 2.0], 20_000)
+    (of,) = frames_of(tmp_path, [around(0)])
+    frames = [seen_by(of, lens, (0.3 * x, 0.3 * y, 0.0), (2.0 * x, 2.0 * y, 0.0)) for x, y in ((1.0, 0.0), (0.7, 0.7))]
+    box = box_of_points(walls, frames)
+    assert (box[0] < [-1.0, -1.9, -1.9]).all() and (box[1] > 1.9).all(), box
+
+
+def test_points_near_the_edges_of_photographs_alone_and_a_blind_camera_give_a_box(tmp_path):
+    of, lens = frames_of(tmp_path, [around(0)])[0], Camera(200, 150, 200.0, 200.0, 100.0, 75.0)
+    at = (-3.0, 0.0, 0.0), (-3.0, 0.2, 0.0), (-3.0, 0.0, 0.0)
+    frames = [seen_by(of, lens, eye, (x, eye[1], 0.0)) for eye, x in zip(at, (0.0, 0.0, -6.0))]
+    draw = np.random.default_rng(1)
+    rim = np.column_stack(
+        (
+            draw.uniform(-0.3, 0.0, 120),
+            draw.choice([-1.0, 1.0], 120) * draw.uniform(1.15, 1.3, 120),
+            draw.uniform(-0.9, 0.9, 120),
+        )
+    )
+    assert np.isfinite(box_of_points(rim, frames)).all()

@@ -13,6 +13,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -28,6 +29,7 @@ PLAIN_TRAINING = ("--timestamp", "run", "--vis", "tensorboard", "--logging.steps
 """Options of ns-train for a run that nobody watches in the viewer, in a folder whose name is known."""
 
 _LAST_LINES = 12  # Lines of output that an error shows
+_LAST_WORDS_S = 5.0  # Longest time to read on after a command has ended, [s]
 
 
 class ProcessCost(NamedTuple):
@@ -102,13 +104,25 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
         stderr=subprocess.STDOUT,
         env=environment,
     )
-    assert process.stdout is not None
+    output = process.stdout
+    assert output is not None
+
+    broken: list[BaseException] = []
+
+    def show() -> None:
+        try:
+            with log.open("wb", buffering=0) as file, output:
+                while arrived := os.read(output.fileno(), 65536):
+                    file.write(arrived)
+                    console.file.write(decoder.decode(arrived))
+                    console.file.flush()
+        except BaseException as problem:  # such as a full disk, or a reader of the console that is gone
+            broken.append(problem)
+            process.terminate()
+
+    reader = Thread(target=show, daemon=True)
+    reader.start()
     try:
-        with log.open("wb", buffering=0) as file, process.stdout as output:
-            while arrived := os.read(output.fileno(), 65536):
-                file.write(arrived)
-                console.file.write(decoder.decode(arrived))
-                console.file.flush()
         if hasattr(os, "wait4"):  # POSIX; elsewhere memory is not measured
             _, status, usage = os.wait4(process.pid, 0)
             process.returncode = os.waitstatus_to_exitcode(status)
@@ -118,6 +132,9 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
         if process.poll() is None:
             process.terminate()
             process.wait()
+        reader.join(_LAST_WORDS_S)  # a process that the command left behind may hold the pipe open
+    if broken:
+        raise broken[0]
     if process.returncode != 0:
         remedy = f"Its whole output is in {log}; its last lines:"
         message = explain(words[0], expected="exit status 0", got=process.returncode, remedy=remedy)

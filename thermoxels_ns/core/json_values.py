@@ -46,7 +46,8 @@ def write_json(path: Path, content: Any, error: type[ThermoxelsError] = Thermoxe
     """Write `plain_values(content)` to a json file; raises `error` for bad values, `OutputError` if writing fails."""
     text = json.dumps(plain_values(content, path.stem, error), indent=1, ensure_ascii=False, allow_nan=False)
     with replace_when_done(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        # Names of files that are not UTF-8 hold surrogates, which are then written as json escapes them.
+        temporary.write_bytes(text.encode("utf-8", "backslashreplace"))
 
 
 def read_json(

@@ -20,13 +20,12 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.core.snapshot import Views, fisheye_as_pinhole
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.ray_sampler import RaySampler, draw_generator
 
 _TRAIN, _EVAL, _EVAL_IMAGE = 0, 1, 2
-_WIDEST = np.deg2rad(80.0)  # largest angle from the optical axis in the pinhole view of a fisheye lens
 
 
 @dataclass
@@ -180,8 +179,6 @@ def views_of_cameras(cameras: Cameras) -> Views:
     kind = cameras.camera_type.numpy().reshape(-1)
 
     fisheye = kind == CameraType.FISHEYE.value
-    before = focal * np.tan(np.clip(centre / focal, -_WIDEST, _WIDEST))
-    behind = focal * np.tan(np.clip((size - centre) / focal, -_WIDEST, _WIDEST))
-    centre = np.where(fisheye[:, None], before, centre)
-    size = np.where(fisheye[:, None], np.ceil(before + behind).astype(np.int64), size)
+    wide_centre, wide_size = fisheye_as_pinhole(focal, centre, size)
+    centre, size = np.where(fisheye[:, None], wide_centre, centre), np.where(fisheye[:, None], wide_size, size)
     return Views(pose, focal, centre, size)

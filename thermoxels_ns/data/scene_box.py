@@ -12,7 +12,7 @@ import numpy as np
 from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.core.snapshot import Views, fisheye_as_pinhole
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model, worlds_of_json
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 
@@ -139,9 +139,8 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
     depth = _depths_in_view(points, frames)
     seen = np.isfinite(depth)
     middle = _depths_in_view(points, frames, _MIDDLE)
-    ahead = np.array(
-        [np.median(row[known]) if known.any() else np.nan for row, known in zip(middle, ~np.isnan(middle))]
-    )
+    rows = (inner if np.isfinite(inner).any() else every for inner, every in zip(middle, depth))
+    ahead = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in rows])
     kept = seen.any(axis=0) & _views(frames).shown_well(points, ahead)
     points, shown = points[kept], seen[:, kept].sum(axis=1)
     if len(points) < _FEWEST_POINTS:
@@ -162,14 +161,15 @@ def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
 
 
 def _views(frames: Sequence[Frame]) -> Views:
-    """Return the frames' cameras as pinholes."""
+    """Return the frames' cameras as pinholes without distortion."""
     lenses = [frame.intrinsics for frame in frames]
-    return Views(
-        np.stack([frame.pose[:3] for frame in frames]),
-        np.array([(lens.fl_x, lens.fl_y) for lens in lenses]),
-        np.array([(lens.cx, lens.cy) for lens in lenses]),
-        np.array([(lens.width, lens.height) for lens in lenses]),
-    )
+    focal = np.array([(lens.fl_x, lens.fl_y) for lens in lenses])
+    centre = np.array([(lens.cx, lens.cy) for lens in lenses])
+    size = np.array([(lens.width, lens.height) for lens in lenses])
+    fisheye = np.array([[lens.lens == "fisheye"] for lens in lenses])
+    wide_centre, wide_size = fisheye_as_pinhole(focal, centre, size)
+    poses = np.stack([frame.pose[:3] for frame in frames])
+    return Views(poses, focal, np.where(fisheye, wide_centre, centre), np.where(fisheye, wide_size, size))
 
 
 def _depths_in_view(points: FloatArray, frames: Sequence[Frame], border: float = 0.0) -> Float32Array:

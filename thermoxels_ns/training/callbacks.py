@@ -64,7 +64,8 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         rays = found[0] if len(found) == 1 else found[0].joined_with(found[1])
         air = air_voxels(lattice, rays).reshape(-1)[voxels.cells]
         centres = np.stack(np.unravel_index(voxels.cells, lattice.cell_shape), axis=1) + 0.5
-        air |= hardly_shown(lattice.index_to_world(centres), views_of_cameras(dataset.cameras))
+        hidden = hardly_shown(lattice.index_to_world(centres), views_of_cameras(dataset.cameras))
+        air |= hidden & ~hidden.all()
         if 0 < air.sum() < len(air):
             CONSOLE.log(
                 f"step {step}: {air.sum():,} of {len(air):,} voxels are air, or in view of fewer than two photographs"
