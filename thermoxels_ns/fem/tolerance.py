@@ -138,7 +138,8 @@ def solve_to_tolerance(
 
         run = _Run(problem, tolerance, memory_bytes, log)
         return run.close(_refine(run, solve_state, 2, 0), allow_unmet)
-    assert tolerance.temperature_k is not None, "steps in time are chosen by it"
+    allowed_k = tolerance.temperature_k
+    assert allowed_k is not None, "steps in time are chosen by it"
     run = _Run(problem, tolerance, memory_bytes, log, times=outputs + 1)
     steps: list[AdaptiveSteps] = []
 
@@ -148,7 +149,7 @@ def solve_to_tolerance(
     def solve_in_time(problem: HeatProblem, _: int) -> Solution:
         if steps:
             return follow(problem, steps[0])
-        tried = AdaptiveSteps(duration_s, tolerance.temperature_k, outputs=outputs)
+        tried = AdaptiveSteps(duration_s, allowed_k, outputs=outputs)
         found = follow(problem, tried)
         for _ in range(_MOST_TRIES):
             finer = replace(tried, tolerance_k=_FINER_STEPS * tried.tolerance_k)
