@@ -18,7 +18,7 @@ OF_THE_RUN = {"capture.html", "lock", "seconds.txt", "key.txt", "features.db"}
 """They hold times, a process number, the options, and rows in the order in which threads ended."""
 
 
-STOPS = ("matches:", "rig: Comparing", "9/9 page")
+STOPS = ("matches:", "rig: Comparing", "8/8 page")
 """What the command says last before it is killed, one after the other."""
 
 
@@ -83,7 +83,7 @@ def test_kill_9_at_any_stage_changes_nothing_in_the_scene(scenes, tmp_path):
         kill_after(last, words)
     again = run(*words)
     assert again.returncode == 0, again.stdout
-    assert "8/9 scene: as before" in again.stdout and "9/9 page: as before" not in again.stdout
+    assert "7/8 scene: as before" in again.stdout and "8/8 page: as before" not in again.stdout
     assert len(written(killed)) == 2 * COUNT + 3  # json, points, tracks
     assert written(killed) == written(alone)
     assert (killed / "capture.html").is_file()

@@ -11,7 +11,6 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.transforms_json import read_pose
 
 _PARTS = ("cameras", "images", "points3D")
 COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "colmap_sparse/0", "sparse/0", "sparse")
@@ -55,6 +54,8 @@ def worlds_of_json(meta: Mapping[str, Any]) -> list[FloatArray]:
     That is the json's ``applied_transform``; without one, no change or the swap of axes of old ns-process-data.
     """
     if "applied_transform" in meta:
+        from thermoxels_ns.data.transforms_json import read_pose  # loads PIL, which the help of commands does not need
+
         return [read_pose(meta["applied_transform"], "applied_transform", turned=False)]
     return [np.eye(4), _LEGACY_TRANSFORM]
 
