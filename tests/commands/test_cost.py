@@ -108,6 +108,7 @@ def test_settings_qualities_and_methods_are_what_a_user_would_type(start, comman
     [
         *(({"settings": (text,)}, "settings") for text in ("64", "0:800", "64:0", "64:8e2", "64:800:2", " 64:800", "")),
         ({"settings": (), "qualities": ()}, "settings"),
+        ({"methods": ()}, "methods"),
         ({"target_mae": math.nan}, "target_mae"),
         ({"scene": Path("nowhere")}, "scene"),
     ],

@@ -209,6 +209,8 @@ def test_errors_of_steps_that_a_body_does_not_forget_are_in_the_estimate(toleran
         true_k,
     )
     assert true_k < tolerance_k
+    assert found.settings.step_tolerance_k <= 0.5 * tolerance_k
+    assert found.settings.error.temperature_k >= found.settings.step_tolerance_k
 
 
 def test_too_little_memory_is_a_status() -> None:

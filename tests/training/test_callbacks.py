@@ -196,13 +196,17 @@ def test_voxels_that_fewer_than_two_photographs_show_go(narrow):
     assert torch.equal(model.grid.kept, torch.from_numpy(~beside if narrow else np.ones_like(beside)))
 
 
-def test_where_no_two_photographs_show_anything_of_the_box_nothing_goes_for_it():
+def test_where_no_two_photographs_show_anything_of_the_box_air_goes_all_the_same():
     model = model_of(prune_threshold=0.0)
-    model.feature_rays = FeatureRays(np.array([[8.0, 9.0, 9.0]]), np.arange(1), np.array([[9.0, 9.0, 9.0]]), np.ones(1))
+    points = np.column_stack(
+        (np.full(25, 0.9), *(part.ravel() for part in np.meshgrid(*2 * [np.linspace(-0.9, 0.9, 5)])))
+    )
+    model.feature_rays = FeatureRays(np.tile([-0.9, 0.0, 0.0], (25, 1)), np.arange(25), points, np.zeros(25))
     given: Any = attributes(model, 10)
     given.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :, [0, 2]] *= -1.0
     next(steps_of(model, given, 1))
-    assert bool(model.grid.kept.all())
+    air = torch.from_numpy(air_voxels(model.grid.lattice, model.feature_rays))
+    assert bool(air.any()) and torch.equal(model.grid.kept, ~air)
 
 
 @pytest.mark.parametrize("voxel_pixels", [0.0, 1.6])

@@ -83,6 +83,8 @@ def run_cost(cost: Cost, console: Console) -> None:
     if not options:
         remedy = "Pass --settings 64:800."
         raise ThermoxelsError("settings", expected="a setting or a quality", got="none", remedy=remedy)
+    if not cost.methods:
+        raise ThermoxelsError("methods", expected="a method", got="none", remedy="Pass --methods thermoxels.")
     if not cost.scene.is_dir():
         raise SceneError("scene", expected="a scene folder", got=f"none at {cost.scene}", remedy="Correct the path.")
     folder, scene, failed = writable_folder(cost.output_dir), str(cost.scene.resolve()), []

@@ -20,7 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.snapshot import Views, fisheye_as_pinhole
+from thermoxels_ns.core.snapshot import Views, as_pinholes
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.ray_sampler import RaySampler, draw_generator
@@ -179,6 +179,4 @@ def views_of_cameras(cameras: Cameras) -> Views:
     kind = cameras.camera_type.numpy().reshape(-1)
 
     fisheye = kind == CameraType.FISHEYE.value
-    wide_centre, wide_size = fisheye_as_pinhole(focal, centre, size)
-    centre, size = np.where(fisheye[:, None], wide_centre, centre), np.where(fisheye[:, None], wide_size, size)
-    return Views(pose, focal, centre, size)
+    return Views(pose, focal, *as_pinholes(fisheye, focal, centre, size))
