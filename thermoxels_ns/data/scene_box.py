@@ -32,8 +32,6 @@ _STEREO_PHOTOGRAPHS, _STEREO_SIDE = 32, 96
 _FEWEST_POINTS = 10  # Sparse points in view that a box needs
 _FEWEST_DEPTHS = 200  # Depths that a box needs; with fewer it is found from the cameras
 _FEW_IN_VIEW = 0.05  # A photograph with fewer points in view, relative to the photograph with most, tells nothing
-_MIDDLE = 0.25
-"""A camera is pointed at what is in view this far from the photograph's edge, relative to its shorter side."""
 _NEARER_HALF = 0.25  # Where no points are known, the surface is taken to stand at this quantile of the depths in a box
 _CONVERGING = 0.5  # Cameras look outwards if the place they look at is nearer than this, relative to their spread
 
@@ -131,19 +129,18 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
 def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
     """Return the box around the points (n, 3), in input coordinates, that photographs show well.
 
-    Points count that photographs show about as well as what cameras are pointed at, see `Views.shown_well`, by which
-    the export chooses its region, too. Along each axis the box leaves out `_TAIL` of them at either end, and is then
-    wider by `_MARGIN` on every side, because parts without texture have no points and a flat scene needs some depth. If
-    a photograph has hardly any of these points in view, as of a plain wall, the box also holds the point on its optical
-    axis at the median distance of what the other cameras are pointed at.
+    Points count that photographs show about as well as what cameras are pointed at: the rule by which the export chooses
+    its region, too, see `Views.shown_well`. A camera is pointed at the median depth of the points in its view. Along
+    each axis the box leaves out `_TAIL` of the points at either end, and is then wider by `_MARGIN` on every side,
+    because parts without texture have no points and a flat scene needs some depth. If a photograph has hardly any of
+    these points in view, as of a plain wall, the box also holds the point on its optical axis at the median distance of
+    what the other cameras are pointed at.
     """
     points = points[np.isfinite(points).all(axis=1)]
     points, frames = points[:: max(len(points) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
     depth = _depths_in_view(points, frames)
     seen = np.isfinite(depth)
-    middle = _depths_in_view(points, frames, _MIDDLE)
-    rows = (inner if np.isfinite(inner).any() else every for inner, every in zip(middle, depth))
-    ahead = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in rows])
+    ahead = np.array([np.median(row[known]) if known.any() else np.nan for row, known in zip(depth, seen)])
     kept = seen.any(axis=0) & _views(frames).shown_well(points, ahead)
     points, shown = points[kept], seen[:, kept].sum(axis=1)
     if len(points) < _FEWEST_POINTS:
@@ -174,17 +171,14 @@ def _views(frames: Sequence[Frame]) -> Views:
     return Views(poses, focal, *as_pinholes(fisheye, focal, centre, size))
 
 
-def _depths_in_view(points: FloatArray, frames: Sequence[Frame], border: float = 0.0) -> Float32Array:
-    """Return the depth of each point in each photograph, (photographs, points); NaN where the point is not in view.
-
-    A point counts as in view at least `border` from the photograph's edge, relative to its shorter side.
-    """
+def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array:
+    """Return the depth of each point in each photograph, (photographs, points); NaN where the point is not in view."""
     depth = np.full((len(frames), len(points)), np.nan, dtype=np.float32)
     for row, frame in zip(depth, frames):
         camera, local = frame.intrinsics, (points - frame.pose[:3, 3]) @ frame.pose[:3, :3] * (1.0, -1.0, -1.0)
         shown = local[:, 2] > 0.0
         if camera.lens == "perspective":
-            shown &= camera.contains(camera.project(local), border * min(camera.width, camera.height))
+            shown &= camera.contains(camera.project(local))
         row[shown] = local[shown, 2]
     return depth
 
