@@ -80,4 +80,7 @@ def test_what_is_shown_well_ends_where_pixels_per_area_fall_off():
     one = np.where(np.arange(8) == 0, reach, np.nan)  # of the others it is not known what they are pointed at
     behind = np.array([(-2.9, 0.0, 0.0), (-3.5, 0.0, 0.0), (2.9, 0.0, 0.0)])
     assert views.shown_well(behind, one).tolist() == [True, False, False]  # (2 / 4.9)^2 = 0.17, (2 / 5.5)^2 = 0.13
+    # Pointed at what is 3 away, it shows places up to 3 / sqrt(0.15) = 7.7 away well.
+    farther = np.array([(-5.5, 0.0, 0.0), (-6.0, 0.0, 0.0)])
+    assert views.shown_well(farther, 1.5 * one).tolist() == [True, False]
     assert views.shown_well(places, np.full(8, np.nan)).all()

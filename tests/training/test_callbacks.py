@@ -46,7 +46,9 @@ class Rays:
 
     def look_closer(self, camera: int) -> None:
         """Let a camera see 14 degrees around the x axis alone."""
-        self.train_dataset.cameras.fx[camera] = self.train_dataset.cameras.fy[camera] = 200.0
+        cameras = self.train_dataset.cameras
+        cameras.fx, cameras.fy = cameras.fx.clone(), cameras.fy.clone()  # both cameras shared one number
+        cameras.fx[camera] = cameras.fy[camera] = 200.0
 
     def training_rays(self, stream: int, most: int) -> Iterator[RayBundle]:
         y, z = torch.meshgrid(*[self.places] * 2, indexing="ij")

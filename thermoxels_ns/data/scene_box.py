@@ -129,8 +129,8 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
 def box_of_points(points: FloatArray, frames: Sequence[Frame]) -> Box:
     """Return the box around the points (n, 3), in input coordinates, that photographs show well.
 
-    Points count that photographs show about as well as what cameras are pointed at: the rule by which the export chooses
-    its region, too, see `Views.shown_well`. A camera is pointed at the median depth of the points in its view. Along
+    Points count that photographs show about as well as what cameras are pointed at, the rule by which the export picks
+    its region, too: see `Views.shown_well`. A camera is pointed at the median depth of the points in its view. Along
     each axis the box leaves out `_TAIL` of the points at either end, and is then wider by `_MARGIN` on every side,
     because parts without texture have no points and a flat scene needs some depth. If a photograph has hardly any of
     these points in view, as of a plain wall, the box also holds the point on its optical axis at the median distance of
