@@ -69,7 +69,7 @@ MECHANISMS: Mapping[str, Without] = {
     "backdrop-rays": Without((_LOSS, "backdrop", "0")),
     "plain-backdrop": Without(
         replaced=(
-            ("thermoxels_ns.multiview.stereo", "plain_backdrop", lambda _, depth: 2 * (np.zeros(len(depth), bool),)),
+            ("thermoxels_ns.multiview.stereo", "plain_backdrop", lambda _, depth: 3 * (np.zeros(len(depth), bool),)),
         )
     ),
     "carve": Without((f"{_MODEL}carve", "off")),

@@ -93,6 +93,61 @@ def test_a_pixel_whose_depth_is_known_is_none():
     assert not plain_backdrop(seen, depth)[0][: WIDTH * 6].any()
 
 
+def room() -> tuple[Photographs, np.ndarray, np.ndarray]:
+    """What eight cameras see of a room from inside, all round; depths of its walls; which pixels show the ceiling.
+
+    The room is 6 x 6 m wide and 3 m high. Walls and ceiling are plain and have temperatures of 0.5 and 0.6.
+    """
+    level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    middle = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    along = np.column_stack((columns.ravel(), rows.ravel(), np.ones(HEIGHT * WIDTH))) @ np.linalg.inv(middle).T @ level
+    matrices, centres, depth = [], [], []
+    for bearing in 0.25 * np.pi * np.arange(8):
+        turn = np.array([[np.cos(bearing), np.sin(bearing), 0], [-np.sin(bearing), np.cos(bearing), 0], [0, 0, 1.0]])
+        centre = -1.5 * turn[1] + (0.0, 0.0, 1.6)  # stands back from the wall that it looks at
+        with np.errstate(divide="ignore"):
+            far = np.where(along @ turn > 0, np.array([3.0, 3.0, 3.0]) - centre, np.array([-3.0, -3.0, 0.0]) - centre)
+            reach = far / (along @ turn)
+        depth.append(
+            np.where(reach.argmin(1) == 2, np.where((along @ turn)[:, 2] > 0, np.nan, reach[:, 2]), reach.min(1))
+        )
+        matrices.append(middle @ np.column_stack((level @ turn, -level @ turn @ centre)))
+        centres.append(centre)
+    depths = np.concatenate(depth).astype(np.float32)
+    is_ceiling = np.isnan(depths)
+    count = len(depths)
+    colours = np.where(is_ceiling[:, None], SKY, WALL) + np.random.default_rng(0).normal(0.0, 0.004, (count, 3))
+    seen = Photographs(
+        np.stack(matrices),
+        np.stack(centres),
+        np.array([[WIDTH, HEIGHT]] * 8),
+        np.arange(8) * WIDTH * HEIGHT,
+        colours.astype(np.float32),
+        np.where(is_ceiling, 0.6, 0.5).astype(np.float32),
+    )
+    return seen, depths, is_ceiling
+
+
+def test_a_plain_ceiling_is_no_sky_unless_it_is_colder_than_all_around():
+    """Photographs of a room show walls behind their cameras, those of a house do not. A yard is open above."""
+    seen, depth, is_ceiling = room()
+    assert 0.1 < is_ceiling.mean() < 0.6
+    backdrop, beside, ceiling = plain_backdrop(seen, depth)
+    assert not backdrop.any() and not beside.any()
+    assert ceiling[is_ceiling].mean() > 0.8 and not ceiling[~is_ceiling].any()
+    yard = replace(seen, thermal=np.where(is_ceiling, np.float32(0.1), seen.thermal))
+    assert plain_backdrop(yard, depth)[0][is_ceiling].mean() > 0.8
+    unknown = replace(seen, thermal=np.full_like(seen.thermal, np.nan))
+    assert not plain_backdrop(unknown, depth)[0].any()
+    first = slice(2 * WIDTH * HEIGHT)  # two photographs show nothing that stands behind their cameras
+    two = Photographs(
+        *(values[:2] for values in (seen.matrices, seen.centres, seen.sizes, seen.firsts)),
+        *(values[first] for values in (seen.colours, seen.thermal)),
+    )
+    assert plain_backdrop(two, depth[first])[0].any()
+
+
 def test_what_looks_like_the_sky_beside_it_has_no_depth_of_its_own():
     """An outline that is a pixel too wide: its depths on the sky go, and those on the wall stay."""
     seen, is_sky = house()
@@ -100,7 +155,7 @@ def test_what_looks_like_the_sky_beside_it_has_no_depth_of_its_own():
     sky = is_sky.reshape(6, HEIGHT, WIDTH)
     outline[:, :-1] |= sky[:, :-1] & ~sky[:, 1:]
     depth = np.where(outline.ravel() | ~is_sky, np.float32(2.0), np.float32(np.nan))
-    backdrop, beside = plain_backdrop(seen, depth)
+    backdrop, beside, _ = plain_backdrop(seen, depth)
     assert beside[outline.ravel()].mean() > 0.9 and not beside[~is_sky].any()
     assert not (backdrop & beside).any()
 

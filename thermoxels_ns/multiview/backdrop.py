@@ -15,19 +15,27 @@ COLOUR_TOLERANCE = 0.1
 """Largest difference of a pixel's channels from the backdrop's colour, of 1. On eight drawn scenes and a real street,
 0.06 finds less of the sky (saharov32: 54 % instead of 69 %); neither value takes more than 1 % of a body's pixels."""
 THERMAL_TOLERANCE = 0.1  # Largest difference of a pixel from the backdrop's temperature, of the scene's range
+RISE_DEG, SURROUNDED = 10.0, 0.02
+"""Cameras stand inside what they photograph if, for half of them, this share of all points of known depth lies behind
+the camera and so many degrees above it. The share is 0.07 in a drawn living room, 0.003 around a statue in a street, 0
+around drawn houses."""
+COLDER = 0.05  # A sky is colder than all pixels of known depth but this share
+_SOME = 20_000  # About as many pixels are used for a statistic
 _WIDEST, _ROUNDS = 0.3, 8
 """Tolerance of the first of so many fits of the backdrop's colour; it shrinks to `COLOUR_TOLERANCE` in the last."""
 
 
-def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolArray, BoolArray]:
-    """Return which pixels show a plain backdrop, and which pixels beside these look like the backdrop, both (pixels,).
+def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Return which pixels show a plain backdrop, which pixels beside these look like it, and which show a ceiling.
+
+    All three have shape (pixels,).
 
     No photograph tells how far away a plain area is. A plain pixel without a known `depth` (pixels,) shows the backdrop
     if plain pixels lead up from it to the edge of the photograph (a wall ends at a roof, windows or the ground), and if
     its colour and temperature are those that most such pixels have as a function of direction (harmonics of degree 2).
     Plain pixels of the same look that touch the backdrop, such as pixels below an object, show it too. Pixels beside
     the backdrop that look like it have wrong depths, taken from an outline (drawn courtyard: 2.6 % of all depths lie on
-    the sky, 0.5 % without these pixels).
+    the sky, 0.5 % without these pixels). What would be a backdrop is a ceiling, if cameras stand `in_a_room`.
     """
     open_above, plain = (np.zeros(len(photographs.colours), dtype=bool) for _ in range(2))
     directions, up = np.empty((len(open_above), 3)), upwards(photographs)
@@ -43,8 +51,9 @@ def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolA
         turns = _turns(inverse, up)
         if turns is not None:
             open_above[pixels] = np.rot90(np.logical_and.accumulate(np.rot90(even, turns), axis=0), -turns).ravel()
+    none = np.zeros_like(open_above)
     if open_above.mean() < 1e-3:
-        return np.zeros_like(open_above), np.zeros_like(open_above)
+        return none, none, none
     values = np.column_stack((photographs.colours, photographs.thermal))
     beside = _alike(values, directions, open_above, photographs.measured)
     alike = plain & beside
@@ -57,7 +66,31 @@ def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolA
         alike[pixels] &= touched[label]
         around = cv2.dilate(alike[pixels].reshape(height, width).astype(np.uint8), np.ones((3, 3), np.uint8)).ravel()
         beside[pixels] &= (around > 0) & ~alike[pixels]
-    return alike, beside
+    return (none, none, alike) if in_a_room(photographs, depth, alike, up) else (alike, beside, none)
+
+
+def in_a_room(photographs: Photographs, depth: Float32Array, plain: BoolArray, up: FloatArray) -> bool:
+    """Return whether cameras stand in a room, whose `plain` ceiling (pixels,) looks like a cloudy sky.
+
+    In a room, known surfaces rise behind cameras too, as other photographs show (`SURROUNDED`). In a yard or a street
+    they do as well; there a sky is known by its temperature, which is below that of nearly all surfaces (`COLDER`).
+    `depth` is that of all pixels, NaN where unknown, (pixels,); `up` is a unit vector, (3,).
+    """
+    (known,) = np.nonzero(np.isfinite(depth))
+    if not len(known):
+        return False
+    some = known[:: max(1, len(known) // _SOME)]
+    origins, along = photographs.of_pixels(some)
+    points, rise, shares = origins + depth[some, None] * along, np.sin(np.deg2rad(RISE_DEG)), []
+    for centre, forward in zip(photographs.centres, photographs.matrices[:, 2, :3]):
+        away = points - centre
+        above = away @ up > rise * np.linalg.norm(away, axis=1)
+        shares.append(np.mean(above & (away @ forward < 0.0)))
+    if np.median(shares) < SURROUNDED:
+        return False
+    warm = photographs.thermal
+    theirs, surfaces = (values[np.isfinite(values)] for values in (warm[plain], warm[known]))
+    return not (len(theirs) and len(surfaces) and np.median(theirs) < np.quantile(surfaces, COLDER))
 
 
 def upwards(photographs: Photographs) -> FloatArray:
@@ -115,7 +148,7 @@ def _alike(
     basis = np.column_stack((np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0))
     tolerance = np.array([COLOUR_TOLERANCE] * 3 + [THERMAL_TOLERANCE])
     some = np.flatnonzero(chosen)
-    some = some[:: max(1, len(some) // 20_000)]
+    some = some[:: max(1, len(some) // _SOME)]
     seen = values[some].astype(np.float64)
     bins = np.unique((np.nan_to_num(seen) / (2.0 * tolerance)).astype(np.int64), axis=0, return_inverse=True)[1]
     bins = bins.reshape(-1)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
-from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.core.feature_rays import MARGIN_ERRORS, FeatureRays
 from thermoxels_ns.multiview.differences import matters, photograph_differences
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs, thermal_at
 from thermoxels_ns.multiview.stereo import (
@@ -24,6 +24,7 @@ from thermoxels_ns.multiview.stereo import (
 
 LEAST_SHARE = 0.01  # Depths are used if at least this share of the pixels has a sure one; fewer may be chance
 REFINED_SIDE = 640  # Pixels along the longer side of the photographs in which depths are refined
+BEYOND = 1e3  # Distance of a backdrop, in diagonals of the box
 LEAST_GAIN = 0.01  # Gains are corrected if the root mean square of their logarithms is above this
 LEAST_OFFSET_K = 0.1  # Offsets of thermal images are corrected if their root mean square is above this, [K]
 
@@ -35,11 +36,30 @@ class PhotographEvidence:
     photographs: Photographs  # Small photographs, with gains and offsets corrected where `log_gain` or `offset` is set
     depth: Float32Array  # Depth of each pixel where it is sure, else NaN, shape (pixels,), [world units]
     backdrop: BoolArray  # True for pixels that show a plain backdrop, shape (pixels,)
+    ceiling: BoolArray  # True for pixels that show the plain ceiling of a room, shape (pixels,)
     feature_rays: FeatureRays | None
     """Rays to the depths on which several photographs agree; None if there are too few such depths (`LEAST_SHARE`)."""
     log_gain: FloatArray | None
     """Natural logarithm of the gain of each channel, (photographs, 3); None: gains were not corrected."""
     offset: FloatArray | None  # Offset of normalised temperature, (photographs,); None: offsets were not corrected
+
+    def plain_rays(self, lo: FloatArray, hi: FloatArray) -> FeatureRays | None:
+        """Return rays through backdrop to points behind the box from `lo` to `hi`, or to a ceiling anywhere in the box.
+
+        There is one ray per pixel; None if pixels are too few (`LEAST_SHARE`). A point anywhere on a ray's way through
+        the box is one near the camera with an error as long as that way.
+        """
+        (chosen,) = np.nonzero(self.backdrop | self.ceiling)
+        if len(chosen) < LEAST_SHARE * len(self.backdrop):
+            return None
+        if not self.ceiling.any():
+            return rays_through(self.photographs, chosen, np.full(len(chosen), BEYOND * np.linalg.norm(hi - lo)))
+        origins, along = self.photographs.of_pixels(chosen)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            way = np.nanmin(np.maximum((lo - origins) / along, (hi - origins) / along), axis=1)
+        return rays_through(
+            self.photographs, chosen[way > 0.0], way[way > 0.0] / BEYOND, way[way > 0.0] / MARGIN_ERRORS
+        )
 
 
 def depths_of_dataset(dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike) -> Depths | None:
@@ -75,7 +95,11 @@ def evidence_of_photographs(
     few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
     temperatures = dataset.temperature_range
     span_k = 1.0 if temperatures is None else temperatures.span_k
-    found = photograph_differences(depths, thermal_at(dataset, photographs, depths.depth)) if gains or offsets else None
+    # Cameras of their own show a pixel of unknown depth about where they show the sky.
+    far = np.float32(BEYOND * np.linalg.norm(np.subtract(hi, lo)))
+    thermal = thermal_at(dataset, photographs, np.where(np.isnan(depths.depth), far, depths.depth))
+    photographs = replace(photographs, thermal=thermal)
+    found = photograph_differences(depths, thermal) if gains or offsets else None
     log_gain = offset = None
     if gains and found is not None and matters(found.log_gain, found.log_gain_error, LEAST_GAIN):
         log_gain, photographs = found.log_gain, found.without_gains(photographs)
@@ -83,17 +107,11 @@ def evidence_of_photographs(
     if offsets and found is not None and matters(found.offset, found.offset_error, LEAST_OFFSET_K / span_k):
         offset, photographs = found.offset, found.without_offsets(photographs)
         say(f"thermal images are offset against each other by {np.std(offset) * span_k:.2f} K: corrected")
-    depths, backdrop = depths_before_backdrop(replace(depths, photographs=photographs))
+    depths, backdrop, ceiling = depths_before_backdrop(replace(depths, photographs=photographs))
+    plain = f"a plain {'ceiling' if ceiling.any() else 'backdrop'} fills {np.mean(backdrop | ceiling):.1%}"
     say(
-        f"depths: {len(photographs)} photographs agree about {depths.share:.1%} of their pixels{few}; "
-        f"a plain backdrop fills {backdrop.mean():.1%}; {time.perf_counter() - began:.1f} s"
+        f"depths: {len(photographs)} photographs agree about {depths.share:.1%} of their pixels{few}; {plain}; "
+        f"{time.perf_counter() - began:.1f} s"
     )
     rays = None if few else feature_rays_to_depths(depths)
-    return PhotographEvidence(photographs, depths.depth, backdrop, rays, log_gain, offset)
-
-
-def rays_through_backdrop(photographs: Photographs, backdrop: BoolArray, beyond: float) -> FeatureRays | None:
-    """Return rays through the backdrop's pixels to points at depth `beyond` [world units]; None for too few pixels."""
-    (chosen,) = np.nonzero(backdrop)
-    enough = len(chosen) >= LEAST_SHARE * len(backdrop)
-    return rays_through(photographs, chosen, np.full(len(chosen), beyond)) if enough else None
+    return PhotographEvidence(photographs, depths.depth, backdrop, ceiling, rays, log_gain, offset)

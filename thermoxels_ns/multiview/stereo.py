@@ -87,10 +87,10 @@ class Depths:
         return float(np.mean(np.isfinite(self.depth)))
 
 
-def depths_before_backdrop(depths: Depths) -> tuple[Depths, BoolArray]:
-    """Set wrong depths beside a backdrop to NaN; return the depths and which pixels show the backdrop, (pixels,)."""
-    backdrop, beside = plain_backdrop(depths.photographs, depths.depth)
-    return replace(depths, depth=np.where(beside, np.float32(np.nan), depths.depth)), backdrop
+def depths_before_backdrop(depths: Depths) -> tuple[Depths, BoolArray, BoolArray]:
+    """Set wrong depths beside a backdrop to NaN; return the depths, and which pixels show backdrop and ceiling."""
+    backdrop, beside, ceiling = plain_backdrop(depths.photographs, depths.depth)
+    return replace(depths, depth=np.where(beside, np.float32(np.nan), depths.depth)), backdrop, ceiling
 
 
 def depths_of(

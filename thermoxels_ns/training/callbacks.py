@@ -20,7 +20,7 @@ from thermoxels_ns.data.datamanager import views_of_cameras
 from thermoxels_ns.field.refine import RowChange, prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import mean_colours
-from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs, rays_through_backdrop
+from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs
 from thermoxels_ns.multiview.votes import air_voxels, hardly_shown
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
@@ -163,8 +163,9 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> PhotographEvidence | None:
     """Find depths in photographs, give the evidence to the model and return it; None if depths are off or impossible.
 
-    The model gets feature rays to depths, rays through a plain backdrop, and, unless the training is resumed, gains,
-    offsets and first colours. See `ThermoxelsModelConfig.photo_depth`; depths need photographs in training.
+    The model gets feature rays to depths, rays through a plain backdrop or to a plain ceiling, and, unless the training
+    is resumed, gains, offsets and first colours. See `ThermoxelsModelConfig.photo_depth`; depths need photographs in
+    training.
     """
     config, pipeline, trainer = model.config, attributes.pipeline, attributes.trainer
     if config.photo_depth == "off" or not model.loss_weights.tracks or pipeline is None:
@@ -192,8 +193,8 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
         model.feature_ray_sampler = FeatureRaySampler(depths, box, far, COARSE_LIGHT)
     elif depths is not None and tracks is not None:
         model.feature_ray_sampler = FeatureRaySampler(tracks.joined_with(depths), box, far)
-    open_rays = rays_through_backdrop(found.photographs, found.backdrop, 1e3 * float(np.linalg.norm(box[1] - box[0])))
-    model.backdrop_ray_sampler = None if open_rays is None else FeatureRaySampler(open_rays, box)
+    plain_rays = found.plain_rays(*box)
+    model.backdrop_ray_sampler = None if plain_rays is None else FeatureRaySampler(plain_rays, box)
     model.plain_areas = PlainAreas(found.photographs, np.isfinite(found.depth), found.backdrop)
     if trainer is None or trainer._start_step == 0:
         points = model.grid.voxels.corner_index() * lattice.voxel_size + np.asarray(lattice.lo)

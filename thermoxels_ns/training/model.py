@@ -126,7 +126,7 @@ class ThermoxelsModel(Model):
         self.feature_rays, self.feature_ray_sampler = rays, None
         if rays is not None and len(rays.point) and config.sh_degree is not None:
             self.feature_ray_sampler = losses.FeatureRaySampler(rays, box, self.surroundings is not None)
-        # Rays through pixels that show a plain backdrop; `callbacks.follow_depths` finds them.
+        # Rays through pixels that show a plain backdrop or ceiling; `callbacks.follow_depths` finds them.
         self.backdrop_ray_sampler: losses.FeatureRaySampler | None = None
         self.plain_areas: PlainAreas | None = None  # Found by `callbacks.follow_depths` too
 
