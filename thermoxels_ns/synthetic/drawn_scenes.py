@@ -369,6 +369,55 @@ def wall_object() -> SyntheticScene:
     return dataclasses.replace(scene, background_rgb=plain(seen.tolist()))
 
 
+def living_room() -> SyntheticScene:
+    """Build a furnished room of 5.2 x 4.2 x 2.7 m, photographed from inside, with white walls and a plain ceiling.
+
+    Walls are 17 to 19 C, colder in the corners of the outer wall, whose window has 12 C and whose radiator has 45 C.
+    """
+    x, y, high, thick = 2.6, 2.1, 2.7, 0.25
+    radiator: Box = ((x - 0.12, -1.0, 0.12), (x, 0.6, 0.75))
+    outer: list[Box] = [((side - thick, -y - thick, 0.0), (side, y + thick, high)) for side in (-x, x + thick)]
+    inner: list[Box] = [((-x, side - thick, 0.0), (x, side, high)) for side in (-y, y + thick)]
+    legs: list[Box] = [((a, b, 0.0), (a + 0.06, b + 0.06, 0.7)) for a in (-0.48, 0.42) for b in (-0.33, 0.27)]
+    wood = Paint((0.55, 0.42, 0.30), 0.2)
+    plan = _plan(
+        (Paint((0.52, 0.38, 0.26), 0.22), ((-x - thick, -y - thick, -thick), (x + thick, y + thick, 0.0))),
+        (Paint((0.92, 0.92, 0.91), 0.0), ((-x - thick, -y - thick, high), (x + thick, y + thick, high + thick))),
+        (Paint((0.90, 0.89, 0.86), 0.02), *outer, *inner),
+        (wood, ((-0.5, -0.35, 0.7), (0.5, 0.35, 0.75)), *legs, ((0.9, y - 0.35, 0.0), (2.1, y, 1.9))),
+        (Paint((0.35, 0.40, 0.46), 0.2), ((-x, -1.2, 0.0), (-1.8, 0.8, 0.42)), ((-x, -1.2, 0.42), (-2.3, 0.8, 0.85))),
+        (Paint((0.93, 0.93, 0.93), 0.02), radiator),
+        openings=(
+            ((0, -1, x), (-1.0, 0.6), (0.95, 2.15), 12.0, _GLASS),
+            ((1, +1, -y), (-1.9, -1.0), (0.0, 2.05), 18.5, _DOOR),
+        ),
+        recess_m=0.12,
+    )
+
+    def temperature_c(points: npt.ArrayLike) -> FloatArray:
+        points = np.asarray(points, dtype=np.float64)
+        across, along, z = points.T
+        degrees = 18.5 + 0.5 * (z - 1.3) - 2.0 * np.exp(-np.abs(x - across) / 0.3)
+        degrees -= 2.5 * np.exp(-np.hypot(across - x, along - y) / 0.3)
+        degrees -= 1.5 * np.exp(-np.hypot(across - x, z - high) / 0.25)
+        plan.add_glows(degrees, points)
+        return degrees + (45.0 - degrees) * np.exp(-np.square(distance_to(radiator, points) / 0.15))
+
+    return painted_scene(
+        plan,
+        texture_seed=5,
+        light=SunLight(),
+        name="living-room",
+        scene_box=((-x - 0.4, -y - 0.4, -0.4), (x + 0.4, y + 0.4, high + 0.4)),
+        temperature_bounds_c=(5.0, 50.0),
+        surface_temperature_c=temperature_c,
+        background_rgb=sky_rgb,
+        background_temperature_c=lambda directions: sky_temperature_c(directions, 10.0, 3.0),
+        rings=rings_around((0.0, 0.0), (1.35, 1.6, 1.5), (0.9, 1.5, 1.9), (1.9, 1.45, 1.1)),
+        focal_share=0.62,
+    )
+
+
 def facade() -> SyntheticScene:
     """Build the textured front of a house with windows, ledges, a door and a strip of ground, under a plain sky.
 
@@ -451,10 +500,16 @@ _BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
     "courtyard": courtyard,
     "pipes": pipes,
     "wall-object": wall_object,
+    "living-room": living_room,
     "facade": facade,
     "street": street,
 }
-DEVELOPMENT_NAMES = ("wall-object", "facade", "street")  # names of hand-drawn scenes that are hard, for development
+DEVELOPMENT_NAMES = (
+    "wall-object",
+    "living-room",
+    "facade",
+    "street",
+)  # names of hand-drawn scenes that are hard, for development
 SCENE_NAMES = tuple(name for name in _BUILDERS if name not in DEVELOPMENT_NAMES)
 """Names of the other hand-drawn scenes; `make_scene` also knows `DEVELOPMENT_NAMES`, `random-N` and `wild-N`."""
 
