@@ -73,7 +73,7 @@ MOST_LINES = {
     "field": 885,
     "heat": 2590,
     "mesh": 5405,
-    "multiview": 1850,
+    "multiview": 1870,
     "radiometry": 1355,
     "render": 1670,
     "reports": 1400,

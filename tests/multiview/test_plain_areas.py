@@ -6,7 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.multiview.backdrop import mean_colours, plain_backdrop, upwards
 from thermoxels_ns.multiview.differences import Differences
+from thermoxels_ns.multiview.evidence import PhotographEvidence
 from thermoxels_ns.multiview.photographs import Photographs
+from thermoxels_ns.multiview.stereo import Depths, feature_rays_to_depths
 
 WIDTH, HEIGHT, FOCAL = 60, 48, 50.0
 SKY, WALL, GROUND, DARK = (0.55, 0.57, 0.6), (0.9, 0.88, 0.85), (0.3, 0.35, 0.2), (0.1, 0.1, 0.15)
@@ -49,6 +51,19 @@ def house(sky=SKY, wall=WALL, wall_warmth=np.nan, turns=(0,) * 6) -> tuple[Photo
         np.concatenate(warmths).astype(np.float32),
     )
     return seen, np.concatenate(skies)
+
+
+def first_of(seen: Photographs, count: int) -> Photographs:
+    pixels = count * WIDTH * HEIGHT
+    return replace(
+        seen,
+        matrices=seen.matrices[:count],
+        centres=seen.centres[:count],
+        sizes=seen.sizes[:count],
+        firsts=seen.firsts[:count],
+        colours=seen.colours[:pixels],
+        thermal=seen.thermal[:pixels],
+    )
 
 
 def found(seen: Photographs) -> np.ndarray:
@@ -140,12 +155,18 @@ def test_a_plain_ceiling_is_no_sky_unless_it_is_colder_than_all_around():
     assert plain_backdrop(yard, depth)[0][is_ceiling].mean() > 0.8
     unknown = replace(seen, thermal=np.full_like(seen.thermal, np.nan))
     assert not plain_backdrop(unknown, depth)[0].any()
-    first = slice(2 * WIDTH * HEIGHT)  # two photographs show nothing that stands behind their cameras
-    two = Photographs(
-        *(values[:2] for values in (seen.matrices, seen.centres, seen.sizes, seen.firsts)),
-        *(values[first] for values in (seen.colours, seen.thermal)),
-    )
-    assert plain_backdrop(two, depth[first])[0].any()
+    two = first_of(seen, 2)  # which show nothing that stands behind their cameras
+    assert plain_backdrop(two, depth[: len(two.colours)])[0].any()
+
+
+def test_a_ceiling_lies_on_the_hull_of_the_walls():
+    seen, depth, is_ceiling = room()
+    rays = feature_rays_to_depths(Depths(seen, depth, np.float32(0.02) * depth))
+    evidence = PhotographEvidence(seen, depth, np.zeros_like(is_ceiling), is_ceiling, rays, None, None)
+    to_ceiling = evidence.plain_rays(10.0)
+    assert to_ceiling is not None and len(to_ceiling.point) == is_ceiling.sum()
+    assert np.abs(to_ceiling.points[:, 2] - 3.0).max() < 0.1
+    assert replace(evidence, feature_rays=None).plain_rays(10.0) is None
 
 
 def test_what_looks_like_the_sky_beside_it_has_no_depth_of_its_own():
@@ -164,13 +185,7 @@ def test_points_get_the_colour_that_photographs_show_there_and_not_that_of_the_s
     seen, _ = house()
     inverse = np.linalg.inv(seen.matrices[0][:, :3])
     at = [seen.centres[0] + 4.0 * inverse @ np.array([x, y, 1.0]) for x, y in ((30.0, 32.0), (30.0, 5.0))]
-    alone = Photographs(
-        seen.matrices[:1],
-        seen.centres[:1],
-        seen.sizes[:1],
-        seen.firsts[:1],
-        *(values[: WIDTH * HEIGHT] for values in (seen.colours, seen.thermal)),
-    )
+    alone = first_of(seen, 1)
     backdrop = found(seen)[: WIDTH * HEIGHT]
     wall, sky = mean_colours(alone, backdrop, np.array(at))
     assert wall == pytest.approx(WALL, abs=0.02)

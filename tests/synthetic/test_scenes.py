@@ -17,7 +17,8 @@ from thermoxels_ns.synthetic.scene_truth import look_at
 from thermoxels_ns.synthetic.solids import BoxSolid, SolidUnion, distance_to_box
 
 RANDOM = tuple(f"random-{seed}" for seed in range(15))
-AROUND = (*DEVELOPMENT_NAMES, "house-corner+street", "hot-object+room")
+ROOM = "living-room"  # cameras stand in it
+AROUND = (*(name for name in DEVELOPMENT_NAMES if name != ROOM), "house-corner+street", "hot-object+room")
 
 
 @pytest.fixture(params=SCENE_NAMES)
@@ -114,6 +115,16 @@ def test_cameras_stand_free_and_frame_the_scene(name: str) -> None:
         sky = scene.background_rgb([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
         kind = "around" if scene.around else "plain" if (sky[0] == sky[1]).all() else "smooth"
         assert kind == ("smooth", "plain", "around")[int(name[5:]) % 3]
+
+
+def test_cameras_in_a_room_see_nothing_but_the_room() -> None:
+    scene = make_scene(ROOM)
+    poses = np.concatenate(scene.poses(6, 1))
+    assert scene.solid.signed_distance(poses[:, :3, 3]).min() > 0.3
+    lowest, highest = scene.temperature_bounds_c
+    for pose in poses:
+        view = render_view(scene, pose, scene.camera(64, 48))
+        assert view.hit.all() and lowest <= view.temperature_c.min() and view.temperature_c.max() <= highest
 
 
 @pytest.mark.parametrize("name", AROUND)

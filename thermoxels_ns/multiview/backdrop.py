@@ -11,10 +11,10 @@ from thermoxels_ns.multiview.photographs import SATURATED, Photographs
 PLAIN = 0.03  # A pixel is plain if each channel differs by at most this, of 1, from the four pixels around
 STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which no side of a photograph is its top
 LEVEL = 10.0  # Weight, in `upwards`, of one image axis being level against that of the other being steep
-COLOUR_TOLERANCE = 0.1
-"""Largest difference of a pixel's channels from the backdrop's colour, of 1. On eight drawn scenes and a real street,
-0.06 finds less of the sky (saharov32: 54 % instead of 69 %); neither value takes more than 1 % of a body's pixels."""
-THERMAL_TOLERANCE = 0.1  # Largest difference of a pixel from the backdrop's temperature, of the scene's range
+TOLERANCE = 0.1
+"""Largest difference of a pixel's channels from the backdrop's colour, of 1, and temperature, of the scene's range. On
+eight drawn scenes and a real street, 0.06 for colours finds less of the sky (saharov32: 54 % instead of 69 %); neither
+value takes more than 1 % of a body's pixels."""
 RISE_DEG, SURROUNDED = 10.0, 0.02
 """Cameras stand inside what they photograph if, for half of them, this share of all points of known depth lies behind
 the camera and so many degrees above it. The share is 0.07 in a drawn living room, 0.003 around a statue in a street, 0
@@ -22,7 +22,7 @@ around drawn houses."""
 COLDER = 0.05  # A sky is colder than all pixels of known depth but this share
 _SOME = 20_000  # About as many pixels are used for a statistic
 _WIDEST, _ROUNDS = 0.3, 8
-"""Tolerance of the first of so many fits of the backdrop's colour; it shrinks to `COLOUR_TOLERANCE` in the last."""
+"""Tolerance of the first of so many fits of the backdrop's colour; it shrinks to `TOLERANCE` in the last."""
 
 
 def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolArray, BoolArray, BoolArray]:
@@ -146,17 +146,16 @@ def _alike(
     """
     x, y, z = directions.T
     basis = np.column_stack((np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0))
-    tolerance = np.array([COLOUR_TOLERANCE] * 3 + [THERMAL_TOLERANCE])
     some = np.flatnonzero(chosen)
     some = some[:: max(1, len(some) // _SOME)]
     seen = values[some].astype(np.float64)
-    bins = np.unique((np.nan_to_num(seen) / (2.0 * tolerance)).astype(np.int64), axis=0, return_inverse=True)[1]
+    bins = np.unique((np.nan_to_num(seen) / (2.0 * TOLERANCE)).astype(np.int64), axis=0, return_inverse=True)[1]
     bins = bins.reshape(-1)
     middle = np.median(seen[bins == np.bincount(bins).argmax()], axis=0)
     expected = np.broadcast_to(middle, (len(some), 4))
     fitted = np.zeros((basis.shape[1], 4))
-    for widest in np.geomspace(_WIDEST / COLOUR_TOLERANCE, 1.0, _ROUNDS):
-        off = np.abs(seen - expected) / tolerance
+    for widest in np.geomspace(_WIDEST / TOLERANCE, 1.0, _ROUNDS):
+        off = np.abs(seen - expected) / TOLERANCE
         near = (np.nan_to_num(off) <= widest).all(1)
         for channel in range(4):
             used = near & np.isfinite(seen[:, channel])
@@ -169,7 +168,7 @@ def _alike(
         lowest, highest = values.copy(), values.copy()
         lowest[:, :3] = np.minimum(values[:, :3], measured)
         highest[:, :3] = np.where(measured >= SATURATED, np.inf, np.maximum(values[:, :3], measured))
-    off = np.maximum(lowest - expected, expected - highest) / tolerance
+    off = np.maximum(lowest - expected, expected - highest) / TOLERANCE
     return (np.nan_to_num(off) <= 1.0).all(1)
 
 

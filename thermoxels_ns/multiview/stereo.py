@@ -30,8 +30,8 @@ angle tells nothing about depth; above, the surface looks too different."""
 BEST_ANGLE_DEG = 15.0  # Neighbours at about this angle are preferred
 RADIUS = 2  # A patch, the square of pixels that is compared, is 2 RADIUS + 1 pixels wide
 LIKENESS = 0.025
-"""Least difference s, of 1, from the middle pixel of a patch at which a pixel has 37 % of the middle pixel's weight."""
-SPREAD = 1.0  # s is this times a typical difference around the middle pixel, if that is above `LIKENESS`
+"""Least difference from the middle pixel of a patch, of 1, at which a pixel has 37 % of the middle pixel's weight; a
+typical difference around the middle pixel takes its place where that is larger."""
 LEAST_WEIGHT = 0.05  # A smaller weight, of 1, is set to 0
 PLANES = (24, 128)
 """Least and most planes per photograph. Within, the picture moves by about a pixel from one plane to the next."""
@@ -213,7 +213,7 @@ def _refine(
                 np.stack([pictures[other] for other in near]),
                 turns[near] @ view.inverse,
                 turns[near] @ view.centre + shifts[near],
-                (REFINED_RADIUS, REFINED_LIKENESS, SPREAD, LEAST_WEIGHT, int(np.ceil(2.0 * ratio)), LEAST_CORRELATION),
+                (REFINED_RADIUS, REFINED_LIKENESS, LEAST_WEIGHT, int(np.ceil(2.0 * ratio)), LEAST_CORRELATION),
                 float(view.noise[0]),
                 depth[pixels],
                 error[pixels],
@@ -323,23 +323,21 @@ def _sweep(view: _View, others: list[_View], near: float, far: float, endless: b
     beyond = min(len(inverse_depths), int(inverse_depths[0] / (inverse_depths[1] - inverse_depths[0]))) * endless
     farthest = 0.5 * inverse_depths[0] / max(1, beyond)
     inverse_depths = np.concatenate((np.linspace(farthest, inverse_depths[0], beyond, endpoint=False), inverse_depths))
-    patches = _Patches.of(view)
+    weights = np.empty(((2 * RADIUS + 1) ** 2, *view.shape), dtype=np.float32)
+    means, variances = (np.empty(view.channels.shape, dtype=np.float32) for _ in range(2))
+    weigh_patches(view.features, view.channels, RADIUS, LIKENESS, LEAST_WEIGHT, view.noise, weights, means, variances)
     cost = np.empty((*view.shape, len(inverse_depths)), dtype=np.float32)
     moved = np.empty((len(others), *view.channels.shape), dtype=np.float32)
-    half, best_yet, at_best = (
-        -(-len(others) // 2),
-        np.full(view.shape, LEAST_CORRELATION),
-        np.full_like(moved, _OUTSIDE),
-    )
+    half, best_yet = -(-len(others) // 2), np.full(view.shape, LEAST_CORRELATION)
+    at_best = np.full_like(moved, _OUTSIDE)
     for plane, inverse_depth in enumerate(inverse_depths):
         for number, other in enumerate(others):
             _warped(other, view, 1.0 / inverse_depth, moved[number])
-        weighed = patches.weights, patches.means, patches.variances
-        correlate(view.channels, moved, RADIUS, *weighed, view.noise, half, plane, cost)
+        correlate(view.channels, moved, RADIUS, weights, means, variances, view.noise, half, plane, cost)
         better = cost[..., plane] >= best_yet
         best_yet[better] = cost[better, plane]
         at_best[:, :, better] = moved[:, :, better]
-    cost[(patches.variances == 0.0).all(axis=0)] = 0.0  # nothing but noise: no plane correlates better than another
+    cost[(variances == 0.0).all(axis=0)] = 0.0  # nothing but noise: no plane correlates better than another
     cost *= -0.5
     cost += 0.5
     correlates = cost[..., 0] <= 0.5 * (1.0 - LEAST_CORRELATION)
@@ -383,23 +381,6 @@ def _expected_pixels(view: _View, at_best: Float32Array) -> tuple[Float32Array, 
             off = np.median(np.abs(shown - expected[number, channel])[told])
             limit[number, channel] = ALIKE * max(1.48 * off, NOISE[channel])  # 1.48: from a median to a deviation
     return expected, limit
-
-
-@dataclass(frozen=True, eq=False)
-class _Patches:
-    """The patches around all pixels of a photograph, filled by `weigh_patches`."""
-
-    weights: Float32Array  # Shape (pixels of a patch, h, w)
-    means: Float32Array  # Shape (channels, h, w)
-    variances: Float32Array  # Shape (channels, h, w)
-
-    @classmethod
-    def of(cls, view: _View) -> _Patches:
-        weights = np.empty(((2 * RADIUS + 1) ** 2, *view.shape), dtype=np.float32)
-        means, variances = (np.empty(view.channels.shape, dtype=np.float32) for _ in range(2))
-        limits = LIKENESS, SPREAD, LEAST_WEIGHT, view.noise
-        weigh_patches(view.features, view.channels, RADIUS, *limits, weights, means, variances)
-        return cls(weights, means, variances)
 
 
 def _neighbours_agree(depth: Float32Array, error: Float32Array) -> BoolArray:

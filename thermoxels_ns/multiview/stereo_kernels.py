@@ -19,7 +19,7 @@ def _difference(features, row, column, i, j):
 
 
 @kernel
-def _weigh(features, row, column, radius, likeness, spread, least_weight, around, weights):
+def _weigh(features, row, column, radius, likeness, least_weight, around, weights):
     """Fill `weights` with those of the patch around one pixel, as in `weigh_patches`, not yet divided by their sum.
 
     `around` is scratch space for nine numbers.
@@ -29,7 +29,7 @@ def _weigh(features, row, column, radius, likeness, spread, least_weight, around
         for j in range(column - 1, column + 2):
             around[k] = _difference(features, row, column, i, j)
             k += 1
-    scale = max(likeness, spread * np.sort(around)[5])  # number 0 is the pixel itself
+    scale = max(likeness, np.sort(around)[5])  # number 0 is the pixel itself
     k = 0
     for i in range(row - radius, row + radius + 1):
         for j in range(column - radius, column + radius + 1):
@@ -39,13 +39,13 @@ def _weigh(features, row, column, radius, likeness, spread, least_weight, around
 
 
 @kernel
-def weigh_patches(features, channels, radius, likeness, spread, least_weight, noise, weights, means, variances):
+def weigh_patches(features, channels, radius, likeness, least_weight, noise, weights, means, variances):
     """Fill `weights`, `means` and `variances` of the patch around each pixel; similar pixels have large weights.
 
     A patch reaches `radius` pixels from its middle. The weight of a pixel in it is exp(-(d / s)^2), or 0 below
     `least_weight` (adaptive support weights, Yoon and Kweon 2006, without distance). d is the difference between the
     `features` (h, w, f) of the pixel and of the middle; s is the fifth smallest d of the eight pixels around the middle
-    times `spread`, at least `likeness`. An outline leaves s small, a texture does not. `weights`, (patch, h, w), sum to
+    but at least `likeness`. An outline leaves s small, a texture does not. `weights`, (patch, h, w), sum to
     1 in a patch. The variance of one of the `channels` (c, h, w) is 0 where the patch leaves the photograph, holds a
     masked pixel (below 0), or has a variance below `noise` (c,). Means and variances are (c, h, w).
     """
@@ -56,7 +56,7 @@ def weigh_patches(features, channels, radius, likeness, spread, least_weight, no
     variances[:] = 0.0
     for row in range(radius, height - radius):
         for column in range(radius, width - radius):
-            _weigh(features, row, column, radius, likeness, spread, least_weight, around, own)
+            _weigh(features, row, column, radius, likeness, least_weight, around, own)
             weights[:, row, column] = own / own.sum()
             for channel in range(count):
                 mean, square, hidden, k = 0.0, 0.0, False, 0
@@ -228,12 +228,12 @@ def refine_depths(
         others: Brightness of the photographs to compare with, (photographs, h, w); below 0 where unknown.
         turns: Matrices from homogeneous pixels of `picture` to those of each of `others` at infinity, (n, 3, 3).
         shifts: Homogeneous pixels that are added per inverse depth, (n, 3).
-        options: Radius, likeness, spread, least weight, steps before and behind, and least correlation.
+        options: Radius, likeness, least weight, steps before and behind, and least correlation.
         noise: Variance of the noise of brightness.
         refined: Receives the new depths, (pixels,); unchanged where a depth stays.
         spacing: Receives the distance in depth that moves `others` by a pixel, (pixels,), where `refined` changes.
     """
-    radius, likeness, spread, least_weight, steps, least = options
+    radius, likeness, least_weight, steps, least = options
     height, columns = picture.shape
     side, count, half = 2 * radius + 1, len(others), (len(others) + 1) // 2
     weights, own = np.empty(side * side), np.empty(side * side)
@@ -254,7 +254,7 @@ def refine_depths(
                 if abs(before - depth[n]) <= 2.0 * error[n] and abs(behind - depth[n]) <= 2.0 * error[n]:
                     slope = 0.5 * (1.0 / behind - 1.0 / before) / ratio
                     slope_u, slope_v = (slope, slope_v) if axis == 0 else (slope_u, slope)
-        _weigh(features, row, column, radius, likeness, spread, least_weight, around, weights)
+        _weigh(features, row, column, radius, likeness, least_weight, around, weights)
         total, mean, variance, k = 0.0, 0.0, 0.0, 0
         for i in range(row - radius, row + radius + 1):
             for j in range(column - radius, column + radius + 1):
