@@ -527,9 +527,10 @@ def test_surfaces_that_photographs_do_not_support_say_so(ball, tmp_path) -> None
     seen, supporting = (boundary.cell_data[f"photographs_{name}"] for name in ("seen", "supporting"))
     assert set(seen) == {0, 1, 2, 3} and not supporting.any()
     assert seen[boundary.cell_centers().points[:, 0] < -0.3].max() == 0
-    with Image.open(tmp_path / "quality.png") as picture:
-        below = np.asarray(picture.convert("RGB"))[-picture.width // 2 :, : picture.width // 2].astype(int)
-    assert np.mean((below[..., 0] > 120) & (below[..., 1:].max(axis=2) < 40)) > 0.05  # red: seen, not placed
+    with Image.open(tmp_path / "support.png") as picture:
+        ahead = np.asarray(picture.convert("RGB"))[:, : picture.width // 2].astype(int)
+    assert np.mean((ahead[..., 0] > 120) & (ahead[..., 1:].max(axis=2) < 40)) > 0.05  # red: seen, not placed
 
     assert export_snapshot(ball, np.eye(4), ExportOptions(), tmp_path)["mesh"]["share_of_area_by_support"] is None
+    assert not (tmp_path / "support.png").exists()
     assert "photographs_seen" not in pyvista.read(tmp_path / "mesh-boundary.vtp").cell_data

@@ -46,7 +46,7 @@ Compare = Callable[["SolidCells", "TetMesh", float], "dict[str, Any] | None"]
 """Compares solid voxels and a mesh with the exact scene, given the metres per unit; None if no exact scene is known."""
 
 _SUMMARY, _HEAT, _QUALITY, _HEAT_PICTURE = "summary.json", "heat.pvd", "quality.json", "heat.png"
-_MESH_PICTURES = ("mesh.png", "mesh-measured.png", "quality.png", "region.png")
+_MESH_PICTURES = ("mesh.png", "mesh-measured.png", "region.png", "support.png")
 HEAT_SKIPPED = (
     "Heat step skipped: the size of the scene is not known. Pass --metres-per-unit, the length in metres of one unit "
     "of the input poses (1 if they are in metres), or --known-distance."
@@ -129,7 +129,7 @@ class ExportOptions:
     """Times whose temperatures are written for ParaView beside those of the start and of the end, [s]: for each the
     nearest time that the scene keeps. all: every kept time; each takes as much space as the mesh."""
     pictures: bool = True
-    """Write PNG pictures of the mesh coloured by temperature, and of its quality."""
+    """Write PNG pictures of the mesh coloured by temperature, and of how photographs support its surface."""
 
 
 @dataclass(frozen=True)
@@ -356,7 +356,7 @@ def export_snapshot(
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
     from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
     from thermoxels_ns.mesh.files.surface import check_stl
-    from thermoxels_ns.mesh.quality.report import check_mesh, picture_of_quality
+    from thermoxels_ns.mesh.quality.report import check_mesh
     from thermoxels_ns.mesh.tetrahedra import support_of_facets
     from thermoxels_ns.reports import mesh_pictures
 
@@ -414,7 +414,8 @@ def export_snapshot(
         states = shown_states(solution.times_s, options.vtk_times)
         files += [p.relative_to(folder).as_posix() for p in heat_series_paths(folder / _HEAT, len(states))]
     if options.pictures:
-        files += [*_MESH_PICTURES, *([] if solution is None else [_HEAT_PICTURE])]
+        files += _MESH_PICTURES[: 3 if support_of_facets(mesh) is None else 4]
+        files += [] if solution is None else [_HEAT_PICTURE]
     summary = {
         "options": {field.name: getattr(options, field.name) for field in fields(options)},
         "versions": export_summary.versions(),
@@ -449,15 +450,14 @@ def export_snapshot(
     if options.pictures:
         look = {"up": up, "view_direction": viewpoint.view_direction}
         mesh_pictures.draw_mesh([folder / name for name in _MESH_PICTURES[:2]], mesh, look, unit)
-        picture_of_quality(folder / _MESH_PICTURES[2], report)
         if support_of_facets(mesh) is not None:
-            mesh_pictures.add_support(folder / _MESH_PICTURES[2], mesh, look)
+            mesh_pictures.draw_support(folder / _MESH_PICTURES[3], mesh, look)
         # Faces of the voxels that are not exported are drawn in grey.
         corners, faces = mesh_pictures.voxel_surface(built.solid.left_out)
         ghost = apply_transform(to_mesh, snapshot.lattice.index_to_world(corners)), faces
         note = "grey: left out of the region" if len(ghost[0]) else "nothing is left out"
         beside: Any = {"title": "Region", "length_unit": unit, "ghost": ghost, "note": note, **look}
-        mesh_pictures.write_picture(folder / _MESH_PICTURES[3], mesh_pictures.image_of_mesh(mesh, **beside))
+        mesh_pictures.write_picture(folder / _MESH_PICTURES[2], mesh_pictures.image_of_mesh(mesh, **beside))
         if solution is not None:
             mesh_pictures.draw_heat(folder / _HEAT_PICTURE, mesh, solution, look)
     write_json(folder / _SUMMARY, summary)
