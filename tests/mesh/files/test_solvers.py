@@ -126,25 +126,11 @@ def test_groups_carry_names_numbers_and_elements(tmp_path, tagged_mesh):
         "walls": (1, 3),
         "floor slab": (2, 3),
     }
-    ours = {2: (tagged_mesh.facets, tagged_mesh.boundary.patch), 3: (tagged_mesh.tets, tagged_mesh.region)}
-    assert [block.dim for block in read.cells] == [2, 2, 2, 2, 3, 3]
-    for block, tags in zip(read.cells, read.cell_data["gmsh:physical"]):
-        cells, index = ours[block.dim]
-        assert len(set(tags)) == 1
-        expected = tagged_mesh.points_m[cells[index == tags[0] - 1]]
-        assert np.array_equal(read.points[block.data], expected)
-
-
-def test_temperatures_are_at_their_nodes(tmp_path, tagged_mesh):
-    shown = tagged_mesh.temperature_c[::-1].copy()
-    write_msh(tmp_path / "house.msh", dataclasses.replace(tagged_mesh, temperature_c=shown))
-    read = meshio.read(tmp_path / "house.msh")
-    assert len(read.points) == len(tagged_mesh.points_m)
-    # The nodes come sorted by where they lie.
-    at = {tuple(point): number for number, point in enumerate(tagged_mesh.points_m)}
-    number = [at[tuple(point)] for point in read.points]
-    assert sorted(number) == list(range(len(at)))
-    assert np.array_equal(read.point_data[TEMPERATURE_VIEW].ravel(), shown[number])
+    assert np.array_equal(read.points, tagged_mesh.points_m)
+    ours = ((tagged_mesh.facets, tagged_mesh.boundary.patch), (tagged_mesh.tets, tagged_mesh.region))
+    for block, tags, (cells, index) in zip(read.cells, read.cell_data["gmsh:physical"], ours, strict=True):
+        assert np.array_equal(block.data, cells) and np.array_equal(tags, index + 1)
+    assert np.array_equal(read.point_data[TEMPERATURE_VIEW].ravel(), tagged_mesh.temperature_c)
 
 
 def test_a_name_that_gmsh_would_cut_is_refused(tmp_path, tagged_mesh):

@@ -7,16 +7,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import MeshError, OutputError
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.units import STEFAN_BOLTZMANN_W_M2K4, ZERO_CELSIUS_K
-from thermoxels_ns.mesh.files.content import checked_tags, node_arrays
+from thermoxels_ns.mesh.files.content import checked_tags, node_arrays, write_bytes
 from thermoxels_ns.mesh.quality.checks import facet_owners
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_areas
 
@@ -27,7 +27,7 @@ TEMPERATURE_VIEW = "temperature_c"  # name of the view of nodal temperatures in 
 _NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UChar"}
 _LONGEST_GMSH_NAME, _LONGEST_INP_NAME = 127, 60  # [bytes], [characters]
 _TRIANGLE, _TETRAHEDRON = 2, 4
-_SIZE, _INT, _DOUBLE = np.dtype("<u8"), np.dtype("<i4"), np.dtype("<f8")
+_INT, _DOUBLE = np.dtype("<i4"), np.dtype("<f8")
 _FACE_OPPOSITE: IntArray = np.array([3, 4, 2, 1], dtype=np.int64)
 """Number in .inp files of the face opposite each node: S1 has the nodes 1 2 3, S2 1 4 2, S3 2 4 3 and S4 3 4 1."""
 _ROWS_AT_ONCE = 1 << 15
@@ -57,14 +57,11 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
             mesh.topology.create_connectivity(2, 3)
             patches = file.read_meshtags(mesh, name="facets")
 
-    The .h5 is written first; there is no .xdmf until it is complete. Raises `OutputError` if `path` ends in .h5.
+    The .h5 is written first; there is no .xdmf until it is complete.
     """
     import h5py
 
     path = Path(path)
-    if path == heavy_data_path(path):
-        remedy = "Name the .xdmf; the .h5 beside it is written with it."
-        raise OutputError(str(path), expected="a name that ends in .xdmf", got=path.suffix, remedy=remedy)
     tags = checked_tags(mesh)
     arrays: dict[str, npt.NDArray] = {
         "points_m": mesh.points_m,
@@ -75,7 +72,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
         **node_arrays(mesh),
     }
     data_file = heavy_data_path(path)
-    text = _index(mesh.region_names, tags.patch_names, arrays, data_file.name)
+    text = _index(mesh.region_names, tags.patch_names, arrays, escape(data_file.name))
 
     writable_folder(path.parent)
     with replace_when_done(data_file) as temporary:
@@ -86,59 +83,51 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
         # An old .xdmf does not fit the new data.
         remove_file(path)
     with replace_when_done(path) as temporary:
-        temporary.write_bytes(text)
+        temporary.write_text(text, encoding="utf-8")
 
 
-def _index(regions: Sequence[str], patches: Sequence[str], arrays: dict[str, npt.NDArray], data_file: str) -> bytes:
+def _index(regions: Sequence[str], patches: Sequence[str], arrays: dict[str, npt.NDArray], data_file: str) -> str:
     """Return the text of the .xdmf file, which describes the arrays in `data_file`."""
-    add = ElementTree.SubElement
-    root = ElementTree.Element("Xdmf", Version="3.0")
-    domain = add(root, "Domain")
 
-    def add_data(parent: ElementTree.Element, name: str) -> None:
-        shape, number = arrays[name].shape, arrays[name].dtype
-        size, kind, width = " ".join(map(str, shape)), _NUMBER_TYPES[number.kind], str(number.itemsize)
-        item = add(parent, "DataItem", Format="HDF", Dimensions=size, NumberType=kind, Precision=width)
-        item.text = f"{data_file}:/{name}"
+    def data(name: str) -> str:
+        shape, number = " ".join(map(str, arrays[name].shape)), arrays[name].dtype
+        kind = f'NumberType="{_NUMBER_TYPES[number.kind]}" Precision="{number.itemsize}"'
+        return f'<DataItem Format="HDF" Dimensions="{shape}" {kind}>{data_file}:/{name}</DataItem>'
 
-    def add_grid(name: str, cells: str, kind: str, names_of: str, names: Sequence[str]) -> ElementTree.Element:
-        grid = add(domain, "Grid", Name=name, GridType="Uniform")
-        numbered = "; ".join(f"{number} = {entry}" for number, entry in enumerate(names, 1))
-        add(grid, "Information", Name=names_of, Value=numbered)
-        count, per_cell = map(str, arrays[cells].shape)
-        topology = add(grid, "Topology", TopologyType=kind, NumberOfElements=count, NodesPerElement=per_cell)
-        add_data(topology, cells)
-        add_data(add(grid, "Geometry", GeometryType="XYZ"), "points_m")
-        return grid
+    def values(name: str, centre: str) -> str:
+        kind = "Vector" if name == "colour" else "Scalar"
+        return f'<Attribute Name="{name}" AttributeType="{kind}" Center="{centre}">{data(name)}</Attribute>'
 
-    def add_values(grid: ElementTree.Element, name: str, centre: str, kind: str = "Scalar") -> None:
-        add_data(add(grid, "Attribute", Name=name, AttributeType=kind, Center=centre), name)
+    def grid(name: str, kind: str, cells: str, tag: str, names: Sequence[str]) -> str:
+        numbered = quoteattr("; ".join(f"{number} = {entry}" for number, entry in enumerate(names, 1)))
+        size = 'NumberOfElements="{}" NodesPerElement="{}"'.format(*arrays[cells].shape)
+        lines = (
+            f'<Grid Name="{name}" GridType="Uniform">',
+            f'<Information Name="{tag}_names" Value={numbered}/>',
+            f'<Topology TopologyType="{kind}" {size}>{data(cells)}</Topology>',
+            f'<Geometry GeometryType="XYZ">{data("points_m")}</Geometry>',
+            values(tag, "Cell"),  # FEniCSx reads the first attribute of a grid as its tags
+            *(values(one, "Node") for one in ("temperature_c", "temperature_k", "observed", "colour") if one in arrays),
+            "</Grid>",
+        )
+        return "\n".join(lines)
 
-    body = add_grid(BODY_GRID, "tets", "Tetrahedron", "region_names", regions)
-    boundary = add_grid(FACET_GRID, "facets", "Triangle", "patch_names", patches)
-    # FEniCSx reads the first attribute of a grid as its tags.
-    add_values(body, "region", "Cell")
-    add_values(boundary, "patch", "Cell")
-    for grid in (body, boundary):
-        for name in ("temperature_c", "temperature_k", "observed"):
-            if name in arrays:
-                add_values(grid, name, "Node")
-        if "colour" in arrays:
-            add_values(grid, "colour", "Node", "Vector")
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+    body = grid(BODY_GRID, "Tetrahedron", "tets", "region", regions)
+    boundary = grid(FACET_GRID, "Triangle", "facets", "patch", patches)
+    start = "<?xml version='1.0' encoding='utf-8'?>\n<Xdmf Version=\"3.0\">\n<Domain>\n"
+    return f"{start}{body}\n{boundary}\n</Domain>\n</Xdmf>\n"
 
 
 def write_msh(path: Path | str, mesh: TetMesh) -> None:
-    """Write a mesh as a Gmsh file, MSH 4.1, binary, with one physical group per region and per patch.
+    """Write a mesh as a Gmsh file, MSH 2.2, binary, with one physical group per region and per patch.
 
     Regions become physical volumes and patches physical surfaces, numbered from 1; empty regions and patches are left
-    out. Nodal temperatures become a view, `TEMPERATURE_VIEW`. Tetrahedron k of the mesh gets the tag k + 1, and the
-    boundary triangles follow. Nodes get new numbers, sorted by the patch or region that they lie on, as Gmsh asks for.
-    Layout: "MSH file format", Gmsh reference manual, version 4.1; meshio cannot write a patch named like a region.
+    out. Nodal temperatures become a view, `TEMPERATURE_VIEW`. Node k and tetrahedron k of the mesh get the number
+    k + 1, and the boundary triangles follow. Layout: "MSH file format version 2", Gmsh reference manual; other than
+    version 4 it sorts no nodes by surfaces and volumes. meshio cannot write a patch named like a region.
 
     Raises:
-        MeshError: A name is too long for Gmsh, or what `TetMesh.check` and `facet_owners` raise.
+        MeshError: A name is too long for Gmsh, or what `TetMesh.check` raises.
     """
     path = Path(path)
     tags = checked_tags(mesh)
@@ -147,109 +136,37 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
             expected = f"at most {_LONGEST_GMSH_NAME} bytes, which is what Gmsh reads"
             got = f"{len(name.encode())} bytes: {name!r}"
             raise MeshError("name of a region or patch", expected=expected, got=got, remedy="Rename it.")
-    # What can fail on a bad mesh is done before the file is opened.
-    owner, _ = facet_owners(mesh.tets, mesh.facets)
-    blocks = _node_blocks(mesh, tags)
-    order = np.concatenate([nodes for *_, nodes in blocks])
-    tag = np.empty_like(order)
-    tag[order] = np.arange(1, len(order) + 1)
-    writable_folder(path.parent)
-    with replace_when_done(path) as temporary, open(temporary, "wb") as file:
-        file.write(b"$MeshFormat\n4.1 1 8\n" + _ints(1) + b"\n$EndMeshFormat\n")
-        lines = [f'2 {group + 1} "{tags.patch_names[group]}"' for group in _used(tags.patch)]
-        lines += [f'3 {group + 1} "{mesh.region_names[group]}"' for group in _used(mesh.region)]
-        file.write("\n".join(["$PhysicalNames", str(len(lines)), *lines, "$EndPhysicalNames", ""]).encode())
-        for section, chunks in (
-            ("Entities", _entities(mesh, tags, owner)),
-            ("Nodes", _nodes(blocks, mesh)),
-            ("Elements", _elements(mesh, tags, tag)),
-        ):
-            file.write(f"${section}\n".encode())
-            file.writelines(chunks)
-            file.write(f"\n$End{section}\n".encode())
-        if mesh.has_temperatures:
-            file.write(_view_of_nodes(TEMPERATURE_VIEW, mesh.temperature_c[order]))
+    names = [f'2 {number + 1} "{tags.patch_names[number]}"' for number in np.unique(tags.patch).tolist()]
+    names += [f'3 {number + 1} "{mesh.region_names[number]}"' for number in np.unique(mesh.region).tolist()]
+    nodes, points = len(mesh.points_m), ("point", _DOUBLE, 3)
+    sections = {
+        b"MeshFormat": b"2.2 1 8\n" + np.array(1, _INT).tobytes(),
+        b"PhysicalNames": "\n".join([str(len(names)), *names]).encode(),
+        b"Nodes": f"{nodes}\n".encode() + _numbered(1, points, mesh.points_m),
+        b"Elements": f"{len(mesh.tets) + len(mesh.facets)}\n".encode()
+        + _elements(_TRIANGLE, 1 + len(mesh.tets), mesh.facets, tags.patch)
+        + _elements(_TETRAHEDRON, 1, mesh.tets, mesh.region),
+    }
+    if mesh.has_temperatures:
+        # The entries are name, time 0, step 0, number of components and number of nodes.
+        head = f'1\n"{TEMPERATURE_VIEW}"\n1\n0.0\n3\n0\n1\n{nodes}\n'
+        sections[b"NodeData"] = head.encode() + _numbered(1, ("value", _DOUBLE), mesh.temperature_c)
+    write_bytes(path, (b"$%b\n%b\n$End%b\n" % (name, text, name) for name, text in sections.items()))
 
 
-def _ints(*values: int) -> bytes:
-    return np.array(values, dtype=_INT).tobytes()
+def _numbered(first: int, field: tuple, values: npt.NDArray) -> bytes:
+    """Return the rows of `values`, each behind its number, as bytes; numbers rise from `first`."""
+    table = np.empty(len(values), dtype=[("number", _INT), field])
+    table["number"], table[field[0]] = np.arange(first, first + len(values)), values
+    return table.tobytes()
 
 
-def _sizes(*values: int) -> bytes:
-    return np.array(values, dtype=_SIZE).tobytes()
-
-
-def _used(index: IntArray) -> list[int]:
-    """Return the numbers of the patches or regions that have members, rising; `index` has the number of each member."""
-    return np.flatnonzero(np.bincount(index)).tolist() if len(index) else []
-
-
-def _bounds(mesh: TetMesh, nodes: IntArray) -> bytes:
-    points = mesh.points_m[nodes.ravel()]
-    return np.concatenate([points.min(axis=0), points.max(axis=0)]).astype(_DOUBLE).tobytes()
-
-
-def _entities(mesh: TetMesh, tags: Boundary, owner: IntArray) -> Iterator[bytes]:
-    # Each patch is one surface and each region one volume, in the physical group with the same number.
-    patches, regions = _used(tags.patch), _used(mesh.region)
-    yield _sizes(0, 0, len(patches), len(regions))
-    for group in patches:
-        yield _ints(group + 1) + _bounds(mesh, mesh.facets[tags.patch == group])
-        yield _sizes(1) + _ints(group + 1) + _sizes(0)
-    for group in regions:
-        around = _used(tags.patch[mesh.region[owner] == group])
-        yield _ints(group + 1) + _bounds(mesh, mesh.tets[mesh.region == group])
-        yield _sizes(1) + _ints(group + 1) + _sizes(len(around)) + _ints(*(patch + 1 for patch in around))
-
-
-def _node_blocks(mesh: TetMesh, tags: Boundary) -> list[tuple[int, int, IntArray]]:
-    """Return dimension, number and nodes of every entity; nodes belong to their first patch, else to a region."""
-    blocks, free = [], np.ones(len(mesh.points_m), dtype=bool)
-    for dimension, cells, index in ((2, mesh.facets, tags.patch), (3, mesh.tets, mesh.region)):
-        for group in _used(index):
-            inside = np.zeros_like(free)
-            inside[cells[index == group]] = True
-            blocks.append((dimension, group + 1, np.flatnonzero(inside & free)))
-            free &= ~inside
-    dimension, number, nodes = blocks[-1]
-    blocks[-1] = dimension, number, np.concatenate([nodes, np.flatnonzero(free)])  # nodes in no tetrahedron
-    return [block for block in blocks if len(block[2])]
-
-
-def _nodes(blocks: list[tuple[int, int, IntArray]], mesh: TetMesh) -> Iterator[bytes]:
-    count, first = len(mesh.points_m), 1
-    yield _sizes(len(blocks), count, 1, count)
-    for dimension, tag, nodes in blocks:
-        yield _ints(dimension, tag, 0) + _sizes(len(nodes))
-        yield np.arange(first, first + len(nodes), dtype=_SIZE).tobytes()
-        yield mesh.points_m[nodes].astype(_DOUBLE).tobytes()
-        first += len(nodes)
-
-
-def _elements(mesh: TetMesh, tags: Boundary, tag: IntArray) -> Iterator[bytes]:
-    patches, regions = _used(tags.patch), _used(mesh.region)
-    count = len(mesh.tets) + len(mesh.facets)
-    yield _sizes(len(patches) + len(regions), count, 1, count)
-    for dimension, kind, groups, cells, index, before in (
-        (2, _TRIANGLE, patches, mesh.facets, tags.patch, len(mesh.tets)),
-        (3, _TETRAHEDRON, regions, mesh.tets, mesh.region, 0),
-    ):
-        for group in groups:
-            rows = np.flatnonzero(index == group)
-            yield _ints(dimension, group + 1, kind) + _sizes(len(rows))
-            table = np.empty((len(rows), 1 + cells.shape[1]), dtype=_SIZE)
-            table[:, 0] = rows + (before + 1)
-            table[:, 1:] = tag[cells[rows]]
-            yield table.tobytes()
-
-
-def _view_of_nodes(name: str, values: FloatArray) -> bytes:
-    """Return the bytes of a view of one value per node; `values`, shape (n,), are in the order of the nodes' tags."""
-    table = np.empty(len(values), dtype=[("tag", _INT), ("value", _DOUBLE)])
-    table["tag"], table["value"] = np.arange(1, len(values) + 1), values
-    # The entries are name, time 0, step 0, number of components and number of nodes.
-    head = f'$NodeData\n1\n"{name}"\n1\n0.0\n3\n0\n1\n{len(values)}\n'
-    return head.encode() + table.tobytes() + b"\n$EndNodeData\n"
+def _elements(kind: int, first: int, cells: IntArray, group: IntArray) -> bytes:
+    """Return elements of one kind as bytes; `group` is their physical group and their geometrical entity."""
+    if not len(cells):
+        return b""
+    rows = np.column_stack([group, group, cells]) + 1
+    return np.array([kind, len(cells), 2], _INT).tobytes() + _numbered(first, ("row", _INT, rows.shape[1]), rows)
 
 
 @dataclass(frozen=True)
