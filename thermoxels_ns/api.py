@@ -78,7 +78,7 @@ class Scene:
         metres, unit = (1.0, "input unit") if scale is None else (scale.metres_per_unit, "m")
         up, up_source = export.up_of(chosen, scene_file, run.viewpoint)
         to_mesh = np.diag([metres, metres, metres, 1.0]) @ run.world_to_input
-        how = MeshOptions(chosen.boundary, chosen.coarsest_cell, up=up, rules=checked.rules)
+        how = MeshOptions(chosen.boundary, up=up, rules=checked.rules)
         with threadpool_limits(1, "blas"):  # with more, the last bits would depend on the number of threads
             built = build_mesh(field, checked.selection, to_mesh, how, metres)
             depths = depths_of_dataset(run.dataset, 0.0, field.lattice.lo, field.lattice.hi) if support else None

@@ -69,15 +69,13 @@ class ExportOptions:
     boundary: Literal["conforming", "voxel"] = "conforming"
     """conforming: the boundary follows the level set of the density. voxel: the boundary follows voxel faces, as in the
     Thermoxels paper, with up to 1.7 times the area of a slanted surface."""
-    voxel_optical_depth: float | None = None
-    """Voxels are solid if density times edge length is at least this; at 0.5, light that crosses a voxel loses 39 %.
-    Lower the value if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: the
-    highest that 95 % of the training rays that end on a surface meet within half a voxel of their end."""
+    density_threshold: float | None = None
+    """Voxels at least this dense are solid, [1 / world unit]; summary.json says which density was used. Lower it if
+    walls have holes, raise it if empty space turns solid. Left out, it is automatic: the highest that 95 % of the
+    training rays that end on a surface meet within half a voxel of their end."""
     density_percentile: float | None = None
     """Voxels are solid if they are denser than this share of all voxels of the scene box, [%], 0 to 100; in the
-    Thermoxels paper 90 keeps the densest tenth. Takes the place of the optical depth."""
-    density_threshold: float | None = None
-    """Voxels at least this dense are solid, [1 / world unit]. Takes the place of optical depth and percentile."""
+    Thermoxels paper 90 keeps the densest tenth."""
     close_gaps: int = 1
     """Fill gaps and pinholes up to twice this many voxels wide, which thin walls need to be continuous. 0: none."""
     region: Literal["auto", "all"] = "auto"
@@ -86,8 +84,6 @@ class ExportOptions:
     mostly floaters, are left out. all: everything that was reconstructed."""
     region_box: tuple[float, float, float, float, float, float] | None = None
     """In place of auto: export the inside of a box, xmin ymin zmin xmax ymax zmax in coordinates of the input poses."""
-    region_near: tuple[float, float, float, float] | None = None
-    """In place of auto: export the inside of a ball, x y z radius in the coordinates of the input poses."""
     interior: Literal["solid", "hollow"] = "solid"
     """Treatment of the inside of a body if photographs show only its shell. solid: the inside is filled, but a cavity
     that holds a camera is a room and stays empty. hollow: only the shell is exported, with the thickness that training
@@ -97,8 +93,6 @@ class ExportOptions:
     wall_thickness: float | None = None
     """For facades seen from one side: make the seen surface this thick, [m], growing away from the cameras; the
     interior is then not filled."""
-    coarsest_cell: int = 4
-    """Edge of the largest cells deep inside a conforming mesh, a power of two, [voxels]; 1: as fine as the surface."""
     patches: Path | None = None
     """A yaml file that names parts of the surface and regions of the volume by box, plane or colour; see
     configs/patches-example.yaml."""
@@ -243,7 +237,7 @@ def check_options(options: ExportOptions) -> CheckedOptions:
     if not options.formats or len(set(options.formats)) < len(options.formats):
         remedy = "Pass --formats vtu glb, for example."
         raise MeshError("formats", expected="at least one format, each once", got=options.formats, remedy=remedy)
-    MeshOptions(options.boundary, options.coarsest_cell)  # raises if a value is out of range
+    MeshOptions(options.boundary)  # raises if a value is out of range
     try:
         selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
     except MeshError as problem:
@@ -355,7 +349,7 @@ def export_snapshot(
     from thermoxels_ns.mesh.build import MeshOptions, apply_transform, build_mesh
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
     from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
-    from thermoxels_ns.mesh.files.surface import check_stl
+    from thermoxels_ns.mesh.files.surface import check_single_precision
     from thermoxels_ns.mesh.quality.report import check_mesh
     from thermoxels_ns.mesh.tetrahedra import support_of_facets
     from thermoxels_ns.reports import mesh_pictures
@@ -366,14 +360,14 @@ def export_snapshot(
     up, up_source = up_of(options, scene_file, viewpoint)
     folder = prepare_folder(output_dir)
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ world_to_input
-    mesh_options = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
+    mesh_options = MeshOptions(options.boundary, up=up, rules=checked.rules)
     built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options, metres)
     if depths is not None:
         built = with_support(built, depths, tracks, snapshot.lattice, to_mesh)
     mesh = built.mesh
     suffixes = [f".{name}" for name in options.formats]
-    if ".stl" in suffixes:
-        check_stl(mesh)
+    if {".stl", ".ply"} & {*suffixes}:
+        check_single_precision(mesh)
     begin_c, starting = checked.scene.initial_c, mesh
     if not mesh.has_temperatures and begin_c is not None:
         starting = replace(mesh, temperature_c=np.full(len(mesh.points_m), begin_c))

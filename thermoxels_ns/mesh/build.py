@@ -33,16 +33,10 @@ class MeshOptions:
     """Options of `build_mesh`: how solid voxels become a mesh."""
 
     boundary: BoundaryMode = "conforming"  # along the level set of the density, or along voxel faces
-    coarsest_cell: int = 4
-    """Edge of the largest cells deep inside a conforming mesh, [voxels], a power of two; 1: all cells are one voxel."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Up direction in the coordinates of the mesh
     rules: PatchRules = field(default_factory=PatchRules)  # The user's rules for patches and regions
 
     def __post_init__(self) -> None:
-        coarsest = self.coarsest_cell
-        if not (isinstance(coarsest, int) and coarsest >= 1 and coarsest & (coarsest - 1) == 0):
-            expected, remedy = "1, 2, 4, 8 or another power of two, [voxels]", "Pass --coarsest-cell 4."
-            raise MeshError("coarsest_cell", expected=expected, got=repr(coarsest), remedy=remedy)
         if self.boundary not in ("conforming", "voxel"):
             raise MeshError("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")
 
@@ -80,8 +74,8 @@ def build_mesh(
         world_to_metres: Similarity (rotation or reflection, one scale, shift), shape (4, 4), that maps homogeneous
             column vectors of the trained scene to metres. After a reflection, nodes are reordered so that volumes stay
             positive.
-        options: Kind of boundary, size of cells, up direction and rules for tags.
-        metres_per_unit: Length, [m], of the unit of the input poses, in which the region's box or point is given.
+        options: Kind of boundary, up direction and rules for tags.
+        metres_per_unit: Length, [m], of the unit of the input poses, in which the region's box is given.
 
     Raises:
         MeshError: `select_solid` fails, or no node of the mesh was measured.
@@ -94,7 +88,7 @@ def build_mesh(
         points, facets = corners.astype(np.float64), boundary_facets(tets)
     else:
         level = level_of(snapshot.centre_density(), solid.threshold, solid.dense, solid.cells)
-        stuffed = sharpen(stuff(level, options.coarsest_cell), level.shape)
+        stuffed = sharpen(stuff(level), level.shape)
         points, tets, facets = stuffed.points, stuffed.tets, stuffed.facets
     known, observed_range_c = snapshot.temperature_c, None
     temperature_c, observed = np.full(len(points), np.nan), np.zeros(len(points), dtype=bool)
@@ -109,7 +103,7 @@ def build_mesh(
     num_voxels = 0
     if parts:
         stays = ~unseen[body]
-        goes = _voxels_of(solid.cells, points, tets, ~stays, voxel)
+        goes = _bodies_at(solid.cells, points[tets[~stays[tets[:, 0]]]].mean(axis=1))
         num_voxels = int(np.count_nonzero(goes))
         solid = replace(solid, cells=solid.cells & ~goes)
         number = np.cumsum(stays) - 1
@@ -151,17 +145,13 @@ def build_mesh(
     )
 
 
-def _voxels_of(cells: BoolArray, points: FloatArray, tets: IntArray, nodes: BoolArray, voxel: bool) -> BoolArray:
-    """Return the solid voxels of all bodies of the mesh that have a marked node; `nodes` is the mask, shape (n,)."""
-    if voxel:
-        inside = points[tets[nodes[tets[:, 0]]]].mean(axis=1)
-    else:  # nodes at voxel centres: every body has one, and voxels that share a face are in one body
-        inside = points[nodes][np.all(points[nodes] % 1.0 == 0.5, axis=1)]
+def _bodies_at(cells: BoolArray, points: FloatArray) -> BoolArray:
+    """Return the solid voxels of all bodies of voxels, joined by faces, in which one of the points (n, 3) lies."""
     body = face_connected(cells)
-    goes = np.zeros(int(body.max()) + 1, dtype=bool)
-    goes[body[tuple(np.floor(inside).astype(np.int64).T)]] = True
-    goes[0] = False
-    return goes[body]
+    chosen = np.zeros(int(body.max()) + 1, dtype=bool)
+    chosen[body[tuple(np.floor(points).astype(np.int64).T)]] = True
+    chosen[0] = False
+    return chosen[body]
 
 
 def _cut_by_region(points: FloatArray, facets: IntArray, within: BoolArray) -> BoolArray:

@@ -10,11 +10,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import yaml
+from pydantic import Field
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, check_finite, check_shape, replace_when_done
@@ -28,6 +29,7 @@ DEFAULT_PATCHES = (*(f"{where}-{facing}" for where in ("exterior", "interior") f
 DEFAULT_REGION = "solid"  # Name of region 0
 
 Vector = tuple[float, float, float]
+_Byte = Annotated[int, Field(ge=0, le=255)]
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")
 _COS_45 = math.sqrt(0.5) + 1e-9
@@ -53,11 +55,9 @@ class Plane:
 
     point: Vector  # Any point of the plane, [m]
     normal: Vector  # Direction across the plane, of any length above 0
-    depth: float = math.inf  # Largest distance from the plane, [m]
+    depth: Annotated[float, Field(gt=0)] = math.inf  # Largest distance from the plane, [m]
 
     def __post_init__(self) -> None:
-        if not self.depth > 0.0:
-            raise wrong("depth", "a number above 0, [m]", self.depth)
         if not (all(map(math.isfinite, self.point)) and 0.0 < math.hypot(*self.normal) < math.inf):
             got = f"{[*self.point]} and {[*self.normal]}"
             raise wrong("point and normal", "finite numbers, and a normal that is not 0", got, "Correct them.")
@@ -67,29 +67,13 @@ class Plane:
 class Colour:
     """Condition of a rule: the element's colour is at most `max_distance` from `rgb`."""
 
-    rgb: tuple[int | float, int | float, int | float]  # Whole numbers from 0 to 255 or decimals from 0.0 to 1.0
-    max_distance: float = math.inf  # Largest Euclidean distance to `rgb`, on the same scale
-
-    def __post_init__(self) -> None:
-        if not all(0.0 <= float(part) <= 255.0 for part in self.rgb):
-            raise wrong("rgb", "three numbers from 0 to 255, or from 0.0 to 1.0", [*self.rgb])
-        if all(isinstance(part, int) for part in self.rgb) and max(map(float, self.rgb)) == 1.0:
-            bright, dark = [float(part) for part in self.rgb], [round(float(part) / 255.0, 4) for part in self.rgb]
-            raise wrong(
-                "rgb",
-                "whole numbers up to 255 or decimals up to 1.0",
-                f"{[*self.rgb]}, which may be either",
-                f"Write {bright} for a bright colour or {dark} for a dark one.",
-            )
-        if not self.max_distance > 0.0:
-            raise wrong("max_distance", "a number above 0, on the scale of rgb", self.max_distance)
+    rgb: tuple[_Byte, _Byte, _Byte]  # Red, green and blue, whole numbers from 0 to 255
+    max_distance: Annotated[float, Field(gt=0)] = math.inf  # Largest Euclidean distance to `rgb`, on the same scale
 
     def distance(self, colours: npt.NDArray) -> FloatArray:
         """Return the distances (n,) of colours (n, 3), in [0, 1], to `rgb`; infinite if beyond `max_distance`."""
-        whole = all(isinstance(part, int) for part in self.rgb) or max(map(float, self.rgb)) > 1.0
-        scale = 255.0 if whole else 1.0
-        distance = np.linalg.norm(colours - np.array(self.rgb, dtype=np.float64) / scale, axis=1)
-        return np.where(distance <= self.max_distance / scale, distance, np.inf)
+        distance = np.linalg.norm(colours - np.array(self.rgb) / 255.0, axis=1)
+        return np.where(distance <= self.max_distance / 255.0, distance, np.inf)
 
 
 @dataclass(frozen=True)
