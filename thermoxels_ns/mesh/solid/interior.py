@@ -14,7 +14,7 @@ from thermoxels_ns.core.arrays import BoolArray, Float32Array
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid.free_space import count_cameras
-from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow, repeated
+from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow
 
 LARGEST_PASS = 4_000_000  # in larger lattices, hidden space is found per block of 2^3, 4^3, ... voxels
 SHADOW_SURROUNDED = 0.1
@@ -139,7 +139,8 @@ def _hidden_in_blocks(
 
     # The empty voxels of a block with a piece of the shell are inside if they are connected to a hidden block.
     inside = tuple(slice(n) for n in shape)
-    seeds, partly = repeated(hidden & ~coarse, block)[inside], repeated(coarse, block)[inside] & ~sealed
+    voxels = np.ones((block, block, block), dtype=bool)
+    seeds, partly = np.kron(hidden & ~coarse, voxels)[inside], np.kron(coarse, voxels)[inside] & ~sealed
     touching = ndimage.generate_binary_structure(3, 1)
     # The longest connection is in a corner of the shell: across the block along all three axes.
     inner = ndimage.binary_dilation(seeds, touching, iterations=3 * (block - 1), mask=partly)
