@@ -88,8 +88,6 @@ class ExportOptions:
     """Treatment of the inside of a body if photographs show only its shell. solid: the inside is filled, but a cavity
     that holds a camera is a room and stays empty. hollow: only the shell is exported, with the thickness that training
     happened to give the shell; with --wall-thickness it is closed, as by a floor, where no camera looks."""
-    seal_openings: int = 2
-    """In the search for the inside, openings in the shell up to twice this many voxels wide count as closed."""
     wall_thickness: float | None = None
     """For facades seen from one side: make the seen surface this thick, [m], growing away from the cameras; the
     interior is then not filled."""
@@ -221,7 +219,6 @@ class ExportThermoxelsMesh(ExportOptions):
 def check_options(options: ExportOptions) -> CheckedOptions:
     """Return the checked options; raises `ThermoxelsError` for a wrong option before anything slow runs."""
     from thermoxels_ns.mesh.boundary.patches import PatchRules, load_patch_rules
-    from thermoxels_ns.mesh.build import MeshOptions
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
     if options.metres_per_unit is not None:
@@ -237,7 +234,6 @@ def check_options(options: ExportOptions) -> CheckedOptions:
     if not options.formats or len(set(options.formats)) < len(options.formats):
         remedy = "Pass --formats vtu glb, for example."
         raise MeshError("formats", expected="at least one format, each once", got=options.formats, remedy=remedy)
-    MeshOptions(options.boundary)  # raises if a value is out of range
     try:
         selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
     except MeshError as problem:
@@ -346,7 +342,7 @@ def export_snapshot(
     from thermoxels_ns.fem.solution import HeatSolution
     from thermoxels_ns.heat.solving import Goals, solve_problem
     from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, shown_states, write_heat_series
-    from thermoxels_ns.mesh.build import MeshOptions, apply_transform, build_mesh
+    from thermoxels_ns.mesh.build import apply_transform, build_mesh
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
     from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
     from thermoxels_ns.mesh.files.surface import check_single_precision
@@ -360,8 +356,9 @@ def export_snapshot(
     up, up_source = up_of(options, scene_file, viewpoint)
     folder = prepare_folder(output_dir)
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ world_to_input
-    mesh_options = MeshOptions(options.boundary, up=up, rules=checked.rules)
-    built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options, metres)
+    built = build_mesh(
+        snapshot, checked.selection, to_mesh, options.boundary, up=up, rules=checked.rules, metres_per_unit=metres
+    )
     if depths is not None:
         built = with_support(built, depths, tracks, snapshot.lattice, to_mesh)
     mesh = built.mesh

@@ -96,7 +96,7 @@ def mesh_summary(
         "bounds": {"lower": mesh.points_m.min(axis=0), "upper": mesh.points_m.max(axis=0)},
         "dihedral_angles_deg": {"min": report.dihedral_range_deg[0], "max": report.dihedral_range_deg[1]},
         "density_threshold_used": solid.threshold,
-        "density_threshold_why": solid.explanation,
+        "density_threshold_why": solid.steps[0].remark,
         "solid_steps": [
             {"step": step.name, "voxels_added": step.added, "voxels_removed": step.removed}
             | ({} if scale is None else {"litres_added": litres * step.added, "litres_removed": litres * step.removed})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,18 +27,7 @@ from thermoxels_ns.mesh.temperature import (
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh, facet_normals
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
 
-
-@dataclass(frozen=True)
-class MeshOptions:
-    """Options of `build_mesh`: how solid voxels become a mesh."""
-
-    boundary: BoundaryMode = "conforming"  # along the level set of the density, or along voxel faces
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Up direction in the coordinates of the mesh
-    rules: PatchRules = field(default_factory=PatchRules)  # The user's rules for patches and regions
-
-    def __post_init__(self) -> None:
-        if self.boundary not in ("conforming", "voxel"):
-            raise MeshError("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")
+_NO_RULES = PatchRules()
 
 
 @dataclass(frozen=True)
@@ -60,7 +49,10 @@ def build_mesh(
     snapshot: GridSnapshot,
     selection: SolidSelection,
     world_to_metres: FloatArray,
-    options: MeshOptions = MeshOptions(),
+    boundary: BoundaryMode = "conforming",
+    *,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    rules: PatchRules = _NO_RULES,
     metres_per_unit: float = 1.0,
 ) -> BuiltMesh:
     """Return a mesh of the solid part of a trained field, with nodal temperatures, regions and boundary tags.
@@ -74,14 +66,18 @@ def build_mesh(
         world_to_metres: Similarity (rotation or reflection, one scale, shift), shape (4, 4), that maps homogeneous
             column vectors of the trained scene to metres. After a reflection, nodes are reordered so that volumes stay
             positive.
-        options: Kind of boundary, up direction and rules for tags.
+        boundary: Whether the boundary follows the level set of the density, or voxel faces.
+        up: Up direction in the coordinates of the mesh.
+        rules: The user's rules for patches and regions.
         metres_per_unit: Length, [m], of the unit of the input poses, in which the region's box is given.
 
     Raises:
         MeshError: `select_solid` fails, or no node of the mesh was measured.
     """
+    if boundary not in ("conforming", "voxel"):
+        raise MeshError("boundary", expected="conforming or voxel", got=boundary, remedy="Pass one of them.")
     transform = np.asarray(world_to_metres, dtype=np.float64)
-    scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
+    scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), boundary == "voxel"
     solid = select_solid(snapshot, selection, scale, transform[:3] / metres_per_unit)
     if voxel:
         corners, tets = kuhn_tets(solid.cells)
@@ -127,7 +123,7 @@ def build_mesh(
         found, near = interpolate_corners(points, snapshot.colour, snapshot.density > 0.0)
         colour = np.where(near[:, None] > 0.0, found, 0.5).astype(np.float32)
     of_tets = points_m[tets].mean(axis=1), None if colour is None else colour[tets].mean(axis=1)
-    region, region_names, idle_regions = apply_regions(options.rules, *of_tets)
+    region, region_names, idle_regions = apply_regions(rules, *of_tets)
     mesh = TetMesh(
         points_m=points_m,
         tets=np.ascontiguousarray(tets),
@@ -139,9 +135,9 @@ def build_mesh(
         region_names=region_names,
         colour=colour,
     )
-    boundary, idle_patches = _tagged(mesh, points, solid, snapshot, transform[:3, :3] / scale, options)
+    tags, idle_patches = _tagged(mesh, points, solid, snapshot, transform[:3, :3] / scale, up, rules)
     return BuiltMesh(
-        replace(mesh, boundary=boundary), solid, parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
+        replace(mesh, boundary=tags), solid, parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
     )
 
 
@@ -170,7 +166,8 @@ def _tagged(
     solid: SolidCells,
     snapshot: GridSnapshot,
     rotation: FloatArray,
-    options: MeshOptions,
+    up: tuple[float, float, float],
+    rules: PatchRules,
 ) -> tuple[Boundary, tuple[str, ...]]:
     """Return the tags of all boundary triangles and the idle rules; without cameras all triangles count as seen."""
     normal = facet_normals(mesh.points_m, mesh.facets)
@@ -186,10 +183,10 @@ def _tagged(
         # In a building with rooms, what faces none is outside, seen or not, as below the lowest floor.
         outside = ~inner if np.count_nonzero(inner) > 0.5 * np.count_nonzero(~seen) else seen
     patch, names, idle = apply_patches(
-        options.rules,
+        rules,
         centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
         normals=normal,
-        up=options.up,
+        up=up,
         seen=outside,
         on_box=mesh.facet_tags == FACET_BOX,
         colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),

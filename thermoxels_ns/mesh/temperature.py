@@ -57,7 +57,7 @@ def extend_harmonically(
     edges: IntArray,
     temperature_c: npt.NDArray[np.floating],
     observed: BoolArray,
-    edge_weights: npt.NDArray | None = None,
+    edge_weights: npt.NDArray,
 ) -> FloatArray:
     """Return the temperatures of all nodes, shape (n,), [degrees Celsius], with unobserved nodes filled in.
 
@@ -69,18 +69,17 @@ def extend_harmonically(
         edges: Node pairs, shape (e, 2); if a pair is listed several times, its weights add up.
         temperature_c: Nodal temperatures, shape (n,), [degrees Celsius]; read at observed nodes only.
         observed: True where a node's temperature is a measurement, shape (n,); one at least in each connected part.
-        edge_weights: Conductance w of each edge, shape (e,), as from `tet_conductances`; all are 1 if left out.
+        edge_weights: Conductance w of each edge, shape (e,), as from `tet_conductances`.
 
     Raises:
         MeshError: No node is observed, a value is not finite, or the solver did not converge.
 
     >>> chain = np.array([[0, 1], [1, 2]])
-    >>> extend_harmonically(chain, np.array([10.0, -99.0, 30.0]), np.array([True, False, True])).tolist()
+    >>> extend_harmonically(chain, np.array([10.0, -99.0, 30.0]), np.array([True, False, True]), np.ones(2)).tolist()
     [10.0, 20.0, 30.0]
     """
     num_nodes = len(temperature_c)
     observed = np.asarray(observed, dtype=bool)
-    weights = np.ones(len(edges)) if edge_weights is None else np.asarray(edge_weights, dtype=np.float64)
     temperature = np.where(observed, np.asarray(temperature_c, dtype=np.float64), 0.0)
     remedy = "The checkpoint is damaged; resume from an earlier one."
     check_finite("observed temperatures", temperature, remedy, MeshError)
@@ -91,7 +90,7 @@ def extend_harmonically(
         raise MeshError("observed temperatures", expected=expected, got="none", remedy=remedy)
 
     start, end = edges[:, 0], edges[:, 1]
-    links = sparse.coo_array((weights, (start, end)), shape=(num_nodes, num_nodes)).tocsr()
+    links = sparse.coo_array((edge_weights, (start, end)), shape=(num_nodes, num_nodes)).tocsr()
     links = (links + links.T).tocsr()
     links.data = np.maximum(links.data, _LEAST_CONDUCTANCE * float(np.abs(links.data).mean()))
     free, fixed = np.flatnonzero(~observed), np.flatnonzero(observed)

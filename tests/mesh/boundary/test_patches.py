@@ -150,7 +150,7 @@ def test_the_example_is_read_and_does_what_its_comments_say() -> None:
         ("patches: [{facing: up}]", "patches entry 1"),
         ("patches: [{name: a, facing: up}, {name: b}]", "patches entry 2: b"),
         ("patches: [{name: a b, facing: up}]", "patches entry 1: name"),
-        ("patches: [{name: Exterior-Up, facing: up}]", "patches entry 1: name"),
+        ("patches: [{name: exterior-up, facing: up}]", "patches entry 1: name"),
         ("patches: [{name: wall, facing: up}, {name: Wall, facing: side}]", "patches entry 2: name"),
         ("regions: [{name: a, facing: up}]", "regions entry 1"),
         ("patches: [{name: a, facing: north}]", "patches entry 1: facing"),

@@ -20,7 +20,6 @@ from thermoxels_ns.mesh.files.solvers import (
     write_msh,
     write_xdmf,
 )
-from thermoxels_ns.mesh.tetrahedra import facet_areas
 
 STEP = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)
 # Nodes of the faces S1 to S4 of a linear tetrahedron, as the manuals of Abaqus and CalculiX list them.
@@ -71,7 +70,6 @@ def test_surfaces_are_the_faces_with_the_nodes_of_the_patch(written, tagged_mesh
         ]
         assert np.array_equal(np.sort(faces, axis=1), np.sort(facets, axis=1))
         assert numbers(written[f"*NSET, NSET=PATCH-{name}"]) == (np.unique(facets) + 1).tolist()
-    assert numbers(written["*NSET, NSET=OBSERVED"]) == (np.flatnonzero(tagged_mesh.observed) + 1).tolist()
 
 
 def test_empty_parts_are_left_out(written):
@@ -104,15 +102,6 @@ def test_names_that_become_one_are_refused(tmp_path, tagged_mesh, names):
     with pytest.raises(MeshError, match="region_names: expected"):
         write_inp(tmp_path / "house.inp", dataclasses.replace(tagged_mesh, region_names=names), STEP)
     assert not list(tmp_path.iterdir())
-
-
-def test_surfaces_say_how_large_they_are(written, tagged_mesh):
-    areas = facet_areas(tagged_mesh.points_m, tagged_mesh.facets)
-    for number, name in enumerate(("UP", "DOWN", "INSIDE", "FA_ADE_1")):
-        patch = tagged_mesh.boundary.patch == number
-        said = [line for line in written if line.startswith("**") and f"PATCH-{name}" in line]
-        numbers_said = [float(word) for line in said for word in line.split() if word.replace(".", "").isdigit()]
-        assert numbers_said == pytest.approx([areas[patch].sum()], rel=1e-8)
 
 
 def test_groups_carry_names_numbers_and_elements(tmp_path, tagged_mesh):

@@ -104,7 +104,7 @@ def test_without_evidence_the_rule_is_an_optical_depth_and_says_so():
         chosen = automatic(snapshot)
         fixed = dense_voxels(snapshot, snapshot.centre_density(), SolidSelection(density_threshold=0.5 / VOXEL))
         assert chosen.density == fixed.density == 2.0 and np.array_equal(chosen.cells, fixed.cells)
-        assert "optical depth 0.5" in select_solid(snapshot, SolidSelection()).explanation
+        assert "optical depth 0.5" in select_solid(snapshot, SolidSelection()).steps[0].remark
 
 
 def test_a_threshold_of_the_user_goes_before_the_automatic_one():

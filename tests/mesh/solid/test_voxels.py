@@ -7,7 +7,7 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
-from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+from thermoxels_ns.mesh.build import build_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, SolidStep, select_solid, where_cameras_look
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, facet_normals
 
@@ -105,7 +105,7 @@ def test_a_hollow_house_that_a_box_halves_is_filled_up_to_the_box():
 def test_where_the_region_ends_the_boundary_is_cut(boundary):
     snapshot = field(WIDE, TABLE | OBJECT, ring())
     selection = SolidSelection(close_gaps=0, region_box=(-5.0, -5.0, -1.0, 0.0, 5.0, 3.0))
-    mesh = build_mesh(snapshot, selection, np.eye(4), MeshOptions(boundary)).mesh
+    mesh = build_mesh(snapshot, selection, np.eye(4), boundary).mesh
     at = mesh.points_m[mesh.facets].mean(axis=1)
     assert mesh.boundary is not None
     plane = (np.abs(at[:, 0]) < 0.6 * WIDE.voxel_size) & (facet_normals(mesh.points_m, mesh.facets)[:, 0] > 0.9)
@@ -216,7 +216,6 @@ def test_a_wall_thickness_needs_a_scale_and_cameras(facade):
     [
         {"density_threshold": -0.1},
         {"close_gaps": -1},
-        {"seal_openings": -1},
         {"region_box": (0.0, 0.0, 0.0, 1.0, 0.0, 1.0)},
         {"interior": "filled"},
         {"wall_thickness": 0.0},

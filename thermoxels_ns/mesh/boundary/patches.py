@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -31,7 +31,7 @@ DEFAULT_REGION = "solid"  # Name of region 0
 Vector = tuple[float, float, float]
 _Byte = Annotated[int, Field(ge=0, le=255)]
 
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")
+_NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")  # solvers do not tell capitals from small letters
 _COS_45 = math.sqrt(0.5) + 1e-9
 """A little above the cosine of 45 degrees, so that a roof of exactly 45 degrees counts as a side despite rounding."""
 
@@ -88,7 +88,7 @@ class RegionRule:
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
-            expected = "up to 40 letters, digits, - and _ that start with a letter"
+            expected = "up to 40 small letters, digits, - and _ that start with a letter"
             raise wrong("name", expected, repr(self.name), "Rename it.")
         conditions = [*vars(self)][1:]
         if all(getattr(self, key) is None for key in conditions):
@@ -129,14 +129,10 @@ def load_patch_rules(path: Path | str) -> PatchRules:
         ("patches", rules.patches, DEFAULT_PATCHES),
         ("regions", rules.regions, (DEFAULT_REGION,)),
     ):
-        known = {name.lower(): name for name in taken}
         for number, entry in enumerate(entries, start=1):
-            before = known.setdefault(entry.name.lower(), entry.name)
-            if before in taken or before != entry.name:
-                others = f"a name other than {', '.join(taken)}"
-                expected = others if before in taken else f"{before}, as above, or another"
-                remedy = "Choose another name; solvers do not tell capitals from small letters."
-                raise wrong(f"{path.name}: {kind} entry {number}: name", expected, entry.name, remedy)
+            if entry.name in taken:
+                name, expected = f"{path.name}: {kind} entry {number}: name", f"a name other than {', '.join(taken)}"
+                raise wrong(name, expected, entry.name, "Choose another name.")
     return rules
 
 
@@ -236,17 +232,15 @@ def with_patches(mesh: TetMesh, rules: PatchRules, up: npt.ArrayLike) -> tuple[T
 
 def write_patch_rules(path: Path, rules: PatchRules, heading: str) -> None:
     """Write rules for patches as a yaml file that `load_patch_rules` reads, below a comment of one line."""
-    plain = [_plain(rule) for rule in rules.patches]
+    plain = [asdict(rule, dict_factory=_told) for rule in rules.patches]
     lines = (yaml.safe_dump(one, default_flow_style=True, sort_keys=False, width=10_000) for one in plain)
     with replace_when_done(path) as temporary:
         temporary.write_text(f"# {heading}\npatches:\n" + "".join(f"  - {line}" for line in lines), encoding="utf-8")
 
 
-def _plain(value: Any) -> Any:
-    """Return a rule as lists and mappings, without what it leaves open."""
-    if is_dataclass(value):
-        return {name: _plain(one) for name, one in vars(value).items() if one is not None and one != math.inf}
-    return [*value] if isinstance(value, tuple) else value
+def _told(fields: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the fields of a rule without those that leave a condition open."""
+    return {name: value for name, value in fields if value is not None and value != math.inf}
 
 
 def apply_regions(rules: PatchRules, tet_centroids: FloatArray, tet_colours: npt.NDArray | None = None) -> Applied:

@@ -37,7 +37,7 @@ def write_mesh(
     *,
     heat_step: HeatStep | None = None,
     up: Sequence[float] = (0.0, 0.0, 1.0),
-) -> list[Path]:
+) -> None:
     """Write a mesh in the format given by the ending of the file's name, see `MESH_FORMATS`.
 
     Args:
@@ -46,15 +46,12 @@ def write_mesh(
         heat_step: Material and time steps, needed for .inp.
         up: Up direction in mesh coordinates, used for .glb.
 
-    Returns:
-        The paths of all files written, `path` first.
-
     Raises:
         MeshError: An array does not fit the mesh or is not finite; or `up` is no direction, the mesh is too
             far from the origin for .stl or .ply, or names are too long or alike for the format.
         OutputError: No format has this ending, or a file cannot be written.
     """
-    path, written = Path(path), mesh_file_paths(path)
+    path = mesh_file_paths(path)[0]
     if path.suffix == ".vtu":
         write_boundary_vtp(boundary_path(path), mesh)
         write_vtu(path, mesh)
@@ -65,4 +62,3 @@ def write_mesh(
         write_glb(path, mesh, up=up)
     else:
         {".xdmf": write_xdmf, ".msh": write_msh, ".stl": write_stl, ".ply": write_ply}[path.suffix](path, mesh)
-    return written

@@ -18,7 +18,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.units import STEFAN_BOLTZMANN_W_M2K4, ZERO_CELSIUS_K
 from thermoxels_ns.mesh.files.content import checked_tags, node_arrays, write_bytes
 from thermoxels_ns.mesh.quality.checks import facet_owners
-from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh, facet_areas
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 
 BODY_GRID, FACET_GRID = "mesh", "facets"
 """Names of the two grids in .xdmf files, of tetrahedra and of boundary triangles; "mesh" is the default in FEniCSx."""
@@ -42,7 +42,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     Regions and patches are numbered from 1, as in .msh files; an ``Information`` element of each grid lists the names.
     In FEniCSx::
 
-        with dolfinx.io.XDMFFile(comm, "mesh.xdmf", "r") as file:
+        with XDMFFile(comm, "mesh.xdmf", "r", encoding=XDMFFile.Encoding.ASCII) as file:
             mesh = file.read_mesh(name="mesh")
             regions = file.read_meshtags(mesh, name="mesh")
             mesh.topology.create_connectivity(2, 3)
@@ -158,9 +158,7 @@ def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep) -> None:
 
     - ``NALL`` and ``EALL``: all nodes and all elements, of type DC3D4, which CalculiX reads as C3D4.
     - ``REGION-<name>``: elements of a region; ``MATERIAL-<name>``: its material, the same for all regions.
-    - ``PATCH-<name>``: nodes of a boundary patch, and a surface of the same name that holds its element faces. A
-      comment before the node set says the area of the patch, [m2].
-    - ``OBSERVED``: the nodes whose temperature was measured, if there are any.
+    - ``PATCH-<name>``: nodes of a boundary patch, and a surface of the same name that holds its element faces.
     - Initial temperatures, and a heat transfer step without boundary conditions that prints temperatures (``NT``).
 
     Names are in capitals, and other characters than letters, digits and underscores become underscores. Empty regions
@@ -229,15 +227,10 @@ def _nodes_and_elements(mesh: TetMesh, regions: Sequence[str]) -> Iterator[str]:
         yield from _rows("%d, %d, %d, %d, %d\n", members + 1, *(mesh.tets[members] + 1).T)
     yield "*ELSET, ELSET=EALL\n"
     yield "".join(f"REGION-{name}\n" for name, _ in used)
-    if mesh.observed.any():
-        yield "*NSET, NSET=OBSERVED\n"
-        yield from _rows("%d\n", np.flatnonzero(mesh.observed) + 1)
 
 
 def _surfaces(mesh: TetMesh, tags: Boundary, patches: Sequence[str], owner: IntArray, face: IntArray) -> Iterator[str]:
-    areas = facet_areas(mesh.points_m, mesh.facets)
     for name, members in _sets(tags.patch, patches):
-        yield f"** PATCH-{name}: {float(areas[members].sum()):.9g} m2\n"
         yield f"*NSET, NSET=PATCH-{name}\n"
         yield from _rows("%d\n", np.unique(mesh.facets[members]) + 1)
         yield f"*SURFACE, NAME=PATCH-{name}, TYPE=ELEMENT\n"

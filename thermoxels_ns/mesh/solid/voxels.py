@@ -42,6 +42,7 @@ LEAST_WEIGHT = 0.5  # with less weight of rays than this in a voxel, [rays], its
 FEWEST_RAYS = 100  # least number of rays that end on something for the threshold to be chosen by rays
 CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # share of an image's sides that counts as its middle, and rays along each side
 NEAREST_SHARE = 0.25  # a camera points at the place at this quantile of the distances to solid along these rays
+SEAL = 2  # to find the interior, openings up to twice this many voxels wide count as closed
 MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` interpolates between blocks of voxels
 
 
@@ -58,8 +59,6 @@ class SolidSelection:
     region: RegionKind = "auto"  # auto: the voxels of `where_cameras_look`; all: all voxels
     region_box: Box | None = None  # xmin ymin zmin xmax ymax zmax, in coordinates of the input poses; replaces `region`
     interior: InteriorKind = "solid"  # solid: the voxels of `interior` are filled; hollow: they stay empty
-    seal_openings: Annotated[int, Field(ge=0, le=100)] = 2
-    """To find the interior, openings up to twice this many voxels wide count as closed."""
     wall_thickness: Annotated[float, Field(gt=0)] | None = None
     """Thickness that walls get instead of a filled interior, [m]."""
 
@@ -89,8 +88,9 @@ class SolidCells:
     cells: BoolArray  # True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is
     dense: BoolArray  # True for voxels that the threshold chose
     threshold: float  # least density at the centre of a voxel that counts as dense, [1 / world unit]
-    explanation: str  # which rule chose the threshold, and why
-    steps: tuple[SolidStep, ...]  # all steps in order; the first is the threshold
+    steps: tuple[
+        SolidStep, ...
+    ]  # all steps in order; the first is the threshold, which says what rule chose it and why
     component_sizes: IntArray  # number of voxels of each body in the region after gaps were closed, largest first
     within: BoolArray  # True for voxels, solid or not, in the region; the solid is cut at its border
     left_out: BoolArray  # True for dense voxels and closed gaps outside the region or in bodies that were too small
@@ -152,28 +152,22 @@ def select_solid(
             remark = f"A wall {asked} is thinner than one and a half voxels; the seen surface stays as thick as it is."
         cells = step("wall", wall, remark)
         if selection.interior == "hollow":
-            inside = interior(opaque | cells, snapshot.lattice, snapshot.views, selection.seal_openings, within)
-            rooms = (inside.enclosed | inside.hidden) & ~cells
+            found = interior(opaque | cells, snapshot.lattice, snapshot.views, SEAL, within)
+            rooms = found.inside & ~cells
             depth = np.asarray(ndimage.distance_transform_edt(cells | rooms | ~within))
             remark = "Where no camera looks, as below the lowest floor, the rooms are closed by a wall as thick."
             cells = step("close rooms", cells | (rooms & (depth <= thickness)), remark)
             rooms &= ~cells
     elif selection.interior == "solid":
-        inside = interior(opaque, snapshot.lattice, snapshot.views, selection.seal_openings, within)
-        remark = f"{int(inside.enclosed.sum())} voxels of enclosed cavities are filled"
-        if snapshot.views is None:
-            remark += "; the cameras are not known, so nothing is known to be hidden from them."
-        else:
-            hidden = int(inside.hidden.sum())
-            remark += f", and {hidden} voxels that cameras cannot look into, within the hull of their body."
-        if inside.rooms:
-            remark += f" {inside.rooms} cavities with a camera in them stay empty."
-        cells = step("interior", cells | inside.enclosed | inside.hidden, remark)
+        found = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
+        remark = "Enclosed cavities are filled, and what cameras cannot look into within the hull of its body."
+        if found.rooms:
+            remark += f" {found.rooms} cavities with a camera in them stay empty."
+        cells = step("interior", cells | found.inside, remark)
     return SolidCells(
         cells=cells,
         dense=chosen.cells,
         threshold=chosen.density,
-        explanation=chosen.explanation,
         steps=tuple(steps),
         component_sizes=np.sort(sizes)[::-1].astype(np.int64),
         within=within,
