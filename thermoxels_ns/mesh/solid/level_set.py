@@ -96,7 +96,7 @@ def _thin(cells: BoolArray) -> BoolArray:
 
 def _beside(cells: BoolArray, axis: int) -> npt.NDArray[np.uint8]:
     """Return the number of each voxel's two neighbours along an axis that are solid; outside it counts itself."""
-    return np.asarray(ndimage.convolve1d(cells.view(np.uint8), [1, 0, 1], axis=axis, mode="nearest"))
+    return np.asarray(ndimage.convolve1d(cells.view(np.uint8), [1, 0, 1], axis=axis, mode="nearest"), dtype=np.uint8)
 
 
 def _keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, cells: BoolArray) -> Float32Array:

@@ -102,13 +102,10 @@ def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
         padded[0, 1:-1, 1:-1] = -np.abs(within[0])
         padded[-1, 1:-1, 1:-1] = -np.abs(within[-1])
 
-    # Levels are halved before each sum: the sum of two levels may overflow the number type, their mean cannot.
-    mean = 0.5 * np.pad(inner, 1, mode="edge")
+    mean = np.pad(inner, 1, mode="edge")
     for axis in range(3):
         mean = np.moveaxis(mean, axis, 0)
-        mean = np.moveaxis(mean[1:] + mean[:-1], 0, axis)
-        if axis < 2:
-            mean *= 0.5
+        mean = np.moveaxis(0.5 * (mean[1:] + mean[:-1]), 0, axis)
     for axis in range(3):
         border = np.moveaxis(mean, axis, 0)[[0, -1]]
         np.moveaxis(mean, axis, 0)[[0, -1]] = np.minimum(border, 0.0)
