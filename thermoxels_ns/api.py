@@ -66,7 +66,7 @@ class Scene:
         from threadpoolctl import threadpool_limits
 
         from thermoxels_ns.commands import export
-        from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+        from thermoxels_ns.mesh.build import build_mesh
         from thermoxels_ns.mesh.files.vtu import blocks_of
         from thermoxels_ns.mesh.quality.report import check_mesh
         from thermoxels_ns.multiview.evidence import depths_of_dataset
@@ -78,9 +78,10 @@ class Scene:
         metres, unit = (1.0, "input unit") if scale is None else (scale.metres_per_unit, "m")
         up, up_source = export.up_of(chosen, scene_file, run.viewpoint)
         to_mesh = np.diag([metres, metres, metres, 1.0]) @ run.world_to_input
-        how = MeshOptions(chosen.boundary, chosen.coarsest_cell, up=up, rules=checked.rules)
         with threadpool_limits(1, "blas"):  # with more, the last bits would depend on the number of threads
-            built = build_mesh(field, checked.selection, to_mesh, how, metres)
+            built = build_mesh(
+                field, checked.selection, to_mesh, chosen.boundary, up=up, rules=checked.rules, metres_per_unit=metres
+            )
             depths = depths_of_dataset(run.dataset, 0.0, field.lattice.lo, field.lattice.hi) if support else None
             if depths is not None:
                 built = export.with_support(built, depths, run.tracks, field.lattice, to_mesh)

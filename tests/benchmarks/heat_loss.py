@@ -23,7 +23,7 @@ from thermoxels_ns.evaluation.truth_comparison import load_known_truth
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection
-from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+from thermoxels_ns.mesh.build import build_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas
@@ -61,7 +61,7 @@ class HeatLoss:
                 raise SystemExit(f"{config}: the exact shape of this scene is not known")
             meshes = {"exact shape": exact_mesh(known.scene, round(FINER * max(trained.snapshot.lattice.cell_shape)))}
             for mode in ("voxel", "conforming"):
-                built = build_mesh(trained.snapshot, SolidSelection(), trained.world_to_input, MeshOptions(mode))
+                built = build_mesh(trained.snapshot, SolidSelection(), trained.world_to_input, mode)
                 meshes[mode] = built.mesh
             truth, true = heat_lost_j(meshes["exact shape"]), known.scene.solid
             for name, mesh in meshes.items():

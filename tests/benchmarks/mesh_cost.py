@@ -28,7 +28,7 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.evaluation.truth_comparison import sample_facets
-from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+from thermoxels_ns.mesh.build import build_mesh
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
@@ -94,7 +94,7 @@ def measure(name: str, voxels: int, mode: Any, repeats: int) -> dict[str, Any]:
     for _ in range(repeats):
         start = time.perf_counter()
         selection = SolidSelection(density_threshold=1.0, close_gaps=0)
-        built = build_mesh(snapshot, selection, np.eye(4), MeshOptions(mode))
+        built = build_mesh(snapshot, selection, np.eye(4), mode)
         seconds.append(time.perf_counter() - start)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     mesh, quality = built.mesh, check_mesh(built.mesh)

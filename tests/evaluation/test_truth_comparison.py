@@ -17,7 +17,7 @@ from thermoxels_ns.evaluation.truth_comparison import (
     geometry_metrics,
     load_known_truth,
 )
-from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+from thermoxels_ns.mesh.build import build_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
@@ -62,7 +62,7 @@ def exact_mesh(
         cells.astype(np.float32) if just_inside else None,
     )
     selection = SolidSelection(close_gaps=0, density_threshold=1e-6, region="all")
-    return build_mesh(snapshot, selection, world_to_metres, MeshOptions("voxel")).mesh, cells, lattice
+    return build_mesh(snapshot, selection, world_to_metres, "voxel").mesh, cells, lattice
 
 
 def test_cameras_are_found_in_a_mirrored_turned_and_scaled_world(hot_object):

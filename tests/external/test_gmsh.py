@@ -64,7 +64,6 @@ def test_gmsh_keeps_the_physical_groups_when_it_saves_what_it_read(tmp_path, sol
         for number, name in enumerate(solid_mesh.region_names)
     }
     assert groups(again) == {key: count for key, count in expected.items() if count}
-    # Nodes come sorted by where they lie, tetrahedra by region: compare their corners.
     tets = np.concatenate([block.data for block in again.cells if block.dim == 3])
     order = np.argsort(solid_mesh.region, kind="stable")
     ours = solid_mesh.points_m[solid_mesh.tets[order]]

@@ -5,10 +5,12 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from tests.support.looking_cameras import looking_at
+from tests.support.stuffed_shapes import on_surface
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh import temperature
 from thermoxels_ns.mesh.boundary.patches import DEFAULT_PATCHES
-from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+from thermoxels_ns.mesh.build import build_mesh
+from thermoxels_ns.mesh.quality.checks import component_of
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
@@ -17,7 +19,7 @@ from thermoxels_ns.mesh.tetrahedra import facet_areas
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 DENSE = SolidSelection(close_gaps=0, density_threshold=0.5)
-VOXEL = MeshOptions("voxel")
+VOXEL = "voxel"
 MODES = ["conforming", "voxel"]
 
 
@@ -37,7 +39,7 @@ def test_rotated_scaled_and_mirrored_meshes_stay_valid(snapshot_of, mirror, mode
     density = np.ones((6, 5, 4))
     density[:3, :3, 2:] = 0.0
     field = snapshot_of(density, lo=(-1.0, 2.0, 0.5), voxel_size=0.25)
-    built = build_mesh(field, DENSE, linear_map(3.0 * linear, (5.0, -7.0, 1.0)), MeshOptions(mode))
+    built = build_mesh(field, DENSE, linear_map(3.0 * linear, (5.0, -7.0, 1.0)), mode)
     quality = check_mesh(built.mesh, mode)  # positive volumes, facets outwards
     exact = built.solid.cells.sum() * (0.25 * 3.0) ** 3
     assert quality.volume_m3 == pytest.approx(exact, rel=1e-12 if mode == "voxel" else 0.2)
@@ -113,7 +115,7 @@ def ball(snapshot_of, seen_side: bool = False):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_temperatures_come_from_what_was_seen_and_stay_in_its_range(snapshot_of, mode):
-    mesh = build_mesh(ball(snapshot_of, seen_side=True), DENSE, np.eye(4), MeshOptions(mode)).mesh
+    mesh = build_mesh(ball(snapshot_of, seen_side=True), DENSE, np.eye(4), mode).mesh
     x = mesh.points_m[:, 0] / 0.5
     assert mesh.observed[x > 11].any() and not mesh.observed[x < 6].any()
     assert mesh.temperature_c[mesh.observed] == pytest.approx(20.0 + x[mesh.observed], abs=0.51)
@@ -123,7 +125,7 @@ def test_temperatures_come_from_what_was_seen_and_stay_in_its_range(snapshot_of,
 @pytest.mark.parametrize("mode", MODES)
 def test_the_area_is_that_of_the_surface_or_of_its_staircase(snapshot_of, mode):
     turn = rotation(6)
-    mesh = build_mesh(ball(snapshot_of), DENSE, linear_map(2.0 * turn), MeshOptions(mode)).mesh
+    mesh = build_mesh(ball(snapshot_of), DENSE, linear_map(2.0 * turn), mode).mesh
     boundary = mesh.boundary
     assert boundary is not None and boundary.seen.all()  # without cameras nothing is known to be hidden
     radius = 5.3 + np.log(2.0) / 3.0  # where density is one half, [voxels]; a voxel is 0.5 * 2 wide
@@ -148,9 +150,7 @@ def test_maximum_principle_on_random_bodies(random_cells, seed):
     random = np.random.default_rng(seed)
     measured = random.normal(20.0, 30.0, num_nodes)
     observed = random.random(num_nodes) < 0.5
-    parts = temperature.connected_components(
-        temperature.sparse.coo_array((weights, tuple(edges.T)), shape=(num_nodes, num_nodes)), directed=False
-    )[1]
+    parts = component_of(num_nodes, *edges.T)
     for part in range(parts.max() + 1):  # every body needs a measurement
         observed[np.flatnonzero(parts == part)[0]] = True
     filled = extend_harmonically(edges, np.where(observed, measured, 1e6), observed, weights)
@@ -185,11 +185,12 @@ def test_linear_temperatures_are_extended_through_tetrahedra_of_any_size():
     solid = stuff(np.clip(level / 1.5, -1.0, 1.0), 4)
     linear = 20.0 + solid.points @ [1.0, -2.0, 0.5]
     edges, conductance = temperature.tet_conductances(solid.points, solid.tets)
-    filled = extend_harmonically(edges, np.where(solid.on_surface, linear, 0.0), solid.on_surface, conductance)
+    known = on_surface(solid)
+    filled = extend_harmonically(edges, np.where(known, linear, 0.0), known, conductance)
     lengths = np.linalg.norm(solid.points[solid.tets[:, 0]] - solid.points[solid.tets[:, 1]], axis=1)
     assert lengths.max() > 1.9  # there are coarse tetrahedra
     worst = np.abs(filled - linear).max() / np.ptp(linear)
-    uniform = extend_harmonically(edges, np.where(solid.on_surface, linear, 0.0), solid.on_surface)
+    uniform = extend_harmonically(edges, np.where(known, linear, 0.0), known, np.ones(len(edges)))
     assert worst < 0.01 < 0.03 < np.abs(uniform - linear).max() / np.ptp(linear)
 
 

@@ -6,7 +6,7 @@ import pytest
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
-from thermoxels_ns.mesh.build import BuiltMesh, MeshOptions, build_mesh
+from thermoxels_ns.mesh.build import BuiltMesh, build_mesh
 from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import facet_areas
@@ -90,8 +90,8 @@ def assert_sound(built: BuiltMesh, mode: str) -> None:
 @pytest.mark.parametrize("name", HARD)
 def test_hard_bodies_become_sound_meshes(name: str, mode) -> None:
     cells = HARD[name]()
-    assert_sound(build_mesh(trained(cells), SolidSelection(), np.eye(4), MeshOptions(mode)), mode)
-    built = build_mesh(trained(cells), AS_IT_IS, np.diag([2.0, 2.0, 2.0, 1.0]), MeshOptions(mode))
+    assert_sound(build_mesh(trained(cells), SolidSelection(), np.eye(4), mode), mode)
+    built = build_mesh(trained(cells), AS_IT_IS, np.diag([2.0, 2.0, 2.0, 1.0]), mode)
     assert_sound(built, mode)
     assert np.array_equal(built.solid.cells, cells) or built.unobserved_parts > 0
     if mode == "voxel":
@@ -103,6 +103,6 @@ def test_hard_bodies_become_sound_meshes(name: str, mode) -> None:
 def test_a_small_body_in_256_cubed_voxels(mode) -> None:
     cells = np.zeros((256, 256, 256), dtype=bool)
     cells[100:130, 100:130, 180:184] = True
-    built = build_mesh(trained(cells), AS_IT_IS, np.eye(4), MeshOptions(mode))
+    built = build_mesh(trained(cells), AS_IT_IS, np.eye(4), mode)
     assert_sound(built, mode)
     assert built.solid.cells.sum() == 30 * 30 * 4

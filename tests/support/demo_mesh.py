@@ -4,7 +4,7 @@ import numpy as np
 
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
-from thermoxels_ns.mesh.build import BoundaryMode, MeshOptions, build_mesh
+from thermoxels_ns.mesh.build import BoundaryMode, build_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.synthetic.scene_folder import make_scene
@@ -34,4 +34,4 @@ def demo_mesh(scene_name: str, voxels: int, boundary: BoundaryMode = "conforming
     temperature_c = scene.surface_temperature_c(lattice.corner_positions().reshape(-1, 3)).reshape(lattice.shape)
     snapshot = exact_snapshot(scene.solid.signed_distance, lattice, temperature_c)
     selection = SolidSelection(density_threshold=1.0, close_gaps=0)
-    return build_mesh(snapshot, selection, np.eye(4), MeshOptions(boundary)).mesh
+    return build_mesh(snapshot, selection, np.eye(4), boundary).mesh

@@ -7,7 +7,7 @@ import numpy as np
 
 from tests.support.demo_mesh import demo_mesh, exact_snapshot
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+from thermoxels_ns.mesh.build import build_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_area_vectors
 from thermoxels_ns.synthetic.scene_folder import make_scene
@@ -67,4 +67,4 @@ def house_corner(voxels: int = 64) -> TetMesh:
 def _mesh(distance, low, high) -> TetMesh:
     snapshot = exact_snapshot(distance, Lattice.covering(low, high, 56))
     selection = SolidSelection(density_threshold=1.0, close_gaps=0)
-    return build_mesh(snapshot, selection, np.eye(4), MeshOptions()).mesh
+    return build_mesh(snapshot, selection, np.eye(4)).mesh

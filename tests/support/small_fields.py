@@ -11,7 +11,7 @@ from tests.support.heat_meshes import mesh_from
 from tests.support.house_mesh import house_mesh
 from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+from thermoxels_ns.mesh.build import build_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -43,7 +43,7 @@ def box_mesh(snapshot_of) -> TetMesh:
     weight[1:-1, 1:-1, 1:-1] = 0.0
     snapshot = snapshot_of(np.ones(shape), 20.0 + 0.5 * (3 * x + y - 2 * z), weight)
     selection = SolidSelection(close_gaps=0, density_threshold=0.5)
-    return replace(build_mesh(snapshot, selection, np.eye(4), MeshOptions("voxel")).mesh, boundary=None)
+    return replace(build_mesh(snapshot, selection, np.eye(4), "voxel").mesh, boundary=None)
 
 
 def crossed_diagonals() -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:

@@ -29,6 +29,11 @@ def tet_mesh(solid: StuffedSolid, voxel_size: float = 1.0) -> TetMesh:
     )
 
 
+def on_surface(solid: StuffedSolid) -> np.ndarray:
+    """True for nodes of boundary triangles, shape (n,)."""
+    return np.isin(np.arange(len(solid.points)), solid.facets)
+
+
 def num_bodies(solid: StuffedSolid) -> int:
     """Parts of the mesh that share no node."""
     start, end = solid.tets[:, [0, 0, 0]].ravel(), solid.tets[:, 1:].ravel()

@@ -46,7 +46,7 @@ Compare = Callable[["SolidCells", "TetMesh", float], "dict[str, Any] | None"]
 """Compares solid voxels and a mesh with the exact scene, given the metres per unit; None if no exact scene is known."""
 
 _SUMMARY, _HEAT, _QUALITY, _HEAT_PICTURE = "summary.json", "heat.pvd", "quality.json", "heat.png"
-_MESH_PICTURES = ("mesh.png", "mesh-measured.png", "quality.png", "region.png")
+_MESH_PICTURES = ("mesh.png", "mesh-measured.png", "region.png", "support.png")
 HEAT_SKIPPED = (
     "Heat step skipped: the size of the scene is not known. Pass --metres-per-unit, the length in metres of one unit "
     "of the input poses (1 if they are in metres), or --known-distance."
@@ -69,15 +69,13 @@ class ExportOptions:
     boundary: Literal["conforming", "voxel"] = "conforming"
     """conforming: the boundary follows the level set of the density. voxel: the boundary follows voxel faces, as in the
     Thermoxels paper, with up to 1.7 times the area of a slanted surface."""
-    voxel_optical_depth: float | None = None
-    """Voxels are solid if density times edge length is at least this; at 0.5, light that crosses a voxel loses 39 %.
-    Lower the value if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: the
-    highest that 95 % of the training rays that end on a surface meet within half a voxel of their end."""
+    density_threshold: float | None = None
+    """Voxels at least this dense are solid, [1 / world unit]; summary.json says which density was used. Lower it if
+    walls have holes, raise it if empty space turns solid. Left out, it is automatic: the highest that 95 % of the
+    training rays that end on a surface meet within half a voxel of their end."""
     density_percentile: float | None = None
     """Voxels are solid if they are denser than this share of all voxels of the scene box, [%], 0 to 100; in the
-    Thermoxels paper 90 keeps the densest tenth. Takes the place of the optical depth."""
-    density_threshold: float | None = None
-    """Voxels at least this dense are solid, [1 / world unit]. Takes the place of optical depth and percentile."""
+    Thermoxels paper 90 keeps the densest tenth."""
     close_gaps: int = 1
     """Fill gaps and pinholes up to twice this many voxels wide, which thin walls need to be continuous. 0: none."""
     region: Literal["auto", "all"] = "auto"
@@ -86,19 +84,13 @@ class ExportOptions:
     mostly floaters, are left out. all: everything that was reconstructed."""
     region_box: tuple[float, float, float, float, float, float] | None = None
     """In place of auto: export the inside of a box, xmin ymin zmin xmax ymax zmax in coordinates of the input poses."""
-    region_near: tuple[float, float, float, float] | None = None
-    """In place of auto: export the inside of a ball, x y z radius in the coordinates of the input poses."""
     interior: Literal["solid", "hollow"] = "solid"
     """Treatment of the inside of a body if photographs show only its shell. solid: the inside is filled, but a cavity
     that holds a camera is a room and stays empty. hollow: only the shell is exported, with the thickness that training
     happened to give the shell; with --wall-thickness it is closed, as by a floor, where no camera looks."""
-    seal_openings: int = 2
-    """In the search for the inside, openings in the shell up to twice this many voxels wide count as closed."""
     wall_thickness: float | None = None
     """For facades seen from one side: make the seen surface this thick, [m], growing away from the cameras; the
     interior is then not filled."""
-    coarsest_cell: int = 4
-    """Edge of the largest cells deep inside a conforming mesh, a power of two, [voxels]; 1: as fine as the surface."""
     patches: Path | None = None
     """A yaml file that names parts of the surface and regions of the volume by box, plane or colour; see
     configs/patches-example.yaml."""
@@ -129,7 +121,7 @@ class ExportOptions:
     """Times whose temperatures are written for ParaView beside those of the start and of the end, [s]: for each the
     nearest time that the scene keeps. all: every kept time; each takes as much space as the mesh."""
     pictures: bool = True
-    """Write PNG pictures of the mesh coloured by temperature, and of its quality."""
+    """Write PNG pictures of the mesh coloured by temperature, and of how photographs support its surface."""
 
 
 @dataclass(frozen=True)
@@ -227,7 +219,6 @@ class ExportThermoxelsMesh(ExportOptions):
 def check_options(options: ExportOptions) -> CheckedOptions:
     """Return the checked options; raises `ThermoxelsError` for a wrong option before anything slow runs."""
     from thermoxels_ns.mesh.boundary.patches import PatchRules, load_patch_rules
-    from thermoxels_ns.mesh.build import MeshOptions
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
     if options.metres_per_unit is not None:
@@ -243,7 +234,6 @@ def check_options(options: ExportOptions) -> CheckedOptions:
     if not options.formats or len(set(options.formats)) < len(options.formats):
         remedy = "Pass --formats vtu glb, for example."
         raise MeshError("formats", expected="at least one format, each once", got=options.formats, remedy=remedy)
-    MeshOptions(options.boundary, options.coarsest_cell)  # raises if a value is out of range
     try:
         selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
     except MeshError as problem:
@@ -352,11 +342,11 @@ def export_snapshot(
     from thermoxels_ns.fem.solution import HeatSolution
     from thermoxels_ns.heat.solving import Goals, solve_problem
     from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, shown_states, write_heat_series
-    from thermoxels_ns.mesh.build import MeshOptions, apply_transform, build_mesh
+    from thermoxels_ns.mesh.build import apply_transform, build_mesh
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
     from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
-    from thermoxels_ns.mesh.files.surface import check_stl
-    from thermoxels_ns.mesh.quality.report import check_mesh, picture_of_quality
+    from thermoxels_ns.mesh.files.surface import check_single_precision
+    from thermoxels_ns.mesh.quality.report import check_mesh
     from thermoxels_ns.mesh.tetrahedra import support_of_facets
     from thermoxels_ns.reports import mesh_pictures
 
@@ -366,14 +356,15 @@ def export_snapshot(
     up, up_source = up_of(options, scene_file, viewpoint)
     folder = prepare_folder(output_dir)
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ world_to_input
-    mesh_options = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
-    built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options, metres)
+    built = build_mesh(
+        snapshot, checked.selection, to_mesh, options.boundary, up=up, rules=checked.rules, metres_per_unit=metres
+    )
     if depths is not None:
         built = with_support(built, depths, tracks, snapshot.lattice, to_mesh)
     mesh = built.mesh
     suffixes = [f".{name}" for name in options.formats]
-    if ".stl" in suffixes:
-        check_stl(mesh)
+    if {".stl", ".ply"} & {*suffixes}:
+        check_single_precision(mesh)
     begin_c, starting = checked.scene.initial_c, mesh
     if not mesh.has_temperatures and begin_c is not None:
         starting = replace(mesh, temperature_c=np.full(len(mesh.points_m), begin_c))
@@ -414,7 +405,8 @@ def export_snapshot(
         states = shown_states(solution.times_s, options.vtk_times)
         files += [p.relative_to(folder).as_posix() for p in heat_series_paths(folder / _HEAT, len(states))]
     if options.pictures:
-        files += [*_MESH_PICTURES, *([] if solution is None else [_HEAT_PICTURE])]
+        files += _MESH_PICTURES[: 3 if support_of_facets(mesh) is None else 4]
+        files += [] if solution is None else [_HEAT_PICTURE]
     summary = {
         "options": {field.name: getattr(options, field.name) for field in fields(options)},
         "versions": export_summary.versions(),
@@ -449,15 +441,14 @@ def export_snapshot(
     if options.pictures:
         look = {"up": up, "view_direction": viewpoint.view_direction}
         mesh_pictures.draw_mesh([folder / name for name in _MESH_PICTURES[:2]], mesh, look, unit)
-        picture_of_quality(folder / _MESH_PICTURES[2], report)
         if support_of_facets(mesh) is not None:
-            mesh_pictures.add_support(folder / _MESH_PICTURES[2], mesh, look)
+            mesh_pictures.draw_support(folder / _MESH_PICTURES[3], mesh, look)
         # Faces of the voxels that are not exported are drawn in grey.
         corners, faces = mesh_pictures.voxel_surface(built.solid.left_out)
         ghost = apply_transform(to_mesh, snapshot.lattice.index_to_world(corners)), faces
         note = "grey: left out of the region" if len(ghost[0]) else "nothing is left out"
         beside: Any = {"title": "Region", "length_unit": unit, "ghost": ghost, "note": note, **look}
-        mesh_pictures.write_picture(folder / _MESH_PICTURES[3], mesh_pictures.image_of_mesh(mesh, **beside))
+        mesh_pictures.write_picture(folder / _MESH_PICTURES[2], mesh_pictures.image_of_mesh(mesh, **beside))
         if solution is not None:
             mesh_pictures.draw_heat(folder / _HEAT_PICTURE, mesh, solution, look)
     write_json(folder / _SUMMARY, summary)

@@ -96,7 +96,7 @@ def mesh_summary(
         "bounds": {"lower": mesh.points_m.min(axis=0), "upper": mesh.points_m.max(axis=0)},
         "dihedral_angles_deg": {"min": report.dihedral_range_deg[0], "max": report.dihedral_range_deg[1]},
         "density_threshold_used": solid.threshold,
-        "density_threshold_why": solid.explanation,
+        "density_threshold_why": solid.steps[0].remark,
         "solid_steps": [
             {"step": step.name, "voxels_added": step.added, "voxels_removed": step.removed}
             | ({} if scale is None else {"litres_added": litres * step.added, "litres_removed": litres * step.removed})
@@ -125,10 +125,10 @@ def mesh_summary(
 
 def region_summary(built: BuiltMesh, selection: SolidSelection) -> dict[str, Any]:
     """Return the entry "region" of summary.json: the exported part, the mesh's extents, and the share of the solid."""
-    near, box, points = selection.region_near, selection.region_box, built.mesh.points_m
+    points = built.mesh.points_m
     left_out, found = int(built.solid.left_out.sum()), _voxels_found(built.solid)
     return {
-        "asked_for": "near a point" if near else "a box" if box else selection.region,
+        "asked_for": "a box" if selection.region_box else selection.region,
         "size": points.max(axis=0) - points.min(axis=0),
         "voxels_taken": found - left_out,
         "voxels_left_out": left_out,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
@@ -21,7 +22,6 @@ from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.mesh.build import apply_transform
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.free_space import count_cameras
-from thermoxels_ns.mesh.solid.morphology import fill_enclosed
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_areas
 from thermoxels_ns.synthetic.raycast import first_surface, visible_surface_points
@@ -88,7 +88,7 @@ def surface_fscore(
     """
     cells = check_shape("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
     transform = np.asarray(world_to_truth, dtype=np.float64)
-    solid = fill_enclosed(cells)
+    solid = np.asarray(ndimage.binary_fill_holes(cells), dtype=bool)
     corners, empty, on_border = _boundary_samples(solid, np.ones_like(solid) if within is None else within)
     if len(corners) == 0:
         return SurfaceScore(), SurfaceScore()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,24 +27,7 @@ from thermoxels_ns.mesh.temperature import (
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh, facet_normals
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
 
-
-@dataclass(frozen=True)
-class MeshOptions:
-    """Options of `build_mesh`: how solid voxels become a mesh."""
-
-    boundary: BoundaryMode = "conforming"  # along the level set of the density, or along voxel faces
-    coarsest_cell: int = 4
-    """Edge of the largest cells deep inside a conforming mesh, [voxels], a power of two; 1: all cells are one voxel."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Up direction in the coordinates of the mesh
-    rules: PatchRules = field(default_factory=PatchRules)  # The user's rules for patches and regions
-
-    def __post_init__(self) -> None:
-        coarsest = self.coarsest_cell
-        if not (isinstance(coarsest, int) and coarsest >= 1 and coarsest & (coarsest - 1) == 0):
-            expected, remedy = "1, 2, 4, 8 or another power of two, [voxels]", "Pass --coarsest-cell 4."
-            raise MeshError("coarsest_cell", expected=expected, got=repr(coarsest), remedy=remedy)
-        if self.boundary not in ("conforming", "voxel"):
-            raise MeshError("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")
+_NO_RULES = PatchRules()
 
 
 @dataclass(frozen=True)
@@ -66,7 +49,10 @@ def build_mesh(
     snapshot: GridSnapshot,
     selection: SolidSelection,
     world_to_metres: FloatArray,
-    options: MeshOptions = MeshOptions(),
+    boundary: BoundaryMode = "conforming",
+    *,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    rules: PatchRules = _NO_RULES,
     metres_per_unit: float = 1.0,
 ) -> BuiltMesh:
     """Return a mesh of the solid part of a trained field, with nodal temperatures, regions and boundary tags.
@@ -80,21 +66,25 @@ def build_mesh(
         world_to_metres: Similarity (rotation or reflection, one scale, shift), shape (4, 4), that maps homogeneous
             column vectors of the trained scene to metres. After a reflection, nodes are reordered so that volumes stay
             positive.
-        options: Kind of boundary, size of cells, up direction and rules for tags.
-        metres_per_unit: Length, [m], of the unit of the input poses, in which the region's box or point is given.
+        boundary: Whether the boundary follows the level set of the density, or voxel faces.
+        up: Up direction in the coordinates of the mesh.
+        rules: The user's rules for patches and regions.
+        metres_per_unit: Length, [m], of the unit of the input poses, in which the region's box is given.
 
     Raises:
         MeshError: `select_solid` fails, or no node of the mesh was measured.
     """
+    if boundary not in ("conforming", "voxel"):
+        raise MeshError("boundary", expected="conforming or voxel", got=boundary, remedy="Pass one of them.")
     transform = np.asarray(world_to_metres, dtype=np.float64)
-    scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), options.boundary == "voxel"
+    scale, voxel = float(np.cbrt(abs(np.linalg.det(transform[:3, :3])))), boundary == "voxel"
     solid = select_solid(snapshot, selection, scale, transform[:3] / metres_per_unit)
     if voxel:
         corners, tets = kuhn_tets(solid.cells)
         points, facets = corners.astype(np.float64), boundary_facets(tets)
     else:
         level = level_of(snapshot.centre_density(), solid.threshold, solid.dense, solid.cells)
-        stuffed = sharpen(stuff(level, options.coarsest_cell), level.shape)
+        stuffed = sharpen(stuff(level), level.shape)
         points, tets, facets = stuffed.points, stuffed.tets, stuffed.facets
     known, observed_range_c = snapshot.temperature_c, None
     temperature_c, observed = np.full(len(points), np.nan), np.zeros(len(points), dtype=bool)
@@ -109,7 +99,7 @@ def build_mesh(
     num_voxels = 0
     if parts:
         stays = ~unseen[body]
-        goes = _voxels_of(solid.cells, points, tets, ~stays, voxel)
+        goes = _bodies_at(solid.cells, points[tets[~stays[tets[:, 0]]]].mean(axis=1))
         num_voxels = int(np.count_nonzero(goes))
         solid = replace(solid, cells=solid.cells & ~goes)
         number = np.cumsum(stays) - 1
@@ -133,7 +123,7 @@ def build_mesh(
         found, near = interpolate_corners(points, snapshot.colour, snapshot.density > 0.0)
         colour = np.where(near[:, None] > 0.0, found, 0.5).astype(np.float32)
     of_tets = points_m[tets].mean(axis=1), None if colour is None else colour[tets].mean(axis=1)
-    region, region_names, idle_regions = apply_regions(options.rules, *of_tets)
+    region, region_names, idle_regions = apply_regions(rules, *of_tets)
     mesh = TetMesh(
         points_m=points_m,
         tets=np.ascontiguousarray(tets),
@@ -145,23 +135,19 @@ def build_mesh(
         region_names=region_names,
         colour=colour,
     )
-    boundary, idle_patches = _tagged(mesh, points, solid, snapshot, transform[:3, :3] / scale, options)
+    tags, idle_patches = _tagged(mesh, points, solid, snapshot, transform[:3, :3] / scale, up, rules)
     return BuiltMesh(
-        replace(mesh, boundary=boundary), solid, parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
+        replace(mesh, boundary=tags), solid, parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
     )
 
 
-def _voxels_of(cells: BoolArray, points: FloatArray, tets: IntArray, nodes: BoolArray, voxel: bool) -> BoolArray:
-    """Return the solid voxels of all bodies of the mesh that have a marked node; `nodes` is the mask, shape (n,)."""
-    if voxel:
-        inside = points[tets[nodes[tets[:, 0]]]].mean(axis=1)
-    else:  # nodes at voxel centres: every body has one, and voxels that share a face are in one body
-        inside = points[nodes][np.all(points[nodes] % 1.0 == 0.5, axis=1)]
+def _bodies_at(cells: BoolArray, points: FloatArray) -> BoolArray:
+    """Return the solid voxels of all bodies of voxels, joined by faces, in which one of the points (n, 3) lies."""
     body = face_connected(cells)
-    goes = np.zeros(int(body.max()) + 1, dtype=bool)
-    goes[body[tuple(np.floor(inside).astype(np.int64).T)]] = True
-    goes[0] = False
-    return goes[body]
+    chosen = np.zeros(int(body.max()) + 1, dtype=bool)
+    chosen[body[tuple(np.floor(points).astype(np.int64).T)]] = True
+    chosen[0] = False
+    return chosen[body]
 
 
 def _cut_by_region(points: FloatArray, facets: IntArray, within: BoolArray) -> BoolArray:
@@ -180,7 +166,8 @@ def _tagged(
     solid: SolidCells,
     snapshot: GridSnapshot,
     rotation: FloatArray,
-    options: MeshOptions,
+    up: tuple[float, float, float],
+    rules: PatchRules,
 ) -> tuple[Boundary, tuple[str, ...]]:
     """Return the tags of all boundary triangles and the idle rules; without cameras all triangles count as seen."""
     normal = facet_normals(mesh.points_m, mesh.facets)
@@ -196,10 +183,10 @@ def _tagged(
         # In a building with rooms, what faces none is outside, seen or not, as below the lowest floor.
         outside = ~inner if np.count_nonzero(inner) > 0.5 * np.count_nonzero(~seen) else seen
     patch, names, idle = apply_patches(
-        options.rules,
+        rules,
         centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
         normals=normal,
-        up=options.up,
+        up=up,
         seen=outside,
         on_box=mesh.facet_tags == FACET_BOX,
         colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),

@@ -47,10 +47,7 @@ def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
 
 def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tuple[int, ...]) -> IntArray:
     """Return `FACET_BOX` for facets on a side of the lattice, else `FACET_SURFACE`, (f,); points are corner indices."""
-    # Each side of the lattice has one bit; a triangle lies on the sides that its three nodes have in common.
-    sides = np.zeros(len(points_index), dtype=np.uint8)
-    for axis, count in enumerate(lattice_shape):
-        sides |= (points_index[:, axis] == 0).astype(np.uint8) << (2 * axis)
-        sides |= (points_index[:, axis] == count - 1).astype(np.uint8) << (2 * axis + 1)
-    common = sides[facets[:, 0]] & sides[facets[:, 1]] & sides[facets[:, 2]]
-    return np.where(common > 0, FACET_BOX, FACET_SURFACE).astype(np.int64)
+    # A triangle lies on the sides of the lattice, of which there are six, that its three nodes have in common.
+    sides = np.concatenate([points_index == 0, points_index == np.array(lattice_shape) - 1], axis=1)
+    on_box = sides[facets].all(axis=1).any(axis=1)
+    return np.where(on_box, FACET_BOX, FACET_SURFACE).astype(np.int64)

@@ -325,26 +325,19 @@ def cut_open(
     return np.array(surface.points, np.float64), facets, np.array(surface.point_data["value"], np.float64), view
 
 
-def add_support(path: Path, mesh: TetMesh, look: Mapping[str, Any]) -> None:
-    """Append to a picture file two views of the mesh, from opposite sides, coloured by the classes of `SUPPORT`.
+def draw_support(path: Path, mesh: TetMesh, look: Mapping[str, Any]) -> None:
+    """Write a picture of two views of the mesh, from opposite sides, coloured by the classes of `SUPPORT`.
 
     `look` are the arguments `up` and `view_direction` of `image_of_surface`; `mesh.boundary.photographs` must be known.
     """
-    from PIL import Image
-
     support = support_of_facets(mesh)
     assert support is not None
     painted = [(*of, support == number) for number, of in enumerate(zip(SUPPORT.values(), _SUPPORT_COLOURS))]
     painted.append(("cut by the scene box or the region", "white", support < 0))
-    with Image.open(path) as image:
-        above = np.asarray(image.convert("RGB"))
-    width, up = above.shape[1] // 2, _unit("up", look["up"])
-    ahead = -_towards_camera(look["up"], look["view_direction"])
-    beside = {"painted": painted, "up": up, "window_size": (width, width)}
+    up, ahead = _unit("up", look["up"]), -_towards_camera(look["up"], look["view_direction"])
+    beside = {"painted": painted, "up": up, "window_size": (700, 700)}
     panels = [
         image_of_mesh(mesh, title="Support by photographs", view_direction=ahead, **beside),
         image_of_mesh(mesh, title="From the other side", view_direction=2.0 * (ahead @ up) * up - ahead, **beside),
     ]
-    row = np.full((width, *above.shape[1:]), 255, dtype=np.uint8)
-    row[:, : 2 * width] = np.concatenate(panels, axis=1)
-    write_picture(path, np.concatenate((above, row)))
+    write_picture(path, np.concatenate(panels, axis=1))

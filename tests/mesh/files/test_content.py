@@ -50,10 +50,11 @@ def test_a_damaged_mesh_is_refused(tagged_mesh, field, change):
 def test_every_format_writes_the_files_that_it_names_and_the_same_bytes_again(tmp_path, tagged_mesh, box_mesh, suffix):
     write_mesh(tmp_path / f"untagged{suffix}", box_mesh, heat_step=STEP)
     path, again = (tmp_path / folder / f"house{suffix}" for folder in ("new folder", "another"))
-    assert write_mesh(path, tagged_mesh, heat_step=STEP) == mesh_file_paths(path)
+    for file in (path, again):
+        write_mesh(file, tagged_mesh, heat_step=STEP)
     assert {path, *mesh_file_paths(path)} == set(path.parent.iterdir())
     assert all(file.stat().st_size for file in mesh_file_paths(path))
-    for first, second in zip(mesh_file_paths(path), write_mesh(again, tagged_mesh, heat_step=STEP)):
+    for first, second in zip(mesh_file_paths(path), mesh_file_paths(again)):
         assert first.read_bytes() == second.read_bytes()
 
 
@@ -93,27 +94,25 @@ def test_stl_is_the_closed_surface(tmp_path, tagged_mesh):
     assert normals == pytest.approx(facet_normals(tagged_mesh.points_m, tagged_mesh.facets), abs=1e-6)
 
 
-def test_stl_far_from_the_origin_is_refused_and_ply_holds_it(tmp_path, tagged_mesh):
+@pytest.mark.parametrize("suffix", [".stl", ".ply"])
+def test_single_precision_far_from_the_origin_is_refused(tmp_path, tagged_mesh, suffix):
     """At five million metres single precision has steps of half a metre, wider than the triangles."""
     far = replace(tagged_mesh, points_m=tagged_mesh.points_m + np.array([450_000.3, 5_200_000.4, 300.0]))
-    with pytest.raises(MeshError, match=r"^mesh for \.stl: .*Write \.ply"):
-        write_mesh(tmp_path / "far.stl", far)
+    with pytest.raises(MeshError, match=r"^mesh for \.stl or \.ply: .*Write \.glb"):
+        write_mesh(tmp_path / f"far{suffix}", far)
     assert not list(tmp_path.iterdir())
-    write_ply(tmp_path / "far.ply", far)
-    assert np.array_equal(meshio.read(tmp_path / "far.ply").points, far.points_m[nodes_and_triangles(far.facets)[0]])
 
 
 def test_ply_holds_colours_of_the_photographs_and_temperatures(tmp_path, tagged_mesh):
     write_ply(tmp_path / "house.ply", tagged_mesh)
     read = meshio.read(tmp_path / "house.ply")
     nodes, _ = nodes_and_triangles(tagged_mesh.facets)
-    assert np.array_equal(read.points, tagged_mesh.points_m[nodes])
+    assert np.array_equal(read.points, tagged_mesh.points_m[nodes].astype(np.float32))
     assert np.array_equal(nodes[read.cells_dict["triangle"]], tagged_mesh.facets)
     assert read.point_data["temperature_c"] == pytest.approx(tagged_mesh.temperature_c[nodes], rel=1e-6)
     assert np.array_equal(read.point_data["observed"], tagged_mesh.observed[nodes])
     rgb = colours(read)
     assert np.abs(rgb / 255.0 - tagged_mesh.colour[nodes]).max() <= 0.5 / 255.0 + 1e-6
-    assert b"comment colours: photographs\n" in (tmp_path / "house.ply").read_bytes()
 
 
 def test_ply_without_photographs_is_coloured_by_temperature(tmp_path, box_mesh):
@@ -125,8 +124,6 @@ def test_ply_without_photographs_is_coloured_by_temperature(tmp_path, box_mesh):
     order = np.argsort(read.point_data["temperature_c"])
     assert np.all(np.diff(brightness[order]) > -1.0)
     assert brightness[order[-1]] > 4.0 * brightness[order[0]]
-    comment = f"inferno from {box_mesh.temperature_c.min():.6g} to {box_mesh.temperature_c.max():.6g} degrees Celsius"
-    assert comment.encode() in (tmp_path / "box.ply").read_bytes()
 
 
 def read_glb(path: Path) -> tuple[trimesh.Trimesh, np.ndarray]:

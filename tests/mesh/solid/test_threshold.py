@@ -102,15 +102,14 @@ def test_without_evidence_the_rule_is_an_optical_depth_and_says_so():
     few = field(wall_in_fog(), np.ones(FEWEST_RAYS - 1))
     for snapshot in (replace(few, evidence=None), few):
         chosen = automatic(snapshot)
-        fixed = dense_voxels(snapshot, snapshot.centre_density(), SolidSelection(voxel_optical_depth=0.5))
+        fixed = dense_voxels(snapshot, snapshot.centre_density(), SolidSelection(density_threshold=0.5 / VOXEL))
         assert chosen.density == fixed.density == 2.0 and np.array_equal(chosen.cells, fixed.cells)
-        assert "optical depth 0.5" in select_solid(snapshot, SolidSelection()).explanation
+        assert "optical depth 0.5" in select_solid(snapshot, SolidSelection()).steps[0].remark
 
 
 def test_a_threshold_of_the_user_goes_before_the_automatic_one():
     snapshot = field(wall_in_fog(), MET)
     assert select_solid(snapshot, SolidSelection(density_threshold=7.0)).threshold == 7.0
-    assert select_solid(snapshot, SolidSelection(voxel_optical_depth=1.25)).threshold == 5.0
     highest = np.percentile(snapshot.centre_density(), 99.5)
     assert select_solid(snapshot, SolidSelection(density_percentile=99.5)).threshold == highest
     assert select_solid(snapshot, SolidSelection()).threshold == 2.0

@@ -7,6 +7,7 @@ from tests.support.stuffed_shapes import (
     Shape,
     box_distance,
     centres,
+    on_surface,
     tet_mesh,
     turn,
     volumes_and_angles,
@@ -105,7 +106,7 @@ def test_angles_move_length_and_topology_are_as_promised():
         solid, sharp, nodes = sharpened(turned_box((0.5, 0.4, 0.3), seed).level(32, 1.0))
         assert len(nodes) > 100
         assert np.all(np.linalg.norm(sharp.points - solid.points, axis=1) <= 1.0)
-        assert solid.on_surface[nodes].all()
+        assert on_surface(solid)[nodes].all()
         assert sharp.tets is solid.tets and sharp.facets is solid.facets
         around = solid.tets[np.isin(solid.tets, nodes).any(axis=1)]
         _, low, high = volumes_and_angles(sharp.points, around)
@@ -129,7 +130,7 @@ def test_smooth_and_noisy_surfaces_stay(name, noise):
     level = SHAPES[name].level(CELLS)
     level += noise * np.random.default_rng(1).normal(size=level.shape)
     solid, sharp, nodes = sharpened(level)
-    assert len(nodes) <= 2e-4 * np.count_nonzero(solid.on_surface)
+    assert len(nodes) <= 2e-4 * np.count_nonzero(on_surface(solid))
     assert relative_errors(SHAPES[name], sharp)[1] == pytest.approx(relative_errors(SHAPES[name], solid)[1], abs=1e-3)
 
 

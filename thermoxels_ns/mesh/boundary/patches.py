@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import yaml
+from pydantic import Field
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, check_finite, check_shape, replace_when_done
@@ -28,8 +29,9 @@ DEFAULT_PATCHES = (*(f"{where}-{facing}" for where in ("exterior", "interior") f
 DEFAULT_REGION = "solid"  # Name of region 0
 
 Vector = tuple[float, float, float]
+_Byte = Annotated[int, Field(ge=0, le=255)]
 
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")
+_NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")  # solvers do not tell capitals from small letters
 _COS_45 = math.sqrt(0.5) + 1e-9
 """A little above the cosine of 45 degrees, so that a roof of exactly 45 degrees counts as a side despite rounding."""
 
@@ -53,11 +55,9 @@ class Plane:
 
     point: Vector  # Any point of the plane, [m]
     normal: Vector  # Direction across the plane, of any length above 0
-    depth: float = math.inf  # Largest distance from the plane, [m]
+    depth: Annotated[float, Field(gt=0)] = math.inf  # Largest distance from the plane, [m]
 
     def __post_init__(self) -> None:
-        if not self.depth > 0.0:
-            raise wrong("depth", "a number above 0, [m]", self.depth)
         if not (all(map(math.isfinite, self.point)) and 0.0 < math.hypot(*self.normal) < math.inf):
             got = f"{[*self.point]} and {[*self.normal]}"
             raise wrong("point and normal", "finite numbers, and a normal that is not 0", got, "Correct them.")
@@ -67,29 +67,13 @@ class Plane:
 class Colour:
     """Condition of a rule: the element's colour is at most `max_distance` from `rgb`."""
 
-    rgb: tuple[int | float, int | float, int | float]  # Whole numbers from 0 to 255 or decimals from 0.0 to 1.0
-    max_distance: float = math.inf  # Largest Euclidean distance to `rgb`, on the same scale
-
-    def __post_init__(self) -> None:
-        if not all(0.0 <= float(part) <= 255.0 for part in self.rgb):
-            raise wrong("rgb", "three numbers from 0 to 255, or from 0.0 to 1.0", [*self.rgb])
-        if all(isinstance(part, int) for part in self.rgb) and max(map(float, self.rgb)) == 1.0:
-            bright, dark = [float(part) for part in self.rgb], [round(float(part) / 255.0, 4) for part in self.rgb]
-            raise wrong(
-                "rgb",
-                "whole numbers up to 255 or decimals up to 1.0",
-                f"{[*self.rgb]}, which may be either",
-                f"Write {bright} for a bright colour or {dark} for a dark one.",
-            )
-        if not self.max_distance > 0.0:
-            raise wrong("max_distance", "a number above 0, on the scale of rgb", self.max_distance)
+    rgb: tuple[_Byte, _Byte, _Byte]  # Red, green and blue, whole numbers from 0 to 255
+    max_distance: Annotated[float, Field(gt=0)] = math.inf  # Largest Euclidean distance to `rgb`, on the same scale
 
     def distance(self, colours: npt.NDArray) -> FloatArray:
         """Return the distances (n,) of colours (n, 3), in [0, 1], to `rgb`; infinite if beyond `max_distance`."""
-        whole = all(isinstance(part, int) for part in self.rgb) or max(map(float, self.rgb)) > 1.0
-        scale = 255.0 if whole else 1.0
-        distance = np.linalg.norm(colours - np.array(self.rgb, dtype=np.float64) / scale, axis=1)
-        return np.where(distance <= self.max_distance / scale, distance, np.inf)
+        distance = np.linalg.norm(colours - np.array(self.rgb) / 255.0, axis=1)
+        return np.where(distance <= self.max_distance / 255.0, distance, np.inf)
 
 
 @dataclass(frozen=True)
@@ -104,7 +88,7 @@ class RegionRule:
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
-            expected = "up to 40 letters, digits, - and _ that start with a letter"
+            expected = "up to 40 small letters, digits, - and _ that start with a letter"
             raise wrong("name", expected, repr(self.name), "Rename it.")
         conditions = [*vars(self)][1:]
         if all(getattr(self, key) is None for key in conditions):
@@ -145,14 +129,10 @@ def load_patch_rules(path: Path | str) -> PatchRules:
         ("patches", rules.patches, DEFAULT_PATCHES),
         ("regions", rules.regions, (DEFAULT_REGION,)),
     ):
-        known = {name.lower(): name for name in taken}
         for number, entry in enumerate(entries, start=1):
-            before = known.setdefault(entry.name.lower(), entry.name)
-            if before in taken or before != entry.name:
-                others = f"a name other than {', '.join(taken)}"
-                expected = others if before in taken else f"{before}, as above, or another"
-                remedy = "Choose another name; solvers do not tell capitals from small letters."
-                raise wrong(f"{path.name}: {kind} entry {number}: name", expected, entry.name, remedy)
+            if entry.name in taken:
+                name, expected = f"{path.name}: {kind} entry {number}: name", f"a name other than {', '.join(taken)}"
+                raise wrong(name, expected, entry.name, "Choose another name.")
     return rules
 
 
@@ -252,17 +232,15 @@ def with_patches(mesh: TetMesh, rules: PatchRules, up: npt.ArrayLike) -> tuple[T
 
 def write_patch_rules(path: Path, rules: PatchRules, heading: str) -> None:
     """Write rules for patches as a yaml file that `load_patch_rules` reads, below a comment of one line."""
-    plain = [_plain(rule) for rule in rules.patches]
+    plain = [asdict(rule, dict_factory=_told) for rule in rules.patches]
     lines = (yaml.safe_dump(one, default_flow_style=True, sort_keys=False, width=10_000) for one in plain)
     with replace_when_done(path) as temporary:
         temporary.write_text(f"# {heading}\npatches:\n" + "".join(f"  - {line}" for line in lines), encoding="utf-8")
 
 
-def _plain(value: Any) -> Any:
-    """Return a rule as lists and mappings, without what it leaves open."""
-    if is_dataclass(value):
-        return {name: _plain(one) for name, one in vars(value).items() if one is not None and one != math.inf}
-    return [*value] if isinstance(value, tuple) else value
+def _told(fields: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the fields of a rule without those that leave a condition open."""
+    return {name: value for name, value in fields if value is not None and value != math.inf}
 
 
 def apply_regions(rules: PatchRules, tet_centroids: FloatArray, tet_colours: npt.NDArray | None = None) -> Applied:

@@ -23,18 +23,45 @@ _UNLIT = "KHR_materials_unlit"
 
 
 def write_stl(path: Path | str, mesh: TetMesh) -> None:
-    """Write the boundary triangles as binary STL, shape only, lengths in [m]; raise `MeshError` as `check_stl` does."""
+    """Write the boundary triangles as binary STL, shape only, lengths in [m]; raises `MeshError` far from the origin.
+
+    See `check_single_precision`.
+    """
     from trimesh import Trimesh
     from trimesh.exchange.stl import export_stl
 
-    path = Path(path)
     mesh.check()
-    check_stl(mesh)
-    write_bytes(path, [export_stl(Trimesh(mesh.points_m, mesh.facets, process=False))])
+    check_single_precision(mesh)
+    write_bytes(Path(path), [export_stl(Trimesh(mesh.points_m, mesh.facets, process=False))])
 
 
-def check_stl(mesh: TetMesh) -> None:
-    """Check that the single precision of STL suffices for a mesh's shape, as it does near the origin.
+def write_ply(path: Path | str, mesh: TetMesh) -> None:
+    """Write the boundary as binary PLY with colours and temperatures (read by MeshLab, CloudCompare, Blender).
+
+    Vertex properties: x, y, z [m], red, green, blue, alpha and, if temperatures are known, `temperature_c` [degrees
+    Celsius] and `observed`. The colours are those of the photographs, or stand for temperatures if the mesh has no
+    colours. Raises `MeshError` far from the origin, see `check_single_precision`.
+    """
+    from trimesh import Trimesh
+    from trimesh.exchange.ply import export_ply
+
+    mesh.check()
+    check_single_precision(mesh)
+    nodes, triangles = nodes_and_triangles(mesh.facets)
+    temperature_c = mesh.temperature_c[nodes]
+    by_temperature = mesh.colour is None and mesh.has_temperatures
+    colours = _temperature_colours(temperature_c) if by_temperature else _photographed_colours(mesh)[nodes]
+    known: dict[str, Any] = {}
+    if mesh.has_temperatures:
+        known = {"temperature_c": temperature_c.astype(np.float32), "observed": mesh.observed[nodes].astype(np.uint8)}
+    shown = Trimesh(
+        mesh.points_m[nodes], triangles, process=False, vertex_colors=colour_bytes(colours), vertex_attributes=known
+    )
+    write_bytes(Path(path), [export_ply(shown, vertex_normal=False)])
+
+
+def check_single_precision(mesh: TetMesh) -> None:
+    """Check that the single precision of .stl and .ply suffices for a mesh's shape, as it does near the origin.
 
     Raises:
         MeshError: Rounding would move nodes by more than a hundredth of the side of a mean triangle.
@@ -45,55 +72,10 @@ def check_stl(mesh: TetMesh) -> None:
     farthest = float(np.abs(mesh.points_m[mesh.facets]).max())
     rounding = 0.5 * float(np.spacing(np.float32(farthest)))
     if rounding > _ROUNDING_NOTICED * side:
-        expected = "coordinates near the origin, because STL has single precision"
+        expected = "coordinates near the origin, because these formats have single precision"
         got = f"one at {farthest:.6g}, where single precision moves nodes by up to {rounding:.3g}"
-        remedy = "Write .ply, which has double precision, or shift the poses towards the origin."
-        raise MeshError("mesh for .stl", expected=expected, got=got, remedy=remedy)
-
-
-def write_ply(path: Path | str, mesh: TetMesh) -> None:
-    """Write the boundary as binary PLY with colours and temperatures (read by MeshLab, CloudCompare, Blender).
-
-    Vertex properties: x, y, z [m], red, green, blue, `temperature_c` [degrees Celsius] and `observed`. The colours are
-    those of the photographs, or stand for temperatures if the mesh has no colours; a comment in the file says which.
-    Positions have double precision, which trimesh and VTK do not write.
-    """
-    path = Path(path)
-    mesh.check()
-    nodes, triangles = nodes_and_triangles(mesh.facets)
-    points, temperature_c = mesh.points_m[nodes], mesh.temperature_c[nodes]
-    if mesh.colour is None and mesh.has_temperatures:
-        low, high = _range_c(temperature_c)
-        shown = f"{_COLOUR_MAP} from {low:.6g} to {high:.6g} degrees Celsius"
-        colours = colour_bytes(_temperature_colours(temperature_c))
-    else:
-        shown, colours = "photographs", colour_bytes(_photographed_colours(mesh)[nodes])
-    columns = {
-        **{name: ("double", "<f8", values) for name, values in zip("xyz", points.T)},
-        **{name: ("uchar", "u1", values) for name, values in zip(("red", "green", "blue"), colours.T)},
-    }
-    if mesh.has_temperatures:
-        columns["temperature_c"] = ("float", "<f4", temperature_c)
-        columns["observed"] = ("uchar", "u1", mesh.observed[nodes])
-    vertices = np.empty(len(nodes), dtype=[(name, kind) for name, (_, kind, _) in columns.items()])
-    for name, (_, _, values) in columns.items():
-        vertices[name] = values
-    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("nodes", "<i4", 3)])
-    faces["count"] = 3
-    faces["nodes"] = triangles
-
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment surface of a tetrahedral mesh, metres",
-        f"comment colours: {shown}",
-        f"element vertex {len(vertices)}",
-        *(f"property {kind} {name}" for name, (kind, _, _) in columns.items()),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header\n",
-    ]
-    write_bytes(path, ["\n".join(header).encode("ascii"), vertices.tobytes(), faces.tobytes()])
+        remedy = "Write .glb or .vtu, which hold such places, or shift the poses towards the origin."
+        raise MeshError("mesh for .stl or .ply", expected=expected, got=got, remedy=remedy)
 
 
 def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:

@@ -138,15 +138,14 @@ def read_surface(path: Path) -> TetMesh:
     data = _read(path)
     points = np.array(data.points, dtype=np.float64)
     data.point_data["node"] = np.arange(len(points))  # not those of the mesh, which is not there
-    facets, tags = _boundary(data, points, path.name)
-    on_box = _array(data.cell_data, "on_box", path.name) != 0
+    facets, facet_tags, tags = _boundary(data, points, path.name)
     return TetMesh(
         points_m=points,
         tets=np.zeros((0, 4), dtype=np.int64),
         temperature_c=_array(data.point_data, "temperature_c", path.name).astype(np.float64),
         observed=_array(data.point_data, "observed", path.name) != 0,
         facets=facets,
-        facet_tags=np.where(on_box, FACET_BOX, FACET_SURFACE).astype(np.int64),
+        facet_tags=facet_tags,
         region=np.zeros(0, dtype=np.int64),
         boundary=tags,
     )
@@ -329,8 +328,7 @@ def mesh_of(body: Any, surface: Any, name: str = BODY, beside: str = BOUNDARY) -
     _check_tetrahedra(body, name)
     points = np.array(body.points, dtype=np.float64)
     colour = body.point_data.get("colour")
-    facets, tags = _boundary(surface, points, beside)
-    on_box = _array(surface.cell_data, "on_box", beside) != 0
+    facets, facet_tags, tags = _boundary(surface, points, beside)
     region, region_names = _numbered(_array(body.cell_data, "region", name), _names(body, name))
     alone = not {"temperature_c", "observed"} & set(body.point_data.keys())  # photographs alone trained
     temperature_c, observed = np.full(len(points), np.nan), np.zeros(len(points), dtype=bool)
@@ -343,7 +341,7 @@ def mesh_of(body: Any, surface: Any, name: str = BODY, beside: str = BOUNDARY) -
         temperature_c=temperature_c,
         observed=observed,
         facets=facets,
-        facet_tags=np.where(on_box, FACET_BOX, FACET_SURFACE).astype(np.int64),
+        facet_tags=facet_tags,
         region=region,
         region_names=region_names,
         boundary=tags,
@@ -442,8 +440,8 @@ def _names(body: Any, name: str) -> tuple[str, ...]:
     return tuple(numbers[number] for number in range(1, len(numbers) + 1))
 
 
-def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Boundary | None]:
-    """Return the boundary triangles (f, 3) and their tags; the tags are None for a mesh written without tags."""
+def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, IntArray, Boundary | None]:
+    """Return triangles (f, 3), their `FACET_BOX` or `FACET_SURFACE`, and tags; None for a mesh written without tags."""
 
     def array(of: str) -> npt.NDArray:
         return _array(surface.cell_data, of, name)
@@ -457,8 +455,9 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Bo
     if not surface.is_all_triangles:
         raise _wrong(name, "triangles only", "other polygons")
     facets = node[np.asarray(surface.regular_faces, dtype=np.int64)]
+    facet_tags = np.where(array("on_box") != 0, FACET_BOX, FACET_SURFACE).astype(np.int64)
     if "seen" not in surface.cell_data and array("patch").dtype.kind != "U":
-        return facets, None
+        return facets, facet_tags, None
     names = surface.GetFieldData().GetAbstractArray("patch_names")
     if names is None:
         raise _wrong(name, "the field array patch_names", "none")
@@ -466,11 +465,15 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Bo
     patch, patch_names = _numbered(array("patch"), every)
     counts = [f"photographs_{what}" for what in ("seen", "supporting")]
     counted = any(count in surface.cell_data for count in counts)
-    return facets, Boundary(
-        seen=array("seen") != 0 if "seen" in surface.cell_data else np.ones(len(facets), dtype=bool),
-        patch=patch,
-        patch_names=patch_names,
-        photographs=np.stack([array(count) for count in counts], axis=1).astype(np.int64) if counted else None,
+    return (
+        facets,
+        facet_tags,
+        Boundary(
+            seen=array("seen") != 0 if "seen" in surface.cell_data else np.ones(len(facets), dtype=bool),
+            patch=patch,
+            patch_names=patch_names,
+            photographs=np.stack([array(count) for count in counts], axis=1).astype(np.int64) if counted else None,
+        ),
     )
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_normals
 
@@ -182,19 +182,3 @@ def count_tets_in_other_bodies(mesh: TetMesh) -> int:
             own = pv.UnstructuredGrid({pv.CellType.TETRA: tets[body == number]}, points)
             found += int(np.count_nonzero(np.atleast_1d(own.find_containing_cell(centres[near])) >= 0))
     return found
-
-
-def surface_components(points: FloatArray, facets: IntArray, sides: Groups) -> BoolArray:
-    """Return for each part of a surface, joined by edges, whether it bounds a hole inside a body, shape (parts,).
-
-    Such a part is closed, and its normals point inwards, so that its signed volume is negative. `sides` is
-    `group_sides(facets)`.
-    """
-    left, right = sides.pairs()
-    component = component_of(len(facets), left // 3, right // 3)
-    count = int(component.max(initial=-1)) + 1
-    closed = np.bincount(component[sides.first // 3], sides.sizes % 2, count) == 0
-    # Signed volumes of the cones from the mean of the nodes to the triangles.
-    corner = (points - points.mean(axis=0))[facets]
-    cones = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6.0
-    return closed & (np.bincount(component, cones, count) < 0.0)

@@ -14,7 +14,7 @@ from thermoxels_ns.core.arrays import BoolArray, Float32Array
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid.free_space import count_cameras
-from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow, repeated
+from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow
 
 LARGEST_PASS = 4_000_000  # in larger lattices, hidden space is found per block of 2^3, 4^3, ... voxels
 SHADOW_SURROUNDED = 0.1
@@ -33,9 +33,9 @@ THINNEST_GROWN = 1.5
 class Interior:
     """The empty voxels that lie inside a solid."""
 
-    enclosed: BoolArray  # voxels of cavities that have no way out through voxel faces and no camera in them
-    hidden: BoolArray
-    """Other voxels that no camera sees, behind the surface and within the convex hull of a body."""
+    inside: BoolArray
+    """Voxels of cavities that have no way out through voxel faces and no camera in them, and voxels that no camera
+    sees, behind the surface and within the convex hull of a body."""
     rooms: int  # cavities left empty because a camera stands in them
 
 
@@ -51,14 +51,12 @@ def interior(
     found as solid and adds crevices that these hide, where surfaces surround them well (`CREVICE_SURROUNDED`).
     """
     sealed, within = close_gaps(cells, seal), np.ones_like(cells) if within is None else within
-    enclosed, room = _enclosed(cells, sealed, lattice, views, seal)
-    rooms = int(face_connected(room).max()) if room.any() else 0
-    if views is None or len(views.focal) == 0:
-        return Interior(enclosed & within, np.zeros_like(cells), rooms)
-    hidden = _hidden(sealed, within, lattice, views, seal) & ~cells & ~enclosed
-    # Cavities that the filled space encloses are inside as well.
-    cavity, _ = _cavities(cells | enclosed | hidden, room | _camera_voxels(cells, lattice, views))
-    return Interior(enclosed & within, (hidden | cavity) & within, rooms)
+    inside, room = _enclosed(cells, sealed, lattice, views, seal)
+    if views is not None and len(views.focal):
+        inside |= _hidden(sealed, within, lattice, views, seal) & ~cells
+        # Cavities that the filled space encloses are inside as well.
+        inside |= _cavities(cells | inside, room | _camera_voxels(cells, lattice, views))[0]
+    return Interior(inside & within, int(face_connected(room).max()) if room.any() else 0)
 
 
 def _enclosed(
@@ -139,7 +137,8 @@ def _hidden_in_blocks(
 
     # The empty voxels of a block with a piece of the shell are inside if they are connected to a hidden block.
     inside = tuple(slice(n) for n in shape)
-    seeds, partly = repeated(hidden & ~coarse, block)[inside], repeated(coarse, block)[inside] & ~sealed
+    voxels = np.ones((block, block, block), dtype=bool)
+    seeds, partly = np.kron(hidden & ~coarse, voxels)[inside], np.kron(coarse, voxels)[inside] & ~sealed
     touching = ndimage.generate_binary_structure(3, 1)
     # The longest connection is in a corner of the shell: across the block along all three axes.
     inner = ndimage.binary_dilation(seeds, touching, iterations=3 * (block - 1), mask=partly)

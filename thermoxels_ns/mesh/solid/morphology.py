@@ -16,13 +16,10 @@ def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
     >>> bounding_box(np.array([[[False, False, True, True, False]]]), 1)
     (slice(0, 2, None), slice(0, 2, None), slice(1, 5, None))
     """
-    box = ()
-    for axis in range(3):
-        used = np.flatnonzero(cells[box].any(axis=tuple({0, 1, 2} - {axis})))
-        if len(used) == 0:
-            return (slice(0, 0),) * 3
-        box = (*box, slice(int(used[0]), int(used[-1]) + 1))
-    return tuple(slice(max(part.start - margin, 0), part.stop + margin) for part in box)
+    found = ndimage.find_objects(cells.view(np.int8))
+    if not found:
+        return (slice(0, 0),) * 3
+    return tuple(slice(max(part.start - margin, 0), part.stop + margin) for part in found[0])
 
 
 def face_connected(cells: BoolArray) -> npt.NDArray[np.int32]:
@@ -38,17 +35,6 @@ def connected(cells: BoolArray, connectivity: int = 3) -> npt.NDArray[np.int32]:
     ndimage.label(cells[box], ndimage.generate_binary_structure(3, connectivity), output=inside)
     labels[box] = inside
     return labels
-
-
-def repeated(values: npt.NDArray, times: int) -> npt.NDArray:
-    """Return an array with every entry repeated `times` times along each of the three axes.
-
-    >>> repeated(np.array([[[1, 2]]]), 2)[1].tolist()
-    [[1, 1, 2, 2], [1, 1, 2, 2]]
-    """
-    for axis in range(3):
-        values = np.repeat(values, times, axis=axis)
-    return values
 
 
 def grow(cells: BoolArray, by: int) -> BoolArray:
@@ -83,19 +69,6 @@ def close_gaps(cells: BoolArray, by: int) -> BoolArray:
     grown = grow(np.pad(cells, by, mode="edge"), by)
     closed = ~grow(~grown, by)
     return np.logical_or(closed[by:-by, by:-by, by:-by], cells)
-
-
-def fill_enclosed(cells: BoolArray) -> BoolArray:
-    """Return the solid voxels and all empty voxels that have no way out of the lattice through voxel faces.
-
-    >>> cells = np.ones((3, 3, 3), dtype=bool)
-    >>> cells[1, 1, 1] = False
-    >>> bool(fill_enclosed(cells).all())
-    True
-    """
-    empty = np.pad(~np.asarray(cells, dtype=bool), 1, constant_values=True)
-    labels = face_connected(empty)
-    return (labels != labels[0, 0, 0])[1:-1, 1:-1, 1:-1]
 
 
 def convex_hull(cells: BoolArray) -> BoolArray:

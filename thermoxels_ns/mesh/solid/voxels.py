@@ -26,7 +26,6 @@ _AsTuple = BeforeValidator(
     lambda given: tuple(np.asarray(given).tolist()) if isinstance(given, (list, np.ndarray)) else given
 )
 Box = Annotated[tuple[float, float, float, float, float, float], _AsTuple]
-Ball = Annotated[tuple[float, float, float, float], _AsTuple]
 
 SMALLEST_BODY = 0.01
 """Bodies (voxels that touch, if only by corners) with less than this share of the largest body's voxels are removed."""
@@ -43,6 +42,7 @@ LEAST_WEIGHT = 0.5  # with less weight of rays than this in a voxel, [rays], its
 FEWEST_RAYS = 100  # least number of rays that end on something for the threshold to be chosen by rays
 CENTRAL_PART, CENTRAL_RAYS = 0.5, 5  # share of an image's sides that counts as its middle, and rays along each side
 NEAREST_SHARE = 0.25  # a camera points at the place at this quantile of the distances to solid along these rays
+SEAL = 2  # to find the interior, openings up to twice this many voxels wide count as closed
 MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` interpolates between blocks of voxels
 
 
@@ -50,34 +50,25 @@ MOST_BLOCKS = 500_000  # in lattices with more voxels, `where_cameras_look` inte
 class SolidSelection:
     """The rules that tell solid voxels from empty ones; the fields are the export's options of the same names."""
 
-    voxel_optical_depth: Annotated[float, Field(gt=0)] | None = None
-    """Least density times edge; rays choose if the first three are None."""
     density_percentile: Annotated[float, Field(ge=0, le=100)] | None = None
-    """Percentile of the density of all voxels, as in the Thermoxels paper; overrides the optical depth."""
+    """Percentile of the density of all voxels, as in the Thermoxels paper."""
     density_threshold: Annotated[float, Field(ge=0)] | None = None
-    """Least density, [1 / world unit]; overrides both rules above."""
+    """Least density, [1 / world unit]; overrides the percentile. Rays choose if both are None."""
     close_gaps: Annotated[int, Field(ge=0, le=100)] = 1
     """Gaps up to twice this many voxels wide are filled (a morphological closing)."""
     region: RegionKind = "auto"  # auto: the voxels of `where_cameras_look`; all: all voxels
     region_box: Box | None = None  # xmin ymin zmin xmax ymax zmax, in coordinates of the input poses; replaces `region`
-    region_near: Ball | None = None  # x y z radius in the same coordinates; replaces `region`
     interior: InteriorKind = "solid"  # solid: the voxels of `interior` are filled; hollow: they stay empty
-    seal_openings: Annotated[int, Field(ge=0, le=100)] = 2
-    """To find the interior, openings up to twice this many voxels wide count as closed."""
     wall_thickness: Annotated[float, Field(gt=0)] | None = None
     """Thickness that walls get instead of a filled interior, [m]."""
 
     def __post_init__(self) -> None:
-        box, near = self.region_box, self.region_near
+        box = self.region_box
         if box is not None and not np.less(box[:3], box[3:]).all():
             expected, remedy = "xmin ymin zmin xmax ymax zmax, minima below maxima", "Pass --region-box 0 0 0 4 3 2."
             raise wrong("region_box", expected, box, remedy)
-        if near is not None and not near[3] > 0:
-            raise wrong("region_near", "x y z radius, above 0", near, "Pass --region-near 0 0 1 2.5.")
-        asked = [f"--region {self.region}"] * (self.region != "auto")
-        asked += ["--region-box"] * (box is not None) + ["--region-near"] * (near is not None)
-        if len(asked) > 1:
-            raise wrong("region", "one of them", " and ".join(asked), "Leave all but one of these options out.")
+        if box is not None and self.region != "auto":
+            raise wrong("region", "one of them", "--region all and --region-box", "Leave one of these options out.")
 
 
 @dataclass(frozen=True)
@@ -97,8 +88,9 @@ class SolidCells:
     cells: BoolArray  # True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is
     dense: BoolArray  # True for voxels that the threshold chose
     threshold: float  # least density at the centre of a voxel that counts as dense, [1 / world unit]
-    explanation: str  # which rule chose the threshold, and why
-    steps: tuple[SolidStep, ...]  # all steps in order; the first is the threshold
+    steps: tuple[
+        SolidStep, ...
+    ]  # all steps in order; the first is the threshold, which says what rule chose it and why
     component_sizes: IntArray  # number of voxels of each body in the region after gaps were closed, largest first
     within: BoolArray  # True for voxels, solid or not, in the region; the solid is cut at its border
     left_out: BoolArray  # True for dense voxels and closed gaps outside the region or in bodies that were too small
@@ -114,10 +106,10 @@ def select_solid(
     """Return the solid voxels of a trained field, chosen by their density and then changed by up to three more steps.
 
     `metres_per_world_unit` is needed for a wall thickness only. `world_to_input`, shape (3, 4), maps world coordinates
-    to those of the region's box or point; None is the identity.
+    to those of the region's box; None is the identity.
 
     Raises:
-        MeshError: No voxel is dense enough; none lies in the box or ball asked for; a percentile is asked for and all
+        MeshError: No voxel is dense enough; none lies in the box asked for; a percentile is asked for and all
             voxels have one density; or the wall thickness cannot be made: the scale or the cameras are not known, or
             the wall is thicker than the scene box.
     """
@@ -127,7 +119,7 @@ def select_solid(
     if not chosen.cells.any():
         expected = f"at least one voxel with density above 0 and at least the threshold {chosen.density:.6g}"
         got = f"none of {density.size}; the highest density at a voxel centre is {density.max():.6g}"
-        remedy = "Train longer, or lower --voxel-optical-depth, --density-threshold or --density-percentile."
+        remedy = "Train longer, or lower --density-threshold or --density-percentile."
         raise MeshError("solid voxels", expected=expected, got=got, remedy=remedy)
     cells = chosen.cells
     steps = [SolidStep("threshold", int(cells.sum()), 0, chosen.explanation)]
@@ -160,28 +152,22 @@ def select_solid(
             remark = f"A wall {asked} is thinner than one and a half voxels; the seen surface stays as thick as it is."
         cells = step("wall", wall, remark)
         if selection.interior == "hollow":
-            inside = interior(opaque | cells, snapshot.lattice, snapshot.views, selection.seal_openings, within)
-            rooms = (inside.enclosed | inside.hidden) & ~cells
+            found = interior(opaque | cells, snapshot.lattice, snapshot.views, SEAL, within)
+            rooms = found.inside & ~cells
             depth = np.asarray(ndimage.distance_transform_edt(cells | rooms | ~within))
             remark = "Where no camera looks, as below the lowest floor, the rooms are closed by a wall as thick."
             cells = step("close rooms", cells | (rooms & (depth <= thickness)), remark)
             rooms &= ~cells
     elif selection.interior == "solid":
-        inside = interior(opaque, snapshot.lattice, snapshot.views, selection.seal_openings, within)
-        remark = f"{int(inside.enclosed.sum())} voxels of enclosed cavities are filled"
-        if snapshot.views is None:
-            remark += "; the cameras are not known, so nothing is known to be hidden from them."
-        else:
-            hidden = int(inside.hidden.sum())
-            remark += f", and {hidden} voxels that cameras cannot look into, within the hull of their body."
-        if inside.rooms:
-            remark += f" {inside.rooms} cavities with a camera in them stay empty."
-        cells = step("interior", cells | inside.enclosed | inside.hidden, remark)
+        found = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
+        remark = "Enclosed cavities are filled, and what cameras cannot look into within the hull of its body."
+        if found.rooms:
+            remark += f" {found.rooms} cavities with a camera in them stay empty."
+        cells = step("interior", cells | found.inside, remark)
     return SolidCells(
         cells=cells,
         dense=chosen.cells,
         threshold=chosen.density,
-        explanation=chosen.explanation,
         steps=tuple(steps),
         component_sizes=np.sort(sizes)[::-1].astype(np.int64),
         within=within,
@@ -232,23 +218,19 @@ def dense_voxels(snapshot: GridSnapshot, density: FloatArray, selection: SolidSe
     Raises:
         MeshError: A percentile above 0 is asked for, and all voxels have the same density.
     """
-    evidence, depth = snapshot.evidence, selection.voxel_optical_depth
+    evidence = snapshot.evidence
     if selection.density_threshold is not None:
         threshold = float(selection.density_threshold)
         explanation = f"Voxels of density {threshold:g} or more are solid, as asked."
         return Threshold((density >= threshold) & (density > 0.0), threshold, explanation)
     if selection.density_percentile is not None:
         return _densest_share(density, selection.density_percentile)
-    reason = ""
-    if depth is None:
-        if evidence is not None and len(evidence.half_depth_density) >= FEWEST_RAYS:
-            return _where_rays_end(evidence, density, snapshot.lattice.voxel_size)
-        known = "nothing is known of" if evidence is None else f"only {len(evidence.half_depth_density)} rays end among"
-        reason = f"Automatic: {known} the training rays, so the rule is a fixed optical depth. "
-        depth = FALLBACK_OPTICAL_DEPTH
-    threshold = depth / snapshot.lattice.voxel_size
-    reason += f"Voxels of optical depth {depth:g} or more are solid (density {threshold:.4g}): light that crosses one "
-    return Threshold(density >= threshold, threshold, f"{reason}loses at least {1.0 - math.exp(-depth):.0%}.")
+    if evidence is not None and len(evidence.half_depth_density) >= FEWEST_RAYS:
+        return _where_rays_end(evidence, density, snapshot.lattice.voxel_size)
+    known = "nothing is known of" if evidence is None else f"only {len(evidence.half_depth_density)} rays end among"
+    threshold = FALLBACK_OPTICAL_DEPTH / snapshot.lattice.voxel_size
+    reason = f"Automatic: {known} the training rays, so voxels of optical depth {FALLBACK_OPTICAL_DEPTH:g} or more"
+    return Threshold(density >= threshold, threshold, f"{reason} are solid (density {threshold:.4g}).")
 
 
 def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) -> Threshold:
@@ -288,31 +270,30 @@ def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) ->
 def _densest_share(density: FloatArray, percentile: float) -> Threshold:
     """Return the densest (100 - percentile) % of all voxels, as in the Thermoxels paper.
 
-    If so many voxels tie at the threshold that more would be taken than asked for (training leaves the initial density
-    in space that no ray touches), only denser voxels are taken, if any. Raises `MeshError` if all are equally dense.
+    Voxels as dense as the threshold are left out if there are denser ones, because training leaves the initial density
+    in space that no ray touches. Raises `MeshError` if all are equally dense.
     """
     threshold = float(np.percentile(density, percentile))
     if percentile > 0.0 and 0.0 < density.min() == density.max():
         remedy = "Train longer, or pass --density-threshold to say from which density on a voxel is solid."
         got = f"the same density {threshold:.6g} in all {density.size} voxels"
         raise MeshError("density", expected="some voxels denser than others", got=got, remedy=remedy)
-    reached, denser = ((density > 0.0) & (over(density, threshold)) for over in (np.greater_equal, np.greater))
-    asked = np.ceil((1.0 - percentile / 100.0) * density.size) + 1
-    tied = np.count_nonzero(reached) > asked and bool(denser.any())
-    said = f"{'more than' if tied else 'at least'} density {threshold:.4g}."
-    explanation = f"The densest {100.0 - percentile:g} % of all voxels are solid, as asked: {said}"
-    return Threshold(denser if tied else reached, threshold, explanation)
+    denser = density > threshold
+    cells = denser if denser.any() else (density >= threshold) & (density > 0.0)
+    explanation = (
+        f"The densest {100.0 - percentile:g} % of all voxels are solid, as asked: above density {threshold:.4g}."
+    )
+    return Threshold(cells, threshold, explanation)
 
 
 def _region(
     cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection, world_to_input: FloatArray | None
 ) -> tuple[BoolArray, str]:
     """Return the voxels, solid or not, of the region asked for, and a sentence that describes the region."""
-    box, near, views = selection.region_box, selection.region_near, snapshot.views
-    if box is not None or near is not None:
+    views = snapshot.views
+    if selection.region_box is not None:
         to_input = np.eye(4)[:3] if world_to_input is None else world_to_input
-        what = "in the box" if near is None else f"within {near[3]:g} of a point"
-        return _asked_region(cells, snapshot.lattice, box, near, to_input), f"What lies {what} is taken."
+        return _in_box(cells, snapshot.lattice, selection.region_box, to_input), "What lies in the box is taken."
     if selection.region == "all":
         return np.ones_like(cells), "All is taken."
     if views is None or len(views.focal) == 0:
@@ -347,23 +328,16 @@ def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> Bool
     return well[tuple(slice(n) for n in cells.shape)]
 
 
-def _asked_region(
-    cells: BoolArray, lattice: Lattice, box: Box | None, near: Ball | None, world_to_input: FloatArray
-) -> BoolArray:
-    """Return the voxels with centres in a box or ball; raise `MeshError` if no solid voxel (`cells`) is among these."""
+def _in_box(cells: BoolArray, lattice: Lattice, box: Box, world_to_input: FloatArray) -> BoolArray:
+    """Return the voxels with centres in a box; raise `MeshError` if no solid voxel (`cells`) is among these."""
     # Each input coordinate is a sum of three terms, one per voxel index: one array per axis is enough.
     middles = [
         lattice.lo[axis] + (np.arange(count) + 0.5) * lattice.voxel_size for axis, count in enumerate(cells.shape)
     ]
     along_x, along_y, along_z = np.ix_(*middles)
     places = [row[0] * along_x + row[1] * along_y + row[2] * along_z + row[3] for row in world_to_input]
-    if box is not None:
-        found = [(place >= low) & (place <= high) for place, low, high in zip(places, box[:3], box[3:])]
-        within = found[0] & found[1] & found[2]
-    else:
-        assert near is not None
-        away = [(place - middle) ** 2 for place, middle in zip(places, near[:3])]
-        within = away[0] + away[1] + away[2] <= near[3] ** 2
+    found = [(place >= low) & (place <= high) for place, low, high in zip(places, box[:3], box[3:])]
+    within = found[0] & found[1] & found[2]
     if (cells & within).any():
         return within
     size = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(world_to_input[:, :3]))))
@@ -371,8 +345,8 @@ def _asked_region(
     ends = (place[cells] for place in places)
     lower, upper = (_typed(end, digits) for end in np.array([(end.min() - size, end.max() + size) for end in ends]).T)
     expected = f"some of the solid in it, which lies from {lower} to {upper}"
-    got, remedy = f"none in {_typed(box or near or ())}", f"Pass --region-box {lower} {upper}, or less."
-    raise MeshError("region_near" if box is None else "region_box", expected=expected, got=got, remedy=remedy)
+    got, remedy = f"none in {_typed(box)}", f"Pass --region-box {lower} {upper}, or less."
+    raise MeshError("region_box", expected=expected, got=got, remedy=remedy)
 
 
 def _typed(values: tuple[float, ...] | FloatArray, digits: int | None = None) -> str:

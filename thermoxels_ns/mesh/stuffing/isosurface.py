@@ -52,7 +52,6 @@ class StuffedSolid:
     """Positions of nodes, shape (n, 3), all different and used; coordinates are from 0 to the number of voxels."""
     tets: IntArray  # node numbers, shape (t, 4), positively oriented
     facets: IntArray  # boundary triangles, shape (f, 3); right-hand normals point out of the solid
-    on_surface: BoolArray  # True for nodes of boundary triangles, shape (n,)
     on_box: BoolArray
     """True for boundary triangles that lie exactly on a border plane of the voxel lattice, shape (f,)."""
 
@@ -95,10 +94,8 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
     # Nodes from number `num_inside` on lie on the surface; only tetrahedra with three such nodes have a face there.
     facets = boundary_facets(tets[(tets >= nodes.num_inside).sum(axis=1) >= 3])
     facets = facets[facets.min(axis=1) >= nodes.num_inside]
-    on_surface = np.zeros(len(nodes.points), dtype=bool)
-    on_surface[facets] = True
     on_box = boundary_tags(facets, nodes.points, tuple(n + 1 for n in level.shape)) == FACET_BOX
-    return StuffedSolid(nodes.points, tets, facets, on_surface, on_box)
+    return StuffedSolid(nodes.points, tets, facets, on_box)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.mesh.solid.morphology import bounding_box, repeated, shrink
+from thermoxels_ns.mesh.solid.morphology import bounding_box, shrink
 
 _AXES = np.eye(3)[[0, 0, 1, 1, 2, 2]] * np.array([1.0, -1.0] * 3)[:, None]
 _DIAGONALS = (np.arange(8)[:, None] >> np.array([2, 1, 0]) & 1) - 0.5
@@ -102,13 +102,10 @@ def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
         padded[0, 1:-1, 1:-1] = -np.abs(within[0])
         padded[-1, 1:-1, 1:-1] = -np.abs(within[-1])
 
-    # Levels are halved before each sum: the sum of two levels may overflow the number type, their mean cannot.
-    mean = 0.5 * np.pad(inner, 1, mode="edge")
+    mean = np.pad(inner, 1, mode="edge")
     for axis in range(3):
         mean = np.moveaxis(mean, axis, 0)
-        mean = np.moveaxis(mean[1:] + mean[:-1], 0, axis)
-        if axis < 2:
-            mean *= 0.5
+        mean = np.moveaxis(0.5 * (mean[1:] + mean[:-1]), 0, axis)
     for axis in range(3):
         border = np.moveaxis(mean, axis, 0)[[0, -1]]
         np.moveaxis(mean, axis, 0)[[0, -1]] = np.minimum(border, 0.0)
@@ -289,7 +286,7 @@ def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
 
 def split_in_eight(level: BoolArray, shape: tuple[int, ...]) -> BoolArray:
     """Return the values `level` of cubes copied to the eight cubes of half the edge in each, cut to `shape`."""
-    return repeated(level, 2)[tuple(slice(n) for n in shape)]
+    return np.kron(level, np.ones((2, 2, 2), dtype=bool))[tuple(slice(n) for n in shape)]
 
 
 @dataclass(frozen=True)
@@ -325,12 +322,12 @@ def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior:
     covered, tets = np.zeros(lattice.shape, dtype=bool), [np.zeros((0, 4), dtype=np.int64)]
     if octree:
         covered[box] = split_in_eight(octree[0], deep[box].shape)
-    for cubes in _each_size(octree, deep[box].shape) if octree else ():
+    for size, whole, joined in _each_size(octree, deep[box].shape) if octree else ():
         for axis in range(3):
-            points = _Points.around(lattice, first, axis, cubes.size)
-            if cubes.size > 1:
-                tets += _between_equals(cubes, axis, points)
-            tets += _between_sizes(cubes, axis, points)
+            points = _Points.around(lattice, first, axis, size)
+            if size > 1:
+                tets += _between_equals(whole, whole & ~joined, axis, points)
+            tets += _between_sizes(whole & ~joined, joined, axis, points)
     return CoarseInterior(covered.reshape(-1), np.concatenate(tets))
 
 
@@ -346,25 +343,20 @@ def _far_from_surface(lattice: BccLattice) -> BoolArray:
     return deep & np.asarray(ndimage.binary_erosion(shrink(corners >= 0.0, 2)), dtype=bool)
 
 
-@dataclass(frozen=True)
-class _Cubes:
-    """The cubes of one size, as arrays over all places for such cubes, padded by one cube on each side."""
+def _each_size(octree: tuple[BoolArray, ...], shape: tuple[int, ...]) -> Iterator[tuple[int, BoolArray, BoolArray]]:
+    """Yield edge, [voxels], and two masks of the cubes of every size, over all their places and one more on each side.
 
-    size: int  # edge of a cube, [voxels]
-    whole: BoolArray  # True where nothing inside the cube is smaller
-    joined: BoolArray  # True where the cube is part of a larger cube of the octree
-    single: BoolArray  # True where the cube is one of the octree: whole, but not joined
-
-
-def _each_size(octree: tuple[BoolArray, ...], shape: tuple[int, ...]) -> Iterator[_Cubes]:
-    """Yield the cubes of every size, single voxels first; all places outside the octree count as single voxels."""
+    Single voxels come first; all places outside the octree count as such. The first mask is True where nothing inside
+    the cube is smaller (whole), the second where the cube is part of a larger one (joined). The cubes of the octree are
+    whole and not joined (single).
+    """
     whole = np.ones([n + 2 for n in shape], dtype=bool)
     for number in range(len(octree) + 1):
         joined = np.zeros_like(whole)
         if number < len(octree):
             inner = joined[1:-1, 1:-1, 1:-1]
             inner[...] = split_in_eight(octree[number], inner.shape)
-        yield _Cubes(1 << number, whole, joined, whole & ~joined)
+        yield 1 << number, whole, joined
         if number < len(octree):
             whole = np.pad(octree[number], 1)
 
@@ -395,11 +387,11 @@ class _Points:
         return self.origin + cubes @ self.per_cube
 
 
-def _between_equals(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntArray]:
+def _between_equals(whole: BoolArray, single: BoolArray, axis: int, points: _Points) -> Iterator[IntArray]:
     """Yield the tetrahedra (t, 4) between each cube and the next along the axis, if both are single."""
     two, ahead = [1, 1, 1], [0, 0, 0]  # a box of a cube and the next along the axis
     two[axis], ahead[axis] = 2, -1
-    pairs, whole = (shrink(mask, tuple(two), tuple(ahead)) for mask in (cubes.single, cubes.whole))
+    pairs, whole = (shrink(mask, tuple(two), tuple(ahead)) for mask in (single, whole))
     pair = np.flatnonzero(pairs)
     lowest = points.of(np.stack(np.unravel_index(pair, pairs.shape), axis=-1) - 1)
     steps = np.array([pairs.shape[1] * pairs.shape[2], pairs.shape[2], 1])
@@ -418,16 +410,11 @@ def _between_equals(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntAr
             yield lowest[which, None] + np.array(tet)
 
 
-def _between_sizes(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntArray]:
+def _between_sizes(single: BoolArray, joined: BoolArray, axis: int, points: _Points) -> Iterator[IntArray]:
     """Yield the tetrahedra (t, 4) between each single cube and a larger cube before or after it along the axis."""
-    single, joined = (np.moveaxis(mask, axis, 0) for mask in (cubes.single, cubes.joined))
     for larger_ahead in (True, False):
-        found = np.zeros_like(cubes.single)
-        if larger_ahead:
-            np.moveaxis(found, axis, 0)[:-1] = single[:-1] & joined[1:]
-        else:
-            np.moveaxis(found, axis, 0)[1:] = single[1:] & joined[:-1]
-        cube = np.argwhere(found) - 1
+        # No cube at the border of the mask is joined, so that nothing comes in from the other end.
+        cube = np.argwhere(single & np.roll(joined, -1 if larger_ahead else 1, axis)) - 1
         lowest = points.of(cube)
         is_high = np.roll(cube, -axis, axis=1)[:, 1:] & 1
         face = points.corners + (points.ahead if larger_ahead else 0)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.kernel_cache import kernel
+from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 from thermoxels_ns.mesh.tetrahedra import facet_area_vectors
 
@@ -79,58 +79,34 @@ def _clear(surface: Surface, node: IntArray, to: FloatArray) -> BoolArray:
 
 def _carry_out(points: FloatArray, tets: IntArray, node: IntArray, to: FloatArray) -> FloatArray:
     """Return positions (n, 3) after the moves, made in order, except moves after which a tetrahedron is not sound."""
-    touched = np.zeros(len(points), dtype=bool)
-    touched[node] = True
-    near = tets[touched[tets].any(axis=1)]
-    order = np.argsort(near.ravel(), kind="stable")
-    first = np.searchsorted(near.ravel()[order], np.arange(len(points) + 1))
-    points = points.copy()
-    _move_nodes(points, near, order // 4, first, node, to, np.cos(np.radians(ANGLES_DEG)))
+    points, moved, near, moves = points.copy(), np.zeros(len(points), dtype=bool), tets, np.arange(len(node))
+    while len(moves):
+        # Moves that are the first one left at all tetrahedra around their node are made at once.
+        first = np.full(len(points), len(node))
+        np.minimum.at(first, node[moves], moves)
+        near = near[(first[near] < len(node)).any(axis=1)]
+        least = first.copy()
+        np.minimum.at(least, near, first[near].min(axis=1, keepdims=True))
+        is_now = least[node[moves]] == moves
+        now, at = moves[is_now], node[moves[is_now]]
+        before, points[at], changed = points[at], to[now], np.zeros_like(moved)
+        changed[at] = True
+        around = near[changed[near].any(axis=1)]
+        changed[around[~_sound(points, around)]] = False
+        points[at] = np.where(changed[at, None], points[at], before)
+        moved[at] = changed[at]
+        moves = moves[~is_now & ~moved[node[moves]]]
     return points
 
 
-@kernel
-def _move_nodes(points, tets, around, first, node, to, bounds):
-    """Move `points` in place where all stays sound; the tetrahedra of node n are `around[first[n]:first[n + 1]]`."""
-    moved = np.zeros(len(points), np.bool_)
-    for move in range(len(node)):
-        n = node[move]
-        if moved[n]:
-            continue
-        before = points[n].copy()
-        points[n] = to[move]
-        moved[n] = True
-        for tet in around[first[n] : first[n + 1]]:
-            if not _is_sound(points[tets[tet]], bounds):
-                points[n], moved[n] = before, False
-                break
-
-
-@kernel
-def _is_sound(corners, bounds):
-    """Return whether a tetrahedron (4, 3) has a volume above 0 and dihedral cosines within `bounds` (high, low)."""
-    normals, volume = np.zeros((4, 3)), 0.0
-    for axis in range(3):
-        one, two = (axis + 1) % 3, (axis + 2) % 3
-        for n in range(1, 4):  # the face opposite node n has the nodes 0, p and q
-            p, q = n % 3 + 1, (n + 1) % 3 + 1
-            normals[n, axis] = (corners[p, one] - corners[0, one]) * (corners[q, two] - corners[0, two])
-            normals[n, axis] -= (corners[p, two] - corners[0, two]) * (corners[q, one] - corners[0, one])
-            normals[0, axis] -= normals[n, axis]
-        volume += (corners[1, axis] - corners[0, axis]) * normals[1, axis]
-    if volume <= 0.0:
-        return False
-    for i in range(4):
-        for j in range(i):
-            product, square_i, square_j = 0.0, 0.0, 0.0
-            for axis in range(3):
-                product += normals[i, axis] * normals[j, axis]
-                square_i += normals[i, axis] ** 2
-                square_j += normals[j, axis] ** 2
-            cosine = -product / np.sqrt(square_i * square_j)
-            if cosine > bounds[0] or cosine < bounds[1]:
-                return False
-    return True
+def _sound(points: FloatArray, tets: IntArray) -> BoolArray:
+    """Return whether tetrahedra have a volume above 0 and dihedral angles within `ANGLES_DEG`, shape (t,)."""
+    sound, (high, low) = np.empty(len(tets), dtype=bool), np.cos(np.radians(ANGLES_DEG))
+    for which, shapes in shapes_in_chunks(points, tets):
+        cosines = shapes.dihedral_cosines()
+        within = (cosines.max(axis=0) <= high) & (cosines.min(axis=0) >= low)
+        sound[which] = within & (shapes.six_volumes > 0.0)
+    return sound
 
 
 @dataclass(frozen=True)
