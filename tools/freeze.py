@@ -152,7 +152,7 @@ class Recorder:
             "bytes": {
                 name: digest(path.read_bytes())
                 for name, path in files.items()
-                if path.suffix in (".msh", ".inp", ".stl", ".ply", ".glb", ".csv", ".xdmf")
+                if path.suffix in (".msh", ".inp", ".stl", ".ply", ".glb", ".csv", ".h5", ".xdmf")
             },
             "columns": {n: path.read_text().splitlines()[0] for n, path in files.items() if path.suffix == ".csv"},
         }

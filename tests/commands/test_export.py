@@ -224,6 +224,7 @@ def test_wrong_options_are_refused_before_anything_runs(ball, tmp_path, options,
     [
         ([], {}),
         (["--region-box", "-1", "-2.5", "-3e-5", "1", "2", "3"], {"region_box": (-1.0, -2.5, -3e-5, 1.0, 2.0, 3.0)}),
+        (["--region-near", "-1", "0", "-3e-5", "2"], {"region_near": (-1.0, 0.0, -3e-5, 2.0)}),
         (["--region", "all"], {"region": "all"}),
     ],
 )
@@ -450,7 +451,9 @@ def test_every_format_is_written_and_leaves_with_the_next_export(ball, tmp_path)
     formats = ("vtu", "xdmf", "msh", "inp", "stl", "ply", "glb")
     options = ExportOptions(metres_per_unit=1.0, steps=1, pictures=False, formats=formats)
     summary = export_snapshot(ball, np.eye(4), options, tmp_path)
-    assert {f"mesh.{name}" for name in formats} | {"mesh-boundary.vtp", "quality.json"} < set(contents(tmp_path))
+    assert {f"mesh.{name}" for name in formats} | {"mesh.h5", "mesh-boundary.vtp", "quality.json"} < set(
+        contents(tmp_path)
+    )
     assert set(contents(tmp_path)) == set(summary["files"])
     summary = export_snapshot(ball, np.eye(4), ExportOptions(pictures=False, formats=("stl",)), tmp_path)
     assert sorted(contents(tmp_path)) == summary["files"] == ["mesh.stl", "quality.json", "summary.json"]

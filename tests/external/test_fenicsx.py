@@ -22,7 +22,7 @@ from petsc4py import PETSc
 
 folder, (conductivity, capacity, steps, seconds) = sys.argv[1], map(float, sys.argv[2:6])
 num_regions, num_patches = map(int, sys.argv[6:])
-with XDMFFile(MPI.COMM_WORLD, folder + "/house.xdmf", "r", encoding=XDMFFile.Encoding.ASCII) as file:
+with XDMFFile(MPI.COMM_WORLD, folder + "/house.xdmf", "r") as file:
     mesh = file.read_mesh(name="mesh")
     regions = file.read_meshtags(mesh, name="mesh")
     mesh.topology.create_connectivity(2, 3)

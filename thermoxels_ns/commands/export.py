@@ -84,6 +84,8 @@ class ExportOptions:
     mostly floaters, are left out. all: everything that was reconstructed."""
     region_box: tuple[float, float, float, float, float, float] | None = None
     """In place of auto: export the inside of a box, xmin ymin zmin xmax ymax zmax in coordinates of the input poses."""
+    region_near: tuple[float, float, float, float] | None = None
+    """In place of auto: export the inside of a ball, x y z radius in the coordinates of the input poses."""
     interior: Literal["solid", "hollow"] = "solid"
     """Treatment of the inside of a body if photographs show only its shell. solid: the inside is filled, but a cavity
     that holds a camera is a room and stays empty. hollow: only the shell is exported, with the thickness that training

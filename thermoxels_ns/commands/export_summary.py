@@ -128,7 +128,7 @@ def region_summary(built: BuiltMesh, selection: SolidSelection) -> dict[str, Any
     points = built.mesh.points_m
     left_out, found = int(built.solid.left_out.sum()), _voxels_found(built.solid)
     return {
-        "asked_for": "a box" if selection.region_box else selection.region,
+        "asked_for": "near a point" if selection.region_near else "a box" if selection.region_box else selection.region,
         "size": points.max(axis=0) - points.min(axis=0),
         "voxels_taken": found - left_out,
         "voxels_left_out": left_out,

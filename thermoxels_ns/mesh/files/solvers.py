@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.arrays import IntArray
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.units import STEFAN_BOLTZMANN_W_M2K4, ZERO_CELSIUS_K
 from thermoxels_ns.mesh.files.content import checked_tags, node_arrays, write_bytes
@@ -34,59 +34,88 @@ _ROWS_AT_ONCE = 1 << 15
 _REAL = "%.12E"  # Abaqus reads fields of at most 20 characters
 
 
+def heavy_data_path(path: Path | str) -> Path:
+    """Return the path of the HDF5 file that belongs to an .xdmf file.
+
+    >>> heavy_data_path("house/mesh.xdmf").as_posix()
+    'house/mesh.h5'
+    """
+    return Path(path).with_suffix(".h5")
+
+
 def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
-    """Write a mesh as an .xdmf file that holds all numbers itself, as text (read by FEniCSx and ParaView).
+    """Write a mesh as ``NAME.xdmf`` and ``NAME.h5``.
 
-    The grid "mesh" holds the tetrahedra with `region` per cell, and `temperature_c`, `temperature_k`, `observed` and
-    `colour` per node, as far as known; the grid "facets" holds the boundary triangles with `patch` per triangle.
-    Regions and patches are numbered from 1, as in .msh files; an ``Information`` element of each grid lists the names.
-    In FEniCSx::
+    The grid "mesh" holds the tetrahedra with `region` per cell; the grid "facets" holds the boundary triangles with
+    `patch` per triangle. Both hold `temperature_c`, `temperature_k`, `observed` and, if the mesh has colours, `colour`
+    per node. Regions and patches are numbered from 1, as in .msh files; an ``Information`` element of each grid lists
+    the names. In FEniCSx::
 
-        with XDMFFile(comm, "mesh.xdmf", "r", encoding=XDMFFile.Encoding.ASCII) as file:
+        with dolfinx.io.XDMFFile(comm, "mesh.xdmf", "r") as file:
             mesh = file.read_mesh(name="mesh")
             regions = file.read_meshtags(mesh, name="mesh")
             mesh.topology.create_connectivity(2, 3)
             patches = file.read_meshtags(mesh, name="facets")
+
+    The .h5 is written first; there is no .xdmf until it is complete.
     """
-    path, tags, points = Path(path), checked_tags(mesh), mesh.points_m
-    # FEniCSx reads the first attribute of a grid as its tags.
-    body = {"region": (mesh.region + 1).astype(np.int32), **node_arrays(mesh)}
-    boundary = {"patch": (tags.patch + 1).astype(np.int32)}
-    text = chain(
-        ["<?xml version='1.0' encoding='utf-8'?>\n<Xdmf Version=\"3.0\">\n<Domain>\n"],
-        _grid(f'Name="{BODY_GRID}"', "Tetrahedron", mesh.tets, points, body, mesh.region_names),
-        _grid(f'Name="{FACET_GRID}"', "Triangle", mesh.facets, points, boundary, tags.patch_names),
-        ["</Domain>\n</Xdmf>\n"],
-    )
-    write_bytes(path, (part.encode() for part in text))
+    import h5py
+
+    path = Path(path)
+    tags = checked_tags(mesh)
+    arrays: dict[str, npt.NDArray] = {
+        "points_m": mesh.points_m,
+        "tets": mesh.tets.astype(np.int64),
+        "region": (mesh.region + 1).astype(np.int32),
+        "facets": mesh.facets.astype(np.int64),
+        "patch": (tags.patch + 1).astype(np.int32),
+        **node_arrays(mesh),
+    }
+    data_file = heavy_data_path(path)
+    text = _index(mesh.region_names, tags.patch_names, arrays, escape(data_file.name))
+
+    writable_folder(path.parent)
+    with replace_when_done(data_file) as temporary:
+        with h5py.File(temporary, "w") as file:
+            for name, values in arrays.items():
+                # Times of day would make two files of one mesh differ.
+                file.create_dataset(name, data=values, track_times=False)
+        # An old .xdmf does not fit the new data.
+        remove_file(path)
+    with replace_when_done(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
-def _grid(
-    name: str, kind: str, cells: IntArray, points: FloatArray, arrays: dict[str, npt.NDArray], names: Sequence[str]
-) -> Iterator[str]:
-    """Yield the text of a grid; `arrays` begin with an array per cell, whose numbers from 1 have `names`."""
-    tag, *_ = arrays
-    numbered = quoteattr("; ".join(f"{number} = {entry}" for number, entry in enumerate(names, 1)))
-    yield f'<Grid {name} GridType="Uniform">\n<Information Name="{tag}_names" Value={numbered}/>\n'
-    size = 'NumberOfElements="{}" NodesPerElement="{}"'.format(*cells.shape)
-    yield from _element("Topology", f'TopologyType="{kind}" {size}', cells)
-    yield from _element("Geometry", 'GeometryType="XYZ"', points)
-    for of, values in arrays.items():
-        where = (
-            f'Center="{"Cell" if of == tag else "Node"}" AttributeType="{"Vector" if values.ndim == 2 else "Scalar"}"'
+def _index(regions: Sequence[str], patches: Sequence[str], arrays: dict[str, npt.NDArray], data_file: str) -> str:
+    """Return the text of the .xdmf file, which describes the arrays in `data_file`."""
+
+    def data(name: str) -> str:
+        shape, number = " ".join(map(str, arrays[name].shape)), arrays[name].dtype
+        kind = f'NumberType="{_NUMBER_TYPES[number.kind]}" Precision="{number.itemsize}"'
+        return f'<DataItem Format="HDF" Dimensions="{shape}" {kind}>{data_file}:/{name}</DataItem>'
+
+    def values(name: str, centre: str) -> str:
+        kind = "Vector" if name == "colour" else "Scalar"
+        return f'<Attribute Name="{name}" AttributeType="{kind}" Center="{centre}">{data(name)}</Attribute>'
+
+    def grid(name: str, kind: str, cells: str, tag: str, names: Sequence[str]) -> str:
+        numbered = quoteattr("; ".join(f"{number} = {entry}" for number, entry in enumerate(names, 1)))
+        size = 'NumberOfElements="{}" NodesPerElement="{}"'.format(*arrays[cells].shape)
+        lines = (
+            f'<Grid Name="{name}" GridType="Uniform">',
+            f'<Information Name="{tag}_names" Value={numbered}/>',
+            f'<Topology TopologyType="{kind}" {size}>{data(cells)}</Topology>',
+            f'<Geometry GeometryType="XYZ">{data("points_m")}</Geometry>',
+            values(tag, "Cell"),  # FEniCSx reads the first attribute of a grid as its tags
+            *(values(one, "Node") for one in ("temperature_c", "temperature_k", "observed", "colour") if one in arrays),
+            "</Grid>",
         )
-        yield from _element("Attribute", f'Name="{of}" {where}', values)
-    yield "</Grid>\n"
+        return "\n".join(lines)
 
-
-def _element(name: str, attributes: str, values: npt.NDArray) -> Iterator[str]:
-    """Yield the text of an element of an .xdmf file that holds numbers, shape (n,) or (n, k)."""
-    size, kind = " ".join(map(str, values.shape)), _NUMBER_TYPES[values.dtype.kind]
-    precision = f'NumberType="{kind}" Precision="{values.dtype.itemsize}"'
-    yield f'<{name} {attributes}><DataItem Format="XML" Dimensions="{size}" {precision}>\n'
-    columns = values.reshape(len(values), -1).T
-    yield from _rows(" ".join(["%r"] * len(columns)) + "\n", *columns)
-    yield f"</DataItem></{name}>\n"
+    body = grid(BODY_GRID, "Tetrahedron", "tets", "region", regions)
+    boundary = grid(FACET_GRID, "Triangle", "facets", "patch", patches)
+    start = "<?xml version='1.0' encoding='utf-8'?>\n<Xdmf Version=\"3.0\">\n<Domain>\n"
+    return f"{start}{body}\n{boundary}\n</Domain>\n</Xdmf>\n"
 
 
 def write_msh(path: Path | str, mesh: TetMesh) -> None:

@@ -26,6 +26,7 @@ _AsTuple = BeforeValidator(
     lambda given: tuple(np.asarray(given).tolist()) if isinstance(given, (list, np.ndarray)) else given
 )
 Box = Annotated[tuple[float, float, float, float, float, float], _AsTuple]
+Ball = Annotated[tuple[float, float, float, float], _AsTuple]
 
 SMALLEST_BODY = 0.01
 """Bodies (voxels that touch, if only by corners) with less than this share of the largest body's voxels are removed."""
@@ -58,17 +59,22 @@ class SolidSelection:
     """Gaps up to twice this many voxels wide are filled (a morphological closing)."""
     region: RegionKind = "auto"  # auto: the voxels of `where_cameras_look`; all: all voxels
     region_box: Box | None = None  # xmin ymin zmin xmax ymax zmax, in coordinates of the input poses; replaces `region`
+    region_near: Ball | None = None  # x y z radius in the same coordinates; replaces `region`
     interior: InteriorKind = "solid"  # solid: the voxels of `interior` are filled; hollow: they stay empty
     wall_thickness: Annotated[float, Field(gt=0)] | None = None
     """Thickness that walls get instead of a filled interior, [m]."""
 
     def __post_init__(self) -> None:
-        box = self.region_box
+        box, near = self.region_box, self.region_near
         if box is not None and not np.less(box[:3], box[3:]).all():
             expected, remedy = "xmin ymin zmin xmax ymax zmax, minima below maxima", "Pass --region-box 0 0 0 4 3 2."
             raise wrong("region_box", expected, box, remedy)
-        if box is not None and self.region != "auto":
-            raise wrong("region", "one of them", "--region all and --region-box", "Leave one of these options out.")
+        if near is not None and not near[3] > 0:
+            raise wrong("region_near", "x y z radius, above 0", near, "Pass --region-near 0 0 1 2.5.")
+        asked = [f"--region {self.region}"] * (self.region != "auto")
+        asked += ["--region-box"] * (box is not None) + ["--region-near"] * (near is not None)
+        if len(asked) > 1:
+            raise wrong("region", "one of them", " and ".join(asked), "Leave all but one of these options out.")
 
 
 @dataclass(frozen=True)
@@ -106,10 +112,10 @@ def select_solid(
     """Return the solid voxels of a trained field, chosen by their density and then changed by up to three more steps.
 
     `metres_per_world_unit` is needed for a wall thickness only. `world_to_input`, shape (3, 4), maps world coordinates
-    to those of the region's box; None is the identity.
+    to those of the region's box or point; None is the identity.
 
     Raises:
-        MeshError: No voxel is dense enough; none lies in the box asked for; a percentile is asked for and all
+        MeshError: No voxel is dense enough; none lies in the box or ball asked for; a percentile is asked for and all
             voxels have one density; or the wall thickness cannot be made: the scale or the cameras are not known, or
             the wall is thicker than the scene box.
     """
@@ -290,10 +296,11 @@ def _region(
     cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection, world_to_input: FloatArray | None
 ) -> tuple[BoolArray, str]:
     """Return the voxels, solid or not, of the region asked for, and a sentence that describes the region."""
-    views = snapshot.views
-    if selection.region_box is not None:
+    box, near, views = selection.region_box, selection.region_near, snapshot.views
+    if box is not None or near is not None:
         to_input = np.eye(4)[:3] if world_to_input is None else world_to_input
-        return _in_box(cells, snapshot.lattice, selection.region_box, to_input), "What lies in the box is taken."
+        what = "in the box" if near is None else f"within {near[3]:g} of a point"
+        return _asked_region(cells, snapshot.lattice, box, near, to_input), f"What lies {what} is taken."
     if selection.region == "all":
         return np.ones_like(cells), "All is taken."
     if views is None or len(views.focal) == 0:
@@ -328,16 +335,23 @@ def where_cameras_look(cells: BoolArray, lattice: Lattice, views: Views) -> Bool
     return well[tuple(slice(n) for n in cells.shape)]
 
 
-def _in_box(cells: BoolArray, lattice: Lattice, box: Box, world_to_input: FloatArray) -> BoolArray:
-    """Return the voxels with centres in a box; raise `MeshError` if no solid voxel (`cells`) is among these."""
+def _asked_region(
+    cells: BoolArray, lattice: Lattice, box: Box | None, near: Ball | None, world_to_input: FloatArray
+) -> BoolArray:
+    """Return the voxels with centres in a box or ball; raise `MeshError` if no solid voxel (`cells`) is among these."""
     # Each input coordinate is a sum of three terms, one per voxel index: one array per axis is enough.
     middles = [
         lattice.lo[axis] + (np.arange(count) + 0.5) * lattice.voxel_size for axis, count in enumerate(cells.shape)
     ]
     along_x, along_y, along_z = np.ix_(*middles)
     places = [row[0] * along_x + row[1] * along_y + row[2] * along_z + row[3] for row in world_to_input]
-    found = [(place >= low) & (place <= high) for place, low, high in zip(places, box[:3], box[3:])]
-    within = found[0] & found[1] & found[2]
+    if box is not None:
+        found = [(place >= low) & (place <= high) for place, low, high in zip(places, box[:3], box[3:])]
+        within = found[0] & found[1] & found[2]
+    else:
+        assert near is not None
+        away = [(place - middle) ** 2 for place, middle in zip(places, near[:3])]
+        within = away[0] + away[1] + away[2] <= near[3] ** 2
     if (cells & within).any():
         return within
     size = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(world_to_input[:, :3]))))
@@ -345,8 +359,8 @@ def _in_box(cells: BoolArray, lattice: Lattice, box: Box, world_to_input: FloatA
     ends = (place[cells] for place in places)
     lower, upper = (_typed(end, digits) for end in np.array([(end.min() - size, end.max() + size) for end in ends]).T)
     expected = f"some of the solid in it, which lies from {lower} to {upper}"
-    got, remedy = f"none in {_typed(box)}", f"Pass --region-box {lower} {upper}, or less."
-    raise MeshError("region_box", expected=expected, got=got, remedy=remedy)
+    got, remedy = f"none in {_typed(box or near or ())}", f"Pass --region-box {lower} {upper}, or less."
+    raise MeshError("region_near" if box is None else "region_box", expected=expected, got=got, remedy=remedy)
 
 
 def _typed(values: tuple[float, ...] | FloatArray, digits: int | None = None) -> str:
