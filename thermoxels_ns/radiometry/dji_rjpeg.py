@@ -21,7 +21,7 @@ from thermoxels_ns.radiometry.decoders import (
     errors_name,
     read_exif_facts,
 )
-from thermoxels_ns.radiometry.measurement_model import ConditionOverrides, Conditions
+from thermoxels_ns.radiometry.measurement_model import Conditions, RadiometryOptions
 
 _SDK = "the DJI Thermal SDK (www.dji.com/downloads/softwares/dji-thermal-sdk)"
 _FUNCTIONS = (
@@ -69,13 +69,14 @@ def is_dji_rjpeg(path: Path) -> bool:
     return made_by_dji and any(name == "APP3" for name, _ in segments)
 
 
-def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrides) -> DjiImage:
-    """Read temperatures from a DJI R-JPEG with `libdirp`, with the user's settings where `overrides` gives them.
+def read_dji_rjpeg(path: Path, options: RadiometryOptions) -> DjiImage:
+    """Read temperatures from a DJI R-JPEG with `libdirp`, with the user's settings where `options` gives them.
 
     How DJI's counts become degrees is not public. `libdirp` of DJI's Thermal SDK converts them; the SDK is free to
-    download but may not be passed on, so the user names the `library`. Raises `ThermalFileError` if the library is
+    download but may not be passed on, so the user names the library. Raises `ThermalFileError` if the library is
     missing, another one, or refuses the file or the settings, or if the file is cut off.
     """
+    library = options.dji_library
     whole = "a whole DJI R-JPEG, as the drone wrote it"
     with errors_name(path, whole, "Copy the file from the drone again.", ThermalFileError):
         app_segments(path, whole=True)  # before a library in another language takes it
@@ -98,12 +99,12 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
 
     call("dirp_create_from_rjpeg", data, ctypes.c_int32(len(content)), ctypes.byref(handle))
     try:
-        return _measure(path, call, handle, overrides)
+        return _measure(path, call, handle, options)
     finally:
         dirp.dirp_destroy(handle)
 
 
-def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, overrides: ConditionOverrides) -> DjiImage:
+def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, options: RadiometryOptions) -> DjiImage:
     size = _Resolution()
     call("dirp_get_rjpeg_resolution", handle, ctypes.byref(size))
     check_thermal_size(path, size.width, size.height)
@@ -122,9 +123,9 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
     except ThermoxelsError as problem:
         expected, remedy = "possible measurement parameters", "Copy the file from the drone again, unedited."
         raise ThermalFileError(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
-    after = overrides.applied_to(before)
+    after = options.applied_to(before)
     if after != before:
-        if overrides.air_c is not None and not knows_air:
+        if options.air_c is not None and not knows_air:
             remedy = "Use a newer DJI Thermal SDK, or leave --air-c out."
             got = "one that takes the reflected temperature for it"
             raise ThermalFileError("air_c", expected="a libdirp that knows the air temperature", got=got, remedy=remedy)
