@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV, RigEstimate, RigFrame, RigStart, radius_squared
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV, RigEstimate, RigFrame, guessed_rig, radius_squared
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.synthetic.raycast import render_view
 from thermoxels_ns.synthetic.scene_folder import make_scene
@@ -42,7 +42,7 @@ class KnownCapture:
         )
 
 
-def changes_between(start: RigStart, camera: Camera, transform: FloatArray) -> FloatArray:
+def changes_between(start: RigEstimate, camera: Camera, transform: FloatArray) -> FloatArray:
     """The ten changes (`PARAMETERS`) that make a rig of a start that is not turned, shape (10,)."""
     turn, before = transform[:3, :3], start.thermal_camera
     angles = cv2.Rodrigues(turn)[0].ravel()
@@ -56,7 +56,7 @@ def projection_difference_px(
     frames: list[RigFrame], first: tuple[Camera, FloatArray], second: tuple[Camera, FloatArray]
 ) -> float:
     """Median distance between where two rigs (camera, visible to thermal) put the frames' points [pixels]."""
-    points = np.concatenate([frame.points_visible() for frame in frames])
+    points = np.concatenate([frame.points for frame in frames])
     pixels = [camera.project(points @ rig[:3, :3].T + rig[:3, 3]) for camera, rig in (first, second)]
     inside = first[0].contains(pixels[0])
     return float(np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)[inside]))
@@ -121,17 +121,14 @@ def known_capture(
         column, row = np.where(inside[:, None], np.minimum(pixel, (plain.width - 1, plain.height - 1)), 0).astype(int).T
         distance = np.linalg.norm(points - pose[:3, 3], axis=1)
         ids = np.flatnonzero(inside & (np.abs(depths[number][row, column] - distance) < 0.01 * distance))
-        frames.append(
-            RigFrame(
-                f"view {number}", photographs[number], temperatures[number], pose, points[ids], ids.astype(np.int64)
-            )
-        )
+        seen = (points[ids] - pose[:3, 3]) @ pose[:3, :3] * (1.0, -1.0, -1.0)
+        frames.append(RigFrame(f"view {number}", photographs[number], temperatures[number], seen, ids.astype(np.int64)))
     return KnownCapture(frames, visible, thermal, rig, offsets, radial)
 
 
 def drawn_capture(
     scene_name: str, ratio: int, thermal_width: int, baseline_m: float, seed: int, views: int | None = None
-) -> tuple[KnownCapture, RigStart]:
+) -> tuple[KnownCapture, RigEstimate]:
     """A capture whose turn, lenses' direction, angle of view and principal point are drawn, and what is known of it.
 
     That is an angle of view up to 5 % off, and nothing else: no ruler was held against the cameras. Six to eight views
@@ -155,7 +152,7 @@ def drawn_capture(
     )
     width, height = capture.thermal.width, capture.thermal.height
     focal = capture.thermal.fl_x * (1.0 + draw.uniform(-0.05, 0.05))
-    return capture, RigStart(Camera(width, height, focal, focal, width / 2, height / 2))
+    return capture, guessed_rig(Camera(width, height, focal, focal, width / 2, height / 2), "the test")
 
 
 def painted_sky(
@@ -183,9 +180,9 @@ def painted_sky(
         photograph = _seen(paint, visible, np.eye(3), 2)
         temperature_c = 20.0 + 3.0 * _seen(paint, thermal, rig[:3, :3], 4)
         pixels = draw.uniform(0.0, 1.0, (600, 2)) * (visible.width, visible.height)
-        points = 10.0 * visible.rays(pixels) * (1.0, -1.0, -1.0)
+        points = 10.0 * visible.rays(pixels)
         ids = np.arange(len(points)) + number * len(points)
-        frames.append(RigFrame(f"sky {number}", photograph, temperature_c.astype(np.float32), np.eye(4), points, ids))
+        frames.append(RigFrame(f"sky {number}", photograph, temperature_c.astype(np.float32), points, ids))
     return KnownCapture(frames, visible, thermal, rig, np.zeros(views), (0.0, 0.0))
 
 

@@ -144,7 +144,6 @@ def model_of_colmap(reconstruction: Any, frame_of_image: Mapping[str, str], size
         found.resized(*size),
         np.stack(poses),
         np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
-        np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
         np.array([point.error for point in points], dtype=np.float64) * float(factor.mean()),
         np.array(frames, dtype=np.int64),
         np.array(seen, dtype=np.int64),

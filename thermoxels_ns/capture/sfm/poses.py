@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
+from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.settings import CaptureSettings, LensModel
 from thermoxels_ns.capture.sfm.colmap import FIELDS, model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
@@ -50,26 +49,24 @@ class ReducedPhotographs:
 
 def find_poses(
     photographs: Mapping[str, Path],
+    size: tuple[int, int],
     folder: Path,
     settings: CaptureSettings,
     focal_px: float | None = None,
     say: Callable[[str], None] = lambda _: None,
-) -> tuple[SfmModel, dict[str, str]]:
+) -> SfmModel:
     """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
 
-    `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length.
-    Returns the model, and a reason for each frame without a pose, by its name.
-    Results of an interrupted run in `folder` are reused. Only the largest set of photographs that fit is kept.
+    `photographs` maps frame names to files of `size` (width, height), in the order they were taken; `focal_px` is their
+    stated focal length. Results of an interrupted run in `folder` are reused. Only the largest set of photographs that
+    fit is kept.
 
     Raises:
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
     """
-    size, dropped = common_size(photographs)
-    names = [name for name in photographs if name not in dropped]
-    if len(names) < MIN_FRAMES:
-        raise _too_few(len(names), "photographs of one size")
-    some = {name: photographs[name] for name in names}
-    reduced, small = _reduced(some, folder, size, settings.image_size)
+    if len(photographs) < MIN_FRAMES:
+        raise _too_few(len(photographs), "photographs of one size")
+    reduced, small = _reduced(photographs, folder, size, settings.image_size)
     # The photographs' own focal length or a usual one, the principal point at the centre.
     focal = focal_px or _GUESSED_FOCAL * max(size)
     start = Camera(*size, focal, focal, size[0] / 2.0, size[1] / 2.0).resized(*small)
@@ -77,19 +74,7 @@ def find_poses(
     model = run_in_process(_map, (reduced, settings.seed), folder, say)
     if model is None or len(model.frames) < MIN_FRAMES:
         raise _too_few(0 if model is None else len(model.frames), "photographs that fit together")
-    few = "too few matches with the largest group of photographs that fit together"
-    return model, dropped | {name: few for name in names if name not in model.frames}
-
-
-def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, str]]:
-    """Return the width and height that most photographs have, and a reason for each frame of another size."""
-    facts = {name: read_photograph_facts(path) for name, path in photographs.items()}
-    sizes = {name: (one.width, one.height) for name, one in facts.items()}
-    if not sizes:
-        raise _too_few(0, "photographs")
-    size = Counter(sizes.values()).most_common(1)[0][0]
-    most = f"the others {size[0]} x {size[1]}: another camera or mode"
-    return size, {name: f"{own[0]} x {own[1]} pixels, {most}" for name, own in sizes.items() if own != size}
+    return model
 
 
 def _reduced(
