@@ -15,7 +15,7 @@ from PIL import Image
 
 from thermoxels_ns.capture.photograph import read_photograph_facts
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError, printable
-from thermoxels_ns.radiometry.decoders import check_file_size, check_thermal_size, errors_name, read_exif_facts
+from thermoxels_ns.radiometry.decoders import check_not_empty, check_thermal_size, errors_name, read_exif_facts
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES, size_of_double_tiff
@@ -118,7 +118,7 @@ def files_below(folder: Path, without: Sequence[Path] = (), say: Callable[[str],
 def identify(path: Path, folder: Path) -> CameraFile:
     """Return a file's role by content, for pictures by names below `folder`; raise `ThermoxelsError` if damaged."""
     with errors_name(path, "a camera file that can be decoded"):
-        check_file_size(path)
+        check_not_empty(path)
         suffix = path.suffix.lower()
         if suffix in (".npy", ".csv"):
             return CameraFile(path, "thermal", None)

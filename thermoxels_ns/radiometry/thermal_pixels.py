@@ -20,7 +20,7 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.radiometry.decoders import (
     JPEG_START,
     PNG_START,
-    check_file_size,
+    check_not_empty,
     check_thermal_size,
     errors_name,
 )
@@ -138,7 +138,7 @@ def detect_format(path: Path) -> ThermalFormat:
     if not path.is_file():
         remedy = "Check the path; in a scene, restore the file, remove its frame or pass --missing-thermal skip."
         raise ThermalFileError("thermal file", expected=f"a file at {path}", got="nothing there", remedy=remedy)
-    check_file_size(path)
+    check_not_empty(path)
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
     found: ThermalFormat | None = next((name for start, name in _STARTS.items() if head.startswith(start)), None)

@@ -11,11 +11,10 @@ import numpy as np
 from PIL import Image
 
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.settings import CaptureSettings, LensModel
+from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.colmap import FIELDS, model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.arrays import IntArray
-from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.core.errors import SceneError
 
@@ -67,11 +66,13 @@ def find_poses(
     if len(photographs) < MIN_FRAMES:
         raise _too_few(len(photographs), "photographs of one size")
     reduced, small = _reduced(photographs, folder, size, settings.image_size)
-    # The photographs' own focal length or a usual one, the principal point at the centre.
-    focal = focal_px or _GUESSED_FOCAL * max(size)
-    start = Camera(*size, focal, focal, size[0] / 2.0, size[1] / 2.0).resized(*small)
-    run_in_process(_find_and_match, (reduced, start, focal_px is not None, settings), folder, say)
-    model = run_in_process(_map, (reduced, settings.seed), folder, say)
+    params = ""
+    if focal_px is not None:
+        start = {"cx": small[0] / 2.0, "cy": small[1] / 2.0}
+        start |= dict.fromkeys(("f", "fl_x", "fl_y"), focal_px * small[0] / size[0])
+        params = ",".join(str(start.get(name, 0.0)) for name in FIELDS[settings.lens])
+    run_in_process(_find_and_match, (reduced, params, settings), say)
+    model = run_in_process(_map, (reduced, settings.seed), say)
     if model is None or len(model.frames) < MIN_FRAMES:
         raise _too_few(0 if model is None else len(model.frames), "photographs that fit together")
     return model
@@ -165,22 +166,23 @@ def image_pairs(count: int) -> IntArray:
 
 
 def _find_and_match(
-    photographs: ReducedPhotographs,
-    camera: Camera,
-    known_focal: bool,
-    settings: CaptureSettings,
-    say: Callable[[str], None],
+    photographs: ReducedPhotographs, params: str, settings: CaptureSettings, say: Callable[[str], None]
 ) -> None:
     """Find features in photographs and match them, adding to what an interrupted run left in the database.
 
-    `camera` is the start value of the lens, at the size of the reduced photographs; `known_focal` is True if its focal
-    length is stated by photographs, not guessed.
+    `params` are the lens's parameters as COLMAP writes them, at the size of the reduced photographs; if empty, the
+    focal length is guessed.
     """
     import pycolmap
 
-    _add_images(photographs, camera, settings.lens, known_focal)
     database, names = photographs.database, list(photographs.frame_of_image)
-    reader = pycolmap.ImageReaderOptions(camera_model=settings.lens, existing_camera_id=1)
+    reader = pycolmap.ImageReaderOptions(camera_model=settings.lens, camera_params=params)
+    reader.default_focal_length_factor = _GUESSED_FOCAL
+    if not database.is_file():
+        # Photographs are numbered here, in order; the threads that find features would number them by chance.
+        with replace_when_done(database) as temporary:
+            pycolmap.Database.open(temporary).close()
+            pycolmap.import_images(temporary, photographs.images, pycolmap.CameraMode.SINGLE, names, reader)
     extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=settings.threads)
     extraction.sift.max_num_features = settings.max_features
     for start in range(0, len(names), _CHUNK):  # COLMAP skips photographs that already have features
@@ -200,28 +202,3 @@ def _find_and_match(
         pairing.match_list_path = str(listed)
         pycolmap.match_image_pairs(database, matching, pairing, verification)
         say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
-
-
-def _add_images(photographs: ReducedPhotographs, camera: Camera, lens: LensModel, known_focal: bool) -> None:
-    """Create the database with photographs numbered in order; the feature threads would number them by chance."""
-    import pycolmap
-
-    if photographs.database.is_file():
-        return
-    names = photographs.frame_of_image
-    with replace_when_done(photographs.database) as temporary, pycolmap.Database.open(temporary) as opened:
-        numbers = {"f": camera.fl_x, **vars(camera)}
-        params = [numbers[name] for name in FIELDS[lens]]
-        size = {"width": camera.width, "height": camera.height}
-        colmap_camera = pycolmap.Camera(camera_id=1, model=lens, params=params, **size)
-        colmap_camera.has_prior_focal_length = known_focal
-        opened.write_camera(colmap_camera, use_camera_id=True)
-        rig = pycolmap.Rig(rig_id=1)
-        rig.add_ref_sensor(colmap_camera.sensor_id)
-        opened.write_rig(rig, use_rig_id=True)
-        for number, name in enumerate(names, start=1):
-            image = pycolmap.Image(name=name, camera_id=1, image_id=number)
-            opened.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=number, rig_id=1)
-            frame.add_data_id(image.data_id)
-            opened.write_frame(frame, use_frame_id=True)
