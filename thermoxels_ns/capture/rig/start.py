@@ -9,6 +9,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame, guessed_rig
@@ -73,11 +74,9 @@ def rig_start(
         camera = centred(visible.fl_x * width / visible.width * ratio)
         x, y = (median(getattr(each, name) for each in flir) for name in ("offset_x", "offset_y"))
         # The thermal image's centre lies at the photograph's centre plus the offset.
-        ahead = np.array([x / visible.fl_x, y / visible.fl_y, 1.0])
-        ahead /= np.linalg.norm(ahead)
-        right = np.cross([0.0, 1.0, 0.0], ahead)
-        right /= np.linalg.norm(right)
-        transform[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
+        ahead, down = [x / visible.fl_x, y / visible.fl_y, 1.0], [0.0, 1.0, 0.0]
+        turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0], down], [ahead, down], [np.inf, 1.0])
+        transform[:3, :3] = turn.as_matrix()
         sigma, source = _FROM_FLIR, f"FLIR's alignment of the pictures (Real2IR {ratio:.3f}, offset {x:g}, {y:g})"
     elif angles:
         angle = median(angles)

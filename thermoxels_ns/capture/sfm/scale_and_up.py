@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph
@@ -232,9 +233,12 @@ class Up:
 
 
 def upright(model: SfmModel, frames: Sequence[CaptureFrame]) -> tuple[SfmModel, Up]:
-    """Return the model of `frames` with z up, y ahead and its origin amid the scene points; and up in its axes."""
+    """Return the model of `frames` with z up, y ahead of the cameras and its origin amid the scene points; and up."""
     up = find_up(model.camera_to_world, [one.gimbal_deg for one in frames], [one.orientation for one in frames])
-    rotation = level_rotation(up.direction, -model.camera_to_world[:, :3, 2].mean(axis=0))
+    ahead = -model.camera_to_world[:, :3, 2].mean(axis=0)
+    # The infinite weight turns up to z exactly; ahead then comes as near to y as it can.
+    turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], [up.direction, ahead], [np.inf, 1.0])
+    rotation = turn.as_matrix()
     origin = np.median(model.points, axis=0) if len(model.points) else model.centres.mean(axis=0)
     return model.moved(rotation, origin), replace(up, direction=rotation @ up.direction)
 
@@ -270,23 +274,6 @@ def find_up(
         if values[0] < 0.2 * values[1] and normal @ mean > _LEAST_COSINE:
             return Up(normal, "Assumed: the photographs' sides were held level.")
     return Up(mean, "Assumed: the mean of the photographs' upward directions.")
-
-
-def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
-    """Return the rotation (3, 3) that turns `up` to z, and the part of `ahead` perpendicular to `up` to y, if not 0.
-
-    >>> level_rotation([0, 1, 0], [0, 0, -1]).round(9).tolist()
-    [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-    """
-    z = np.asarray(up, dtype=np.float64)
-    z = z / np.linalg.norm(z)
-    y = np.asarray(ahead, dtype=np.float64)
-    y = y - (y @ z) * z
-    if not np.linalg.norm(y) > 1e-6:
-        y = np.eye(3)[np.argmin(np.abs(z))]
-        y = y - (y @ z) * z
-    y = y / np.linalg.norm(y)
-    return np.stack([np.cross(y, z), y, z]) + 0.0
 
 
 def _robust_mean(directions: FloatArray) -> FloatArray:
