@@ -157,7 +157,7 @@ def test_a_point_of_the_thermal_image_lands_where_the_scene_has_it():
     model = ring_model(3)
     seen, pixels = model.seen_by(1)
     points = model.in_camera(1, model.points[seen])
-    frame = RigFrame("f1", np.zeros((480, 640)), np.zeros((60, 80)), points, seen)
+    frame = RigFrame(np.zeros((480, 640)), np.zeros((60, 80)), points, seen)
     thermal, rig = Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4)
     rig[:3, 3] = (0.3, -0.1, 0.05)
     chosen = np.argmin(np.linalg.norm(pixels - (320, 240), axis=1))

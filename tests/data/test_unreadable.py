@@ -24,7 +24,7 @@ from thermoxels_ns.training.pipeline import load_checkpoint
 
 
 def read_rig_photograph(path: Path) -> None:
-    frame = RigFrame("a", path, np.zeros((3, 4)), np.zeros((0, 3)), np.zeros(0, np.int64))
+    frame = RigFrame(path, np.zeros((3, 4)), np.zeros((0, 3)), np.zeros(0, np.int64))
     read_photograph(frame)
 
 

@@ -33,9 +33,8 @@ _SMALLEST_DEPTH_SHARE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class RigFrame:
-    """One photograph with its thermal image, its pose and the scene points that it shows."""
+    """One photograph with its thermal image and the scene points that it shows."""
 
-    name: str
     photograph: npt.NDArray | Path
     """Grey or RGB array of any number type, or the photograph's file. The size is that of the visible camera, or
     smaller in the same proportions."""

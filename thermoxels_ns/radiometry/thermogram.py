@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image
@@ -143,11 +143,8 @@ def _read_stored(
     conditions = options.applied_to(Conditions())
     per_count = unit.scale if picture and unit.kind == "linear" else None
     metadata = ThermogramMetadata(found, exif.camera, conditions=conditions, celsius_per_count=per_count)
-    if conditions != Conditions():  # pixels that have no temperature under the new conditions count as out of range
-        again = masked_image(corrected_temperature_c(image.temperature_c, conditions))
-        lost = again.report.masked - image.report.masked
-        report = replace(image.report, out_of_range=image.report.out_of_range + lost)
-        image = ThermalImage(again.temperature_c, report)
+    if conditions != Conditions():
+        image = masked_image(corrected_temperature_c(image.temperature_c, conditions))
     return image, metadata
 
 

@@ -36,7 +36,7 @@ def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame
         seen, _ = model.seen_by(index)
         seen = seen[good[seen]]
         points = model.in_camera(index, model.points[seen])
-        result.append(RigFrame(frame.name, frame.photograph, frame.thermal, points, seen))
+        result.append(RigFrame(frame.photograph, frame.thermal, points, seen))
     return result
 
 
