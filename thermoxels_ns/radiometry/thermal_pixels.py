@@ -165,6 +165,7 @@ def read_thermal_file(
     Raises:
         ThermalFileError: The file is missing, damaged, a colour picture, or its counts have no unit.
     """
+    values: npt.NDArray[Any]
     no_data = None
     with errors_name(path, _EXPECTED, _REMEDY, ThermalFileError):
         found = detect_format(path)

@@ -75,7 +75,7 @@ def rig_start(
         x, y = (median(getattr(each, name) for each in flir) for name in ("offset_x", "offset_y"))
         # The thermal image's centre lies at the photograph's centre plus the offset.
         ahead, down = [x / visible.fl_x, y / visible.fl_y, 1.0], [0.0, 1.0, 0.0]
-        turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0], down], [ahead, down], [np.inf, 1.0])
+        turn = Rotation.align_vectors([[0.0, 0.0, 1.0], down], [ahead, down], [np.inf, 1.0])[0]
         transform[:3, :3] = turn.as_matrix()
         sigma, source = _FROM_FLIR, f"FLIR's alignment of the pictures (Real2IR {ratio:.3f}, offset {x:g}, {y:g})"
     elif angles:

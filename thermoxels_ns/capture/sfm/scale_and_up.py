@@ -237,7 +237,7 @@ def upright(model: SfmModel, frames: Sequence[CaptureFrame]) -> tuple[SfmModel, 
     up = find_up(model.camera_to_world, [one.gimbal_deg for one in frames], [one.orientation for one in frames])
     ahead = -model.camera_to_world[:, :3, 2].mean(axis=0)
     # The infinite weight turns up to z exactly; ahead then comes as near to y as it can.
-    turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], [up.direction, ahead], [np.inf, 1.0])
+    turn = Rotation.align_vectors([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], [up.direction, ahead], [np.inf, 1.0])[0]
     rotation = turn.as_matrix()
     origin = np.median(model.points, axis=0) if len(model.points) else model.centres.mean(axis=0)
     return model.moved(rotation, origin), replace(up, direction=rotation @ up.direction)
