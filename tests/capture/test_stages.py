@@ -297,6 +297,8 @@ def test_another_scale_and_a_given_rig_run_only_what_depends_on_them_and_so_does
 def test_the_command(capture, tmp_path, capsys):
     assert cli.main(["capture", str(tmp_path / "nowhere"), "--output", str(tmp_path / "scene")]) == 2
     assert "nothing at" in capsys.readouterr().err
+    assert cli.main(["capture", str(tmp_path), "--output", str(tmp_path / "scene"), "--emissivity", "1.5"]) == 2
+    assert "emissivity: expected" in capsys.readouterr().err
     card, scene, _, _ = capture
     words = ["--skip-bad", "True", "--max-features", "500", "--thermal-field-of-view-deg", str(ANGLE_DEG)]
     assert cli.main(["capture", str(card), "--output", str(scene), *words]) == 0

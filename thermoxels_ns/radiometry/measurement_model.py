@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_positive, check_ranges
-from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin, kelvin_to_celsius
 
 DEFAULT_RELATIVE_HUMIDITY = 0.5
@@ -94,11 +94,11 @@ class RadiometryOptions:
         if (scale is None) != (offset is None) or scale == 0:
             expected, got = "both, with a scale other than 0, or neither", f"{scale} and {offset}"
             remedy = "Pass --celsius-per-count 0.04 --celsius-offset -273.15, for example."
-            raise ThermalFileError("celsius_per_count, celsius_offset", expected=expected, got=got, remedy=remedy)
+            raise ThermoxelsError("celsius_per_count, celsius_offset", expected=expected, got=got, remedy=remedy)
         if scale is not None and self.camera is not None:
             remedy = "Leave --camera or --celsius-per-count and --celsius-offset out."
             got = f"the preset {self.camera} and {scale} K per count"
-            raise ThermalFileError("camera", expected="a preset or a scale of your own", got=got, remedy=remedy)
+            raise ThermoxelsError("camera", expected="a preset or a scale of your own", got=got, remedy=remedy)
 
     def applied_to(self, conditions: Conditions) -> Conditions:
         """Return `conditions` with every field replaced that is not None here.
