@@ -102,9 +102,10 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
             camera, angle = flir.camera.model, flir.camera.field_of_view_deg
             metadata = ThermogramMetadata(found, camera, angle, conditions, flir.picture_in_picture)
         elif found == "DJI R-JPEG":
-            dji = read_dji_rjpeg(path, options)
-            image = masked_image(dji.temperature_c)
-            metadata = ThermogramMetadata(found, dji.exif.camera, conditions=dji.conditions)
+            temperature_c, conditions = read_dji_rjpeg(path, options)
+            image = masked_image(temperature_c)
+            with Image.open(path) as opened:
+                metadata = ThermogramMetadata(found, read_exif_facts(opened).camera, conditions=conditions)
         elif found == "JPEG":
             app_segments(path, whole=True)  # says so if the file is cut off
             expected = "a FLIR or DJI R-JPEG, a TIFF, a 16-bit PNG, or a table of degrees C (.npy, .csv)"
