@@ -26,6 +26,7 @@ _WEAKEST_EDGE = 0.05
 FARTHEST_FROM_POINT = 0.06
 """If the nearest scene point is farther from an edge (on the plane at depth 1), the edge's depth counts as unknown."""
 SURE_DISTANCE = 0.01  # an edge so far from the nearest scene point, both drawn to depth 1, has half the weight
+_EDGE_REACH = 2.0  # half the width of an edge, in standard deviations of its blur
 _MARGIN_SHARE = 0.15
 _FINER = 1.23
 _GRADIENT_SIGMA_PX = 1.2
@@ -147,7 +148,13 @@ class PreparedFrames:
         rays, (rows, columns) = rays[keep], place[keep].T
         depth, distance = frame.depth.at(rays)
         known = distance < FARTHEST_FROM_POINT
-        value = field[rows, columns] / (1.0 + (distance / SURE_DISTANCE) ** 4)
+        # An edge's trust is constant across its width. Otherwise, where only one side of an outline has scene points,
+        # the trust would fall across the outline and shift the edge.
+        trust = np.zeros(field.shape, np.float32)
+        trust[rows, columns] = 1.0 / (1.0 + (distance / SURE_DISTANCE) ** 4)
+        reach = 2 * int(np.ceil(_EDGE_REACH * (blur_px * scale / same + 1.0))) + 1
+        trust = cv2.dilate(trust, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+        value = (field * trust)[rows, columns]
         return EdgePoints(rays[known] * depth[known, None], value[known].astype(np.complex64))
 
 

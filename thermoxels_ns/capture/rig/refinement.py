@@ -20,8 +20,9 @@ _MOST_STEPS = 20
 _GRADIENT_TOLERANCE = 3e-2
 THERMAL_BLUR_PX = 0.6
 """Standard deviation of a blur of both images, so that interpolation does not matter [thermal pixels]."""
-_NOISE_K = 0.05  # standard deviation of the independent noise of the pixels of uncooled cameras [K]
-_SMALLEST_CONTRAST = 1e-8
+_NOISE_TO_MEDIAN = 0.6745
+_NOISE_KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6.0
+_SMALLEST_VARIANCE = 1e-8
 _STEP_PX = 1e-3
 _BLOCKS = 4
 """Every image is divided into _BLOCKS x _BLOCKS parts, whose contributions to a slope count as independent."""
@@ -142,6 +143,11 @@ class SmoothThermal:
     def __init__(self, contrast: FloatImage) -> None:
         """Fit the spline to local contrasts, shape (height, width) [K]; NaN where unknown."""
         bad = ~np.isfinite(contrast)
+        # The noise is estimated from second differences along both axes at once (Immerkaer 1996).
+        curved = np.abs(ndimage.convolve(contrast.astype(np.float64), _NOISE_KERNEL, mode="nearest"))
+        curved = curved[np.isfinite(curved)]
+        self.noise_k = float(np.median(curved)) / _NOISE_TO_MEDIAN if len(curved) else 0.0
+        """Standard deviation of the pixels' independent noise [K]."""
         filled = np.where(bad, 0.0, contrast).astype(np.float64)
         smooth = cv2.GaussianBlur(filled, (0, 0), THERMAL_BLUR_PX, borderType=cv2.BORDER_REFLECT)
         self._spline = np.asarray(ndimage.spline_filter(smooth, order=3, mode="mirror"))
@@ -186,6 +192,8 @@ class WindowScore:
         self.frames, self.rig = list(zip(windows, thermal)), rig
         self.count = sum(len(each.index) for each in windows)
         """Number of windows in all frames."""
+        # One noise level for all images: no window counts as more certain than the noise allows.
+        self._noise = float(np.median([image.noise_k for image in thermal])) if len(thermal) else 0.0
 
     def agreement(self, change: FloatArray, shift_px: tuple[float, float] = (0.0, 0.0)) -> list[FloatArray]:
         """Return R2 of every window at the ten changes `change`, one array (windows,) per frame. Windows are moved by
@@ -226,7 +234,7 @@ class WindowScore:
         value = temperature[windows.index] * windows.weight
         value = value - (value @ windows.plain) @ windows.plain.T
         gain = np.einsum("wk,wk->w", windows.bright, value)
-        floor = _NOISE_K**2 * float(windows.weight @ windows.weight)  # no window is surer than the noise allows
+        floor = (self._noise**2 + _SMALLEST_VARIANCE) * float(windows.weight @ windows.weight)
         return value, gain, np.sum(value * value, axis=1) + floor
 
 
@@ -337,6 +345,6 @@ def choose_windows(
     bright -= (bright @ plain) @ plain.T
     length = np.linalg.norm(bright, axis=1)
     best = np.sort(np.argsort(-length, kind="stable")[:most])
-    bright /= np.maximum(length, _SMALLEST_CONTRAST)[:, None]
+    bright /= np.maximum(length, _SMALLEST_VARIANCE)[:, None]
     every = Windows(points, index, plain, bright, weight, trust[index[:, index.shape[1] // 2]])
-    return every.chosen(best[length[best] > _SMALLEST_CONTRAST])
+    return every.chosen(best[length[best] > _SMALLEST_VARIANCE])
