@@ -106,11 +106,9 @@ def main(arguments: list[str] | None = None) -> int:
         The exit status: 0 on success, 130 after the user's interrupt; after an error, which is printed, that of
         `errors.exit_status`.
     """
-    command = tyro.cli(
-        Commands, prog="thermoxels", args=arguments, description="RGB and thermal photographs to a solid with heat."
-    )
+    about = "RGB and thermal photographs to a solid with heat."
     try:
-        command.main()
+        tyro.cli(Commands, prog="thermoxels", args=arguments, description=about).main()
     except ThermoxelsError as problem:
         _complain("[bold red]Error:[/bold red]", str(problem))
         return exit_status(problem)

@@ -10,22 +10,19 @@ from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.frames import CaptureFrames, read_frames
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import read_photograph_facts
-from thermoxels_ns.radiometry.thermogram import RadiometryOptions
+from thermoxels_ns.capture.settings import CaptureSettings
 
 
 def pair(folder: Path, name: str, temperature_c: np.ndarray | None = None, **exif) -> Pair:
-    return Pair(
-        name,
-        photograph(folder / f"{name}-visible.jpg", **exif),
-        counts(folder / f"{name}-radiometric.tiff", temperature_c),
-        "equal names",
-    )
+    photograph(folder / f"{name}-visible.jpg", **exif)
+    counts(folder / f"{name}-radiometric.tiff", temperature_c)
+    return Pair(f"{name}-visible.jpg", f"{name}-radiometric.tiff", "equal names")
 
 
 def read(pairs, tmp_path, skip_bad=False):
     work = tmp_path / "work"
     work.mkdir(exist_ok=True)
-    return read_frames(pairs, tmp_path / "card", work, RadiometryOptions(), skip_bad)
+    return read_frames(pairs, tmp_path / "card", work, CaptureSettings(skip_bad=skip_bad))
 
 
 def test_degrees_and_what_the_files_say(tmp_path):
@@ -35,8 +32,8 @@ def test_degrees_and_what_the_files_say(tmp_path):
     (frame,) = frames.frames
     assert np.load(frame.thermal) == pytest.approx(temperature_c, abs=0.013)
     assert (frame.focal_px, frame.camera) == (40.0, "Workswell WIRIS Pro")
-    assert (frame.photograph_source, frame.thermal_source) == ("a-visible.jpg", "a-radiometric.tiff")
-    assert frames.thermal_size == (16, 12)
+    assert (frame.name, frame.thermal_source) == ("a-visible.jpg", "a-radiometric.tiff")
+    assert (frames.photograph_size, frames.thermal_size) == ((32, 24), (16, 12))
 
 
 def test_the_list_survives_a_move_of_both_folders(tmp_path):
@@ -44,11 +41,11 @@ def test_the_list_survives_a_move_of_both_folders(tmp_path):
     card = tmp_path / "card"
     first = pair(card, "a", gps=(48.0, 11.0, 500.0))
     (card / "F.jpg").write_bytes(flir.jpeg())
-    frames = read([first, Pair("F", card / "F.jpg", card / "F.jpg", "both in one file")], tmp_path)
+    frames = read([first, Pair("F.jpg", "F.jpg", "both in one file")], tmp_path)
     (tmp_path / "work").rename(tmp_path / "work2")
     card.rename(tmp_path / "card2")
     loaded = CaptureFrames.load(tmp_path / "work2", tmp_path / "card2")
-    assert [frame.name for frame in loaded.frames] == ["a", "F"]
+    assert [frame.name for frame in loaded.frames] == ["a-visible.jpg", "F.jpg"]
     assert loaded.frames[0].gps == frames.frames[0].gps
     for frame in loaded.frames:
         assert frame.photograph.is_file() and frame.thermal.is_file()
@@ -60,7 +57,7 @@ def test_a_photograph_inside_a_flir_file_is_taken_out(tmp_path):
     card.mkdir()
     flir = FlirFile(np.full((12, 16), 14000, np.uint16), photograph=jpeg_bytes(pixels), alignment=(1.2, 3, -4))
     (card / "F.jpg").write_bytes(flir.jpeg())
-    (frame,) = read([Pair("F", card / "F.jpg", card / "F.jpg", "")], tmp_path).frames
+    (frame,) = read([Pair("F.jpg", "F.jpg", "")], tmp_path).frames
     assert np.asarray(Image.open(frame.photograph)).mean(axis=(0, 1)) == pytest.approx((200, 30, 30), abs=3)
     assert (
         frame.metadata.picture_in_picture is not None
@@ -72,20 +69,20 @@ def test_a_photograph_inside_a_flir_file_is_taken_out(tmp_path):
 def test_the_rest_goes_on_without_damaged_files(tmp_path):
     card = tmp_path / "card"
     pairs = {name: pair(card, name) for name in ("thermal", "photo")}
-    for path in (pairs["thermal"].thermal, pairs["photo"].photograph):
+    for path in (card / pairs["thermal"].thermal, card / pairs["photo"].photograph):
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     frames = read([*pairs.values(), pair(card, "good")], tmp_path, skip_bad=True)
-    assert [frame.name for frame in frames.frames] == ["good"]
-    assert set(frames.dropped) == set(pairs)
-    assert all(name in why for name, why in frames.dropped.items())
+    assert [frame.name for frame in frames.frames] == ["good-visible.jpg"]
+    assert set(frames.dropped) == {pair.photograph for pair in pairs.values()}
+    assert all(name.split("-")[0] in why for name, why in frames.dropped.items())
 
 
 def test_a_frame_of_another_thermal_camera_is_dropped_by_name(tmp_path):
     card = tmp_path / "card"
     pairs = [pair(card, "a"), pair(card, "b"), pair(card, "odd", np.full((6, 8), 20.0))]
     frames = read(pairs, tmp_path)
-    assert [frame.name for frame in frames.frames] == ["a", "b"]
-    assert "8 x 6 pixels, most have 16 x 12" in frames.dropped["odd"]
+    assert [frame.name for frame in frames.frames] == ["a-visible.jpg", "b-visible.jpg"]
+    assert "8 x 6 pixels, most have 16 x 12" in frames.dropped["odd-visible.jpg"]
 
 
 def test_stuck_pixels_become_nan(tmp_path):

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from tests.support.camera_card import counts, photograph, write_pairs
-from tests.support.flir_file import dji_jpeg
 from thermoxels_ns.capture.folder_scan import scan_folder
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.commands.capture import capture_folder
@@ -41,14 +40,6 @@ def test_a_folder_without_pairs_says_what_is_in_it_and_what_helps(tmp_path, phot
         counts(card / f"{name}.tiff")
     message = no_pairs_said(card)
     assert all(words in message for words in said)
-    assert "--dji-library" not in message
-
-
-def test_a_lone_dji_file_lacks_its_partner_and_djis_library(tmp_path):
-    (tmp_path / "card").mkdir()
-    (tmp_path / "card" / "DJI_0001_T.JPG").write_bytes(dji_jpeg())
-    assert "--dji-library" in no_pairs_said(tmp_path / "card")
-    assert "--dji-library" not in no_pairs_said(tmp_path / "card", dji_library=tmp_path / "libdirp.so")
 
 
 def test_links_that_lead_nowhere_in_circles_or_to_folders_and_pipes_are_passed_over(tmp_path):

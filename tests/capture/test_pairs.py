@@ -23,7 +23,7 @@ def of(*files: tuple[str, str] | tuple[str, str, float], clock_offset_s: float =
 
 
 def names(search: PairSearch) -> list[tuple[str, str]]:
-    return [(pair.photograph.name, pair.thermal.name) for pair in search.pairs]
+    return [(Path(pair.photograph).name, Path(pair.thermal).name) for pair in search.pairs]
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def names(search: PairSearch) -> list[tuple[str, str]]:
 def test_equal_names_belong_together(photo, thermal):
     search = of((photo, "photograph"), (thermal, "thermal"), ("other.jpg", "photograph"))
     assert names(search) == [(Path(photo).name, Path(thermal).name)]
-    assert list(search.unpaired) == [ROOT / "other.jpg"]
+    assert list(search.unpaired) == ["other.jpg"]
 
 
 def test_the_same_name_in_two_folders_is_told_apart_by_the_folder():
@@ -49,14 +49,13 @@ def test_the_same_name_in_two_folders_is_told_apart_by_the_folder():
         *(("day1/visible/a.jpg", "photograph"), ("day1/thermal/a.tif", "thermal")),
         *(("day2/visible/a.jpg", "photograph"), ("day2/thermal/a.tif", "thermal")),
     )
-    assert [(p.photograph.parts[2], p.thermal.parts[2]) for p in search.pairs] == [("day1", "day1"), ("day2", "day2")]
-    assert len({pair.name for pair in search.pairs}) == 2
+    assert [(p.photograph[:4], p.thermal[:4]) for p in search.pairs] == [("day1", "day1"), ("day2", "day2")]
 
 
 def test_two_thermal_images_of_one_name_are_ambiguous_and_both_named():
     search = of(("a.jpg", "photograph"), ("a.npy", "thermal"), ("a.csv", "thermal"))
     assert search.pairs == ()
-    assert set(search.unpaired) == {ROOT / "a.jpg", ROOT / "a.npy", ROOT / "a.csv"}
+    assert set(search.unpaired) == {"a.jpg", "a.npy", "a.csv"}
     assert all("ambiguous" in why for why in search.unpaired.values())
 
 
@@ -73,8 +72,8 @@ def test_dji_names_pair_though_their_times_differ_by_a_second():
         ("DJI_20220723151220_0001_V.JPG", "DJI_20220723151219_0001_T.JPG"),
         ("DJI_20240502000000_0003_V.JPG", "DJI_20240501235959_0003_T.JPG"),
     ]
-    assert "DJI_0002_W.JPG is the partner" in search.unpaired[ROOT / "DJI_0002_Z.JPG"]
-    assert ROOT / "DJI_20220723160000_0001_V.JPG" in search.unpaired
+    assert "DJI_0002_W.JPG is the partner" in search.unpaired["DJI_0002_Z.JPG"]
+    assert "DJI_20220723160000_0001_V.JPG" in search.unpaired
 
 
 def test_times_pair_what_names_do_not_unless_two_are_about_as_near():
@@ -83,12 +82,12 @@ def test_times_pair_what_names_do_not_unless_two_are_about_as_near():
         *(("FLIR7.jpg", "thermal", 0.4), ("FLIR8.jpg", "thermal", 10.9)),
     )
     assert names(search) == [("IMG_1.jpg", "FLIR7.jpg"), ("IMG_2.jpg", "FLIR8.jpg")]
-    assert "49.1 s away" in search.unpaired[ROOT / "IMG_3.jpg"]
+    assert "49.1 s away" in search.unpaired["IMG_3.jpg"]
     files = (("a.jpg", "photograph", 0.0), ("b.npy", "thermal", 3600.2))  # a clock that is ahead
     assert of(*files).pairs == ()
     assert names(of(*files, clock_offset_s=3600.0)) == [("a.jpg", "b.npy")]
     search = of(("x.jpg", "photograph", 1.0), ("p.npy", "thermal", 0.5), ("q.npy", "thermal", 1.6))
-    assert search.pairs == () and "about as near" in search.unpaired[ROOT / "x.jpg"]
+    assert search.pairs == () and "about as near" in search.unpaired["x.jpg"]
 
 
 def test_every_file_is_in_a_pair_or_explained():
@@ -99,7 +98,7 @@ def test_every_file_is_in_a_pair_or_explained():
     paired = [path for pair in search.pairs for path in (pair.photograph, pair.thermal)]
     assert len(search.pairs) > 3
     assert len(paired) == len(set(paired))
-    assert set(paired) | set(search.unpaired) == {ROOT / f[0] for f in files}
+    assert set(paired) | set(search.unpaired) == {f[0] for f in files}
     assert not set(paired) & set(search.unpaired)
 
 

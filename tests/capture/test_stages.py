@@ -71,8 +71,9 @@ def found_poses(scene):
 def test_what_is_left_out_is_named_with_its_reason_and_nothing_is_written_elsewhere(capture):
     dropped, (before, after) = capture[2].dropped, capture[3]
     assert len(before) > 2 * COUNT and after == before
-    assert set(dropped) == {f"shot{COUNT}", "shot8", "lonely.jpg", "shot9-visible.jpg"}
-    assert "too few matches" in dropped[f"shot{COUNT}"] and "32 x 24 pixels" in dropped["shot8"]
+    assert set(dropped) == {f"shot{COUNT}-visible.jpg", "shot8-visible.jpg", "lonely.jpg", "shot9-visible.jpg"}
+    assert "too few matches" in dropped[f"shot{COUNT}-visible.jpg"]
+    assert "32 x 24 pixels" in dropped["shot8-visible.jpg"]
     assert "zero bytes" in dropped["shot9-visible.jpg"]
     assert (len(capture[2].pairs), len(capture[2].scene.frames)) == (COUNT + 2, COUNT)
 
@@ -130,12 +131,12 @@ def words(result, **scene) -> str:
 def test_numbers_on_the_page_have_their_errors(capture):
     errors = {"rx": 0.003, "ry": 0.004, "rz": 0.012, "log_focal": 0.01, "cx": 0.42, "cy": 0.57}
     covariance = np.diag([errors.get(name, 0.0) ** 2 for name in PARAMETERS])
-    rig = RigEstimate(Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4), True, "", PARAMETERS, covariance)
+    rig = RigEstimate(Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4), True, "", covariance)
     result = replace(capture[2], start=rig)
     said = words(result, rig=rig)
     assert "41.0, 29.0 41.0 ± 0.4, 29.0 ± 0.6 " in said and "70.0 70.0 ± 0.7 " in said
     assert "turned by 0.00 ± 0.74 degrees" in said
-    assert "41.0, 29.0 41.0, 29.0 " in words(result, rig=replace(rig, parameters=(), covariance=np.zeros((0, 0))))
+    assert "41.0, 29.0 41.0, 29.0 " in words(result, rig=replace(rig, covariance=np.full((10, 10), np.nan)))
     assert f"unknown ({result.scale_missing}); give a length when you export the mesh" in said
     known = words(result, scale=SceneScale(0.5, 0.01, "GPS."))
     assert "0.5 ± 0.01 (2.0 %) m per unit" in known and "unknown" not in known
@@ -144,7 +145,7 @@ def test_numbers_on_the_page_have_their_errors(capture):
 def test_names_of_files_are_no_markup(capture):
     evil = "<script>alert(1)</script>"
     frames = [replace(frame, camera=evil) for frame in capture[2].scene.frames]
-    pairs = [Pair("a", Path(f"{evil}.jpg"), Path("a.tiff"), evil)]
+    pairs = [Pair(f"{evil}.jpg", "a.tiff", evil)]
     changed = replace(capture[2], source=Path(evil), dropped={evil: evil}, pairs=pairs, scale_missing=evil)
     text = page_of(changed, evil, frames=frames)
     assert "<script" not in text
@@ -155,11 +156,12 @@ def test_a_point_of_the_thermal_image_lands_where_the_scene_has_it():
     """A warm spot at the projection of a scene point appears at that point in the photograph."""
     model = ring_model(3)
     seen, pixels = model.seen_by(1)
-    frame = RigFrame("f1", np.zeros((480, 640)), np.zeros((60, 80)), model.camera_to_world[1], model.points[seen], seen)
+    points = model.in_camera(1, model.points[seen])
+    frame = RigFrame(np.zeros((480, 640)), np.zeros((60, 80)), points, seen)
     thermal, rig = Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4)
     rig[:3, 3] = (0.3, -0.1, 0.05)
     chosen = np.argmin(np.linalg.norm(pixels - (320, 240), axis=1))
-    spot = thermal.project(frame.points_visible()[[chosen]] @ rig[:3, :3].T + rig[:3, 3])[0]
+    spot = thermal.project(points[[chosen]] @ rig[:3, :3].T + rig[:3, 3])[0]
     x, y = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
     temperature_c = 20 + 10 * np.exp(-((x - spot[0]) ** 2 + (y - spot[1]) ** 2) / 8)
     carried = thermal_in_photograph(frame, temperature_c, model.camera, RigEstimate(thermal, rig, True, ""), width=640)
@@ -188,7 +190,7 @@ def written(capture, tmp_path):
         frames=[replace(scene.frames[0], thermal=tmp_path / "holed.npy"), *scene.frames[1:]],
         drift=replace(scene.drift, radial=(0.5,)),
         scale=SceneScale(0.5, 0.01, "GPS."),
-        up=Up(np.array([0.0, 0.6, 0.8]), "Measured.", 0.1),
+        up=Up(np.array([0.0, 0.6, 0.8]), "Measured."),
     )
     folder = prepare_output(tmp_path / "scene")
     write_scene_folder(scene, folder)
@@ -200,7 +202,7 @@ def test_numbers_come_back_as_they_went_in(written):
     read = read_scene_file(folder)
     by_source = {entry["source"]: entry for entry in read.meta["frames"]}
     for number, frame in enumerate(scene.frames):
-        entry = by_source[frame.photograph_source]
+        entry = by_source[frame.name]
         assert np.array(entry["transform_matrix"]) == pytest.approx(scene.model.camera_to_world[number])
         # A scene point: x_thermal = rig @ x_visible, both in OpenCV axes.
         point = scene.model.points[:1]
@@ -241,7 +243,7 @@ def test_an_earlier_scene_is_replaced_and_nothing_else_or_stays_whole(written, m
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("thermoxels_ns.capture.scene_writer.write_points", stop)
+    monkeypatch.setattr("thermoxels_ns.capture.scene_writer.write_tracks", stop)
     with pytest.raises(KeyboardInterrupt):
         write_scene_folder(scene, folder)
     assert (folder / "transforms.json").read_bytes() == before
@@ -270,39 +272,33 @@ def test_a_second_run_takes_everything_from_the_first(capture):
     assert np.array_equal(again.scene.drift.offsets_k, first.scene.drift.offsets_k)
 
 
-def test_another_scale_runs_only_what_depends_on_it_and_so_does_from_stage(capture, tmp_path):
+def test_another_scale_and_a_given_rig_run_only_what_depends_on_them_and_so_does_from_stage(capture, tmp_path):
     card, earlier, _, _ = capture
     scene = tmp_path / "scene"
     shutil.copytree(earlier, scene)
     said = []
-    more = {"skip_bad": True, "drift": "off", "rig": earlier / "transforms.json"}
+    more = {"skip_bad": True, "rig": earlier / "transforms.json"}
     more["known_distance"] = ("shot2-visible.jpg", 100.0, 100.0, 380.0, 120.0, 2.0)
-    result = capture_folder(card, scene, settings(**more), said.append)
+    result, given = capture_folder(card, scene, settings(**more), said.append), content(earlier)
+    assert content(scene)["rig"] == given["rig"] and content(scene)["thermal_camera"] == given["thermal_camera"]
+    assert result.scene.drift.used
     assert [line.split(":")[0] for line in said if "as before" in line] == [
         "1/8 pairs",
         "2/8 temperatures",
         "3/8 poses",
     ]
     assert content(scene)["metres_per_unit"] == result.scene.scale.metres_per_unit
-    assert not result.scene.drift.used
     said.clear()
     capture_folder(card, scene, settings(from_stage="scene", **more), said.append)
     ran = [line for line in said if re.match(r"\d/8", line) and "as before" not in line]
     assert ran == ["7/8 scene", "8/8 page"]
 
 
-def test_a_given_rig_is_kept(capture, tmp_path):
-    card, scene, _, _ = capture
-    meta = content(scene)
-    result = capture_folder(card, tmp_path / "scene", settings(skip_bad=True, rig=scene / "transforms.json"))
-    new = content(tmp_path / "scene")
-    assert new["rig"] == meta["rig"] and new["thermal_camera"] == meta["thermal_camera"]
-    assert result.scene.drift.used
-
-
 def test_the_command(capture, tmp_path, capsys):
     assert cli.main(["capture", str(tmp_path / "nowhere"), "--output", str(tmp_path / "scene")]) == 2
     assert "nothing at" in capsys.readouterr().err
+    assert cli.main(["capture", str(tmp_path), "--output", str(tmp_path / "scene"), "--emissivity", "1.5"]) == 2
+    assert "emissivity: expected" in capsys.readouterr().err
     card, scene, _, _ = capture
     words = ["--skip-bad", "True", "--max-features", "500", "--thermal-field-of-view-deg", str(ANGLE_DEG)]
     assert cli.main(["capture", str(card), "--output", str(scene), *words]) == 0

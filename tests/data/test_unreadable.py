@@ -11,7 +11,6 @@ from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig.images import read_photograph
 from thermoxels_ns.capture.rig_types import RigFrame
 from thermoxels_ns.commands.cost import read_table
-from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.core.yaml_records import read_yaml
@@ -25,8 +24,8 @@ from thermoxels_ns.training.pipeline import load_checkpoint
 
 
 def read_rig_photograph(path: Path) -> None:
-    frame = RigFrame("a", path, np.zeros((3, 4)), np.eye(4), np.zeros((0, 3)), np.zeros(0, np.int64))
-    read_photograph(frame, Camera(4, 3, 4.0, 4.0, 2.0, 1.5))
+    frame = RigFrame(path, np.zeros((3, 4)), np.zeros((0, 3)), np.zeros(0, np.int64))
+    read_photograph(frame)
 
 
 READERS = {

@@ -14,7 +14,7 @@ from tests.support.textured_room import write_card
 
 COUNT = 5
 OPTIONS = "--max-features 300 --image-size 320 --thermal-field-of-view-deg 56"
-OF_THE_RUN = {"capture.html", "lock", "seconds.txt", "key.txt", "features.db"}
+OF_THE_RUN = {"capture.html", "lock", "key.txt", "features.db"}
 """They hold times, a process number, the options, and rows in the order in which threads ended."""
 
 
@@ -84,7 +84,7 @@ def test_kill_9_at_any_stage_changes_nothing_in_the_scene(scenes, tmp_path):
     again = run(*words)
     assert again.returncode == 0, again.stdout
     assert "7/8 scene: as before" in again.stdout and "8/8 page: as before" not in again.stdout
-    assert len(written(killed)) == 2 * COUNT + 3  # json, points, tracks
+    assert len(written(killed)) == 2 * COUNT + 2  # json, tracks
     assert written(killed) == written(alone)
     assert (killed / "capture.html").is_file()
 

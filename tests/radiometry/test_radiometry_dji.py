@@ -10,7 +10,8 @@ from PIL import Image
 from tests.support.flir_file import dji_jpeg, segment
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
-from thermoxels_ns.radiometry.thermogram import RadiometryOptions, read_thermogram
+from thermoxels_ns.radiometry.measurement_model import RadiometryOptions
+from thermoxels_ns.radiometry.thermogram import read_thermogram
 
 STUB = Path(__file__).parents[1] / "support" / "dirp_stub.c"
 

@@ -13,8 +13,9 @@ import pytest
 from tests.support.flir_file import FlirFile, picture_bytes, smooth_counts
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
+from thermoxels_ns.radiometry.measurement_model import RadiometryOptions
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, read_thermal_file
-from thermoxels_ns.radiometry.thermogram import RadiometryOptions, read_thermogram
+from thermoxels_ns.radiometry.thermogram import read_thermogram
 
 REAL_SHAPES = {
     "flir_b60_cc0.jpg": (180, 180),

@@ -149,8 +149,8 @@ def test_a_tiff_of_64_bit_numbers_is_celsius(tmp_path, big_endian):
 @pytest.mark.parametrize(
     ("name", "pixels", "named"),
     [
-        ("a.tiff", np.full((3, 3), 9, np.int32), "Give in transforms.json .*thermal_unit"),
-        ("a.tiff", np.full((3, 3), 9, np.uint16), "Give in transforms.json .*thermal_unit"),
+        ("a.tiff", np.full((3, 3), 9, np.int32), "give in transforms.json .*thermal_unit"),
+        ("a.tiff", np.full((3, 3), 9, np.uint16), "give in transforms.json .*thermal_unit"),
         ("a.png", np.full((3, 3), 65535, np.uint16), "65535"),
         ("a.png", np.full((3, 3), 255, np.uint8), "255"),
     ],

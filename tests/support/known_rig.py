@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV, RigEstimate, RigFrame, RigStart, radius_squared
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV, RigEstimate, RigFrame, guessed_rig, radius_squared
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.synthetic.raycast import render_view
 from thermoxels_ns.synthetic.scene_folder import make_scene
@@ -42,7 +42,7 @@ class KnownCapture:
         )
 
 
-def changes_between(start: RigStart, camera: Camera, transform: FloatArray) -> FloatArray:
+def changes_between(start: RigEstimate, camera: Camera, transform: FloatArray) -> FloatArray:
     """The ten changes (`PARAMETERS`) that make a rig of a start that is not turned, shape (10,)."""
     turn, before = transform[:3, :3], start.thermal_camera
     angles = cv2.Rodrigues(turn)[0].ravel()
@@ -56,7 +56,7 @@ def projection_difference_px(
     frames: list[RigFrame], first: tuple[Camera, FloatArray], second: tuple[Camera, FloatArray]
 ) -> float:
     """Median distance between where two rigs (camera, visible to thermal) put the frames' points [pixels]."""
-    points = np.concatenate([frame.points_visible() for frame in frames])
+    points = np.concatenate([frame.points for frame in frames])
     pixels = [camera.project(points @ rig[:3, :3].T + rig[:3, 3]) for camera, rig in (first, second)]
     inside = first[0].contains(pixels[0])
     return float(np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)[inside]))
@@ -75,10 +75,6 @@ def known_capture(
     baseline_m: tuple[float, float, float] = (0.15, 0.03, 0.02),
     turn_deg: tuple[float, float, float] = (0.8, -1.6, 0.5),
     zoom: float = 1.06,
-    noise_k: float = 0.05,
-    drift_k: float = 1.0,
-    radial: tuple[float, float] = (1.2, 0.5),
-    points_per_frame: int = 900,
     seed: int = 0,
     centre_px: tuple[float, float] = (0.0, 0.0),
 ) -> KnownCapture:
@@ -86,7 +82,7 @@ def known_capture(
 
     `centre_px` is how far the thermal principal point lies from the image's centre.
     """
-    scene, draw = make_scene(scene_name), np.random.default_rng(seed)
+    scene, draw, radial = make_scene(scene_name), np.random.default_rng(seed), (1.2, 0.5)
     plain = scene.camera(photograph_width, photograph_width * 3 // 4)
     small = scene.camera(thermal_width, thermal_width * 4 // 5)
     focal = small.fl_x * zoom
@@ -97,7 +93,7 @@ def known_capture(
     rig[:3, :3], rig[:3, 3] = turned(*turn_deg), baseline_m
     to_visible = OPENGL_FROM_OPENCV @ np.linalg.inv(rig) @ OPENGL_FROM_OPENCV
     poses, _ = scene.poses(views, 0)
-    offsets = drift_k * draw.standard_normal(views)
+    offsets = draw.standard_normal(views)
     offsets -= offsets.mean()
     grid = np.stack(np.meshgrid(np.arange(small.width) + 0.5, np.arange(small.height) + 0.5), axis=-1)
     r2 = radius_squared(grid, small.width, small.height)
@@ -108,9 +104,9 @@ def known_capture(
         depths.append(view.depth_m)
         measured = render_view(scene, pose @ to_visible, thermal).temperature_c
         measured = measured + offsets[number] + radial[0] * r2 + radial[1] * r2 * r2
-        temperatures.append((measured + noise_k * draw.standard_normal(measured.shape)).astype(np.float32))
+        temperatures.append((measured + 0.05 * draw.standard_normal(measured.shape)).astype(np.float32))
         seen = np.flatnonzero(view.hit.ravel())
-        chosen = draw.choice(seen, min(points_per_frame, len(seen)), replace=False)
+        chosen = draw.choice(seen, min(900, len(seen)), replace=False)
         directions = plain.directions(pose).reshape(-1, 3)
         world.append(pose[:3, 3] + view.depth_m.ravel()[chosen, None] * directions[chosen])
     points = np.concatenate(world)
@@ -121,17 +117,14 @@ def known_capture(
         column, row = np.where(inside[:, None], np.minimum(pixel, (plain.width - 1, plain.height - 1)), 0).astype(int).T
         distance = np.linalg.norm(points - pose[:3, 3], axis=1)
         ids = np.flatnonzero(inside & (np.abs(depths[number][row, column] - distance) < 0.01 * distance))
-        frames.append(
-            RigFrame(
-                f"view {number}", photographs[number], temperatures[number], pose, points[ids], ids.astype(np.int64)
-            )
-        )
+        seen = (points[ids] - pose[:3, 3]) @ pose[:3, :3] * (1.0, -1.0, -1.0)
+        frames.append(RigFrame(photographs[number], temperatures[number], seen, ids.astype(np.int64)))
     return KnownCapture(frames, visible, thermal, rig, offsets, radial)
 
 
 def drawn_capture(
     scene_name: str, ratio: int, thermal_width: int, baseline_m: float, seed: int, views: int | None = None
-) -> tuple[KnownCapture, RigStart]:
+) -> tuple[KnownCapture, RigEstimate]:
     """A capture whose turn, lenses' direction, angle of view and principal point are drawn, and what is known of it.
 
     That is an angle of view up to 5 % off, and nothing else: no ruler was held against the cameras. Six to eight views
@@ -155,27 +148,16 @@ def drawn_capture(
     )
     width, height = capture.thermal.width, capture.thermal.height
     focal = capture.thermal.fl_x * (1.0 + draw.uniform(-0.05, 0.05))
-    return capture, RigStart(Camera(width, height, focal, focal, width / 2, height / 2))
+    return capture, guessed_rig(Camera(width, height, focal, focal, width / 2, height / 2), "the test")
 
 
-def painted_sky(
-    views: int = 5,
-    photograph_width: int = 480,
-    thermal_width: int = 120,
-    turn_deg: tuple[float, float, float] = (0.8, -1.6, 0.5),
-    zoom: float = 1.07,
-    seed: int = 0,
-) -> KnownCapture:
+def painted_sky() -> KnownCapture:
     """Two cameras in one place look at random blobs: no parallax, no outlines, so only the comparison of edges errs."""
-    draw = np.random.default_rng(seed)
-    focal = 0.86 * photograph_width
-    visible = Camera(
-        photograph_width, photograph_width * 3 // 4, focal, focal, photograph_width / 2, photograph_width * 3 / 8
-    )
-    focal = 0.86 * thermal_width * zoom
-    thermal = Camera(thermal_width, thermal_width * 4 // 5, focal, focal, thermal_width / 2, thermal_width * 0.4)
+    draw, views = np.random.default_rng(0), 5
+    visible = Camera(480, 360, 412.8, 412.8, 240.0, 180.0)
+    thermal = Camera(120, 96, 110.424, 110.424, 60.0, 48.0)
     rig = np.eye(4)
-    rig[:3, :3] = turned(*turn_deg)
+    rig[:3, :3] = turned(0.8, -1.6, 0.5)
     frames = []
     for number in range(views):
         paint = cv2.GaussianBlur(draw.standard_normal((1000, 1300)).astype(np.float32), (0, 0), 14.0)
@@ -183,9 +165,9 @@ def painted_sky(
         photograph = _seen(paint, visible, np.eye(3), 2)
         temperature_c = 20.0 + 3.0 * _seen(paint, thermal, rig[:3, :3], 4)
         pixels = draw.uniform(0.0, 1.0, (600, 2)) * (visible.width, visible.height)
-        points = 10.0 * visible.rays(pixels) * (1.0, -1.0, -1.0)
+        points = 10.0 * visible.rays(pixels)
         ids = np.arange(len(points)) + number * len(points)
-        frames.append(RigFrame(f"sky {number}", photograph, temperature_c.astype(np.float32), np.eye(4), points, ids))
+        frames.append(RigFrame(photograph, temperature_c.astype(np.float32), points, ids))
     return KnownCapture(frames, visible, thermal, rig, np.zeros(views), (0.0, 0.0))
 
 

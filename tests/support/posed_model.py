@@ -21,7 +21,6 @@ def ring_model(count: int = 8, points: int = 300, seed: int = 0, unit_m: float =
         camera=CAMERA,
         camera_to_world=poses,
         points=on_wall / unit_m,
-        colours=rng.integers(0, 255, (points, 3)).astype(np.uint8),
         point_error_px=np.zeros(points),
         sighting_frame=np.zeros(0, dtype=np.int64),
         sighting_point=np.zeros(0, dtype=np.int64),

@@ -15,17 +15,13 @@ from PIL import Image
 
 from thermoxels_ns.capture.photograph import read_photograph_facts
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError, printable
-from thermoxels_ns.radiometry.decoders import check_file_size, check_thermal_size, errors_name, read_exif_facts
+from thermoxels_ns.radiometry.decoders import check_not_empty, check_thermal_size, errors_name, read_exif_facts
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.radiometry.thermal_pixels import size_of_double_tiff
+from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES, size_of_double_tiff
 
 Role = Literal["photograph", "thermal", "both", "thermal picture"]
 """What a camera file holds. "both": photograph and temperatures; "thermal picture": colours only, named thermal."""
-
-_PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
-SUFFIXES = (*_PICTURES, ".npy", ".csv")
-"""Suffixes of the files that are read; other files on a card (videos, logs, thumbnails) are only counted."""
 
 _THERMAL_WORDS = frozenset({"thermal", "radiometric", "temperature", "temperatures", "celsius", "ir", "tir", "lwir"})
 _PHOTOGRAPH_WORDS = frozenset({"visible", "vis", "rgb", "colour", "color", "photo", "photos", "optical"})
@@ -40,7 +36,6 @@ class CameraFile:
     path: Path
     role: Role
     taken_at: datetime | None  # as the camera's clock showed it, without a time zone
-    dji: bool = False  # True for DJI's R-JPEG, which only DJI's own library reads
 
 
 @dataclass(frozen=True)
@@ -50,7 +45,7 @@ class CameraFolder:
     folder: Path
     files: tuple[CameraFile, ...]
     unreadable: dict[Path, str] = field(default_factory=dict)  # reason by file
-    others: int = 0  # number of files with a suffix outside `SUFFIXES`, which were not opened
+    others: int = 0  # number of other files (videos, logs), which were not opened
 
 
 def words_of(name: str) -> tuple[str, ...]:
@@ -88,7 +83,7 @@ def scan_folder(
     files, unreadable, others = [], dict[Path, str](), 0
     found = files_below(folder, without, say)
     for number, path in enumerate(found):
-        if path.suffix.lower() not in SUFFIXES:
+        if path.suffix.lower() not in THERMAL_SUFFIXES:
             others += 1
             continue
         try:
@@ -123,7 +118,7 @@ def files_below(folder: Path, without: Sequence[Path] = (), say: Callable[[str],
 def identify(path: Path, folder: Path) -> CameraFile:
     """Return a file's role by content, for pictures by names below `folder`; raise `ThermoxelsError` if damaged."""
     with errors_name(path, "a camera file that can be decoded"):
-        check_file_size(path)
+        check_not_empty(path)
         suffix = path.suffix.lower()
         if suffix in (".npy", ".csv"):
             return CameraFile(path, "thermal", None)
@@ -134,7 +129,7 @@ def identify(path: Path, folder: Path) -> CameraFile:
                 role: Role = "thermal" if flir.visible is None else "both"
                 return CameraFile(path, role, None if taken_at is None else taken_at.replace(tzinfo=None))
             if is_dji_rjpeg(path):
-                return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
+                return CameraFile(path, "thermal", read_photograph_facts(path).taken_at)
         elif size_of_double_tiff(path) is not None:
             return CameraFile(path, "thermal", None)
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,13 +12,14 @@ from pydantic import TypeAdapter
 
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_photograph_facts
+from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.stage_cache import load_json
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
-from thermoxels_ns.radiometry.measurement_model import conditions_text
+from thermoxels_ns.radiometry.measurement_model import RadiometryOptions, conditions_text
 from thermoxels_ns.radiometry.thermal_pixels import find_dead_pixels
-from thermoxels_ns.radiometry.thermogram import RadiometryOptions, ThermogramMetadata, read_thermogram
+from thermoxels_ns.radiometry.thermogram import ThermogramMetadata, read_thermogram
 
 _LIST = "frames.json"
 _MOST_FOR_DEAD_PIXELS = 60  # at most so many frames are searched for stuck pixels, to save memory
@@ -29,10 +29,9 @@ _MOST_FOR_DEAD_PIXELS = 60  # at most so many frames are searched for stuck pixe
 class CaptureFrame:
     """One pair of photograph and thermal image after reading."""
 
-    name: str
+    name: str  # path of the camera's file with the photograph, relative to the capture folder
     photograph: Path  # a picture file that holds the photograph and no thermal image
     thermal: Path  # a .npy file of float32 degrees C, shape (height, width), NaN where no temperature is known
-    photograph_source: str  # path of the camera's file with the photograph, relative to the capture folder
     thermal_source: str  # path of the camera's file with the thermal image, relative to the capture folder
     metadata: ThermogramMetadata  # what the thermal file states besides its temperatures
     camera: str | None = None  # maker and model of the thermal camera, or else of the photograph's
@@ -49,6 +48,7 @@ class CaptureFrames:
     """The frames of a capture that could be read, and the reason for each frame that was left out."""
 
     frames: tuple[CaptureFrame, ...]
+    photograph_size: tuple[int, int]  # width and height of all photographs, [pixels]
     thermal_size: tuple[int, int]  # width and height of all thermal images, [pixels]
     dead_pixels: int  # number of sensor pixels that are stuck at one value; these are NaN in every frame
     dropped: dict[str, str] = field(default_factory=dict)  # reason by the name of the frame
@@ -56,30 +56,29 @@ class CaptureFrames:
     @classmethod
     def load(cls, folder: Path, root: Path) -> CaptureFrames:
         """Read the list that `read_frames` wrote to `folder`; `root` is the capture folder, and both may have moved."""
-        content = load_json(folder / _LIST)
-        frames = list[CaptureFrame]()
-        for frame in TypeAdapter(list[CaptureFrame]).validate_python(content["frames"]):
-            taken_out = frame.photograph_source == frame.thermal_source
-            photograph = folder / "photographs" / frame.photograph if taken_out else root / frame.photograph_source
-            frames.append(replace(frame, photograph=photograph, thermal=folder / "thermal" / f"{frame.name}.npy"))
-        return cls(**{**content, "frames": tuple(frames), "thermal_size": tuple(content["thermal_size"])})
+        found = TypeAdapter(CaptureFrames).validate_python(load_json(folder / _LIST))
+        frames = []
+        for frame in found.frames:
+            taken_out = frame.name == frame.thermal_source
+            photograph = folder / "photographs" / frame.photograph if taken_out else root / frame.name
+            frames.append(replace(frame, photograph=photograph, thermal=folder / "thermal" / frame.thermal))
+        return replace(found, frames=tuple(frames))
 
 
 def read_frames(
     pairs: Sequence[Pair],
     root: Path,
     folder: Path,
-    radiometry: RadiometryOptions,
-    skip_bad: bool,
+    settings: CaptureSettings,
     say: Callable[[str], None] = lambda _: None,
 ) -> CaptureFrames:
     """Write each pair's temperatures, and photographs taken out of thermal files, to `folder`; return the frames.
 
-    Pixels of the thermal sensor that are stuck at one value become NaN. With `skip_bad` a pair with an unreadable file
-    goes to `dropped`, as thermal images of an unusual size always do.
+    Pixels of the thermal sensor that are stuck at one value become NaN. With `settings.skip_bad` a pair with an
+    unreadable file goes to `dropped`, as photographs and thermal images of an unusual size always do.
 
     Raises:
-        ThermoxelsError: A file cannot be read and `skip_bad` is off, or no pair is left.
+        ThermoxelsError: A file cannot be read and `settings.skip_bad` is off, or no pair is left.
         OSError: A result cannot be written.
     """
     (folder / "thermal").mkdir(exist_ok=True)
@@ -87,58 +86,65 @@ def read_frames(
     frames, dropped, sizes = [], dict[str, str](), []
     for number, pair in enumerate(pairs, start=1):
         try:
-            frame, size = _read(pair, root, folder, radiometry)
+            frame, own = _read(pair, number, root, folder, settings)
             frames.append(frame)
-            sizes.append(size)
+            sizes.append(own)
         except ThermoxelsError as problem:  # a fault of a file that is read; a full disk raises OSError
-            if not skip_bad:
+            if not settings.skip_bad:
                 raise
-            dropped[pair.name] = str(problem)
+            dropped[pair.photograph] = str(problem)
         if number % 20 == 0:
             say(f"read: {number} of {len(pairs)} pairs")
     if not frames:
         remedy = "Look at the files, or at the pairs that were found in capture.html."
         got = f"none of {len(pairs)}: " + (next(iter(dropped.values())) if dropped else "there are no pairs")
         raise SceneError("pairs", expected="at least one pair whose files can be read", got=got, remedy=remedy)
-    size = Counter(sizes).most_common(1)[0][0]
+    usual = [Counter(column).most_common(1)[0][0] for column in zip(*sizes)]
     for frame, own in zip(frames, sizes):
-        if own != size:
-            got, most = f"{own[0]} x {own[1]} pixels", f"{size[0]} x {size[1]}"
-            dropped[frame.name] = f"{frame.thermal_source} has {got}, most have {most}: another thermal camera"
+        for file, (width, height), most in zip((frame.name, frame.thermal_source), own, usual):
+            if (width, height) != most:
+                why = f"{width} x {height} pixels, most have {most[0]} x {most[1]}: another camera or mode"
+                dropped[frame.name] = f"{file} has {why}"
     kept = [frame for frame in frames if frame.name not in dropped]
     dead, kept = _without_stuck_pixels(kept)
-    result = CaptureFrames(tuple(kept), size, dead, dropped)
+    result = CaptureFrames(tuple(kept), usual[0], usual[1], dead, dropped)
     bare = [replace(frame, photograph=frame.photograph.name, thermal=frame.thermal.name) for frame in kept]
     write_json(folder / _LIST, replace(result, frames=bare))
     return result
 
 
-def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -> tuple[CaptureFrame, tuple[int, int]]:
-    """Read one pair and write its files; return the frame, and width and height of its thermal image."""
-    thermogram = read_thermogram(pair.thermal, radiometry)
-    photograph, thermal_focal = pair.photograph, None
+_Size = tuple[int, int]  # width and height, [pixels]
+
+
+def _read(
+    pair: Pair, number: int, root: Path, folder: Path, options: RadiometryOptions
+) -> tuple[CaptureFrame, tuple[_Size, _Size]]:
+    """Read pair number `number` and write its files; return the frame, and sizes of photograph and thermal image."""
+    photograph, camera_file = root / pair.photograph, root / pair.thermal
+    thermogram = read_thermogram(camera_file, options)
+    thermal_focal = None
     if pair.in_one_file:
-        content = read_flir_jpeg(pair.photograph).visible
+        content = read_flir_jpeg(photograph).visible
         if content is None:
             remedy = "Export the photograph with the camera's program and put it beside the file."
             got = "none in a form that is known"
-            raise SceneError(str(pair.photograph), expected="a photograph inside the file", got=got, remedy=remedy)
-        photograph = folder / "photographs" / (pair.name + (".jpg" if content.startswith(b"\xff\xd8") else ".png"))
+            raise SceneError(str(photograph), expected="a photograph inside the file", got=got, remedy=remedy)
+        suffix = ".jpg" if content.startswith(b"\xff\xd8") else ".png"
+        photograph = folder / "photographs" / f"{number:05d}{suffix}"
         photograph.write_bytes(content)
     elif thermogram.metadata.format in ("TIFF", "DJI R-JPEG"):
-        thermal_focal = read_photograph_facts(pair.thermal).focal_px
+        thermal_focal = read_photograph_facts(camera_file).focal_px
     open_photograph(photograph).close()  # a file that is cut off shows only when it is decoded
     facts = read_photograph_facts(photograph)
-    holder = read_photograph_facts(pair.thermal) if pair.in_one_file else facts
-    thermal = folder / "thermal" / f"{pair.name}.npy"
+    holder = read_photograph_facts(camera_file) if pair.in_one_file else facts
+    thermal = folder / "thermal" / f"{number:05d}.npy"
     np.save(thermal, thermogram.temperature_c)
     metadata = thermogram.metadata
     frame = CaptureFrame(
-        name=pair.name,
+        name=pair.photograph,
         photograph=photograph.resolve(),
         thermal=thermal.resolve(),
-        photograph_source=Path(os.path.relpath(pair.photograph, root)).as_posix(),
-        thermal_source=Path(os.path.relpath(pair.thermal, root)).as_posix(),
+        thermal_source=pair.thermal,
         metadata=metadata,
         camera=metadata.camera or facts.exif.camera,
         focal_px=facts.focal_px,
@@ -149,7 +155,7 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
         masked=thermogram.report.masked,
     )
     height, width = thermogram.temperature_c.shape
-    return frame, (width, height)
+    return frame, ((facts.width, facts.height), (width, height))
 
 
 def _without_stuck_pixels(frames: list[CaptureFrame]) -> tuple[int, list[CaptureFrame]]:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
-from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
@@ -30,19 +29,14 @@ _REMEDY = (
     "folder, as the camera wrote them; give both of a shot the same name (DJI: _T and _V or _W), or the right time "
     "(--clock-offset-s, --time-limit-s)."
 )
-_DJI_LIBRARY = (
-    "DJI's thermal images also need DJI's own library: download the DJI Thermal SDK and pass --dji-library with the "
-    "path of libdirp.so (libdirp.dll on Windows)."
-)
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One photograph and its thermal image."""
+    """One photograph and its thermal image, named by their paths relative to the capture folder, with "/"."""
 
-    name: str  # name of the frame, unique in the capture; letters, digits, dot, dash and underscore
-    photograph: Path
-    thermal: Path  # the same path as `photograph` where the camera writes both into one file
+    photograph: str
+    thermal: str  # the same as `photograph` where the camera writes both into one file
     how: str  # the rule by which the two files were paired
 
     @property
@@ -56,7 +50,7 @@ class PairSearch:
     """All pairs of a folder, and for every other camera file the reason why no pair contains that file."""
 
     pairs: tuple[Pair, ...]  # sorted by the photographs' paths (`natural_key`)
-    unpaired: dict[Path, str] = field(default_factory=dict)  # reason by file
+    unpaired: dict[str, str] = field(default_factory=dict)  # reason by file, relative to the capture folder
 
 
 def search_pairs(
@@ -75,7 +69,8 @@ def search_pairs(
         remedy = "" if "--skip-bad" in first else " To go on without such files, pass --skip-bad True."
         raise SceneError(f"{first}{more}{remedy}")
     if search.pairs:
-        return replace(search, unpaired=found.unreadable | search.unpaired)
+        unreadable = {_name(path, folder): why for path, why in found.unreadable.items()}
+        return replace(search, unpaired=unreadable | search.unpaired)
     roles = Counter(file.role for file in found.files)
     parts = [
         *((roles["photograph"], "photographs"), (roles["thermal"], "thermal images")),
@@ -83,12 +78,9 @@ def search_pairs(
         *((len(found.unreadable), "unreadable files"), (found.others, "files of other kinds")),
     ]
     got = ", ".join(f"{number} {what}" for number, what in parts if number) or "no files"
-    for path, why in list(search.unpaired.items())[:1]:
-        got += f" ({printable(path.name)}: {why})"
-    remedy = _REMEDY
-    if any(file.dji for file in found.files) and settings.dji_library is None:
-        remedy += f" {_DJI_LIBRARY}"
-    raise SceneError(str(found.folder), expected="photographs with thermal images", got=got, remedy=remedy)
+    for name, why in list(search.unpaired.items())[:1]:
+        got += f" ({Path(name).name}: {why})"
+    raise SceneError(str(found.folder), expected="photographs with thermal images", got=got, remedy=_REMEDY)
 
 
 def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: float = 0.0) -> PairSearch:
@@ -115,11 +107,15 @@ def find_pairs(found: CameraFolder, time_limit_s: float = 1.5, clock_offset_s: f
     pairs += matched
     unpaired |= explained
     ordered = sorted(pairs, key=lambda pair: natural_key(pair[0].path.relative_to(found.folder)))
-    names = _names([photograph.path for photograph, _, _ in ordered], found.folder)
+    left_out = sorted(unpaired.items(), key=lambda item: natural_key(item[0]))
     return PairSearch(
-        tuple(Pair(name, photo.path, partner.path, how) for name, (photo, partner, how) in zip(names, ordered)),
-        dict(sorted(unpaired.items(), key=lambda item: natural_key(item[0]))),
+        tuple(Pair(_name(one.path, found.folder), _name(two.path, found.folder), how) for one, two, how in ordered),
+        {_name(path, found.folder): why for path, why in left_out},
     )
+
+
+def _name(path: Path, folder: Path) -> str:
+    return printable(path.relative_to(folder).as_posix())
 
 
 _Found = tuple[list[tuple[CameraFile, CameraFile, str]], dict[Path, str]]
@@ -239,27 +235,3 @@ def _by_time(
             pairs.append((photo, partner, f"taken {nearest:.1f} s apart"))
             del explained[photo.path], explained[partner.path]
     return pairs, explained
-
-
-def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
-    """Return a unique frame name per photograph: the shot's, with folder or number where several shots share one."""
-
-    def slug(text: str) -> str:
-        return re.sub(r"[^A-Za-z0-9._-]+", "_", text).strip("._-")[:100] or "frame"
-
-    stems = [slug(_without_role(path.stem)) for path in photographs]
-    counted = Counter(stem.lower() for stem in stems)
-    places = ["-".join((*path.relative_to(folder).parts[:-1], _without_role(path.stem))) for path in photographs]
-    longer = [stem if counted[stem.lower()] == 1 else slug(place) for stem, place in zip(stems, places)]
-    # Files get these names, and some disks do not distinguish A from a.
-    names, taken = [], set[str]()
-    for name in longer:
-        numbered = chain([name], (f"{name}-{number}" for number in count(2)))
-        names.append(next(each for each in numbered if each.lower() not in taken))
-        taken.add(names[-1].lower())
-    return names
-
-
-def _without_role(stem: str) -> str:
-    """Return a file name's stem without the words at its end for the kind of image: "a7-thermal" gives "a7"."""
-    return re.sub(rf"(?:[\W_]+(?:{'|'.join(ROLE_WORDS | _LAST_LETTERS)}))+$", "", stem, flags=re.IGNORECASE)

@@ -24,71 +24,46 @@ pose in OpenCV axes."""
 PARAMETERS = ("rx", "ry", "rz", "tx", "ty", "tz", "log_focal", "cx", "cy", "k1")
 """The ten changes of a rig against its start: rotation vector r [radians], shift t [world units], natural logarithm of
 the focal length's growth, shift of the principal point [thermal pixels at full size], and OpenCV's k1."""
-_TRANSLATION_SHARE = 0.03
+_TURN_SIGMA_DEG, _K1_SIGMA = 3.0, 0.05  # standard deviations of the turn about each axis, and of k1, of a guess
+_CENTRE_SIGMA = 0.005
+"""Standard deviation of a guessed principal point, as a share of the image width. With a narrow lens its shift looks
+almost like a turn, so a larger value also leaves the rotation more uncertain."""
 _SMALLEST_DEPTH_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class RigFrame:
-    """One photograph with its thermal image, its pose and the scene points that it shows."""
+    """One photograph with its thermal image and the scene points that it shows."""
 
-    name: str
     photograph: npt.NDArray | Path
     """Grey or RGB array of any number type, or the photograph's file. The size is that of the visible camera, or
     smaller in the same proportions."""
     temperature_c: npt.NDArray | Path
     """Temperatures [degrees C], shape (height, width), NaN where unknown; or the path of a .npy file of them."""
-    camera_to_world: FloatArray  # pose of the visible camera, shape (4, 4), OpenGL axes
-    points_world: FloatArray  # scene points that structure from motion saw in this photograph, shape (n, 3)
+    points: FloatArray
+    """Scene points that structure from motion saw in this photograph, in the visible camera's OpenCV axes, (n, 3)."""
     point_ids: IntArray  # number of each scene point, equal in all frames that see the point, shape (n,)
-
-    def points_visible(self) -> FloatArray:
-        """Return the frame's scene points in the visible camera's OpenCV axes, shape (n, 3)."""
-        pose = np.asarray(self.camera_to_world, dtype=np.float64)
-        local = (np.asarray(self.points_world, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
-        return local * (1.0, -1.0, -1.0)
-
-
-@dataclass(frozen=True, eq=False)
-class RigStart:
-    """The guess of the rig, with standard deviations, from which the comparison of the images starts."""
-
-    thermal_camera: Camera  # start value of the thermal intrinsics, at the thermal images' size
-    visible_to_thermal: FloatArray = field(default_factory=lambda: np.eye(4))
-    """x_thermal = visible_to_thermal @ x_visible, shape (4, 4), OpenCV axes, lengths in world units."""
-    focal_sigma: float = 0.08  # standard deviation of the focal length, as a share of it
-    rotation_sigma_deg: float = 3.0  # standard deviation of the rotation about each axis [degrees]
-    translation_sigma: float | None = None
-    """Standard deviation of the shift along each axis [world units]. None: 3 % of the median depth of the points."""
-    centre_sigma: float = 0.005
-    """Standard deviation of the principal point, as a share of the image width. With a narrow lens its shift looks
-    almost like a turn, so a larger value also leaves the rotation more uncertain."""
-    k1_sigma: float = 0.05  # standard deviation of the radial distortion; 0 keeps the start's k1
-    source: str = "a guess: same place and direction as the visible camera"
-    """Text for the report that says where the start values come from."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:
-    """The rig that was found or given, or the start values where the images do not determine the rig."""
+    """A rig that was found or given, or the guess that a search starts from."""
 
     thermal_camera: Camera
     visible_to_thermal: FloatArray
     """x_thermal = visible_to_thermal @ x_visible, shape (4, 4), OpenCV axes, lengths in world units."""
     determined: bool
-    """True when the rig was found or given. False: camera and transform are those of the start."""
-    explanation: str  # text for the report: what was found, or why the rig is not determined
-    parameters: tuple[str, ...] = ()
-    """Names (of `PARAMETERS`) of the rows and columns of `covariance`. Empty: nothing was estimated."""
-    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    """Covariance of the changes named in `parameters`, shape (n, n); that of the prior if the search found no rig."""
+    """True when the rig was found or given. False: camera and transform are a guess."""
+    explanation: str  # text for the report: what was found, where a guess comes from, why the rig is not determined
+    covariance: FloatArray = field(default_factory=lambda: np.full((10, 10), np.nan))
+    """Covariance of the changes `PARAMETERS`, shape (10, 10), NaN where unknown; of a guess: how far it may be off."""
     projection_sigma_px: float = math.nan
     """Typical standard error of a scene point's place in the thermal image, both axes together [thermal pixels]."""
 
     @property
     def standard_errors(self) -> dict[str, float]:
         """Standard error of each parameter, by its name; units as in `PARAMETERS`."""
-        return dict(zip(self.parameters, np.sqrt(np.diag(self.covariance)).tolist()))
+        return dict(zip(PARAMETERS, np.sqrt(np.diag(self.covariance)).tolist()))
 
     @property
     def turn_deg(self) -> float:
@@ -98,8 +73,7 @@ class RigEstimate:
     @property
     def turn_error_deg(self) -> float:
         """Standard error of the rotation about all axes together [degrees]; NaN where the covariance is unknown."""
-        errors = self.standard_errors
-        return float(np.degrees(np.linalg.norm([errors.get(name, math.nan) for name in ("rx", "ry", "rz")])))
+        return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
 
     def thermal_pose(self, camera_to_world: npt.ArrayLike) -> FloatArray:
         """Return the thermal camera's pose for a pose of the visible camera, both (4, 4) in OpenGL axes."""
@@ -107,12 +81,22 @@ class RigEstimate:
         return pose @ OPENGL_FROM_OPENCV @ np.linalg.inv(self.visible_to_thermal) @ OPENGL_FROM_OPENCV
 
 
-def prior_sigmas(start: RigStart, median_depth: float) -> FloatArray:
-    """Return the standard deviations of the ten changes (`PARAMETERS`) that `start` states, shape (10,). A shift
-    without a stated deviation gets 3 % of `median_depth` [world units]."""
-    shift = _TRANSLATION_SHARE * median_depth if start.translation_sigma is None else start.translation_sigma
-    turn, centre = np.radians(start.rotation_sigma_deg), start.centre_sigma * start.thermal_camera.width
-    return np.array([turn] * 3 + [shift] * 3 + [start.focal_sigma, centre, centre, start.k1_sigma])
+def guessed_rig(
+    camera: Camera,
+    source: str,
+    visible_to_thermal: FloatArray | None = None,
+    focal_sigma: float = 0.08,
+    shift_sigma: float = math.nan,
+) -> RigEstimate:
+    """Return a guess with the usual standard deviations; without a transform, that of two cameras in one place.
+
+    `source` says where the guess comes from; `focal_sigma` is the standard deviation of the focal length, as a share of
+    it; `shift_sigma` that of the lens's place along each axis [world units], NaN if unknown.
+    """
+    centre, turn = _CENTRE_SIGMA * camera.width, np.radians(_TURN_SIGMA_DEG)
+    sigmas = np.array([turn] * 3 + [shift_sigma] * 3 + [focal_sigma, centre, centre, _K1_SIGMA], dtype=np.float64)
+    transform = np.eye(4) if visible_to_thermal is None else visible_to_thermal
+    return RigEstimate(camera, transform, False, source, np.diag(sigmas**2))
 
 
 @dataclass(frozen=True, eq=False)

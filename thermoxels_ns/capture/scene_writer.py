@@ -1,4 +1,4 @@
-"""Writes the scene folder that the dataparser reads: photographs, temperatures, points, transforms.json."""
+"""Writes the scene folder that the dataparser reads: photographs, temperatures, tracks of points, transforms.json."""
 
 from __future__ import annotations
 
@@ -9,29 +9,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.rig_types import DriftEstimate, FloatArray, RigEstimate
+from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.sfm.scale_and_up import Up
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import CACHE_FOLDER
-from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import remove_file, writable_folder
 from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.data.scene_scale import SceneScale
 from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, write_tracks
 
 JSON_NAME = "transforms.json"
-POINTS_NAME = "sparse_points.ply"
 TRACKS_NAME = "sparse_tracks.npz"
 _FOLDERS = ("images", "thermal")
-SCENE_CONTENT = (JSON_NAME, POINTS_NAME, TRACKS_NAME, *_FOLDERS)
+SCENE_CONTENT = (JSON_NAME, TRACKS_NAME, *_FOLDERS)
 """Names of a scene's files and folders in the output folder."""
 _COPIED = {"JPEG": ".jpg", "PNG": ".png"}
-_MOST_POINT_ERROR_PX = 2.0
-_LEAST_SIGHTINGS = 3
 EVAL_INTERVAL = 8
 
 
@@ -71,11 +67,6 @@ def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = 
         if (number + 1) % 20 == 0:
             say(f"scene: {number + 1} of {len(scene.frames)} frames")
     model, names = scene.model, tuple(entry["file_path"] for entry in entries)
-    sightings = np.bincount(model.sighting_point, minlength=len(model.points))
-    good = (sightings >= _LEAST_SIGHTINGS) & (model.point_error_px <= _MOST_POINT_ERROR_PX)
-    if np.count_nonzero(good) < 100:
-        good[:] = True
-    write_points(new / POINTS_NAME, model.points[good], model.colours[good])
     tracks = SparseTracks(model.points, model.point_error_px, names, model.sighting_frame, model.sighting_point)
     write_tracks(new / TRACKS_NAME, tracks)
     write_json(new / JSON_NAME, _content(scene, entries))
@@ -83,20 +74,9 @@ def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = 
     for name in _FOLDERS:
         shutil.rmtree(output / name, ignore_errors=True)
         (new / name).rename(output / name)
-    for name in (POINTS_NAME, TRACKS_NAME, JSON_NAME):
+    for name in (TRACKS_NAME, JSON_NAME):
         (new / name).replace(output / name)
     shutil.rmtree(new, ignore_errors=True)
-
-
-def write_points(path: Path, points: FloatArray, colours: npt.NDArray[np.uint8]) -> None:
-    """Write points (n, 3) and their colours (n, 3) as a binary PLY file."""
-    rows = np.zeros(len(points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = points, colours
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    lines += [f"property float {axis}" for axis in "xyz"]
-    lines += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
-    with replace_when_done(path) as temporary:
-        temporary.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + rows.tobytes())
 
 
 def _write_frame(scene: Scene, number: int, frame: CaptureFrame, name: str, folder: Path) -> dict[str, Any]:
@@ -115,7 +95,7 @@ def _write_frame(scene: Scene, number: int, frame: CaptureFrame, name: str, fold
         "thermal_file_path": f"thermal/{name}.tiff",
         "transform_matrix": pose.tolist(),
         "thermal_transform_matrix": scene.rig.thermal_pose(pose).tolist(),
-        "source": frame.photograph_source,
+        "source": frame.name,
         "thermal_source": frame.thermal_source,
     }
     return entry
@@ -129,6 +109,7 @@ def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:
         "thermal_camera": rig.thermal_camera.entries(),
         "pixel_convention": "the centre of the top left pixel is at (0.5, 0.5)",
         "up": scene.up.direction.tolist(),
+        TRACKS_KEY: TRACKS_NAME,
         "rig": rig.visible_to_thermal.tolist(),
         "rig_info": {
             "meaning": "x_thermal = rig @ x_visible, both in OpenCV camera axes, translation in units of the scene",
@@ -144,10 +125,6 @@ def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:
             "explanation": drift.explanation,
         },
     }
-    if len(scene.model.points):
-        content["ply_file_path"] = POINTS_NAME
-    if len(scene.model.sighting_point):
-        content[TRACKS_KEY] = TRACKS_NAME
     if scene.scale is not None:
         content["metres_per_unit"] = scene.scale.metres_per_unit
         if scene.scale.standard_error is not None:

@@ -6,37 +6,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from thermoxels_ns.radiometry.measurement_model import RadiometryOptions
+
 StageName = Literal["pairs", "temperatures", "poses", "scale", "rig", "drift", "scene", "page"]
 """The stages of a capture in order."""
 LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
 
-@dataclass
-class CaptureSettings:
+@dataclass(frozen=True)
+class CaptureSettings(RadiometryOptions):
     """All settings of ``thermoxels capture`` except the input and output folders."""
 
     from_stage: StageName | None = None
     """Run this stage and all later stages again. Without it, only stages whose input or options changed run again."""
     skip_bad: bool = False
     """Leave out and report files that cannot be read, instead of stopping at the first of them."""
-    camera: Literal["workswell", "flir-high-gain", "flir-low-gain", "flir-duo", "sensefly"] | None = None
-    """Camera whose counts TIFF or PNG files hold. Default: recognised from the file, which some files do not allow."""
-    celsius_per_count: float | None = None
-    """Degrees per count of TIFF, PNG or whole-number NPY files, instead of --camera; goes with --celsius-offset."""
-    celsius_offset: float | None = None
-    """Temperature that count 0 stands for, in degrees C; goes with --celsius-per-count."""
-    emissivity: float | None = None
-    """Emissivity of the photographed surfaces, above 0, at most 1. Default: the camera's setting."""
-    reflected_c: float | None = None
-    """Apparent temperature of what the surfaces reflect, in degrees C. Default: the camera's setting."""
-    distance_m: float | None = None
-    """Distance from camera to surfaces, to correct for the air between, in metres. Default: the camera's setting."""
-    relative_humidity: float | None = None
-    """Relative humidity of the air, 0 to 1. Default: the camera's setting."""
-    air_c: float | None = None
-    """Air temperature, in degrees C. Default: the camera's setting."""
-    dji_library: Path | None = None
-    """Path of DJI's libdirp.so or libdirp.dll, for DJI R-JPEG (from the DJI Thermal SDK)."""
     time_limit_s: float = 1.5
     """Longest time between the two exposures where a pair is found by time alone, in seconds."""
     clock_offset_s: float = 0.0
@@ -63,5 +47,3 @@ class CaptureSettings:
     rig: Path | None = None
     """transforms.json of an earlier capture with the same camera: its thermal camera and rig are used unchanged, except
     that the rig's lengths are converted where both captures have a scale."""
-    drift: Literal["auto", "off"] = "auto"
-    """Correct vignetting and offsets between thermal images, if this helps at points that the fit does not use."""

@@ -6,9 +6,8 @@ import hashlib
 import io
 import json
 import shutil
-import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -23,8 +22,8 @@ from thermoxels_ns.core.version import __version__
 
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
-_FORMAT = 3  # number of the results' file format; a higher number makes all earlier results invalid
-_KEY_FILE, _DONE_FILE = "key.txt", "seconds.txt"
+_FORMAT = 4  # number of the results' file format; a higher number makes all earlier results invalid
+_KEY_FILE, _DONE_FILE = "key.txt", "done"
 _Record = TypeVar("_Record")
 _EXPECTED, _REMEDY = "what an earlier stage of the capture wrote", "Run it again with --from-stage pairs."
 
@@ -41,8 +40,6 @@ class StageCache:
     folder: Path  # the capture's output folder
     from_stage: StageName | None = None  # run this stage and all later ones, also where nothing has changed
     say: Callable[[str], None] = lambda _: None  # told one line per stage
-    seconds: list[tuple[str, float]] = field(default_factory=list)
-    """Name of each stage and the time [s] it took, in order; for a cached stage, the time of its earlier run."""
     _previous: str = ""
 
     def run(
@@ -63,12 +60,10 @@ class StageCache:
         self._previous = key
         folder = self.folder / CACHE_FOLDER / name
         forced = self.from_stage is not None and STAGES.index(name) >= STAGES.index(self.from_stage)
-        title = _title(name)
+        title = f"{STAGES.index(name) + 1}/{len(STAGES)} {name}"
         stale = forced or _read(folder / _KEY_FILE) != key
-        done = None if stale else _read(folder / _DONE_FILE)
-        if done is not None and all(path.exists() for path in writes):
+        if not stale and (folder / _DONE_FILE).is_file() and all(path.exists() for path in writes):
             self.say(f"{title}: as before")
-            self.seconds.append((name, float(done)))
             return folder
         remove_file(folder / _DONE_FILE)
         if stale:
@@ -80,37 +75,25 @@ class StageCache:
         with replace_when_done(folder / _KEY_FILE) as temporary:
             temporary.write_text(key, encoding="utf-8")
         self.say(title)
-        start = time.monotonic()
         work(folder)
-        took = time.monotonic() - start
-        with replace_when_done(folder / _DONE_FILE) as temporary:
-            temporary.write_text(f"{took}", encoding="utf-8")
-        self.seconds.append((name, took))
+        (folder / _DONE_FILE).touch()
         return folder
 
 
-def _title(name: StageName) -> str:
-    return f"{STAGES.index(name) + 1}/{len(STAGES)} {name}"
+def fingerprint(paths: Sequence[Path], root: Path | None = None) -> list[tuple[str, int, int]]:
+    """Return name (relative to `root`, if given), size [bytes] and time of change [ns] of each file.
 
-
-def fingerprint(paths: Sequence[Path], root: Path) -> list[tuple[str, int, int]]:
-    """Return name (relative to `root` if inside), size [bytes] and time of change [ns] of each file, sorted."""
+    Raises `SceneError` for a missing file.
+    """
     rows = []
-    for path in sorted(set(paths)):
-        status = path.stat()
-        name = path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
-        rows.append((name, status.st_size, status.st_mtime_ns))
-    return rows
-
-
-def given_fingerprints(paths: Sequence[Path | None]) -> list[tuple[str, int, int]]:
-    """Return the `fingerprint` of files that the user names, ignoring None; raise `SceneError` for a missing file."""
-    there = [path for path in paths if path is not None]
-    for path in there:
+    for path in paths:
         if not path.is_file():
             remedy = "Check the path, or leave it out."
             raise SceneError(str(path), expected="a file", got="nothing there", remedy=remedy)
-    return fingerprint(there, Path("/")) if there else []
+        status = path.stat()
+        name = path if root is None else path.relative_to(root)
+        rows.append((name.as_posix(), status.st_size, status.st_mtime_ns))
+    return rows
 
 
 def prepare_output(folder: Path) -> Path:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _LISTED = 10
 
 
-@dataclass
+@dataclass(frozen=True)
 class Capture(CaptureSettings):
     """Turn camera files into a scene: pair photographs with thermal images, read temperatures, find poses, scale, the
     rig between the two cameras and drift; write a scene for thermal-data, and a page by which to judge the scene."""

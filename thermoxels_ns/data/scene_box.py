@@ -15,6 +15,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.snapshot import Views, as_pinholes
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model, worlds_of_json
 from thermoxels_ns.data.scene_file import Frame, SceneFile
+from thermoxels_ns.data.tracks import FEWEST_VIEWS, MOST_ERROR_PX, TRACKS_KEY, read_tracks
 
 Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 
@@ -82,8 +83,8 @@ def find_scene_box(scene: SceneFile, option: Sequence[Sequence[float]] | None, t
     """Return the best evidence of where the scene box is.
 
     The first available counts: `option`, ``scene_box`` in the json (both in input coordinates), sparse points
-    (``ply_file_path``, or a COLMAP model in one of `COLMAP_FOLDERS`), depths on which the photographs that train
-    (indices `training`) agree, the cameras. The same folder and split give the same result.
+    (``ply_file_path``, ``tracks_file_path``, or a COLMAP model in one of `COLMAP_FOLDERS`), depths on which the
+    photographs that train (indices `training`) agree, the cameras. The same folder and split give the same result.
 
     Raises:
         SceneError: A given box has no volume or is not finite, or a file cannot be read.
@@ -97,6 +98,12 @@ def find_scene_box(scene: SceneFile, option: Sequence[Sequence[float]] | None, t
     if "ply_file_path" in scene.meta:
         path = scene.folder / str(scene.meta["ply_file_path"])
         return BoxEvidence(f"the points of {path.name}", frames, points=_read_ply(path))
+    if TRACKS_KEY in scene.meta:
+        tracks = read_tracks(scene.folder / str(scene.meta[TRACKS_KEY]))
+        views = np.bincount(tracks.sighting_point, minlength=len(tracks.points))
+        good = (views >= FEWEST_VIEWS) & (tracks.point_error_px <= MOST_ERROR_PX)
+        points = tracks.points[good] if np.count_nonzero(good) >= _FEWEST_POINTS else tracks.points
+        return BoxEvidence("the points of structure from motion", frames, points=points)
     for folder in COLMAP_FOLDERS:
         if any((scene.folder / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
             return BoxEvidence(f"the points of {folder}", frames, points=_read_colmap(folder, scene))

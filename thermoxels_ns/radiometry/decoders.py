@@ -18,7 +18,6 @@ LARGEST_SIDE = 8192
 """Largest side of a thermal image, [pixels]: four times that of the largest sensors and super-resolution (2048)."""
 JPEG_START, PNG_START = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _MAKE, _MODEL, _CHANGED_AT, _TAKEN_AT, _EXIF = 271, 272, 306, 36867, 34665
-LARGEST_FILE_BYTES = 2**29  # room for a table of 4096 x 4096 numbers of 30 characters; camera files are far smaller
 
 
 @contextmanager
@@ -61,16 +60,11 @@ def check_thermal_size(path: Path | str, width: int, height: int) -> None:
         raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 
-def check_file_size(path: Path) -> None:
-    """Raise `ThermalFileError` if a file is empty or has more than `LARGEST_FILE_BYTES`."""
-    size = path.stat().st_size
-    if size == 0:
+def check_not_empty(path: Path) -> None:
+    """Raise `ThermalFileError` if a file has no bytes."""
+    if path.stat().st_size == 0:
         remedy = "Copy it from the camera again, or remove it."
         raise ThermalFileError(str(path), expected="a camera file", got="a file of zero bytes", remedy=remedy)
-    if size > LARGEST_FILE_BYTES:
-        expected = f"a thermal image of at most {LARGEST_FILE_BYTES} bytes"
-        remedy = "Write one file per image; read videos frame by frame."
-        raise ThermalFileError(str(path), expected=expected, got=f"{size} bytes", remedy=remedy)
 
 
 def app_segments(path: Path, whole: bool = False) -> list[tuple[str, bytes]]:

@@ -5,23 +5,20 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from thermoxels_ns.core.arrays import Float32Array
 from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
 from thermoxels_ns.radiometry.decoders import (
-    ExifFacts,
     app_segments,
     check_thermal_size,
     errors_name,
-    read_exif_facts,
 )
-from thermoxels_ns.radiometry.measurement_model import ConditionOverrides, Conditions
+from thermoxels_ns.radiometry.measurement_model import Conditions, RadiometryOptions
 
 _SDK = "the DJI Thermal SDK (www.dji.com/downloads/softwares/dji-thermal-sdk)"
 _FUNCTIONS = (
@@ -53,15 +50,6 @@ class _Parameters(ctypes.Structure):
     ]
 
 
-@dataclass(frozen=True)
-class DjiImage:
-    """Temperatures and metadata of one R-JPEG of a DJI camera."""
-
-    temperature_c: Float32Array  # shape (height, width), [degrees C]
-    conditions: Conditions  # the settings that the temperatures were computed with
-    exif: ExifFacts
-
-
 def is_dji_rjpeg(path: Path) -> bool:
     """Return whether a JPEG names DJI and has APP3 segments with counts, which DJI's photographs do not have."""
     segments = app_segments(path)
@@ -69,13 +57,14 @@ def is_dji_rjpeg(path: Path) -> bool:
     return made_by_dji and any(name == "APP3" for name, _ in segments)
 
 
-def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrides) -> DjiImage:
-    """Read temperatures from a DJI R-JPEG with `libdirp`, with the user's settings where `overrides` gives them.
+def read_dji_rjpeg(path: Path, options: RadiometryOptions) -> tuple[Float32Array, Conditions]:
+    """Return the temperatures (height, width) [degrees C] of a DJI R-JPEG, and the settings they were computed with.
 
     How DJI's counts become degrees is not public. `libdirp` of DJI's Thermal SDK converts them; the SDK is free to
-    download but may not be passed on, so the user names the `library`. Raises `ThermalFileError` if the library is
+    download but may not be passed on, so the user names the library. Raises `ThermalFileError` if the library is
     missing, another one, or refuses the file or the settings, or if the file is cut off.
     """
+    library = options.dji_library
     whole = "a whole DJI R-JPEG, as the drone wrote it"
     with errors_name(path, whole, "Copy the file from the drone again.", ThermalFileError):
         app_segments(path, whole=True)  # before a library in another language takes it
@@ -98,12 +87,14 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
 
     call("dirp_create_from_rjpeg", data, ctypes.c_int32(len(content)), ctypes.byref(handle))
     try:
-        return _measure(path, call, handle, overrides)
+        return _measure(path, call, handle, options)
     finally:
         dirp.dirp_destroy(handle)
 
 
-def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, overrides: ConditionOverrides) -> DjiImage:
+def _measure(
+    path: Path, call: Callable[..., None], handle: ctypes.c_void_p, options: RadiometryOptions
+) -> tuple[Float32Array, Conditions]:
     size = _Resolution()
     call("dirp_get_rjpeg_resolution", handle, ctypes.byref(size))
     check_thermal_size(path, size.width, size.height)
@@ -122,9 +113,9 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
     except ThermoxelsError as problem:
         expected, remedy = "possible measurement parameters", "Copy the file from the drone again, unedited."
         raise ThermalFileError(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
-    after = overrides.applied_to(before)
+    after = options.applied_to(before)
     if after != before:
-        if overrides.air_c is not None and not knows_air:
+        if options.air_c is not None and not knows_air:
             remedy = "Use a newer DJI Thermal SDK, or leave --air-c out."
             got = "one that takes the reflected temperature for it"
             raise ThermalFileError("air_c", expected="a libdirp that knows the air temperature", got=got, remedy=remedy)
@@ -137,8 +128,7 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
     temperature_c = np.full((size.height, size.width), np.nan, dtype=np.float32)
     pointer = temperature_c.ctypes.data_as(ctypes.POINTER(ctypes.c_float))
     call("dirp_measure_ex", handle, pointer, ctypes.c_int32(temperature_c.nbytes))
-    with Image.open(path, formats=("JPEG", "MPO")) as image:
-        return DjiImage(temperature_c, after, read_exif_facts(image))
+    return temperature_c, after
 
 
 def _load(library: Path) -> ctypes.CDLL:

@@ -1,10 +1,12 @@
-"""Conditions of a thermal measurement, and the formula from a camera's signal to degrees C and back."""
+"""Conditions of a thermal measurement, the user's settings, and the formula from a camera's signal to degrees C."""
 
 from __future__ import annotations
 
 import math
 import sys
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +24,7 @@ _ABOVE_0 = sys.float_info.min
 _PLANCK_REMEDY = "Use the constants of the camera file."
 
 Floats = npt.NDArray[np.floating]
+CameraName = Literal["workswell", "flir-high-gain", "flir-low-gain", "flir-duo", "sensefly"]
 
 
 @dataclass(frozen=True)
@@ -62,26 +65,48 @@ class Conditions:
 
 
 @dataclass(frozen=True)
-class ConditionOverrides:
-    """The user's settings in place of the camera's; None keeps the file's value. Units are those of `Conditions`."""
+class RadiometryOptions:
+    """The user's settings for degrees C; None keeps what the file says. Contradictions raise `ThermoxelsError`."""
 
+    camera: CameraName | None = None
+    """Camera whose counts TIFF or PNG files hold. Default: recognised from the file, which some files do not allow."""
+    celsius_per_count: float | None = None
+    """Degrees per count of TIFF, PNG or whole-number NPY files, instead of --camera; goes with --celsius-offset."""
+    celsius_offset: float | None = None
+    """Temperature that count 0 stands for, in degrees C; goes with --celsius-per-count."""
     emissivity: float | None = None
+    """Emissivity of the photographed surfaces, above 0, at most 1. Default: the camera's setting."""
     reflected_c: float | None = None
+    """Apparent temperature of what the surfaces reflect, in degrees C. Default: the camera's setting."""
     distance_m: float | None = None
+    """Distance from camera to surfaces, to correct for the air between, in metres. Default: the camera's setting."""
     relative_humidity: float | None = None
+    """Relative humidity of the air, 0 to 1. Default: the camera's setting."""
     air_c: float | None = None
+    """Air temperature, in degrees C. Default: the camera's setting."""
+    dji_library: Path | None = None
+    """Path of DJI's libdirp.so or libdirp.dll, for DJI R-JPEG (from the DJI Thermal SDK)."""
 
     def __post_init__(self) -> None:
         # The temperatures that may be required are given here, so that only wrong values raise.
         self.applied_to(Conditions(reflected_c=0.0, air_c=0.0))
+        scale, offset = self.celsius_per_count, self.celsius_offset
+        if (scale is None) != (offset is None) or scale == 0:
+            expected, got = "both, with a scale other than 0, or neither", f"{scale} and {offset}"
+            remedy = "Pass --celsius-per-count 0.04 --celsius-offset -273.15, for example."
+            raise ThermoxelsError("celsius_per_count, celsius_offset", expected=expected, got=got, remedy=remedy)
+        if scale is not None and self.camera is not None:
+            remedy = "Leave --camera or --celsius-per-count and --celsius-offset out."
+            got = f"the preset {self.camera} and {scale} K per count"
+            raise ThermoxelsError("camera", expected="a preset or a scale of your own", got=got, remedy=remedy)
 
     def applied_to(self, conditions: Conditions) -> Conditions:
         """Return `conditions` with every field replaced that is not None here.
 
-        >>> ConditionOverrides(emissivity=0.9, reflected_c=15.0).applied_to(Conditions()).emissivity
+        >>> RadiometryOptions(emissivity=0.9, reflected_c=15.0).applied_to(Conditions()).emissivity
         0.9
         """
-        given = {field.name: getattr(self, field.name) for field in fields(ConditionOverrides)}
+        given = {each.name: getattr(self, each.name, None) for each in fields(Conditions)}
         return replace(conditions, **{name: value for name, value in given.items() if value is not None})
 
 
@@ -238,13 +263,6 @@ class RadiometricModel:
         return weight, background
 
 
-def corrected_temperature_c(
-    temperature_c: npt.ArrayLike, before: Conditions, after: Conditions, sensor: PlanckConstants = LONG_WAVE
-) -> Floats:
-    """Return temperatures [degrees C] as the camera would have shown them with other settings, any shape, float64.
-
-    The settings `before` turn `temperature_c` back into the sensor's signal, and the settings `after` turn that signal
-    into the result. The sensor's offset and scale do not matter.
-    """
-    signal = RadiometricModel(before, sensor).signal(temperature_c)
-    return RadiometricModel(after, sensor).temperature_c(signal)
+def corrected_temperature_c(apparent_c: npt.ArrayLike, conditions: Conditions) -> Floats:
+    """Return the temperatures [degrees C] of objects from their apparent temperatures, any shape, float64."""
+    return RadiometricModel(conditions).temperature_c(RadiometricModel(Conditions()).signal(apparent_c))

@@ -1,8 +1,9 @@
-"""Reads the pixels of thermal files, whose unit is known, as degrees Celsius, and finds stuck pixels."""
+"""Finds the format of thermal files by their content, reads pixels of a known unit as degrees C, finds stuck pixels."""
 
 from __future__ import annotations
 
 import csv
+import re
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -16,9 +17,17 @@ from PIL import Image, TiffImagePlugin
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
+from thermoxels_ns.radiometry.decoders import (
+    JPEG_START,
+    PNG_START,
+    check_not_empty,
+    check_thermal_size,
+    errors_name,
+)
+from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 
+ThermalFormat = Literal["FLIR R-JPEG", "DJI R-JPEG", "JPEG", "TIFF", "PNG", "NPY", "CSV"]
 THERMAL_SUFFIXES = (
     ".png",
     ".jpg",
@@ -27,24 +36,35 @@ THERMAL_SUFFIXES = (
     ".tiff",
     ".npy",
     ".csv",
-)  # suffixes of the file types that `read_thermal_file` reads
-
+)
+"""Suffixes of thermal files and photographs; other files of a folder (videos, logs) are passed over."""
+_HEAD_BYTES = 4096
+_STARTS: dict[bytes, ThermalFormat] = {
+    b"II*\0": "TIFF",
+    b"MM\0*": "TIFF",
+    b"II+\0": "TIFF",
+    b"MM\0+": "TIFF",
+    PNG_START: "PNG",
+    b"\x93NUMPY": "NPY",
+}
+_NUMBERS = re.compile(rb"(?:\xef\xbb\xbf)?[-+0-9.,;eE\s\"]|nan|na|n/a|null|none", re.IGNORECASE)
+_TEXT = re.compile(rb"[\t\n\r -~\xef\xbb\xbf]*")
 _WIDTH, _HEIGHT, _SAMPLE_BITS, _SAMPLE_FORMAT = 256, 257, 258, 339  # tags of TIFF
 _FLOATING = 3  # value of TIFF's sample format for floating-point numbers
 VALID_RANGE_C = (-100.0, 2000.0)  # temperatures outside this range count as no measurements, [degrees C]
 MIN_FRAMES = 5  # with fewer frames, no pixel counts as stuck
 _WINDOW = 2  # half width of a neighbourhood of 5 x 5 pixels, in which a dead column or row is a minority
 _EXPECTED = "a readable thermal file"
-_REMEDY = "The file is damaged or not what its suffix says; copy it again or remove its frame."
-_TIFF_SUFFIXES = (".tif", ".tiff")
+_REMEDY = "The file is damaged; copy it from the camera again or remove its frame."
 _LINEAR_UNIT = 'in transforms.json "thermal_unit": {"celsius_per_count": ..., "celsius_offset": ...}'
 _UNIT_REMEDY = (
     "Pass --thermal-bounds -5 42 with the degrees of black and white, or give temperature_bounds.json "
     f"(absolute_min_temperature, absolute_max_temperature) or, {_LINEAR_UNIT}."
 )
 _COUNTS_REMEDY = (
-    f"Give {_LINEAR_UNIT}, as the camera's manual has them; counts from 0 to 65535 that span the bounds have "
-    "(highest - lowest) / 65535 per count and an offset of the lowest."
+    f"Pass --camera, or --celsius-per-count and --celsius-offset; in a scene give {_LINEAR_UNIT}, as the camera's "
+    "manual has them; counts from 0 to 65535 that span the bounds have (highest - lowest) / 65535 per count and an "
+    "offset of the lowest."
 )
 
 
@@ -113,30 +133,48 @@ class ThermalImage:
     report: PixelReport
 
 
+def detect_format(path: Path) -> ThermalFormat:
+    """Return the format of a file by its content; raise `ThermalFileError` if it is missing, empty or of no format."""
+    if not path.is_file():
+        remedy = "Check the path; in a scene, restore the file, remove its frame or pass --missing-thermal skip."
+        raise ThermalFileError("thermal file", expected=f"a file at {path}", got="nothing there", remedy=remedy)
+    check_not_empty(path)
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    found: ThermalFormat | None = next((name for start, name in _STARTS.items() if head.startswith(start)), None)
+    if found is not None:
+        return found
+    if head.startswith(JPEG_START):
+        return "FLIR R-JPEG" if is_flir_jpeg(path) else "DJI R-JPEG" if is_dji_rjpeg(path) else "JPEG"
+    if _TEXT.fullmatch(head) and _NUMBERS.match(head) and re.search(rb"[0-9]", head):  # a table of numbers
+        return "CSV"
+    expected = "a FLIR or DJI R-JPEG, a TIFF, a 16-bit PNG, or a table of degrees C (.npy, .csv)"
+    got, remedy = f"none of them: it starts with {head[:8]!r}", "Export it from the camera's program in one of these."
+    raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
+
+
 def read_thermal_file(
-    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = VALID_RANGE_C, suffix: str | None = None
+    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = VALID_RANGE_C
 ) -> ThermalImage:
-    """Read temperatures from PNG, JPG or TIFF counts, a float TIFF, a FLIR R-JPEG, ``.npy`` or ``.csv``.
+    """Read the temperatures of a file whose `unit` is known; its content tells the format, not its name.
 
     A FLIR R-JPEG is converted by the calibration and settings in the file; `unit` is ignored. Counts need a unit:
-    bounds or linear for PNG and JPG, linear for TIFF. A floating-point TIFF is in degrees Celsius unless the unit is
-    linear. ``.csv`` and floating-point ``.npy`` are always in degrees Celsius; an integer ``.npy`` holds counts if the
-    unit is linear, else degrees Celsius. `suffix`, if given, replaces the file name's suffix.
+    bounds or linear for PNG and JPEG, linear for TIFF and NPY. A floating-point TIFF is in degrees Celsius unless the
+    unit is linear; CSV and floating-point NPY are always in degrees Celsius.
 
     Raises:
         ThermalFileError: The file is missing, damaged, a colour picture, or its counts have no unit.
     """
-    suffix = (suffix or path.suffix).lower()
     values: npt.NDArray[Any]
     no_data = None
     with errors_name(path, _EXPECTED, _REMEDY, ThermalFileError):
-        _check_there(path, suffix)
-        if suffix == ".npy":
+        found = detect_format(path)
+        if found == "FLIR R-JPEG":
+            return masked_image(read_flir_jpeg(path).temperature_c(), valid_range_c)
+        if found == "NPY":
             values = _read_npy(path)
-        elif suffix == ".csv":
+        elif found == "CSV":
             values = _read_csv(path)
-        elif is_flir_jpeg(path):
-            values, unit = read_flir_jpeg(path).temperature_c(), ThermalUnit.celsius()
         else:
             values, no_data = _read_image(path)
     if values.ndim != 2 or 0 in values.shape:
@@ -144,14 +182,14 @@ def read_thermal_file(
         remedy = "Export a single-channel thermal image."
         raise ThermalFileError(str(path), expected=expected, got=f"shape {values.shape}", remedy=remedy)
     saturated = np.zeros(values.shape, dtype=bool)
-    if unit.kind == "linear" and (values.dtype.kind in "ui" or suffix in _TIFF_SUFFIXES):
+    if unit.kind == "linear" and (values.dtype.kind in "ui" or found == "TIFF"):
         if values.dtype.kind in "ui":
             ends = np.iinfo(values.dtype)
             saturated = (values == ends.min) | (values == ends.max)
         celsius = values.astype(np.float64) * unit.scale + unit.offset_c
-    elif values.dtype.kind == "f" or suffix in (".npy", ".csv"):
+    elif values.dtype.kind == "f":
         celsius = values.astype(np.float64)
-    elif unit.kind == "bounds" and suffix not in _TIFF_SUFFIXES and values.dtype in (np.uint8, np.uint16):
+    elif unit.kind == "bounds" and found not in ("TIFF", "NPY") and values.dtype in (np.uint8, np.uint16):
         most = np.iinfo(values.dtype).max
         if (values == most).all():
             expected, got = "temperatures below the highest of the bounds", f"count {most} in every pixel"
@@ -160,58 +198,39 @@ def read_thermal_file(
         celsius = values.astype(np.float64) / most * unit.scale + unit.offset_c
     else:
         # Cameras write a TIFF's counts in steps of a fixed size, which bounds do not give.
-        got = f"{values.dtype} counts " + ("of a TIFF beside bounds" if unit.kind == "bounds" else "and no unit")
-        remedy = _COUNTS_REMEDY if unit.kind == "bounds" or suffix in _TIFF_SUFFIXES else _UNIT_REMEDY
+        got = f"{values.dtype} counts of a {found} " + ("beside bounds" if unit.kind == "bounds" else "and no unit")
+        remedy = _COUNTS_REMEDY if unit.kind == "bounds" or found in ("TIFF", "NPY") else _UNIT_REMEDY
         raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
     if no_data is not None:
         celsius[no_data] = np.nan
-    saturated &= np.isfinite(celsius)
-    return masked_image(celsius, (max(valid_range_c[0], -ZERO_CELSIUS_K), valid_range_c[1]), saturated)
+    return masked_image(celsius, valid_range_c, saturated & np.isfinite(celsius))
 
 
 def masked_image(
     temperature_c: npt.NDArray[np.floating],
-    valid_range_c: tuple[float, float],
+    valid_range_c: tuple[float, float] = VALID_RANGE_C,
     saturated: BoolArray | None = None,
 ) -> ThermalImage:
     """Set temperatures (height, width) [degrees C] to NaN if not finite, saturated or out of range, and count these."""
     if saturated is None:
         saturated = np.zeros(temperature_c.shape, dtype=bool)
     nan = ~np.isfinite(temperature_c) & ~saturated
+    low, high = max(valid_range_c[0], -ZERO_CELSIUS_K), valid_range_c[1]
     with np.errstate(invalid="ignore"):
-        inside = (temperature_c >= valid_range_c[0]) & (temperature_c <= valid_range_c[1])
+        inside = (temperature_c >= low) & (temperature_c <= high)
     outside = ~inside & ~nan & ~saturated
     masked = np.where(nan | saturated | outside, np.nan, temperature_c).astype(np.float32)
     report = PixelReport(masked.size, int(nan.sum()), int(saturated.sum()), int(outside.sum()))
     return ThermalImage(masked, report)
 
 
-def _check_there(path: Path, suffix: str) -> None:
-    """Raise `ThermalFileError` if the file is missing or empty, or its suffix is unknown."""
-    if not path.is_file():
-        remedy = "Restore the file, or remove the frame or pass --missing-thermal skip."
-        raise ThermalFileError("thermal file", expected=f"a file at {path}", got="nothing there", remedy=remedy)
-    if path.stat().st_size == 0:
-        raise _damaged(path, "a file of zero bytes")
-    if suffix not in THERMAL_SUFFIXES:
-        expected = "a thermal file of type " + ", ".join(THERMAL_SUFFIXES)
-        remedy = "Convert the file to one of these."
-        raise ThermalFileError(str(path), expected=expected, got=f"suffix '{suffix}'", remedy=remedy)
-
-
-def load_array(path: Path) -> npt.NDArray[Any]:
-    """Return the memory-mapped array of a .npy file; raise `ThermalFileError` if damaged or not of real numbers."""
+def _read_npy(path: Path) -> npt.NDArray[Any]:
     try:
-        values = np.load(path, mmap_mode="r", allow_pickle=False)
+        values = np.load(path, mmap_mode="r", allow_pickle=False)  # the size is checked before the numbers are read
     except ValueError as problem:  # numpy's message may contain the whole header, so it is not shown
         raise _damaged(path, "a header that is no array's, or fewer numbers than it says") from problem
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fui":
         raise _damaged(path, f"an array of type {getattr(values, 'dtype', type(values))}")
-    return values
-
-
-def _read_npy(path: Path) -> npt.NDArray[Any]:
-    values = load_array(path)  # memory-mapped: the size is checked before the numbers are read
     if values.ndim >= 2 and values.size:
         check_thermal_size(path, values.shape[1], values.shape[0])
     values = np.array(values)

@@ -48,7 +48,7 @@ def write_capture_page(result: CaptureResult) -> None:
         known = temperature_c[np.isfinite(temperature_c)]
         low, high = (float(each) for each in np.percentile(known, PERCENTILES)) if known.size else (0.0, 1.0)
         alone = image_file(colours(temperature_c, (low, high)))
-        title = f"{names[index]}: {scene.frames[index].photograph_source}"
+        title = f"{names[index]}: {scene.frames[index].name}"
         ends = f": {low:.1f} °C and less are black, {high:.1f} °C and more are bright yellow" if known.size else ""
         overlays.append((title, start, found, alone, f"thermal image{ends}"))
     samples, masked, pixels = [], 0, 0
@@ -69,7 +69,7 @@ def thermal_in_photograph(
     height = max(1, round(visible.height * width / visible.width))
     rays = _grid_rays(visible, width, height)
     coarse = (max(2, width // _DEPTH_STEP), max(2, height // _DEPTH_STEP))
-    depth, _ = SparseDepth(frame.points_visible()).at(_grid_rays(visible, *coarse))
+    depth, _ = SparseDepth(frame.points).at(_grid_rays(visible, *coarse))
     inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=np.isfinite(depth)).reshape(coarse[::-1])
     parallax = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR).ravel()
     rotation, shift = rig.visible_to_thermal[:3, :3], rig.visible_to_thermal[:3, 3]
@@ -118,7 +118,7 @@ def capture_page(
     scene, rig, drift = result.scene, result.scene.rig, result.scene.drift
     errors, known_c = scene.model.sighting_error_px(), temperatures_c[np.isfinite(temperatures_c)]
     label = "temperature, °C; how many pixels of a sample, without the coldest and hottest 0.1 %"
-    off = {**rig.standard_errors, "focal": rig.standard_errors.get("log_focal", math.nan) * rig.thermal_camera.fl_x}
+    off = {**rig.standard_errors, "focal": rig.standard_errors["log_focal"] * rig.thermal_camera.fl_x}
     frames = []
     for index, (name, frame) in enumerate(zip(scene_names(len(scene.frames)), scene.model.frames)):
         own = errors[scene.model.sighting_frame == index] if errors.size else errors

@@ -68,7 +68,7 @@ def test_too_few_points_or_frames_are_said() -> None:
     one = estimate_drift(capture.frames[:1], capture.thermal, capture.visible_to_thermal)
     assert not one.used
     assert len(one.offsets_k) == 1
-    assert "nothing to compare" in one.explanation
+    assert "only 0 scene points" in one.explanation
 
 
 def test_images_are_corrected_by_what_was_put_into_them_where_they_have_a_temperature() -> None:

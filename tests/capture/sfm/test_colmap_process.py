@@ -28,11 +28,6 @@ def raise_one(problem, say):
     raise problem
 
 
-def abort_as_colmap(words, say):
-    os.write(2, words.encode())
-    os.abort()
-
-
 def wait_for_ever(folder, say):
     (folder / "pid").write_text(str(os.getpid()))
     say("waiting")
@@ -53,32 +48,26 @@ def work(tmp_path_factory, monkeypatch):
 
 def test_it_is_another_process_that_says_how_far_it_is_and_what_it_returns_arrives(tmp_path, work):
     said = []
-    number, words = run_in_process(work.count_to, (3,), tmp_path, said.append)
+    number, words = run_in_process(work.count_to, (3,), said.append)
     assert said == ["0 ä", "1 ä", "2 ä"]
     assert number != os.getpid() and words == ["ä"] * 100_000
-    assert list(tmp_path.iterdir()) == [] and multiprocessing.active_children() == []
+    assert multiprocessing.active_children() == []
 
 
 @pytest.mark.parametrize("problem", [SceneError("frame 3: no."), OSError(28, "No space left on device", "pairs.txt")])
 def test_errors_arrive_as_they_were_raised(tmp_path, work, problem):
     said = []
     with pytest.raises(type(problem)) as raised:
-        run_in_process(work.raise_one, (problem,), tmp_path, said.append)
+        run_in_process(work.raise_one, (problem,), said.append)
     assert type(raised.value) is type(problem) and str(raised.value) == str(problem)
     assert said == ["before"]
-
-
-def test_an_abort_is_an_error_with_its_reason(tmp_path, work):
-    words = "E1 thread.cc] SQLite error: disk I/O error\n*** Check failure stack trace: ***\n    @ 0x7f\n"
-    with pytest.raises(ThermoxelsError, match=r"COLMAP: .*SQLite error: disk I/O error.*--from-stage"):
-        run_in_process(work.abort_as_colmap, (words,), tmp_path)
 
 
 def test_a_mapping_that_aborts_is_an_error_and_the_capture_goes_on_behind_its_features(tmp_path, monkeypatch):
     write_pairs(tmp_path / "card")
     said: list[str] = []
     monkeypatch.setattr("thermoxels_ns.capture.sfm.poses._map", _abort_in_the_middle)
-    with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end, got exit status.*--from-stage poses"):
+    with pytest.raises(ThermoxelsError, match=r"COLMAP: .* terminated abruptly.*--from-stage poses"):
         capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings(), said.append)
     assert said[-1].startswith("matches: 3 of 3")
     monkeypatch.undo()
@@ -96,7 +85,7 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from capture_apart import wait_for_ever
 from thermoxels_ns.capture.sfm.colmap import run_in_process
-run_in_process(wait_for_ever, (Path(sys.argv[1]),), Path(sys.argv[1]), lambda line: print(line, flush=True))
+run_in_process(wait_for_ever, (Path(sys.argv[1]),), lambda line: print(line, flush=True))
 """
 
 

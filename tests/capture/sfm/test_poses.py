@@ -8,9 +8,7 @@ from tests.support.posed_model import CAMERA, ring_model
 from tests.support.textured_room import write_card
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.colmap import model_of_colmap
-from thermoxels_ns.capture.sfm.poses import (
-    image_pairs,
-)
+from thermoxels_ns.capture.sfm.poses import image_pairs
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.data.colmap_model import read_model
 

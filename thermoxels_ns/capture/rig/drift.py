@@ -44,16 +44,11 @@ def estimate_drift(
     fitted to differences of two readings of one point by robust least squares (Huber's loss, reweighted), mean offset
     0. As a test, four fifths of the points are fitted: if that does not lower the differences at the other points, the
     result has offsets of zero, `used` False and the reason.
-
-    Raises:
-        SceneError: A thermal image does not have the camera's size.
     """
-    if len(frames) < 2:
-        return no_drift(len(frames), f"No correction: {len(frames)} frame: there is nothing to compare it with.")
     return drift_of_samples(sample_shared_points(frames, thermal_camera, np.asarray(visible_to_thermal, np.float64)))
 
 
-def no_drift(frames: int, why: str, before_k: float = np.nan) -> DriftEstimate:
+def _no_drift(frames: int, why: str, before_k: float = np.nan) -> DriftEstimate:
     """Return a `DriftEstimate` without correction for `frames` thermal images; `why` is its explanation."""
     return DriftEstimate(np.zeros(frames), (), before_k, before_k, False, why)
 
@@ -64,7 +59,7 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
     points = int(samples.point[-1]) + 1 if len(samples.point) else 0
     if points < _FEWEST_POINTS:
         seen = f"only {points} scene points are seen by two thermal images (at least {_FEWEST_POINTS})"
-        return no_drift(frames, f"No correction: {seen}.")
+        return _no_drift(frames, f"No correction: {seen}.")
     point, design, difference_k = _differences(samples)
     share = 1.0 / np.bincount(samples.point)[point]  # weight: a point's differences outnumber its readings
     held_out = point % _HELD_OUT_EVERY == _HELD_OUT_EVERY - 1
@@ -81,7 +76,7 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
             f"No correction: two images differ by {before_k:.3g} K at shared points, and by {after_k:.3g} K with the "
             "best correction, at points it was not fitted to."
         )
-        return no_drift(frames, why, before_k)
+        return _no_drift(frames, why, before_k)
     unknowns = frames + _RADIAL_TERMS * radial
     best = _fit(design[:, :unknowns], difference_k, share, unknowns)
     offsets_k, coefficients = best[:frames] - best[:frames].mean(), best[frames:] if radial else ()
@@ -149,10 +144,10 @@ def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_
     """
     columns = []
     for number, frame in enumerate(frames):
-        pixels = camera.project(frame.points_visible() @ visible_to_thermal[:3, :3].T + visible_to_thermal[:3, 3])
+        pixels = camera.project(frame.points @ visible_to_thermal[:3, :3].T + visible_to_thermal[:3, 3])
         inside = camera.contains(pixels, _BORDER_PX)
         ids, pixels = frame.point_ids[inside], pixels[inside]
-        reading, steepness = _read(read_temperatures(frame, camera), pixels)
+        reading, steepness = _read(read_temperatures(frame), pixels)
         known = np.isfinite(reading) & np.isfinite(steepness)
         smooth = known & (steepness <= np.quantile(steepness[known], _SMOOTH_SHARE) if known.any() else known)
         radius2 = radius_squared(pixels[smooth], camera.width, camera.height)

@@ -16,7 +16,6 @@ from thermoxels_ns.capture.rig_types import RigFrame, RigModel
 from thermoxels_ns.capture.sfm.sfm_model import SparseDepth
 from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.errors import SceneError
 
 FloatImage = Float32Array
 
@@ -30,7 +29,6 @@ SURE_DISTANCE = 0.01  # an edge so far from the nearest scene point, both drawn 
 _EDGE_REACH = 2.0  # half the width of an edge, in standard deviations of its blur
 _MARGIN_SHARE = 0.15
 _FINER = 1.23
-_ASPECT_TOLERANCE = 0.02
 _GRADIENT_SIGMA_PX = 1.2
 _NOISE_FACTOR = 3.0
 _STRONG_PERCENTILE, _SMALLEST_SHARE = 98.0, 3e-3
@@ -39,7 +37,6 @@ _CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE = 6.0, 0.02
 _FEWEST_FOR_PATTERN = 8
 _PATTERN_CORRELATION = 0.25
 _BORDER_PX, _BORDER_SHARE = 2.0, 0.05
-_TINY = 1e-12
 _PADDING = 2
 
 
@@ -61,9 +58,9 @@ class ThermalEdges:
         padded = np.pad(field, _PADDING)  # zeros around, so that everything outside reads 0
         self._planes = padded, np.gradient(padded, axis=1), np.gradient(padded, axis=0)
 
-    def sample(self, pixels: FloatArray, *, slopes: bool = False) -> npt.NDArray[np.complex64]:
-        """Return edge values (1, n) at pixels (n, 2), 0 outside; if `slopes`, (3, n) with derivatives by x and y."""
-        return np.stack([_bilinear(plane, pixels) for plane in self._planes[: 3 if slopes else 1]])
+    def sample(self, pixels: FloatArray) -> npt.NDArray[np.complex64]:
+        """Return edge values and their derivatives by x and y, shape (3, n), at pixels (n, 2); 0 outside."""
+        return np.stack([_bilinear(plane, pixels) for plane in self._planes])
 
     def weight_at(self, pixels: FloatArray) -> FloatArray:
         """Return the weights, 0 to 1, of points at pixels (n, 2), shape (n,); weights are 0 at the image's border."""
@@ -74,13 +71,10 @@ class RigScore:
     """Score of how well a rig makes the edges of all frames agree, at one size of the thermal images.
 
     The edges of every photograph are points in front of its camera, each with an edge value a. A rig projects each
-    point into the thermal image, whose edge value there is b. The score of the rig is
-    sum(w Re a* b) / sqrt(sum(w |a|^2) sum(w |b|^2)) over the points of all frames: 1 if all edges agree, 0 by chance.
-    The weights w fall to 0 at the border of the thermal image.
-
-    A rig is refined by maximising sum(w Re a* b) alone (`slopes`), with weights w that stay while the rig changes. If
-    the score were divided by a changing sum(w |b|^2), or the weights followed the rig, it would pay to move points to
-    where b is small, and the focal length would come out half a percent too long.
+    point into the thermal image, whose edge value there is b. The score of the rig is sum(w Re a* b) over the points of
+    all frames. The weights w fall to 0 at the border of the thermal image, and stay while the rig changes. If the score
+    were divided by a changing sum(w |b|^2), or the weights followed the rig, it would pay to move points to where b is
+    small, and the focal length would come out half a percent too long.
     """
 
     def __init__(
@@ -89,33 +83,13 @@ class RigScore:
         """Store the edges of each frame and the start `rig`; the weights are those at the changes `around` (10,)."""
         self.edges, self.thermal, self.rig = edges, thermal, rig
         self._weights = [t.weight_at(rig.project(around, e.points)) for e, t in zip(edges, thermal)]
-        self._own = sum(float(w @ np.abs(e.value) ** 2) for e, w in zip(edges, self._weights))
-        self._norm = self._sums(around)[1]
-
-    def around(self, change: FloatArray) -> RigScore:
-        """Return a `RigScore` of the same images whose weights are those at the ten changes `change`."""
-        return RigScore(self.edges, self.thermal, self.rig, change)
-
-    def value(self, change: FloatArray) -> float:
-        """Return the score, -1 to 1, of the rig with the ten changes `change`, over all frames."""
-        product, norm = self._sums(change)
-        return product / norm
-
-    def _sums(self, change: FloatArray) -> tuple[float, float]:
-        """Return the two parts of the score: sum(w Re a* b), and sqrt(sum(w |a|^2) sum(w |b|^2))."""
-        product, other = 0.0, 0.0
-        for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
-            (value,) = thermal.sample(self.rig.project(change, one.points))
-            product += float(weight @ (one.value.conj() * value).real)
-            other += float(weight @ np.abs(value) ** 2)
-        return product, float(np.sqrt(max(self._own * other, _TINY)))
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
-        """Return sum(w Re a* b) / the root at `around`, and its derivative by `change` per frame, (frames, 10)."""
+        """Return the score of the rig with the ten changes `change`, and its derivative per frame, (frames, 10)."""
         total, rows = 0.0, []
         for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
-            sampled = thermal.sample(self.rig.project(change, one.points), slopes=True)
-            value, *slope = weight / self._norm * (one.value.conj() * sampled).real
+            sampled = thermal.sample(self.rig.project(change, one.points))
+            value, *slope = weight * (one.value.conj() * sampled).real
             total += float(value.sum())
             rows.append(self.rig.pull_back(change, one.points, np.stack(slope, axis=1)))
         return total, np.array(rows)
@@ -180,47 +154,35 @@ class PreparedFrames:
         trust[rows, columns] = 1.0 / (1.0 + (distance / SURE_DISTANCE) ** 4)
         reach = 2 * int(np.ceil(_EDGE_REACH * (blur_px * scale / same + 1.0))) + 1
         trust = cv2.dilate(trust, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
-        turn = level.transform[:3, :3]
-        roll = np.exp(2j * np.arctan2(turn[1, 0], turn[0, 0]))
-        value = (field * trust)[rows, columns] * roll
+        value = (field * trust)[rows, columns]
         return EdgePoints(rays[known] * depth[known, None], value[known].astype(np.complex64))
 
 
 def prepare_frames(frames: Sequence[RigFrame], visible: Camera, thermal: Camera) -> PreparedFrames:
-    """Read the images of all frames and remove the fixed pattern; raise `SceneError` for a wrong size or bad file."""
-    temperatures = [read_temperatures(frame, thermal) for frame in frames]
+    """Read the images of all frames and remove the fixed pattern; raise `SceneError` for a file that is damaged."""
+    temperatures = [read_temperatures(frame) for frame in frames]
     prepared, depths = [], []
     for frame, contrast in zip(frames, without_fixed_pattern(temperatures)):
-        points = frame.points_visible()
-        depths.append(points[points[:, 2] > 0.0, 2])
-        prepared.append(PreparedFrame(read_photograph(frame, visible), contrast, SparseDepth(points)))
+        depths.append(frame.points[frame.points[:, 2] > 0.0, 2])
+        prepared.append(PreparedFrame(read_photograph(frame), contrast, SparseDepth(frame.points)))
     return PreparedFrames(tuple(prepared), visible, thermal, float(np.median(np.concatenate(depths))))
 
 
-def read_temperatures(frame: RigFrame, camera: Camera) -> FloatImage:
-    """Return a frame's temperatures [degrees C], in the shape (height, width) of `camera`; else raise `SceneError`."""
+def read_temperatures(frame: RigFrame) -> FloatImage:
+    """Return a frame's temperatures [degrees C], shape (height, width) of the thermal camera."""
     source = frame.temperature_c
     image = np.load(source, allow_pickle=False) if isinstance(source, Path) else np.asarray(source)
-    if image.shape != (camera.height, camera.width):
-        expected = f"the thermal camera's {camera.height} rows and {camera.width} columns"
-        remedy = "Leave the frame out, or give the camera that took it."
-        raise SceneError(f"{frame.name}: temperatures", expected=expected, got=image.shape, remedy=remedy)
     return image.astype(np.float32)
 
 
-def read_photograph(frame: RigFrame, camera: Camera) -> FloatImage:
-    """Return a frame's photograph as grey values, not turned by EXIF; raise `SceneError` for other proportions."""
+def read_photograph(frame: RigFrame) -> FloatImage:
+    """Return a frame's photograph as grey values, not turned by EXIF; raise `SceneError` if it cannot be decoded."""
     source = frame.photograph
     if isinstance(source, Path):
         image = np.asarray(open_photograph(source).convert("L"))
     else:
         image = np.asarray(source)
         image = image[..., :3].mean(axis=2) if image.ndim == 3 else image
-    height, width = image.shape
-    if abs(width * camera.height / (height * camera.width) - 1.0) > _ASPECT_TOLERANCE:
-        expected = f"the aspect of the visible camera, {camera.width} x {camera.height}"
-        got, remedy = f"{width} x {height} pixels", "Use the photographs that the poses were computed from."
-        raise SceneError(f"{frame.name}: photograph", expected=expected, got=got, remedy=remedy)
     return image.astype(np.float32)
 
 

@@ -9,9 +9,10 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.capture.frames import CaptureFrame
-from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame, RigStart
+from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame, guessed_rig
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
@@ -28,15 +29,14 @@ _BELIEVED_DEG = (3.0, 150.0)  # angles of view outside these limits are ignored;
 
 
 def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame]:
-    """Return a `RigFrame` for each frame of the model, in the model's order; points that project badly are left out."""
-    by_name = {frame.name: frame for frame in frames}
+    """Return a `RigFrame` for each of the model's frames, given in its order, without points that project badly."""
     good = model.point_error_px <= _MOST_ERROR_PX
     result = []
-    for index, name in enumerate(model.frames):
+    for index, frame in enumerate(frames):
         seen, _ = model.seen_by(index)
         seen = seen[good[seen]]
-        images = by_name[name].photograph, by_name[name].thermal
-        result.append(RigFrame(name, *images, model.camera_to_world[index], model.points[seen], seen))
+        points = model.in_camera(index, model.points[seen])
+        result.append(RigFrame(frame.photograph, frame.thermal, points, seen))
     return result
 
 
@@ -46,7 +46,7 @@ def rig_start(
     thermal_size: tuple[int, int],
     field_of_view_deg: float | None = None,
     metres_per_unit: float | None = None,
-) -> RigStart:
+) -> RigEstimate:
     """Return a guess of the thermal camera and the rig; a known `metres_per_unit` limits the shift of the lenses.
 
     The focal length follows from the first that is known: `field_of_view_deg`, the thermal files' focal length, FLIR's
@@ -74,11 +74,9 @@ def rig_start(
         camera = centred(visible.fl_x * width / visible.width * ratio)
         x, y = (median(getattr(each, name) for each in flir) for name in ("offset_x", "offset_y"))
         # The thermal image's centre lies at the photograph's centre plus the offset.
-        ahead = np.array([x / visible.fl_x, y / visible.fl_y, 1.0])
-        ahead /= np.linalg.norm(ahead)
-        right = np.cross([0.0, 1.0, 0.0], ahead)
-        right /= np.linalg.norm(right)
-        transform[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
+        ahead, down = [x / visible.fl_x, y / visible.fl_y, 1.0], [0.0, 1.0, 0.0]
+        turn = Rotation.align_vectors([[0.0, 0.0, 1.0], down], [ahead, down], [np.inf, 1.0])[0]
+        transform[:3, :3] = turn.as_matrix()
         sigma, source = _FROM_FLIR, f"FLIR's alignment of the pictures (Real2IR {ratio:.3f}, offset {x:g}, {y:g})"
     elif angles:
         angle = median(angles)
@@ -87,8 +85,8 @@ def rig_start(
     else:
         camera = centred(visible.fl_x * width / visible.width)
         sigma, source = _GUESSED, "a guess: the photographs' angle of view"
-    shift = None if metres_per_unit is None else _BASELINE_SIGMA_M / metres_per_unit
-    return RigStart(camera, transform, focal_sigma=sigma, translation_sigma=shift, source=source)
+    shift = math.nan if metres_per_unit is None else _BASELINE_SIGMA_M / metres_per_unit
+    return guessed_rig(camera, source, transform, sigma, shift)
 
 
 def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float | None = None) -> RigEstimate:
@@ -113,9 +111,3 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
     else:
         lengths = "its lengths taken for those of this scene, because not both have a scale"
     return RigEstimate(camera, transform, True, f"Given in {file.name}, {lengths}.")
-
-
-def kept_start(start: RigStart, why: str) -> RigEstimate:
-    """Return the start as a `RigEstimate` with `determined` False; its explanation begins with `why`."""
-    text = f"{why} The start value is kept: {start.source}."
-    return RigEstimate(start.thermal_camera, start.visible_to_thermal, False, text)

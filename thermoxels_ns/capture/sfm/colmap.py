@@ -1,15 +1,13 @@
-"""Runs COLMAP in a process of its own, reports why that process stopped, and converts COLMAP's models."""
+"""Runs COLMAP in a process of its own, and converts COLMAP's models."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -23,8 +21,9 @@ from thermoxels_ns.data.colmap_model import camera_to_world
 Say = Callable[[str], None]
 _Result = TypeVar("_Result")
 
-_KILLED = -int(getattr(signal, "SIGKILL", 9))
 _FATAL_ONLY = 3
+_POLL_S = 0.1
+_pipe: Connection  # of the new process
 FIELDS: dict[str, tuple[str, ...]] = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
@@ -33,14 +32,12 @@ FIELDS: dict[str, tuple[str, ...]] = {
 """COLMAP's lens models that --lens offers, and the order of their parameters; f is both focal lengths."""
 
 
-def run_in_process(
-    work: Callable[..., _Result], arguments: tuple[Any, ...], folder: Path, say: Say = lambda _: None
-) -> _Result:
-    """Call ``work(*arguments, say)`` in a new process, wait for its end and return the result of `work`.
+def run_in_process(work: Callable[..., _Result], arguments: tuple[Any, ...], say: Say = lambda _: None) -> _Result:
+    """Call ``work(*arguments, say)`` in a new process and return the result of `work`.
 
-    On some errors, such as a thread that cannot write, COLMAP aborts its process; the caller's process survives that.
-    If the caller's process ends or is killed, the new process ends too. `work` must be a function at the top of a
-    module, and its arguments and result must be picklable.
+    On some errors, such as a thread that cannot write, COLMAP says why and aborts its process; the caller's process
+    survives that. If the caller's process is killed, the new process ends too. `work` must be a function at the top of
+    a module, and its arguments and result must be picklable.
 
     Raises:
         ThermoxelsError: `work` raised this error, or the process ended without a result.
@@ -48,52 +45,37 @@ def run_in_process(
     """
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe(duplex=False)
-    log = folder / "colmap.log"
-    child = context.Process(target=_serve, args=(there, log, work, arguments), daemon=True)
-    child.start()
-    there.close()
-    ended: tuple[Any, Exception | None] | None = None  # the result of `work`, and the error that `work` raised
-    try:
-        with suppress(EOFError):
-            while ended is None:
-                message = here.recv()
-                if isinstance(message, str):
-                    say(message)
-                else:
-                    ended = message
-        child.join()
-    finally:
-        if child.is_alive():
-            child.kill()
-            child.join()
-        words = log.read_text("utf-8", "replace") if log.is_file() else ""
-        log.unlink(missing_ok=True)
-    if ended is None:
-        reason = _reason(child.exitcode, words)
-        remedy = "Check free space and memory and run the command again; if that does not help, begin anew with "
-        raise ThermoxelsError("COLMAP", expected="to end", got=reason, remedy=remedy + "--from-stage poses.")
-    if ended[1] is not None:
-        raise ended[1]
-    return ended[0]
+    with ProcessPoolExecutor(1, context, _prepare, (there,)) as process:
+        running = process.submit(_call, work, arguments)
+        while not running.done() or here.poll():
+            if here.poll(_POLL_S):
+                say(here.recv())
+        try:
+            return running.result()
+        except (ThermoxelsError, OSError):
+            raise
+        except Exception as problem:  # what pycolmap raises, or that the process aborted or was killed
+            remedy = (
+                "Check free space; where memory runs out, lower --threads, --image-size or --max-features; if that "
+                "does not help, begin anew with --from-stage poses."
+            )
+            raise ThermoxelsError("COLMAP", expected="to end", got=problem, remedy=remedy) from problem
 
 
-def _serve(pipe: Connection, log: Path, work: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Call `work` in the new process and send its result or error; COLMAP's output goes to the file `log`."""
-    with log.open("ab") as file:
-        for stream in (1, 2):
-            os.dup2(file.fileno(), stream)
+def _prepare(pipe: Connection) -> None:
+    """Prepare the new process: its lines of progress go to `pipe`, and it ends when the caller's process ends."""
+    global _pipe
+    _pipe = pipe
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    import pycolmap  # has its own BLAS, whose sums depend on its number of threads: imported before threadpool_limits
+    import pycolmap
 
     log_of_colmap: Any = pycolmap.logging
     log_of_colmap.minloglevel = _FATAL_ONLY
-    ended: tuple[Any, Exception | None]
-    with threadpool_limits(1, "blas"):
-        try:
-            ended = work(*arguments, pipe.send), None
-        except (ThermoxelsError, OSError) as problem:
-            ended = None, problem
-    pipe.send(ended)
+    threadpool_limits(1, "blas")  # pycolmap has its own BLAS, whose sums depend on its number of threads
+
+
+def _call(work: Callable[..., _Result], arguments: tuple[Any, ...]) -> _Result:
+    return work(*arguments, _pipe.send)
 
 
 def _exit_with_parent() -> None:
@@ -101,15 +83,6 @@ def _exit_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-def _reason(status: int | None, words: str) -> str:
-    """Return why the process ended: its exit status, and the last line of output that names an error (or any line)."""
-    if status == _KILLED:
-        return "it was killed, as systems do where memory runs out (lower --threads, --image-size or --max-features)"
-    said = [line for line in words.splitlines() if line.strip()]
-    telling = [line for line in said if "error" in line.lower()] or said[-1:]
-    return f"exit status {status}" + (f" ({telling[-1]})" if telling else "")
 
 
 def model_of_colmap(reconstruction: Any, frame_of_image: Mapping[str, str], size: tuple[int, int]) -> SfmModel:
@@ -144,7 +117,6 @@ def model_of_colmap(reconstruction: Any, frame_of_image: Mapping[str, str], size
         found.resized(*size),
         np.stack(poses),
         np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
-        np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
         np.array([point.error for point in points], dtype=np.float64) * float(factor.mean()),
         np.array(frames, dtype=np.int64),
         np.array(seen, dtype=np.int64),

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
-from thermoxels_ns.capture.settings import CaptureSettings, LensModel
+from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.colmap import FIELDS, model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.arrays import IntArray
-from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.core.errors import SceneError
 
@@ -24,7 +21,7 @@ MIN_FRAMES = 3  # smallest number of photographs that are reconstructed
 _SAID_EVERY = 10
 _GUESSED_FOCAL = 1.0  # focal length as a share of the longest side, if no photograph states one: a 53 degree lens
 _JPEG_QUALITY = 95
-_DATABASE = "features.db"
+_DATABASE, _IMAGES = "features.db", "images"
 EXHAUSTIVE_UP_TO = 80  # all pairs are compared up to this number of photographs; time grows with its square
 _NEIGHBOURS = 8
 """Beyond it, each photograph is matched with the next `_NEIGHBOURS`, and with those 2, 4, 8, ... times
@@ -36,72 +33,48 @@ _CHUNK = 8
 _PAIR_CHUNK = 200
 
 
-@dataclass(frozen=True)
-class ReducedPhotographs:
-    """Files that COLMAP reads and writes: reduced photographs, and a database of features and matches."""
-
-    database: Path  # COLMAP's database file, made if it does not exist; COLMAP also writes to its folder
-    images: Path  # folder of the reduced photographs, all of one size
-    frame_of_image: Mapping[str, str]
-    """Frame name by file name in `images`, in the order the photographs were taken."""
-    size: tuple[int, int]
-    """Width and height of the original photographs, [pixels]; the photographs in `images` may be smaller."""
-
-
 def find_poses(
     photographs: Mapping[str, Path],
+    size: tuple[int, int],
     folder: Path,
     settings: CaptureSettings,
     focal_px: float | None = None,
     say: Callable[[str], None] = lambda _: None,
-) -> tuple[SfmModel, dict[str, str]]:
+) -> SfmModel:
     """Find lens, poses and points from the photographs of one camera (incremental structure from motion by COLMAP).
 
-    `photographs` maps frame names to files, in the order they were taken; `focal_px` is their stated focal length.
-    Returns the model, and a reason for each frame without a pose, by its name.
-    Results of an interrupted run in `folder` are reused. Only the largest set of photographs that fit is kept.
+    `photographs` maps frame names to files of `size` (width, height), in the order they were taken; `focal_px` is their
+    stated focal length. Results of an interrupted run in `folder` are reused. Only the largest set of photographs that
+    fit is kept.
 
     Raises:
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
     """
-    size, dropped = common_size(photographs)
-    names = [name for name in photographs if name not in dropped]
-    if len(names) < MIN_FRAMES:
-        raise _too_few(len(names), "photographs of one size")
-    some = {name: photographs[name] for name in names}
-    reduced, small = _reduced(some, folder, size, settings.image_size)
-    # The photographs' own focal length or a usual one, the principal point at the centre.
-    focal = focal_px or _GUESSED_FOCAL * max(size)
-    start = Camera(*size, focal, focal, size[0] / 2.0, size[1] / 2.0).resized(*small)
-    run_in_process(_find_and_match, (reduced, start, focal_px is not None, settings), folder, say)
-    model = run_in_process(_map, (reduced, settings.seed), folder, say)
+    if len(photographs) < MIN_FRAMES:
+        raise _too_few(len(photographs), "photographs of one size")
+    frame_of_image, small = _reduced(photographs, folder / _IMAGES, size, settings.image_size)
+    params = ""
+    if focal_px is not None:
+        start = {"cx": small[0] / 2.0, "cy": small[1] / 2.0}
+        start |= dict.fromkeys(("f", "fl_x", "fl_y"), focal_px * small[0] / size[0])
+        params = ",".join(str(start.get(name, 0.0)) for name in FIELDS[settings.lens])
+    run_in_process(_find_and_match, (folder, list(frame_of_image), params, settings), say)
+    model = run_in_process(_map, (folder, frame_of_image, size, settings.seed), say)
     if model is None or len(model.frames) < MIN_FRAMES:
         raise _too_few(0 if model is None else len(model.frames), "photographs that fit together")
-    few = "too few matches with the largest group of photographs that fit together"
-    return model, dropped | {name: few for name in names if name not in model.frames}
-
-
-def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, str]]:
-    """Return the width and height that most photographs have, and a reason for each frame of another size."""
-    facts = {name: read_photograph_facts(path) for name, path in photographs.items()}
-    sizes = {name: (one.width, one.height) for name, one in facts.items()}
-    if not sizes:
-        raise _too_few(0, "photographs")
-    size = Counter(sizes.values()).most_common(1)[0][0]
-    most = f"the others {size[0]} x {size[1]}: another camera or mode"
-    return size, {name: f"{own[0]} x {own[1]} pixels, {most}" for name, own in sizes.items() if own != size}
+    return model
 
 
 def _reduced(
-    photographs: Mapping[str, Path], folder: Path, size: tuple[int, int], longest: int
-) -> tuple[ReducedPhotographs, tuple[int, int]]:
-    """Write photographs for COLMAP, at most `longest` pixels wide and high, into `folder`.
+    photographs: Mapping[str, Path], images: Path, size: tuple[int, int], longest: int
+) -> tuple[dict[str, str], tuple[int, int]]:
+    """Write photographs for COLMAP, at most `longest` pixels wide and high, into the folder `images`.
 
-    The files have no EXIF, by which COLMAP would turn them. Returns the files, and their width and height [pixels].
+    The files have no EXIF, by which COLMAP would turn them. Returns the frames' names by the files', in the order in
+    which the photographs were taken, and the files' width and height [pixels].
     """
     factor = min(1.0, longest / max(size))
     small = max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
-    images = folder / "images"
     images.mkdir(exist_ok=True)
     digits = max(4, len(str(len(photographs))))
     files = {f"{index:0{digits}d}.jpg": name for index, name in enumerate(photographs)}
@@ -114,7 +87,7 @@ def _reduced(
             temporary = images / f".{file}"
             picture.save(temporary, format="JPEG", quality=_JPEG_QUALITY)
             temporary.replace(images / file)
-    return ReducedPhotographs(folder / _DATABASE, images, files, size), small
+    return files, small
 
 
 def _too_few(got: int, what: str) -> SceneError:
@@ -124,7 +97,9 @@ def _too_few(got: int, what: str) -> SceneError:
     return SceneError("poses", expected=f"at least {MIN_FRAMES} {what}", got=got, remedy=remedy)
 
 
-def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> SfmModel | None:
+def _map(
+    folder: Path, frame_of_image: Mapping[str, str], size: tuple[int, int], seed: int, say: Callable[[str], None]
+) -> SfmModel | None:
     """Return the model of the largest group of photographs that fit together, or None."""
     import pycolmap
 
@@ -134,22 +109,10 @@ def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> 
         nonlocal found
         found += 1
         if found % _SAID_EVERY == 0:
-            count = len(matched.frame_of_image)
+            count = len(frame_of_image)
             say(f"poses: {min(found, count)} of {count} photographs")
 
-    folder = matched.database.parent
     pycolmap.set_random_seed(seed)
-    given = matched.database, matched.images, folder, _options(seed)
-    groups: dict[int, Any] = pycolmap.incremental_mapping(*given, next_image_callback=next_image)
-    if not groups:
-        return None
-    largest = max(groups.values(), key=lambda group: (group.num_reg_images(), len(group.points3D)))
-    return model_of_colmap(largest, matched.frame_of_image, matched.size)
-
-
-def _options(seed: int) -> Any:
-    import pycolmap
-
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.mapper.random_seed = seed
@@ -158,7 +121,12 @@ def _options(seed: int) -> Any:
     options.num_threads = 1
     options.mapper.num_threads = 1
     options.min_model_size = MIN_FRAMES
-    return options
+    given = folder / _DATABASE, folder / _IMAGES, folder, options
+    groups: dict[int, Any] = pycolmap.incremental_mapping(*given, next_image_callback=next_image)
+    if not groups:
+        return None
+    largest = max(groups.values(), key=lambda group: (group.num_reg_images(), len(group.points3D)))
+    return model_of_colmap(largest, frame_of_image, size)
 
 
 def image_pairs(count: int) -> IntArray:
@@ -180,28 +148,29 @@ def image_pairs(count: int) -> IntArray:
 
 
 def _find_and_match(
-    photographs: ReducedPhotographs,
-    camera: Camera,
-    known_focal: bool,
-    settings: CaptureSettings,
-    say: Callable[[str], None],
+    folder: Path, names: list[str], params: str, settings: CaptureSettings, say: Callable[[str], None]
 ) -> None:
-    """Find features in photographs and match them, adding to what an interrupted run left in the database.
+    """Find features in reduced photographs and match them, adding to what an interrupted run left in the database.
 
-    `camera` is the start value of the lens, at the size of the reduced photographs; `known_focal` is True if its focal
-    length is stated by photographs, not guessed.
+    `names` are their files in the order in which they were taken; `params` are the lens's parameters as COLMAP writes
+    them, at the size of the reduced photographs; if empty, the focal length is guessed.
     """
     import pycolmap
 
-    _add_images(photographs, camera, settings.lens, known_focal)
-    database, names = photographs.database, list(photographs.frame_of_image)
-    reader = pycolmap.ImageReaderOptions(camera_model=settings.lens, existing_camera_id=1)
+    database, images = folder / _DATABASE, folder / _IMAGES
+    reader = pycolmap.ImageReaderOptions(camera_model=settings.lens, camera_params=params)
+    reader.default_focal_length_factor = _GUESSED_FOCAL
+    if not database.is_file():
+        # Photographs are numbered here, in order; the threads that find features would number them by chance.
+        with replace_when_done(database) as temporary:
+            pycolmap.Database.open(temporary).close()
+            pycolmap.import_images(temporary, images, pycolmap.CameraMode.SINGLE, names, reader)
     extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=settings.threads)
     extraction.sift.max_num_features = settings.max_features
     for start in range(0, len(names), _CHUNK):  # COLMAP skips photographs that already have features
         some = names[start : start + _CHUNK]
         given: dict[str, Any] = {"reader_options": reader, "extraction_options": extraction}
-        pycolmap.extract_features(database, photographs.images, some, **given)
+        pycolmap.extract_features(database, images, some, **given)
         say(f"features: {start + len(some)} of {len(names)} photographs")
     pairs = image_pairs(len(names))
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=settings.threads)
@@ -215,28 +184,3 @@ def _find_and_match(
         pairing.match_list_path = str(listed)
         pycolmap.match_image_pairs(database, matching, pairing, verification)
         say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
-
-
-def _add_images(photographs: ReducedPhotographs, camera: Camera, lens: LensModel, known_focal: bool) -> None:
-    """Create the database with photographs numbered in order; the feature threads would number them by chance."""
-    import pycolmap
-
-    if photographs.database.is_file():
-        return
-    names = photographs.frame_of_image
-    with replace_when_done(photographs.database) as temporary, pycolmap.Database.open(temporary) as opened:
-        numbers = {"f": camera.fl_x, **vars(camera)}
-        params = [numbers[name] for name in FIELDS[lens]]
-        size = {"width": camera.width, "height": camera.height}
-        colmap_camera = pycolmap.Camera(camera_id=1, model=lens, params=params, **size)
-        colmap_camera.has_prior_focal_length = known_focal
-        opened.write_camera(colmap_camera, use_camera_id=True)
-        rig = pycolmap.Rig(rig_id=1)
-        rig.add_ref_sensor(colmap_camera.sensor_id)
-        opened.write_rig(rig, use_rig_id=True)
-        for number, name in enumerate(names, start=1):
-            image = pycolmap.Image(name=name, camera_id=1, image_id=number)
-            opened.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=number, rig_id=1)
-            frame.add_data_id(image.data_id)
-            opened.write_frame(frame, use_frame_id=True)

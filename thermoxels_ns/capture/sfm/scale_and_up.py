@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
+from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph
 from thermoxels_ns.capture.rig_types import FloatArray
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
@@ -85,11 +87,7 @@ def local_metres(fixes: Sequence[GpsFix]) -> FloatArray:
     return np.stack([east, north_radius * (latitude - middle), altitude - altitude.mean()], axis=1)
 
 
-def scale_from_distance(
-    model: SfmModel,
-    known: tuple[str, float, float, float, float, float],
-    photograph_of: Mapping[str, str],
-) -> SceneScale:
+def scale_from_distance(model: SfmModel, known: tuple[str, float, float, float, float, float]) -> SceneScale:
     """Find the scale from the measured distance between two points that one photograph shows.
 
     The depth at each of the two pixels is that of a plane through the scene points around the pixel: inverse depth is
@@ -97,8 +95,7 @@ def scale_from_distance(
 
     Args:
         model: Poses and scene points.
-        known: Name of the photograph or its frame, x and y of one end, x and y of the other [pixels], distance [m].
-        photograph_of: Photograph's file, relative to the capture, by frame name.
+        known: Name of the photograph, x and y of one end, x and y of the other [pixels], distance [m].
 
     Raises:
         ThermoxelsError: The photograph has no pose, a pixel lies outside or has no scene points around it, or the
@@ -106,10 +103,9 @@ def scale_from_distance(
     """
     name, x0, y0, x1, y1, metres = known
     check_positive("known distance", metres, "Pass the measured length in metres.")
-    files = {frame: photograph_of.get(frame, frame) for frame in model.frames}
-    named = [frame for frame, file in files.items() if name in (frame, file, Path(file).name, Path(file).stem)]
+    named = [frame for frame in model.frames if name in (frame, Path(frame).name, Path(frame).stem)]
     if not named:
-        remedy = f"Pass one of them, such as {files[model.frames[0]]}."
+        remedy = f"Pass one of them, such as {model.frames[0]}."
         raise SceneError("known distance", expected="a photograph whose pose was found", got=name, remedy=remedy)
     index = model.frames.index(named[0])
     (first, error), (second, other_error) = (_surface_point(model, index, pixel) for pixel in ((x0, y0), (x1, y1)))
@@ -234,8 +230,17 @@ class Up:
 
     direction: FloatArray  # unit vector in the model's coordinates, shape (3,)
     source: str  # sentence for the report that says how the direction was found
-    spread_deg: float | None
-    """Median deviation of single photographs from `direction`, [degrees]; None: unknown."""
+
+
+def upright(model: SfmModel, frames: Sequence[CaptureFrame]) -> tuple[SfmModel, Up]:
+    """Return the model of `frames` with z up, y ahead of the cameras and its origin amid the scene points; and up."""
+    up = find_up(model.camera_to_world, [one.gimbal_deg for one in frames], [one.orientation for one in frames])
+    ahead = -model.camera_to_world[:, :3, 2].mean(axis=0)
+    # The infinite weight turns up to z exactly; ahead then comes as near to y as it can.
+    turn = Rotation.align_vectors([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], [up.direction, ahead], [np.inf, 1.0])[0]
+    rotation = turn.as_matrix()
+    origin = np.median(model.points, axis=0) if len(model.points) else model.centres.mean(axis=0)
+    return model.moved(rotation, origin), replace(up, direction=rotation @ up.direction)
 
 
 def find_up(
@@ -256,9 +261,7 @@ def find_up(
             # A camera that is rolled clockwise, as seen from behind, has up to its left.
             local.append((-math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch), -math.sin(pitch)))
         each = np.einsum("nij,nj->ni", rotations[measured], np.array(local))
-        up = _robust_mean(each)
-        spread = _median_angle(each, up)
-        return Up(up, f"From the pitch and roll that {len(measured)} photographs state.", spread)
+        return Up(_robust_mean(each), f"From the pitch and roll that {len(measured)} photographs state.")
     flat = np.array([_UP_OF_ORIENTATION[o] for o in orientation], dtype=np.float64)
     held = np.einsum("nij,nj->ni", rotations[:, :, :2], flat)
     mean = _robust_mean(held)
@@ -269,26 +272,8 @@ def find_up(
         normal = vectors[:, 0] if vectors[:, 0] @ mean > 0 else -vectors[:, 0]
         # Axes that lie in no plane are of cameras that were rolled, or that all look one way: they tell no normal.
         if values[0] < 0.2 * values[1] and normal @ mean > _LEAST_COSINE:
-            off = np.degrees(np.arcsin(np.clip(np.abs(level @ normal), 0.0, 1.0)))
-            return Up(normal, "Assumed: the photographs' sides were held level.", float(np.median(off)))
-    return Up(mean, "Assumed: the mean of the photographs' upward directions.", _median_angle(held, mean))
-
-
-def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
-    """Return the rotation (3, 3) that turns `up` to z, and the part of `ahead` perpendicular to `up` to y, if not 0.
-
-    >>> level_rotation([0, 1, 0], [0, 0, -1]).round(9).tolist()
-    [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-    """
-    z = np.asarray(up, dtype=np.float64)
-    z = z / np.linalg.norm(z)
-    y = np.asarray(ahead, dtype=np.float64)
-    y = y - (y @ z) * z
-    if not np.linalg.norm(y) > 1e-6:
-        y = np.eye(3)[np.argmin(np.abs(z))]
-        y = y - (y @ z) * z
-    y = y / np.linalg.norm(y)
-    return np.stack([np.cross(y, z), y, z]) + 0.0
+            return Up(normal, "Assumed: the photographs' sides were held level.")
+    return Up(mean, "Assumed: the mean of the photographs' upward directions.")
 
 
 def _robust_mean(directions: FloatArray) -> FloatArray:
@@ -299,7 +284,3 @@ def _robust_mean(directions: FloatArray) -> FloatArray:
         nearness = directions @ mean
         mean = directions[nearness >= np.median(nearness)].sum(axis=0)
     return mean / max(float(np.linalg.norm(mean)), 1e-12)
-
-
-def _median_angle(directions: FloatArray, up: FloatArray) -> float:
-    return float(np.degrees(np.median(np.arccos(np.clip(directions @ up, -1.0, 1.0)))))

@@ -30,7 +30,6 @@ class SfmModel:
     camera: Camera  # lens of all photographs, at their original size
     camera_to_world: FloatArray  # poses, shape (f, 4, 4), camera axes x right, y up, z back, as in transforms.json
     points: FloatArray  # scene points, shape (n, 3), in world units
-    colours: npt.NDArray[np.uint8]  # red, green and blue of the points, shape (n, 3)
     point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
     sighting_frame: IntArray  # index into `frames`, shape (s,)
     sighting_point: IntArray  # index into `points`, shape (s,)
