@@ -168,7 +168,7 @@ def test_options_that_do_not_fit_are_refused(written, wrong):
 def test_photographs_that_only_the_model_has_are_named(copied):
     folder = copied("colmap")
     (folder / "images" / "frame_train_00002.png").unlink()
-    assert read_scene_file(folder, "skip").left_out == ["frame_train_00002.png", "thermal/frame_train_00002.png"]
+    assert read_scene_file(folder).left_out == ["frame_train_00002.png"]
 
 
 def test_thermal_images_of_other_names_are_paired_in_their_order(copied):
