@@ -7,7 +7,6 @@ from thermoxels_ns.data.dataparser import split_frames
 from thermoxels_ns.data.scene_scale import (
     choose_scale,
     scale_from_known_distance,
-    scale_from_option,
     scale_from_scene_file,
     up_from_scene_file,
 )
@@ -74,7 +73,7 @@ def test_an_interval_goes_before_names_and_names_before_lists() -> None:
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, True, "2"])
 def test_scale_and_distance_must_be_above_zero(value):
     with pytest.raises(ThermoxelsError, match=r"^metres_per_unit: "):
-        scale_from_option(value)
+        choose_scale(option=value)
     with pytest.raises(ThermoxelsError, match=r"^distance_m: "):
         scale_from_known_distance((0, 0, 0), (1, 0, 0), value)
 
