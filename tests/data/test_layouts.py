@@ -14,10 +14,10 @@ from PIL import Image
 from tests.support.flir_file import FlirFile, smooth_counts
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data import layouts
-from thermoxels_ns.data.colmap_tracks import read_colmap_tracks
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.scene_file import BOUNDS_NAME, read_scene_file
+from thermoxels_ns.data.tracks import read_colmap_tracks
 from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
 from thermoxels_ns.synthetic import scene_folder
 
