@@ -25,11 +25,10 @@ MOST_ERROR_PX = 2.0  # mean reprojection error above which a point is left out, 
 LEAST_ERROR_PX = 0.3  # a smaller reprojection error of a point is due to luck and is raised to this, [pixels]
 LEAST_PARALLAX_DEG = 2.0  # a point is left out if the largest angle between its rays is not above this
 MOST_BEHIND = 0.1  # if a larger share of sightings lies behind the camera, the tracks belong to other poses
-MOST_OFF_PX = 2.0
-"""A photograph is left out if points seen from the model's pose and from the given pose are farther apart than this
-(median over its points)."""
-LEAST_AGREEING = 0.7
-"""Share of the photographs with points whose poses must agree; with fewer, the model belongs to other poses."""
+MOST_OFF = 0.01
+"""A photograph is left out if an axis of its camera in the model is off the given one by more than this, or its place
+by more than this share of the cameras' distance from their middle."""
+LEAST_AGREEING = 0.7  # share of the photographs whose poses must agree; with fewer, the model belongs to other poses
 TrackSource = Literal["auto", "given", "off"]
 _REMEDY = f"Write the scene again with thermoxels capture, or remove {TRACKS_KEY} from the json to train without it."
 
@@ -113,8 +112,8 @@ def read_colmap_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> 
     """Return the tracks of the COLMAP model in a scene's folder, in input coordinates; None if there is no model.
 
     Photographs are matched by name. The json's poses must be in the model's world, or in one of `worlds_of_json`. Two
-    poses of a photograph agree if points appear less than `MOST_OFF_PX` apart from both (median). Sightings of
-    photographs whose poses do not agree are left out, and `say` receives their names.
+    poses of a photograph agree if they differ by less than `MOST_OFF`. Sightings of photographs whose poses do not
+    agree are left out, and `say` receives their names.
 
     Raises:
         SceneError: The model is damaged, is not of these photographs, or too few of its poses agree.
@@ -148,26 +147,25 @@ def read_colmap_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> 
     point, frame = np.unique(np.array(seen, dtype=np.int64), axis=0).T
     widths = [f.intrinsics.width / model.cameras[image.camera_id].width for f, image in zip(frames, images)]
     error_px = np.array([one.error for one in model.points3D.values()], dtype=np.float64) * float(np.median(widths))
-    poses = np.stack(list(map(camera_to_world, images)))
-    tried = []
-    for world in worlds_of_json(scene.meta):
-        moved = points @ world[:3, :3].T + world[:3, 3]
-        tried.append((moved, _off_px(frames, world @ poses, moved, frame, point)))
-    moved, off_px = min(tried, key=lambda one: np.nanmedian(one[1]))
-    agree = off_px <= MOST_OFF_PX  # NaN, of a photograph that sees nothing, is False
-    seeing = int(np.isfinite(off_px).sum())
-    if agree.sum() < max(3, LEAST_AGREEING * seeing):
+    poses, given = np.stack(list(map(camera_to_world, images))), np.stack([one.pose for one in frames])
+    spread = np.linalg.norm(given[:, :3, 3] - given[:, :3, 3].mean(axis=0), axis=1).max()
+    unit = np.array([1.0, 1.0, 1.0, max(spread, 1e-300)])
+    tried = [(np.abs(((w @ poses - given) / unit)[:, :3]).max(axis=(1, 2)), w) for w in worlds_of_json(scene.meta)]
+    off, world = min(tried, key=lambda one: np.median(one[0]))
+    agree = off <= MOST_OFF
+    if agree.sum() < max(3, LEAST_AGREEING * len(agree)):
         raise SceneError(
-            f"its poses are others than those of {scene.json_path.name}: {int(agree.sum())} of {seeing} photographs "
-            f"agree within {MOST_OFF_PX:g} pixels (median {np.nanmedian(off_px):.1f})"
+            f"its poses are others than those of {scene.json_path.name}: {int(agree.sum())} of {len(agree)} "
+            f"photographs agree within {MOST_OFF:.0%} (median {np.median(off):.1%})"
         )
     say(
         f"Tracks of the COLMAP model in {folder}: {len(points):,} points, {int(agree.sum())} of {len(scene.frames)} "
-        f"photographs, whose poses agree within {np.median(off_px[agree]):.2f} pixels (median)."
+        "photographs."
     )
-    strays = [one.name for one, good, off in zip(frames, agree, off_px) if not good and np.isfinite(off)]
-    if strays:
-        say(f"Tracks: other poses than COLMAP's, left out: {', '.join(strays)}")
+    if not agree.all():
+        strays = ", ".join(one.name for one, good in zip(frames, agree) if not good)
+        say(f"Tracks: other poses than COLMAP's, left out: {strays}")
+    moved = points @ world[:3, :3].T + world[:3, 3]
     kept = agree[frame]
     return SparseTracks(moved, error_px, tuple(one.name for one in frames), frame[kept], point[kept])
 
@@ -239,23 +237,3 @@ def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, in
         pairs += [(number[ending], place) for ending in endings if ending in number][:1]
     once = Counter(image for image, _ in pairs)
     return [pair for pair in pairs if once[pair[0]] == 1]
-
-
-def _off_px(
-    frames: Sequence[Frame], poses: FloatArray, points: FloatArray, frame: IntArray, point: IntArray
-) -> FloatArray:
-    """Return how far apart (median) a frame's points appear from its own pose and from its pose in `poses` (n, 4, 4).
-
-    Sighting number s is: frame `frame[s]` sees `points[point[s]]`. The result, shape (frames,), is in pixels; NaN for a
-    frame that sees nothing.
-    """
-    seen = []
-    for stands in (poses, np.stack([one.pose for one in frames])):
-        line = np.einsum("sji,sj->si", stands[frame, :3, :3], points[point] - stands[frame, :3, 3])
-        seen.append(line / np.maximum(np.linalg.norm(line, axis=1), 1e-300)[:, None])
-    focal = np.array([min(one.intrinsics.fl_x, one.intrinsics.fl_y) for one in frames])
-    off = np.linalg.norm(seen[0] - seen[1], axis=1) * focal[frame]
-    median = np.full(len(frames), np.nan)
-    for number in np.unique(frame):
-        median[number] = np.median(off[frame == number])
-    return median
