@@ -46,7 +46,6 @@ from measuring import (
     run_with_options,
     synthetic_scene,
     train_and_evaluate,
-    write_rows,
 )
 
 from thermoxels_ns.core.errors import ThermoxelsError
@@ -300,15 +299,11 @@ def _median(found: Sequence[float], name: str) -> str:
 
 
 def _read(path: Path) -> list[Row]:
-    """Rows that are there; where columns have changed since, the file is written again with those of today."""
+    """Rows that are there."""
     if not path.is_file():
         return []
     with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        rows = [{name: row.get(name) or "" for name in (*_KEY, *_KEPT)} for row in reader]
-    if rows and reader.fieldnames != [*_KEY, *_KEPT]:
-        write_rows(path, rows)
-    return rows
+        return list(csv.DictReader(file))
 
 
 def _append(path: Path, row: Row) -> None:

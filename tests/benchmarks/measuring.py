@@ -1,6 +1,5 @@
-"""Runs, tables and logarithmic panels for the other benchmarks, which may then import tests.support."""
+"""Runs and tables for the other benchmarks, which may then import tests.support."""
 
-import csv
 import json
 import os
 import sys
@@ -14,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
@@ -137,36 +135,3 @@ def print_head(*columns: str) -> None:
     """Print the head of a Markdown table."""
     print_row(*columns)
     print(len(columns) * "|---" + "|", flush=True)
-
-
-def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replace_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def logarithmic_panels(lines: int, columns: int, **options: Any) -> tuple[Any, Any]:
-    """A figure and its panels, shape (lines, columns), both axes logarithmic with plain numbers beside them."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    figure, panels = pyplot.subplots(lines, columns, squeeze=False, layout="constrained", **options)
-    for panel in panels.ravel():
-        panel.set(xscale="log", yscale="log")
-        panel.grid(True, which="both", alpha=0.25)
-        for axis in (panel.xaxis, panel.yaxis):
-            axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            axis.set_minor_formatter(NullFormatter())
-    return figure, panels
-
-
-def save(figure: Any, path: Path, dpi: int = 110) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replace_when_done(path) as temporary:
-        figure.savefig(temporary, dpi=dpi)
