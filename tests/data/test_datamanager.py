@@ -210,15 +210,6 @@ def directions(views: Views, number: int) -> np.ndarray:
     return local @ views.camera_to_world[number, :, :3].T
 
 
-def inside(views: Views, number: int, rays: np.ndarray) -> np.ndarray:
-    """Which directions (n, 3) a view sees."""
-    local = rays @ views.camera_to_world[number, :, :3]
-    ahead = local[:, 2] < -1e-9
-    depth = np.where(ahead, -local[:, 2], 1.0)[:, None]
-    pixel = views.centre[number] + views.focal[number] * local[:, :2] * (1, -1) / depth
-    return ahead & ((pixel >= -1e-6) & (pixel <= views.size[number] + 1e-6)).all(axis=1)
-
-
 @pytest.mark.parametrize("own_camera", [False, True])
 def test_every_pixel_looks_along_its_training_ray(scene_folder, own_camera):
     scene = scene_folder(own_camera=own_camera, thermal_size=(12, 10) if own_camera else None)
@@ -249,7 +240,7 @@ def test_a_fisheye_lens_spans_its_angles():
     for number in range(2):
         middle_row = lens.generate_rays(number, keep_shape=True).directions[33].numpy()
         middle_column = lens.generate_rays(number, keep_shape=True).directions[:, 54].numpy()
-        assert inside(views, number, middle_row).all() and inside(views, number, middle_column).all()
+        assert views.shows(number, middle_row).all() and views.shows(number, middle_column).all()
     ends = np.rad2deg(np.arctan2([views.centre[0], views.size[0] - views.centre[0]], views.focal[0]))
     np.testing.assert_allclose(ends, [[54, 33], [66, 27]], atol=0.5)
 

@@ -146,7 +146,7 @@ class KnownTruth:
             return SurfaceScore(recall=recalled), SurfaceScore()
         precision, share = float(agrees[scored].mean()), float(scored.mean())
         whole = SurfaceScore(precision, recalled, share, float(distance[scored].mean()))
-        free = count_cameras(solid, lattice, self._views(world_to_truth)).free[tuple(empty[~on_border].T)]
+        free = count_cameras(solid, lattice, self.views(world_to_truth)).free[tuple(empty[~on_border].T)]
         shown = scored & (free >= MIN_VIEWS)
         if not shown.any():
             return whole, SurfaceScore()
@@ -158,7 +158,7 @@ class KnownTruth:
             return np.ones(len(points), dtype=bool)
         return agrees | (self.scene.around.solid.signed_distance(points) > tolerance_m)
 
-    def _views(self, world_to_truth: FloatArray) -> Views:
+    def views(self, world_to_truth: FloatArray) -> Views:
         """Return the training cameras in the world that the similarity (4, 4) brings to the scene's coordinates."""
         scale = _scale_of(world_to_truth)
         poses, camera, count = self.training_poses, self.camera, len(self.training_poses)
