@@ -204,12 +204,10 @@ def compare_with_truth(
 ) -> dict[str, Any] | None:
     """Compare solid voxels, and the temperatures of a mesh made from them, with the exact scene; return the figures.
 
-    Precision is the share of the reconstructed boundary within `TOLERANCE_VOXELS` of the true surface. Recall is the
-    share of the true surface seen by `MIN_VIEWS` training cameras that lies within that tolerance of the boundary. The
-    F-score is their harmonic mean. `KnownTruth.score` says which faces are left out. Figures named ``..._seen`` are of
-    the part of the boundary that cameras see; they are 0 if cameras see none. `cells` has the shape
-    `lattice.cell_shape`. `world_to_truth` (4, 4) is the similarity from the lattice's world to the coordinates of the
-    input poses, in which a synthetic scene is written in metres; `metres_per_unit` is the scale of the mesh's nodes.
+    Scores are those of `KnownTruth.score` within `TOLERANCE_VOXELS`. Figures named ``..._seen`` are of the part of the
+    boundary that cameras see; they are 0 if cameras see none. `cells` has the shape `lattice.cell_shape`.
+    `world_to_truth` (4, 4) is the similarity from the lattice's world to the coordinates of the input poses, in which a
+    synthetic scene is written in metres; `metres_per_unit` is the scale of the mesh's nodes.
 
     Returns:
         Figures by name, which json can hold, in metres of the scene; None if the truth is not known. Scores are 0 to 1.
