@@ -105,11 +105,11 @@ def load(run: Path | str, *, metres_per_unit: float | None = None) -> Scene:
 
     from thermoxels_ns.commands.export import load_trained_scene, scene_json
     from thermoxels_ns.core.config_loader import check_run
-    from thermoxels_ns.data.scene_scale import choose_scale, scale_from_option
+    from thermoxels_ns.data.scene_scale import choose_scale
     from thermoxels_ns.mesh.temperature import MIN_OBSERVED_WEIGHT
 
     config = Path(run) if Path(run).suffix == ".yml" else Path(run) / "config.yml"
-    given = None if metres_per_unit is None else scale_from_option(metres_per_unit).metres_per_unit
+    choose_scale(metres_per_unit)  # raises for a wrong one
     check_run(config)  # before nerfstudio is imported, which takes many seconds
     hook = sys.excepthook  # our plugin makes nerfstudio's commands print errors without a traceback, which Python keeps
     with threadpool_limits(1, "blas"), warnings.catch_warnings():
@@ -121,7 +121,7 @@ def load(run: Path | str, *, metres_per_unit: float | None = None) -> Scene:
             trained = load_trained_scene(config)
         finally:
             CONSOLE.quiet, sys.excepthook = loud, hook
-    scale, field = choose_scale(given, None, scene_json(trained.scene_folder)), trained.snapshot
+    scale, field = choose_scale(metres_per_unit, None, scene_json(trained.scene_folder)), trained.snapshot
     metres = None if scale is None else scale.metres_per_unit
     units = (metres or 1.0) * float(np.cbrt(abs(np.linalg.det(trained.world_to_input[:3, :3]))))
     measured = field.observed_weight >= MIN_OBSERVED_WEIGHT

@@ -49,9 +49,6 @@ class Synthetic:
     """Height of the photographs, [pixels]."""
     thermal_width: int | None = None
     """Width of the thermal images, [pixels]; by default --width, or half of it with --own-thermal-camera True."""
-    thermal_format: Literal["png16", "tiff", "npy"] = "png16"
-    """Format of the thermal images: 16-bit PNG that spans the temperature bounds, 16-bit TIFF of centikelvin counts, or
-    float32 numpy in degrees Celsius."""
     photo_format: Literal["jpeg", "png"] = "jpeg"
     """Format of the photographs: JPEG, as cameras write it, or PNG, which is lossless."""
     seed: int = 0

@@ -4,11 +4,13 @@
     python tests/benchmarks/ablation.py --output RUNS --quality draft --scenes wild-20 saharov32 --without carve planes
 
 Scenes are synthetic ones by name, or `saharov32` (see real_depths.py) and `arco` from ../shared/data beside the
-checkout. Each is trained and evaluated by the commands that a user types; what follows `--options`, which comes last,
-is handed to `ns-train` in all runs. Each run is a row of ``ablation.csv`` in the output folder, written as it ends. A
-row that is there is not measured again: a benchmark that was interrupted goes on, and more scenes, seeds or mechanisms
-may follow. Logs stay, checkpoints go. A run that fails is said and left out; the next call tries it again. Rows of
-earlier code are not told from those of today's: begin with an empty folder.
+checkout. A synthetic scene's name may go on with flaws of its photographs and the seed that draws them, as in
+`house-corner:all:5` (`FLAWS` in measuring.py): with `--without` and no mechanism, rows say what flaws cost, and logs
+what was corrected. Each is trained and evaluated by the commands that a user types; what follows `--options`, which
+comes last, is handed to `ns-train` in all runs. Each run is a row of ``ablation.csv`` in the output folder, written as
+it ends. A row that is there is not measured again: a benchmark that was interrupted goes on, and more scenes, seeds or
+mechanisms may follow. Logs stay, checkpoints go. A run that fails is said and left out; the next call tries it again.
+Rows of earlier code are not told from those of today's: begin with an empty folder.
 
 In the end a table says for each mechanism the median over the scenes of each figure with everything on minus without
 the mechanism, the scenes where that is least and most for F, and the noise: of the figures of different seeds with
@@ -32,13 +34,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import entry_points
-from io import StringIO
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from measuring import SHARED_DATA, run_of, run_with_options, synthetic_scene, train_and_evaluate, write_rows
+from measuring import (
+    SHARED_DATA,
+    run_of,
+    run_quietly,
+    run_with_options,
+    synthetic_scene,
+    train_and_evaluate,
+)
 
 from thermoxels_ns.core.errors import ThermoxelsError
 
@@ -124,7 +132,8 @@ FIGURES = {
 """Figures of the table and how they are written; those of depth_off_share and what follows are better if smaller."""
 _KEPT = (
     *("fscore_128_seen", "fscore_128", "fscore", "precision", "recall", "psnr", "psnr_8", "psnr_box"),
-    *("psnr_fitted", "thermal_psnr", "thermal_mae_c", "half_transparent", "surface_distance_m"),
+    *("psnr_fitted", "thermal_psnr", "thermal_mae_c", "thermal_mae_debiased_c", "half_transparent"),
+    "surface_distance_m",
     *("depth_error", "depth_off_share", "opaque_share", "sky_filled", "seconds"),
 )
 _COMMAND = "--run-without"  # First word of this script's command line in processes that it starts
@@ -140,7 +149,7 @@ class Ablation:
     output: Path
     """Folder for scenes, logs, ablation.csv and ablation.md."""
     scenes: tuple[str, ...] = _SCENES
-    """Synthetic scenes by name, saharov32, arco."""
+    """Synthetic scenes by name, perhaps with flaws, saharov32, arco."""
     without: tuple[str, ...] = tuple(MECHANISMS)
     """Mechanisms that are switched off, one at a time; with everything on comes first."""
     quality: Literal["draft", "standard"] = "standard"
@@ -183,10 +192,6 @@ class Ablation:
 
     def measure(self, mechanism: str, scene: str, seed: int, options: Sequence[str]) -> dict[str, float]:
         """Train and evaluate once; the folder keeps logs alone."""
-        from rich.console import Console
-
-        from thermoxels_ns.commands.installed_commands import run_command
-
         method, data = _METHODS.get(scene, "thermoxels"), SHARED_DATA / scene
         if scene not in _METHODS:
             data = self.output / "scenes" / scene
@@ -200,7 +205,7 @@ class Ablation:
         if scene == SAHAROV:
             found = folder / "depths.json"
             command = [*launcher, _DEPTHS, str(run_of(folder) / "config.yml"), str(data), str(found)]
-            run_command(command, folder / "depths.log", Console(file=StringIO()))
+            run_quietly(command, folder / "depths.log")
             figures |= json.loads(found.read_text(encoding="utf-8"))
         shutil.rmtree(folder / "outputs")
         return figures | {"seconds": seconds}
@@ -295,15 +300,11 @@ def _median(found: Sequence[float], name: str) -> str:
 
 
 def _read(path: Path) -> list[Row]:
-    """Rows that are there; where columns have changed since, the file is written again with those of today."""
+    """Rows that are there."""
     if not path.is_file():
         return []
     with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        rows = [{name: row.get(name) or "" for name in (*_KEY, *_KEPT)} for row in reader]
-    if rows and reader.fieldnames != [*_KEY, *_KEPT]:
-        write_rows(path, rows)
-    return rows
+        return list(csv.DictReader(file))
 
 
 def _append(path: Path, row: Row) -> None:

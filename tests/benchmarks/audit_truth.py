@@ -29,7 +29,6 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass, replace
-from io import StringIO
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -37,7 +36,7 @@ from typing import Literal
 
 import numpy as np
 import tyro
-from measuring import print_head, print_row
+from measuring import print_head, print_row, run_of, run_quietly, trained
 
 from tests.support.audited_house import (
     CONTACT_M,
@@ -111,9 +110,6 @@ def house_findings(
 
 def trained_mesh(truth: Truth, stated: Conditions, folder: Path, quality: str, seed: int) -> TetMesh:
     """Photograph a solved house, train and export; the folder keeps logs, and the mesh."""
-    from rich.console import Console
-
-    from thermoxels_ns.commands.installed_commands import run_command
     from thermoxels_ns.mesh.files.vtu import read_mesh
     from thermoxels_ns.synthetic.imperfections import Imperfections
     from thermoxels_ns.synthetic.scene_folder import TRUTH, write_scene
@@ -122,25 +118,10 @@ def trained_mesh(truth: Truth, stated: Conditions, folder: Path, quality: str, s
     write_scene(house_scene(truth, stated), folder / "scene", seed=seed, imperfections=flaws, progress=False)
     (folder / "scene" / TRUTH).unlink()  # no command knows a scene of this name
     (folder / "patches.yaml").write_text(patches_yaml(), encoding="utf-8")
-    quiet = Console(file=StringIO(), width=200)
-    run_command(
-        [
-            *("ns-train", "thermoxels", "--output-dir", str(folder / "outputs"), "--experiment-name", "scene"),
-            *("--timestamp", "run", "--vis", "tensorboard", "--quality", quality),
-            *("thermal-data", "--data", str(folder / "scene")),
-        ],
-        folder / "train.log",
-        quiet,
-    )
-    config = folder / "outputs" / "scene" / "thermoxels" / "run" / "config.yml"
-    run_command(
-        [
-            *("ns-export", "thermoxels-mesh", "--load-config", str(config), "--output-dir", str(folder / "export")),
-            *("--metres-per-unit", "1", "--patches", str(folder / "patches.yaml")),
-        ],
-        folder / "export.log",
-        quiet,
-    )
+    trained(folder / "scene", folder, ["--quality", quality])
+    command = ["ns-export", "thermoxels-mesh", "--load-config", str(run_of(folder) / "config.yml")]
+    command += ["--output-dir", str(folder / "export"), "--metres-per-unit", "1"]
+    run_quietly([*command, "--patches", str(folder / "patches.yaml")], folder / "export.log")
     mesh = read_mesh(folder / "export" / "mesh.vtu")
     for name in ("outputs", "scene"):
         shutil.rmtree(folder / name)

@@ -7,6 +7,7 @@ import sys
 import time
 import types
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,26 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 SHARED_DATA = Path(os.environ.get("THERMOXELS_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 """Folder of real photographs beside the checkout."""
 VIEWS = (42, 6)  # Photographs of a synthetic scene that train, and that are held out
+_EXPOSURE = Imperfections(exposure_stops=0.3, white_balance=0.03, noise_counts=2.0)
+FLAWS = {
+    "none": Imperfections(),
+    "exposure": _EXPOSURE,
+    "poses": Imperfections(pose_error_deg=0.15),
+    "poses-x2": Imperfections(pose_error_deg=0.3),
+    "walk": Imperfections(pose_error_deg=0.15, pose_correlation=0.95),
+    "focal": Imperfections(focal_error=0.005),
+    "thermal": Imperfections(thermal_blur_px=1.5, drift_k=1.0, noise_k=0.1),
+    "passers-by": Imperfections(passers_by=0.2),
+    "all": replace(_EXPOSURE, pose_error_deg=0.15, thermal_blur_px=1.5, drift_k=1.0, noise_k=0.1),
+}
+"""Flaws of cameras and poses; those without a number are as large as real captures were found to be off."""
 
 if "tests" not in sys.modules:  # Another distribution may have installed a package of this name.
     sys.modules["tests"] = types.ModuleType("tests")
@@ -44,18 +59,19 @@ def take_turns(
 def synthetic_scene(name: str, folder: Path) -> SyntheticScene:
     """Make a synthetic scene and write it, as benchmarks photograph it, unless the folder holds it already.
 
-    A folder that holds it with other cameras or another box than it has now is written again.
+    The name may go on with flaws and the seed that draws them, as in ``house-corner:all:5``. A folder that holds the
+    scene with other cameras or another box than it has now is written again.
     """
+    name, flaws, seed = (*name.split(":"), *("none", "0")[name.count(":") :])
     scene = make_scene(name)
-    path = folder / "transforms.json"  # written last
-    if path.is_file():
-        content, truth = (json.loads((folder / file).read_text(encoding="utf-8")) for file in (path.name, "truth.json"))
-        poses = np.array([frame["transform_matrix"] for frame in content["frames"]])
-        wanted = np.concatenate(scene.poses(*VIEWS))
+    path = folder / "truth.json"
+    if path.is_file() and (folder / "transforms.json").is_file():  # written last
+        truth = json.loads(path.read_text(encoding="utf-8"))
+        poses, wanted = np.array(truth["poses"]), np.concatenate(scene.poses(*VIEWS))
         same = poses.shape == wanted.shape and np.allclose(poses, wanted)
         if same and np.allclose(truth["scene_box"], scene.scene_box):
             return scene
-    write_scene(scene, folder, *VIEWS, progress=False)
+    write_scene(scene, folder, *VIEWS, progress=False, imperfections=FLAWS[flaws], seed=int(seed))
     return scene
 
 
@@ -64,41 +80,39 @@ def run_of(folder: Path, method: str = "thermoxels") -> Path:
     return folder / "outputs" / "scene" / method / "run"
 
 
-def train_and_evaluate(
-    scene: Path,
-    folder: Path,
-    options: Sequence[str] = (),
-    method: str = "thermoxels",
-    launcher: Sequence[str] = (),
-) -> tuple[float, dict[str, float]]:
-    """Train and evaluate a scene by the commands that a user types, with `options` for ns-train; logs stay in `folder`.
+def trained(
+    scene: Path, folder: Path, options: Sequence[str] = (), method: str = "thermoxels", launcher: Sequence[str] = ()
+) -> float:
+    """Train a scene by the command that a user types, with `options`, and return the seconds of the whole `ns-train`.
 
-    The words of a `launcher`, a command of this installation, stand before both commands.
-
-    Returns:
-        Seconds of the whole `ns-train`, and what `ns-eval` reports.
+    The log stays in `folder`. The words of a `launcher`, a command of this installation, stand before the command.
     """
+    from thermoxels_ns.commands.installed_commands import PLAIN_TRAINING
+
+    began = time.perf_counter()
+    command = [*launcher, "ns-train", method, "--output-dir", str(folder / "outputs"), "--experiment-name", "scene"]
+    run_quietly([*command, *PLAIN_TRAINING, *options, "thermal-data", "--data", str(scene)], folder / "train.log")
+    return time.perf_counter() - began
+
+
+def run_quietly(command: Sequence[str], log: Path) -> None:
+    """Run a command of this installation, whose words go to `log`."""
     from rich.console import Console
 
     from thermoxels_ns.commands.installed_commands import run_command
 
+    log.parent.mkdir(parents=True, exist_ok=True)
+    run_command(list(command), log, Console(file=StringIO(), width=200))
+
+
+def train_and_evaluate(
+    scene: Path, folder: Path, options: Sequence[str] = (), method: str = "thermoxels", launcher: Sequence[str] = ()
+) -> tuple[float, dict[str, float]]:
+    """Train a scene as `trained` does, evaluate it, and return the seconds of the training and what `ns-eval` says."""
+    seconds = trained(scene, folder, options, method, launcher)
     config, results = run_of(folder, method) / "config.yml", folder / "eval.json"
-    quiet = Console(file=StringIO(), width=200)
-    folder.mkdir(parents=True, exist_ok=True)
-    began = time.perf_counter()
-    run_command(
-        [
-            *(*launcher, "ns-train", method, "--output-dir", str(folder / "outputs"), "--experiment-name", "scene"),
-            *("--timestamp", "run", "--vis", "tensorboard", "--logging.steps-per-log", "100"),
-            *options,
-            *("thermal-data", "--data", str(scene)),
-        ],
-        folder / "train.log",
-        quiet,
-    )
-    seconds = time.perf_counter() - began
     command = [*launcher, "ns-eval", "--load-config", str(config), "--output-path", str(results)]
-    run_command(command, folder / "eval.log", quiet)
+    run_quietly(command, folder / "eval.log")
     figures = json.loads(results.read_text(encoding="utf-8"))["results"]
     return seconds, {name: float(value) for name, value in figures.items() if value is not None}
 

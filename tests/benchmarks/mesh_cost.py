@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import tyro
-from measuring import logarithmic_panels, print_head, print_row, save
+from measuring import print_head, print_row
 
 from tests.support.demo_mesh import exact_snapshot
 from tests.support.looking_cameras import looking_at
@@ -122,8 +122,14 @@ def measure(name: str, voxels: int, mode: Any, repeats: int) -> dict[str, Any]:
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
     names = list(dict.fromkeys(row["body"] for row in rows))
-    figure, panels = logarithmic_panels(2, len(names), figsize=(3.1 * len(names), 5.6), sharex=True, sharey="row")
+    size, shared = (3.1 * len(names), 5.6), {"sharex": True, "sharey": "row"}
+    figure, panels = pyplot.subplots(2, len(names), squeeze=False, layout="constrained", figsize=size, **shared)
     for (line, key), (column, name) in product(enumerate(("area_error", "volume_error")), enumerate(names)):
         panel = panels[line][column]
         for mode, colour, marker in (("conforming", "#b5367a", "o"), ("voxel", "#31688e", "s")):
@@ -132,12 +138,14 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
             panel.plot(*zip(*dots), color=colour, marker=marker, label=mode) if dots else None
             for row, dot in zip(chosen, dots):
                 panel.annotate(str(row["voxels"]), dot, xytext=(4, 4), textcoords="offset points", fontsize=7)
+        panel.set(xscale="log", yscale="log")
+        panel.grid(True, which="both", alpha=0.25)
         panel.margins(x=0.2)
         panels[0][column].set_title(name)
         panels[1][column].set_xlabel("seconds")
         panels[line][0].set_ylabel(f"{key.replace('_', ' ')} [%]")
     panels[0][0].legend(fontsize=7, loc="upper right")
-    save(figure, path, dpi=130)
+    figure.savefig(path, dpi=130)
 
 
 @dataclass

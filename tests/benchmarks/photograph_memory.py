@@ -10,7 +10,6 @@ command that a user types. Printed are the most resident memory, the seconds of 
 import json
 import os
 import resource
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from pathlib import Path
 
 import cv2
 import tyro
-from measuring import print_head, print_row
+from measuring import print_head, print_row, run_quietly
 from PIL import Image
 
 from thermoxels_ns.synthetic.drawn_scenes import make_scene
@@ -60,12 +59,7 @@ class PhotographMemory:
             *("--logging.steps-per-log", "10", "thermal-data", "--data", str(scene)),
         ]
         log = self.output / f"{scene.name}.log"
-        with log.open("w", encoding="utf-8") as file:
-            process = subprocess.Popen(
-                [sys.executable, str(Path(__file__).resolve()), "--run", *command], stdout=file, stderr=file
-            )
-            if process.wait():
-                sys.exit(f"the training failed; see {log}")
+        run_quietly([Path(sys.executable).name, str(Path(__file__).resolve()), "--run", *command], log)
         found = json.loads(log.read_text(encoding="utf-8").splitlines()[-1])
         return found["peak"], found["per_step"]
 

@@ -24,9 +24,9 @@ def manager(data: Path, mode: str = "val", parser: dict | None = None, **options
 def all_rays(cameras) -> dict[str, torch.Tensor]:
     """nerfstudio's rays of every pixel of every camera, flat."""
     bundles = [cameras[n : n + 1].generate_rays(0, keep_shape=True).flatten() for n in range(len(cameras))]
-    return {
-        name: torch.cat([getattr(b, name) for b in bundles]) for name in ("origins", "directions", "pixel_area")
-    } | {"camera_indices": torch.cat([torch.full((len(b), 1), i) for i, b in enumerate(bundles)])}
+    return {name: torch.cat([getattr(b, name) for b in bundles]) for name in ("origins", "directions")} | {
+        "camera_indices": torch.cat([torch.full((len(b), 1), i) for i, b in enumerate(bundles)])
+    }
 
 
 def nearest_pixel(bundle, reference) -> torch.Tensor:
@@ -39,7 +39,7 @@ def nearest_pixel(bundle, reference) -> torch.Tensor:
 
 def check_rays(bundle, reference) -> torch.Tensor:
     pixels = nearest_pixel(bundle, reference)
-    for name in ("origins", "directions", "pixel_area"):
+    for name in ("origins", "directions"):
         torch.testing.assert_close(getattr(bundle, name), reference[name][pixels], atol=2e-6, rtol=2e-3)
     assert torch.equal(bundle.camera_indices, reference["camera_indices"][pixels])
     assert bundle.camera_indices.dtype == torch.int64
@@ -136,13 +136,12 @@ def test_masked_pixels_are_never_drawn(scene_folder):
 def test_optical_axis_of_a_fisheye_lens_is_finite():
     """A pixel centre exactly on the axis, where nerfstudio's rays are 0 / 0."""
     cameras = Cameras(torch.eye(4)[None, :3], 5.0, 5.0, 2.5, 1.5, 5, 3, camera_type=CameraType.FISHEYE)
-    for limit in (0, 1 << 20):
-        columns = CameraRays(cameras, table_limit_bytes=limit).columns(torch.arange(15))
-        assert torch.equal(columns["directions"][7], torch.tensor([0.0, 0.0, -1.0]))
-        assert all(torch.isfinite(columns[name]).all() for name in ("directions", "pixel_area"))
+    columns = CameraRays(cameras).columns(torch.arange(15))
+    assert torch.equal(columns["directions"][7], torch.tensor([0.0, 0.0, -1.0]))
+    assert all(torch.isfinite(columns[name]).all() for name in ("directions", "pixel_area"))
 
 
-def test_frames_of_different_resolutions_and_lenses_with_and_without_a_table_of_rays(scene_folder):
+def test_frames_of_different_resolutions_and_lenses(scene_folder):
     scene = scene_folder(frames=5, distortion=DISTORTION)
     name = scene.names[0]
     rng = np.random.default_rng(0)
@@ -156,12 +155,10 @@ def test_frames_of_different_resolutions_and_lenses_with_and_without_a_table_of_
     pixels = check_rays(bundle, all_rays(cameras))
     colours = torch.cat([served.train_dataset[i]["image"].reshape(-1, 3) for i in range(4)])
     torch.testing.assert_close(batch["image"], colours[pixels])
-    tabled, lean = CameraRays(cameras), CameraRays(cameras, table_limit_bytes=0)
-    assert tabled.has_table and not lean.has_table
-    for rays in (tabled, lean):
-        columns = rays.columns(torch.arange(len(tabled)))
-        for key, expected in all_rays(cameras).items():
-            torch.testing.assert_close(columns[key], expected, atol=1e-6, rtol=2e-3)
+    rays = CameraRays(cameras)
+    columns = rays.columns(torch.arange(len(rays)))
+    for key, expected in all_rays(cameras).items():
+        torch.testing.assert_close(columns[key], expected, atol=1e-6, rtol=2e-3)
 
 
 def test_training_rays_are_a_regular_subset(scene_folder):
@@ -213,15 +210,6 @@ def directions(views: Views, number: int) -> np.ndarray:
     return local @ views.camera_to_world[number, :, :3].T
 
 
-def inside(views: Views, number: int, rays: np.ndarray) -> np.ndarray:
-    """Which directions (n, 3) a view sees."""
-    local = rays @ views.camera_to_world[number, :, :3]
-    ahead = local[:, 2] < -1e-9
-    depth = np.where(ahead, -local[:, 2], 1.0)[:, None]
-    pixel = views.centre[number] + views.focal[number] * local[:, :2] * (1, -1) / depth
-    return ahead & ((pixel >= -1e-6) & (pixel <= views.size[number] + 1e-6)).all(axis=1)
-
-
 @pytest.mark.parametrize("own_camera", [False, True])
 def test_every_pixel_looks_along_its_training_ray(scene_folder, own_camera):
     scene = scene_folder(own_camera=own_camera, thermal_size=(12, 10) if own_camera else None)
@@ -252,7 +240,7 @@ def test_a_fisheye_lens_spans_its_angles():
     for number in range(2):
         middle_row = lens.generate_rays(number, keep_shape=True).directions[33].numpy()
         middle_column = lens.generate_rays(number, keep_shape=True).directions[:, 54].numpy()
-        assert inside(views, number, middle_row).all() and inside(views, number, middle_column).all()
+        assert views.shows(number, middle_row).all() and views.shows(number, middle_column).all()
     ends = np.rad2deg(np.arctan2([views.centre[0], views.size[0] - views.centre[0]], views.focal[0]))
     np.testing.assert_allclose(ends, [[54, 33], [66, 27]], atol=0.5)
 

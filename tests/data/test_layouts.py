@@ -14,10 +14,10 @@ from PIL import Image
 from tests.support.flir_file import FlirFile, smooth_counts
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data import layouts
-from thermoxels_ns.data.colmap_tracks import read_colmap_tracks
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.scene_file import BOUNDS_NAME, read_scene_file
+from thermoxels_ns.data.tracks import read_colmap_tracks
 from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
 from thermoxels_ns.synthetic import scene_folder
 
@@ -168,7 +168,7 @@ def test_options_that_do_not_fit_are_refused(written, wrong):
 def test_photographs_that_only_the_model_has_are_named(copied):
     folder = copied("colmap")
     (folder / "images" / "frame_train_00002.png").unlink()
-    assert read_scene_file(folder, "skip").left_out == ["frame_train_00002.png", "thermal/frame_train_00002.png"]
+    assert read_scene_file(folder).left_out == ["frame_train_00002.png"]
 
 
 def test_thermal_images_of_other_names_are_paired_in_their_order(copied):
@@ -195,13 +195,16 @@ def test_a_writer_refuses_what_its_layout_cannot_say(tmp_path, written):
 
 def test_a_held_out_thermal_image_holds_its_pair_out(copied):
     folder = copied("thermalnerf")
-    content = json.loads((folder / "transforms.json").read_text())
+    for path in folder.glob("images*/frame_*"):
+        path.rename(path.with_name(path.name.replace("frame_train_", "a").replace("frame_eval_", "b")))
+    text = (folder / "transforms.json").read_text().replace("frame_train_", "a").replace("frame_eval_", "b")
+    content = json.loads(text)
     warm = [frame["file_path"] for frame in content["frames"] if frame.get("is_thermal")]
     cold = [frame["file_path"] for frame in content["frames"] if not frame.get("is_thermal")]
     (folder / "transforms.json").write_text(json.dumps(content | {"test_filenames": [cold[0], f"./{warm[2]}"]}))
-    named = {path.name for path in parsed(folder, "test", eval_mode="lists").image_filenames}
+    named = {path.name for path in parsed(folder, "test").image_filenames}
     assert named == {Path(cold[0]).name, Path(cold[2]).name}
-    assert named.isdisjoint(path.name for path in parsed(folder, eval_mode="lists").image_filenames)
+    assert named.isdisjoint(path.name for path in parsed(folder).image_filenames)
 
 
 def test_a_json_without_frames_says_what_a_colmap_model_cannot(copied):

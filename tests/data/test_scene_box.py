@@ -100,7 +100,7 @@ def test_the_log_says_from_what_and_how_large_in_metres(tmp_path, capsys):
     outputs = ThermalDataParserConfig(data=tmp_path / "scene").setup().get_dataparser_outputs()
     said = " ".join(capsys.readouterr().out.split())
     sides = (outputs.scene_box.aabb[1] - outputs.scene_box.aabb[0]) / outputs.dataparser_scale * 10.0
-    assert f"photographs agree, {' x '.join(f'{side:.3g}' for side in sides.tolist())} m, which" in said, said
+    assert f"photographs agree, {' x '.join(f'{side:.3g}' for side in sides.tolist())} m;" in said, said
     assert 10.0 < float(sides[0]) < 13.0
 
 

@@ -9,11 +9,17 @@ from tests.support.colmap_model import write_colmap_model
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS
-from thermoxels_ns.data.colmap_tracks import _matched, read_colmap_tracks
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import read_scene_file
-from thermoxels_ns.data.tracks import TRACKS_KEY, SparseTracks, feature_rays, write_tracks
+from thermoxels_ns.data.tracks import (
+    TRACKS_KEY,
+    SparseTracks,
+    _matched,
+    feature_rays,
+    read_colmap_tracks,
+    write_tracks,
+)
 
 TAGS = ["train", "train", "eval", "train", "train", "train"]
 NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]

@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 from tests.support.looking_cameras import looking_at
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.evaluation.truth_comparison import SurfaceScore, sample_facets, surface_distances, surface_fscore
+from thermoxels_ns.evaluation.truth_comparison import KnownTruth, SurfaceScore, mesh_errors, sample_facets
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+from thermoxels_ns.synthetic.drawn_scenes import make_scene
+from thermoxels_ns.synthetic.scene_truth import Body
 from thermoxels_ns.synthetic.solids import Solid, Sphere
 
 LATTICE = Lattice.covering((-1, -1, -1), (1, 1, 1), 24)
@@ -16,9 +19,20 @@ SPHERE = Sphere((0.0, 0.0, 0.0), 0.6)
 SEEN = SPHERE.surface_points(2000, 0)[0]
 
 
-def score_of(cells, truth=SPHERE, seen=SEEN, views=None, **more):
+def known(solid: Solid, seen: np.ndarray, views: Views, surroundings: Solid | None = None) -> KnownTruth:
+    """A body of which cameras of one lens see the points `seen`, 10 C warm at x = 0 and 4 K/m warmer along x."""
+    ball = make_scene("sphere")
+    around = None if surroundings is None else Body(surroundings, ball.colour, ball.surface_temperature_c)
+    scene = replace(ball, solid=solid, around=around, surface_temperature_c=lambda points: 10.0 + 4.0 * points[:, 0])
+    poses = np.concatenate((views.camera_to_world, np.tile([0.0, 0.0, 0.0, 1.0], (len(views.size), 1, 1))), axis=1)
+    truth = KnownTruth(scene, poses, Camera(*views.size[0].tolist(), *views.focal[0], *views.centre[0]))
+    vars(truth)["points_seen"] = seen
+    return truth
+
+
+def score_of(cells, truth=SPHERE, seen=SEEN, views=None, surroundings=None):
     views = from_above() if views is None else views
-    return surface_fscore(cells, LATTICE, truth, seen, 1.5 * H, np.eye(4), views, **more)
+    return known(truth, seen, views, surroundings).score(cells, LATTICE, np.eye(4), 1.5 * H)
 
 
 def voxels(shape: Sphere) -> np.ndarray:
@@ -117,18 +131,18 @@ def slab(mesh_of_cells) -> TetMesh:
 
 
 def test_parallel_planes_are_their_distance_apart_and_temperatures_those_of_the_closest_point(mesh_of_cells):
-    truth = Plane(0.20)
-    points = truth.surface_points(500, 0)[0]
-    both_ways, closest, temperature_c = surface_distances(slab(mesh_of_cells), truth, points)
-    assert both_ways == pytest.approx(0.05, abs=1e-12)
-    assert closest == pytest.approx(np.full(500, 0.05), abs=1e-12)
-    assert temperature_c == pytest.approx(10.0 + 4.0 * points[:, 0], abs=1e-6)
+    points = Plane(0.20).surface_points(500, 0)[0]
+    found = [mesh_errors(known(Plane(0.20), points, from_above()), slab(mesh_of_cells), t) for t in (0.0501, 0.0499)]
+    assert found[0]["chamfer_m"] == pytest.approx(0.05, abs=1e-12)
+    assert found[0]["temperature_seen_mae_c"] == pytest.approx(0.0, abs=1e-6)
+    assert [one["share_of_seen_reached"] for one in found] == [1.0, 0.0]
 
 
 def test_a_mesh_that_is_all_cut_by_the_box_has_no_surface(mesh_of_cells):
     mesh = mesh_of_cells(np.ones((2, 2, 2), dtype=bool), 0.5)
     assert np.all(mesh.facet_tags == FACET_BOX)
-    assert surface_distances(mesh, Plane(0.5), np.zeros((1, 3))) is None
+    found = mesh_errors(known(Plane(0.5), np.zeros((1, 3)), from_above()), mesh, 0.1)
+    assert set(found) == {"mesh_volume_m3", "mesh_area_m2"}
 
 
 def test_samples_are_spread_by_area_and_lie_on_the_triangles(mesh_of_cells):

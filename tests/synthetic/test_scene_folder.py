@@ -55,17 +55,16 @@ def test_layout_is_that_of_thermoscenes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("thermal_format", "name", "within_k", "own"),
+    ("layout", "name", "within_k", "own"),
     [
-        ("png16", "hot-object", 1e-3, False),
-        ("tiff", "house-corner", 0.0051, False),
-        ("npy", "sphere", 2e-6, False),
-        ("png16", "hot-object", 1e-3, True),
+        ("thermoscenes", "house-corner", 1e-3, False),
+        ("nerfstudio", "sphere", 2e-6, False),
+        ("thermoscenes", "hot-object", 1e-3, True),
     ],
 )
-def test_files_hold_the_pictures_that_the_scene_shows(tmp_path, thermal_format, name, within_k, own) -> None:
+def test_files_hold_the_pictures_that_the_scene_shows(tmp_path, layout, name, within_k, own) -> None:
     scene = make_scene(name)
-    options = {"thermal_format": thermal_format, "thermal_width": 20, "own_thermal_camera": own}
+    options = {"layout": layout, "thermal_width": 20, "own_thermal_camera": own}
     write_scene(scene, tmp_path, photo_format="png", **options, **SMALL)
     content, camera = transforms(tmp_path), scene.camera(20, 15)
     if own:
@@ -79,14 +78,11 @@ def test_files_hold_the_pictures_that_the_scene_shows(tmp_path, thermal_format, 
         np.testing.assert_allclose(offsets[0][:3, :3] @ offsets[0][:3, :3].T, np.eye(3), atol=1e-12)
         assert 0.005 < np.linalg.norm(offsets[0][:3, 3]) < 0.1
     for frame in content["frames"]:
-        path, pose = tmp_path / frame["thermal_file_path"], np.array(frame["transform_matrix"])
-        if thermal_format == "png16":
-            celsius = png_to_celsius(tmp_path, frame)
-        elif thermal_format == "npy":
-            celsius = np.load(path)
+        pose = np.array(frame["transform_matrix"])
+        if layout == "nerfstudio":
+            celsius = np.load(tmp_path / "thermal" / f"{Path(frame['file_path']).stem}.npy")
         else:
-            unit = content["thermal_unit"]
-            celsius = np.asarray(Image.open(path)) * unit["celsius_per_count"] + unit["celsius_offset"]
+            celsius = png_to_celsius(tmp_path, frame)
         seen = render_view(scene, np.array(frame.get("thermal_transform_matrix", pose)), camera)
         assert np.abs(celsius - seen.temperature_c).max() < within_k
         rgb = np.asarray(Image.open(tmp_path / frame["file_path"])) / 255.0
@@ -134,7 +130,7 @@ def test_real_photographs_have_no_truth_and_are_not_overwritten(tmp_path: Path) 
 
 def test_nothing_stale_stays_of_an_older_scene_not_even_of_an_interrupted_write(tmp_path: Path) -> None:
     scene = make_scene("sphere")
-    write_scene(scene, tmp_path, thermal_format="tiff", **{**SMALL, "num_train": 5})
+    write_scene(scene, tmp_path, layout="nerfstudio", **{**SMALL, "num_train": 5})
     (tmp_path / "images" / "mine.png").write_text("mine")
 
     def broken(points: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -23,7 +23,6 @@ from thermoxels_ns.data.scene_scale import (
     SceneScale,
     choose_scale,
     scale_from_known_distance,
-    scale_from_option,
     up_from_scene_file,
 )
 
@@ -223,8 +222,6 @@ def check_options(options: ExportOptions) -> CheckedOptions:
     from thermoxels_ns.mesh.boundary.patches import PatchRules, load_patch_rules
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
-    if options.metres_per_unit is not None:
-        scale_from_option(options.metres_per_unit)
     distance = None
     if options.known_distance is not None:
         first, second, length = options.known_distance[:3], options.known_distance[3:6], options.known_distance[6]
@@ -413,7 +410,7 @@ def export_snapshot(
         "options": {field.name: getattr(options, field.name) for field in fields(options)},
         "versions": export_summary.versions(),
         "length_unit": unit,
-        "scale": None if scale is None else scale.as_mapping(),
+        "scale": None if scale is None else asdict(scale),
         "up": up,
         "up_source": up_source,
         "region": region,

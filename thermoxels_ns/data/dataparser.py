@@ -24,20 +24,19 @@ from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError, ThermalFileError
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
-from thermoxels_ns.data.colmap_tracks import TrackSource, find_feature_rays
 from thermoxels_ns.data.layouts import BOUNDS_NAME, LayoutName
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
+from thermoxels_ns.data.tracks import TrackSource, find_feature_rays
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixels, read_thermal_file
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
 _FAR_SIDES = 16.0
 """Distance of the box from the origin, in longest sides of the box, beyond which a shift in single precision is wrong
 by more than a millionth of the box. National coordinates are so far away."""
-_LEAST_THAT_MEETS = 0.01  # share of the rays that must meet the scene box
-_COLDEST_SKY_K = 150.0  # a file's median may be this far below the declared lowest temperature: it shows a clear sky
 _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
-"""A file whose median is at least the first holds kelvins if the median less 273.15 is within the second of others."""
+"""A file whose median is at least the first may hold kelvins; within the second of others it has the same unit."""
+_SHIFTS_K = (-ZERO_CELSIUS_K, ZERO_CELSIUS_K)
 _MOST_FRAMES = 64  # training files in which stuck pixels are sought
 
 _BYTES_PER_PIXEL = 8  # Three colours, and of masked photographs the mask and the pixel's number
@@ -46,7 +45,7 @@ MOST_PHOTOGRAPHS = 500  # with more, poses stay as given: the normal equations w
 FEWEST_PHOTOGRAPHS = 3  # with fewer, poses stay as given
 
 PoseSource = Literal["auto", "given"]
-SplitMode = Literal["auto", "filename", "lists", "interval"]
+_INTERVAL = 8  # Without tagged names and lists every n-th frame evaluates
 _KEYS = {"train": "train_filenames", "val": "val_filenames", "test": "test_filenames"}
 
 
@@ -72,13 +71,10 @@ class ThermalDataParserConfig(DataParserConfig):
     scene_box: Optional[tuple[tuple[float, float, float], tuple[float, float, float]]] = None  # noqa: UP045
     """Box to reconstruct, in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax. Default: scene_box in
     the json, else found from the sparse points, else from depths that photographs agree on, else from the cameras."""
-    eval_mode: SplitMode = "auto"
-    """How frames are split into training and evaluation. filename: by frame_train_ / frame_eval_ in the names. lists:
-    by train_filenames / val_filenames / test_filenames in the json. interval: every eval_interval-th frame evaluates.
-    auto: the first of these three that suits the scene."""
-    eval_interval: int = 8
-    """With n here and eval_mode interval, every n-th frame by sorted name evaluates. Counting starts in the middle of
-    the first n frames, so that the ends of the sequence stay in training."""
+    eval_every: Optional[int] = None  # noqa: UP045 - read by tyro
+    """Evaluate every n-th frame by sorted name; counting starts in the middle of the first n frames, so that the ends
+    of the sequence stay in training. Default: frames with frame_eval_ in their names; without tagged names those in
+    val_filenames / test_filenames of the json, or not in train_filenames; without lists every 8th."""
     missing_thermal: Literal["error", "skip"] = "error"
     """What happens to a frame without a thermal image. error: stop. skip: leave the frame out and print its name."""
     valid_range_c: tuple[float, float] = (-100.0, 2000.0)
@@ -211,8 +207,8 @@ class ThermalDataParser(DataParser):
         file = read_scene_file(Path(config.data), config.missing_thermal, config.layout, config.thermal_bounds)
         CONSOLE.print(f"Layout {file.layout} (--layout takes another).", markup=False)
         names = [frame.name for frame in file.frames]
-        split = split_frames(names, file.meta, config.eval_mode, config.eval_interval, file.left_out)
-        rays, given, fitted = find_feature_rays(file, split.train, config.tracks), file, {}
+        split = split_frames(names, file.meta, config.eval_every, file.left_out)
+        rays, given, fitted = find_feature_rays(file, split.train, config.tracks, CONSOLE.print), file, {}
         if rays is None and config.refine_poses == "auto":
             file, fitted = refine_poses(given, split.train, CONSOLE.print)
         evidence = find_scene_box(file, config.scene_box, split.train)
@@ -222,6 +218,14 @@ class ThermalDataParser(DataParser):
             # nerfstudio keeps dataparser_transform in single precision; unrounded, the two would differ by metres.
             translation = translation.astype(np.float32).astype(np.float64)
         scale = SCENE_SIZE / longest
+        pixel_size = evidence.pixel_size(box)
+        if math.isinf(pixel_size) and any(frame.intrinsics.lens == "perspective" for frame in file.frames):
+            expected = f"photographs that look at the scene box, from {evidence.source}"
+            remedy = (
+                "Check that poses are camera to world with x right, y up, z back, or pass --scene-box with its corners "
+                "in their coordinates: xmin ymin zmin xmax ymax zmax."
+            )
+            raise SceneError("cameras", expected=expected, got="none that has it in view", remedy=remedy)
         training, shapes, temperatures, dead = [file.frames[index] for index in split.train], {}, None, {}
         if file.has_thermal:
             paths, those = ([f.thermal for f in some if f.thermal is not None] for some in (file.frames, training))
@@ -233,7 +237,7 @@ class ThermalDataParser(DataParser):
             "thermal_unit": file.unit,
             "valid_range_c": tuple(config.valid_range_c),
             "thermal_dead_pixels": dead,
-            "pixel_size": scale * evidence.pixel_size(box),
+            "pixel_size": scale * pixel_size,
             "input_box": tuple(map(tuple, box.tolist())),
             "scene_name": file.folder.resolve().name,
         }
@@ -241,14 +245,12 @@ class ThermalDataParser(DataParser):
         if rays is not None:
             rays = rays.moved(np.eye(3), translation, scale)
         scene = _Scene(file, split, shapes, translation, scale, metadata, placed, rays, file is not given, fitted)
-        met = _share_that_meets(training, scene.placed([f.pose for f in training]), placed, evidence.source)
         metres = file.meta.get("metres_per_unit")
         sides = (placed.aabb[1] - placed.aabb[0]).double() * (metres or 1.0) / scale
         size = f"{' x '.join(f'{side:.3g}' for side in sides.tolist())} {'m' if metres else 'units'}"
         CONSOLE.print(
             f"Scene {metadata['scene_name']}: {len(names)} frames, {len(split.train)} train, "
-            f"{len({*split.val, *split.test})} evaluate ({split.how}); box from {evidence.source}, {size}, which "
-            f"{met:.0%} of the rays meet; "
+            f"{len({*split.val, *split.test})} evaluate ({split.how}); box from {evidence.source}, {size}; "
             + (f"{temperatures.min_c:.2f} to {temperatures.max_c:.2f} C." if temperatures else "no temperatures.")
         )
         if file.bounds_swapped and file.bounds_c is not None:
@@ -257,34 +259,6 @@ class ThermalDataParser(DataParser):
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
         return scene
-
-
-def _share_that_meets(frames: list[Frame], poses: torch.Tensor, box: SceneBox, source: str) -> float:
-    """Return the share of rays, 8 x 8 per photograph, that meet the scene box; 1 if any lens is not perspective.
-
-    Raises `SceneError` if the share is below `_LEAST_THAT_MEETS`. `source` says in the message where `box` comes from.
-    """
-    corners, shares = box.aabb.double().numpy(), []
-    x, y = (each.ravel() for each in np.meshgrid(*2 * [(np.arange(8) + 0.5) / 8]))
-    for frame, pose in zip(frames, poses.double().numpy()):
-        lens = frame.intrinsics
-        if lens.lens != "perspective":
-            return 1.0
-        rays = (lens.rays(np.column_stack([x * lens.width, y * lens.height])) * (1.0, -1.0, -1.0)) @ pose[:, :3].T
-        rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
-        enter, leave = np.sort((corners[:, None] - pose[:, 3]) / rays, axis=0)
-        shares.append(np.mean(np.maximum(enter.max(axis=1), 0.0) <= leave.min(axis=1)))
-    share = float(np.mean(shares))
-    if share < _LEAST_THAT_MEETS:
-        away = float(np.mean(np.array(shares) == 0.0))
-        expected = f"photographs that look at the scene box, from {source}"
-        got = f"{share:.1%} of their rays meeting it, and {away:.0%} of the {len(frames)} cameras looking past it"
-        remedy = (
-            "Check that poses are camera to world with x right, y up, z back, or pass --scene-box with its corners in "
-            "their coordinates: xmin ymin zmin xmax ymax zmax."
-        )
-        raise SceneError("cameras", expected=expected, got=got, remedy=remedy)
-    return share
 
 
 def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int]]) -> None:
@@ -302,32 +276,26 @@ def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int
             raise SceneError(thermal.name, expected=expected, got=f"{found[1]} x {found[0]}", remedy=remedy)
 
 
-def _refuse_beyond_bounds(middles_c: dict[Path, float], bounds_c: tuple[float, float]) -> None:
-    """Raise `ThermalFileError` for a file whose median is so far from the declared bounds that its unit must differ."""
-    width = bounds_c[1] - bounds_c[0]
-    least, most = bounds_c[0] - max(width, _COLDEST_SKY_K), bounds_c[1] + max(width, _SAME_PLACE_K)
-    for path, middle in middles_c.items():
-        if not least <= middle <= most:
-            expected = (
-                f"temperatures near {bounds_c[0]:g} to {bounds_c[1]:g} C, as {BOUNDS_NAME} or --thermal-bounds says"
-            )
-            got = f"{middle:.2f} C in the middle"
-            remedy = "Subtract 273.15 if the file holds kelvins; else correct the bounds."
-            raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
+def _refuse_other_units(middles_c: dict[Path, float], bounds_c: tuple[float, float] | None) -> None:
+    """Raise `ThermalFileError` for a file that holds kelvins among Celsius, or the reverse.
 
-
-def _refuse_mixed_units(middles_c: dict[Path, float]) -> None:
-    """Raise `ThermalFileError` if the medians of some files are about 273 degrees above the rest: they hold kelvins."""
+    Its median is far from the declared bounds, or without bounds from the medians of the other files, and 273.15
+    degrees more or less bring it there.
+    """
     usual = [middle for middle in middles_c.values() if middle < _LEAST_OF_KELVINS]
-    shifted = [
-        path.name
-        for path, middle in middles_c.items()
-        if usual and middle >= _LEAST_OF_KELVINS and abs(middle - ZERO_CELSIUS_K - np.median(usual)) < _SAME_PLACE_K
-    ]
-    if shifted:
-        got = f"{len(shifted)} of {len(middles_c)} files 273 degrees above the others, such as {shifted[0]}"
-        remedy = "Subtract 273.15 in these files. If they are as hot as that, pass --valid-range-c -100 1999."
-        raise ThermalFileError("thermal images", expected="one unit in all files", got=got, remedy=remedy)
+    if bounds_c is None and not usual:
+        return
+    low, high = bounds_c or 2 * (float(np.median(usual)),)
+    for path, middle in middles_c.items():
+        near = [low - _SAME_PLACE_K <= middle + shift <= high + _SAME_PLACE_K for shift in (0.0, *_SHIFTS_K)]
+        if any(near) and not near[0]:
+            where = f"{BOUNDS_NAME} or --thermal-bounds says" if bounds_c else "in most of the other files"
+            expected, got = f"temperatures near {low:g} to {high:g} C, as {where}", f"{middle:.2f} C in the middle"
+            remedy = (
+                "Subtract 273.15 if the file holds kelvins, or correct the bounds. If it is as hot as that, pass "
+                "--valid-range-c -100 1999."
+            )
+            raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 
 def survey_thermal_files(
@@ -365,10 +333,8 @@ def survey_thermal_files(
             kept.setdefault((height, width), []).append(temperature_c)
         extremes[path] = (float(np.nanmin(temperature_c)), float(np.nanmax(temperature_c)))
         middles[path] = float(np.nanmedian(temperature_c))
-    if bounds_c is not None:
-        _refuse_beyond_bounds(middles, bounds_c)
     if tuple(valid_range_c) == ThermalDataParserConfig.valid_range_c:
-        _refuse_mixed_units(middles)
+        _refuse_other_units(middles, bounds_c)
     dead = {shape: find_dead_pixels(np.stack(frames)) for shape, frames in kept.items()}
     dead = {shape: mask for shape, mask in dead.items() if mask.any()}
     for path in extremes:
@@ -445,33 +411,33 @@ class Split:
 
 
 def split_frames(
-    names: Sequence[str], meta: Mapping[str, Any], mode: SplitMode, interval: int, left_out: Sequence[str] = ()
+    names: Sequence[str], meta: Mapping[str, Any], interval: int | None = None, left_out: Sequence[str] = ()
 ) -> Split:
     """Split frames, given by their sorted `names`, into training and evaluation.
 
-    "filename" splits by frame_train_ and frame_eval_ in the names, "lists" by train_filenames, val_filenames and
-    test_filenames of `meta`, the json. "interval" evaluates every `interval`-th frame from index interval // 2 on, so
-    that the ends of the sequence train. "auto" takes the first of the three that suits the scene. Lists may name
-    frames in `left_out`, which are skipped.
+    With an `interval` every such frame from index interval // 2 on evaluates, so that the ends of the sequence train.
+    Else frame_train_ and frame_eval_ in the names decide, else train_filenames, val_filenames and test_filenames of
+    `meta`, the json, else the interval is 8. Lists may name frames in `left_out`, which are skipped.
 
     Raises:
         SceneError: A side is empty, a frame is on both sides, a name is untagged or unknown, or `interval` is below 2.
     """
     tagged = [("frame_train_" in Path(n).name, "frame_eval_" in Path(n).name) for n in names]
-    if mode == "filename" or (mode == "auto" and any(train or test for train, test in tagged)):
+    if interval is None and any(train or test for train, test in tagged):
         unclear = [name for name, (train, evaluate) in zip(names, tagged) if train == evaluate]
         if unclear:
             expected, got = "frame_train_ or frame_eval_ in every name", f"{unclear[0]} ({len(unclear)} such)"
-            remedy = "Rename them or pass --eval-mode interval."
+            remedy = "Rename them or pass --eval-every 8."
             raise SceneError("split by file name", expected=expected, got=got, remedy=remedy)
         train, val = ([i for i, tags in enumerate(tagged) if tags[side]] for side in (0, 1))
         split = Split(train, val, val, "by file name")
-    elif mode == "lists" or (mode == "auto" and not meta.keys().isdisjoint(_KEYS.values())):
+    elif interval is None and not meta.keys().isdisjoint(_KEYS.values()):
         split = _by_lists(names, meta, left_out)
     else:
+        interval = _INTERVAL if interval is None else interval
         if interval < 2:
-            expected, remedy = "an interval of at least 2", "Pass --eval-interval 8."
-            raise SceneError("eval_interval", expected=expected, got=interval, remedy=remedy)
+            expected, remedy = "an interval of at least 2", "Pass --eval-every 8."
+            raise SceneError("eval_every", expected=expected, got=interval, remedy=remedy)
         start = interval // 2
         val = list(range(start, len(names), interval))
         train = [i for i in range(len(names)) if i % interval != start]
@@ -479,7 +445,7 @@ def split_frames(
     for side, chosen in (("training", split.train), ("evaluation", split.val), ("evaluation", split.test)):
         if not chosen:
             expected = f"at least one of the {len(names)} frames ({split.how})"
-            remedy = "Add frames or choose another split, e.g. --eval-mode interval --eval-interval 2."
+            remedy = "Add frames or choose another split, e.g. --eval-every 2."
             raise SceneError(f"{side} frames", expected=expected, got="none", remedy=remedy)
     both = set(split.train) & (set(split.val) | set(split.test))
     if both:

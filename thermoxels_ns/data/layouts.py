@@ -97,12 +97,8 @@ def find_source(data: Path, wanted: LayoutName | None = None) -> SceneSource:
     got = "none of them" if data.is_dir() else "no such folder"
     remedy = "Pass --data the folder that holds it (thermoxels capture and ns-process-data write it)."
     if wanted is not None and (json_path or model):
-        one = next(layout for layout in LAYOUTS if layout.name == wanted)
-        needs = (
-            [JSON_NAMES[:1], one.marks] if not one.photographs else [("a COLMAP model",), one.photographs, one.marks]
-        )
-        expected = f"as parts of the layout {wanted}: {', and '.join(' or '.join(each) for each in needs if each)}"
-        got, remedy = "a folder without them", "Leave --layout out: it is then recognised."
+        expected, got = f"the parts of the layout {wanted}, which docs/data.md lists", "a folder without them"
+        remedy = "Leave --layout out: it is then recognised."
     raise SceneError(f"scene folder {data}", expected=expected, got=got, remedy=remedy)
 
 

@@ -21,11 +21,8 @@ from thermoxels_ns.data.dataset import ThermalDataset
 
 Streams = Literal["both", "rgb", "thermal"]
 _BITS = {"both": RGB_STREAM | THERMAL_STREAM, "rgb": RGB_STREAM, "thermal": THERMAL_STREAM}
-TABLE_LIMIT_BYTES = 2 * 1024**3
-"""Largest table of ray directions; else they are computed per batch, as where all photographs differ in intrinsics."""
 _CHUNK = 1 << 17
 _GRID_RAYS = 1 << 14  # most rays of a bundle of `grid`
-_BYTES_PER_PIXEL = 16
 _FISHEYE = CameraType.FISHEYE.value
 
 
@@ -186,15 +183,13 @@ class CameraRays:
 
     Directions in camera axes depend on the intrinsics alone, so cameras with equal intrinsics share one table, and a
     ray costs one look-up and one rotation. nerfstudio's `Cameras.generate_rays` fills the table, so that lens
-    distortion is the same as in evaluation. Instead of a table above `table_limit_bytes`, `columns` computes the rays.
+    distortion is the same as in evaluation.
 
     Attributes:
         first_pixel: Number of the first pixel of each camera and, last, the number of all pixels, shape (n + 1,).
     """
 
-    def __init__(
-        self, cameras: Cameras, device: torch.device | str = "cpu", table_limit_bytes: int = TABLE_LIMIT_BYTES
-    ) -> None:
+    def __init__(self, cameras: Cameras, device: torch.device | str = "cpu") -> None:
         self.device = torch.device(device)
         self.cameras = cameras.to("cpu")
         self.widths = self.cameras.width.view(-1).to(torch.int64)
@@ -205,6 +200,7 @@ class CameraRays:
         poses = self.cameras.camera_to_worlds
         self._rotations = poses[:, :, :3].contiguous().to(self.device)
         self._origins = poses[:, :, 3].contiguous().to(self.device)
+        self._areas = (1.0 / (self.cameras.fx * self.cameras.fy)).to(self.device)
 
         # Cameras with equal rows in `models` have equal directions in camera axes.
         names = ["fx", "fy", "cx", "cy", "width", "height", "camera_type", "distortion_params"]
@@ -212,32 +208,26 @@ class CameraRays:
         models = torch.cat(parts, dim=-1).numpy()
         _, first, self_model = np.unique(models, axis=0, return_index=True, return_inverse=True)
         model_sizes = sizes[torch.from_numpy(first)]
-        self.has_table = int(model_sizes.sum()) * _BYTES_PER_PIXEL <= table_limit_bytes
-        if self.has_table:
-            starts = torch.cat([torch.zeros(1, dtype=torch.int64), model_sizes.cumsum(0)])[:-1]
-            shift = starts[torch.from_numpy(self_model.reshape(-1))] - self.first_pixel[:-1]
-            self._table_shift = shift.to(self.device)
-            tables = [self._camera_axes(int(index)) for index in first]
-            self._directions = torch.cat([directions for directions, _ in tables]).to(self.device)
-            self._pixel_area = torch.cat([area for _, area in tables]).to(self.device)
+        starts = torch.cat([torch.zeros(1, dtype=torch.int64), model_sizes.cumsum(0)])[:-1]
+        shift = starts[torch.from_numpy(self_model.reshape(-1))] - self.first_pixel[:-1]
+        self._table_shift = shift.to(self.device)
+        self._directions = torch.cat([self._camera_axes(int(index)) for index in first]).to(self.device)
 
     def __len__(self) -> int:
         return int(self.first_pixel[-1])
 
     def columns(self, pixels: Int[Tensor, " n"]) -> dict[str, Tensor]:
         """Return rays through the centres of `pixels`, numbers (n,) on `self.device`, as fields of `RayBundle`: origins
-        (n, 3), unit directions (n, 3), pixel_area (n, 1) and camera_indices (n, 1)."""
+        (n, 3), unit directions (n, 3), camera_indices (n, 1), and pixel_area (n, 1) as in the middle of the image."""
         image = torch.searchsorted(self._first_pixel, pixels, right=True) - 1
-        if self.has_table:
-            place = pixels + self._table_shift.index_select(0, image)
-            camera_axes = self._directions.index_select(0, place)[..., None]
-            directions = torch.bmm(self._rotations.index_select(0, image), camera_axes)[..., 0]
-            origins, area = self._origins.index_select(0, image), self._pixel_area.index_select(0, place)
-        else:
-            rays = self._generate(image.cpu(), (pixels - self._first_pixel[image]).cpu(), self.cameras)
-            parts = (rays.directions, rays.origins, rays.pixel_area)
-            directions, origins, area = (part.to(self.device) for part in parts)
-        return {"origins": origins, "directions": directions, "pixel_area": area, "camera_indices": image[:, None]}
+        place = pixels + self._table_shift.index_select(0, image)
+        camera_axes = self._directions.index_select(0, place)[..., None]
+        return {
+            "origins": self._origins.index_select(0, image),
+            "directions": torch.bmm(self._rotations.index_select(0, image), camera_axes)[..., 0],
+            "pixel_area": self._areas.index_select(0, image),
+            "camera_indices": image[:, None],
+        }
 
     def grid(self, most: int | None) -> Int[Tensor, " n"]:
         """Return the numbers of every n-th pixel in both directions, in ascending order, at most `most` in an image.
@@ -257,44 +247,27 @@ class CameraRays:
             numbers.append((first + rows[:, None] * width + columns[None, :]).reshape(-1))
         return torch.cat(numbers).to(self.device)
 
-    def _camera_axes(self, index: int) -> tuple[Float[Tensor, "pixels 3"], Float[Tensor, "pixels 1"]]:
-        """Return the ray directions in camera axes, and the areas, of all pixels of one camera."""
+    def _camera_axes(self, index: int) -> Float[Tensor, "pixels 3"]:
+        """Return the ray directions in camera axes of all pixels of one camera.
+
+        On the optical axis of a fisheye lens, where nerfstudio divides 0 by 0, it is the axis. Raises `SceneError` if
+        the distortion cannot be undone in another pixel.
+        """
         still = self.cameras[index : index + 1]
         still.camera_to_worlds = torch.eye(4)[None, :3]
-        size = int(self.widths[index] * self.heights[index])
-        directions, areas = torch.empty(size, 3), torch.empty(size, 1)
-        for start in range(0, size, _CHUNK):
-            local = torch.arange(start, min(start + _CHUNK, size))
-            rays = self._generate(torch.zeros_like(local), local, still)
-            directions[local], areas[local] = rays.directions, rays.pixel_area
-        return directions, areas
-
-    def _generate(self, image: Int[Tensor, " n"], local: Int[Tensor, " n"], cameras: Cameras) -> RayBundle:
-        width = cameras.width.view(-1)[image]
-        coords = torch.stack([local // width, local % width], dim=-1) + 0.5
-        rays = cameras.generate_rays(image[:, None], coords=coords)
-        finite = torch.isfinite(rays.directions).all(dim=1)
-        if not bool((finite & torch.isfinite(rays.pixel_area[:, 0])).all()):
-            _mend_optical_axis(rays, cameras, image, coords, ~finite)
-        return rays
-
-
-def _mend_optical_axis(
-    rays: RayBundle, cameras: Cameras, image: Int[Tensor, " n"], coords: Float[Tensor, "n 2"], lost: Bool[Tensor, " n"]
-) -> None:
-    """Set the direction and area of rays on the optical axis of a fisheye lens, where nerfstudio divides 0 by 0.
-
-    `lost` marks directions that are not finite. Raises `SceneError` if `lost` marks any other ray, whose distortion
-    cannot be undone.
-    """
-    axis = torch.cat([cameras.cy, cameras.cx], dim=-1)[image]
-    on_axis = ((coords - axis).abs().amax(dim=1) < 1e-3) & (cameras.camera_type.view(-1)[image] == _FISHEYE)
-    if bool((lost & ~on_axis).any()):
-        what = f"camera of photograph {int(image[lost & ~on_axis][0])}"
-        remedy = "Check k1 to p2, or undistort the photographs."
-        expected = "a lens distortion that can be undone in every pixel"
-        got = f"{int((lost & ~on_axis).sum())} pixels without a finite ray"
-        raise SceneError(what, expected=expected, got=got, remedy=remedy)
-    rays.directions[lost] = -cameras.camera_to_worlds[image[lost], :, 2]
-    area = 1.0 / (cameras.fx * cameras.fy)[image]
-    rays.pixel_area = torch.where(torch.isfinite(rays.pixel_area), rays.pixel_area, area)
+        width = int(self.widths[index])
+        pixels = torch.arange(width * int(self.heights[index]))
+        coords = torch.stack([pixels // width, pixels % width], dim=-1) + 0.5
+        directions = torch.empty(len(pixels), 3)
+        for part in pixels.split(_CHUNK):
+            directions[part] = still.generate_rays(torch.zeros_like(part)[:, None], coords=coords[part]).directions
+        lost = ~torch.isfinite(directions).all(dim=1)
+        if bool(lost.any()):
+            off = (coords[lost] - torch.cat([still.cy, still.cx], dim=-1)).abs().amax(dim=1)
+            if int(still.camera_type) != _FISHEYE or float(off.max()) >= 1e-3:
+                expected = "a lens distortion that can be undone in every pixel"
+                got = f"{int(lost.sum())} pixels without a finite ray"
+                remedy = "Check k1 to p2, or undistort the photographs."
+                raise SceneError(f"camera of photograph {index}", expected=expected, got=got, remedy=remedy)
+            directions[lost] = torch.tensor([0.0, 0.0, -1.0])
+        return directions

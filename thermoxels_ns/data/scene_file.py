@@ -65,7 +65,7 @@ class SceneFile:
     unit: ThermalUnit  # unit of the numbers in thermal files
     bounds_c: tuple[float, float] | None  # lowest and highest temperature of temperature_bounds.json, [degrees Celsius]
     meta: dict[str, Any]  # the json (split lists, scene_box, ply_file_path, ...), or what stands for it
-    left_out: list[str] = field(default_factory=list)  # names of frames and files that missing_thermal="skip" left out
+    left_out: list[str] = field(default_factory=list)  # names of frames that missing_thermal="skip" left out
     bounds_swapped: bool = False  # True if temperature_bounds.json has the lowest temperature above the highest
     layout: str = ""  # the layout and where its parts are, in words
 
@@ -107,7 +107,7 @@ def read_scene_file(
     there = sum(map(len, by_stem.values()))
     named = [entry["file_path"] for entry in entries if isinstance(entry, dict) and "file_path" in entry]
     folders = {Path(str(name)).parent.name for name in named}  # a thermal image in one of these is of its photographs
-    frames, left_out, by_name_alone, place = [], [], True, f"{thermal_folder.name}/"
+    frames, left_out, place = [], [], f"{thermal_folder.name}/"
     for index, entry in enumerate(entries):
         where = f"{json_path.name}: frame {index}"
         if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
@@ -121,7 +121,7 @@ def read_scene_file(
         if "thermal_file_path" in entry:
             partners = [path] if (path := folder / str(entry["thermal_file_path"])).is_file() else []
         else:
-            every, by_name_alone = by_stem.get(image.stem, []), False
+            every = by_stem.get(image.stem, [])
             beside = [path for path in every if path.parent.name == image.parent.name]  # as in rgb/train, thermal/train
             here = [path for path in every if path.parent == thermal_folder]
             partners = beside or here or [path for path in every if path.parent.name not in folders]
@@ -140,25 +140,11 @@ def read_scene_file(
         )
         got = f"{len(entries)} frames, none with one ({there} files in {place})"
         raise SceneError(json_path.name, expected="frames with a thermal image", got=got, remedy=remedy)
-    stems = {frame.image.stem for frame in frames}
-    for parent in {frame.image.parent for frame in frames}:  # photographs without a pose may have thermal images too
-        stems |= {path.stem for path in parent.iterdir()}
-    orphans = [
-        str(path.relative_to(folder))
-        for stem, paths in by_stem.items()
-        for path in paths
-        if not by_name_alone and stem not in stems
-    ]
     if missing_thermal == "error" and left_out:
         expected = f"a thermal image for each of the {len(entries)} frames (thermal_file_path, or the stem in {place})"
         got = f"none for {len(left_out)}: {_some(left_out)} ({there} files in {place})"
         remedy = "Restore the thermal images, remove these frames, or pass --missing-thermal skip."
         raise SceneError(json_path.name, expected=expected, got=got, remedy=remedy)
-    if missing_thermal == "error" and orphans:
-        expected = "one photograph for every thermal image"
-        got = f"{there} thermal images, {len(orphans)} of them without a photograph: {_some(orphans)}"
-        remedy = "Restore the photographs, remove these files, or pass --missing-thermal skip."
-        raise SceneError(f"{folder.name}/{place}", expected=expected, got=got, remedy=remedy)
     warm = [frame.thermal for frame in frames if frame.thermal is not None]
     for kind, paths in (("photograph", [frame.image for frame in frames]), ("thermal image", warm)):
         twice = [path.name for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
@@ -184,8 +170,8 @@ def read_scene_file(
     unit = _unit({} if thermal_bounds else meta, json_path, bounds)
     read = "photographs alone" if alone else f"thermal images {f'in {place}' if there else 'named in the json'}"
     words = f"{source.layout.name}: poses from {json_path.relative_to(folder).as_posix()}, {read}"
-    every = [*source.left_out, *left_out, *orphans]
-    return SceneFile(folder, json_path, frames, unit, bounds, meta, every, swapped, words)
+    left_out = [*source.left_out, *left_out]
+    return SceneFile(folder, json_path, frames, unit, bounds, meta, left_out, swapped, words)
 
 
 def _read_bounds(folder: Path) -> tuple[float, float] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
@@ -36,10 +36,6 @@ class SceneScale:
         """
         return None if self.standard_error is None else power * (self.standard_error / self.metres_per_unit) * abs(size)
 
-    def as_mapping(self) -> dict[str, Any]:
-        """Return the fields by name, as json can hold them."""
-        return asdict(self)  # type: ignore[call-overload]
-
 
 @record(ThermoxelsError)
 class _KnownDistance:
@@ -66,12 +62,6 @@ class _InFile:
         if self.up is not None and not 0.0 < math.hypot(*self.up) < math.inf:
             remedy = "Correct the json, for instance to [0, 0, 1], or remove the key."
             raise SceneError("up", expected="three finite numbers, not all 0", got=[*self.up], remedy=remedy)
-
-
-def scale_from_option(metres_per_unit: float) -> SceneScale:
-    """Return the scale that the user gives, without a standard error; raises `ThermoxelsError` unless above 0."""
-    given = SceneScale(metres_per_unit, None, "")
-    return replace(given, source=f"Given by the user: {given.metres_per_unit:g} m per unit.")
 
 
 def scale_from_known_distance(
@@ -132,18 +122,17 @@ def choose_scale(
 ) -> SceneScale | None:
     """Return the scale that the user gives, else the scale in the scene's json; None if there is neither.
 
-    The user gives `option`, in metres per unit, or `known_distance`; giving both raises `ThermoxelsError`. If the json
-    has a scale too, the source of the result says that the user's goes before it.
+    The user gives `option`, in metres per unit, or `known_distance`; giving both, or an option not above 0, raises
+    `ThermoxelsError`. If the json has a scale too, the source of the result says that the user's goes before it.
     """
     if option is not None and known_distance is not None:
         remedy = "Leave one of them out."
         got = f"both: {option} m per unit, and {known_distance.metres_per_unit:g} from the distance"
         raise ThermoxelsError("scale", expected="metres per unit or a known distance", got=got, remedy=remedy)
-    in_file = scale_from_scene_file(scene_file or {})
-    given = known_distance if option is None else scale_from_option(option)
-    if given is None:
-        return in_file
-    if in_file is None:
-        return given
+    in_file, given = scale_from_scene_file(scene_file or {}), known_distance
+    if option is not None:
+        given = replace(SceneScale(option, None, ""), source=f"Given by the user: {option:g} m per unit.")
+    if given is None or in_file is None:
+        return given or in_file
     beside = f"It goes before the {in_file.metres_per_unit:g} m per unit of {_FILE}."
     return replace(given, source=f"{given.source} {beside}")

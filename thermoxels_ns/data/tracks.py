@@ -1,12 +1,14 @@
-"""Tracks of structure from motion: their file, and feature rays from tracks."""
+"""Tracks of structure from motion, from their file or from a COLMAP model, and feature rays from them."""
 
 from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Literal
 
 import numpy as np
 
@@ -14,7 +16,8 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import remedy_of, replace_when_done
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
-from thermoxels_ns.data.scene_file import Frame
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_model, read_model, worlds_of_json
+from thermoxels_ns.data.scene_file import Frame, SceneFile
 
 TRACKS_KEY = "tracks_file_path"  # key of transforms.json that names the file of tracks
 FEWEST_VIEWS = 3  # photographs that must see a point: two photographs agree on many wrong points
@@ -22,6 +25,11 @@ MOST_ERROR_PX = 2.0  # mean reprojection error above which a point is left out, 
 LEAST_ERROR_PX = 0.3  # a smaller reprojection error of a point is due to luck and is raised to this, [pixels]
 LEAST_PARALLAX_DEG = 2.0  # a point is left out if the largest angle between its rays is not above this
 MOST_BEHIND = 0.1  # if a larger share of sightings lies behind the camera, the tracks belong to other poses
+MOST_OFF = 0.01
+"""A photograph is left out if an axis of its camera in the model is off the given one by more than this, or its place
+by more than this share of the cameras' distance from their middle."""
+LEAST_AGREEING = 0.7  # share of the photographs whose poses must agree; with fewer, the model belongs to other poses
+TrackSource = Literal["auto", "given", "off"]
 _REMEDY = f"Write the scene again with thermoxels capture, or remove {TRACKS_KEY} from the json to train without it."
 
 
@@ -72,6 +80,94 @@ def read_tracks(path: Path) -> SparseTracks:
         raise SceneError(path.name, expected="points, frames and pairs of their numbers", got=shapes, remedy=_REMEDY)
     places = points.astype(np.float64), error.astype(np.float64)
     return SparseTracks(*places, tuple(map(str, frames)), frame.astype(np.int64), point.astype(np.int64))
+
+
+def find_feature_rays(
+    scene: SceneFile, training: Sequence[int], source: TrackSource, say: Callable[[str], None]
+) -> FeatureRays | None:
+    """Return the feature rays of the photographs that train, in input coordinates; None if there are no tracks.
+
+    `training` holds indices of frames. "auto" takes the file of tracks that the json names, else a COLMAP model in the
+    scene's folder; if it cannot be used, `say` receives the reason. "given": only the file; "off": None.
+
+    Raises:
+        SceneError: The file that the json names cannot be used, or does not fit the poses.
+    """
+    frames = [scene.frames[index] for index in training]
+    if source == "off":
+        return None
+    if TRACKS_KEY in scene.meta:
+        path = scene.folder / str(scene.meta[TRACKS_KEY])
+        return feature_rays(read_tracks(path), frames, path.name)
+    try:
+        found = read_colmap_tracks(scene, say) if source == "auto" else None
+        remedy = "Give it the photographs and poses of the json, or move it away."
+        return None if found is None else feature_rays(found, frames, "its tracks", remedy)
+    except SceneError as problem:
+        say(f"Tracks: the COLMAP model in the scene's folder is not used (--tracks off leaves it alone): {problem}")
+        return None
+
+
+def read_colmap_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> SparseTracks | None:
+    """Return the tracks of the COLMAP model in a scene's folder, in input coordinates; None if there is no model.
+
+    Photographs are matched by name. The json's poses must be in the model's world, or in one of `worlds_of_json`. Two
+    poses of a photograph agree if they differ by less than `MOST_OFF`. Sightings of photographs whose poses do not
+    agree are left out, and `say` receives their names.
+
+    Raises:
+        SceneError: The model is damaged, is not of these photographs, or too few of its poses agree.
+    """
+    folder = next((name for name in COLMAP_FOLDERS if is_model(scene.folder / name)), None)
+    if folder is None:
+        return None
+    model = read_model(scene.folder / folder)
+    if any(point.error < 0.0 for point in model.points3D.values()):  # not computed
+        model.update_point_3d_errors()
+    images = [image for image in model.images.values() if image.has_pose]
+    pairs = _matched([image.name for image in images], [frame.name for frame in scene.frames])
+    if not pairs:
+        there, here = next((image.name for image in images), "none"), scene.frames[0].name
+        names = f"such as {there} there and {here} here"
+        raise SceneError(f"it has no photograph of this scene, or several of one name ({names})")
+    images, frames = [images[image] for image, _ in pairs], [scene.frames[frame] for _, frame in pairs]
+    if not all(camera.width for camera in model.cameras.values()):
+        raise SceneError("it has a camera whose photographs are 0 pixels wide")
+    number = {image.image_id: place for place, image in enumerate(images)}
+    points = np.array([point.xyz for point in model.points3D.values()], dtype=np.float64).reshape(-1, 3)
+    seen = [
+        (place, number[element.image_id])
+        for place, one in enumerate(model.points3D.values())
+        for element in one.track.elements
+        if element.image_id in number
+    ]
+    if not seen:
+        raise SceneError("it has no points that photographs of this scene see")
+    # A track may hold two features of one photograph.
+    point, frame = np.unique(np.array(seen, dtype=np.int64), axis=0).T
+    widths = [f.intrinsics.width / model.cameras[image.camera_id].width for f, image in zip(frames, images)]
+    error_px = np.array([one.error for one in model.points3D.values()], dtype=np.float64) * float(np.median(widths))
+    poses, given = np.stack(list(map(camera_to_world, images))), np.stack([one.pose for one in frames])
+    spread = np.linalg.norm(given[:, :3, 3] - given[:, :3, 3].mean(axis=0), axis=1).max()
+    unit = np.array([1.0, 1.0, 1.0, max(spread, 1e-300)])
+    tried = [(np.abs(((w @ poses - given) / unit)[:, :3]).max(axis=(1, 2)), w) for w in worlds_of_json(scene.meta)]
+    off, world = min(tried, key=lambda one: np.median(one[0]))
+    agree = off <= MOST_OFF
+    if agree.sum() < max(3, LEAST_AGREEING * len(agree)):
+        raise SceneError(
+            f"its poses are others than those of {scene.json_path.name}: {int(agree.sum())} of {len(agree)} "
+            f"photographs agree within {MOST_OFF:.0%} (median {np.median(off):.1%})"
+        )
+    say(
+        f"Tracks of the COLMAP model in {folder}: {len(points):,} points, {int(agree.sum())} of {len(scene.frames)} "
+        "photographs."
+    )
+    if not agree.all():
+        strays = ", ".join(one.name for one, good in zip(frames, agree) if not good)
+        say(f"Tracks: other poses than COLMAP's, left out: {strays}")
+    moved = points @ world[:3, :3].T + world[:3, 3]
+    kept = agree[frame]
+    return SparseTracks(moved, error_px, tuple(one.name for one in frames), frame[kept], point[kept])
 
 
 def feature_rays(
@@ -127,3 +223,17 @@ def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray
     across = np.linalg.norm(np.cross(directions, mean[point]), axis=1)
     np.maximum.at(off, point, np.arctan2(across, (directions * mean[point]).sum(axis=1)))
     return 2.0 * off
+
+
+def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, int]]:
+    """Return the pairs (image, frame) of indices that belong to the same photograph: the frame's name ends with the
+    image's, folders included. The longest such image is taken; images that then belong to several frames are left out.
+    """
+    number = {image: place for place, image in enumerate(images)}
+    pairs = []
+    for place, frame in enumerate(frames):
+        parts = PurePosixPath(frame).parts
+        endings = ("/".join(parts[first:]) for first in range(len(parts)))
+        pairs += [(number[ending], place) for ending in endings if ending in number][:1]
+    once = Counter(image for image, _ in pairs)
+    return [pair for pair in pairs if once[pair[0]] == 1]

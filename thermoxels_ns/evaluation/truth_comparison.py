@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
@@ -22,12 +21,12 @@ from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.mesh.build import apply_transform
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.free_space import count_cameras
+from thermoxels_ns.mesh.solid.interior import camera_voxels, cavities
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_areas
 from thermoxels_ns.synthetic.raycast import first_surface, visible_surface_points
 from thermoxels_ns.synthetic.scene_folder import load_truth
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
-from thermoxels_ns.synthetic.solids import Solid
 
 MIN_VIEWS = 3  # A point of a surface counts as seen if at least this many training cameras see it
 TOLERANCE_VOXELS = 1.5  # Two surfaces agree where their distance is at most this, [voxels]
@@ -57,61 +56,6 @@ class SurfaceScore:
         return 2.0 * self.precision * self.recall / (self.precision + self.recall or 1.0)
 
 
-def surface_fscore(
-    cells: BoolArray,
-    lattice: Lattice,
-    truth: Solid,
-    true_points_seen: FloatArray,
-    tolerance: float,
-    world_to_truth: FloatArray,
-    views: Views,
-    surroundings: Solid | None = None,
-    within: BoolArray | None = None,
-) -> tuple[SurfaceScore, SurfaceScore]:
-    """Return two scores of the boundary of solid voxels against the true surface: of all faces, and of the seen ones.
-
-    Enclosed cavities are filled first, as no camera sees into them. The boundary is sampled at four points per voxel
-    face. Faces at the end of the lattice or of the region `within` cut the scene; they do not count for precision. A
-    face is seen if `MIN_VIEWS` cameras have a free line, past the solid voxels, to the empty voxel in front of it.
-
-    Args:
-        cells: Solid voxels, shape `lattice.cell_shape`.
-        lattice: Lattice of the voxels, [world units].
-        truth: The true body.
-        true_points_seen: Points of the true surface that training cameras see, shape (m, 3), m > 0, [truth units].
-        tolerance: Distance up to which surfaces agree, above 0, [truth units].
-        world_to_truth: Similarity, shape (4, 4), from the lattice's world to truth coordinates.
-        views: The training cameras, in the coordinates of the lattice.
-        surroundings: True shape of what stands beside the body. Boundary within the tolerance of this shape, and not of
-            the body, is not scored: photographs do not say where the body ends and its surroundings begin.
-        within: Voxels of the region that was reconstructed, shape `lattice.cell_shape`; None: all voxels.
-    """
-    cells = check_shape("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
-    transform = np.asarray(world_to_truth, dtype=np.float64)
-    solid = np.asarray(ndimage.binary_fill_holes(cells), dtype=bool)
-    corners, empty, on_border = _boundary_samples(solid, np.ones_like(solid) if within is None else within)
-    if len(corners) == 0:
-        return SurfaceScore(), SurfaceScore()
-    points = apply_transform(transform, lattice.index_to_world(corners))
-
-    def recall(some: FloatArray) -> float:
-        return float(np.mean(KDTree(some).query(true_points_seen)[0] <= tolerance)) if len(some) else 0.0
-
-    inner, recalled = points[~on_border], recall(points)
-    distance = np.abs(truth.signed_distance(inner))
-    scored = np.ones(len(inner), dtype=bool)
-    if surroundings is not None:
-        scored = (surroundings.signed_distance(inner) > tolerance) | (distance <= tolerance)
-    if not scored.any():
-        return SurfaceScore(recall=recalled), SurfaceScore()
-    agrees = distance <= tolerance
-    whole = SurfaceScore(float(agrees[scored].mean()), recalled, float(scored.mean()), float(distance[scored].mean()))
-    shown = scored & (count_cameras(solid, lattice, views).free[tuple(empty[~on_border].T)] >= MIN_VIEWS)
-    if not shown.any():
-        return whole, SurfaceScore()
-    return whole, SurfaceScore(float(agrees[shown].mean()), recall(inner[shown]), float(shown.mean()))
-
-
 def _boundary_samples(cells: BoolArray, within: BoolArray) -> tuple[FloatArray, IntArray, BoolArray]:
     """Return points on the faces between solid and empty voxels, (n, 3) [corner indices], the empty voxel in front of
     each point (n, 3), and whether that voxel is outside the lattice or the region `within` (n,)."""
@@ -138,46 +82,6 @@ def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArra
     return np.asarray(sample_surface(Trimesh(points, facets, process=False), count, seed=0)[0], np.float64)
 
 
-def surface_distances(
-    mesh: TetMesh,
-    truth: Solid,
-    true_points: FloatArray,
-    metres_per_unit: float = 1.0,
-    surroundings: Solid | None = None,
-    tolerance: float = 0.0,
-) -> tuple[float, FloatArray, FloatArray] | None:
-    """Compare a mesh's surface with the true one; return None if nothing of the surface can be measured.
-
-    Facets on the scene box, which cuts the scene, are left out. Distances from mesh to truth start at 20,000 points of
-    the other facets; a point within `tolerance` [truth units] of `surroundings` and not of the truth does not count.
-    Distances from truth to mesh go from `true_points` (m, 3), [truth units], to the nearest point of these facets.
-
-    Returns:
-        The mean of both mean distances, [truth units]; the distance of each true point to the mesh, (m,); and the
-        temperature of the mesh at the point nearest to each, (m,), [degrees Celsius].
-    """
-    import pyvista as pv
-    from trimesh.triangles import points_to_barycentric
-
-    points = mesh.points_m / metres_per_unit
-    facets = mesh.facets[mesh.facet_tags != FACET_BOX]
-    if len(facets) == 0:
-        return None
-    samples = sample_facets(points, facets, 20_000)
-    outwards = np.abs(truth.signed_distance(samples))
-    if surroundings is not None:
-        outwards = outwards[(outwards <= tolerance) | (surroundings.signed_distance(samples) > tolerance)]
-        if len(outwards) == 0:
-            return None
-    surface = pv.PolyData.from_regular_faces(points, facets)
-    cell, closest = surface.find_closest_cell(true_points, return_closest_point=True)  # type: ignore[misc]
-    inwards = np.linalg.norm(closest - true_points, axis=1)
-    triangle = facets[np.asarray(cell)]
-    share = np.clip(points_to_barycentric(points[triangle], np.asarray(closest)), 0.0, 1.0)
-    temperature_c = np.einsum("ij,ij->i", share / share.sum(axis=1, keepdims=True), mesh.temperature_c[triangle])
-    return 0.5 * float(outwards.mean() + inwards.mean()), inwards, temperature_c
-
-
 @dataclass(frozen=True, eq=False)
 class KnownTruth:
     """A synthetic scene, whose coordinates are metres, and the cameras of its training photographs."""
@@ -185,11 +89,6 @@ class KnownTruth:
     scene: SyntheticScene
     training_poses: FloatArray  # Training cameras, camera to world (OpenGL), shape (c, 4, 4), [m]
     camera: Camera  # Intrinsics of all training cameras
-
-    @property
-    def surroundings(self) -> Solid | None:
-        """Shape of what stands around the scene's solid and is not scored; None if nothing does."""
-        return None if self.scene.around is None else self.scene.around.solid
 
     @cached_property
     def points_seen(self) -> FloatArray:
@@ -212,21 +111,66 @@ class KnownTruth:
         lattice: Lattice,
         world_to_truth: FloatArray,
         tolerance_m: float,
-        within: BoolArray | None,
+        within: BoolArray | None = None,
     ) -> tuple[SurfaceScore, SurfaceScore]:
-        """Return the two scores of `surface_fscore` for solid voxels against this scene, with its cameras, [m]."""
+        """Return two scores of the boundary of solid voxels against the surface: of all faces, and of the seen ones.
+
+        Enclosed cavities are filled first, as no camera sees into them, but for rooms in which a camera stands. The
+        boundary is sampled at four points per voxel face. Faces at the end of the lattice or of the region `within` cut
+        the scene; they do not count for precision. Neither does boundary near the surroundings and not near the body:
+        photographs do not say where the body ends and its surroundings begin. A face is seen if `MIN_VIEWS` cameras
+        have a free line, past the solid voxels, to the empty voxel in front of it.
+
+        Args:
+            cells: Solid voxels, shape `lattice.cell_shape`.
+            lattice: Lattice of the voxels, [world units].
+            world_to_truth: Similarity, shape (4, 4), from the lattice's world to the scene's coordinates.
+            tolerance_m: Distance up to which surfaces agree, above 0, [m].
+            within: Voxels of the region that was reconstructed, shape `lattice.cell_shape`; None: all voxels.
+        """
+        cells = check_shape("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
+        views = self.views(world_to_truth)
+        solid = cells | cavities(cells, camera_voxels(cells, lattice, views))[0]
+        corners, empty, on_border = _boundary_samples(solid, np.ones_like(solid) if within is None else within)
+        if len(corners) == 0:
+            return SurfaceScore(), SurfaceScore()
+        points = apply_transform(world_to_truth, lattice.index_to_world(corners))
+
+        def recall(some: FloatArray) -> float:
+            return float(np.mean(KDTree(some).query(self.points_seen)[0] <= tolerance_m)) if len(some) else 0.0
+
+        inner, recalled = points[~on_border], recall(points)
+        distance = np.abs(self.scene.solid.signed_distance(inner))
+        agrees = distance <= tolerance_m
+        scored = self.counts(inner, agrees, tolerance_m)
+        if not scored.any():
+            return SurfaceScore(recall=recalled), SurfaceScore()
+        precision, share = float(agrees[scored].mean()), float(scored.mean())
+        whole = SurfaceScore(precision, recalled, share, float(distance[scored].mean()))
+        free = count_cameras(solid, lattice, views).free[tuple(empty[~on_border].T)]
+        shown = scored & (free >= MIN_VIEWS)
+        if not shown.any():
+            return whole, SurfaceScore()
+        return whole, SurfaceScore(float(agrees[shown].mean()), recall(inner[shown]), float(shown.mean()))
+
+    def counts(self, points: FloatArray, agrees: BoolArray, tolerance_m: float) -> BoolArray:
+        """Return which points (n, 3) of a reconstructed boundary count: all that agree or are not at surroundings."""
+        if self.scene.around is None:
+            return np.ones(len(points), dtype=bool)
+        return agrees | (self.scene.around.solid.signed_distance(points) > tolerance_m)
+
+    def views(self, world_to_truth: FloatArray) -> Views:
+        """Return the training cameras in the world that the similarity (4, 4) brings to the scene's coordinates."""
         scale = _scale_of(world_to_truth)
         poses, camera, count = self.training_poses, self.camera, len(self.training_poses)
         axes = world_to_truth[:3, :3].T / scale  # the inverse of its rotation (and mirror)
         centres = (poses[:, :3, 3] - world_to_truth[:3, 3]) @ axes.T / scale
-        views = Views(
+        return Views(
             camera_to_world=np.concatenate([axes @ poses[:, :3, :3], centres[:, :, None]], axis=2),
             focal=np.tile([camera.fl_x, camera.fl_y], (count, 1)),
             centre=np.tile([camera.cx, camera.cy], (count, 1)),
             size=np.tile([camera.width, camera.height], (count, 1)),
         )
-        truth = self.scene.solid, self.points_seen, tolerance_m
-        return surface_fscore(cells, lattice, *truth, world_to_truth, views, self.surroundings, within)
 
 
 def _scale_of(similarity: FloatArray) -> float:
@@ -261,12 +205,10 @@ def compare_with_truth(
 ) -> dict[str, Any] | None:
     """Compare solid voxels, and the temperatures of a mesh made from them, with the exact scene; return the figures.
 
-    Precision is the share of the reconstructed boundary within `TOLERANCE_VOXELS` of the true surface. Recall is the
-    share of the true surface seen by `MIN_VIEWS` training cameras that lies within that tolerance of the boundary. The
-    F-score is their harmonic mean. `surface_fscore` says which faces are left out. Figures named ``..._seen`` are of
-    the part of the boundary that cameras see; they are 0 if cameras see none. `cells` has the shape
-    `lattice.cell_shape`. `world_to_truth` (4, 4) is the similarity from the lattice's world to the coordinates of the
-    input poses, in which a synthetic scene is written in metres; `metres_per_unit` is the scale of the mesh's nodes.
+    Scores are those of `KnownTruth.score` within `TOLERANCE_VOXELS`. Figures named ``..._seen`` are of the part of the
+    boundary that cameras see; they are 0 if cameras see none. `cells` has the shape `lattice.cell_shape`.
+    `world_to_truth` (4, 4) is the similarity from the lattice's world to the coordinates of the input poses, in which a
+    synthetic scene is written in metres; `metres_per_unit` is the scale of the mesh's nodes.
 
     Returns:
         Figures by name, which json can hold, in metres of the scene; None if the truth is not known. Scores are 0 to 1.
@@ -304,7 +246,9 @@ def compare_with_truth(
         "true_area_m2": float(known.scene.solid.area),
     }
     if mesh is not None:
-        result |= _mesh_errors(known, mesh, voxel_m, metres_per_unit)
+        result |= mesh_errors(known, mesh, tolerance_m, metres_per_unit)
+        if "chamfer_m" in result:
+            result["chamfer_voxels"] = result["chamfer_m"] / voxel_m
     return result
 
 
@@ -385,23 +329,38 @@ def depth_metrics(
     return result | ({"sky_filled": float(sky.mean())} if len(sky) else {})
 
 
-def _mesh_errors(known: KnownTruth, mesh: TetMesh, voxel_m: float, metres_per_unit: float) -> dict[str, Any]:
-    """Return volume and area of the mesh, and distances and temperature errors at the true points seen, by name."""
-    area = facet_areas(mesh.points_m, mesh.facets)
+def mesh_errors(known: KnownTruth, mesh: TetMesh, tolerance_m: float, metres_per_unit: float = 1.0) -> dict[str, Any]:
+    """Return volume and area of a mesh, and distances and temperature errors at the true points seen, by name.
+
+    Facets on the scene box, which cuts the scene, are left out. Distances from mesh to truth start at 20,000 points of
+    the other facets; those from truth to mesh go from the true points to the nearest point of these facets. Without
+    such facets, or if all of them stand at surroundings, there are volume and area alone.
+    """
+    import pyvista as pv
+    from trimesh.triangles import points_to_barycentric
+
     result: dict[str, Any] = {
         "mesh_volume_m3": float(signed_volumes(mesh.points_m, mesh.tets).sum()) / metres_per_unit**3,
-        "mesh_area_m2": float(area.sum()) / metres_per_unit**2,
+        "mesh_area_m2": float(facet_areas(mesh.points_m, mesh.facets).sum()) / metres_per_unit**2,
     }
-    tolerance_m, seen = TOLERANCE_VOXELS * voxel_m, known.points_seen
-    distances = surface_distances(mesh, known.scene.solid, seen, metres_per_unit, known.surroundings, tolerance_m)
-    if distances is None:
+    points, scene, seen = mesh.points_m / metres_per_unit, known.scene, known.points_seen
+    facets = mesh.facets[mesh.facet_tags != FACET_BOX]
+    if len(facets) == 0:
         return result
-    chamfer_m, closest_m, temperature_c = distances
-    reached = closest_m <= tolerance_m
-    error_k = np.abs(temperature_c - known.scene.surface_temperature_c(seen))[reached]
+    samples = sample_facets(points, facets, _SURFACE_POINTS)
+    outwards = np.abs(scene.solid.signed_distance(samples))
+    outwards = outwards[known.counts(samples, outwards <= tolerance_m, tolerance_m)]
+    if len(outwards) == 0:
+        return result
+    surface = pv.PolyData.from_regular_faces(points, facets)
+    cell, closest = surface.find_closest_cell(seen, return_closest_point=True)  # type: ignore[misc]
+    inwards = np.linalg.norm(closest - seen, axis=1)
+    triangle, reached = facets[np.asarray(cell)], inwards <= tolerance_m
+    share = np.clip(points_to_barycentric(points[triangle], np.asarray(closest)), 0.0, 1.0)
+    temperature_c = np.einsum("ij,ij->i", share / share.sum(axis=1, keepdims=True), mesh.temperature_c[triangle])
+    error_k = np.abs(temperature_c - scene.surface_temperature_c(seen))[reached]
     return result | {
-        "chamfer_voxels": chamfer_m / voxel_m,
-        "chamfer_m": chamfer_m,
+        "chamfer_m": 0.5 * float(outwards.mean() + inwards.mean()),
         "temperature_seen_mae_c": float(error_k.mean()) if len(error_k) and mesh.has_temperatures else None,
         "share_of_seen_reached": float(reached.mean()),
     }

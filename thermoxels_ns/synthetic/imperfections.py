@@ -92,8 +92,10 @@ class DrawnFlaws:
 
     def given_poses(self) -> FloatArray:
         """Return the wrong poses (n, 4, 4) that a scene folder contains in place of the true poses."""
+        from scipy.spatial.transform import Rotation  # imported here so that --help stays fast
+
         given = self._poses.copy()
-        given[:, :3, :3] = given[:, :3, :3] @ _turned(self.turns_rad)
+        given[:, :3, :3] = given[:, :3, :3] @ Rotation.from_rotvec(self.turns_rad).as_matrix()
         given[:, :3, 3] += self._moves
         return given
 
@@ -138,13 +140,6 @@ class DrawnFlaws:
             "passers_by": np.flatnonzero(self._passing).tolist(),
             "poses": self._poses.tolist(),
         }
-
-
-def _turned(rotation_vectors: FloatArray) -> FloatArray:
-    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
-    from scipy.spatial.transform import Rotation  # imported here so that --help stays fast
-
-    return Rotation.from_rotvec(rotation_vectors).as_matrix()
 
 
 def _passer_by(shape: tuple[int, ...], place: float) -> BoolArray:

@@ -24,12 +24,10 @@ from thermoxels_ns.synthetic.raycast import first_surface, render_view
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 _Frames = list[dict[str, Any]]
-ThermalFormat = Literal["png16", "tiff", "npy"]
-"""16-bit PNG that spans the temperature bounds; uint16 TIFF of centikelvin counts; float32 numpy in Celsius."""
 LayoutName = Literal["thermoscenes", "nerfstudio", "thermalnerf", "rgbt-scenes", "thermalmix", "colmap", "rgb"]
 PhotoFormat = Literal["jpeg", "png"]  # JPEG as cameras write, of quality 92 by default; PNG, which loses nothing
 
-_SUFFIXES = {"png16": ".png", "tiff": ".tiff", "npy": ".npy"}
+_IN_DEGREES = ("nerfstudio", "thermalmix")  # layouts whose thermal images are .npy; those of the others are 16-bit PNG
 _FOLDERS: dict[LayoutName, tuple[str, str, str]] = {
     "thermoscenes": ("images", "thermal", ""),
     "nerfstudio": ("images", "thermal", ""),
@@ -47,7 +45,6 @@ _PHOTO_SUFFIXES: dict[str, str] = {"jpeg": ".jpg", "png": ".png"}
 TRUTH = "truth.json"
 _LARGEST_COUNT = 65535
 _MOST_SIDE = 4096  # most pixels along a side of an image: all rays of an image are in memory at once
-_CENTIKELVIN = {"celsius_per_count": 0.01, "celsius_offset": -273.15}
 # Lens, turn (1 degree) and shift (2 % of the scene) of a separate thermal camera, relative to the photographs' camera.
 _THERMAL_ASPECT, _THERMAL_ZOOM, _THERMAL_CENTRE_SHIFT = 0.8, 0.95, (-0.012, 0.008)
 _RIG_ROTATION_RAD = (0.005, -0.018, 0.003)
@@ -62,7 +59,6 @@ def write_scene(
     width: int = 320,
     height: int = 240,
     thermal_width: int | None = None,
-    thermal_format: ThermalFormat = "png16",
     seed: int = 0,
     own_thermal_camera: bool = False,
     photo_format: PhotoFormat = "jpeg",
@@ -74,9 +70,9 @@ def write_scene(
 
     The `layout` "thermoscenes" is that of ThermoScenes: ``images/``, ``thermal/``, ``transforms.json`` (written last)
     and ``temperature_bounds.json``, with ``frame_train_`` and ``frame_eval_`` names. ``transforms.json`` also has the
-    scale (metres) and up (z), as after a capture, and the unit of TIFF counts as ``thermal_unit``. ``docs/data.md`` has
-    the other layouts; "nerfstudio" and "thermalmix" hold degrees as ``.npy``. The scene's name and exact box and the
-    drawn `imperfections` go to ``truth.json``, which training never reads.
+    scale (metres) and up (z), as after a capture. Thermal images are 16-bit PNG that span the temperature bounds.
+    ``docs/data.md`` has the other layouts; "nerfstudio" and "thermalmix" hold degrees as ``.npy``. The scene's name and
+    exact box and the drawn `imperfections` go to ``truth.json``, which training never reads.
 
     The folder is made if absent; an earlier synthetic scene in it is removed, any other scene is refused. Held-out
     views lie half-way between training views. `thermal_width` [pixels] is by default the width of photographs, or half
@@ -93,8 +89,6 @@ def write_scene(
         expected = "one camera for both, which is all that this layout can say"
         remedy = "Leave --own-thermal-camera out, or pass --layout thermalnerf."
         raise SceneError("own_thermal_camera", expected=expected, got=f"True and layout {layout}", remedy=remedy)
-    if layout in ("nerfstudio", "thermalmix"):
-        thermal_format = "npy"
     imperfections.check()
     camera = scene.camera(width, height)
     train, held_out = scene.poses(num_train, num_eval)
@@ -103,10 +97,7 @@ def write_scene(
     flaws = DrawnFlaws(imperfections, seed, poses, np.mean(scene.scene_box, axis=0))
     given_poses = flaws.given_poses()
     bounds = flaws.bounds_c(*scene.temperature_bounds_c)
-    # Temperature [C] = count * celsius_per_count + celsius_offset.
-    unit = {"celsius_per_count": (bounds[1] - bounds[0]) / _LARGEST_COUNT, "celsius_offset": bounds[0]}
-    if thermal_format == "tiff":
-        unit = _CENTIKELVIN
+    celsius_per_count, suffix = (bounds[1] - bounds[0]) / _LARGEST_COUNT, ".npy" if layout in _IN_DEGREES else ".png"
 
     target = _prepared_folder(folder, layout)
     frames: _Frames = []
@@ -118,7 +109,7 @@ def write_scene(
         side = "train" if number < num_train else "test"
         frame: dict[str, Any] = {
             "file_path": f"{photographs.format(side)}/{name}{_PHOTO_SUFFIXES[photo_format]}",
-            "thermal_file_path": f"{thermals.format(side)}/{name}{_SUFFIXES[thermal_format]}",
+            "thermal_file_path": f"{thermals.format(side)}/{name}{suffix}",
             "transform_matrix": given_poses[number].tolist(),
         }
         if own_thermal_camera:
@@ -129,13 +120,13 @@ def write_scene(
         if not thermals:
             continue
         with replace_when_done(target / frame["thermal_file_path"]) as path:
-            if thermal_format == "npy":
+            if layout in _IN_DEGREES:
                 np.save(path, measured_c.astype(np.float32))
             else:
-                counts = np.round((measured_c - unit["celsius_offset"]) / unit["celsius_per_count"])
+                counts = np.round((measured_c - bounds[0]) / celsius_per_count)
                 Image.fromarray(np.clip(counts, 0, _LARGEST_COUNT).astype(np.uint16)).save(path)
 
-    if layout == "thermoscenes" or (thermals and thermal_format == "png16"):
+    if thermals and layout not in _IN_DEGREES:
         named = {"absolute_min_temperature": bounds[0], "absolute_max_temperature": bounds[1]}
         write_json(target / _BOUNDS, named)
     transforms: dict[str, Any] = flaws.given_camera(camera).entries()
@@ -145,8 +136,6 @@ def write_scene(
         frames = [{key: value for key, value in frame.items() if key != "thermal_file_path"} for frame in frames]
     if own_thermal_camera and layout != "thermalnerf":
         transforms["thermal_camera"] = thermal_camera.entries()
-    if thermal_format == "tiff":  # counts of a 16-bit PNG span the temperature bounds, which are written above
-        transforms["thermal_unit"] = unit
     transforms |= {"metres_per_unit": 1.0, "up": [0, 0, 1], "frames": frames}
     truth = {"synthetic_scene": scene.name, "scene_box": scene.scene_box, "seed": seed}
     write_json(target / TRUTH, truth | flaws.truth())

@@ -55,7 +55,7 @@ def interior(
     if views is not None and len(views.focal):
         inside |= _hidden(sealed, within, lattice, views, seal) & ~cells
         # Cavities that the filled space encloses are inside as well.
-        inside |= _cavities(cells | inside, room | _camera_voxels(cells, lattice, views))[0]
+        inside |= cavities(cells | inside, room | camera_voxels(cells, lattice, views))[0]
     return Interior(inside & within, int(face_connected(room).max()) if room.any() else 0)
 
 
@@ -64,13 +64,13 @@ def _enclosed(
 ) -> tuple[BoolArray, BoolArray]:
     """Return two masks, cavities without and with a camera, both of the shell and of the sealed shell."""
     everywhere = np.ones((3, 3, 3), dtype=bool)
-    cameras = _camera_voxels(cells, lattice, views)
+    cameras = camera_voxels(cells, lattice, views)
     # Sealing closes alcoves and corridors of a cavity, where cameras may stand: cameras are grown by the same width.
     if seal and cameras.any():
         cameras = np.asarray(ndimage.binary_dilation(cameras, everywhere, iterations=2 * seal, mask=~cells), dtype=bool)
-    cavity, room = _cavities(cells, cameras)
+    cavity, room = cavities(cells, cameras)
     if seal:
-        wide, wide_room = _cavities(sealed, cameras)
+        wide, wide_room = cavities(sealed, cameras)
         room |= wide_room
         if wide.any():
             # Sealing also fills corners and openings of a cavity; the filled voxels belong to the cavity.
@@ -80,7 +80,8 @@ def _enclosed(
     return cavity, room
 
 
-def _camera_voxels(cells: BoolArray, lattice: Lattice, views: Views | None) -> BoolArray:
+def camera_voxels(cells: BoolArray, lattice: Lattice, views: Views | None) -> BoolArray:
+    """Return the voxels in which cameras stand, shape of `cells`; none if `views` is None."""
     cameras = np.zeros_like(cells)
     if views is not None:
         at = np.floor(lattice.world_to_index(views.camera_to_world[:, :, 3])).astype(np.int64)
@@ -88,8 +89,11 @@ def _camera_voxels(cells: BoolArray, lattice: Lattice, views: Views | None) -> B
     return cameras
 
 
-def _cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Return two masks, cavities without and with a camera: empty voxels without a way out through voxel faces."""
+def cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """Return two masks, cavities without and with a camera (a voxel True in `cameras`).
+
+    A cavity is empty voxels without a way out of the lattice through voxel faces.
+    """
     labels = face_connected(np.pad(~shell, 1, constant_values=True))
     kept = np.ones(int(labels.max()) + 1, dtype=bool)
     kept[[0, labels[0, 0, 0]]] = False
