@@ -75,7 +75,7 @@ def test_the_first_page_of_help_is_one_screen_of_options_that_there_are(monkeypa
     [
         "--missing-thermal skip",
         "--scene-box -1 -1 -1 1 1 1",
-        "--eval-every 2",
+        "--eval-mode interval --eval-interval 2",
         "--downscale-factor=2",
         "--valid_range_c -100 1999",
     ],
@@ -107,7 +107,7 @@ def test_typed_options_are_found(monkeypatch):
     assert typed("--load-dir") and typed("--optimizers.sh.scheduler") and not typed("--load-step")
 
 
-@pytest.mark.parametrize("field", ["missing_thermal", "downscale_factor", "scene_box", "eval_every"])
+@pytest.mark.parametrize("field", ["missing_thermal", "downscale_factor", "scene_box", "eval_mode"])
 def test_commands_without_options_of_the_scene_say_where_they_stand(monkeypatch, capsys, field):
     """ns-eval has no --missing-thermal: it reads config.yml, where the field is found and can be changed."""
     problem = SceneError("frame 1", expected="x", got="y", remedy=f"Pass --{field.replace('_', '-')} 2.")

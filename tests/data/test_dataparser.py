@@ -423,7 +423,7 @@ def test_what_has_no_partner_is_left_out_if_one_asks_for_it(scene_folder):
     [
         {"downscale_factor": 0},
         {"photographs_gb": 0.0},
-        {"eval_every": 1},
+        {"eval_mode": "interval", "eval_interval": 1},
         *({"valid_range_c": limits} for limits in ((math.nan, 30.0), (30.0, -100.0), (-300.0, 10.0))),
     ],
 )

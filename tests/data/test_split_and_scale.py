@@ -3,7 +3,7 @@ import math
 import pytest
 
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
-from thermoxels_ns.data.dataparser import split_frames
+from thermoxels_ns.data.dataparser import SplitMode, split_frames
 from thermoxels_ns.data.scene_scale import (
     choose_scale,
     scale_from_known_distance,
@@ -14,10 +14,10 @@ from thermoxels_ns.data.scene_scale import (
 NAMES = [f"images/{letter}.jpg" for letter in "abcdefghij"]
 
 
-def listed(left_out: tuple[str, ...] = (), **lists: str) -> tuple[str, str, str]:
+def listed(mode: SplitMode = "auto", left_out: tuple[str, ...] = (), **lists: str) -> tuple[str, str, str]:
     """The letters that train, validate and test, from lists of letters."""
     meta = {f"{side}_filenames": [f"images/{letter}.jpg" for letter in letters] for side, letters in lists.items()}
-    split = split_frames(NAMES, meta, None, left_out)
+    split = split_frames(NAMES, meta, mode, 8, left_out)
     train, val, test = ("".join(NAMES[i][7] for i in part) for part in (split.train, split.val, split.test))
     return train, val, test
 
@@ -52,22 +52,23 @@ def test_a_listed_frame_that_was_left_out_is_not_missed_and_an_unknown_one_is() 
         listed(train="abcx", val="h", left_out=("images/y.jpg",))
 
 
-@pytest.mark.parametrize(("interval", "held"), [(None, "e"), (8, "e"), (4, "cg")])
+@pytest.mark.parametrize(("interval", "held"), [(8, "e"), (4, "cg")])
 def test_every_nth_frame_is_held_out_from_the_middle_of_the_interval_on(interval, held) -> None:
-    split = split_frames(NAMES, {}, interval)
+    split = split_frames(NAMES, {}, "auto", interval)
     assert "".join(NAMES[i][7] for i in split.val) == held and split.val == split.test
     assert sorted(split.train + split.val) == list(range(10))
 
 
-def test_an_interval_goes_before_names_and_names_before_lists() -> None:
+def test_names_go_before_lists_and_lists_before_numbers() -> None:
     names = ["frame_eval_1.jpg", "frame_train_1.jpg", "frame_train_2.jpg"]
     lists = {"train_filenames": names[:2], "val_filenames": names[2:]}
-    assert split_frames(names, lists).val == [0]
-    assert split_frames(names, lists, 3).val == [1]
+    assert split_frames(names, lists, "auto", 8).val == [0]
+    assert split_frames(names, lists, "lists", 8).val == [2]
+    assert split_frames(names, lists, "interval", 3).val == [1]
     with pytest.raises(SceneError, match=r"split by file name: .* got other.jpg \(1 such\)"):
-        split_frames([*names, "other.jpg"], {})
+        split_frames([*names, "other.jpg"], {}, "auto", 8)
     with pytest.raises(SceneError, match="evaluation frames: expected at least one of the 2 frames"):
-        split_frames(names[1:], {})
+        split_frames(names[1:], {}, "filename", 8)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, True, "2"])

@@ -19,7 +19,7 @@ TASKS: dict[str, dict[str, str]] = {
         "--missing-thermal skip": "leave out photographs without a thermal image",
         "--scene-box XMIN YMIN ZMIN XMAX YMAX ZMAX": "the box to reconstruct; by default where photographs agree",
         "--downscale-factor 2": "photographs of half the width, which is faster",
-        "--eval-every 8": "which frames are held out to judge by",
+        "--eval-mode interval --eval-interval 8": "which frames are held out to judge by",
         "--refine-poses given": "keep the given poses, also where photographs say that they are off",
     },
     "Size and speed": {

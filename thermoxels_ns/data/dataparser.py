@@ -45,7 +45,7 @@ MOST_PHOTOGRAPHS = 500  # with more, poses stay as given: the normal equations w
 FEWEST_PHOTOGRAPHS = 3  # with fewer, poses stay as given
 
 PoseSource = Literal["auto", "given"]
-_INTERVAL = 8  # Without tagged names and lists every n-th frame evaluates
+SplitMode = Literal["auto", "filename", "lists", "interval"]
 _KEYS = {"train": "train_filenames", "val": "val_filenames", "test": "test_filenames"}
 
 
@@ -71,10 +71,13 @@ class ThermalDataParserConfig(DataParserConfig):
     scene_box: Optional[tuple[tuple[float, float, float], tuple[float, float, float]]] = None  # noqa: UP045
     """Box to reconstruct, in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax. Default: scene_box in
     the json, else found from the sparse points, else from depths that photographs agree on, else from the cameras."""
-    eval_every: Optional[int] = None  # noqa: UP045 - read by tyro
-    """Evaluate every n-th frame by sorted name; counting starts in the middle of the first n frames, so that the ends
-    of the sequence stay in training. Default: frames with frame_eval_ in their names; without tagged names those in
-    val_filenames / test_filenames of the json, or not in train_filenames; without lists every 8th."""
+    eval_mode: SplitMode = "auto"
+    """How frames are split into training and evaluation. filename: by frame_train_ / frame_eval_ in the names. lists:
+    by train_filenames / val_filenames / test_filenames in the json. interval: every eval_interval-th frame evaluates.
+    auto: the first of these three that suits the scene."""
+    eval_interval: int = 8
+    """With n here and eval_mode interval, every n-th frame by sorted name evaluates. Counting starts in the middle of
+    the first n frames, so that the ends of the sequence stay in training."""
     missing_thermal: Literal["error", "skip"] = "error"
     """What happens to a frame without a thermal image. error: stop. skip: leave the frame out and print its name."""
     valid_range_c: tuple[float, float] = (-100.0, 2000.0)
@@ -207,7 +210,7 @@ class ThermalDataParser(DataParser):
         file = read_scene_file(Path(config.data), config.missing_thermal, config.layout, config.thermal_bounds)
         CONSOLE.print(f"Layout {file.layout} (--layout takes another).", markup=False)
         names = [frame.name for frame in file.frames]
-        split = split_frames(names, file.meta, config.eval_every, file.left_out)
+        split = split_frames(names, file.meta, config.eval_mode, config.eval_interval, file.left_out)
         rays, given, fitted = find_feature_rays(file, split.train, config.tracks, CONSOLE.print), file, {}
         if rays is None and config.refine_poses == "auto":
             file, fitted = refine_poses(given, split.train, CONSOLE.print)
@@ -411,33 +414,33 @@ class Split:
 
 
 def split_frames(
-    names: Sequence[str], meta: Mapping[str, Any], interval: int | None = None, left_out: Sequence[str] = ()
+    names: Sequence[str], meta: Mapping[str, Any], mode: SplitMode, interval: int, left_out: Sequence[str] = ()
 ) -> Split:
     """Split frames, given by their sorted `names`, into training and evaluation.
 
-    With an `interval` every such frame from index interval // 2 on evaluates, so that the ends of the sequence train.
-    Else frame_train_ and frame_eval_ in the names decide, else train_filenames, val_filenames and test_filenames of
-    `meta`, the json, else the interval is 8. Lists may name frames in `left_out`, which are skipped.
+    "filename" splits by frame_train_ and frame_eval_ in the names, "lists" by train_filenames, val_filenames and
+    test_filenames of `meta`, the json. "interval" evaluates every `interval`-th frame from index interval // 2 on, so
+    that the ends of the sequence train. "auto" takes the first of the three that suits the scene. Lists may name
+    frames in `left_out`, which are skipped.
 
     Raises:
         SceneError: A side is empty, a frame is on both sides, a name is untagged or unknown, or `interval` is below 2.
     """
     tagged = [("frame_train_" in Path(n).name, "frame_eval_" in Path(n).name) for n in names]
-    if interval is None and any(train or test for train, test in tagged):
+    if mode == "filename" or (mode == "auto" and any(train or test for train, test in tagged)):
         unclear = [name for name, (train, evaluate) in zip(names, tagged) if train == evaluate]
         if unclear:
             expected, got = "frame_train_ or frame_eval_ in every name", f"{unclear[0]} ({len(unclear)} such)"
-            remedy = "Rename them or pass --eval-every 8."
+            remedy = "Rename them or pass --eval-mode interval."
             raise SceneError("split by file name", expected=expected, got=got, remedy=remedy)
         train, val = ([i for i, tags in enumerate(tagged) if tags[side]] for side in (0, 1))
         split = Split(train, val, val, "by file name")
-    elif interval is None and not meta.keys().isdisjoint(_KEYS.values()):
+    elif mode == "lists" or (mode == "auto" and not meta.keys().isdisjoint(_KEYS.values())):
         split = _by_lists(names, meta, left_out)
     else:
-        interval = _INTERVAL if interval is None else interval
         if interval < 2:
-            expected, remedy = "an interval of at least 2", "Pass --eval-every 8."
-            raise SceneError("eval_every", expected=expected, got=interval, remedy=remedy)
+            expected, remedy = "an interval of at least 2", "Pass --eval-interval 8."
+            raise SceneError("eval_interval", expected=expected, got=interval, remedy=remedy)
         start = interval // 2
         val = list(range(start, len(names), interval))
         train = [i for i in range(len(names)) if i % interval != start]
@@ -445,7 +448,7 @@ def split_frames(
     for side, chosen in (("training", split.train), ("evaluation", split.val), ("evaluation", split.test)):
         if not chosen:
             expected = f"at least one of the {len(names)} frames ({split.how})"
-            remedy = "Add frames or choose another split, e.g. --eval-every 2."
+            remedy = "Add frames or choose another split, e.g. --eval-mode interval --eval-interval 2."
             raise SceneError(f"{side} frames", expected=expected, got="none", remedy=remedy)
     both = set(split.train) & (set(split.val) | set(split.test))
     if both:
