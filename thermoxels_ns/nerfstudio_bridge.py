@@ -108,7 +108,6 @@ def _cli(script: ModuleType, name: str, f: Any, *, args: Sequence[str] | None = 
     command = tyro.cli(_with_mesh_export(f) if stock else f, args=words, **kwargs)
     if name != _TRAIN and isinstance(config := getattr(command, "load_config", None), Path):
         check_run(config)
-        ConfigLoader.run_folder = config.parent
     for name in ("output_path", "output_dir", "render_output_path"):
         path = getattr(command, name, None)
         if isinstance(path, Path) and callable(getattr(command, "main", None)):

@@ -42,7 +42,6 @@ SUMMARY = {
         "mesh_area_m2": 3.5,
         "true_area_m2": 2.5,
     },
-    "heat": {"energy_residual": 2e-14},
     "mesh": {"tets": 60000, "share_of_nodes_observed": 0.6},
 }
 
@@ -116,7 +115,6 @@ def quick_demo(fake_command, monkeypatch):
             + picture
             + "folder = after('--output-dir')\nos.makedirs(folder)\n"
             + "for name in ('mesh', 'mesh-measured'): Image.new('RGB', (8, 6)).save(f'{folder}/{name}.png')\n"
-            + "Image.new('RGB', (24, 6), 'red').save(f'{folder}/heat.png')\n"
             + f"nan = float('nan')\njson.dump({summary}, open(f'{{folder}}/summary.json', 'w'))",
         )
 
@@ -147,9 +145,9 @@ def test_the_whole_demo_leaves_a_page(quick_demo, tmp_path, capfd):
         assert f"$ {word} " in out
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "Thermoxels demo: house-corner" in page
-    assert page.count("<img") == 3 + 2 * 6 + 4 * 2 + 2 + 1
+    assert page.count("<img") == 3 + 2 * 6 + 4 * 2 + 1 + 1
     assert ">-20.0<" in page and ">15.0\xa0°C<" in page  # the bounds of the house's temperatures
-    assert page.count(">yes<") == 5 + len(true_u_of_patches(PATCHES)) + 1 and ">no<" not in page
+    assert page.count(">yes<") == 4 + len(true_u_of_patches(PATCHES)) + 1 and ">no<" not in page
     assert page.index(">Result<") < page.index("Audit: the truth beside the answer") < page.index("What went in")
     assert (folder / "survey" / "conditions.yaml").is_file()
     for figure in ("17.0 mm", "0.50 voxels, 30.0 mm", "0.20 °C (97 % of the surface)", "0.08 m³ (true: 0.09 m³)"):

@@ -144,9 +144,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     if not 0.0 <= least_w < math.inf:
         remedy = "Pass --least-bridge-w 0 to count all."
         raise AuditError("--least-bridge-w", expected="a number of watts, at least 0", got=least_w, remedy=remedy)
-    others = ("summary.json", "quality.json", "series.csv")
-    written = (ANSWERS, PAGE, DOCUMENT, SURFACE, *ENVELOPES.values())
-    folder = result_folder(options.output_dir, written, (SURFACE, ANSWERS), others)
+    folder = result_folder(options.output_dir, (ANSWERS, PAGE, DOCUMENT, SURFACE, *ENVELOPES.values()), SURFACE)
     lacking = why_no_pdf() if options.pdf else ""
     if lacking:
         say(f"Without audit.pdf: {lacking}")

@@ -133,7 +133,7 @@ def demo_commands(folder: Path) -> dict[str, list[str]]:
             *("--image-format", "png", "--colormap-options.colormap", "inferno"),
             *("--output-path", str(folder / "renders")),
         ],
-        "Export the mesh and let heat flow": [
+        "Export the mesh": [
             *(*export, "--metres-per-unit", "1", "--output-dir", str(folder / "export")),
         ],
         "Audit the house": [
@@ -142,7 +142,7 @@ def demo_commands(folder: Path) -> dict[str, list[str]]:
             *("--output-dir", audited, "--pdf", "True"),
         ],
         "Export the house with rooms": [
-            *(*export, "--output-dir", str(folder / "walls"), "--metres-per-unit", "1", "--steps", "1"),
+            *(*export, "--output-dir", str(folder / "walls"), "--metres-per-unit", "1"),
             *("--interior", "hollow", "--wall-thickness", "0.3"),
         ],
         "Let a winter night act on the house": [

@@ -60,7 +60,7 @@ def read_results(eval_json: Path, summary_json: Path) -> tuple[tuple[Target, ...
     Returns the figures with a target, and name and text of further ones.
     """
     image = numbers_of(eval_json, "results")
-    truth, heat, mesh = (numbers_of(summary_json, name) for name in ("truth", "heat", "mesh"))
+    truth, mesh = (numbers_of(summary_json, name) for name in ("truth", "mesh"))
     tolerance = truth("tolerance_voxels")
     targets = (
         Target(
@@ -74,10 +74,6 @@ def read_results(eval_json: Path, summary_json: Path) -> tuple[tuple[Target, ...
         Target(
             *(f"Surface F-score at {tolerance:g} voxels", truth("fscore"), 0.6, True, "{:.3f}"),
             f"1: the surface is nowhere further than {tolerance:g} voxels from the true one, and none is missing.",
-        ),
-        Target(
-            *("Heat conserved, relative error", heat("energy_residual"), 1e-9, False, "{:.0e}"),
-            "Change of the heat in the insulated solid while heat flows inside it.",
         ),
     )
     seen_percent = 100.0 * truth("share_of_seen_reached")
@@ -189,7 +185,6 @@ def demo_page(
             gradient=gradient(),
             ends_c=[float(bounds[f"absolute_{end}_temperature"]) for end in ("min", "max")],
             night=(folder / "heat" / "surface-end.png").read_bytes(),
-            heat=(export / "heat.png").read_bytes(),
             mesh=(export / "mesh.png").read_bytes(),
             measured=(export / "mesh-measured.png").read_bytes(),
             seconds=seconds,

@@ -99,9 +99,8 @@ def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     from thermoxels_ns.heat.vtk_series import STEP_PATTERN
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES
 
-    names, others = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *HEAT_PICTURES), ("summary.json", "quality.json")
-    series = f"{Path(THROUGH_TIME).stem}/{STEP_PATTERN}"
-    folder = result_folder(options.output_dir, names, (ANSWERS, SERIES), others, series)
+    names, series = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY), f"{Path(THROUGH_TIME).stem}/{STEP_PATTERN}"
+    folder = result_folder(options.output_dir, (*names, *HEAT_PICTURES), SERIES, series)
     run = compute_heat(options, say)
     write_heat_files(folder, options, run, say)
     return run

@@ -206,31 +206,26 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
         raise OutputError("output folder", expected=expected, got=", ".join(blocked), remedy=remedy)
 
 
-def result_folder(
-    path: Path | str, files: Sequence[str], own: Sequence[str], others: Sequence[str], series: str | None = None
-) -> Path:
+def result_folder(path: Path | str, files: Sequence[str], first: str, series: str | None = None) -> Path:
     """Make and return the folder of a command's results, and remove temporary files that killed runs left there.
 
-    Raises `OutputError` if something is in the way of the results, if the folder holds results of another command, or
-    if the command would replace or remove files that it did not write.
+    Raises `OutputError` if something is in the way of the results, or if the command would replace or remove files that
+    it did not write.
 
     Args:
         files: Names of all files in the folder `path` that the command may write.
-        own: Names of files that a run writes first and last. If none exists, the command wrote none of `files`.
-        others: Names of files by which results of another command are recognised.
+        first: Name of the file that a run writes first. Without it, the command wrote none of `files`.
         series: Pattern of files in a subfolder, as ``heat/step-*.vtu``; None if the command writes no such files.
     """
     folder, steps = writable_folder(path), [] if series is None else [series]
     refuse_what_is_in_the_way(folder, files, [Path(name).parent.name for name in steps])
-    found, every = [name for name in others if (folder / name).exists()], (*files, *steps)
-    if not any((folder / name).exists() for name in own):
-        there = [next(folder.glob(name), None) for name in every]
-        found += [one.relative_to(folder).as_posix() for one in there if one is not None]
-    if found:
+    there = [next(folder.glob(name), None) for name in (*files, *steps)]
+    found = [one.relative_to(folder).as_posix() for one in there if one is not None]
+    if found and first not in found:
         expected = f"no files but those of an earlier run of this command in {folder}"
         remedy = "Choose another folder with --output-dir, or move them away."
-        raise OutputError("output folder", expected=expected, got=", ".join(dict.fromkeys(found)), remedy=remedy)
-    for name in every:
+        raise OutputError("output folder", expected=expected, got=", ".join(found), remedy=remedy)
+    for name in (*files, *steps):
         remove_stale_temporaries((folder / name).parent, [Path(name).name])
     return folder
 

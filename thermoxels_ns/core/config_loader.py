@@ -71,11 +71,15 @@ _PlainLoader.add_multi_constructor(_PYTHON_TAG, _plain)
 
 
 def check_run(config: Path) -> None:
-    """Raise `CheckpointError` if a run lacks its config.yml, checkpoint or photographs; nerfstudio is not imported."""
+    """Raise `CheckpointError` if a run lacks its config.yml, checkpoint or photographs; nerfstudio is not imported.
+
+    `ConfigLoader` then takes the folder of `config` as that of the run, which may have been moved.
+    """
     if not config.is_file():
         remedy = "Pass that of a run, outputs/<scene>/thermoxels/<time>/config.yml."
         got = f"no file at {config}"
         raise CheckpointError("load_config", expected="the config.yml of a training run", got=got, remedy=remedy)
+    ConfigLoader.run_folder = config.parent
     try:
         content = yaml.load(config.read_text(encoding="utf-8"), Loader=_PlainLoader)
         models = config.parent.joinpath(*content["relative_model_dir"])
