@@ -15,7 +15,6 @@ import tyro
 from thermoxels_ns.commands.audit import Audit
 from thermoxels_ns.commands.batch import Batch
 from thermoxels_ns.commands.capture import Capture
-from thermoxels_ns.commands.cost import Cost
 from thermoxels_ns.commands.demo import Demo
 from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.core import quiet_warnings
@@ -88,7 +87,6 @@ Commands = tyro.conf.FlagConversionOff[
         Annotated[Capture, tyro.conf.subcommand(name="capture")],
         Annotated[Demo, tyro.conf.subcommand(name="demo")],
         Annotated[Synthetic, tyro.conf.subcommand(name="synthetic")],
-        Annotated[Cost, tyro.conf.subcommand(name="cost")],
         Annotated[Heat, tyro.conf.subcommand(name="heat")],
         Annotated[Audit, tyro.conf.subcommand(name="audit")],
         Annotated[Batch, tyro.conf.subcommand(name="batch")],

@@ -28,7 +28,7 @@ QUALITIES: Mapping[Quality, tuple[int, int, float]] = {
     "standard": (128, 1500, 1.6),
     "fine": (256, 4000, 1.6),
 }
-"""Last resolution, steps, and width of a voxel in pixels of each named quality; `thermoxels cost` measures them.
+"""Last resolution, steps, and width of a voxel in pixels of each named quality.
 Voxels of one pixel follow noise (wild-5: F falls from 0.89 to 0.87), voxels of two pixels lose shape (courtyard: F of
 the seen surface is 0.81, 0.86, 0.89 with 2.1, 1.9, 1.6 pixels). House-corner keeps the resolution given here."""
 

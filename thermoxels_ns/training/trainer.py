@@ -39,7 +39,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
     quality: Quality | None = None
     """Named setting of resolution and length: draft (voxels of 3.2 pixels, up to 128 along the longest side, 800
     steps: a first look, a minute or two on two cores), standard (1.6 pixels, up to 256, 1500 steps, the default: one to
-    some minutes) or fine (1.6 pixels, up to 512, 4000 steps: many minutes); `thermoxels cost` measures all three.
+    some minutes) or fine (1.6 pixels, up to 512, 4000 steps: many minutes).
     A quality replaces max-num-iterations, the lengths of the learning rate schedules, and the model's resolutions,
     refine-at, voxel-pixels, steps, prune-at, thin-at, distortion-ramp and view-dependence-from."""
     show_settings: bool = False
