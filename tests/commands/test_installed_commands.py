@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from thermoxels_ns.commands import installed_commands
 from thermoxels_ns.commands.installed_commands import run_command
 from thermoxels_ns.core.errors import ThermoxelsError
 
@@ -68,11 +67,10 @@ def test_memory_is_that_of_the_command(fake_command, tmp_path):
     """
     fake_command("work", "x = b'1' * int(sys.argv[1]); del x")
     script = f"""
-import io, pathlib, sys
-from rich.console import Console
+import pathlib, sys
 from thermoxels_ns.commands.installed_commands import run_command
 sys.executable = {str(tmp_path / "bin" / "python")!r}
-peak = lambda size: run_command(['work', str(size)], pathlib.Path('log'), Console(file=io.StringIO())).peak_memory_gb
+peak = lambda size: run_command(['work', str(size)], pathlib.Path('log')).peak_memory_gb
 print(peak(200_000_000), peak(600_000_000))
 """
     done = subprocess.run([PYTHON, "-c", script], capture_output=True, text=True, check=True, cwd=tmp_path)
@@ -129,8 +127,7 @@ def test_systems_that_do_not_tell_memory_still_measure_time(fake_command, tmp_pa
     assert cost.seconds > 0 and cost.peak_memory_gb != cost.peak_memory_gb
 
 
-def test_a_process_that_a_command_leaves_behind_does_not_hold_it_up(fake_command, tmp_path, console, monkeypatch):
-    monkeypatch.setattr(installed_commands, "_LAST_WORDS_S", 0.5)
+def test_a_process_that_a_command_leaves_behind_does_not_hold_it_up(fake_command, tmp_path, console):
     fake_command(
         "leave",
         "import subprocess\nsubprocess.Popen([sys.executable, '-c', 'import time; time.sleep(30)'])\nprint('done')",

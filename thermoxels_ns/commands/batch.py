@@ -276,8 +276,6 @@ def run_stage(name: str, stage: str, attempt: int) -> int:
     A stage that ended by itself for another reason than memory is not tried a second time: `attempt` 2 then ends as it
     did. What ends it before its command does leaves the note that it was ended from outside.
     """
-    from rich.console import Console
-
     folder = writable_folder(Path(name) / "logs").parent
     failed, log = folder / "logs" / f"{stage}.failed.json", folder / "logs" / f"{stage}.log"
     earlier = _read(failed).get("status", _ENDED)
@@ -286,8 +284,7 @@ def run_stage(name: str, stage: str, attempt: int) -> int:
     write_json(failed, {"status": _ENDED, "why": "ended from outside, as by a limit of memory or time"})
     command = plan_of(read_batch(Path())[name], Path(name))[stage].command
     try:
-        with Path(os.devnull).open("w") as nowhere:  # the log has all
-            cost = run_command(command, log, Console(file=nowhere))
+        cost = run_command(command, log)
         peak = cost.peak_memory_gb if math.isfinite(cost.peak_memory_gb) else None
         write_json(folder / f"{stage}.json", {"seconds": cost.seconds, "peak_memory_gb": peak, "command": command})
     except (ThermoxelsError, OSError) as problem:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 # Only light imports at the top, so that ``thermoxels --help`` answers at once.
+import shlex
 import shutil
 import time
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from thermoxels_ns.commands.installed_commands import PLAIN_TRAINING, command_line, run_command
+from thermoxels_ns.commands.installed_commands import PLAIN_TRAINING, run_command
 from thermoxels_ns.core.checks import writable_folder
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
@@ -63,7 +64,7 @@ def run_demo(demo: Demo, console: Console) -> None:
         yield
         seconds.append((name, time.monotonic() - start))
 
-    photograph = command_line(["thermoxels", "synthetic", _SCENE, "--output-dir", folder / "scene"])
+    photograph = shlex.join(["thermoxels", "synthetic", _SCENE, "--output-dir", str(folder / "scene")])
     with step("Photograph the synthetic scene"):
         console.print(f"$ {photograph}", style="bold", markup=False, soft_wrap=True)
         write_scene(make_scene(_SCENE), folder / "scene", _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT)
@@ -81,7 +82,7 @@ def run_demo(demo: Demo, console: Console) -> None:
             told = f"{one.name}: {one.measured_text}, target {one.bound_text}, {'met' if one.met else 'not met'}"
             console.print(told, style=None if one.met else "bold red", markup=False)
 
-    index, shown = folder / "index.html", [photograph, *map(command_line, commands.values())]
+    index, shown = folder / "index.html", [photograph, *map(shlex.join, commands.values())]
     page = demo_page(folder, targets, others, compared, seconds, shown)
     write_page(index, page)
     console.print(f"All pictures and figures: {index}", markup=False, soft_wrap=True)
