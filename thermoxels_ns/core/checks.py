@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import math
 import os
-import re
 import shutil
 import sys
 import tempfile
@@ -159,11 +158,12 @@ def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock
 def replace_when_done(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename the file there to `path` only if the block ends without an error.
 
-    The temporary name keeps the suffix, by which writers choose their format. Raises `OutputError` if the block or the
+    The temporary name keeps the suffix, by which writers choose their format; what a killed process left under it is
+    overwritten. Raises `OutputError` if the block or the
     renaming ends in an error of the operating system.
     """
     final = Path(path)
-    temporary = final.with_name(f".{final.stem}.{os.getpid()}.part{final.suffix}")
+    temporary = final.with_name(f".{final.stem}.part{final.suffix}")
     try:
         yield temporary
         os.replace(temporary, final)
@@ -185,17 +185,6 @@ def remove_file(path: Path | str) -> None:
         raise _output_error(Path(path), "a file that can be removed", problem) from problem
 
 
-def remove_stale_temporaries(folder: Path | str, names: Iterable[str]) -> None:
-    """Remove temporary files that a killed process left in a folder while it wrote files of these names.
-
-    Names may have stars, as in ``step-*.vtu``. Only temporary files of `replace_when_done` are removed.
-    """
-    for name in map(Path, names):
-        for path in sorted(Path(folder).glob(f".{name.stem}.*.part{name.suffix}")):
-            if re.search(r"\.\d+\.part$", path.name.removesuffix(name.suffix)):
-                remove_file(path)
-
-
 def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Iterable[str] = ()) -> None:
     """Raise `OutputError` if a folder has the name of one of `files`, or a file the name of one of `folders`."""
     blocked = [name for name in files if (folder / name).is_dir()]
@@ -207,7 +196,7 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
 
 
 def result_folder(path: Path | str, files: Sequence[str], first: str, series: str | None = None) -> Path:
-    """Make and return the folder of a command's results, and remove temporary files that killed runs left there.
+    """Make and return the folder of a command's results.
 
     Raises `OutputError` if something is in the way of the results, or if the command would replace or remove files that
     it did not write.
@@ -225,8 +214,6 @@ def result_folder(path: Path | str, files: Sequence[str], first: str, series: st
         expected = f"no files but those of an earlier run of this command in {folder}"
         remedy = "Choose another folder with --output-dir, or move them away."
         raise OutputError("output folder", expected=expected, got=", ".join(found), remedy=remedy)
-    for name in (*files, *steps):
-        remove_stale_temporaries((folder / name).parent, [Path(name).name])
     return folder
 
 
