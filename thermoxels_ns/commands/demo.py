@@ -75,7 +75,7 @@ def run_demo(demo: Demo, console: Console) -> None:
             log = logs / f"{command[1] if command[0] == 'thermoxels' else command[0]}.log"
             run_command(command, log.with_stem(f"{log.stem}-walls") if log.exists() else log, console)
     with step("Compare with the truth"):
-        targets, others = read_results(folder / "eval.json", folder / "export" / "summary.json")
+        targets = read_results(folder / "eval.json", folder / "export" / "summary.json")
         compared = compare(folder / "audit" / "answers.json", patches)
         targets += (audit_target(compared),)
         for one in targets:
@@ -83,7 +83,7 @@ def run_demo(demo: Demo, console: Console) -> None:
             console.print(told, style=None if one.met else "bold red", markup=False)
 
     index, shown = folder / "index.html", [photograph, *map(shlex.join, commands.values())]
-    page = demo_page(folder, targets, others, compared, seconds, shown)
+    page = demo_page(folder, targets, compared, seconds, shown)
     write_page(index, page)
     console.print(f"All pictures and figures: {index}", markup=False, soft_wrap=True)
     missed = [f"{t.name} {t.measured_text} (target {t.bound_text})" for t in targets if not t.met]
