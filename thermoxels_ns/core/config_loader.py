@@ -7,7 +7,6 @@ import enum
 import importlib
 import os
 import sys
-from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
@@ -36,20 +35,25 @@ class ConfigLoader(yaml.Loader):
     run_folder: ClassVar[Path | None] = None
     """Folder of the config.yml that is loaded next, to which the run may have been moved; None: not known."""
 
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Return the next node of the file, or raise `CheckpointError` with a forbidden name and its line."""
+        node = super().compose_node(parent, index)
+        tag = "" if node is None else node.tag.removeprefix(_PYTHON_TAG)
+        if node is not None and node.tag != tag and not _harmless(tag):
+            expected = "a config.yml that names only configuration classes of nerfstudio and its installed plugins"
+            remedy = "Do not use this file: it could run code. If you trust it, install the package that it names."
+            got = f"{tag} in line {node.start_mark.line + 1}"
+            raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
+        return node
+
     def get_single_data(self) -> Any:
-        """Return the content of the file, or raise `CheckpointError` with a forbidden name and its line."""
-        expected = "a config.yml that names only configuration classes of nerfstudio and its installed plugins"
-        remedy = "Do not use this file: it could run code. If you trust it, install the package that it names."
+        """Return the content of the file; raise `CheckpointError` if it cannot be read safely."""
         try:
             node = self.get_single_node()
         except RecursionError as problem:
-            got, remedy = "entries nested too deeply to read", "Pass the config.yml of a training run."
+            expected, remedy = "a config.yml that ns-train wrote", "Pass the config.yml of a training run."
+            got = "entries nested too deeply to read"
             raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy) from problem
-        for place in _nodes(node):
-            tag = place.tag.removeprefix(_PYTHON_TAG)
-            if place.tag != tag and not _harmless(tag):
-                got = f"{tag} in line {place.start_mark.line + 1}"
-                raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
         found = None if node is None else self.construct_document(node)
         folder, ConfigLoader.run_folder = ConfigLoader.run_folder, None
         if folder is not None and found is not None and hasattr(found, "moved_to"):
@@ -100,21 +104,6 @@ def scene_of_run(folder: Path, told: Path, from_run: str) -> Path:
     """Return the path of a run's scene: `from_run`, as seen from its folder, if something is there, else `told`."""
     beside = Path(os.path.normpath(folder / from_run))
     return beside if from_run and beside.exists() else told
-
-
-def _nodes(root: yaml.Node | None) -> Iterator[yaml.Node]:
-    """Yield a yaml node and all nodes below, each once."""
-    seen, waiting = set[int](), [root] if root is not None else []
-    while waiting:
-        node = waiting.pop()
-        if id(node) in seen:
-            continue
-        seen.add(id(node))
-        yield node
-        if isinstance(node, yaml.MappingNode):
-            waiting += [part for pair in node.value for part in pair]
-        elif isinstance(node, yaml.SequenceNode):
-            waiting += node.value
 
 
 def _harmless(tag: str) -> bool:
