@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
-import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -114,14 +113,6 @@ class Viewpoint:
     """Direction from the picture's camera to the mesh; None: obliquely from above."""
 
 
-class CheckedOptions(NamedTuple):
-    """Settings made from `ExportOptions` whose values are in range; result of `check_options`."""
-
-    selection: SolidSelection
-    rules: PatchRules
-    distance: SceneScale | None  # Scale that follows from the known distance; None without a known distance
-
-
 @dataclass(frozen=True)
 class TrainedScene:
     """A trained field, and what else an export needs from the training run."""
@@ -175,8 +166,11 @@ class ExportThermoxelsMesh(ExportOptions):
         return export_scene(load_trained_scene(self.load_config), self, self.output_dir, say)
 
 
-def check_options(options: ExportOptions) -> CheckedOptions:
-    """Return the checked options; raises `ThermoxelsError` for a wrong option before anything slow runs."""
+def check_options(options: ExportOptions) -> tuple[SolidSelection, PatchRules, SceneScale | None]:
+    """Return the rules for the solid, those for patches, and the scale that follows from a known distance, if any.
+
+    Raises `ThermoxelsError` for a wrong option.
+    """
     from thermoxels_ns.mesh.boundary.patches import PatchRules, load_patch_rules
     from thermoxels_ns.mesh.build import MeshOptions
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
@@ -195,17 +189,8 @@ def check_options(options: ExportOptions) -> CheckedOptions:
         remedy = "Pass --formats vtu glb, for example."
         raise MeshError("formats", expected="at least one format, each once", got=options.formats, remedy=remedy)
     MeshOptions(options.boundary, options.coarsest_cell)  # raises if a value is out of range
-    try:
-        selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
-    except MeshError as problem:
-        option = re.split(r"[: ]", str(problem), maxsplit=1)[0].replace("_", "-")
-        said = str(problem).removesuffix("Correct it.")
-        if said == str(problem):
-            raise
-        raise MeshError(f"{said}Correct --{option}, or leave it out.") from problem
-    return CheckedOptions(
-        selection, PatchRules() if options.patches is None else load_patch_rules(options.patches), distance
-    )
+    selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
+    return selection, PatchRules() if options.patches is None else load_patch_rules(options.patches), distance
 
 
 def scale_of(options: ExportOptions, distance: SceneScale | None, scene_file: Mapping) -> SceneScale | None:
@@ -254,13 +239,14 @@ def mesh_of_scene(run: TrainedScene, options: ExportOptions) -> SceneMesh:
     from thermoxels_ns.mesh.quality.report import check_mesh
     from thermoxels_ns.multiview.evidence import depths_of_dataset
 
-    checked, scene_file, lattice = check_options(options), scene_json(run.scene_folder), run.snapshot.lattice
-    scale = scale_of(options, checked.distance, scene_file)
+    selection, rules, distance = check_options(options)
+    scene_file, lattice = scene_json(run.scene_folder), run.snapshot.lattice
+    scale = scale_of(options, distance, scene_file)
     metres = 1.0 if scale is None else scale.metres_per_unit
     up, up_source = up_of(options, scene_file, run.viewpoint)
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ run.world_to_input
-    how = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
-    built = build_mesh(run.snapshot, checked.selection, to_mesh, how, metres)
+    how = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=rules)
+    built = build_mesh(run.snapshot, selection, to_mesh, how, metres)
     depths = None if run.dataset is None else depths_of_dataset(run.dataset, 0.0, lattice.lo, lattice.hi)
     if depths is not None:
         built = with_support(built, depths, run.tracks, lattice, to_mesh)
