@@ -70,7 +70,7 @@ def _trainer(
 def _preset(name: str, *optimizers: type[OptimizerConfig]) -> MethodSpecification:
     content = read_preset(name)
     description = content.pop("description")
-    return MethodSpecification(with_overrides(_trainer(*optimizers), content, name), description)
+    return MethodSpecification(with_overrides(_trainer(*optimizers), content), description)
 
 
 thermoxels = MethodSpecification(_trainer(), "RGB and thermal photographs to a voxel model that heat can be solved on.")

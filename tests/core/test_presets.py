@@ -15,7 +15,7 @@ from nerfstudio.configs.method_configs import all_methods
 from thermoxels_ns import config
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
-from thermoxels_ns.core.yaml_records import read_preset, read_yaml, with_overrides
+from thermoxels_ns.core.yaml_records import read_preset, read_yaml
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -93,18 +93,6 @@ def test_methods_share_no_configuration() -> None:
         assert len(parts) == 4
         assert not parts & seen
         seen |= parts
-
-
-@pytest.mark.parametrize(
-    ("overrides", "named"),
-    [
-        ({"pipeline": {"model": {"resolution": [64]}}}, "mine.pipeline.model.resolution"),
-        ({"optimizers": {"sh": {"optimizer": {"rate": 1.0}}}}, "mine.optimizers.sh.optimizer.rate"),
-    ],
-)
-def test_an_unknown_key_is_named(overrides: dict[str, Any], named: str) -> None:
-    with pytest.raises(ThermoxelsError, match=f"^{named}: expected one of "):
-        with_overrides(config.thermoxels.config, overrides, "mine")
 
 
 def test_an_installed_package_brings_the_presets(tmp_path: Path) -> None:

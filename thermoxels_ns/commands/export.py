@@ -26,8 +26,6 @@ from thermoxels_ns.data.scene_scale import (
 )
 
 if TYPE_CHECKING:
-    from nerfstudio.engine.trainer import TrainerConfig
-
     from thermoxels_ns.core.feature_rays import FeatureRays
     from thermoxels_ns.core.snapshot import GridSnapshot
     from thermoxels_ns.mesh.boundary.patches import PatchRules
@@ -420,30 +418,15 @@ def scene_json(scene_folder: Path) -> dict[str, Any]:
 
 def load_trained_scene(load_config: Path) -> TrainedScene:
     """Load a trained Thermoxels model through nerfstudio; raises `CheckpointError` for anything else."""
-    check_run(load_config)
-    import yaml
+    content = check_run(load_config)
+    if "scene_from_run" not in content:
+        got = f"one of another method ({content.get('method_name')})"
+        remedy = "Train with ns-train thermoxels, or choose another subcommand of ns-export."
+        raise CheckpointError("load_config", expected="a run of a Thermoxels method", got=got, remedy=remedy)
     from nerfstudio.utils.eval_utils import eval_setup
 
-    def check(config: TrainerConfig) -> TrainerConfig:
-        pipeline: Any = config.pipeline
-        if not callable(getattr(pipeline._target, "grid_snapshot", None)):
-            expected = "a model trained with a Thermoxels method"
-            got = f"the checkpoint of another method ({config.method_name})"
-            remedy = "Train with ns-train thermoxels, or choose another subcommand of ns-export."
-            raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
-        return config
-
     try:
-        _, pipeline, _, _ = eval_setup(load_config, test_mode="test", update_config_callback=check)
-    except ThermoxelsError:
-        raise
-    except (yaml.YAMLError, AssertionError, KeyError, UnicodeDecodeError) as problem:
-        expected = "a config.yml that ns-train of this installation wrote"
-        # errors of nerfstudio's own checks have no message
-        reason = f"{type(problem).__name__}: {problem}" if str(problem) else "it holds no TrainerConfig of nerfstudio"
-        got = f"{load_config}, which cannot be read ({reason})"
-        remedy = "Pass the config.yml of the training run."
-        raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy) from problem
+        _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
     except RuntimeError as problem:
         expected = "the parameters of the model that config.yml describes"
         got = f"{type(problem).__name__}: {problem}"

@@ -74,23 +74,29 @@ def _plain(loader: _PlainLoader, _: str, node: yaml.Node) -> Any:
 _PlainLoader.add_multi_constructor(_PYTHON_TAG, _plain)
 
 
-def check_run(config: Path) -> None:
-    """Raise `CheckpointError` if a run lacks its config.yml, checkpoint or photographs; nerfstudio is not imported.
+def check_run(config: Path) -> dict[str, Any]:
+    """Return the content of a run's config.yml as `_PlainLoader` reads it; nerfstudio is not imported.
 
-    `ConfigLoader` then takes the folder of `config` as that of the run, which may have been moved.
+    Raises `CheckpointError` if the file, a checkpoint or the photographs are missing; a run of another method needs the
+    file alone. `ConfigLoader` then takes the folder of `config` as that of the run, which may have been moved.
     """
-    if not config.is_file():
-        remedy = "Pass that of a run, outputs/<scene>/thermoxels/<time>/config.yml."
-        got = f"no file at {config}"
-        raise CheckpointError("load_config", expected="the config.yml of a training run", got=got, remedy=remedy)
+    got, remedy = "no such file", "Pass that of a run, outputs/<scene>/thermoxels/<time>/config.yml."
+    content: Any = None
+    if config.is_file():
+        try:
+            content = yaml.load(config.read_text(encoding="utf-8"), Loader=_PlainLoader)
+            got = "no settings of a run"
+        except (yaml.YAMLError, OSError, ValueError, RecursionError) as problem:
+            got = " ".join(str(problem).split())
+    if not isinstance(content, dict):
+        raise CheckpointError("load_config", expected="the config.yml of a run", got=f"{config}: {got}", remedy=remedy)
     ConfigLoader.run_folder = config.parent
     try:
-        content = yaml.load(config.read_text(encoding="utf-8"), Loader=_PlainLoader)
         models = config.parent.joinpath(*content["relative_model_dir"])
         manager, from_run = content["pipeline"]["datamanager"], content["scene_from_run"]  # other methods lack it
         told = Path(*(manager["data"] or manager["dataparser"]["data"]))
-    except (yaml.YAMLError, OSError, UnicodeDecodeError, KeyError, TypeError, RecursionError):
-        return  # another layout is left to whoever loads the file
+    except (KeyError, TypeError):
+        return content
     remedy = "Copy the whole folder of the run, or train to the first checkpoint."
     if not any(models.glob("step-*.ckpt")):
         raise CheckpointError("checkpoint", expected=f"a file step-*.ckpt in {models}", got="none", remedy=remedy)
@@ -98,6 +104,7 @@ def check_run(config: Path) -> None:
         expected, remedy = "the photographs that it was trained on", f"Put the scene folder at {told}"
         remedy += f", or at {from_run} as seen from the folder of the run." if from_run else "."
         raise CheckpointError(f"scene of {config}", expected=expected, got="none", remedy=remedy)
+    return content
 
 
 def scene_of_run(folder: Path, told: Path, from_run: str) -> Path:
