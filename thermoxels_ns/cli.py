@@ -66,8 +66,6 @@ class Synthetic:
         Raises:
             ThermoxelsError: An option is out of range or the folder cannot be used.
         """
-        from rich.console import Console
-
         from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
         folder = write_scene(
@@ -75,11 +73,7 @@ class Synthetic:
             self.output_dir,
             **{name: value for name, value in vars(self).items() if name not in ("scene", "output_dir")},
         )
-        Console(highlight=False).print(
-            f"Written to {folder}. Train with: ns-train thermoxels --data {shlex.quote(str(folder))}",
-            markup=False,
-            soft_wrap=True,
-        )
+        print(f"Written to {folder}. Train with: ns-train thermoxels --data {shlex.quote(str(folder))}")
 
 
 Commands = tyro.conf.FlagConversionOff[
@@ -110,13 +104,13 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         command.main()
     except ThermoxelsError as problem:
-        _complain("[bold red]Error:[/bold red]", str(problem))
+        print(f"Error: {problem}", file=sys.stderr)
         return exit_status(problem)
     except MemoryError as problem:
-        _complain("[bold red]Error:[/bold red]", f"memory does not suffice: {problem}")
+        print(f"Error: memory does not suffice: {problem}", file=sys.stderr)
         return exit_status(problem)
     except KeyboardInterrupt:
-        _complain("[bold red]Interrupted.[/bold red]")
+        print("Interrupted.", file=sys.stderr)
         return 130
     return 0
 
@@ -133,13 +127,6 @@ def entrypoint() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = 1
     sys.exit(status)
-
-
-def _complain(heading: str, message: str = "") -> None:
-    from rich.console import Console
-    from rich.markup import escape
-
-    Console(stderr=True, highlight=False).print(f"{heading} {escape(message)}", soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import math
 import time as clock
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -100,12 +101,9 @@ class Audit:
 
     def main(self) -> None:
         """Run the audit; raises `ThermoxelsError` if the mesh, the conditions or an option cannot be used."""
-        from rich.console import Console
-
-        console = Console(highlight=False)
         # With more BLAS threads, the last bits of results would depend on the number of threads.
         with threadpool_limits(1, "blas"):
-            run_audit(self, lambda line: console.print(line, markup=False, soft_wrap=True))
+            run_audit(self, partial(print, flush=True))
 
 
 def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:

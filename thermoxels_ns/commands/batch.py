@@ -12,8 +12,9 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -103,12 +104,10 @@ class Batch:
 
     def main(self) -> None:
         """Run all stages, and write the page; raises `ThermoxelsError` if any building is not finished."""
-        from rich.console import Console
-
-        run_batch(self, Console(highlight=False))
+        run_batch(self, partial(print, flush=True))
 
 
-def run_batch(batch: Batch, console: Any) -> None:
+def run_batch(batch: Batch, say: Callable[[str], None]) -> None:
     """Run a `Batch`: read the list, start Snakemake, and write the page over all buildings."""
     if batch.cores < 1 or not (batch.memory_gb is None or 0.0 < batch.memory_gb < math.inf):
         got, remedy = f"{batch.cores} and {batch.memory_gb} GB", "Leave them out for the defaults."
@@ -118,7 +117,7 @@ def run_batch(batch: Batch, console: Any) -> None:
         remedy = "Install it, with Python 3.11 or newer: pip install 'snakemake>=9'"
         raise ThermoxelsError("snakemake", expected="a package of this Python", got="none", remedy=remedy)
     folder = writable_folder(batch.output_dir).resolve()
-    with hold_folder(folder / ".batch.lock", "Wait for it, or pass another --output-dir.", console.print) as lock:
+    with hold_folder(folder / ".batch.lock", "Wait for it, or pass another --output-dir.", say) as lock:
         write_json(folder / BATCH, {name: asdict(one) for name, one in buildings.items()})
         if not batch.dry_run:
             _forget_what_changed(folder, buildings)
@@ -131,7 +130,7 @@ def run_batch(batch: Batch, console: Any) -> None:
             *(("--executor", batch.executor) if batch.executor else ()),
             *(("--dry-run",) if batch.dry_run else ("--quiet", "rules")),
         ]
-        console.print(f"$ {shlex.join(command)}", style="bold", markup=False, soft_wrap=True)
+        say(f"$ {shlex.join(command)}")
         # Snakemake inherits the lock: while it runs, also without this process, no other batch begins in the folder.
         held = lock._context.lock_file_fd
         process = subprocess.Popen(command, pass_fds=[held] if held is not None and os.name == "posix" else [])
@@ -147,7 +146,7 @@ def run_batch(batch: Batch, console: Any) -> None:
         if batch.dry_run:
             return
         _write_page(folder / PAGE, rows)
-    console.print(f"All buildings: {folder / PAGE}", markup=False, soft_wrap=True)
+    say(f"All buildings: {folder / PAGE}")
     missing = [row for row in rows if not row["finished"]]
     if missing:
         got = "; ".join(f"{row['name']}: {row['why'][0]}" for row in missing[:5])

@@ -5,6 +5,7 @@ from __future__ import annotations
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -149,12 +150,9 @@ class ExportThermoxelsMesh(ExportOptions):
 
     def main(self) -> None:
         """Run the export; raises `ThermoxelsError` for wrong options, an unusable run, or if nothing is solid."""
-        from nerfstudio.utils.rich_utils import CONSOLE
-        from rich.markup import escape
-
         # With more BLAS threads, the last bits of results would depend on the number of threads.
         with threadpool_limits(1, "blas"):
-            self.run(lambda line: CONSOLE.print(escape(line)))
+            self.run(partial(print, flush=True))
 
     def run(self, say: Say) -> dict[str, Any]:
         """Run the export and return the summary that summary.json holds, or raise `ThermoxelsError`."""

@@ -8,6 +8,7 @@ import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -80,18 +81,15 @@ class Heat:
 
     def main(self) -> None:
         """Run; raises `ThermoxelsError` if the mesh, the scene or an option cannot be used, or the solver fails."""
-        from rich.console import Console
-
         from thermoxels_ns.core.yaml_records import write_example
 
-        console = Console(highlight=False)
         if self.write_scene is not None:
             write_example(self.write_scene, EXAMPLE, HeatError)
-            console.print(f"Written to {self.write_scene}: keep what your scene has, and pass it with --scene.")
+            print(f"Written to {self.write_scene}: keep what your scene has, and pass it with --scene.")
             return
         # With more BLAS threads, the last bits of results would depend on the number of threads.
         with threadpool_limits(1, "blas"):
-            run_heat(self, lambda line: console.print(line, markup=False, soft_wrap=True))
+            run_heat(self, partial(print, flush=True))
 
 
 def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:

@@ -13,17 +13,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
 from thermoxels_ns.core import quiet_warnings
 from thermoxels_ns.core.errors import BAD_DATA, CRASH, LACK_OF_MEMORY, ThermoxelsError, explain
 
-if TYPE_CHECKING:
-    # Linux reports for a process at least the peak memory of the process that started it: import little here.
-    from rich.console import Console
-
+# Linux reports for a process at least the peak memory of the process that started it: import little here.
 PLAIN_TRAINING = ("--timestamp", "run", "--vis", "tensorboard", "--logging.steps-per-log", "100")
 """Options of ns-train for a run that nobody watches in the viewer, in a folder whose name is known."""
 
@@ -68,10 +65,10 @@ def command_of(name: str, options: Any) -> str:
     return shlex.join(words)
 
 
-def run_command(words: Sequence[str], log: Path, console: Console | None = None) -> ProcessCost:
+def run_command(words: Sequence[str], log: Path, screen: TextIO | None = None) -> ProcessCost:
     """Run a command of this installation, write its output to the file `log`, and return its time and memory.
 
-    The folder of `log` must exist. `console` shows the output as it comes. Raises `ThermoxelsError` if the command
+    The folder of `log` must exist. `screen` gets the output as it comes. Raises `ThermoxelsError` if the command
     fails or does not exist.
     """
     folder = Path(sys.executable).parent
@@ -81,10 +78,10 @@ def run_command(words: Sequence[str], log: Path, console: Console | None = None)
         raise ThermoxelsError(words[0], expected=f"a command in {folder}", got="none", remedy=remedy)
     environment = dict(os.environ, PYTHONUNBUFFERED="1", PYTHONIOENCODING="utf-8")
     environment.setdefault("PYTHONWARNINGS", quiet_warnings.environment_value())
-    if console is not None:
-        if console.is_terminal:
-            environment |= {"FORCE_COLOR": "1", "COLUMNS": str(console.width)}
-        console.print(f"$ {shlex.join(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)
+    if screen is not None:
+        if screen.isatty():
+            environment |= {"FORCE_COLOR": "1", "COLUMNS": str(shutil.get_terminal_size().columns)}
+        screen.write(f"$ {shlex.join(words)}\n")
     start, peak_memory_gb = time.monotonic(), math.nan
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")  # output so far may end within a character
     with log.open("wb") as written, log.open("rb") as shown:
@@ -101,9 +98,9 @@ def run_command(words: Sequence[str], log: Path, console: Console | None = None)
                         peak_memory_gb = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
                 else:
                     process.poll()
-                if console is not None:
-                    console.file.write(decoder.decode(shown.read()))
-                    console.file.flush()
+                if screen is not None:
+                    screen.write(decoder.decode(shown.read()))
+                    screen.flush()
         finally:
             if process.returncode is None:
                 process.terminate()
