@@ -46,13 +46,9 @@ class Synthetic:
     """Width of the photographs, [pixels]."""
     height: int = 240
     """Height of the photographs, [pixels]."""
-    thermal_width: int | None = None
-    """Width of the thermal images, [pixels]; by default --width, or half of it with --own-thermal-camera True."""
     thermal_format: Literal["png16", "tiff", "npy"] = "png16"
     """Format of the thermal images: 16-bit PNG that spans the temperature bounds, 16-bit TIFF of centikelvin counts, or
     float32 numpy in degrees Celsius."""
-    photo_format: Literal["jpeg", "png"] = "jpeg"
-    """Format of the photographs: JPEG, as cameras write it, or PNG, which is lossless."""
     seed: int = 0
     """Seed of the random numbers of the imperfections; the same seed writes the same files."""
     own_thermal_camera: bool = False

@@ -148,14 +148,8 @@ def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
 
     See `geometry_metrics` and `depth_metrics`, which `training` may not import; no figures without an exact scene.
     """
-    from nerfstudio.utils.rich_utils import CONSOLE
-    from rich.markup import escape
-
     from thermoxels_ns.core.lattice import input_from_world
     from thermoxels_ns.evaluation.truth_comparison import depth_metrics, geometry_metrics, load_known_truth
-
-    def say(line: str) -> None:
-        CONSOLE.print(escape(line))
 
     datamanager: Any = pipeline.datamanager
     outputs = datamanager.train_dataparser_outputs
@@ -165,9 +159,9 @@ def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
         if known is None:
             return {}
         # The snapshot has the rays' evidence and the cameras, which decide what is solid, as in an export.
-        figures = geometry_metrics(pipeline.grid_snapshot(), world_to_input, known, say)
+        figures = geometry_metrics(pipeline.grid_snapshot(), world_to_input, known)
     except SceneError as problem:
-        say(f"Geometry is not compared with the truth: {problem}")
+        print(f"Geometry is not compared with the truth: {problem}")
         return {}
     return figures | depth_metrics(_held_out_rays(pipeline), pipeline.model.grid.lattice, world_to_input, known.scene)
 

@@ -298,9 +298,9 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
 
 
 def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return the U-value that no element exceeds, [W/(m2 K)] by name, and sentences on values and ends beyond it.
+    """Return the U-value that no element exceeds, [W/(m2 K)] by name, and a sentence on intervals that reach beyond it.
 
-    A sentence names the two inputs that widen the U-value's interval most: one of these clashes with the readings.
+    The sentence names the two inputs that widen the U-value's interval most: one of these clashes with the readings.
     """
     from thermoxels_ns.audit.draws import GEOMETRY, REPEATABILITY
     from thermoxels_ns.audit.exchange import most_u_w_m2k
@@ -317,21 +317,15 @@ def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
         if share > 0.0 and name not in (GEOMETRY, REPEATABILITY)
     ]
     inputs = " and ".join(widest[:2]) or "the airs and the camera"
-    over = [one.name for one in found.patches if one.u_w_m2k.value > most[one.name]]
-    ends = [one.name for one in found.patches if one.u_w_m2k.value <= most[one.name] < one.u_w_m2k.high]
-
-    def than(names: list[str]) -> str:
-        allowed = " to ".join(dict.fromkeys(f"{end(most[name] for name in names):.1f}" for end in (min, max)))
-        return f"more than the {allowed} W/(m² K) that the films of air on both sides allow without a wall (ISO 6946)"
-
-    said = []
-    if over:
-        clash = f"What is stated clashes with the readings; look at {inputs} first."
-        said.append(f"Impossible: {', '.join(over)} would have a U-value of {than(over)}. {clash}")
-    if ends:
-        clash = f"the part above is impossible, and what is stated of {inputs} reaches too far."
-        said.append(f"The U-value of {', '.join(ends)} has an interval that ends at {than(ends)}: {clash}")
-    return most, tuple(said)
+    over = [one.name for one in found.patches if one.u_w_m2k.high > most[one.name]]
+    if not over:
+        return most, ()
+    allowed = " to ".join(dict.fromkeys(f"{end(most[name] for name in over):.1f}" for end in (min, max)))
+    told = (
+        f"Impossible: the U-value of {', '.join(over)} reaches beyond the {allowed} W/(m² K) that the films of air on "
+    )
+    told += "both sides allow without a wall (ISO 6946). What is stated clashes with the readings; "
+    return most, (f"{told}look at {inputs} first.",)
 
 
 def answers_of(
