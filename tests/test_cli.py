@@ -1,5 +1,4 @@
 import json
-import os
 import subprocess
 import sys
 import warnings
@@ -10,7 +9,7 @@ import torch
 from thermoxels_ns import cli
 from thermoxels_ns.commands.installed_commands import CommandFailed
 from thermoxels_ns.core.errors import HeatMemoryError, MemoryBudgetError, SceneError, exit_status
-from thermoxels_ns.core.quiet_warnings import PROGRAMMERS_WARNINGS, environment_value
+from thermoxels_ns.core.quiet_warnings import PROGRAMMERS_WARNINGS
 from thermoxels_ns.synthetic.scene_folder import load_truth
 
 SMALL = ["--num-train", "3", "--num-eval", "1", "--width", "16", "--height", "12"]
@@ -76,17 +75,6 @@ def test_warnings_for_programmers_are_not_shown_unless_warnings_are_asked_for(mo
         warnings.simplefilter("always")
         cli.entrypoint()
     assert [str(one.message) for one in caught][: len(seen)] == seen
-
-
-def test_commands_that_we_start_hide_the_same_warnings():
-    script = (
-        "import warnings\nfrom thermoxels_ns.core.quiet_warnings import PROGRAMMERS_WARNINGS\n"
-        "for begin, kind in (*PROGRAMMERS_WARNINGS, ('another', FutureWarning)):\n"
-        "    warnings.warn(begin + ' x', kind)\n"
-    )
-    environment = {**os.environ, "PYTHONWARNINGS": environment_value()}
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment)
-    assert done.returncode == 0 and done.stderr.count("Warning") == 1 and "another" in done.stderr
 
 
 def test_the_entry_point_hands_the_status_to_the_shell(tmp_path):

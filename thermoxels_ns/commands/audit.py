@@ -167,12 +167,6 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     whole = found.whole
     say(f"Heat loss: {interval_text(whole.loss_w, 'W')}; U-value: {interval_text(whole.u_w_m2k, 'W/(m2 K)')}.")
     say(f"{sum(not one.not_counted for one in found.defects)} thermal bridges or defects.")
-    if found.energy is not None:
-        say(f"A year: {interval_text(found.energy.whole.heat_kwh, 'kWh')} through what was observed.")
-    calibration = found.calibration
-    if calibration is not None:
-        told = [f"{name} {interval_text(one, calibration.units[name])}" for name, one in calibration.found.items()]
-        say(f"Calibration: {'; '.join(told) or f'refused. {calibration.refused}'} {calibration.doubt}".rstrip())
     photographs, range_c = {}, None
     if scene is not None:
         scale = (export.get("scale") or {}).get("metres_per_unit", 1.0)

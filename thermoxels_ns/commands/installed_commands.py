@@ -17,7 +17,6 @@ from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
-from thermoxels_ns.core import quiet_warnings
 from thermoxels_ns.core.errors import BAD_DATA, CRASH, LACK_OF_MEMORY, ThermoxelsError, explain
 
 # Linux reports for a process at least the peak memory of the process that started it: import little here.
@@ -77,7 +76,6 @@ def run_command(words: Sequence[str], log: Path, screen: TextIO | None = None) -
         remedy = "Install this package and nerfstudio into the environment of this Python."
         raise ThermoxelsError(words[0], expected=f"a command in {folder}", got="none", remedy=remedy)
     environment = dict(os.environ, PYTHONUNBUFFERED="1", PYTHONIOENCODING="utf-8")
-    environment.setdefault("PYTHONWARNINGS", quiet_warnings.environment_value())
     if screen is not None:
         if screen.isatty():
             environment |= {"FORCE_COLOR": "1", "COLUMNS": str(shutil.get_terminal_size().columns)}
