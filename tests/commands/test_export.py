@@ -358,37 +358,11 @@ def test_up_can_be_given(small, tmp_path_factory) -> None:
     assert summary["up"] == (0.0, 0.0, -1.0) and "--up" in summary["up_source"] and "up" not in summary["scale"]
 
 
-@pytest.fixture
-def config_file(tmp_path) -> Path:
-    path = tmp_path / "config.yml"
-    path.write_text("scene_from_run: ../scene")
-    return path
-
-
-@pytest.mark.parametrize(
-    ("fail", "named"),
-    [
-        (RuntimeError("Error(s) in loading state_dict"), "checkpoint: expected the parameters"),
-        (CheckpointError("checkpoint: expected a voxel grid"), "checkpoint: expected a voxel grid"),
-        (ZeroDivisionError("a bug"), None),
-    ],
-)
-def test_a_run_that_cannot_be_loaded_is_one_sentence_and_a_bug_is_not_hidden(
-    tmp_path, config_file, monkeypatch, fail, named
-) -> None:
-    def eval_setup(*_, **__):
-        raise fail
-
-    monkeypatch.setattr("nerfstudio.utils.eval_utils.eval_setup", eval_setup)
-    with pytest.raises(ThermoxelsError if named else ZeroDivisionError, match=named):
-        ExportThermoxelsMesh(load_config=config_file, output_dir=tmp_path / "out").main()
-
-
 @pytest.mark.parametrize("text", ["just words", "", "# a comment", "a: [", "!!python/object:no.such.Thing {}"])
-def test_garbage_config_file(tmp_path, config_file, text) -> None:
-    config_file.write_text(text)
+def test_garbage_config_file(tmp_path, text) -> None:
+    (tmp_path / "config.yml").write_text(text)
     with pytest.raises(CheckpointError, match=r"^load_config: expected"):
-        ExportThermoxelsMesh(load_config=config_file, output_dir=tmp_path / "out").run(lambda _: None)
+        ExportThermoxelsMesh(load_config=tmp_path / "config.yml", output_dir=tmp_path / "out").main()
 
 
 def test_every_format_is_written_and_leaves_with_the_next_export(ball, tmp_path) -> None:

@@ -395,10 +395,7 @@ def _against_truth(run: TrainedScene, made: SceneMesh, say: Say) -> dict[str, An
         say(f"Not compared with the truth: {problem}")
         return {"error": str(problem)}
     if truth is not None:
-        told = (
-            f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in truth.items()
-        )
-        say(f"Against the truth: {', '.join(told)}")
+        say(f"Against the truth: F-score {truth['fscore']:.3g}; more in {_SUMMARY}.")
     return truth
 
 
@@ -423,24 +420,17 @@ def load_trained_scene(load_config: Path) -> TrainedScene:
         raise CheckpointError("load_config", expected="a run of a Thermoxels method", got=got, remedy=remedy)
     from nerfstudio.utils.eval_utils import eval_setup
 
-    try:
-        _, pipeline, _, _ = eval_setup(load_config, test_mode="test")
-    except RuntimeError as problem:
-        expected = "the parameters of the model that config.yml describes"
-        got = f"{type(problem).__name__}: {problem}"
-        remedy = "Use the config.yml and the checkpoint of one and the same training run."
-        raise CheckpointError("checkpoint", expected=expected, got=got, remedy=remedy) from problem
-    pipeline_of_ours: Any = pipeline
-    outputs = pipeline_of_ours.datamanager.train_dataparser_outputs
+    pipeline: Any = eval_setup(load_config, test_mode="test")[1]
+    outputs = pipeline.datamanager.train_dataparser_outputs
     world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
     return TrainedScene(
-        pipeline_of_ours.grid_snapshot(),
+        pipeline.grid_snapshot(),
         world_to_input,
         viewpoint_of_cameras(outputs.cameras.camera_to_worlds.numpy(), world_to_input),
-        Path(pipeline_of_ours.datamanager.get_datapath()),
-        pipeline_of_ours.datamanager.train_dataset,
+        Path(pipeline.datamanager.get_datapath()),
+        pipeline.datamanager.train_dataset,
         outputs.metadata["feature_rays"],
-        pipeline_of_ours.corrections(),
+        pipeline.corrections(),
     )
 
 
