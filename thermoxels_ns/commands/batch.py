@@ -119,13 +119,13 @@ def run_batch(batch: Batch, say: Callable[[str], None]) -> None:
     folder = writable_folder(batch.output_dir).resolve()
     with hold_folder(folder / ".batch.lock", "Wait for it, or pass another --output-dir.", say) as lock:
         write_json(folder / BATCH, {name: asdict(one) for name, one in buildings.items()})
-        if not batch.dry_run:
-            _forget_what_changed(folder, buildings)
+        for note in () if batch.dry_run else folder.glob("*/logs/*.failed.json"):
+            remove_file(note)  # of an earlier start
         command = [
             *(sys.executable, "-m", "snakemake", "--directory", str(folder)),
             *("--snakefile", str(Path(__file__).parents[1] / "workflow" / "Snakefile")),
             *("--cores" if not batch.executor else "--jobs", str(batch.cores)),
-            *("--keep-going", "--rerun-incomplete", "--rerun-triggers", "mtime", "--nolock"),
+            *("--keep-going", "--rerun-incomplete", "--rerun-triggers", "mtime", "params", "--nolock"),
             *(() if batch.memory_gb is None else ("--resources", f"mem_mb={int(1e3 * batch.memory_gb)}")),
             *(("--executor", batch.executor) if batch.executor else ()),
             *(("--dry-run",) if batch.dry_run else ("--quiet", "rules")),
@@ -152,16 +152,6 @@ def run_batch(batch: Batch, say: Callable[[str], None]) -> None:
         got = "; ".join(f"{row['name']}: {row['why'][0]}" for row in missing[:5])
         remedy = f"Correct what {folder / PAGE} names; the same command then goes on."
         raise ThermoxelsError("batch", expected=f"{len(rows)} buildings finished", got=got, remedy=remedy)
-
-
-def _forget_what_changed(folder: Path, buildings: Mapping[str, Building]) -> None:
-    """Remove the markers of stages whose commands differ from those of today, and what earlier runs say of failures."""
-    for name, building in buildings.items():
-        for stage, (command, _) in plan_of(building, Path(name)).items():
-            remove_file(folder / name / "logs" / f"{stage}.failed.json")
-            marker = folder / name / f"{stage}.json"
-            if marker.is_file() and _read(marker).get("command") != command:
-                remove_file(marker)
 
 
 def read_list(path: Path) -> dict[str, Building]:
@@ -285,7 +275,7 @@ def run_stage(name: str, stage: str, attempt: int) -> int:
     try:
         cost = run_command(command, log)
         peak = cost.peak_memory_gb if math.isfinite(cost.peak_memory_gb) else None
-        write_json(folder / f"{stage}.json", {"seconds": cost.seconds, "peak_memory_gb": peak, "command": command})
+        write_json(folder / f"{stage}.json", {"seconds": cost.seconds, "peak_memory_gb": peak})
     except (ThermoxelsError, OSError) as problem:
         told = (problem.exit_status, problem.last_line) if isinstance(problem, CommandFailed) else (CRASH, str(problem))
         write_json(failed, dict(zip(("status", "why"), told)))
