@@ -52,13 +52,20 @@ def test_bad_input_is_one_sentence_and_exit_status_2(tmp_path, capsys):
     assert "Traceback" not in shown.out
 
 
-def test_an_interrupted_command_has_its_own_status(monkeypatch, capsys):
-    def interrupt(self):
-        raise KeyboardInterrupt
+@pytest.mark.parametrize(
+    ("problem", "status", "said"),
+    [
+        (KeyboardInterrupt(), 130, "Interrupted.\n"),
+        (MemoryError("Unable to allocate 8 TiB"), 3, "Error: memory does not suffice: Unable to allocate 8 TiB\n"),
+    ],
+)
+def test_an_interrupt_and_a_lack_of_memory_are_one_sentence(monkeypatch, capsys, problem, status, said):
+    def main(self) -> None:
+        raise problem
 
-    monkeypatch.setattr(cli.Demo, "main", interrupt)
-    assert cli.main(["demo"]) == 130
-    assert "Interrupted" in capsys.readouterr().err
+    monkeypatch.setattr(cli.Demo, "main", main)
+    assert cli.main(["demo"]) == status
+    assert capsys.readouterr().err == said
 
 
 @pytest.mark.parametrize(("asked", "seen"), [([], ["another"]), (["default"], ["`torch.jit.script` is deprecated: x"])])
@@ -114,12 +121,3 @@ def test_a_reader_that_has_seen_enough_ends_the_help_without_a_traceback():
 )
 def test_what_ended_a_command_is_its_exit_status(problem, status):
     assert exit_status(problem) == status
-
-
-def test_a_lack_of_memory_is_one_sentence(monkeypatch, capsys):
-    def main(self) -> None:
-        raise MemoryError("Unable to allocate 8 TiB")
-
-    monkeypatch.setattr("thermoxels_ns.commands.demo.Demo.main", main)
-    assert cli.main(["demo"]) == 3
-    assert capsys.readouterr().err == "Error: memory does not suffice: Unable to allocate 8 TiB\n"

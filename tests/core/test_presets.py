@@ -15,7 +15,7 @@ from nerfstudio.configs.method_configs import all_methods
 from thermoxels_ns import config
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
-from thermoxels_ns.core.yaml_records import read_preset, read_yaml
+from thermoxels_ns.core.yaml_records import read_yaml
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -61,7 +61,7 @@ def test_a_method_has_the_values_of_its_file_and_else_those_of_the_base(name: st
     specification = _object(METHODS[name])
     for path, value in _leaves(_settings(name)):
         assert _at(specification.config, path) == value, ".".join(path)
-    assert specification.description == read_preset(name)["description"]
+    assert specification.description == read_yaml(ROOT / "configs" / f"{name}.yaml")["description"]
     base = dict(_leaves(dataclasses.asdict(config.thermoxels.config)))
     ours = dict(_leaves(dataclasses.asdict(_object(METHODS[name]).config)))
     # Another class of optimizer has fields of its own, so the two trees are compared without their optimizers.

@@ -235,11 +235,6 @@ class _UniqueKeyLoader(yaml.SafeLoader):
 Config = TypeVar("Config")
 
 
-def read_preset(name: str) -> dict[str, Any]:
-    """Read ``configs/<name>.yaml``, or raise `ThermoxelsError` if the file does not exist or is not a mapping."""
-    return read_yaml(configs_folder() / f"{name}.yaml")
-
-
 def with_overrides(config: Config, overrides: Mapping[str, Any]) -> Config:
     """Return a copy of a (nested) dataclass, or a mapping of dataclasses, with the fields in `overrides` replaced.
 
