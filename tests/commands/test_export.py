@@ -151,9 +151,9 @@ def test_mesh_lies_at_the_input_poses(ball, tmp_path) -> None:
     rotation *= np.sign(np.linalg.det(rotation))
     shift, scale = rng.normal(size=3), 0.37
     camera = np.array([1.0, -2.0, 3.0])  # input coordinates
-    trained = scale * (rotation @ camera + shift)
+    there = scale * (rotation @ camera + shift)
     undo = input_from_world(np.column_stack([rotation, shift]), scale)
-    np.testing.assert_allclose((undo @ [*trained, 1.0])[:3], camera, atol=1e-12)
+    np.testing.assert_allclose((undo @ [*there, 1.0])[:3], camera, atol=1e-12)
 
     options = ExportOptions(metres_per_unit=3.0, pictures=False, boundary="voxel")
     export_scene(trained(ball, world_to_input=undo), options, tmp_path)
