@@ -100,7 +100,7 @@ def test_hook_keeps_members_and_markers(hooked, tmp_path) -> None:
     # FlagConversionOff: booleans take a value, for the stock subcommands and for ours.
     assert exporter.entrypoint(["one", "--deep", "True"]) == exporter.One(True)
     config = tmp_path / "config.yml"
-    config.touch()
+    config.write_text("method_name: probe")
     words = ["thermoxels-mesh", "--load-config", str(config), "--output-dir", "o", "--pictures", "False"]
     assert exporter.entrypoint(words) == ExportThermoxelsMesh(load_config=config, output_dir=Path("o"), pictures=False)
     # Everything else is tyro's.
