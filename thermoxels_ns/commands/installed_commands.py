@@ -103,7 +103,7 @@ def run_command(words: Sequence[str], log: Path, screen: TextIO | None = None) -
             if process.returncode is None:
                 process.terminate()
                 process.wait()
-    if process.returncode != 0:
+    if process.returncode:
         remedy = f"Its whole output is in {log}; its last lines:"
         message = explain(words[0], expected="exit status 0", got=process.returncode, remedy=remedy)
         lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
