@@ -1,5 +1,4 @@
 import json
-import os
 import subprocess
 import sys
 import warnings
@@ -10,7 +9,7 @@ import torch
 from thermoxels_ns import cli
 from thermoxels_ns.commands.installed_commands import CommandFailed
 from thermoxels_ns.core.errors import HeatMemoryError, MemoryBudgetError, SceneError, exit_status
-from thermoxels_ns.core.quiet_warnings import PROGRAMMERS_WARNINGS, environment_value
+from thermoxels_ns.core.quiet_warnings import PROGRAMMERS_WARNINGS
 from thermoxels_ns.synthetic.scene_folder import load_truth
 
 SMALL = ["--num-train", "3", "--num-eval", "1", "--width", "16", "--height", "12"]
@@ -52,13 +51,20 @@ def test_bad_input_is_one_sentence_and_exit_status_2(tmp_path, capsys):
     assert "Traceback" not in shown.out
 
 
-def test_an_interrupted_command_has_its_own_status(monkeypatch, capsys):
-    def interrupt(self):
-        raise KeyboardInterrupt
+@pytest.mark.parametrize(
+    ("problem", "status", "said"),
+    [
+        (KeyboardInterrupt(), 130, "Interrupted.\n"),
+        (MemoryError("Unable to allocate 8 TiB"), 3, "Error: memory does not suffice: Unable to allocate 8 TiB\n"),
+    ],
+)
+def test_an_interrupt_and_a_lack_of_memory_are_one_sentence(monkeypatch, capsys, problem, status, said):
+    def main(self) -> None:
+        raise problem
 
-    monkeypatch.setattr(cli.Demo, "main", interrupt)
-    assert cli.main(["demo"]) == 130
-    assert "Interrupted" in capsys.readouterr().err
+    monkeypatch.setattr(cli.Demo, "main", main)
+    assert cli.main(["demo"]) == status
+    assert capsys.readouterr().err == said
 
 
 @pytest.mark.parametrize(("asked", "seen"), [([], ["another"]), (["default"], ["`torch.jit.script` is deprecated: x"])])
@@ -75,17 +81,6 @@ def test_warnings_for_programmers_are_not_shown_unless_warnings_are_asked_for(mo
         warnings.simplefilter("always")
         cli.entrypoint()
     assert [str(one.message) for one in caught][: len(seen)] == seen
-
-
-def test_commands_that_we_start_hide_the_same_warnings():
-    script = (
-        "import warnings\nfrom thermoxels_ns.core.quiet_warnings import PROGRAMMERS_WARNINGS\n"
-        "for begin, kind in (*PROGRAMMERS_WARNINGS, ('another', FutureWarning)):\n"
-        "    warnings.warn(begin + ' x', kind)\n"
-    )
-    environment = {**os.environ, "PYTHONWARNINGS": environment_value()}
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment)
-    assert done.returncode == 0 and done.stderr.count("Warning") == 1 and "another" in done.stderr
 
 
 def test_the_entry_point_hands_the_status_to_the_shell(tmp_path):
@@ -125,12 +120,3 @@ def test_a_reader_that_has_seen_enough_ends_the_help_without_a_traceback():
 )
 def test_what_ended_a_command_is_its_exit_status(problem, status):
     assert exit_status(problem) == status
-
-
-def test_a_lack_of_memory_is_one_sentence(monkeypatch, capsys):
-    def main(self) -> None:
-        raise MemoryError("Unable to allocate 8 TiB")
-
-    monkeypatch.setattr("thermoxels_ns.commands.demo.Demo.main", main)
-    assert cli.main(["demo"]) == 3
-    assert capsys.readouterr().err == "Error: memory does not suffice: Unable to allocate 8 TiB\n"

@@ -14,7 +14,7 @@ from nerfstudio.configs.method_configs import all_methods
 
 from thermoxels_ns import nerfstudio_bridge
 from thermoxels_ns.commands.export import ExportThermoxelsMesh
-from thermoxels_ns.core.errors import CheckpointError, OutputError
+from thermoxels_ns.core.errors import CheckpointError
 from thermoxels_ns.training.pipeline import load_checkpoint
 
 HEAVY = ("pyvista", "vtk", "vtkmodules", "skfem", "open3d", "pymeshlab", "pycolmap", "numba")
@@ -75,20 +75,6 @@ Commands = tyro.conf.FlagConversionOff[
 def entrypoint(args):
     return tyro.cli(Commands, args=args)
 """
-EVALUATION = """
-import tyro
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Optional
-
-@dataclass
-class ComputePSNR:
-    output_path: Path = Path("output.json")
-    render_output_path: Optional[Path] = None
-
-    def main(self):
-        pass
-"""
 
 
 @pytest.fixture
@@ -114,7 +100,7 @@ def test_hook_keeps_members_and_markers(hooked, tmp_path) -> None:
     # FlagConversionOff: booleans take a value, for the stock subcommands and for ours.
     assert exporter.entrypoint(["one", "--deep", "True"]) == exporter.One(True)
     config = tmp_path / "config.yml"
-    config.touch()
+    config.write_text("method_name: probe")
     words = ["thermoxels-mesh", "--load-config", str(config), "--output-dir", "o", "--pictures", "False"]
     assert exporter.entrypoint(words) == ExportThermoxelsMesh(load_config=config, output_dir=Path("o"), pictures=False)
     # Everything else is tyro's.
@@ -136,25 +122,6 @@ def test_numpy_scalars_load_with_weights_only(tmp_path) -> None:
     nerfstudio_bridge.allow_checkpoint_globals()
     loaded = torch.load(path, weights_only=True)["schedulers"]["_last_lr"]
     assert loaded == numbers and [type(one) for one in loaded] == [type(one) for one in numbers]
-
-
-@pytest.mark.parametrize(
-    ("options", "name"),
-    [
-        (["--output-path", "file/e.json"], "output folder"),
-        (["--output-path", "folder.json"], "output folder"),
-        (["--output-path", "results"], "output_path"),
-        (["--render-output-path", "file"], "output folder"),
-    ],
-)
-def test_an_evaluation_finds_out_first_that_it_cannot_write(tmp_path, monkeypatch, hooked, options, name):
-    monkeypatch.chdir(tmp_path)
-    Path("file").touch()
-    Path("folder.json").mkdir()
-    script = hooked("nerfstudio.scripts.eval", EVALUATION)
-    assert script.tyro.cli(script.ComputePSNR, args=["--output-path", "new/e.json"]).output_path.name == "e.json"
-    with pytest.raises(OutputError, match=f"^{name}: expected"):
-        script.tyro.cli(script.ComputePSNR, args=options)
 
 
 @pytest.mark.parametrize(

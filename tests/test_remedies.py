@@ -2,13 +2,11 @@ import ast
 import contextlib
 import io
 import re
-import sys
 from copy import deepcopy
 from pathlib import Path
 
 import pytest
 import tyro
-import yaml
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 
 import thermoxels_ns
@@ -17,7 +15,6 @@ from thermoxels_ns.commands.export import ExportThermoxelsMesh
 from thermoxels_ns.commands.train_help import TASKS, print_first_page
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.config_loader import typed
-from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.nerfstudio_bridge import METHODS, _with_dataparser_last
 
 PACKAGE = Path(thermoxels_ns.__file__).parent
@@ -105,21 +102,3 @@ def test_our_methods_are_known_by_name():
 def test_typed_options_are_found(monkeypatch):
     monkeypatch.setattr("sys.argv", ["ns-train", "--load_dir", "x", "--optimizers.sh.scheduler.max-steps=3"])
     assert typed("--load-dir") and typed("--optimizers.sh.scheduler") and not typed("--load-step")
-
-
-@pytest.mark.parametrize("field", ["missing_thermal", "downscale_factor", "scene_box", "eval_mode"])
-def test_commands_without_options_of_the_scene_say_where_they_stand(monkeypatch, capsys, field):
-    """ns-eval has no --missing-thermal: it reads config.yml, where the field is found and can be changed."""
-    problem = SceneError("frame 1", expected="x", got="y", remedy=f"Pass --{field.replace('_', '-')} 2.")
-    for command, says in (("ns-eval", True), ("ns-viewer", True), ("ns-train", False), ("thermoxels", False)):
-        monkeypatch.setattr("sys.argv", [f"/usr/bin/{command}"])
-        with pytest.raises(SystemExit) as ended:
-            sys.excepthook(SceneError, problem, None)
-        assert ended.value.code == 2
-        said = capsys.readouterr().err
-        advice = f"{command} has them in config.yml: change {field} there, below dataparser."
-        assert said == f"Error: {problem}{' ' + advice if says else ''}\n"
-    text = yaml.dump(deepcopy(thermoxels.config))
-    below = text[text.index("dataparser:") :]
-    changed = text.replace(below, re.sub(rf"(\b{field}: )[^\n]*(\n +-[^\n]*)*", r"\g<1>marked", below, count=1))
-    assert getattr(yaml.load(changed, Loader=yaml.Loader).pipeline.datamanager.dataparser, field) == "marked"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,29 +65,16 @@ class Scene:
         """
         from threadpoolctl import threadpool_limits
 
-        from thermoxels_ns.commands import export
-        from thermoxels_ns.mesh.build import build_mesh
+        from thermoxels_ns.commands.export import ExportOptions, mesh_of_scene
         from thermoxels_ns.mesh.files.vtu import blocks_of
-        from thermoxels_ns.mesh.quality.report import check_mesh
-        from thermoxels_ns.multiview.evidence import depths_of_dataset
 
         options.setdefault("metres_per_unit", None if "known_distance" in options else self.metres_per_unit)
-        chosen, run, field = export.ExportOptions(**options), self.trained, self.trained.snapshot
-        checked, scene_file = export.check_options(chosen), export.scene_json(run.scene_folder)
-        scale = export.scale_of(chosen, checked, scene_file)
-        metres, unit = (1.0, "input unit") if scale is None else (scale.metres_per_unit, "m")
-        up, up_source = export.up_of(chosen, scene_file, run.viewpoint)
-        to_mesh = np.diag([metres, metres, metres, 1.0]) @ run.world_to_input
+        chosen = ExportOptions(**options)
         with threadpool_limits(1, "blas"):  # with more, the last bits would depend on the number of threads
-            built = build_mesh(
-                field, checked.selection, to_mesh, chosen.boundary, up=up, rules=checked.rules, metres_per_unit=metres
-            )
-            depths = depths_of_dataset(run.dataset, 0.0, field.lattice.lo, field.lattice.hi) if support else None
-            if depths is not None:
-                built = export.with_support(built, depths, run.tracks, field.lattice, to_mesh)
-            report = check_mesh(built.mesh, chosen.boundary, built.observed_range_c, length_unit=unit)
-        about = {"up": up, "up_source": up_source, "length_unit": unit, "options": vars(chosen)}
-        return blocks_of(built.mesh, {**about, "mesh": {"volume": report.volume_m3, "area": report.area_m2}})
+            made = mesh_of_scene(self.trained if support else replace(self.trained, dataset=None), chosen)
+        about = {"up": made.up, "up_source": made.up_source, "length_unit": made.unit, "options": vars(chosen)}
+        size = {"volume": made.report.volume_m3, "area": made.report.area_m2}
+        return blocks_of(made.built.mesh, {**about, "mesh": size})
 
 
 def load(run: Path | str, *, metres_per_unit: float | None = None) -> Scene:

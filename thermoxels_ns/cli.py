@@ -8,7 +8,7 @@ import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, Union
+from typing import Annotated, Union
 
 import tyro
 
@@ -47,10 +47,6 @@ class Synthetic:
     """Width of the photographs, [pixels]."""
     height: int = 240
     """Height of the photographs, [pixels]."""
-    thermal_width: int | None = None
-    """Width of the thermal images, [pixels]; by default --width, or half of it with --own-thermal-camera True."""
-    photo_format: Literal["jpeg", "png"] = "jpeg"
-    """Format of the photographs: JPEG, as cameras write it, or PNG, which is lossless."""
     seed: int = 0
     """Seed of the random numbers of the imperfections; the same seed writes the same files."""
     own_thermal_camera: bool = False
@@ -64,8 +60,6 @@ class Synthetic:
         Raises:
             ThermoxelsError: An option is out of range or the folder cannot be used.
         """
-        from rich.console import Console
-
         from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
         folder = write_scene(
@@ -73,11 +67,7 @@ class Synthetic:
             self.output_dir,
             **{name: value for name, value in vars(self).items() if name not in ("scene", "output_dir")},
         )
-        Console(highlight=False).print(
-            f"Written to {folder}. Train with: ns-train thermoxels --data {shlex.quote(str(folder))}",
-            markup=False,
-            soft_wrap=True,
-        )
+        print(f"Written to {folder}. Train with: ns-train thermoxels --data {shlex.quote(str(folder))}")
 
 
 Commands = tyro.conf.FlagConversionOff[
@@ -107,13 +97,13 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         tyro.cli(Commands, prog="thermoxels", args=arguments, description=about).main()
     except ThermoxelsError as problem:
-        _complain("[bold red]Error:[/bold red]", str(problem))
+        print(f"Error: {problem}", file=sys.stderr)
         return exit_status(problem)
     except MemoryError as problem:
-        _complain("[bold red]Error:[/bold red]", f"memory does not suffice: {problem}")
+        print(f"Error: memory does not suffice: {problem}", file=sys.stderr)
         return exit_status(problem)
     except KeyboardInterrupt:
-        _complain("[bold red]Interrupted.[/bold red]")
+        print("Interrupted.", file=sys.stderr)
         return 130
     return 0
 
@@ -130,13 +120,6 @@ def entrypoint() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = 1
     sys.exit(status)
-
-
-def _complain(heading: str, message: str = "") -> None:
-    from rich.console import Console
-    from rich.markup import escape
-
-    Console(stderr=True, highlight=False).print(f"{heading} {escape(message)}", soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from thermoxels_ns import nerfstudio_bridge
-from thermoxels_ns.core.yaml_records import read_preset, with_overrides
+from thermoxels_ns.core.yaml_records import configs_folder, read_yaml, with_overrides
 from thermoxels_ns.data.datamanager import ThermalDataManagerConfig
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
@@ -68,9 +68,9 @@ def _trainer(
 
 
 def _preset(name: str, *optimizers: type[OptimizerConfig]) -> MethodSpecification:
-    content = read_preset(name)
+    content = read_yaml(configs_folder() / f"{name}.yaml")
     description = content.pop("description")
-    return MethodSpecification(with_overrides(_trainer(*optimizers), content, name), description)
+    return MethodSpecification(with_overrides(_trainer(*optimizers), content), description)
 
 
 thermoxels = MethodSpecification(_trainer(), "RGB and thermal photographs to a voxel model that heat can be solved on.")

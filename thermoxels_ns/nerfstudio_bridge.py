@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import sys
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -16,9 +15,8 @@ import torch
 import tyro
 import yaml
 
-from thermoxels_ns.core.checks import refuse_what_is_in_the_way, writable_folder
 from thermoxels_ns.core.config_loader import ConfigLoader, ModuleWith, check_run
-from thermoxels_ns.core.errors import CRASH, OutputError, SceneError, ThermoxelsError, exit_status
+from thermoxels_ns.core.errors import CRASH, SceneError, ThermoxelsError, exit_status
 
 if TYPE_CHECKING:
     from thermoxels_ns.evaluation.truth_comparison import RenderedRays
@@ -49,7 +47,7 @@ def print_our_errors_plainly() -> None:
 
     def hook(kind: type[BaseException], problem: BaseException, traceback: TracebackType | None) -> None:
         if isinstance(problem, ThermoxelsError):
-            print(f"Error: {problem}{_where_to_say_it(str(problem))}", file=sys.stderr)
+            print(f"Error: {problem}", file=sys.stderr)
         else:
             previous(kind, problem, traceback)
         if exit_status(problem) != CRASH and not hasattr(sys, "ps1"):  # an interactive Python goes on
@@ -72,7 +70,7 @@ def allow_checkpoint_globals() -> None:
 
 
 def extend_commands() -> None:
-    """Add ``thermoxels-mesh`` to ``ns-export``, and make ``ns-*`` commands check their output paths at the start.
+    """Add ``thermoxels-mesh`` to ``ns-export``, and make ``ns-*`` commands look for all parts of a run at the start.
 
     nerfstudio's scripts call ``tyro.cli`` when they start. Where the script of export, train, eval, render or viewer is
     loaded, as a module or as ``__main__``, its name `tyro` is bound to a copy whose `cli`, our `_cli`, does this.
@@ -89,7 +87,7 @@ def extend_commands() -> None:
 
 
 def _cli(script: ModuleType, name: str, f: Any, *, args: Sequence[str] | None = None, **kwargs: Any) -> Any:
-    """Return the command that `tyro.cli` parses; raise `OutputError` if its results could not be written.
+    """Return the command that `tyro.cli` parses; raise `CheckpointError` if it loads a run of which something lacks.
 
     ns-export gets our subcommand too; with ns-train, options of our dataparser may stand anywhere after the method, and
     --help shows one page, --help-all every option.
@@ -108,15 +106,6 @@ def _cli(script: ModuleType, name: str, f: Any, *, args: Sequence[str] | None = 
     command = tyro.cli(_with_mesh_export(f) if stock else f, args=words, **kwargs)
     if name != _TRAIN and isinstance(config := getattr(command, "load_config", None), Path):
         check_run(config)
-        ConfigLoader.run_folder = config.parent
-    for name in ("output_path", "output_dir", "render_output_path"):
-        path = getattr(command, name, None)
-        if isinstance(path, Path) and callable(getattr(command, "main", None)):
-            file = path if path.suffix and name == "output_path" else None
-            refuse_what_is_in_the_way(writable_folder(path.parent if file else path), [file.name] if file else [])
-    if hasattr(command, "render_output_path") and command.output_path.suffix != ".json":
-        got, remedy = repr(command.output_path.name), "Pass --output-path eval.json."
-        raise OutputError("output_path", expected="a name that ends in .json", got=got, remedy=remedy)
     return command
 
 
@@ -128,34 +117,19 @@ def _with_dataparser_last(words: list[str]) -> list[str]:
     """
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
-    ours = _dataparser_options()
+    from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+
+    names = {field.name for field in dataclasses.fields(ThermalDataParserConfig)} - {"data"}
     if not words or words[0] not in METHODS or (all_dataparsers.keys() - {_DATAPARSER}) & set(words):
         return words
     kept, moved, behind = list[str](), list[str](), False
     for word in words:
         if word.startswith("--"):
-            behind = word.partition("=")[0].replace("_", "-") in ours
+            behind = word[2:].partition("=")[0].replace("-", "_") in names
         elif word == _DATAPARSER:
             behind = False
         (moved if behind else kept).append(word)
     return [*kept, *([_DATAPARSER] if moved and _DATAPARSER not in kept else []), *moved]
-
-
-def _dataparser_options() -> dict[str, str]:
-    """Return the field names of our dataparser's config by their ns-train options, such as "--missing-thermal"."""
-    from thermoxels_ns.data.dataparser import ThermalDataParserConfig
-
-    names = (field.name for field in dataclasses.fields(ThermalDataParserConfig))
-    return {f"--{name.replace('_', '-')}": name for name in names if name != "data"}
-
-
-def _where_to_say_it(problem: str) -> str:
-    """Return a hint to config.yml if a message names ns-train options that the running command lacks, else ""."""
-    command, words = Path(sys.argv[0]).name, re.findall(r"--[a-z-]*[a-z]", problem)
-    named = [field for option, field in _dataparser_options().items() if option in words]
-    if not named or command not in ("ns-eval", "ns-export", "ns-render", "ns-viewer"):
-        return ""
-    return f" {command} has them in config.yml: change {', '.join(named)} there, below dataparser."
 
 
 def _with_mesh_export(commands: Any) -> Any:
@@ -174,14 +148,8 @@ def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
 
     See `geometry_metrics` and `depth_metrics`, which `training` may not import; no figures without an exact scene.
     """
-    from nerfstudio.utils.rich_utils import CONSOLE
-    from rich.markup import escape
-
     from thermoxels_ns.core.lattice import input_from_world
     from thermoxels_ns.evaluation.truth_comparison import depth_metrics, geometry_metrics, load_known_truth
-
-    def say(line: str) -> None:
-        CONSOLE.print(escape(line))
 
     datamanager: Any = pipeline.datamanager
     outputs = datamanager.train_dataparser_outputs
@@ -191,9 +159,9 @@ def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
         if known is None:
             return {}
         # The snapshot has the rays' evidence and the cameras, which decide what is solid, as in an export.
-        figures = geometry_metrics(pipeline.grid_snapshot(), world_to_input, known, say)
+        figures = geometry_metrics(pipeline.grid_snapshot(), world_to_input, known)
     except SceneError as problem:
-        say(f"Geometry is not compared with the truth: {problem}")
+        print(f"Geometry is not compared with the truth: {problem}")
         return {}
     return figures | depth_metrics(_held_out_rays(pipeline), pipeline.model.grid.lattice, world_to_input, known.scene)
 

@@ -8,7 +8,6 @@ import time
 import types
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -97,12 +96,10 @@ def trained(
 
 def run_quietly(command: Sequence[str], log: Path) -> None:
     """Run a command of this installation, whose words go to `log`."""
-    from rich.console import Console
-
     from thermoxels_ns.commands.installed_commands import run_command
 
     log.parent.mkdir(parents=True, exist_ok=True)
-    run_command(list(command), log, Console(file=StringIO(), width=200))
+    run_command(list(command), log)
 
 
 def train_and_evaluate(

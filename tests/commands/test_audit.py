@@ -218,7 +218,7 @@ def test_what_is_missing_is_named(given, name) -> None:
 
 
 def test_results_of_other_commands_are_not_replaced(export, tmp_path) -> None:
-    (tmp_path / "summary.json").write_text("{}")
+    (tmp_path / "answers.json").write_text("{}")
     with pytest.raises(OutputError, match=r"^output folder: expected"):
         run_audit(Audit(export / "mesh.vtu", export / "conditions.yaml", tmp_path))
 

@@ -20,31 +20,8 @@ from thermoxels_ns.synthetic.drawn_scenes import BRIDGE_PSI_W_MK
 from thermoxels_ns.training.schedule import QUALITIES
 
 PATCHES = configs_folder() / "house-corner-patches.yaml"
-IMAGES = {
-    "psnr": 28.0,
-    "ssim": 0.9,
-    "thermal_mae_c": 0.5,
-    "thermal_mae_hit_c": 0.75,
-}
-SUMMARY = {
-    "truth": {
-        "tolerance_voxels": 1.5,
-        "fscore": 0.9,
-        "precision": 0.95,
-        "recall": 0.85,
-        "voxel_size_m": 0.017,
-        "mesh_volume_m3": 0.08,
-        "chamfer_voxels": 0.5,
-        "chamfer_m": 0.03,
-        "temperature_seen_mae_c": 0.2,
-        "share_of_seen_reached": 0.97,
-        "true_volume_m3": 0.09,
-        "mesh_area_m2": 3.5,
-        "true_area_m2": 2.5,
-    },
-    "heat": {"energy_residual": 2e-14},
-    "mesh": {"tets": 60000, "share_of_nodes_observed": 0.6},
-}
+IMAGES = {"psnr": 28.0, "thermal_mae_c": 0.5}
+SUMMARY = {"truth": {"tolerance_voxels": 1.5, "fscore": 0.9}}
 
 
 def test_only_the_folder_of_a_demo_is_cleared_and_of_what_the_demo_wrote_only(tmp_path):
@@ -80,7 +57,7 @@ def test_the_commands_take_what_the_commands_before_them_wrote():
 def test_the_tables_of_the_docs_name_the_sizes_and_the_targets_of_the_demo(tmp_path):
     (tmp_path / "eval.json").write_text(json.dumps({"results": IMAGES}))
     (tmp_path / "summary.json").write_text(json.dumps(SUMMARY))
-    targets, _ = read_results(tmp_path / "eval.json", tmp_path / "summary.json")
+    targets = read_results(tmp_path / "eval.json", tmp_path / "summary.json")
     tools = Path(__file__).parents[2] / "tools"
     stated = [
         row.target.split() for row in run_path(str(tools / "figures.py"))["ROWS"] if row.target not in ("", "all")
@@ -116,7 +93,6 @@ def quick_demo(fake_command, monkeypatch):
             + picture
             + "folder = after('--output-dir')\nos.makedirs(folder)\n"
             + "for name in ('mesh', 'mesh-measured'): Image.new('RGB', (8, 6)).save(f'{folder}/{name}.png')\n"
-            + "Image.new('RGB', (24, 6), 'red').save(f'{folder}/heat.png')\n"
             + f"nan = float('nan')\njson.dump({summary}, open(f'{{folder}}/summary.json', 'w'))",
         )
 
@@ -147,13 +123,11 @@ def test_the_whole_demo_leaves_a_page(quick_demo, tmp_path, capfd):
         assert f"$ {word} " in out
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "Thermoxels demo: house-corner" in page
-    assert page.count("<img") == 3 + 2 * 6 + 4 * 2 + 2 + 1
+    assert page.count("<img") == 3 + 2 * 6 + 4 * 2 + 1 + 1
     assert ">-20.0<" in page and ">15.0\xa0°C<" in page  # the bounds of the house's temperatures
-    assert page.count(">yes<") == 5 + len(true_u_of_patches(PATCHES)) + 1 and ">no<" not in page
+    assert page.count(">yes<") == 4 + len(true_u_of_patches(PATCHES)) + 1 and ">no<" not in page
     assert page.index(">Result<") < page.index("Audit: the truth beside the answer") < page.index("What went in")
     assert (folder / "survey" / "conditions.yaml").is_file()
-    for figure in ("17.0 mm", "0.50 voxels, 30.0 mm", "0.20 °C (97 % of the surface)", "0.08 m³ (true: 0.09 m³)"):
-        assert figure in page
     assert f"ns-viewer --load-config {folder}/outputs/demo/thermoxels/run/config.yml" in page
     assert sorted(path.name for path in (folder / "logs").iterdir()) == [
         *("audit.log", "heat.log", "ns-eval.log", "ns-export-walls.log", "ns-export.log", "ns-render.log"),

@@ -5,7 +5,6 @@ import sys
 import tempfile
 from dataclasses import fields
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,16 +17,17 @@ from tests.support.unreadable import files_end_after
 from thermoxels_ns.commands.export import (
     ExportOptions,
     ExportThermoxelsMesh,
+    TrainedScene,
     Viewpoint,
     check_options,
-    export_snapshot,
+    export_scene,
     scene_json,
     viewpoint_of_cameras,
 )
 from thermoxels_ns.core.errors import CheckpointError, MeshError, OutputError, SceneError, ThermoxelsError
 from thermoxels_ns.core.lattice import Lattice, input_from_world
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.fem.problem import TimeSteps
+from thermoxels_ns.mesh.boundary.patches import PatchRules
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import depths_of
@@ -46,7 +46,14 @@ def ball() -> GridSnapshot:
     return GridSnapshot(lattice, density, temperature, np.where(radius < UNSEEN, 0.0, 9.0).astype(np.float32))
 
 
-SCALED = {"metres_per_unit": 1.0, "steps": 1}
+SCALED = {"metres_per_unit": 1.0}
+OPTIONS = {field.name for field in fields(ExportOptions)}
+
+
+def trained(snapshot: GridSnapshot, **more) -> TrainedScene:
+    """A trained field without photographs and without a scene's json."""
+    known = {"world_to_input": np.eye(4), "viewpoint": Viewpoint(), "scene_folder": Path("no/scene"), "dataset": None}
+    return TrainedScene(snapshot, **{**known, "tracks": None, "corrections": {}, **more})
 
 
 def read(folder: Path) -> dict:
@@ -72,36 +79,29 @@ def drawn(monkeypatch) -> list:
 
 @pytest.fixture
 def small(ball, tmp_path):
-    """Gives a function that exports the ball, by default without pictures and with one step in metres."""
+    """Gives a function that exports the ball, by default without pictures and in metres."""
 
-    def export(**more) -> dict:
+    def export(say=lambda _: None, **more) -> dict:
         options = {**SCALED, "pictures": False, **{k: v for k, v in more.items() if k in OPTIONS}}
-        others = {k: v for k, v in more.items() if k not in OPTIONS}
-        return export_snapshot(ball, np.eye(4), ExportOptions(**options), tmp_path, **others)
+        run = trained(ball, **{k: v for k, v in more.items() if k not in OPTIONS})
+        return export_scene(run, ExportOptions(**options), tmp_path, say)
 
     return export
 
 
-OPTIONS = {field.name for field in fields(ExportOptions)}
+@pytest.fixture
+def truth(monkeypatch):
+    """Gives a function that replaces the comparison with the exact scene."""
+    return lambda compare: monkeypatch.setattr("thermoxels_ns.evaluation.truth_comparison.compare_with_truth", compare)
 
 
 def test_full_export(ball, tmp_path) -> None:
-    lines: list[str] = []
-    options = ExportOptions(
-        metres_per_unit=2.0,
-        steps=3,
-        density_percentile=80.0,
-        boundary="voxel",
-        interior="hollow",
-        vtk_times=(70.0,),
-    )
+    options = ExportOptions(metres_per_unit=2.0, density_percentile=80.0, boundary="voxel", interior="hollow")
     folder = tmp_path / "new" / "folder"
-    export_snapshot(ball, np.eye(4), options, folder, lines.append)
+    export_scene(trained(ball), options, folder)
     summary = read(folder)
     assert set(contents(folder)) == set(summary["files"])
-    assert {"mesh.vtu", "mesh.png", "heat.pvd", "heat.png", "heat/step-0002.vtu", "summary.json"} <= set(
-        contents(folder)
-    )
+    assert {"mesh.vtu", "mesh.png", "quality.json", "summary.json"} <= set(contents(folder))
     grid = pyvista.read(folder / "mesh.vtu")
     assert (grid.n_points, grid.n_cells) == (summary["mesh"]["nodes"], summary["mesh"]["tets"])
     assert summary["mesh"]["tets"] == 6 * summary["mesh"]["voxels"]
@@ -109,55 +109,33 @@ def test_full_export(ball, tmp_path) -> None:
     assert summary["mesh"]["volume"] == pytest.approx(summary["mesh"]["voxels"] * 0.2**3)
     assert summary["mesh"]["voxels"] == pytest.approx(0.2 * 12**3, rel=0.15)
     assert 0.0 < summary["mesh"]["share_of_nodes_observed"] < 1.0
-    assert summary["length_unit"] == "m" and summary["options"]["steps"] == 3
+    assert summary["length_unit"] == "m" and summary["options"]["boundary"] == "voxel"
     assert {"thermoxels", "python", "numpy", "torch", "nerfstudio", "pyvista", "scikit-fem"} <= set(summary["versions"])
-    assert pyvista.PVDReader(folder / "heat.pvd").time_values == [0.0, 60.0, 180.0]
-    heat = summary["heat"]
-    concrete = {"conductivity_w_mk": 1.7, "density_kg_m3": 2200.0, "specific_heat_j_kgk": 880.0}
-    assert heat["material"] == {"name": "concrete"} | concrete
-    assert heat["time"] == {"steps": 3, "step_seconds": 60.0}
-    assert abs(heat["energy_after_j"] / heat["energy_before_j"] - 1.0) < 1e-9
-    assert heat["energy_residual"] < 1e-9 and "converged" in heat["status"]
-    # Mean temperature of the ball is 20 C: its heat content is volume * rho c * 293.15 K.
-    expected = summary["mesh"]["volume"] * 2200.0 * 880.0 * 293.15
-    assert heat["energy_before_j"] == pytest.approx(expected, rel=1e-6)
-    assert heat["temperature_c"]["after"]["max"] < heat["temperature_c"]["before"]["max"]
-    assert any("converged" in line for line in lines)
 
 
-def test_without_a_scale_heat_is_skipped_and_the_message_says_what_to_pass(ball, tmp_path, drawn) -> None:
-    export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
-    assert {"mesh.png", "mesh-measured.png", "heat.png", "heat.pvd"} <= set(contents(tmp_path))
+def test_without_a_scale_the_message_says_what_to_pass(ball, tmp_path, drawn) -> None:
+    export_scene(trained(ball), ExportOptions(**SCALED), tmp_path)
+    assert {"mesh.png", "mesh-measured.png"} <= set(contents(tmp_path))
     (tmp_path / "mine.png").touch()
     lines: list[str] = []
-    summary = export_snapshot(ball, np.eye(4), ExportOptions(pictures=False), tmp_path, lines.append)
-    assert any("--metres-per-unit" in line for line in lines)
-    assert summary["heat"]["computed"] is False and "--metres-per-unit" in summary["heat"]["reason"]
-    assert summary["length_unit"] == "input unit"
-    # Heat and pictures of an earlier export belong to another mesh.
+    summary = export_scene(trained(ball), ExportOptions(pictures=False), tmp_path, lines.append)
+    assert any("--metres-per-unit" in line for line in lines) and summary["length_unit"] == "input unit"
+    # Pictures of an earlier export show another mesh.
     assert "mesh.vtu" in summary["files"] and set(contents(tmp_path)) == {*summary["files"], "mine.png"}
-
-
-def test_small_changes_fill_their_own_symmetric_scale(ball, tmp_path, drawn) -> None:
-    export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
-    (before, first), (after, last), (change, look) = drawn[3:]
-    assert first["clim"] == last["clim"]
-    np.testing.assert_array_equal(change, after - before)
-    low, high = look["clim"]
-    assert -low == high and 0.0 < high < 0.1 * np.ptp(first["clim"]) and look["bar_title"] == "change [K]"
-    assert Image.open(tmp_path / "heat.png").size == (24, 6)
 
 
 def test_torch_s_compiler_still_loads_after_drawing() -> None:
     """Mesa's LLVM and triton's crash the process if pictures come first; the export sees to the order."""
     code = """
+from pathlib import Path
 import numpy as np
-from thermoxels_ns.commands.export import ExportOptions, export_snapshot
+from thermoxels_ns.commands.export import ExportOptions, TrainedScene, Viewpoint, export_scene
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 ones = np.ones((3, 3, 3), np.float32)
 ball = GridSnapshot(Lattice((0.0, 0.0, 0.0), 1.0, (3, 3, 3)), ones, 20 * ones, ones)
-export_snapshot(ball, np.eye(4), ExportOptions(density_threshold=0.5), "out")
+run = TrainedScene(ball, np.eye(4), Viewpoint(), Path("no/scene"), None, None, {})
+export_scene(run, ExportOptions(density_threshold=0.5), "out")
 import torch._dynamo
 print("alive")
 """
@@ -173,12 +151,12 @@ def test_mesh_lies_at_the_input_poses(ball, tmp_path) -> None:
     rotation *= np.sign(np.linalg.det(rotation))
     shift, scale = rng.normal(size=3), 0.37
     camera = np.array([1.0, -2.0, 3.0])  # input coordinates
-    trained = scale * (rotation @ camera + shift)
+    there = scale * (rotation @ camera + shift)
     undo = input_from_world(np.column_stack([rotation, shift]), scale)
-    np.testing.assert_allclose((undo @ [*trained, 1.0])[:3], camera, atol=1e-12)
+    np.testing.assert_allclose((undo @ [*there, 1.0])[:3], camera, atol=1e-12)
 
-    options = ExportOptions(metres_per_unit=3.0, pictures=False, steps=1, boundary="voxel")
-    export_snapshot(ball, undo, options, tmp_path)
+    options = ExportOptions(metres_per_unit=3.0, pictures=False, boundary="voxel")
+    export_scene(trained(ball, world_to_input=undo), options, tmp_path)
     points = pyvista.read(tmp_path / "mesh.vtu").points / 3.0
     back = scale * (points @ rotation.T + shift)
     index = ball.lattice.world_to_index(back)
@@ -205,18 +183,13 @@ def test_impossible_dataparser_transforms_are_refused(transform, scale) -> None:
         ({"formats": ("inp",)}, "scale"),
         ({"wall_thickness": 0.3}, "scale"),
         ({"density_percentile": 101.0}, "density_percentile"),
-        ({"heat_preset": "cheese"}, "heat scene"),
-        ({"heat_preset": "winter-night"}, "heat_preset"),
-        ({"step_seconds": -1.0}, "step_seconds"),
         ({"up": (0.0, 0.0, 0.0)}, "up"),
     ],
 )
-def test_wrong_options_are_refused_before_anything_runs(ball, tmp_path, options, name) -> None:
-    with pytest.raises(ThermoxelsError, match=f"{name}: expected") as refusal:
-        export_snapshot(ball, np.eye(4), ExportOptions(**options), tmp_path / "out")
-    if name == "density_percentile":
-        assert "--density-percentile" in str(refusal.value), "an option is named as it is typed"
-    assert not (tmp_path / "out").exists()
+def test_wrong_options_are_refused_and_nothing_is_written(ball, tmp_path, options, name) -> None:
+    with pytest.raises(ThermoxelsError, match=f"{name}: expected"):
+        export_scene(trained(ball), ExportOptions(**options), tmp_path / "out")
+    assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
 @pytest.mark.parametrize(
@@ -229,16 +202,15 @@ def test_wrong_options_are_refused_before_anything_runs(ball, tmp_path, options,
     ],
 )
 def test_the_command_line_gives_the_preset_but_for_what_is_said(words, changed) -> None:
-    checked = check_options(tyro.cli(ExportThermoxelsMesh, args=["--load-config", "c", "--output-dir", "o", *words]))
-    assert checked.selection == SolidSelection(**changed) and checked.distance is None
-    assert (checked.material.name, checked.time) == ("concrete", TimeSteps(10, 60.0))
+    options = tyro.cli(ExportThermoxelsMesh, args=["--load-config", "c", "--output-dir", "o", *words])
+    assert check_options(options) == (SolidSelection(**changed), PatchRules(), None)
 
 
 def test_a_region_is_exported_said_and_drawn(ball, tmp_path, drawn) -> None:
     """Half of the ball, in the coordinates of input poses that are twice as far apart."""
     lines: list[str] = []
-    options = ExportOptions(metres_per_unit=0.5, region_box=(0.0, -2.0, -2.0, 2.0, 2.0, 2.0), steps=1)
-    summary = export_snapshot(ball, np.diag([2.0, 2.0, 2.0, 1.0]), options, tmp_path, lines.append)
+    options = ExportOptions(metres_per_unit=0.5, region_box=(0.0, -2.0, -2.0, 2.0, 2.0, 2.0))
+    summary = export_scene(trained(ball, world_to_input=np.diag([2.0, 2.0, 2.0, 1.0])), options, tmp_path, lines.append)
     region = summary["region"]
     assert region["asked_for"] == "a box" and region["share_of_solid_taken"] == pytest.approx(0.5)
     assert region["voxels_taken"] == region["voxels_left_out"] > 0
@@ -250,39 +222,39 @@ def test_a_region_is_exported_said_and_drawn(ball, tmp_path, drawn) -> None:
     assert summary["mesh"]["patches"]["cut"] == pytest.approx(np.pi * 0.5**2, rel=0.2)
 
 
-def test_truth_and_viewpoint_reach_the_summary_and_the_pictures(ball, tmp_path, drawn) -> None:
+def test_truth_and_viewpoint_reach_the_summary_and_the_pictures(ball, tmp_path, drawn, truth) -> None:
     look = Viewpoint(up=(0.0, 1.0, 0.0), view_direction=(0.0, 0.0, -1.0))
     options = ExportOptions(density_threshold=4.0)
     asked = []
 
-    def compare(solid, mesh, metres):
-        assert metres == 1.0
-        asked.append((int(solid.cells.sum()), len(mesh.tets)))
+    def compare(cells, lattice, world_to_truth, folder, mesh, metres, within):
+        assert metres == 1.0 and lattice == ball.lattice and within.shape == cells.shape
+        asked.append((int(cells.sum()), len(mesh.tets)))
         return {"fscore": 0.5}
 
-    unscaled = export_snapshot(ball, np.eye(4), options, tmp_path, viewpoint=look, compare=compare)
+    truth(compare)
+    unscaled = export_scene(trained(ball, viewpoint=look), options, tmp_path)
     assert not asked and "truth" not in unscaled  # a truth is in metres
     assert {(v["up"], v["view_direction"], v["length_unit"]) for _, v in drawn} == {
         (look.up, look.view_direction, "input unit")
     }
-    options = ExportOptions(density_threshold=4.0, pictures=False, **SCALED)
-    export_snapshot(ball, np.eye(4), options, tmp_path, compare=compare)
+    export_scene(trained(ball), ExportOptions(density_threshold=4.0, pictures=False, **SCALED), tmp_path)
     assert asked[0][0] > 0 and asked[0][1] > 6 * asked[0][0] and read(tmp_path)["truth"] == {"fscore": 0.5}
 
 
-def test_a_failed_export_leaves_the_earlier_one_untouched(ball, tmp_path, drawn) -> None:
+def test_a_failed_export_leaves_the_earlier_one_untouched(ball, tmp_path, drawn, truth) -> None:
     """Found at the last moment before files are written: json has no NaN."""
-    export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+    export_scene(trained(ball), ExportOptions(**SCALED), tmp_path)
     before = contents(tmp_path)
-    options = ExportOptions(density_threshold=6.0, **SCALED)
+    truth(lambda *_, **__: {"fscore": float("nan")})
     with pytest.raises(ThermoxelsError):
-        export_snapshot(ball, np.eye(4), options, tmp_path, compare=lambda *_: {"fscore": float("nan")})
+        export_scene(trained(ball), ExportOptions(density_threshold=6.0, **SCALED), tmp_path)
     assert contents(tmp_path) == before
 
 
 def test_export_interrupted_while_writing_leaves_no_summary(ball, tmp_path, monkeypatch, drawn) -> None:
     """So a folder with a summary is never a mixture."""
-    export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+    export_scene(trained(ball), ExportOptions(**SCALED), tmp_path)
 
     def interrupt(*_, **__) -> None:
         assert not (tmp_path / "summary.json").exists()
@@ -290,48 +262,49 @@ def test_export_interrupted_while_writing_leaves_no_summary(ball, tmp_path, monk
 
     monkeypatch.setattr("thermoxels_ns.mesh.files.formats.write_mesh", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+        export_scene(trained(ball), ExportOptions(**SCALED), tmp_path)
     assert not (tmp_path / "summary.json").exists()
 
 
 @pytest.fixture(scope="module")
 def exported(ball, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("exported")
-    export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), folder)
+    export_scene(trained(ball), ExportOptions(**SCALED), folder)
     return folder
 
 
 @pytest.mark.parametrize(
     ("size_bytes", "broken"),
-    [(1000, "quality.json"), (75_000, "mesh.vtu"), (83_000, "step-0001.vtu"), (120_000, r"mesh.*\.png")],
+    [(1000, "quality.json"), (75_000, "mesh.vtu"), (120_000, r"mesh.*\.png")],
 )
 def test_a_full_disk_is_one_line_and_leaves_no_half_of_a_file(ball, exported, tmp_path, size_bytes, broken) -> None:
     shutil.copytree(exported, tmp_path, dirs_exist_ok=True)
     (tmp_path / "mine.txt").write_text("mine")
     before = contents(tmp_path)
     with files_end_after(size_bytes), pytest.raises(OutputError, match=rf"{broken}.*space") as caught:
-        export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+        export_scene(trained(ball), ExportOptions(**SCALED), tmp_path)
     assert "\n" not in str(caught.value)
     after = contents(tmp_path)
     assert "summary.json" not in after and after["mine.txt"] == before["mine.txt"]
     assert {name: before[name] for name in after} == after  # the same again, whether they are old or new
 
 
-@pytest.mark.parametrize("name", ["mesh.vtu/", "summary.json/", "heat.png/", "answers.json", "heat.pvd", "mesh.stl"])
+@pytest.mark.parametrize("name", ["mesh.vtu/", "summary.json/", "mesh.stl"])
 def test_files_of_others_and_folders_in_the_place_of_files_are_found_first(ball, tmp_path, name) -> None:
     path = tmp_path / name
     path.mkdir() if name.endswith("/") else path.write_text("mine")
     with pytest.raises(OutputError, match=f"got {path.name}"):
-        export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+        export_scene(trained(ball), ExportOptions(**SCALED), tmp_path)
     assert [one.name for one in tmp_path.rglob("*")] == [path.name] and (path.is_dir() or path.read_text() == "mine")
 
 
-def test_truth_that_cannot_be_used_does_not_cost_the_export(small, tmp_path) -> None:
-    def compare(*_):
+def test_truth_that_cannot_be_used_does_not_cost_the_export(small, tmp_path, truth) -> None:
+    def compare(*_, **__):
         raise SceneError("transforms.json: expected a scene. Write it again.")
 
+    truth(compare)
     lines: list[str] = []
-    small(say=lines.append, compare=compare)
+    small(lines.append)
     assert read(tmp_path)["truth"] == {"error": "transforms.json: expected a scene. Write it again."}
     assert any("Not compared with the truth: transforms.json" in line for line in lines)
 
@@ -341,11 +314,10 @@ def test_the_scene_json_may_begin_with_the_mark_that_windows_editors_write(tmp_p
     assert scene_json(tmp_path) == scene_json(tmp_path / "transforms.json") == {"metres_per_unit": 2.0}
 
 
-def test_summary_says_that_only_the_shell_is_there(ball, tmp_path) -> None:
+def test_summary_says_how_much_of_the_surface_was_measured(ball, tmp_path) -> None:
     seen_half = np.where(ball.lattice.corner_positions()[..., 0] < 0.01, 9.0, 0.0).astype(np.float32)
     half = GridSnapshot(ball.lattice, ball.density, ball.temperature_c, seen_half)
-    summary = export_snapshot(half, np.eye(4), ExportOptions(pictures=False, **SCALED), tmp_path)
-    assert any("The heat content is that of the mesh" in text for text in summary["heat"]["skipped_effects"])
+    summary = export_scene(trained(half), ExportOptions(pictures=False, **SCALED), tmp_path)
     grid = pyvista.read(tmp_path / "mesh.vtu").extract_surface(algorithm=None).compute_cell_sizes()
     seen = grid.point_data["observed"][grid.regular_faces].all(axis=1)
     share = grid.cell_data["Area"][~seen].sum() / grid.area
@@ -377,85 +349,28 @@ def test_up_of_cameras_that_look_down_is_that_of_their_level_pictures() -> None:
     assert one_way.up == pytest.approx((0.0, np.sqrt(0.75), 0.5)) and "the mean" in one_way.up_source
 
 
-def test_up_can_be_given(small) -> None:
-    summary = small(up=(0.0, 0.0, -2.0), scene_file={"up": [0.0, 1.0, 0.0]})
+def test_up_can_be_given(small, tmp_path_factory) -> None:
+    scene = tmp_path_factory.mktemp("scene")
+    (scene / "transforms.json").write_text('{"up": [0.0, 1.0, 0.0]}')
+    summary = small(up=(0.0, 0.0, -2.0), scene_folder=scene)
     assert summary["up"] == (0.0, 0.0, -1.0) and "--up" in summary["up_source"] and "up" not in summary["scale"]
 
 
-@pytest.fixture
-def config_file(tmp_path) -> Path:
-    path = tmp_path / "config.yml"
-    path.write_text("probe")
-    return path
-
-
-@pytest.mark.parametrize(
-    ("fail", "named"),
-    [
-        (RuntimeError("Error(s) in loading state_dict"), "checkpoint: expected the parameters"),
-        (AssertionError("not a TrainerConfig"), "load_config: expected"),
-        (KeyError("some-method"), "load_config: expected"),
-        (CheckpointError("checkpoint: expected a voxel grid"), "checkpoint: expected a voxel grid"),
-        (ZeroDivisionError("a bug"), None),
-    ],
-)
-def test_main_prints_one_clean_error_and_exits_1_but_hides_no_bug(
-    tmp_path, config_file, monkeypatch, capsys, fail, named
-) -> None:
-    def eval_setup(*_, **__):
-        raise fail
-
-    monkeypatch.setattr("nerfstudio.utils.eval_utils.eval_setup", eval_setup)
-    with pytest.raises(SystemExit if named else ZeroDivisionError) as ended:
-        ExportThermoxelsMesh(load_config=config_file, output_dir=tmp_path / "out").main()
-    if named:
-        assert isinstance(ended.value, SystemExit) and ended.value.code == 2
-        printed = " ".join(capsys.readouterr().out.split())
-        assert f"Error: {named}" in printed and "Traceback" not in printed
-
-
-@pytest.mark.parametrize(
-    ("scene", "problem"),
-    [
-        ({}, MeshError),
-        ({"metres_per_unit": 0.5}, ZeroDivisionError),
-    ],
-)
-def test_a_missing_scale_is_refused_before_anything_is_loaded(
-    tmp_path, config_file, monkeypatch, scene, problem
-) -> None:
-    """Only where the scene's json is known to have none; a damaged one is left to who reads the scene."""
-    (tmp_path / "transforms.json").write_text(json.dumps(scene))
-    manager = SimpleNamespace(data=None, dataparser=SimpleNamespace(data=tmp_path))
-    ours = SimpleNamespace(_target=type("Ours", (), {"grid_snapshot": lambda self: None}), datamanager=manager)
-    config = SimpleNamespace(pipeline=ours, method_name="probe")
-
-    def setup(path, test_mode, update_config_callback):
-        update_config_callback(config)
-        raise ZeroDivisionError("the checkpoint is loaded")
-
-    monkeypatch.setattr("nerfstudio.utils.eval_utils.eval_setup", setup)
-    command = ExportThermoxelsMesh(load_config=config_file, output_dir=tmp_path / "out", formats=("vtu", "inp"))
-    with pytest.raises(problem):
-        command.run(lambda _: None)
-
-
 @pytest.mark.parametrize("text", ["just words", "", "# a comment", "a: [", "!!python/object:no.such.Thing {}"])
-def test_garbage_config_file(tmp_path, config_file, text) -> None:
-    config_file.write_text(text)
+def test_garbage_config_file(tmp_path, text) -> None:
+    (tmp_path / "config.yml").write_text(text)
     with pytest.raises(CheckpointError, match=r"^load_config: expected"):
-        ExportThermoxelsMesh(load_config=config_file, output_dir=tmp_path / "out").run(lambda _: None)
+        ExportThermoxelsMesh(load_config=tmp_path / "config.yml", output_dir=tmp_path / "out").main()
 
 
 def test_every_format_is_written_and_leaves_with_the_next_export(ball, tmp_path) -> None:
     formats = ("vtu", "xdmf", "msh", "inp", "stl", "ply", "glb")
-    options = ExportOptions(metres_per_unit=1.0, steps=1, pictures=False, formats=formats)
-    summary = export_snapshot(ball, np.eye(4), options, tmp_path)
+    summary = export_scene(trained(ball), ExportOptions(pictures=False, formats=formats, **SCALED), tmp_path)
     assert {f"mesh.{name}" for name in formats} | {"mesh.h5", "mesh-boundary.vtp", "quality.json"} < set(
         contents(tmp_path)
     )
     assert set(contents(tmp_path)) == set(summary["files"])
-    summary = export_snapshot(ball, np.eye(4), ExportOptions(pictures=False, formats=("stl",)), tmp_path)
+    summary = export_scene(trained(ball), ExportOptions(pictures=False, formats=("stl",)), tmp_path)
     assert sorted(contents(tmp_path)) == summary["files"] == ["mesh.stl", "quality.json", "summary.json"]
 
 
@@ -463,16 +378,18 @@ def test_scale_from_a_known_distance(small, tmp_path) -> None:
     known: dict = {"known_distance": (0.0, 0.0, 0.0, 0.0, 3.0, 4.0, 10.0), "metres_per_unit": None}
     summary = small(**known)
     assert summary["scale"]["metres_per_unit"] == pytest.approx(2.0)
-    assert (summary["length_unit"], summary["heat"]["computed"]) == ("m", True)
+    assert summary["length_unit"] == "m"
     extent = np.ptp(pyvista.read(tmp_path / "mesh.vtu").points, axis=0)
     assert extent == pytest.approx(np.full(3, 2.0), abs=0.25)  # a ball of radius 0.5 units
     mesh = small(known_distance_error=0.1, **known)["mesh"]
     assert mesh["volume_standard_error"] == pytest.approx(0.03 * mesh["volume"])
 
 
-def test_scale_and_up_from_the_scene_file(small, tmp_path) -> None:
+def test_scale_and_up_from_the_scene_file(small, tmp_path, tmp_path_factory) -> None:
     scene = {"metres_per_unit": 0.5, "metres_per_unit_standard_error": 0.01, "up": [0.0, 2.0, 0.0], "frames": []}
-    summary = small(metres_per_unit=None, scene_file=scene)
+    folder = tmp_path_factory.mktemp("scene")
+    (folder / "transforms.json").write_text(json.dumps(scene))
+    summary = small(metres_per_unit=None, scene_folder=folder)
     assert (summary["scale"]["metres_per_unit"], summary["up"]) == (0.5, (0.0, 1.0, 0.0))
     mesh = summary["mesh"]
     assert mesh["volume_standard_error"] == pytest.approx(3 * 0.02 * mesh["volume"])
@@ -507,7 +424,7 @@ def test_quality_says_which_promises_hold(small, tmp_path, boundary) -> None:
     assert summary["mesh"]["area"] == pytest.approx((1.5 if boundary == "voxel" else 1.0) * np.pi, rel=0.1)
 
 
-def test_surfaces_that_photographs_do_not_support_say_so(ball, tmp_path) -> None:
+def test_surfaces_that_photographs_do_not_support_say_so(ball, tmp_path, monkeypatch) -> None:
     """Grey photographs from one side see half of the ball and place nothing."""
     views = looking_at((0, 0, 0), [(2.0, y, 0.2) for y in (-0.6, 0.0, 0.6)], focal=60.0, size=40)
     grey = np.full((3 * 40 * 40, 3), 0.5, dtype=np.float32)
@@ -516,7 +433,8 @@ def test_surfaces_that_photographs_do_not_support_say_so(ball, tmp_path) -> None
     photographs = Photographs(views.matrices(), centres, views.size, np.arange(3) * 1600, grey, thermal)
     lines: list[str] = []
     depths = depths_of(photographs, ball.lattice.lo, ball.lattice.hi)
-    summary = export_snapshot(ball, np.eye(4), ExportOptions(), tmp_path, lines.append, depths=depths)
+    monkeypatch.setattr("thermoxels_ns.multiview.evidence.depths_of_dataset", lambda *_: depths)
+    summary = export_scene(trained(ball, dataset=photographs), ExportOptions(), tmp_path, lines.append)
     shares = summary["mesh"]["share_of_area_by_support"]
     assert shares["supported"] == shares["weak"] == 0.0
     assert shares["smooth"] + shares["filled"] == pytest.approx(1.0) and 0.3 < shares["smooth"] < 0.6
@@ -529,6 +447,6 @@ def test_surfaces_that_photographs_do_not_support_say_so(ball, tmp_path) -> None
         ahead = np.asarray(picture.convert("RGB"))[:, : picture.width // 2].astype(int)
     assert np.mean((ahead[..., 0] > 120) & (ahead[..., 1:].max(axis=2) < 40)) > 0.05  # red: seen, not placed
 
-    assert export_snapshot(ball, np.eye(4), ExportOptions(), tmp_path)["mesh"]["share_of_area_by_support"] is None
+    assert export_scene(trained(ball), ExportOptions(), tmp_path)["mesh"]["share_of_area_by_support"] is None
     assert not (tmp_path / "support.png").exists()
     assert "photographs_seen" not in pyvista.read(tmp_path / "mesh-boundary.vtp").cell_data

@@ -179,7 +179,7 @@ def test_a_failing_run_leaves_the_old_results(folder, tmp_path) -> None:
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-@pytest.mark.parametrize("name", ["quality.json", "heat.pvd", "heat/step-0001.vtu", "report.html"])
+@pytest.mark.parametrize("name", ["heat.pvd", "heat/step-0001.vtu", "report.html"])
 def test_files_of_others_are_not_removed(folder, tmp_path, name) -> None:
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text("mine")

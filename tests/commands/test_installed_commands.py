@@ -5,9 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
-from thermoxels_ns.commands import installed_commands
 from thermoxels_ns.commands.installed_commands import run_command
 from thermoxels_ns.core.errors import ThermoxelsError
 
@@ -15,23 +13,18 @@ PYTHON = sys.executable
 
 
 @pytest.fixture
-def console() -> Console:
-    return Console(file=io.StringIO(), width=200)
+def screen() -> io.StringIO:
+    return io.StringIO()
 
 
-def shown(console: Console) -> str:
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
-
-
-def test_output_of_a_command_is_shown_and_kept(fake_command, tmp_path, console):
+def test_output_of_a_command_is_shown_and_kept(fake_command, tmp_path, screen):
     fake_command("say", "print('it says [bold]', *sys.argv[1:]); print('\\u00b0C', file=sys.stderr)")
-    run_command(["say", "a b", "c"], tmp_path / "say.log", console)
-    assert shown(console).splitlines() == ["$ say 'a b' c", "it says [bold] a b c", "°C"]
+    run_command(["say", "a b", "c"], tmp_path / "say.log", screen)
+    assert screen.getvalue().splitlines() == ["$ say 'a b' c", "it says [bold] a b c", "°C"]
     assert (tmp_path / "say.log").read_text(encoding="utf-8") == "it says [bold] a b c\n°C\n"
 
 
-def test_output_of_a_command_comes_while_it_runs(fake_command, tmp_path, console):
+def test_output_of_a_command_comes_while_it_runs(fake_command, tmp_path, screen):
     gate = tmp_path / "gate"
     # The command ends well only after its first line was shown: showing it opens the gate.
     fake_command(
@@ -47,17 +40,20 @@ def test_output_of_a_command_comes_while_it_runs(fake_command, tmp_path, console
                 gate.write_text("open")
             return super().write(text)
 
-    seen = Console(file=Opener(), width=200)
-    run_command(["wait"], tmp_path / "wait.log", seen)
-    assert shown(seen).splitlines()[-2:] == ["first", "second"]
+    run_command(["wait"], tmp_path / "wait.log", seen := Opener())
+    assert seen.getvalue().splitlines()[-2:] == ["first", "second"]
 
 
-def test_a_command_draws_for_the_terminal_that_shows_it(fake_command, tmp_path, console, monkeypatch):
-    monkeypatch.setenv("TERM", "xterm")
+def test_a_command_draws_for_the_terminal_that_shows_it(fake_command, tmp_path, screen, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("COLUMNS", "77")
     fake_command("ask", "print(os.environ.get('FORCE_COLOR'), os.environ.get('COLUMNS'))")
-    run_command(["ask"], tmp_path / "ask.log", Console(file=io.StringIO(), width=77, force_terminal=True))
+    run_command(["ask"], tmp_path / "ask.log", Terminal())
     assert (tmp_path / "ask.log").read_text() == "1 77\n"
-    run_command(["ask"], tmp_path / "ask.log", console)
+    run_command(["ask"], tmp_path / "ask.log", screen)
     assert (tmp_path / "ask.log").read_text().startswith(f"{os.environ.get('FORCE_COLOR')} ")
 
 
@@ -68,11 +64,10 @@ def test_memory_is_that_of_the_command(fake_command, tmp_path):
     """
     fake_command("work", "x = b'1' * int(sys.argv[1]); del x")
     script = f"""
-import io, pathlib, sys
-from rich.console import Console
+import pathlib, sys
 from thermoxels_ns.commands.installed_commands import run_command
 sys.executable = {str(tmp_path / "bin" / "python")!r}
-peak = lambda size: run_command(['work', str(size)], pathlib.Path('log'), Console(file=io.StringIO())).peak_memory_gb
+peak = lambda size: run_command(['work', str(size)], pathlib.Path('log')).peak_memory_gb
 print(peak(200_000_000), peak(600_000_000))
 """
     done = subprocess.run([PYTHON, "-c", script], capture_output=True, text=True, check=True, cwd=tmp_path)
@@ -81,24 +76,24 @@ print(peak(200_000_000), peak(600_000_000))
     assert large - small == pytest.approx(0.4, abs=0.01)
 
 
-def test_a_failing_command_is_an_error_with_its_last_lines(fake_command, tmp_path, console):
+def test_a_failing_command_is_an_error_with_its_last_lines(fake_command, tmp_path, screen):
     fake_command("fail", "for n in range(40): print('line', n)\nsys.exit('no space left')")
     with pytest.raises(ThermoxelsError) as caught:
-        run_command(["fail"], tmp_path / "fail.log", console)
+        run_command(["fail"], tmp_path / "fail.log", screen)
     message = str(caught.value)
     assert message.startswith("fail: expected exit status 0, got 1.")
     assert message.splitlines()[-2:] == ["    line 39", "    no space left"]
     assert len(message.splitlines()) < 20 and str(tmp_path / "fail.log") in message
 
 
-def test_a_command_of_another_environment_is_not_used(fake_command, tmp_path, console, monkeypatch):
+def test_a_command_of_another_environment_is_not_used(fake_command, tmp_path, screen, monkeypatch):
     other = tmp_path / "other"
     other.mkdir()
     (other / "ns-train").write_text("#!/bin/sh\n")
     (other / "ns-train").chmod(0o755)
     monkeypatch.setenv("PATH", str(other))
     with pytest.raises(ThermoxelsError, match=r"^ns-train: expected"):
-        run_command(["ns-train"], tmp_path / "log", console)
+        run_command(["ns-train"], tmp_path / "log", screen)
 
 
 def test_an_interrupt_ends_the_command(fake_command, tmp_path):
@@ -117,23 +112,22 @@ def test_an_interrupt_ends_the_command(fake_command, tmp_path):
             return len(text)
 
     with pytest.raises(KeyboardInterrupt):
-        run_command(["work"], tmp_path / "log", Console(file=Interrupter()))
+        run_command(["work"], tmp_path / "log", Interrupter())
     assert not Path(f"/proc/{(tmp_path / 'pid').read_text()}").exists()
     assert not mark.exists()
 
 
-def test_systems_that_do_not_tell_memory_still_measure_time(fake_command, tmp_path, console, monkeypatch):
+def test_systems_that_do_not_tell_memory_still_measure_time(fake_command, tmp_path, screen, monkeypatch):
     monkeypatch.delattr("os.wait4")
     fake_command("work", "sys.exit(0)")
-    cost = run_command(["work"], tmp_path / "log", console)
+    cost = run_command(["work"], tmp_path / "log", screen)
     assert cost.seconds > 0 and cost.peak_memory_gb != cost.peak_memory_gb
 
 
-def test_a_process_that_a_command_leaves_behind_does_not_hold_it_up(fake_command, tmp_path, console, monkeypatch):
-    monkeypatch.setattr(installed_commands, "_LAST_WORDS_S", 0.5)
+def test_a_process_that_a_command_leaves_behind_does_not_hold_it_up(fake_command, tmp_path, screen):
     fake_command(
         "leave",
         "import subprocess\nsubprocess.Popen([sys.executable, '-c', 'import time; time.sleep(30)'])\nprint('done')",
     )
-    took = run_command(["leave"], tmp_path / "leave.log", console)
-    assert took.seconds < 20.0 and shown(console).splitlines()[-1] == "done"
+    took = run_command(["leave"], tmp_path / "leave.log", screen)
+    assert took.seconds < 20.0 and screen.getvalue().splitlines()[-1] == "done"

@@ -29,8 +29,8 @@ def read_rig_photograph(path: Path) -> None:
 
 
 READERS = {
-    "tracks.npz": read_tracks,
     "cost.csv": read_table,
+    "tracks.npz": read_tracks,
     "points.ply": _read_ply,
     "any.json": read_json,
     "any.yaml": read_yaml,

@@ -33,7 +33,7 @@ def test_a_layout_is_trained_evaluated_and_exported(layout, tmp_path):
         *("--metres-per-unit", "1", "--formats", "vtu", "xdmf", "msh", "ply", "glb"),
     )
     mesh, summary = read_mesh(out / "mesh.vtu"), json.loads((out / "summary.json").read_text())
-    assert mesh.has_temperatures == summary["heat"]["computed"] == warm and mesh.colour is not None
+    assert mesh.has_temperatures == (summary["mesh"]["temperature_c"] is not None) == warm and mesh.colour is not None
     for suffix in ("glb", "ply", "msh", "xdmf"):
         assert (b"temperature_c" in (out / f"mesh.{suffix}").read_bytes().lower()) == warm, suffix
     if warm:
@@ -47,4 +47,3 @@ def test_a_layout_is_trained_evaluated_and_exported(layout, tmp_path):
     export = "ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", str(tmp_path / "inp")
     export = (*export, "--metres-per-unit", "1", "--formats", "inp", "--pictures", "False")
     assert "leave inp out of --formats" in fail(*export) and not (tmp_path / "inp" / "mesh.inp").exists()
-    succeed(*export, "--heat-preset", str(own))

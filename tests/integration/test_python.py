@@ -35,7 +35,7 @@ def test_the_five_lines_of_the_docs_on_a_run_that_was_moved(trained: Trained, tm
     assert heat.results.balance.into_body > 0.0 and found.whole.loss_w.low < found.whole.loss_w.high
     assert len(repr(scene)) + len(repr(heat)) + len(repr(found)) < 400
 
-    options = ("--density-percentile", "90", "--interior", "hollow", "--pictures", "False", "--steps", "1")
+    options = ("--density-percentile", "90", "--interior", "hollow", "--pictures", "False")
     where = ("--load-config", str(run / "config.yml"), "--output-dir", str(tmp_path / "export"))
     succeed("ns-export", "thermoxels-mesh", *where, *options)
     ours, theirs = any_mesh(names["mesh"])[0], read_mesh(tmp_path / "export" / "mesh.vtu")

@@ -36,7 +36,7 @@ from thermoxels_ns.capture.stage_cache import (
     prepare_output,
     save,
 )
-from thermoxels_ns.core.checks import hold_folder, plain_os_errors, remove_stale_temporaries
+from thermoxels_ns.core.checks import hold_folder, plain_os_errors
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.data.scene_scale import SceneScale
@@ -90,7 +90,6 @@ def run_capture(
     remedy = "Wait until it ends, or pass another folder with --output."
     lock = hold_folder(folder / CACHE_FOLDER / "lock", remedy, say)
     try:
-        remove_stale_temporaries(folder, [PAGE_NAME])
         # Results of BLAS depend on its number of threads in the last bits; one thread is no slower here.
         remedy = "Check free space and permissions, and run the command again: finished stages are kept."
         with threadpool_limits(1, "blas"), plain_os_errors(folder, remedy=remedy):

@@ -7,6 +7,7 @@ import math
 import time as clock
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -100,12 +101,9 @@ class Audit:
 
     def main(self) -> None:
         """Run the audit; raises `ThermoxelsError` if the mesh, the conditions or an option cannot be used."""
-        from rich.console import Console
-
-        console = Console(highlight=False)
         # With more BLAS threads, the last bits of results would depend on the number of threads.
         with threadpool_limits(1, "blas"):
-            run_audit(self, lambda line: console.print(line, markup=False, soft_wrap=True))
+            run_audit(self, partial(print, flush=True))
 
 
 def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
@@ -144,9 +142,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     if not 0.0 <= least_w < math.inf:
         remedy = "Pass --least-bridge-w 0 to count all."
         raise AuditError("--least-bridge-w", expected="a number of watts, at least 0", got=least_w, remedy=remedy)
-    others = ("summary.json", "quality.json", "series.csv")
-    written = (ANSWERS, PAGE, DOCUMENT, SURFACE, *ENVELOPES.values())
-    folder = result_folder(options.output_dir, written, (SURFACE, ANSWERS), others)
+    folder = result_folder(options.output_dir, (ANSWERS, PAGE, DOCUMENT, SURFACE, *ENVELOPES.values()), SURFACE)
     lacking = why_no_pdf() if options.pdf else ""
     if lacking:
         say(f"Without audit.pdf: {lacking}")
@@ -171,12 +167,6 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     whole = found.whole
     say(f"Heat loss: {interval_text(whole.loss_w, 'W')}; U-value: {interval_text(whole.u_w_m2k, 'W/(m2 K)')}.")
     say(f"{sum(not one.not_counted for one in found.defects)} thermal bridges or defects.")
-    if found.energy is not None:
-        say(f"A year: {interval_text(found.energy.whole.heat_kwh, 'kWh')} through what was observed.")
-    calibration = found.calibration
-    if calibration is not None:
-        told = [f"{name} {interval_text(one, calibration.units[name])}" for name, one in calibration.found.items()]
-        say(f"Calibration: {'; '.join(told) or f'refused. {calibration.refused}'} {calibration.doubt}".rstrip())
     photographs, range_c = {}, None
     if scene is not None:
         scale = (export.get("scale") or {}).get("metres_per_unit", 1.0)
@@ -302,9 +292,9 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
 
 
 def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return the U-value that no element exceeds, [W/(m2 K)] by name, and sentences on values and ends beyond it.
+    """Return the U-value that no element exceeds, [W/(m2 K)] by name, and a sentence on intervals that reach beyond it.
 
-    A sentence names the two inputs that widen the U-value's interval most: one of these clashes with the readings.
+    The sentence names the two inputs that widen the U-value's interval most: one of these clashes with the readings.
     """
     from thermoxels_ns.audit.draws import GEOMETRY, REPEATABILITY
     from thermoxels_ns.audit.exchange import most_u_w_m2k
@@ -321,21 +311,15 @@ def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
         if share > 0.0 and name not in (GEOMETRY, REPEATABILITY)
     ]
     inputs = " and ".join(widest[:2]) or "the airs and the camera"
-    over = [one.name for one in found.patches if one.u_w_m2k.value > most[one.name]]
-    ends = [one.name for one in found.patches if one.u_w_m2k.value <= most[one.name] < one.u_w_m2k.high]
-
-    def than(names: list[str]) -> str:
-        allowed = " to ".join(dict.fromkeys(f"{end(most[name] for name in names):.1f}" for end in (min, max)))
-        return f"more than the {allowed} W/(m² K) that the films of air on both sides allow without a wall (ISO 6946)"
-
-    said = []
-    if over:
-        clash = f"What is stated clashes with the readings; look at {inputs} first."
-        said.append(f"Impossible: {', '.join(over)} would have a U-value of {than(over)}. {clash}")
-    if ends:
-        clash = f"the part above is impossible, and what is stated of {inputs} reaches too far."
-        said.append(f"The U-value of {', '.join(ends)} has an interval that ends at {than(ends)}: {clash}")
-    return most, tuple(said)
+    over = [one.name for one in found.patches if one.u_w_m2k.high > most[one.name]]
+    if not over:
+        return most, ()
+    allowed = " to ".join(dict.fromkeys(f"{end(most[name] for name in over):.1f}" for end in (min, max)))
+    told = (
+        f"Impossible: the U-value of {', '.join(over)} reaches beyond the {allowed} W/(m² K) that the films of air on "
+    )
+    told += "both sides allow without a wall (ISO 6946). What is stated clashes with the readings; "
+    return most, (f"{told}look at {inputs} first.",)
 
 
 def answers_of(

@@ -12,8 +12,9 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -103,12 +104,10 @@ class Batch:
 
     def main(self) -> None:
         """Run all stages, and write the page; raises `ThermoxelsError` if any building is not finished."""
-        from rich.console import Console
-
-        run_batch(self, Console(highlight=False))
+        run_batch(self, partial(print, flush=True))
 
 
-def run_batch(batch: Batch, console: Any) -> None:
+def run_batch(batch: Batch, say: Callable[[str], None]) -> None:
     """Run a `Batch`: read the list, start Snakemake, and write the page over all buildings."""
     if batch.cores < 1 or not (batch.memory_gb is None or 0.0 < batch.memory_gb < math.inf):
         got, remedy = f"{batch.cores} and {batch.memory_gb} GB", "Leave them out for the defaults."
@@ -118,20 +117,20 @@ def run_batch(batch: Batch, console: Any) -> None:
         remedy = "Install it, with Python 3.11 or newer: pip install 'snakemake>=9'"
         raise ThermoxelsError("snakemake", expected="a package of this Python", got="none", remedy=remedy)
     folder = writable_folder(batch.output_dir).resolve()
-    with hold_folder(folder / ".batch.lock", "Wait for it, or pass another --output-dir.", console.print) as lock:
+    with hold_folder(folder / ".batch.lock", "Wait for it, or pass another --output-dir.", say) as lock:
         write_json(folder / BATCH, {name: asdict(one) for name, one in buildings.items()})
-        if not batch.dry_run:
-            _forget_what_changed(folder, buildings)
+        for note in () if batch.dry_run else folder.glob("*/logs/*.failed.json"):
+            remove_file(note)  # of an earlier start
         command = [
             *(sys.executable, "-m", "snakemake", "--directory", str(folder)),
             *("--snakefile", str(Path(__file__).parents[1] / "workflow" / "Snakefile")),
             *("--cores" if not batch.executor else "--jobs", str(batch.cores)),
-            *("--keep-going", "--rerun-incomplete", "--rerun-triggers", "mtime", "--nolock"),
+            *("--keep-going", "--rerun-incomplete", "--rerun-triggers", "mtime", "params", "--nolock"),
             *(() if batch.memory_gb is None else ("--resources", f"mem_mb={int(1e3 * batch.memory_gb)}")),
             *(("--executor", batch.executor) if batch.executor else ()),
             *(("--dry-run",) if batch.dry_run else ("--quiet", "rules")),
         ]
-        console.print(f"$ {shlex.join(command)}", style="bold", markup=False, soft_wrap=True)
+        say(f"$ {shlex.join(command)}")
         # Snakemake inherits the lock: while it runs, also without this process, no other batch begins in the folder.
         held = lock._context.lock_file_fd
         process = subprocess.Popen(command, pass_fds=[held] if held is not None and os.name == "posix" else [])
@@ -147,22 +146,12 @@ def run_batch(batch: Batch, console: Any) -> None:
         if batch.dry_run:
             return
         _write_page(folder / PAGE, rows)
-    console.print(f"All buildings: {folder / PAGE}", markup=False, soft_wrap=True)
+    say(f"All buildings: {folder / PAGE}")
     missing = [row for row in rows if not row["finished"]]
     if missing:
         got = "; ".join(f"{row['name']}: {row['why'][0]}" for row in missing[:5])
         remedy = f"Correct what {folder / PAGE} names; the same command then goes on."
         raise ThermoxelsError("batch", expected=f"{len(rows)} buildings finished", got=got, remedy=remedy)
-
-
-def _forget_what_changed(folder: Path, buildings: Mapping[str, Building]) -> None:
-    """Remove the markers of stages whose commands differ from those of today, and what earlier runs say of failures."""
-    for name, building in buildings.items():
-        for stage, (command, _) in plan_of(building, Path(name)).items():
-            remove_file(folder / name / "logs" / f"{stage}.failed.json")
-            marker = folder / name / f"{stage}.json"
-            if marker.is_file() and _read(marker).get("command") != command:
-                remove_file(marker)
 
 
 def read_list(path: Path) -> dict[str, Building]:
@@ -276,8 +265,6 @@ def run_stage(name: str, stage: str, attempt: int) -> int:
     A stage that ended by itself for another reason than memory is not tried a second time: `attempt` 2 then ends as it
     did. What ends it before its command does leaves the note that it was ended from outside.
     """
-    from rich.console import Console
-
     folder = writable_folder(Path(name) / "logs").parent
     failed, log = folder / "logs" / f"{stage}.failed.json", folder / "logs" / f"{stage}.log"
     earlier = _read(failed).get("status", _ENDED)
@@ -286,10 +273,9 @@ def run_stage(name: str, stage: str, attempt: int) -> int:
     write_json(failed, {"status": _ENDED, "why": "ended from outside, as by a limit of memory or time"})
     command = plan_of(read_batch(Path())[name], Path(name))[stage].command
     try:
-        with Path(os.devnull).open("w") as nowhere:  # the log has all
-            cost = run_command(command, log, Console(file=nowhere))
+        cost = run_command(command, log)
         peak = cost.peak_memory_gb if math.isfinite(cost.peak_memory_gb) else None
-        write_json(folder / f"{stage}.json", {"seconds": cost.seconds, "peak_memory_gb": peak, "command": command})
+        write_json(folder / f"{stage}.json", {"seconds": cost.seconds, "peak_memory_gb": peak})
     except (ThermoxelsError, OSError) as problem:
         told = (problem.exit_status, problem.last_line) if isinstance(problem, CommandFailed) else (CRASH, str(problem))
         write_json(failed, dict(zip(("status", "why"), told)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,8 +14,6 @@ import tyro
 from thermoxels_ns.capture.settings import CaptureSettings
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from thermoxels_ns.capture.stages import CaptureResult
 
 _LISTED = 10
@@ -33,13 +32,8 @@ class Capture(CaptureSettings):
 
     def main(self) -> None:
         """Run the capture; raises `ThermoxelsError` for unusable files or options, and without pairs or poses."""
-        from rich.console import Console
-
-        console = Console(highlight=False)
-        result = capture_folder(
-            self.source, self.output, self, lambda line: console.print(line, markup=False, soft_wrap=True)
-        )
-        _print_result(result, self.output, console)
+        result = capture_folder(self.source, self.output, self, partial(print, flush=True))
+        _print_result(result, self.output)
 
 
 def capture_folder(
@@ -52,22 +46,18 @@ def capture_folder(
     return run_capture(source, output, settings, write_capture_page, say)
 
 
-def _print_result(result: CaptureResult, folder: Path, console: Console) -> None:
+def _print_result(result: CaptureResult, folder: Path) -> None:
     """Print the numbers of frames and pairs, what was left out and why, and the next command."""
-
-    def say(line: str, style: str | None = None) -> None:
-        console.print(line, style=style, markup=False, soft_wrap=True)
-
-    say(f"{len(result.scene.frames)} frames of {len(result.pairs)} pairs are in the scene.")
+    print(f"{len(result.scene.frames)} frames of {len(result.pairs)} pairs are in the scene.")
     if result.dropped:
-        say(f"Left out: {len(result.dropped)}", "bold yellow")
+        print(f"Left out: {len(result.dropped)}")
         for name, why in list(result.dropped.items())[:_LISTED]:
-            say(f"  {name}: {why}")
+            print(f"  {name}: {why}")
         if len(result.dropped) > _LISTED:
-            say(f"  and {len(result.dropped) - _LISTED} more, listed in {result.page}")
+            print(f"  and {len(result.dropped) - _LISTED} more, listed in {result.page}")
     if not result.scene.rig.determined:
-        say(f"The rig was not determined. {result.scene.rig.explanation}", "bold yellow")
+        print(f"The rig was not determined. {result.scene.rig.explanation}")
     if result.scene.scale is None:
-        say(f"The scale is unknown: {result.scale_missing}. Give a length when you export.", "bold yellow")
-    say(f"What was found, with pictures to judge it by: {result.page}")
-    say(f"Train with: ns-train thermoxels --data {shlex.quote(str(folder))}")
+        print(f"The scale is unknown: {result.scale_missing}. Give a length when you export.")
+    print(f"What was found, with pictures to judge it by: {result.page}")
+    print(f"Train with: ns-train thermoxels --data {shlex.quote(str(folder))}")

@@ -7,10 +7,11 @@ import math
 import re
 import shlex
 import shutil
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TextIO
 
 import tyro
 
@@ -19,9 +20,6 @@ from thermoxels_ns.core.checks import check_positive, remedy_of, replace_when_do
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.core.version import __version__
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 FIGURES = {
     "seconds": ("ns-train", "{:.0f} s"),
@@ -65,16 +63,14 @@ class Cost:
 
     def main(self) -> None:
         """Measure and report; raises `ThermoxelsError` if an option or the scene cannot be used, or a run failed."""
-        from rich.console import Console
-
-        run_cost(self, Console(highlight=False))
+        run_cost(self, sys.stdout)
 
 
-def run_cost(cost: Cost, console: Console) -> None:
-    """Train and evaluate every setting that cost.csv does not hold, and print the table. See `Cost`."""
+def run_cost(cost: Cost, screen: TextIO) -> None:
+    """Train and evaluate every setting that cost.csv does not hold, and write the table to `screen`. See `Cost`."""
 
     def say(line: str) -> None:
-        console.print(line, markup=False, soft_wrap=True)
+        print(line, file=screen)
 
     if cost.target_mae is not None:
         check_positive("target_mae", cost.target_mae, "Correct --target-mae, or leave it out.")
@@ -96,7 +92,7 @@ def run_cost(cost: Cost, console: Console) -> None:
             row = next((one for one in kept if key.items() <= one.items()), None)
             if row is None:
                 try:
-                    row = {**key, **_measure(cost.scene, method, words, name, folder, console)}
+                    row = {**key, **_measure(cost.scene, method, words, name, folder, screen)}
                 except ThermoxelsError as problem:
                     failed.append(f"{name}: {problem}")
                     say(f"{name} failed: {problem}")
@@ -153,18 +149,17 @@ def cheapest(rows: Sequence[Row], target_mae: float) -> str:
     return f"Cheapest setting with {wanted}: {best['setting']}. Train with: {best['training']} --data {best['scene']}"
 
 
-def _measure(
-    scene: Path, method: str, words: Sequence[str], name: str, folder: Path, console: Console
-) -> dict[str, str]:
+def _measure(scene: Path, method: str, words: Sequence[str], name: str, folder: Path, screen: TextIO) -> dict[str, str]:
     """Train a setting, evaluate it, remove the model, and return all figures as texts, empty where there is none."""
     name = re.sub(r"[^0-9A-Za-z.-]+", "-", name)
     models, logs = (writable_folder(folder / part) for part in ("models", "logs"))
-    train = ["ns-train", method, "--data", scene, "--output-dir", models, "--experiment-name", name]
+    train = ["ns-train", method, "--data", str(scene), "--output-dir", str(models), "--experiment-name", name]
     config, output = models / name / method / "run" / "config.yml", logs / f"{name}.json"
+    evaluate = ["ns-eval", "--load-config", str(config), "--output-path", str(output)]
     shutil.rmtree(models / name, ignore_errors=True)
     try:
-        trained = run_command([*train, *PLAIN_TRAINING, *words], logs / f"{name}-train.log", console)
-        run_command(["ns-eval", "--load-config", config, "--output-path", output], logs / f"{name}-eval.log", console)
+        trained = run_command([*train, *PLAIN_TRAINING, *words], logs / f"{name}-train.log", screen)
+        run_command(evaluate, logs / f"{name}-eval.log", screen)
     finally:
         shutil.rmtree(models / name, ignore_errors=True)
     expected, remedy = "the results of ns-eval", "Start the command again; finished runs are kept."

@@ -54,15 +54,11 @@ class Target:
         return ("≥ " if self.at_least else "≤ ") + self.form.format(self.bound)
 
 
-def read_results(eval_json: Path, summary_json: Path) -> tuple[tuple[Target, ...], tuple[tuple[str, str], ...]]:
-    """Read the results of ``ns-eval`` (on held-out views) and of ``ns-export thermoxels-mesh``.
-
-    Returns the figures with a target, and name and text of further ones.
-    """
-    image = numbers_of(eval_json, "results")
-    truth, heat, mesh = (numbers_of(summary_json, name) for name in ("truth", "heat", "mesh"))
+def read_results(eval_json: Path, summary_json: Path) -> tuple[Target, ...]:
+    """Return figures of ``ns-eval`` (on held-out views) and of ``ns-export thermoxels-mesh`` with their targets."""
+    image, truth = numbers_of(eval_json, "results"), numbers_of(summary_json, "truth")
     tolerance = truth("tolerance_voxels")
-    targets = (
+    return (
         Target(
             *("RGB PSNR, held-out views", image("psnr"), 26.0, True, "{:.2f} dB"),
             "How like the photographs the model's pictures are, at places where it was never shown one.",
@@ -75,27 +71,7 @@ def read_results(eval_json: Path, summary_json: Path) -> tuple[tuple[Target, ...
             *(f"Surface F-score at {tolerance:g} voxels", truth("fscore"), 0.6, True, "{:.3f}"),
             f"1: the surface is nowhere further than {tolerance:g} voxels from the true one, and none is missing.",
         ),
-        Target(
-            *("Heat conserved, relative error", heat("energy_residual"), 1e-9, False, "{:.0e}"),
-            "Change of the heat in the insulated solid while heat flows inside it.",
-        ),
     )
-    seen_percent = 100.0 * truth("share_of_seen_reached")
-    seen_error = f"{truth('temperature_seen_mae_c'):.2f} °C ({seen_percent:.0f} % of the surface)"
-    distance = f"{truth('chamfer_voxels'):.2f} voxels, {1e3 * truth('chamfer_m'):.1f} mm"
-    others = (
-        ("RGB SSIM", f"{image('ssim'):.3f}"),
-        ("Temperature error, pixels that hit the object, mean", f"{image('thermal_mae_hit_c'):.2f} °C"),
-        ("Voxel size", f"{1e3 * truth('voxel_size_m'):.1f} mm"),
-        ("Surface precision and recall", f"{truth('precision'):.3f} and {truth('recall'):.3f}"),
-        ("Distance of mesh and true surface, mean of both ways (Chamfer)", distance),
-        ("Temperature error of the mesh on the seen surface, mean", seen_error),
-        ("Volume of the mesh", f"{truth('mesh_volume_m3'):.4g} m³ (true: {truth('true_volume_m3'):.4g} m³)"),
-        ("Surface of the mesh", f"{truth('mesh_area_m2'):.4g} m² (true: {truth('true_area_m2'):.4g} m²)"),
-        ("Tetrahedra", f"{mesh('tets'):,.0f}"),
-        ("Nodes with a measured temperature", f"{100.0 * mesh('share_of_nodes_observed'):.0f} %"),
-    )
-    return targets, others
 
 
 def numbers_of(path: Path, name: str) -> Callable[[str], float]:
@@ -157,14 +133,13 @@ def audit_target(compared: Sequence[Compared]) -> Target:
 def demo_page(
     folder: Path,
     targets: Iterable[Target],
-    others: Sequence[tuple[str, str]],
     compared: Sequence[Compared],
     seconds: Sequence[tuple[str, float]],
     commands: Sequence[str],
 ) -> str:
     """Return the html text of a demo's page; raises `ThermoxelsError` if a picture is missing in the demo's folder.
 
-    `others`: names and texts of figures; `seconds`: names and durations of steps.
+    `seconds`: names and durations of steps.
     """
     export, renders, drawn = folder / "export", folder / "renders" / "test", folder / "scene"
     photographs = sorted((drawn / "images").glob("frame_train_*"))
@@ -182,14 +157,12 @@ def demo_page(
             "demo.html.j2",
             photographs=len(photographs),
             targets=targets,
-            others=others,
             compared=compared,
             inputs=inputs,
             views=[(name, [(renders / of / f"{name}.png").read_bytes() for of in kinds]) for name in held_out],
             gradient=gradient(),
             ends_c=[float(bounds[f"absolute_{end}_temperature"]) for end in ("min", "max")],
             night=(folder / "heat" / "surface-end.png").read_bytes(),
-            heat=(export / "heat.png").read_bytes(),
             mesh=(export / "mesh.png").read_bytes(),
             measured=(export / "mesh-measured.png").read_bytes(),
             seconds=seconds,

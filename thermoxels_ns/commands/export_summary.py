@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
 
@@ -13,23 +12,11 @@ import numpy as np
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.version import __version__
 from thermoxels_ns.data.scene_scale import SceneScale
-from thermoxels_ns.fem.problem import TimeSteps
-from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.build import BuiltMesh
 from thermoxels_ns.mesh.quality.report import QualityReport
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection
+from thermoxels_ns.mesh.solid.voxels import SolidCells
 from thermoxels_ns.mesh.tetrahedra import SUPPORT, TetMesh, facet_areas, support_of_facets
-
-SKIPPED_EFFECTS = (
-    "Convection: not modelled, the boundary is insulated.",
-    "Thermal radiation: not modelled, the boundary is insulated.",
-    "Solar gain and internal sources: not modelled.",
-    "Space that no camera saw and that the mesh leaves empty, such as the inside of a building seen from outside with "
-    "--interior hollow or --wall-thickness. The heat content is that of the mesh.",
-)
-"""Sentences on what the heat balance lacks if no effect acts; if any effect acts, only the last one holds."""
 
 
 def lines_on_mesh(
@@ -123,12 +110,11 @@ def mesh_summary(
     }
 
 
-def region_summary(built: BuiltMesh, selection: SolidSelection) -> dict[str, Any]:
+def region_summary(built: BuiltMesh, asked_for: str) -> dict[str, Any]:
     """Return the entry "region" of summary.json: the exported part, the mesh's extents, and the share of the solid."""
-    points = built.mesh.points_m
-    left_out, found = int(built.solid.left_out.sum()), _voxels_found(built.solid)
+    points, left_out, found = built.mesh.points_m, int(built.solid.left_out.sum()), _voxels_found(built.solid)
     return {
-        "asked_for": "near a point" if selection.region_near else "a box" if selection.region_box else selection.region,
+        "asked_for": asked_for,
         "size": points.max(axis=0) - points.min(axis=0),
         "voxels_taken": found - left_out,
         "voxels_left_out": left_out,
@@ -156,28 +142,6 @@ def support_shares(mesh: TetMesh) -> dict[str, float] | None:
     area = facet_areas(mesh.points_m, mesh.facets)
     total = np.bincount(support + 1, weights=area, minlength=len(SUPPORT) + 1)[1:]
     return dict(zip(SUPPORT, (total / total.sum()).tolist()))
-
-
-def heat_summary(material: Material, time: TimeSteps, solution: HeatSolution) -> dict[str, Any]:
-    """Return the entry "heat" of summary.json: the heat balance in joules, and how it was computed."""
-    return {
-        "computed": True,
-        "material": asdict(material),
-        "time": asdict(time),
-        "scheme": "P1 tetrahedra, lumped mass, backward Euler, conjugate gradients",
-        "energy_before_j": float(solution.heat_content_j[0]),
-        "energy_after_j": float(solution.heat_content_j[-1]),
-        "energy_residual": solution.energy_residual,
-        "energy_residual_of_spread": solution.energy_residual_of_spread,
-        "largest_net_heat_flow_w": float(np.abs(solution.heat_w).max()),
-        "temperature_c": {
-            name: {"min": float(state.min()), "max": float(state.max())}
-            for name, state in (("before", solution.temperature_c[0]), ("after", solution.temperature_c[-1]))
-        },
-        "status": solution.status,
-        "iterations": solution.iterations,
-        "skipped_effects": list(SKIPPED_EFFECTS[-1:] if solution.effects else SKIPPED_EFFECTS),
-    }
 
 
 def versions() -> dict[str, str]:

@@ -8,6 +8,7 @@ import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -80,18 +81,15 @@ class Heat:
 
     def main(self) -> None:
         """Run; raises `ThermoxelsError` if the mesh, the scene or an option cannot be used, or the solver fails."""
-        from rich.console import Console
-
         from thermoxels_ns.core.yaml_records import write_example
 
-        console = Console(highlight=False)
         if self.write_scene is not None:
             write_example(self.write_scene, EXAMPLE, HeatError)
-            console.print(f"Written to {self.write_scene}: keep what your scene has, and pass it with --scene.")
+            print(f"Written to {self.write_scene}: keep what your scene has, and pass it with --scene.")
             return
         # With more BLAS threads, the last bits of results would depend on the number of threads.
         with threadpool_limits(1, "blas"):
-            run_heat(self, lambda line: console.print(line, markup=False, soft_wrap=True))
+            run_heat(self, partial(print, flush=True))
 
 
 def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
@@ -99,9 +97,8 @@ def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     from thermoxels_ns.heat.vtk_series import STEP_PATTERN
     from thermoxels_ns.reports.mesh_pictures import HEAT_PICTURES
 
-    names, others = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *HEAT_PICTURES), ("summary.json", "quality.json")
-    series = f"{Path(THROUGH_TIME).stem}/{STEP_PATTERN}"
-    folder = result_folder(options.output_dir, names, (ANSWERS, SERIES), others, series)
+    names, series = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY), f"{Path(THROUGH_TIME).stem}/{STEP_PATTERN}"
+    folder = result_folder(options.output_dir, (*names, *HEAT_PICTURES), SERIES, series)
     run = compute_heat(options, say)
     write_heat_files(folder, options, run, say)
     return run

@@ -13,23 +13,18 @@ import time
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from threading import Thread
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
-from thermoxels_ns.core import quiet_warnings
 from thermoxels_ns.core.errors import BAD_DATA, CRASH, LACK_OF_MEMORY, ThermoxelsError, explain
 
-if TYPE_CHECKING:
-    # Linux reports for a process at least the peak memory of the process that started it: import little here.
-    from rich.console import Console
-
+# Linux reports for a process at least the peak memory of the process that started it: import little here.
 PLAIN_TRAINING = ("--timestamp", "run", "--vis", "tensorboard", "--logging.steps-per-log", "100")
 """Options of ns-train for a run that nobody watches in the viewer, in a folder whose name is known."""
 
 _LAST_LINES = 12  # Lines of output that an error shows
-_LAST_WORDS_S = 5.0  # Longest time to read on after a command has ended, [s]
+_LOOK_AFTER_S = 0.05  # Time after which new output is shown, [s]
 
 
 class ProcessCost(NamedTuple):
@@ -55,15 +50,6 @@ class CommandFailed(ThermoxelsError):
         """Last line of its output, which says why."""
 
 
-def command_line(arguments: Sequence[str | Path]) -> str:
-    """Return a command as it is typed in a shell.
-
-    >>> command_line(["ns-train", "thermoxels", "--data", "my scene"])
-    "ns-train thermoxels --data 'my scene'"
-    """
-    return shlex.join(str(argument) for argument in arguments)
-
-
 def command_of(name: str, options: Any) -> str:
     """Return ``thermoxels NAME`` with options as typed in a shell; `options` is a dataclass such as `Heat`.
 
@@ -78,64 +64,46 @@ def command_of(name: str, options: Any) -> str:
     return shlex.join(words)
 
 
-def run_command(arguments: Sequence[str | Path], log: Path, console: Console) -> ProcessCost:
+def run_command(words: Sequence[str], log: Path, screen: TextIO | None = None) -> ProcessCost:
     """Run a command of this installation, write its output to the file `log`, and return its time and memory.
 
-    The folder of `log` must exist. `console` shows the output as it comes. Raises `ThermoxelsError` if the command
+    The folder of `log` must exist. `screen` gets the output as it comes. Raises `ThermoxelsError` if the command
     fails or does not exist.
     """
-    words = [str(argument) for argument in arguments]
     folder = Path(sys.executable).parent
     program = shutil.which(words[0], path=str(folder))
     if program is None:
         remedy = "Install this package and nerfstudio into the environment of this Python."
         raise ThermoxelsError(words[0], expected=f"a command in {folder}", got="none", remedy=remedy)
     environment = dict(os.environ, PYTHONUNBUFFERED="1", PYTHONIOENCODING="utf-8")
-    environment.setdefault("PYTHONWARNINGS", quiet_warnings.environment_value())
-    if console.is_terminal:
-        environment |= {"FORCE_COLOR": "1", "COLUMNS": str(console.width)}
-    console.print(f"$ {command_line(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)
+    if screen is not None:
+        if screen.isatty():
+            environment |= {"FORCE_COLOR": "1", "COLUMNS": str(shutil.get_terminal_size().columns)}
+        screen.write(f"$ {shlex.join(words)}\n")
     start, peak_memory_gb = time.monotonic(), math.nan
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")  # output so far may end within a character
-    process = subprocess.Popen(
-        [program, *words[1:]],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env=environment,
-    )
-    output = process.stdout
-    assert output is not None
-
-    broken: list[BaseException] = []
-
-    def show() -> None:
+    with log.open("wb") as written, log.open("rb") as shown:
+        process = subprocess.Popen(
+            [program, *words[1:]], stdin=subprocess.DEVNULL, stdout=written, stderr=subprocess.STDOUT, env=environment
+        )
         try:
-            with log.open("wb", buffering=0) as file, output:
-                while arrived := os.read(output.fileno(), 65536):
-                    file.write(arrived)
-                    console.file.write(decoder.decode(arrived))
-                    console.file.flush()
-        except BaseException as problem:  # such as a full disk, or a reader of the console that is gone
-            broken.append(problem)
-            process.terminate()
-
-    reader = Thread(target=show, daemon=True)
-    reader.start()
-    try:
-        if hasattr(os, "wait4"):  # POSIX; elsewhere memory is not measured
-            _, status, usage = os.wait4(process.pid, 0)
-            process.returncode = os.waitstatus_to_exitcode(status)
-            peak_memory_gb = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
-        process.wait()
-    finally:
-        if process.poll() is None:
-            process.terminate()
-            process.wait()
-        reader.join(_LAST_WORDS_S)  # a process that the command left behind may hold the pipe open
-    if broken:
-        raise broken[0]
-    if process.returncode != 0:
+            while process.returncode is None:
+                time.sleep(_LOOK_AFTER_S)
+                if hasattr(os, "wait4"):  # POSIX; elsewhere memory is not measured
+                    ended, status, usage = os.wait4(process.pid, os.WNOHANG)
+                    if ended:
+                        process.returncode = os.waitstatus_to_exitcode(status)
+                        peak_memory_gb = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
+                else:
+                    process.poll()
+                if screen is not None:
+                    screen.write(decoder.decode(shown.read()))
+                    screen.flush()
+        finally:
+            if process.returncode is None:
+                process.terminate()
+                process.wait()
+    if process.returncode:
         remedy = f"Its whole output is in {log}; its last lines:"
         message = explain(words[0], expected="exit status 0", got=process.returncode, remedy=remedy)
         lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import math
 import os
-import re
 import shutil
 import sys
 import tempfile
@@ -159,11 +158,12 @@ def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock
 def replace_when_done(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename the file there to `path` only if the block ends without an error.
 
-    The temporary name keeps the suffix, by which writers choose their format. Raises `OutputError` if the block or the
+    The temporary name keeps the suffix, by which writers choose their format; what a killed process left under it is
+    overwritten. Raises `OutputError` if the block or the
     renaming ends in an error of the operating system.
     """
     final = Path(path)
-    temporary = final.with_name(f".{final.stem}.{os.getpid()}.part{final.suffix}")
+    temporary = final.with_name(f".{final.stem}.part{final.suffix}")
     try:
         yield temporary
         os.replace(temporary, final)
@@ -185,17 +185,6 @@ def remove_file(path: Path | str) -> None:
         raise _output_error(Path(path), "a file that can be removed", problem) from problem
 
 
-def remove_stale_temporaries(folder: Path | str, names: Iterable[str]) -> None:
-    """Remove temporary files that a killed process left in a folder while it wrote files of these names.
-
-    Names may have stars, as in ``step-*.vtu``. Only temporary files of `replace_when_done` are removed.
-    """
-    for name in map(Path, names):
-        for path in sorted(Path(folder).glob(f".{name.stem}.*.part{name.suffix}")):
-            if re.search(r"\.\d+\.part$", path.name.removesuffix(name.suffix)):
-                remove_file(path)
-
-
 def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Iterable[str] = ()) -> None:
     """Raise `OutputError` if a folder has the name of one of `files`, or a file the name of one of `folders`."""
     blocked = [name for name in files if (folder / name).is_dir()]
@@ -206,32 +195,25 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
         raise OutputError("output folder", expected=expected, got=", ".join(blocked), remedy=remedy)
 
 
-def result_folder(
-    path: Path | str, files: Sequence[str], own: Sequence[str], others: Sequence[str], series: str | None = None
-) -> Path:
-    """Make and return the folder of a command's results, and remove temporary files that killed runs left there.
+def result_folder(path: Path | str, files: Sequence[str], first: str, series: str | None = None) -> Path:
+    """Make and return the folder of a command's results.
 
-    Raises `OutputError` if something is in the way of the results, if the folder holds results of another command, or
-    if the command would replace or remove files that it did not write.
+    Raises `OutputError` if something is in the way of the results, or if the command would replace or remove files that
+    it did not write.
 
     Args:
         files: Names of all files in the folder `path` that the command may write.
-        own: Names of files that a run writes first and last. If none exists, the command wrote none of `files`.
-        others: Names of files by which results of another command are recognised.
+        first: Name of the file that a run writes first. Without it, the command wrote none of `files`.
         series: Pattern of files in a subfolder, as ``heat/step-*.vtu``; None if the command writes no such files.
     """
     folder, steps = writable_folder(path), [] if series is None else [series]
     refuse_what_is_in_the_way(folder, files, [Path(name).parent.name for name in steps])
-    found, every = [name for name in others if (folder / name).exists()], (*files, *steps)
-    if not any((folder / name).exists() for name in own):
-        there = [next(folder.glob(name), None) for name in every]
-        found += [one.relative_to(folder).as_posix() for one in there if one is not None]
-    if found:
+    there = [next(folder.glob(name), None) for name in (*files, *steps)]
+    found = [one.relative_to(folder).as_posix() for one in there if one is not None]
+    if found and first not in found:
         expected = f"no files but those of an earlier run of this command in {folder}"
         remedy = "Choose another folder with --output-dir, or move them away."
-        raise OutputError("output folder", expected=expected, got=", ".join(dict.fromkeys(found)), remedy=remedy)
-    for name in every:
-        remove_stale_temporaries((folder / name).parent, [Path(name).name])
+        raise OutputError("output folder", expected=expected, got=", ".join(found), remedy=remedy)
     return folder
 
 

@@ -7,7 +7,6 @@ import enum
 import importlib
 import os
 import sys
-from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
@@ -36,20 +35,25 @@ class ConfigLoader(yaml.Loader):
     run_folder: ClassVar[Path | None] = None
     """Folder of the config.yml that is loaded next, to which the run may have been moved; None: not known."""
 
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Return the next node of the file, or raise `CheckpointError` with a forbidden name and its line."""
+        node = super().compose_node(parent, index)
+        tag = "" if node is None else node.tag.removeprefix(_PYTHON_TAG)
+        if node is not None and node.tag != tag and not _harmless(tag):
+            expected = "a config.yml that names only configuration classes of nerfstudio and its installed plugins"
+            remedy = "Do not use this file: it could run code. If you trust it, install the package that it names."
+            got = f"{tag} in line {node.start_mark.line + 1}"
+            raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
+        return node
+
     def get_single_data(self) -> Any:
-        """Return the content of the file, or raise `CheckpointError` with a forbidden name and its line."""
-        expected = "a config.yml that names only configuration classes of nerfstudio and its installed plugins"
-        remedy = "Do not use this file: it could run code. If you trust it, install the package that it names."
+        """Return the content of the file; raise `CheckpointError` if it cannot be read safely."""
         try:
             node = self.get_single_node()
         except RecursionError as problem:
-            got, remedy = "entries nested too deeply to read", "Pass the config.yml of a training run."
+            expected, remedy = "a config.yml that ns-train wrote", "Pass the config.yml of a training run."
+            got = "entries nested too deeply to read"
             raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy) from problem
-        for place in _nodes(node):
-            tag = place.tag.removeprefix(_PYTHON_TAG)
-            if place.tag != tag and not _harmless(tag):
-                got = f"{tag} in line {place.start_mark.line + 1}"
-                raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
         found = None if node is None else self.construct_document(node)
         folder, ConfigLoader.run_folder = ConfigLoader.run_folder, None
         if folder is not None and found is not None and hasattr(found, "moved_to"):
@@ -70,19 +74,29 @@ def _plain(loader: _PlainLoader, _: str, node: yaml.Node) -> Any:
 _PlainLoader.add_multi_constructor(_PYTHON_TAG, _plain)
 
 
-def check_run(config: Path) -> None:
-    """Raise `CheckpointError` if a run lacks its config.yml, checkpoint or photographs; nerfstudio is not imported."""
-    if not config.is_file():
-        remedy = "Pass that of a run, outputs/<scene>/thermoxels/<time>/config.yml."
-        got = f"no file at {config}"
-        raise CheckpointError("load_config", expected="the config.yml of a training run", got=got, remedy=remedy)
+def check_run(config: Path) -> dict[str, Any]:
+    """Return the content of a run's config.yml as `_PlainLoader` reads it; nerfstudio is not imported.
+
+    Raises `CheckpointError` if the file, a checkpoint or the photographs are missing; a run of another method needs the
+    file alone. `ConfigLoader` then takes the folder of `config` as that of the run, which may have been moved.
+    """
+    got, remedy = "no such file", "Pass that of a run, outputs/<scene>/thermoxels/<time>/config.yml."
+    content: Any = None
+    if config.is_file():
+        try:
+            content = yaml.load(config.read_text(encoding="utf-8"), Loader=_PlainLoader)
+            got = "no settings of a run"
+        except (yaml.YAMLError, OSError, ValueError, RecursionError) as problem:
+            got = " ".join(str(problem).split())
+    if not isinstance(content, dict):
+        raise CheckpointError("load_config", expected="the config.yml of a run", got=f"{config}: {got}", remedy=remedy)
+    ConfigLoader.run_folder = config.parent
     try:
-        content = yaml.load(config.read_text(encoding="utf-8"), Loader=_PlainLoader)
         models = config.parent.joinpath(*content["relative_model_dir"])
         manager, from_run = content["pipeline"]["datamanager"], content["scene_from_run"]  # other methods lack it
         told = Path(*(manager["data"] or manager["dataparser"]["data"]))
-    except (yaml.YAMLError, OSError, UnicodeDecodeError, KeyError, TypeError, RecursionError):
-        return  # another layout is left to whoever loads the file
+    except (KeyError, TypeError):
+        return content
     remedy = "Copy the whole folder of the run, or train to the first checkpoint."
     if not any(models.glob("step-*.ckpt")):
         raise CheckpointError("checkpoint", expected=f"a file step-*.ckpt in {models}", got="none", remedy=remedy)
@@ -90,27 +104,13 @@ def check_run(config: Path) -> None:
         expected, remedy = "the photographs that it was trained on", f"Put the scene folder at {told}"
         remedy += f", or at {from_run} as seen from the folder of the run." if from_run else "."
         raise CheckpointError(f"scene of {config}", expected=expected, got="none", remedy=remedy)
+    return content
 
 
 def scene_of_run(folder: Path, told: Path, from_run: str) -> Path:
     """Return the path of a run's scene: `from_run`, as seen from its folder, if something is there, else `told`."""
     beside = Path(os.path.normpath(folder / from_run))
     return beside if from_run and beside.exists() else told
-
-
-def _nodes(root: yaml.Node | None) -> Iterator[yaml.Node]:
-    """Yield a yaml node and all nodes below, each once."""
-    seen, waiting = set[int](), [root] if root is not None else []
-    while waiting:
-        node = waiting.pop()
-        if id(node) in seen:
-            continue
-        seen.add(id(node))
-        yield node
-        if isinstance(node, yaml.MappingNode):
-            waiting += [part for pair in node.value for part in pair]
-        elif isinstance(node, yaml.SequenceNode):
-            waiting += node.value
 
 
 def _harmless(tag: str) -> bool:

@@ -21,12 +21,3 @@ def silence() -> None:
     if not sys.warnoptions:
         for begin, kind in PROGRAMMERS_WARNINGS:
             warnings.filterwarnings("ignore", re.escape(begin), kind)
-
-
-def environment_value() -> str:
-    """Return a value of PYTHONWARNINGS that silences them from a process's first import on.
-
-    >>> environment_value()[:60]
-    'ignore:`torch.jit.script` is deprecated:FutureWarning,ignore'
-    """
-    return ",".join(f"ignore:{begin}:{kind.__name__}" for begin, kind in PROGRAMMERS_WARNINGS)

@@ -22,8 +22,6 @@ from thermoxels_ns.reports.page import image_file
 if TYPE_CHECKING:
     import pyvista as pv
 
-    from thermoxels_ns.fem.solution import HeatSolution
-
 # Part of the picture that the mesh may fill, as (left, bottom, right, top) shares of width and height. The title is
 # above this part, the colour bar is to the right, and the axes and the size of the mesh are below.
 _MESH_AREA = (0.04, 0.16, 0.80, 0.90)
@@ -254,15 +252,6 @@ def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], len
     write_picture(paths[0], every)
     title = "Measured surface temperature"
     write_picture(paths[1], image_of_mesh(mesh, title=title, painted=painted, length_unit=length_unit, **look))
-
-
-def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[str, Any]) -> None:
-    """Draw one picture with three panels: temperatures before and after, in one range of colours, and their change.
-
-    `look` are the arguments `up` and `view_direction` of `image_of_surface`.
-    """
-    shown = before_after_change(solution.temperature_c, solution.times_s, np.unique(mesh.facets))
-    write_picture(path, np.concatenate([image_of_mesh(mesh, values, **how, **look) for values, how in shown], axis=1))
 
 
 def draw_surface(

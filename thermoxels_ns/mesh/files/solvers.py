@@ -218,7 +218,7 @@ def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep) -> None:
 def check_start(mesh: TetMesh) -> None:
     """Raise `MeshError` if a mesh has no temperatures, with which a computation by an .inp file starts."""
     if not mesh.has_temperatures:
-        remedy = "Pass --heat-preset a yaml file with initial: {temperature_c: 15}, or leave inp out of --formats."
+        remedy = "Leave inp out of --formats."
         raise MeshError("mesh for .inp", expected="temperatures at the start", got="none", remedy=remedy)
 
 
