@@ -35,7 +35,7 @@ from thermoxels_ns.audit.conditions import (
 )
 from thermoxels_ns.audit.defects import find_defects, undisturbed_temperature
 from thermoxels_ns.audit.draws import COUNT, FORMULA, GEOMETRY, Interval, draw, interval_of
-from thermoxels_ns.audit.heat_flow import CONVECTION, SIMPLE, net_radiation_w_m2
+from thermoxels_ns.audit.heat_flow import FILMS, net_radiation_w_m2, simple_models
 from thermoxels_ns.audit.run import Audit, audit
 from thermoxels_ns.audit.surface import audited_surface
 from thermoxels_ns.core.errors import AuditError
@@ -126,8 +126,8 @@ def test_on_a_clear_calm_night_the_balance_holds_the_truth_and_simple_formulas_a
     found = audit(mesh, NIGHT, UP)
     assert found.whole.surface_c.value < truth.draws["outside air"][0] and truth.u_w_m2k["facade"] > 0.7
     assert found.whole.u_w_m2k.low < truth.u_w_m2k["facade"] < found.whole.u_w_m2k.high
-    assert found.failing_models == tuple(SIMPLE["outside"]) and found.whole.u_by_model["dallo"] < 0.0
-    for model in SIMPLE["outside"]:
+    assert found.failing_models == simple_models("outside") and found.whole.u_by_model["dallo"] < 0.0
+    for model in simple_models("outside"):
         with pytest.raises(AuditError, match=r"^film: model: .*Write model: balance"):
             audit(mesh, replace(NIGHT, film=Film(model, Measured(1.0, 0.2))), UP)
 
@@ -136,7 +136,7 @@ def test_formulas_of_convection_are_drawn_by_their_weights_and_widen_the_interva
     """Weights 1 and 3: a quarter of the draws is by ISO 6946, whose 4 + 4 v is the largest here; the mean is stated."""
     stated = replace(STATED, film=Film(weights={"iso-6946": 1.0, "watmuff": 3.0}))
     drawn = draw(stated)[FORMULA]
-    names = list(CONVECTION["outside"])
+    names = list(FILMS["outside"])
     assert drawn[0] == -1.0 and drawn.shape == (COUNT + 1,)
     shares = {names[int(n)]: float(np.mean(drawn[1:] == n)) for n in np.unique(drawn[1:])}
     assert shares == pytest.approx({"iso-6946": 0.25, "watmuff": 0.75}, abs=1e-3)
