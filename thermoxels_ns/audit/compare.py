@@ -63,20 +63,6 @@ class Comparison:
     moved: bool  # True if the earlier mesh was turned and shifted onto the later one
     residual_m: float  # Median distance between the two surfaces, [m]
 
-    def lines(self) -> list[str]:
-        """Return sentences for a log: how the meshes were aligned, and how many changes are significant."""
-        how = "turned and shifted onto the later one" if self.moved else "taken as it is: same coordinates"
-        sure = [one for one in (*self.elements, *self.bridges) if one.significant]
-        return [
-            f"Compared: the earlier mesh was {how}; median distance {1e3 * self.residual_m:.0f} mm.",
-            f"Significant changes: {', '.join(one.name for one in sure) or 'none'}.",
-            *(
-                f"Only {when}: {', '.join(n)}."
-                for when, n in (("before", self.only_before), ("after", self.only_after))
-                if n
-            ),
-        ]
-
 
 class Pose(NamedTuple):
     """A rotation and a shift that take the earlier mesh's coordinates into those of the later one."""
@@ -138,11 +124,7 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
     new = _Survey(after, later, _partners(len(there.counted), counted[1], at_new, counted[0], at_old))
     elements, only_after = new.elements(old)
     if not elements:
-        if moved:  # a wall slides along a larger one: how far apart they are does not tell that they do not fit
-            got = "no surface in common where they fit best"
-            raise AuditError("compare", expected="two meshes that fit each other", got=got, remedy=_POSE_TOGETHER)
-        expected, remedy = "surface that both surveys saw", "Compare surveys that show the same walls."
-        raise AuditError("compare", expected=expected, got="none", remedy=remedy)
+        raise AuditError("compare", expected="surface that both surveys saw", got="none", remedy=_POSE_TOGETHER)
     bridges, parts = _bridges(old, new), list(elements.values())
     was_m2, *was = old.flows([*map(old.from_other, parts), *(part for one in bridges for part in one.before[:2])])
     now_m2, *now = new.flows([*parts, *(part for one in bridges for part in one.after[:2])])
@@ -328,10 +310,6 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
         lost |= np.einsum("ij,ij->i", turned, facing[nearest]) < _FACES
         return np.where(lost, _UNMATCHED_M, along), moved, nearest
 
-    def residual(pose: Pose) -> tuple[float, float]:  # the mean tells what a notch or a balcony shows, the median not
-        off = np.abs(distances(pose)[0])
-        return float(np.mean(off)), float(np.median(off))
-
     def refined(pose: Pose) -> Pose:
         for _ in range(_ALIGN_STEPS):
             along, moved, nearest = distances(pose)
@@ -345,32 +323,32 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
 
     as_given = Pose(np.eye(3), np.zeros(3))
     edge = 2.0 * float(np.sqrt(2.0 * max(np.median(one.area_m2[one.counted]) for one in (before, after))))
-    mean, given = residual(as_given)
+    given = np.abs(distances(as_given)[0])
     back = KDTree(_places(points, normals)).query(_places(target, facing))[0]  # one survey may have seen less
-    given_back = np.minimum(back, _UNMATCHED_M)
-    for average, median in ((mean, given), (float(given_back.mean()), float(np.median(given_back)))):
-        if average <= min(edge, _FITS_M):
-            return as_given, median, False
+    for off in (given, np.minimum(back, _UNMATCHED_M)):
+        if off.mean() <= min(edge, _FITS_M):
+            return as_given, float(np.median(off)), False
     up = [np.array(one.selection.up) for one in (before, after)]
     upright = Rotation.align_vectors(up[1][None], up[0][None])[0].as_matrix()
-    tried = list[tuple[float, float, Pose]]()
+    tried = list[tuple[float, float, Pose]]()  # The mean tells what a notch or a balcony shows, the median not
     for degrees in np.arange(0.0, 360.0, _TURN_DEG):
         turn = Rotation.from_rotvec(np.radians(degrees) * up[1]).as_matrix() @ upright
-        start = Pose(turn, target.mean(axis=0) - turn @ points.mean(axis=0))
-        pose = refined(start)
-        tried.append((*residual(pose), pose))
+        pose = refined(Pose(turn, target.mean(axis=0) - turn @ points.mean(axis=0)))
+        off = np.abs(distances(pose)[0])
+        tried.append((float(off.mean()), float(np.median(off)), pose))
     tried.sort(key=lambda one: one[0])
     best, median, pose = tried[0]
-    if given <= _FITS_M and mean <= 1.5 * best:
-        return as_given, given, False
-    if median > _FITS_M:
-        got = f"meshes {median:.2f} m apart (median) where they fit best, {given:.2f} m as they are"
-        raise AuditError("compare", expected="two meshes that fit each other", got=got, remedy=_POSE_TOGETHER)
-    other = next((one for one in tried if _turned_deg(pose, one[2]) > _TURN_DEG), None)
-    if other is not None and other[0] <= _LIKE_BEST * best + 0.1 * edge:
-        got = f"two positions {_turned_deg(pose, other[2]):.0f} degrees apart, {best:.2f} and {other[0]:.2f} m off"
-        remedy = "Pose the photographs of both surveys together, so that both meshes have the same coordinates."
-        raise AuditError("compare", expected="one position in which the meshes fit", got=got, remedy=remedy)
+    if np.median(given) <= _FITS_M and given.mean() <= 1.5 * best:
+        return as_given, float(np.median(given)), False
+    others = [
+        one for one in tried if _turned_deg(pose, one[2]) > _TURN_DEG and one[0] <= _LIKE_BEST * best + 0.1 * edge
+    ]
+    if median > _FITS_M or others:
+        got = f"{median:.2f} m between them (median) where they fit best"
+        if others:
+            got = f"two positions, {_turned_deg(pose, others[0][2]):.0f} degrees apart"
+        expected = "one position in which the meshes fit each other"
+        raise AuditError("compare", expected=expected, got=got, remedy=_POSE_TOGETHER)
     return pose, median, True
 
 
