@@ -52,6 +52,7 @@ def test_u_values_between_20_and_0_c_after_published_formulas(flow_w_m2, publish
         ("inside", "iso-6946", 0.0, -1.0, 2.5),
         ("inside", "walton", 0.0, -8.0, 2.62),
         ("inside", "khalifa", 0.0, -1.0, 2.30),
+        ("inside", "iso-6946-combined", 0.0, -1.0, 1.0 / 0.13),
     ],
 )
 def test_convection_on_a_wall_after_published_formulas(side, name, wind_m_s, warmer_k, published) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -71,14 +71,6 @@ def _around(conditions: Conditions, groups: Readings, draws: Draws) -> list[Exch
     return [exchange(conditions, groups, draws.stated, step) for step in (-HALF_STEP_K, 0.0, HALF_STEP_K)]
 
 
-def in_chunks(conditions: Conditions, groups: Readings, draws: Draws) -> Iterator[tuple[slice, Exchange]]:
-    """Yield slices of the groups and their exchange, each of about `CHUNK` values, to save memory."""
-    step = max(1, CHUNK // draws.count)
-    for start in range(0, len(groups.reading_c), step):
-        part = slice(start, start + step)
-        yield part, exchange(conditions, groups.some(part), draws)
-
-
 class Parts:
     """Parts of the surface, which are p sets of triangles that count, with their heat exchange in draws.
 
@@ -115,7 +107,10 @@ class Parts:
         """
         rows = self._rows[:first]
         surface_c, flow_w = (np.repeat(off[:first], draws.count, axis=1) for off in self._off)
-        for part, some in in_chunks(self.conditions, self.groups, draws):
+        step = max(1, CHUNK // draws.count)
+        for start in range(0, len(self.groups.reading_c), step):
+            part = slice(start, start + step)
+            some = exchange(self.conditions, self.groups.some(part), draws)
             surface_c += rows[:, part] @ some.surface_c
             flow_w += rows[:, part] @ some.flow_w_m2
         area = self.area_m2[:first, None]

@@ -14,7 +14,6 @@ from thermoxels_ns.audit.calibration import Calibration, calibrated
 from thermoxels_ns.audit.conditions import BALANCE, Conditions, Survey, load_conditions
 from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
 from thermoxels_ns.audit.draws import (
-    ENDS,
     GEOMETRY,
     Draws,
     Interval,
@@ -28,7 +27,6 @@ from thermoxels_ns.audit.energy import EnergyResult, year_of
 from thermoxels_ns.audit.exchange import (
     Exchange,
     Parts,
-    in_chunks,
     other_models,
     reference_doubts,
     triangle_exchange,
@@ -54,8 +52,7 @@ SEVERE_SHARE, MODERATE_SHARE = 0.05, 0.01
 F_RSI_M2K_W = (0.13, 0.25)
 """Inside surface resistances Rsi of the temperature factors, [m2 K / W]; ISO 13788 judges mould by the second."""
 _LEAST_FLOW_W_M2 = 1e-9
-_FEW = 2000  # Number of draws that tell by how much a cause widens an interval, and of those of single triangles
-_OF_A_TRIANGLE = 10**6  # Argument `number` of `Draws.local`, larger than any part's number
+_FEW = 2000  # Number of draws that tell by how much a cause widens an interval
 
 LEAST_DIFFERENCE_K, MOST_WIND_M_S, LEAST_HOURS_WITHOUT_SUN, LEAST_HOURS_DRY = 10.0, 5.0, 2.0, 24.0
 """Limits of EN 13187: least difference of the airs, most wind, least hours since the sun and since wetness."""
@@ -141,9 +138,16 @@ class SurveyCheck:
     """Shortcomings of a survey, in words for the report."""
 
     asked: tuple[Asked, ...]  # The conditions that EN 13187 and ISO 6781-3 ask for, met or not
-    forbidden: tuple[str, ...]  # Sentences on conditions that EN 13187 does not allow
     doubts: tuple[str, ...]  # Sentences on what makes the figures less certain than their intervals say
     missing: tuple[str, ...]  # Names of facts that EN 13187 wants in a report and that the conditions do not state
+
+    @property
+    def forbidden(self) -> tuple[str, ...]:
+        """Sentences on conditions that EN 13187 does not allow."""
+        wrong = [one for one in self.asked if one.verdict == "not met"]
+        return tuple(
+            f"{one.what[0].upper()}{one.what[1:]}: {one.stated}. EN 13187 asks for {one.asked}." for one in wrong
+        )
 
 
 @dataclass(frozen=True)
@@ -172,7 +176,7 @@ class Audit(HasTables):
     not_counted_m2: Mapping[str, float]  # Area of triangles that do not count, by the texts of `WHY_NOT`
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
-    triangle_u: FloatArray  # U-value and both ends of its interval, shape (f, 3), [W/(m2 K)]; NaN: does not count
+    triangle_u: FloatArray  # U-value, shape (f,), [W/(m2 K)]; NaN: does not count, or no U-value is known
 
     def __repr__(self) -> str:
         loss, u = self.whole.loss_w, self.whole.u_w_m2k
@@ -202,7 +206,7 @@ class Audit(HasTables):
         for name, values in {
             "surface_temperature_c": self.triangle_surface_c,
             "heat_flow_w_m2": self.triangle_flow_w_m2,
-            **dict(zip(("u_w_m2k", "u_low_w_m2k", "u_high_w_m2k"), self.triangle_u.T)),
+            "u_w_m2k": self.triangle_u,
             "counted": self.surface.counted.astype(np.uint8),
             "defect": numbers,
             **({} if calibration is None else {"measured_minus_computed_k": calibration.difference_k}),
@@ -280,7 +284,7 @@ def audit(
         not_counted_m2={why: area for why, area in left.items() if area > 0.0},
         triangle_surface_c=stated.surface_c,
         triangle_flow_w_m2=stated.flow_w_m2,
-        triangle_u=work.triangle_u(),
+        triangle_u=stated.flow_w_m2 / draws.difference_k[0],
     )
 
 
@@ -320,7 +324,7 @@ class _Work:
         stated: Exchange,
         found: Sequence[FoundDefect],
     ) -> None:
-        self.conditions, self.surface, self.draws, self.stated = conditions, surface, draws, stated
+        self.conditions, self.surface, self.draws = conditions, surface, draws
         self.storey_names, self.storey = [*conditions.storeys, ""], _storey_of(surface, conditions)
         counted = np.flatnonzero(surface.counted)
         several = len(self.storey_names)
@@ -396,17 +400,6 @@ class _Work:
             )
             found.append(_Drawn(element, flow_w[n], area[n], u[n]))
         return found[: len(patches)], found[len(patches) : -1], found[-1], _largest_first(budget)
-
-    def triangle_u(self) -> FloatArray:
-        """Return the U-value of each triangle and both ends of its interval; see `Audit.triangle_u`."""
-        few, found, (groups, of) = self.draws.first(_FEW), [], self.surface.alike
-        off_k = few.local(self.conditions.camera.repeatability.off_by, _OF_A_TRIANGLE)
-        few = replace(few, values={**few.values, "camera offset": few["camera offset"] + off_k})
-        for _, some in in_chunks(self.conditions, groups, few):
-            u = some.flow_w_m2 / few.difference_k
-            found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ENDS, axis=1).T], axis=1))
-        u = np.concatenate(found)[of]
-        return u + (self.stated.flow_w_m2 / few.difference_k[0] - u[:, 0])[:, None]
 
     def own_error_k(self, number: int) -> FloatArray:
         """Draw the reading error that a defect, or the coldest spot, does not share with others, shape (k,), [K]."""
@@ -555,13 +548,7 @@ def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tup
 
 def check_survey(conditions: Conditions) -> SurveyCheck:
     """Return what EN 13187 forbids and misses in the conditions of a survey, and what makes results doubtful."""
-    asked = asked_of_survey(conditions.survey, conditions)
-    forbidden = [
-        f"{one.what[0].upper()}{one.what[1:]}: {one.stated}. EN 13187 asks for {one.asked}."
-        for one in asked
-        if one.verdict == "not met"
-    ]
-    return SurveyCheck(asked, tuple(forbidden), _doubts(conditions), _missing(conditions))
+    return SurveyCheck(asked_of_survey(conditions.survey, conditions), _doubts(conditions), _missing(conditions))
 
 
 def _doubts(conditions: Conditions) -> tuple[str, ...]:
