@@ -13,8 +13,7 @@ known to 1 K and with one contact temperature known to 0.2 K in its place, and o
 With --trained the whole way is in the loop: a house with a room, a window in each of two walls, a door and a balcony
 slab is solved under what each seed draws, photographed by a camera that errs as stated (noise 0.1 K, drift 0.5 K,
 exposure 0.2 stops, poses 0.1 degrees), trained, exported and audited by the commands that a user types, and beside it
-the solved mesh itself ("no training"), so that what reconstruction adds shows. Each audit's figures are rows of
-``audit_truth.csv`` in the output folder, written as they come; seeds that are there are not run again.
+the solved mesh itself ("no training"), so that what reconstruction adds shows. The output folder keeps logs and meshes.
 
 With --calibrate conductivities are estimated instead, from starts that are off by factors of two: of wall and glazing
 from outside with a contact temperature, of the wall from inside. With --calibrate --history-h 48 the wall (of a time
@@ -23,12 +22,10 @@ the survey, and as if heat flow were steady. With --balance the formula of conve
 too, for the truth as for the audits, and a calm, clear night is added, whose sky cools the wall below the air.
 """
 
-import csv
 import shutil
-import sys
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from io import StringIO
 from itertools import product
 from pathlib import Path
@@ -148,42 +145,20 @@ def trained_mesh(truth: Truth, stated: Conditions, folder: Path, quality: str, s
 
 
 def run_trained(output: Path, quality: str, seeds: int) -> None:
-    """Train and audit the houses that the output folder does not have yet, and print what all say."""
-    path, done = output / "audit_truth.csv", set[tuple[str, str]]()
-    output.mkdir(parents=True, exist_ok=True)
-    columns = ["quality", "seed", "audit", "quantity", "true", "value", "low", "high"]
-    if path.is_file():
-        with path.open(newline="", encoding="utf-8") as file:
-            done = {(row["quality"], row["seed"]) for row in csv.DictReader(file)}
-    else:
-        path.write_text(",".join(columns) + "\n", encoding="utf-8")
+    """Train and audit houses, and print what all say."""
+    rows: Rows = {}
     for seed in range(seeds):
-        if (quality, str(seed)) in done:
-            continue
         draws = true_draws(STATED, seed)
         truth, plain = (solve_wall(house_mesh(slab=slab), STATED, draws) for slab in (True, False))
-        folder = output / f"{quality} {seed}"
-        shutil.rmtree(folder, ignore_errors=True)
         meshes = {
             "no training": photographed(truth, STATED, seed),
-            "trained": trained_mesh(truth, STATED, folder, quality, seed),
+            "trained": trained_mesh(truth, STATED, output / f"{quality} {seed}", quality, seed),
         }
         contact = with_contact(STATED, truth, seed, CONTACT_M)
-        rows = [
-            [quality, seed, f"{how}, {known}", name, true, *astuple(found)]
-            for how, mesh in meshes.items()
-            for known, conditions in (("offset", STATED), ("contact", contact))
-            for name, true, found in house_findings(mesh, truth, plain, conditions)
-        ]
-        with path.open("a", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows(rows)
+        for (how, mesh), (known, stated) in product(meshes.items(), (("offset", STATED), ("contact", contact))):
+            for name, true, found in house_findings(mesh, truth, plain, stated):
+                rows.setdefault((f"{how}, {known}", name), []).append((true, found))
         print(f"seed {seed}: done", flush=True)
-    rows: Rows = {}
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            if row["quality"] == quality:
-                found = Interval(*(float(row[name]) for name in ("value", "low", "high")))
-                rows.setdefault((row["audit"], row["quantity"]), []).append((float(row["true"]), found))
     report(rows)
 
 
@@ -219,7 +194,7 @@ class AuditTruth:
     trained: Literal["draft", "standard"] | None = None
     """Photograph, train and export solved houses of this quality, and audit these."""
     output: Path = Path("audit-truth")
-    """Folder for the rows and logs of --trained."""
+    """Folder for the meshes and logs of --trained."""
 
     def main(self) -> None:
         rows: Rows = {}
@@ -231,7 +206,6 @@ class AuditTruth:
                 for seed, side, steady in product(range(self.seeds), ("outside", "inside"), (False, True)):
                     how = f"{side}, {'as if steady' if steady else f'{self.history_h:g} h of air'}"
                     found, calibration = calibrated_after(side, seed, Path(folder), self.history_h, steady)
-                    print(seed, how, *astuple(found)[:3], calibration.refused[:60], sep="; ", file=sys.stderr)
                     if calibration.refused:
                         refused[how] += 1
                     else:
