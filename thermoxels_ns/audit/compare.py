@@ -126,8 +126,8 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
     if not elements:
         raise AuditError("compare", expected="surface that both surveys saw", got="none", remedy=_POSE_TOGETHER)
     bridges, parts = _bridges(old, new), list(elements.values())
-    was_m2, *was = old.flows([*map(old.from_other, parts), *(part for one in bridges for part in one.before[:2])])
-    now_m2, *now = new.flows([*parts, *(part for one in bridges for part in one.after[:2])])
+    was = old.flows([*map(old.from_other, parts), *(part for one in bridges for part in one.before[:2])])
+    now = new.flows([*parts, *(part for one in bridges for part in one.after[:2])])
 
     def middle(part: IntArray) -> tuple[float, float, float]:
         x, y, z = np.average(there.centroid_m[part], axis=0, weights=there.area_m2[part]).tolist()
@@ -136,8 +136,8 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
     def change_of_u(name: str, part: IntArray, before: FloatArray, after: FloatArray, area_m2: float) -> Change:
         return _change(name, "in both", middle(part), "W/(m2 K)", before, after, area_m2 * difference_k)
 
-    areas = now_m2[: len(parts)]
-    u = [sum(flows)[: len(parts)] / area[: len(parts), None] for flows, area in ((was, was_m2), (now, now_m2))]
+    areas = now[0][: len(parts)]
+    u = [(flow + own)[: len(parts)] / area[: len(parts), None] for area, flow, own in (was, now)]
     changes = [change_of_u(name, part, u[0][n], u[1][n], areas[n]) for n, (name, part) in enumerate(elements.items())]
     mean_was, mean_now = (areas @ one / areas.sum() for one in u)
     found = list[Change]()
@@ -146,11 +146,11 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
         length, unit = (bridge.length_m, "W/(m K)") if bridge.kind == "line" else (1.0, "W/K")
         drawn = [
             (flow[zone] + own[zone] - flow[zone + 1] / area[zone + 1] * base_m2) / length
-            for (flow, own), area, (_, _, base_m2) in ((was, was_m2, one.before), (now, now_m2, one.after))
+            for (area, flow, own), (_, _, base_m2) in ((was, one.before), (now, one.after))
         ]
         patch = (old if one.state == "went" else new).surface.selection.patch_names[bridge.patch]
         name = f"{'thermal bridge' if bridge.kind != 'area' else 'defect'} ({bridge.kind}) in {patch}"
-        found.append(_change(name, one.state, middle(one.after[0]), unit, *drawn, length * difference_k))
+        found.append(_change(name, one.state, middle(one.after[0]), unit, drawn[0], drawn[1], length * difference_k))
     return Comparison(
         whole=change_of_u("all that both saw", np.concatenate(parts), mean_was, mean_now, float(areas.sum())),
         elements=_ranked(changes),
@@ -211,7 +211,8 @@ class _Survey:
         off_by, difference_k = conditions.camera.repeatability.off_by, self.draws.difference_k
         off_k = np.stack([self.draws.local(off_by, n) for n in range(len(parts))])
         _, flow_w = found.in_draws(self.draws)
-        return found.area_m2, flow_w / difference_k, found.slope_w_k[:, None] * off_k / difference_k
+        own_w = found.slope_w_k[:, None] * off_k
+        return np.maximum(found.area_m2, 1e-12), flow_w / difference_k, own_w / difference_k
 
 
 def _bridges(old: _Survey, new: _Survey) -> list[_Bridge]:

@@ -88,7 +88,8 @@ class Parts:
     ) -> None:
         """Take the parts as indices of triangles; `stated` is the `triangle_exchange`."""
         self.conditions, (self.groups, of_triangle) = conditions, surface.alike
-        row, every = np.repeat(np.arange(len(which)), [len(one) for one in which]), np.concatenate(which)
+        row = np.repeat(np.arange(len(which)), [len(one) for one in which])
+        every = np.concatenate([np.zeros(0, np.int64), *which])
         area, shape = surface.area_m2[every], (len(which), len(self.groups.reading_c))
         self._rows = sparse.coo_array((area, (row, of_triangle[every])), shape=shape).tocsc()
         low, mean, high = _around(conditions, self.groups, draws)
