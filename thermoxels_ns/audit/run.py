@@ -246,22 +246,15 @@ def audit(
     surface = audited_surface(mesh, conditions, up)
     draws = with_references(surface, conditions, draw(conditions))
     stated = triangle_exchange(conditions, surface, draws)
-    warm, least_k = conditions.side == "outside", conditions.camera.repeatability.off_by
-    found = find_defects(surface, stated.surface_c, warm, least_k)
+    off_by = conditions.camera.repeatability.off_by
+    found = find_defects(surface, stated.surface_c, conditions.side == "outside", off_by)
     work = _Work(conditions, surface, draws, stated, found)
     patches, storeys, whole, budget = work.elements()
     failing = _failing_models(conditions, [one.element for one in (*patches, *storeys, whole)])
-    loss = whole.element.loss_w.value
-    defects = [work.defect(number, one, loss) for number, one in enumerate(found)]
-    if least_bridge_w > 0.0:
-        why = f"It loses less than {least_bridge_w:g} W extra (--least-bridge-w)."
-        slight = [not one.not_counted and one.extra_w.value < least_bridge_w for one, _ in defects]
-        defects = [(replace(one, not_counted=why) if drop else one, psi) for (one, psi), drop in zip(defects, slight)]
-    order = sorted(range(len(found)), key=lambda n: (bool(defects[n][0].not_counted), -defects[n][0].extra_w.value))
-    defects, factors = (
-        [defects[n] for n in order],
-        work.temperature_factors(len(work.flow_w) - 1, work.own_error_k(3 * len(found))),
-    )
+    loss_w = whole.element.loss_w.value
+    bridges = [(one, *work.defect(number, one, loss_w, least_bridge_w)) for number, one in enumerate(found)]
+    bridges.sort(key=lambda item: (bool(item[1].not_counted), -item[1].extra_w.value))
+    factors = work.temperature_factors(len(work.flow_w) - 1, work.own_error_k(3 * len(found)))
     check, (remembered, told) = check_survey(conditions), _remembered(conditions)
     left = {why: float(surface.area_m2[surface.why_not == n].sum()) for n, why in enumerate(WHY_NOT.values())}
     return Audit(
@@ -271,9 +264,9 @@ def audit(
         patches=tuple(one.element for one in patches),
         storeys=tuple(one.element for one in storeys),
         whole=whole.element,
-        defects=tuple(one for one, _ in defects),
-        found=tuple(found[n] for n in order),
-        limits=_limits(conditions, patches, defects, whole, factors),
+        defects=tuple(one for _, one, _ in bridges),
+        found=tuple(one for one, _, _ in bridges),
+        limits=_limits(conditions, patches, [(one, psi) for _, one, psi in bridges], whole, factors),
         energy=year_of(conditions, draws, [(one.element.name, one.area_m2, one.u) for one in patches]),
         calibration=calibrated(conditions, surface, draws),
         f_rsi=tuple(interval_of(one) for one in factors),
@@ -418,12 +411,12 @@ class _Work:
         above = self.surface_c[part] + off_k - self.draws["outside air"]
         return tuple(np.asarray(temperature_factor(above / flow, one)) for one in F_RSI_M2K_W)
 
-    def defect(self, number: int, one: FoundDefect, whole_w: float) -> tuple[Defect, FloatArray]:
+    def defect(self, number: int, one: FoundDefect, whole_w: float, least_w: float) -> tuple[Defect, FloatArray]:
         """Return the results of defect `number`, with draws of its `Defect.coefficient`.
 
         Extra heat flow is the flow of the zone minus the flow that the undisturbed surface near by would have on the
         area under the zone (psi = q_tb - q_uniform per metre, O'Grady and others 2017; areas are of the seen side).
-        `whole_w` is the observed heat loss, [W].
+        `whole_w` is the observed heat loss, `least_w` the least extra flow that counts, [W].
         """
         surface, zone, off_k = self.surface, len(self.piece_patch) + 3 * number, self.own_error_k(number)
         calm, spot = zone + 1, zone + 2
@@ -435,7 +428,9 @@ class _Work:
             extra = extra * (1.0 + border * min(edge / one.length_m, 0.9))
         per_kelvin = extra / self.draws.difference_k / (one.length_m if one.kind == "line" else 1.0)
         extra_w, f_rsi = interval_of(extra), tuple(map(interval_of, self.temperature_factors(spot, off_k)))
-        around_c = float(self.surface_c[calm, 0])
+        around_c, why = float(self.surface_c[calm, 0]), one.not_counted
+        if not why and max(extra_w.value, 0.0) < least_w:
+            why = f"It loses less than {least_w:g} W extra (--least-bridge-w)."
         area, spot_c = surface.area_m2[one.core], interval_of(self.surface_c[spot] + off_k)
         x, y, z = np.average(surface.centroid_m[one.core], axis=0, weights=area).tolist()
         defect = Defect(
@@ -453,7 +448,7 @@ class _Work:
             coefficient=interval_of(per_kelvin),
             f_rsi=f_rsi,
             severity=_severity(self.conditions, extra_w, f_rsi, whole_w),
-            not_counted=one.not_counted,
+            not_counted=why,
         )
         return defect, per_kelvin
 
