@@ -23,6 +23,7 @@ from thermoxels_ns.core.yaml_records import as_record, raising
 _DRAWS = 4000  # Ends of intervals scatter by about 1 % of the width
 _NEAR_M = 0.3  # Surface moves by less: insulation is thinner, and reconstructions err by less, [m]
 _FACES = 0.7  # Least cosine between normals of the same surface
+_ONE_POSITION = "one position in which the meshes fit each other"
 _POSE_TOGETHER = "Compare surveys of the same building in metres, or pose the photographs of both together."
 _FITS_M, _UNMATCHED_M = 0.2, 1.0  # Largest median distance of meshes that fit; distance of points without a partner
 _TURN_DEG = 15.0  # Step between the directions in which an alignment starts
@@ -124,7 +125,8 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
     new = _Survey(after, later, _partners(len(there.counted), counted[1], at_new, counted[0], at_old))
     elements, only_after = new.elements(old)
     if not elements:
-        raise AuditError("compare", expected="surface that both surveys saw", got="none", remedy=_POSE_TOGETHER)
+        got = "no surface that both surveys saw"
+        raise AuditError("compare", expected=_ONE_POSITION, got=got, remedy=_POSE_TOGETHER)
     bridges, parts = _bridges(old, new), list(elements.values())
     was = old.flows([*map(old.from_other, parts), *(part for one in bridges for part in one.before[:2])])
     now = new.flows([*parts, *(part for one in bridges for part in one.after[:2])])
@@ -348,8 +350,7 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
         got = f"{median:.2f} m between them (median) where they fit best"
         if others:
             got = f"two positions, {_turned_deg(pose, others[0][2]):.0f} degrees apart"
-        expected = "one position in which the meshes fit each other"
-        raise AuditError("compare", expected=expected, got=got, remedy=_POSE_TOGETHER)
+        raise AuditError("compare", expected=_ONE_POSITION, got=got, remedy=_POSE_TOGETHER)
     return pose, median, True
 
 
