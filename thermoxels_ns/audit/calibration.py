@@ -359,7 +359,7 @@ class _Fit:
         """Return the logarithms of the properties in every draw, (m, k), which quantity moves each property most, and
         by how much the air before the weather file moves each, (m,).
 
-        For each quantity that acts on all readings, the fit is repeated at both ends of its range; straight lines stand
+        For each quantity that acts on all readings, the fit is repeated at both ends of its range; a parabola stands
         for the values in between; of formulas each is tried. Effects of several quantities add up.
         """
         gain = np.linalg.solve(self.slope.T @ (self.weight[:, None] * self.slope), self.slope.T * self.weight)
@@ -373,9 +373,15 @@ class _Fit:
                 drawn[:, 1:] += each[:, place]
                 moved[name] = np.ptp(each, axis=1)
                 continue
-            low, high = values.min(), values.max()
-            below, above = (self._follow(gain, name, end) - self.logarithm for end in (low, high))
-            drawn += [np.interp(values, (low, values[0], high), (one, 0.0, other)) for one, other in zip(below, above)]
+            at = values - values[0]
+            low, high = at.min(), at.max()
+            below, above = (self._follow(gain, name, values[0] + end) - self.logarithm for end in (low, high))
+            if low == 0.0 or high == 0.0:  # stated at an end of what is possible, such as no wind: a line
+                rise, bend = (above / high if high > 0.0 else below / low), np.zeros(len(below))
+            else:  # the parabola through (low, below), (0, 0) and (high, above)
+                bend = (above / high - below / low) / (high - low)
+                rise = above / high - bend * high
+            drawn += rise[:, None] * at + bend[:, None] * at**2
             moved[name] = np.abs(above - below)
         for number, step in self._local(gain):
             drawn += step[:, None] * self.draws.local(off, _OF_A_PATCH + number)
