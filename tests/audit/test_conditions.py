@@ -21,6 +21,9 @@ surfaces: [{emissivity: 0.93 +- 0.02}]
 """
 
 
+AIRS, DAYS = {"inside": "20 C", "heating_limit": "15 C"}, {"degree_hours": "3000 K d"}
+
+
 @pytest.fixture
 def changed(tmp_path: Path):
     """Write conditions in which one entry is another one, given by its path; None removes it."""
@@ -85,6 +88,23 @@ def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) 
         (("camera", "emissivity"), 0.95, r"camera: reflected"),
         (("references",), [{"at": [float("nan"), 0.0, 1.2], "temperature": "1.4 C"}], r"references entry 1: at"),
         (("limits", "u"), {"*": "0.3 W"}, r"limits: u: \*"),
+        (("energy",), {"currency": "EUR"}, "energy: climate or degree_hours: expected one of climate, degree_hours"),
+        (
+            ("energy",),
+            {"climate": "a", "degree_hours": "8 K h", **AIRS},
+            "energy: climate or degree_hours: expected one",
+        ),
+        (("energy",), {"climate": "a.epw", "inside": "20 C"}, "energy: heating_limit: expected one"),
+        (
+            ("energy",),
+            {"degree_hours": "8 K h", "inside": "20 C"},
+            "energy: inside: expected none, because degree_hours",
+        ),
+        (("energy",), {"climate": "a.epw", **AIRS, "heating_limit": "21 C"}, "energy: heating_limit: expected surely"),
+        (("energy",), {"degree_hours": "80000"}, "energy: degree_hours: expected"),
+        (("energy",), {"degree_hours": "3000 K d", "price": "12 EUR"}, "energy: price: expected"),
+        (("energy",), DAYS | {"measures": {"x": {"patches": ["*"]}}}, "energy: measures: x: expected the key u"),
+        (("energy",), DAYS | {"measures": {"x": {"patches": [], "u": "1 W/(m2 K)"}}}, "energy: measures: x: patches"),
     ],
 )
 def test_bad_conditions_are_one_clear_error(changed, keys, value, named) -> None:

@@ -1,6 +1,6 @@
 """Heat, money and carbon dioxide of a year: degree hours by hand, the same draws before and after measures."""
 
-from dataclasses import make_dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +10,8 @@ from tests.support.epw_file import write_epw
 from thermoxels_ns.audit.conditions import Energy, Measure
 from thermoxels_ns.audit.draws import Draws, Interval
 from thermoxels_ns.audit.energy import EnergyResult, year_of
-from thermoxels_ns.core.errors import AuditError, ThermoxelsError
+from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
-from thermoxels_ns.core.yaml_records import as_record
 
 AREA_M2, U = 50.0, 0.8
 
@@ -83,34 +82,6 @@ def test_a_saving_has_the_draws_of_before_and_after() -> None:
     assert saved.high == pytest.approx(heat.high - 0.24 * AREA_M2 * 72.0)
     unsure = replace(exact, measures={"insulate": Measure(("wall-*",), Measured(0.24, 0.1))})
     assert year(unsure).savings[0].heat_kwh.low == pytest.approx((U - 0.33) * AREA_M2 * 72.0, rel=0.01)
-
-
-AIRS = {"inside": "20 C", "heating_limit": "15 C"}
-
-
-@pytest.mark.parametrize(
-    ("content", "named"),
-    [
-        ({}, "energy: climate or degree_hours: expected one of climate, degree_hours"),
-        ({"climate": "a.epw", "degree_hours": "80000 K h", **AIRS}, "energy: climate or degree_hours: expected one of"),
-        ({"climate": "a.epw", "inside": "20 C"}, "energy: heating_limit: expected one"),
-        ({"degree_hours": "80000 K h", "inside": "20 C"}, "energy: inside: expected none, because degree_hours"),
-        ({"climate": "a.epw", **AIRS, "heating_limit": "21 C"}, "energy: heating_limit: expected surely"),
-        ({"degree_hours": "80000"}, "energy: degree_hours: expected"),
-        ({"degree_hours": "3000 K d", "price": "12 EUR"}, "energy: price: expected"),
-        (
-            {"degree_hours": "3000 K d", "measures": {"x": {"patches": ["*"]}}},
-            "energy: measures: x: expected the key u",
-        ),
-        (
-            {"degree_hours": "3000 K d", "measures": {"x": {"patches": [], "u": "0.2 W/(m2 K)"}}},
-            "energy: measures: x: patches: expected",
-        ),
-    ],
-)
-def test_what_is_wrong_with_an_energy_section_is_one_line(content, named) -> None:
-    with pytest.raises(ThermoxelsError, match=rf"^{named}[^\n]*$"):
-        as_record("", {"energy": content}, make_dataclass("Content", [("energy", Energy)]))
 
 
 @pytest.mark.parametrize(

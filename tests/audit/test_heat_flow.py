@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.audit.heat_flow import (
-    CONVECTION,
-    SIMPLE,
+    FILMS,
     fourth_power,
     net_radiation_w_m2,
     reading_k,
@@ -27,9 +26,9 @@ def radiation(emissivity: float, warm_c: float, cold_c: float) -> float:
     ("flow_w_m2", "published_u"),
     [
         (radiation(0.93, 2.0, 1.0) + 8.0 * 2.0, 1.01851),  # Fokaides and Kalogirou
-        (radiation(0.93, 2.0, 0.0) + 2.0 * SIMPLE["outside"]["albatici-tonelli"].w_m2k(1.0, 2.0, 0.0), 0.81515),
-        (2.0 * SIMPLE["outside"]["dallo"].w_m2k(1.0, 2.0, 0.0), 0.96054),
-        (radiation(0.9, 19.5, 18.0) + 2.0 * CONVECTION["inside"]["madding"].w_m2k(0.0, -2.0, 0.0), 0.54583),
+        (radiation(0.93, 2.0, 0.0) + 2.0 * FILMS["outside"]["albatici-tonelli"].w_m2k(1.0, 2.0, 0.0), 0.81515),
+        (2.0 * FILMS["outside"]["dallo"].w_m2k(1.0, 2.0, 0.0), 0.96054),
+        (radiation(0.9, 19.5, 18.0) + 2.0 * FILMS["inside"]["madding"].w_m2k(0.0, -2.0, 0.0), 0.54583),
     ],
 )
 def test_u_values_between_20_and_0_c_after_published_formulas(flow_w_m2, published_u) -> None:
@@ -53,10 +52,11 @@ def test_u_values_between_20_and_0_c_after_published_formulas(flow_w_m2, publish
         ("inside", "iso-6946", 0.0, -1.0, 2.5),
         ("inside", "walton", 0.0, -8.0, 2.62),
         ("inside", "khalifa", 0.0, -1.0, 2.30),
+        ("inside", "iso-6946-combined", 0.0, -1.0, 1.0 / 0.13),
     ],
 )
 def test_convection_on_a_wall_after_published_formulas(side, name, wind_m_s, warmer_k, published) -> None:
-    found = CONVECTION[side][name].w_m2k(wind_m_s, warmer_k, np.zeros(1))
+    found = FILMS[side][name].w_m2k(wind_m_s, warmer_k, np.zeros(1))
     assert np.ravel(found).item() == pytest.approx(published, abs=1e-3)
 
 

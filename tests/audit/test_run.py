@@ -34,8 +34,8 @@ from thermoxels_ns.audit.conditions import (
     Surroundings,
 )
 from thermoxels_ns.audit.defects import find_defects, undisturbed_temperature
-from thermoxels_ns.audit.draws import COUNT, FORMULA, GEOMETRY, Interval, draw, interval_of
-from thermoxels_ns.audit.heat_flow import CONVECTION, SIMPLE, net_radiation_w_m2
+from thermoxels_ns.audit.draws import COUNT, FORMULA, GEOMETRY, Interval, draw
+from thermoxels_ns.audit.heat_flow import FILMS, net_radiation_w_m2, simple_models
 from thermoxels_ns.audit.run import Audit, audit
 from thermoxels_ns.audit.surface import audited_surface
 from thermoxels_ns.core.errors import AuditError
@@ -80,9 +80,8 @@ def test_elements_have_their_true_u_value_and_loss(walls, balcony) -> None:
     counted, area, flow = balcony.surface.counted, balcony.surface.area_m2, balcony.triangle_flow_w_m2
     assert np.isnan(flow[~counted]).all()
     assert float(area[counted] @ flow[counted]) == pytest.approx(balcony.whole.loss_w.value, rel=1e-5)
-    mean = float(np.average(balcony.triangle_u[counted, 0], weights=area[counted]))
+    mean = float(np.average(balcony.triangle_u[counted], weights=area[counted]))
     assert mean == pytest.approx(balcony.whole.u_w_m2k.value, rel=1e-9)
-    assert (balcony.triangle_u[counted, 1] <= balcony.triangle_u[counted, 0]).all()
     assert next(iter(balcony.budget)) == "camera offset" and min(balcony.budget.values()) >= 0.0
     assert balcony.budget["inside air"] == pytest.approx(0.0, abs=1e-9)  # the heat flow outside does not see it
 
@@ -126,8 +125,8 @@ def test_on_a_clear_calm_night_the_balance_holds_the_truth_and_simple_formulas_a
     found = audit(mesh, NIGHT, UP)
     assert found.whole.surface_c.value < truth.draws["outside air"][0] and truth.u_w_m2k["facade"] > 0.7
     assert found.whole.u_w_m2k.low < truth.u_w_m2k["facade"] < found.whole.u_w_m2k.high
-    assert found.failing_models == tuple(SIMPLE["outside"]) and found.whole.u_by_model["dallo"] < 0.0
-    for model in SIMPLE["outside"]:
+    assert found.failing_models == simple_models("outside") and found.whole.u_by_model["dallo"] < 0.0
+    for model in simple_models("outside"):
         with pytest.raises(AuditError, match=r"^film: model: .*Write model: balance"):
             audit(mesh, replace(NIGHT, film=Film(model, Measured(1.0, 0.2))), UP)
 
@@ -136,7 +135,7 @@ def test_formulas_of_convection_are_drawn_by_their_weights_and_widen_the_interva
     """Weights 1 and 3: a quarter of the draws is by ISO 6946, whose 4 + 4 v is the largest here; the mean is stated."""
     stated = replace(STATED, film=Film(weights={"iso-6946": 1.0, "watmuff": 3.0}))
     drawn = draw(stated)[FORMULA]
-    names = list(CONVECTION["outside"])
+    names = list(FILMS["outside"])
     assert drawn[0] == -1.0 and drawn.shape == (COUNT + 1,)
     shares = {names[int(n)]: float(np.mean(drawn[1:] == n)) for n in np.unique(drawn[1:])}
     assert shares == pytest.approx({"iso-6946": 0.25, "watmuff": 0.75}, abs=1e-3)
@@ -290,24 +289,12 @@ def test_film_models_are_shown_beside_each_other_and_may_be_chosen(walls) -> Non
         assert chosen.u_w_m2k.value == pytest.approx(found.whole.u_by_model[model], rel=1e-12)
 
 
-def test_a_room_seen_from_within(walls) -> None:
+def test_a_room_seen_from_within() -> None:
     """Heat flow by the coefficient of the solver, temperature factor by the wall's own resistances."""
-    truth = walls["plain"]
-    names = truth.mesh.boundary.patch_names
-    seen = truth.mesh.boundary.patch == names.index("room")
-    mesh = replace(truth.mesh, boundary=replace(truth.mesh.boundary, seen=seen))
-    inside = replace(
-        STATED,
-        side="inside",
-        surroundings=Surroundings(reflected=Measured(20.0, 0.1)),
-        film=Film("iso-6946-combined", Measured(1.0, 0.05)),
-        camera=Camera(Measured(0.0, 0.1), Measured(0.0, 0.05)),
-        surfaces=(Surface(Measured(1.0)),),
-        limits=Limits(f_rsi=Measured(0.7)),
-    )
-    nodes = np.zeros(len(mesh.points_m), dtype=bool)
-    nodes[mesh.facets[seen]] = True
-    found = audit(replace(mesh, observed=nodes), inside, UP)
+    room = audited_wall(slab=False, window=False, side="inside")
+    truth = solve_wall(room, INSIDE, true_draws(INSIDE, None))
+    near = replace(INSIDE, camera=Camera(Measured(0.0, 0.1), Measured(0.0, 0.05)), limits=Limits(f_rsi=Measured(0.7)))
+    found = audit(photographed(truth, near), near, UP)
     assert found.whole.loss_w.value == pytest.approx(truth.loss_w, rel=1e-6)
     to_outside = (found.whole.surface_c.value - 0.0) / (truth.loss_w / 12.0)
     assert found.f_rsi[0].value == pytest.approx(to_outside / (to_outside + 0.13), rel=1e-6)
@@ -534,9 +521,3 @@ def test_the_undisturbed_temperature_is_that_of_the_larger_part() -> None:
     temperature_c, least_departure_k = undisturbed_temperature(values, np.ones(1000))
     assert temperature_c == pytest.approx(3.0, abs=0.05)
     assert 0.25 < least_departure_k < 0.6  # three standard deviations, a little more for what is mixed in
-
-
-def test_intervals_hold_nine_tenths_of_the_draws() -> None:
-    values = np.random.default_rng(1).normal(2.0, 1.0, 4001)
-    found = interval_of(np.concatenate([[7.0], values]))
-    assert found.value == 7.0 and np.mean((values > found.low) & (values < found.high)) == pytest.approx(0.9, abs=1e-3)

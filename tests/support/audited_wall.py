@@ -28,7 +28,7 @@ from thermoxels_ns.audit.conditions import (
 )
 from thermoxels_ns.audit.draws import FORMULA, Draws, Interval, draw, emissivity_name
 from thermoxels_ns.audit.exchange import radiant_k4
-from thermoxels_ns.audit.heat_flow import CONVECTION
+from thermoxels_ns.audit.heat_flow import FILMS
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
@@ -166,7 +166,7 @@ def solve_wall(mesh: TetMesh, conditions: Conditions, draws: Draws) -> Truth:
     inside = conditions.side == "inside"
     seen = ("room",) if inside else patches
     balance = conditions.film.model == BALANCE
-    formulas = list(CONVECTION[conditions.side].values()) if balance else []
+    formulas = list(FILMS[conditions.side].values()) if balance else []
     names, airs = mesh.boundary.patch_names, (value["inside air"], value["outside air"])
     air, other_air = airs if inside else airs[::-1]
     materials = {name: Material(name, k, 1000.0, 1000.0) for name, k in CONDUCTIVITY.items()}

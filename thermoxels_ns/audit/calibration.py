@@ -19,8 +19,8 @@ from scipy.optimize import least_squares
 from thermoxels_ns.audit.conditions import Calibrate, Conditions
 from thermoxels_ns.audit.draws import FORMULA, Draws, Interval, emissivity_name, interval_of
 from thermoxels_ns.audit.exchange import HALF_STEP_K, film_flow_w_m2, radiant_k4, triangle_exchange
-from thermoxels_ns.audit.heat_flow import SIMPLE
-from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface, chosen_names
+from thermoxels_ns.audit.heat_flow import FILMS
+from thermoxels_ns.audit.surface import AuditedSurface, chosen_names
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
@@ -65,17 +65,15 @@ class Calibration:
     doubt: str = ""  # Sentence on a history that is too short; empty if it is long enough
 
 
-def calibrated(
-    conditions: Conditions, surface: AuditedSurface, groups: AlikeTriangles, draws: Draws
-) -> Calibration | None:
+def calibrated(conditions: Conditions, surface: AuditedSurface, draws: Draws) -> Calibration | None:
     """Find the unknown properties of `Conditions.calibrate`; return None if the conditions have no `calibrate`.
 
-    `groups` are the `alike_triangles` of `surface`. Raises `AuditError` or `HeatError` if mesh and model do not fit.
+    Raises `AuditError` or `HeatError` if mesh and model do not fit.
     """
     asked = conditions.calibrate
     if asked is None:
         return None
-    fit = _Fit(_Wall(conditions, asked, surface, groups), draws)
+    fit = _Fit(_Wall(conditions, asked, surface), draws)
     names = fit.names
     units = {name: _UNITS[name.split()[0]] for name in asked.stated()}
     refused = fit.what_cannot_be_told(units)
@@ -106,10 +104,8 @@ def calibrated(
 class _Wall:
     """The body with its films; computes surface temperatures for given properties and draws."""
 
-    def __init__(
-        self, conditions: Conditions, asked: Calibrate, surface: AuditedSurface, groups: AlikeTriangles
-    ) -> None:
-        self.conditions, self.asked, self.surface, self.groups = conditions, asked, surface, groups
+    def __init__(self, conditions: Conditions, asked: Calibrate, surface: AuditedSurface) -> None:
+        self.conditions, self.asked, self.surface = conditions, asked, surface
         names, patch = surface.selection.patch_names, surface.selection.facet_patch
         behind = chosen_names("calibrate: behind", names, asked.behind)
         insulated = {name for pattern in asked.adiabatic for name in matching_names(names, pattern)}
@@ -182,7 +178,7 @@ class _Wall:
 
     def measured_c(self, draws: Draws) -> FloatArray:
         """Return the corrected temperature of every triangle in `counted`, shape (c,), [degrees Celsius]."""
-        return triangle_exchange(self.conditions, self.surface, self.groups, draws)[0][self.counted]
+        return triangle_exchange(self.conditions, self.surface, draws).surface_c[self.counted]
 
     def computed_c(self, values: Mapping[str, float], draws: Draws, measured_c: FloatArray) -> FloatArray:
         """Return the temperature of every triangle in `counted`, shape (c,), for `values` of all properties.
@@ -246,7 +242,7 @@ class _Wall:
 
     def _far_side(self, values: Mapping[str, float]) -> FloatArray:
         """Return the coefficient of film and layers on the side not photographed, shape (b,), [W/(m2 K)]."""
-        far = SIMPLE["inside" if self.conditions.side == "outside" else "outside"]["iso-6946-combined"]
+        far = FILMS["inside" if self.conditions.side == "outside" else "outside"]["iso-6946-combined"]
         resistance = np.ones(len(self.behind)) / far.w_m2k(0.0, 0.0, self.surface.upward[self.behind])
         for name, where in self._layers.items():
             resistance = resistance + where * values[f"thickness of {name}"] / values[f"conductivity of {name}"]

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.audit.defects import FoundDefect
 from thermoxels_ns.audit.draws import FORMULA, SEED, Draws, Interval, draw, interval_of, uncertain
-from thermoxels_ns.audit.exchange import part_totals, with_references
+from thermoxels_ns.audit.exchange import Parts, triangle_exchange, with_references
 from thermoxels_ns.audit.run import Audit
-from thermoxels_ns.audit.surface import AuditedSurface, alike_triangles
+from thermoxels_ns.audit.surface import AuditedSurface
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.yaml_records import as_record, raising
@@ -23,15 +23,14 @@ from thermoxels_ns.core.yaml_records import as_record, raising
 _DRAWS = 4000  # Ends of intervals scatter by about 1 % of the width
 _NEAR_M = 0.3  # Surface moves by less: insulation is thinner, and reconstructions err by less, [m]
 _FACES = 0.7  # Least cosine between normals of the same surface
+_ONE_POSITION = "one position in which the meshes fit each other"
 _POSE_TOGETHER = "Compare surveys of the same building in metres, or pose the photographs of both together."
 _FITS_M, _UNMATCHED_M = 0.2, 1.0  # Largest median distance of meshes that fit; distance of points without a partner
 _TURN_DEG = 15.0  # Step between the directions in which an alignment starts
 _ALIGN_STEPS = 25  # Steps of each alignment
 _LIKE_BEST = 1.3  # A quite different position that fits as well, but for this factor, makes the alignment ambiguous
 _SEEN_SHARE = 0.2  # Least share of an element that the other survey has seen, too
-_OVERLAP = 0.3  # Least area that two findings of one bridge share, over the geometric mean of their areas
-_COMMON = ("film factor", FORMULA)
-"""Causes that err alike in both surveys, besides emissivities: whoever surveys twice uses the same formula."""
+_OVERLAP = 0.5  # Least share of the smaller of two findings of one bridge that lies in the larger
 
 State = Literal["in both", "appeared", "went"]
 
@@ -64,20 +63,6 @@ class Comparison:
     common: tuple[str, ...]  # Causes of uncertainty that are drawn the same in both surveys
     moved: bool  # True if the earlier mesh was turned and shifted onto the later one
     residual_m: float  # Median distance between the two surfaces, [m]
-
-    def lines(self) -> list[str]:
-        """Return sentences for a log: how the meshes were aligned, and how many changes are significant."""
-        how = "turned and shifted onto the later one" if self.moved else "taken as it is: same coordinates"
-        sure = [one for one in (*self.elements, *self.bridges) if one.significant]
-        return [
-            f"Compared: the earlier mesh was {how}; median distance {1e3 * self.residual_m:.0f} mm.",
-            f"Significant changes: {', '.join(one.name for one in sure) or 'none'}.",
-            *(
-                f"Only {when}: {', '.join(n)}."
-                for when, n in (("before", self.only_before), ("after", self.only_after))
-                if n
-            ),
-        ]
 
 
 class Pose(NamedTuple):
@@ -140,14 +125,11 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
     new = _Survey(after, later, _partners(len(there.counted), counted[1], at_new, counted[0], at_old))
     elements, only_after = new.elements(old)
     if not elements:
-        if moved:  # a wall slides along a larger one: how far apart they are does not tell that they do not fit
-            got = "no surface in common where they fit best"
-            raise AuditError("compare", expected="two meshes that fit each other", got=got, remedy=_POSE_TOGETHER)
-        expected, remedy = "surface that both surveys saw", "Compare surveys that show the same walls."
-        raise AuditError("compare", expected=expected, got="none", remedy=remedy)
-    bridges, parts = _matched(old, new), list(elements.values())
-    was = old.flows([*map(old.from_other, parts), *(part for _, _, place, _ in bridges for part in place[:2])])
-    now = new.flows([*parts, *(part for _, _, _, place in bridges for part in place[:2])])
+        got = "no surface that both surveys saw"
+        raise AuditError("compare", expected=_ONE_POSITION, got=got, remedy=_POSE_TOGETHER)
+    bridges, parts = _bridges(old, new), list(elements.values())
+    was = old.flows([*map(old.from_other, parts), *(part for one in bridges for part in one.before[:2])])
+    now = new.flows([*parts, *(part for one in bridges for part in one.after[:2])])
 
     def middle(part: IntArray) -> tuple[float, float, float]:
         x, y, z = np.average(there.centroid_m[part], axis=0, weights=there.area_m2[part]).tolist()
@@ -156,17 +138,21 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
     def change_of_u(name: str, part: IntArray, before: FloatArray, after: FloatArray, area_m2: float) -> Change:
         return _change(name, "in both", middle(part), "W/(m2 K)", before, after, area_m2 * difference_k)
 
-    areas, u = now.area_m2[: len(parts)], (was.u, now.u)
+    areas = now[0][: len(parts)]
+    u = [(flow + own)[: len(parts)] / area[: len(parts), None] for area, flow, own in (was, now)]
     changes = [change_of_u(name, part, u[0][n], u[1][n], areas[n]) for n, (name, part) in enumerate(elements.items())]
-    mean_was, mean_now = (areas @ one[: len(parts)] / areas.sum() for one in u)
+    mean_was, mean_now = (areas @ one / areas.sum() for one in u)
     found = list[Change]()
-    for n, (bridge, state, (_, _, old_m2), (zone, _, new_m2)) in enumerate(bridges):
+    for n, one in enumerate(bridges):
+        bridge, zone = one.bridge, len(parts) + 2 * n
         length, unit = (bridge.length_m, "W/(m K)") if bridge.kind == "line" else (1.0, "W/K")
-        row = len(parts) + 2 * n
-        drawn = (was.extra_w_k(row, old_m2) / length, now.extra_w_k(row, new_m2) / length)
-        patch = (old if state == "went" else new).surface.selection.patch_names[bridge.patch]
+        drawn = [
+            (flow[zone] + own[zone] - flow[zone + 1] / area[zone + 1] * base_m2) / length
+            for (area, flow, own), (_, _, base_m2) in ((was, one.before), (now, one.after))
+        ]
+        patch = (old if one.state == "went" else new).surface.selection.patch_names[bridge.patch]
         name = f"{'thermal bridge' if bridge.kind != 'area' else 'defect'} ({bridge.kind}) in {patch}"
-        found.append(_change(name, state, middle(zone), unit, *drawn, length * difference_k))
+        found.append(_change(name, one.state, middle(one.after[0]), unit, drawn[0], drawn[1], length * difference_k))
     return Comparison(
         whole=change_of_u("all that both saw", np.concatenate(parts), mean_was, mean_now, float(areas.sum())),
         elements=_ranked(changes),
@@ -184,22 +170,13 @@ Place = tuple[IntArray, IntArray, float]
 """Triangles of a bridge's zone and of the undisturbed surface near by, and the area without the bridge, [m2]."""
 
 
-class _Flows(NamedTuple):
-    """Heat flows per kelvin through p parts of one survey's surface in k draws."""
+class _Bridge(NamedTuple):
+    """A bridge that the later survey found, or the earlier one alone, and its place in both."""
 
-    area_m2: FloatArray  # Shape (p,)
-    coupling_w_k: FloatArray  # Shape (p, k)
-    own_w_k: FloatArray  # By how much readings of each part alone change it, shape (p, k)
-
-    @property
-    def u(self) -> FloatArray:
-        """Draws of the U-value of each part, shape (p, k)."""
-        return (self.coupling_w_k + self.own_w_k) / self.area_m2[:, None]
-
-    def extra_w_k(self, zone: int, base_m2: float) -> FloatArray:
-        """Return draws of what part `zone` loses beyond the undisturbed part `zone + 1`, on an area, (k,), [W/K]."""
-        calm = self.coupling_w_k[zone + 1] / max(float(self.area_m2[zone + 1]), 1e-12)
-        return self.coupling_w_k[zone] + self.own_w_k[zone] - calm * base_m2
+    bridge: FoundDefect
+    state: State
+    before: Place
+    after: Place
 
 
 class _Survey:
@@ -229,45 +206,37 @@ class _Survey:
                 alone.append(names[number])
         return shared, tuple(alone)
 
-    def place_of(self, bridge: FoundDefect, found_by: _Survey) -> Place | None:
-        """Return where a bridge that the other survey found lies in this one; None if this one did not see it."""
-        zone, calm = self.from_other(bridge.zone), self.from_other(bridge.reference)
-        share = float(self.area_m2[zone].sum() / found_by.area_m2[bridge.zone].sum())
-        return (zone, calm, bridge.base_area_m2 * share) if share >= 0.5 and len(calm) else None
-
-    def mostly_in(self, bridge: FoundDefect, others: Sequence[FoundDefect]) -> bool:
-        """Return whether most of a bridge lies in `others`, of the other survey, which may have found two as one."""
-        cores = [np.zeros(0, np.int64), *(one.core for one in others)]
-        inside = np.isin(self.partner[bridge.core], np.concatenate(cores))
-        return bool(self.area_m2[bridge.core[inside]].sum() >= 0.5 * self.area_m2[bridge.core].sum())
-
-    def flows(self, parts: list[IntArray]) -> _Flows:
-        """Return flows through parts, indices of triangles that count."""
-        conditions, groups = self.audit.conditions, alike_triangles(self.surface)
-        totals = part_totals(conditions, groups, self.draws, groups.rows(parts, self.area_m2))
-        off, difference_k = conditions.camera.repeatability.off_by, self.draws.difference_k
-        own = np.stack([totals.slope_w_k[n] * self.draws.local(off, n) for n in range(len(parts))])
-        return _Flows(totals.area_m2, totals.flow_w / difference_k, own / difference_k)
+    def flows(self, parts: list[IntArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return areas of parts, (p,), and draws of flows per kelvin and of what own readings add to these, (p, k)."""
+        conditions, stated = self.audit.conditions, triangle_exchange(self.audit.conditions, self.surface, self.draws)
+        found = Parts(conditions, self.surface, self.draws, stated, parts)
+        off_by, difference_k = conditions.camera.repeatability.off_by, self.draws.difference_k
+        off_k = np.stack([self.draws.local(off_by, n) for n in range(len(parts))])
+        _, flow_w = found.in_draws(self.draws)
+        own_w = found.slope_w_k[:, None] * off_k
+        return np.maximum(found.area_m2, 1e-12), flow_w / difference_k, own_w / difference_k
 
 
-def _matched(old: _Survey, new: _Survey) -> list[tuple[FoundDefect, State, Place, Place]]:
-    """Return the bridges of two surveys, each with its state and its place in the earlier and in the later survey."""
-    found, left = list[tuple[FoundDefect, State, Place, Place]](), list(old.bridges)
-    for bridge in new.bridges:
-        own = bridge.zone, bridge.reference, bridge.base_area_m2
-        size, on = new.area_m2[bridge.core].sum(), new.partner[bridge.core]
-        share = [
-            new.area_m2[bridge.core[np.isin(on, one.core)]].sum() / np.sqrt(size * old.area_m2[one.core].sum())
-            for one in left
-        ]
-        if share and max(share) >= _OVERLAP:
-            same = left.pop(int(np.argmax(share)))
-            found.append((bridge, "in both", (same.zone, same.reference, same.base_area_m2), own))
-        elif not new.mostly_in(bridge, old.bridges) and (elsewhere := old.place_of(bridge, new)) is not None:
-            found.append((bridge, "appeared", elsewhere, own))
-    for bridge in left:
-        if not old.mostly_in(bridge, new.bridges) and (elsewhere := new.place_of(bridge, old)) is not None:
-            found.append((bridge, "went", (bridge.zone, bridge.reference, bridge.base_area_m2), elsewhere))
+def _bridges(old: _Survey, new: _Survey) -> list[_Bridge]:
+    """Return the bridges of two surveys whose places both saw; a bridge that both found has the later one's place."""
+
+    def same(before: FoundDefect, after: FoundDefect) -> bool:
+        shared = new.area_m2[after.core[np.isin(new.partner[after.core], before.core)]].sum()
+        return bool(shared >= _OVERLAP * min(old.area_m2[before.core].sum(), new.area_m2[after.core].sum()))
+
+    found = list[_Bridge]()
+    gone = [one for one in old.bridges if not any(same(one, other) for other in new.bridges)]
+    for bridge, own, other in (*((one, new, old) for one in new.bridges), *((one, old, new) for one in gone)):
+        zone, calm = other.from_other(bridge.zone), other.from_other(bridge.reference)
+        share = float(other.area_m2[zone].sum() / own.area_m2[bridge.zone].sum())
+        if share < 0.5 or not len(calm):
+            continue
+        here, there = (bridge.zone, bridge.reference, bridge.base_area_m2), (zone, calm, bridge.base_area_m2 * share)
+        if own is old:
+            found.append(_Bridge(bridge, "went", here, there))
+        else:
+            both = any(same(one, bridge) for one in old.bridges)
+            found.append(_Bridge(bridge, "in both" if both else "appeared", there, here))
     return found
 
 
@@ -292,12 +261,14 @@ def _ranked(changes: Sequence[Change]) -> tuple[Change, ...]:
 
 
 def _with_common(before: Conditions, after: Conditions, earlier: Draws) -> tuple[Draws, tuple[str, ...]]:
-    """Return draws of the later survey in which what is common errs as in `earlier`, and the names of that."""
+    """Return draws of the later survey in which what is common errs as in `earlier`, and the names of that.
+
+    Emissivities, and the film's factor and formula, are common: whoever surveys twice uses the same ones.
+    """
     later = draw(after, _DRAWS, SEED + 1)
     values, common, stated, was = dict(later.values), list[str](), uncertain(after), uncertain(before)
-    same_film = before.film.model == after.film.model
     for name, what in stated.items():
-        alike = name.startswith("emissivity of ") or (name in _COMMON and same_film)
+        alike = name.startswith("emissivity of ") or name == "film factor"
         if alike and name in was and what.off_by > 0.0 and was[name].off_by > 0.0:
             off = (earlier[name] - was[name].value) / was[name].off_by
             values[name] = what.value + off * what.off_by
@@ -342,10 +313,6 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
         lost |= np.einsum("ij,ij->i", turned, facing[nearest]) < _FACES
         return np.where(lost, _UNMATCHED_M, along), moved, nearest
 
-    def residual(pose: Pose) -> tuple[float, float]:  # the mean tells what a notch or a balcony shows, the median not
-        off = np.abs(distances(pose)[0])
-        return float(np.mean(off)), float(np.median(off))
-
     def refined(pose: Pose) -> Pose:
         for _ in range(_ALIGN_STEPS):
             along, moved, nearest = distances(pose)
@@ -359,32 +326,31 @@ def aligned(before: AuditedSurface, after: AuditedSurface) -> tuple[Pose, float,
 
     as_given = Pose(np.eye(3), np.zeros(3))
     edge = 2.0 * float(np.sqrt(2.0 * max(np.median(one.area_m2[one.counted]) for one in (before, after))))
-    mean, given = residual(as_given)
+    given = np.abs(distances(as_given)[0])
     back = KDTree(_places(points, normals)).query(_places(target, facing))[0]  # one survey may have seen less
-    given_back = np.minimum(back, _UNMATCHED_M)
-    for average, median in ((mean, given), (float(given_back.mean()), float(np.median(given_back)))):
-        if average <= min(edge, _FITS_M):
-            return as_given, median, False
+    for off in (given, np.minimum(back, _UNMATCHED_M)):
+        if off.mean() <= min(edge, _FITS_M):
+            return as_given, float(np.median(off)), False
     up = [np.array(one.selection.up) for one in (before, after)]
     upright = Rotation.align_vectors(up[1][None], up[0][None])[0].as_matrix()
-    tried = list[tuple[float, float, Pose]]()
+    tried = list[tuple[float, float, Pose]]()  # The mean tells what a notch or a balcony shows, the median not
     for degrees in np.arange(0.0, 360.0, _TURN_DEG):
         turn = Rotation.from_rotvec(np.radians(degrees) * up[1]).as_matrix() @ upright
-        start = Pose(turn, target.mean(axis=0) - turn @ points.mean(axis=0))
-        pose = refined(start)
-        tried.append((*residual(pose), pose))
+        pose = refined(Pose(turn, target.mean(axis=0) - turn @ points.mean(axis=0)))
+        off = np.abs(distances(pose)[0])
+        tried.append((float(off.mean()), float(np.median(off)), pose))
     tried.sort(key=lambda one: one[0])
     best, median, pose = tried[0]
-    if given <= _FITS_M and mean <= 1.5 * best:
-        return as_given, given, False
-    if median > _FITS_M:
-        got = f"meshes {median:.2f} m apart (median) where they fit best, {given:.2f} m as they are"
-        raise AuditError("compare", expected="two meshes that fit each other", got=got, remedy=_POSE_TOGETHER)
-    other = next((one for one in tried if _turned_deg(pose, one[2]) > _TURN_DEG), None)
-    if other is not None and other[0] <= _LIKE_BEST * best + 0.1 * edge:
-        got = f"two positions {_turned_deg(pose, other[2]):.0f} degrees apart, {best:.2f} and {other[0]:.2f} m off"
-        remedy = "Pose the photographs of both surveys together, so that both meshes have the same coordinates."
-        raise AuditError("compare", expected="one position in which the meshes fit", got=got, remedy=remedy)
+    if np.median(given) <= _FITS_M and given.mean() <= 1.5 * best:
+        return as_given, float(np.median(given)), False
+    others = [
+        one for one in tried if _turned_deg(pose, one[2]) > _TURN_DEG and one[0] <= _LIKE_BEST * best + 0.1 * edge
+    ]
+    if median > _FITS_M or others:
+        got = f"{median:.2f} m between them (median) where they fit best"
+        if others:
+            got = f"two positions, {_turned_deg(pose, others[0][2]):.0f} degrees apart"
+        raise AuditError("compare", expected=_ONE_POSITION, got=got, remedy=_POSE_TOGETHER)
     return pose, median, True
 
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 from pydantic import Field
 
-from thermoxels_ns.audit.heat_flow import CONVECTION, SIMPLE
+from thermoxels_ns.audit.heat_flow import FILMS, simple_models
 from thermoxels_ns.audit.weather import survey_weather, with_weather
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import AuditError
@@ -37,8 +37,8 @@ FilmModel: TypeAlias = str
 
 BALANCE: FilmModel = "balance"  # Radiation to what each triangle sees, and convection by formulas that are drawn
 FILM_MODELS: Mapping[Side, tuple[FilmModel, ...]] = {
-    "outside": (BALANCE, *CONVECTION["outside"], *SIMPLE["outside"], "given"),
-    "inside": (BALANCE, *CONVECTION["inside"], *SIMPLE["inside"], "given"),
+    "outside": (BALANCE, *FILMS["outside"], "given"),
+    "inside": (BALANCE, *FILMS["inside"], "given"),
 }
 WINDLESS: tuple[FilmModel, ...] = ("iso-6946-combined", "given")  # Need no wind speed for an outer surface
 
@@ -318,9 +318,10 @@ class Conditions:
         if model not in known:
             name, remedy = f"film: model of surfaces seen from {self.side}", f"Write model: {known[0]}, for example."
             raise AuditError(name, expected=f"one of {', '.join(known)}", got=model, remedy=remedy)
-        strange = sorted(set(self.film.weights) - set(CONVECTION[self.side]))
+        formulas = [name for name in FILMS[self.side] if name not in simple_models(self.side)]
+        strange = sorted(set(self.film.weights) - set(formulas))
         if strange:
-            remedy = f"Choose from {', '.join(CONVECTION[self.side])}."
+            remedy = f"Choose from {', '.join(formulas)}."
             raise AuditError("film: weights", expected=f"formulas for {self.side}", got=strange[0], remedy=remedy)
         if self.side == "outside" and model not in WINDLESS and self.outside.wind is None:
             expected, remedy = f"a speed, because {model} needs it", "Add wind: 1.5 +- 0.5 m/s, for example."
@@ -355,10 +356,13 @@ class Conditions:
 
     @property
     def film_shares(self) -> FloatArray:
-        """How often each formula of `CONVECTION` is drawn, in its order; the shares add up to 1."""
-        weights = self.film.weights or {name: one.weight for name, one in CONVECTION[self.side].items()}
-        shares = np.array([weights.get(name, 0.0) for name in CONVECTION[self.side]])
-        return shares / shares.sum()
+        """How often each formula of `FILMS` is drawn, in its order; the shares add up to 1, those of "given" to 0."""
+        formulas, model = FILMS[self.side], self.film.model
+        weights = self.film.weights or {
+            name: one.weight if model == BALANCE else float(name == model) for name, one in formulas.items()
+        }
+        shares = np.array([weights.get(name, 0.0) for name in formulas])
+        return shares / (shares.sum() or 1.0)
 
     @property
     def difference_k(self) -> float:

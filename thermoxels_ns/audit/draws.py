@@ -62,8 +62,7 @@ class Draws:
 
     values: Mapping[str, FloatArray]
     seed: int = SEED
-    errors_of_parts: bool = True  # True: `local` draws errors; False: `local` returns zeros
-    errors_of_geometry: bool = True  # The same for `geometry`
+    without: tuple[str, ...] = ()  # Out of `REPEATABILITY` and `GEOMETRY`: those whose errors are 0
 
     @property
     def count(self) -> int:
@@ -89,15 +88,13 @@ class Draws:
 
     def frozen(self, cause: str) -> Draws:
         """Return draws in which one cause has its stated value; `REPEATABILITY`, `GEOMETRY`: no such errors."""
-        if cause == GEOMETRY:
-            return replace(self, errors_of_geometry=False)
-        if cause == REPEATABILITY:
-            return replace(self, errors_of_parts=False)
+        if cause in (REPEATABILITY, GEOMETRY):
+            return replace(self, without=(*self.without, cause))
         return replace(self, values={**self.values, cause: np.full(self.count, self[cause][0])})
 
-    def local(self, off_by: float, number: int) -> FloatArray:
+    def local(self, off_by: float, number: int, cause: str = REPEATABILITY) -> FloatArray:
         """Return random errors within +- `off_by`, (1 + k,), the first 0; each `number`, a seed, has its own errors."""
-        if not self.errors_of_parts:
+        if cause in self.without:
             return np.zeros(self.count)
         drawn = np.random.default_rng((self.seed, number)).uniform(-off_by, off_by, self.count)
         drawn[0] = 0.0
@@ -108,17 +105,15 @@ class Draws:
 
         Half is common to all parts, as reconstructions round all edges alike; half is the part's own.
         """
-        if not self.errors_of_geometry:
-            return np.zeros(self.count)
-        whole = replace(self, errors_of_parts=True)
-        return 0.5 * (whole.local(1.0, _COMMON_GEOMETRY) + whole.local(1.0, _COMMON_GEOMETRY + 1 + number))
+        numbers = _COMMON_GEOMETRY, _COMMON_GEOMETRY + 1 + number
+        return np.mean([self.local(1.0, one, GEOMETRY) for one in numbers], axis=0)
 
 
 def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:
     """Draw `count` values of each uncertain quantity, one at random in each of `count` equal parts of its range.
 
-    For the model `BALANCE`, `FORMULA` is the place of a formula in `CONVECTION`, as often as its weight says; -1, the
-    stated value, stands for the mean of all.
+    If several formulas are drawn, `FORMULA` is the place of one in `FILMS`, as often as its weight says; -1, the stated
+    value, stands for the mean of all.
     """
     generator = np.random.default_rng(seed)
 
@@ -129,7 +124,7 @@ def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:
         name: np.concatenate([[what.value], what.low + (what.high - what.low) * spread()])
         for name, what in uncertain(conditions).items()
     }
-    if conditions.film.model == BALANCE:
+    if FORMULA in causes(conditions):
         reach = np.cumsum(conditions.film_shares)
         values[FORMULA] = np.concatenate([[-1.0], np.searchsorted(reach[:-1], spread(), side="right")])
     return Draws(_possible(values), seed)

@@ -10,6 +10,7 @@ import numpy as np
 from thermoxels_ns.audit.conditions import Conditions, Energy
 from thermoxels_ns.audit.draws import Draws, Interval, interval_of
 from thermoxels_ns.audit.surface import chosen_names
+from thermoxels_ns.audit.weather import check_airs
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
@@ -97,9 +98,7 @@ def _degree_hours(asked: Energy, drawn: Callable[[Measured], FloatArray]) -> Flo
         hours, air_c = found["hours"], found.get("outside_c")
         years = (hours[-1] - hours[0] + 1.0) / _YEAR_H
         whole = max(round(years), 1)
-        if air_c is not None and not ((air_c > -90.0) & (air_c < 70.0)).all():
-            got = f"{air_c.min():g} to {air_c.max():g} C"
-            raise wrong(asked.climate, "outside_c from -90 to 70 C", got, "Leave out lines without a value.")
+        check_airs(asked.climate, found)
         if air_c is None or abs(years - whole) * _YEAR_H > _MOST_OFF_H or np.diff(hours).max() > _MOST_GAP_H:
             got = f"{', '.join(found)}, {hours[-1] - hours[0]:g} hours with gaps of up to {np.diff(hours).max():g}"
             expected = f"outside_c of one or more whole years, without gaps above {_MOST_GAP_H:g} hours"

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.audit.draws import Interval
+from thermoxels_ns.audit.draws import Interval, draw, interval_of
+from thermoxels_ns.audit.exchange import Parts, triangle_exchange, with_references
 from thermoxels_ns.audit.run import Audit
 from thermoxels_ns.mesh.boundary.planes import Building, FlatElement
 
@@ -43,14 +44,18 @@ class Envelope:
 
 def envelope_of(found: Audit, building: Building) -> Envelope:
     """Return the envelope of the building that `find_building` found on the audited mesh."""
-    area, known = found.surface.area_m2, np.isfinite(found.triangle_u).all(axis=1)
-    u, share = dict[str, Interval | None](), dict[str, float]()
-    for one in building.every():
-        which = one.facets[known[one.facets]]
-        share[one.name] = float(area[which].sum() / max(area[one.facets].sum(), 1e-12))
-        mean = np.average(found.triangle_u[which], axis=0, weights=area[which]) if len(which) else None
-        u[one.name] = None if mean is None else Interval(*mean.tolist())
-    return Envelope(building, u, share)
+    conditions, surface = found.conditions, found.surface
+    draws = with_references(surface, conditions, draw(conditions))
+    which = {one.name: one.facets[surface.counted[one.facets]] for one in building.every()}
+    area_m2 = {one.name: max(float(surface.area_m2[one.facets].sum()), 1e-12) for one in building.every()}
+    u = dict[str, Interval | None].fromkeys(which)
+    seen = [name for name, part in which.items() if len(part) and conditions.outside_known]
+    parts = Parts(conditions, surface, draws, triangle_exchange(conditions, surface, draws), [which[n] for n in seen])
+    off_by = conditions.camera.repeatability.off_by
+    for n, (name, flow_w) in enumerate(zip(seen, parts.in_draws(draws)[1])):
+        flow_w = flow_w + parts.slope_w_k[n] * draws.local(off_by, n)
+        u[name] = interval_of(flow_w / parts.area_m2[n] / draws.difference_k)
+    return Envelope(building, u, {name: float(surface.area_m2[which[name]].sum()) / area_m2[name] for name in which})
 
 
 def hbjson(envelope: Envelope, title: str) -> dict[str, Any]:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
-from thermoxels_ns.audit.conditions import BALANCE, FILM_MODELS, WINDLESS, Conditions, Film, FilmModel
+from thermoxels_ns.audit.conditions import FILM_MODELS, WINDLESS, Conditions, Film, FilmModel
 from thermoxels_ns.audit.draws import FORMULA, Draws, emissivity_name
 from thermoxels_ns.audit.heat_flow import (
-    CONVECTION,
-    SIMPLE,
+    FILMS,
     fourth_power,
     net_radiation_w_m2,
     reading_k,
@@ -21,7 +20,7 @@ from thermoxels_ns.audit.heat_flow import (
     surface_temperature_k,
     view_shares,
 )
-from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface
+from thermoxels_ns.audit.surface import AuditedSurface, Readings
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
@@ -35,80 +34,94 @@ _OF_A_REFERENCE = 2 * 10**6  # First argument `number` of `Draws.local` for refe
 
 
 class Exchange(NamedTuple):
-    """Temperature and heat flow of g groups of triangles in k draws; draw 0 is made of the stated values."""
+    """Temperature and heat flow of n pieces of surface in k draws; draw 0 is made of the stated values."""
 
-    surface_c: FloatArray  # Surface temperature, corrected, shape (g, k), [degrees Celsius]
-    flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (g, k), [W/m2]
-
-
-class PartTotals(NamedTuple):
-    """Totals and means over each of p parts of the surface in k draws; draw 0 is made of the stated values."""
-
-    area_m2: FloatArray  # Area, shape (p,), [m2]
-    surface_c: FloatArray  # Mean surface temperature, shape (p, k), [degrees Celsius]
-    flow_w: FloatArray  # Heat flow from inside to outside, shape (p, k), [W]
-    slope_w_k: FloatArray  # Change of the stated flow per kelvin that all readings of a part are higher, shape (p,)
+    surface_c: FloatArray  # Surface temperature, corrected, shape (n, k), [degrees Celsius]
+    flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (n, k), [W/m2]
 
 
-def exchange(conditions: Conditions, groups: AlikeTriangles, draws: Draws, warmer_k: float = 0.0) -> Exchange:
-    """Return the surface temperature and the heat flow of each group in each draw.
+def exchange(conditions: Conditions, readings: Readings, draws: Draws, warmer_k: float = 0.0) -> Exchange:
+    """Return the surface temperature and the heat flow of each piece of surface in each draw.
 
     Readings plus `warmer_k` [K] are corrected for emissivity and reflection; the film model gives the heat flow.
     """
     emissivity = np.stack([draws[emissivity_name(conditions, n)] for n in range(len(conditions.surfaces))])
-    emissivity = emissivity[groups.surface_entry]
-    around_k4 = radiant_k4(conditions, draws, groups.upward)
-    reading_k = celsius_to_kelvin(groups.reading_c + warmer_k)[:, None] + draws["camera offset"]
+    emissivity = emissivity[readings.surface_entry]
+    around_k4 = radiant_k4(conditions, draws, readings.upward)
+    reading_k = celsius_to_kelvin(readings.reading_c + warmer_k)[:, None] + draws["camera offset"]
     surface_k = surface_temperature_k(reading_k, emissivity, around_k4, *_camera_settings(draws))
-    flow = film_flow_w_m2(conditions, draws, surface_k, around_k4, emissivity, groups.upward)
+    flow = film_flow_w_m2(conditions, draws, surface_k, around_k4, emissivity, readings.upward)
     return Exchange(surface_k - ZERO_CELSIUS_K, flow)
 
 
-def slopes(conditions: Conditions, groups: AlikeTriangles, draws: Draws) -> Exchange:
-    """Return by how much an `exchange` of the stated values changes per kelvin of readings, shape (g, 1)."""
-    low, high = (exchange(conditions, groups, draws.stated, step) for step in (-HALF_STEP_K, HALF_STEP_K))
-    return Exchange(*((above - below) / (2.0 * HALF_STEP_K) for below, above in zip(low, high)))
+def triangle_exchange(conditions: Conditions, surface: AuditedSurface, draws: Draws) -> Exchange:
+    """Return the exchange of each boundary triangle by the stated values, (f,) each; NaN where one does not count.
+
+    Within a group of alike triangles it is linear in the reading.
+    """
+    groups, of = surface.alike
+    low, mean, high = _around(conditions, groups, draws)
+    off_k = (surface.reading_c - groups.reading_c[of]) / (2.0 * HALF_STEP_K)
+    found = (one[of, 0] + off_k * (above - below)[of, 0] for below, one, above in zip(low, mean, high))
+    return Exchange(*(np.where(surface.counted, values, np.nan) for values in found))
+
+
+def _around(conditions: Conditions, groups: Readings, draws: Draws) -> list[Exchange]:
+    """Return the stated exchange with readings lower by `HALF_STEP_K`, as they are, and higher by it."""
+    return [exchange(conditions, groups, draws.stated, step) for step in (-HALF_STEP_K, 0.0, HALF_STEP_K)]
+
+
+class Parts:
+    """Parts of the surface, which are p sets of triangles that count, with their heat exchange in draws.
+
+    Draws are computed for groups of alike triangles. By what the triangles of a part differ from the means of their
+    groups is computed from the stated values alone.
+    """
+
+    def __init__(
+        self,
+        conditions: Conditions,
+        surface: AuditedSurface,
+        draws: Draws,
+        stated: Exchange,
+        which: Sequence[IntArray],
+    ) -> None:
+        """Take the parts as indices of triangles; `stated` is the `triangle_exchange`."""
+        self.conditions, (self.groups, of_triangle) = conditions, surface.alike
+        row = np.repeat(np.arange(len(which)), [len(one) for one in which])
+        every = np.concatenate([np.zeros(0, np.int64), *which])
+        area, shape = surface.area_m2[every], (len(which), len(self.groups.reading_c))
+        self._rows = sparse.coo_array((area, (row, of_triangle[every])), shape=shape).tocsc()
+        low, mean, high = _around(conditions, self.groups, draws)
+        self.area_m2: FloatArray = np.asarray(self._rows.sum(axis=1), np.float64)  # Shape (p,), [m2]
+        self.slope_w_k = (self._rows @ (high.flow_w_m2 - low.flow_w_m2))[:, 0] / (2.0 * HALF_STEP_K)
+        """Change of the stated flow per kelvin that all readings of a part are higher, shape (p,), [W/K]."""
+        self._off = [
+            np.bincount(row, area * own[every], len(which))[:, None] - self._rows @ of_group
+            for own, of_group in zip(stated, mean)
+        ]
+
+    def in_draws(self, draws: Draws, first: int | None = None) -> tuple[FloatArray, FloatArray]:
+        """Return mean surface temperatures, [C], and heat flows from inside to outside, [W], (p, k) each.
+
+        Only the `first` parts are computed if their number is given.
+        """
+        rows = self._rows[:first]
+        surface_c, flow_w = (np.repeat(off[:first], draws.count, axis=1) for off in self._off)
+        step = max(1, CHUNK // draws.count)
+        for start in range(0, len(self.groups.reading_c), step):
+            part = slice(start, start + step)
+            some = exchange(self.conditions, self.groups.some(part), draws)
+            surface_c += rows[:, part] @ some.surface_c
+            flow_w += rows[:, part] @ some.flow_w_m2
+        area = self.area_m2[:first, None]
+        return surface_c / np.where(area > 0.0, area, 1.0), flow_w
 
 
 def _camera_settings(draws: Draws) -> tuple[FloatArray, FloatArray]:
     """Return the emissivity and the reflected temperature, [K], set in the camera; 0 C if no temperature was stated."""
     reflected_c = draws.values.get("reflected temperature set in the camera", np.zeros(draws.count))
     return draws["emissivity set in the camera"], celsius_to_kelvin(reflected_c)
-
-
-def part_totals(conditions: Conditions, groups: AlikeTriangles, draws: Draws, rows: sparse.csr_array) -> PartTotals:
-    """Return totals of p parts, whose `AlikeTriangles.rows` are `rows`, (2 p, g)."""
-    parts = (len(rows.indptr) - 1) // 2
-    area, off = rows[:parts].tocsc(), rows[parts:]
-    total = np.asarray(area.sum(axis=1)).reshape(-1, 1)
-    slope = slopes(conditions, groups, draws)
-    temperature, flow_w = (np.repeat(off @ one, draws.count, axis=1) for one in slope)
-    for part in chunks(len(groups.reading_c), draws):
-        some = exchange(conditions, groups.some(part), draws)
-        flow_w += area[:, part] @ some.flow_w_m2
-        temperature += area[:, part] @ some.surface_c
-    mean_c = temperature / np.where(total > 0.0, total, 1.0)
-    return PartTotals(total[:, 0], mean_c, flow_w, (area @ slope.flow_w_m2)[:, 0])
-
-
-def chunks(count: int, draws: Draws) -> Iterator[slice]:
-    """Yield slices that divide `count` groups so that draws of a slice have about `CHUNK` values."""
-    step = max(1, CHUNK // draws.count)
-    yield from (slice(start, start + step) for start in range(0, count, step))
-
-
-def triangle_exchange(
-    conditions: Conditions, surface: AuditedSurface, groups: AlikeTriangles, draws: Draws
-) -> tuple[FloatArray, FloatArray]:
-    """Return surface temperature [degrees Celsius] and heat flow [W/m2] of each triangle, shape (f,) each.
-
-    Both follow from the first draw, the stated values. Both are NaN where a triangle does not count.
-    """
-    of, pairs = groups.of_triangle, zip(exchange(conditions, groups, draws), slopes(conditions, groups, draws))
-    temperature, flow = (
-        np.where(surface.counted, mean[of, 0] + groups.off_k * slope[of, 0], np.nan) for mean, slope in pairs
-    )
-    return temperature, flow
 
 
 def radiant_k4(conditions: Conditions, draws: Draws, upward: FloatArray) -> FloatArray:
@@ -134,35 +147,31 @@ def film_flow_w_m2(
 
     `surface_k`, `around_k4` (see `radiant_k4`) and `emissivity` have shape (g, k), `upward` (see `view_shares`) (g,).
     """
-    model, inside = conditions.film.model, conditions.side == "inside"
-    air_k = celsius_to_kelvin(draws["inside air" if inside else "outside air"])
-    warmer_k, upward = surface_k - air_k, upward[:, None]
-    simple = SIMPLE[conditions.side].get(model)
+    side, model = conditions.side, conditions.film.model
+    air_k = celsius_to_kelvin(draws[f"{side} air"])
+    warmer_k, film = surface_k - air_k, FILMS[side].get(model)
     if model == "given":
         coefficient = draws["film coefficient"]
-    elif simple is not None:
-        coefficient = simple.w_m2k(draws.values.get("wind", np.zeros(draws.count)), warmer_k, upward)
     else:
-        coefficient = _convection_w_m2k(conditions, draws, warmer_k, upward)
+        coefficient = _convection_w_m2k(conditions, draws, warmer_k, upward[:, None])
     flow = draws["film factor"] * coefficient * warmer_k
-    if simple is None or simple.radiates != "included":
-        flow = flow + net_radiation_w_m2(emissivity, surface_k, around_k4 if simple is None else fourth_power(air_k))
-    return -flow if inside else flow
+    if film is None or film.radiates != "included":
+        seen_k4 = fourth_power(air_k) if film is not None and film.radiates == "air" else around_k4
+        flow = flow + net_radiation_w_m2(emissivity, surface_k, seen_k4)
+    return -flow if side == "inside" else flow
 
 
 def _convection_w_m2k(conditions: Conditions, draws: Draws, warmer_k: FloatArray, upward: FloatArray) -> FloatArray:
-    """Return the coefficient of convection by the formula of each draw, shape (g, k); draws without one take the mean.
+    """Return the coefficient by the formula of each draw, shape (g, k); draws without one take the mean by shares.
 
     `warmer_k` is surface minus air, shape (g, k), `upward` the upward part of normals, shape (g, 1).
     """
-    formulas, model = CONVECTION[conditions.side], conditions.film.model
     drawn = draws.values.get(FORMULA, np.full(draws.count, -1.0))
-    shares = conditions.film_shares if model == BALANCE else [float(name == model) for name in formulas]
     wind, found = draws.values.get("wind", np.zeros(draws.count)), np.zeros(warmer_k.shape)
-    for number, (one, share) in enumerate(zip(formulas.values(), shares)):
+    for number, (film, share) in enumerate(zip(FILMS[conditions.side].values(), conditions.film_shares)):
         for which, part in ((drawn == number, 1.0), (drawn < 0.0, share)):
             if part > 0.0 and which.any():
-                found[:, which] += part * one.w_m2k(wind[which], warmer_k[:, which], upward)
+                found[:, which] += part * film.w_m2k(wind[which], warmer_k[:, which], upward)
     return found
 
 
@@ -185,7 +194,7 @@ def most_u_w_m2k(surface: AuditedSurface, conditions: Conditions, which: IntArra
     area. A larger U-value is impossible: an input clashes with the readings.
     """
     upward = surface.upward[which] * (-1.0 if conditions.side == "outside" else 1.0)
-    inside = SIMPLE["inside"]["iso-6946-combined"].w_m2k(0.0, 0.0, upward)
+    inside = FILMS["inside"]["iso-6946-combined"].w_m2k(0.0, 0.0, upward)
     allowed = 1.0 / (1.0 / inside + OUTSIDE_RESISTANCE_M2K_W)
     return float(np.average(allowed, weights=surface.area_m2[which]))
 

@@ -47,10 +47,10 @@ def natural_w_m2k(warmer_k: Values, upward: Values) -> Values:
     return np.cbrt(np.abs(warmer_k)) * np.where(np.asarray(warmer_k) * upward > 0.0, free, held)
 
 
-class Convection(NamedTuple):
-    """A published formula for the coefficient of convection, without radiation."""
+class FilmFormula(NamedTuple):
+    """A published formula for the heat exchange between a surface and the air."""
 
-    weight: float  # How often it is drawn beside the others, if the conditions name no weights
+    weight: float  # How often the balance draws it, if the conditions name no weights
     w_m2k: Callable[[Values, Values, Values], Values]
     """The coefficient, from the wind beside the surface [m/s], how much warmer than the air the surface is [K], and the
     upward part of its outward unit normal."""
@@ -58,12 +58,12 @@ class Convection(NamedTuple):
     """Radiation beside it: to what the surface sees, to surroundings as warm as the air, or within the coefficient."""
 
 
-def _mowitt(factor: float, power: float) -> Convection:
-    return Convection(0.5, lambda v, dt, up: np.hypot(0.84 * np.cbrt(np.abs(dt)), factor * np.power(v, power)))
+def _mowitt(factor: float, power: float) -> FilmFormula:
+    return FilmFormula(0.5, lambda v, dt, up: np.hypot(0.84 * np.cbrt(np.abs(dt)), factor * np.power(v, power)))
 
 
-def _mixed(factor: float, power: float) -> Convection:
-    return Convection(0.5, lambda v, dt, up: natural_w_m2k(dt, up) + factor * np.power(v, power))
+def _mixed(factor: float, power: float) -> FilmFormula:
+    return FilmFormula(0.5, lambda v, dt, up: natural_w_m2k(dt, up) + factor * np.power(v, power))
 
 
 _SPARROW = 2.537 * 1.67 * 0.5**0.5  # For walls of brick with a perimeter over area of 0.5 per metre
@@ -76,30 +76,34 @@ def _by_direction(w_m2k: Mapping[Any, float]) -> Callable[[Values, Values, Value
     return lambda v, dt, up: np.select([up < -_SLANT, up > _SLANT], [w_m2k["up"], w_m2k["down"]], w_m2k["horizontal"])
 
 
-CONVECTION: Mapping[str, Mapping[str, Convection]] = {
+FILMS: Mapping[str, Mapping[str, FilmFormula]] = {
     "outside": {
-        "iso-6946": Convection(1.0, lambda v, dt, up: 4.0 + 4.0 * v),
-        "jurges": Convection(0.0, lambda v, dt, up: 5.8 + 3.94 * v),
-        "mcadams": Convection(0.0, lambda v, dt, up: 5.7 + 3.8 * v),
-        "watmuff": Convection(1.0, lambda v, dt, up: 2.8 + 3.0 * v),
+        "iso-6946": FilmFormula(1.0, lambda v, dt, up: 4.0 + 4.0 * v),
+        "jurges": FilmFormula(0.0, lambda v, dt, up: 5.8 + 3.94 * v),
+        "mcadams": FilmFormula(0.0, lambda v, dt, up: 5.7 + 3.8 * v),
+        "watmuff": FilmFormula(1.0, lambda v, dt, up: 2.8 + 3.0 * v),
         "mowitt-windward": _mowitt(3.26, 0.89),
         "mowitt-leeward": _mowitt(3.55, 0.617),
         "tarp-windward": _mixed(_SPARROW, 0.5),
         "tarp-leeward": _mixed(0.5 * _SPARROW, 0.5),
         "emmel-windward": _mixed(5.15, 0.81),
         "emmel-leeward": _mixed(3.54, 0.76),
+        "iso-6946-combined": FilmFormula(0.0, lambda v, dt, up: 1.0 / OUTSIDE_RESISTANCE_M2K_W, "included"),
+        "albatici-tonelli": FilmFormula(0.0, lambda v, dt, up: WIND_W_S_M3K * v, "air"),
+        "dallo": FilmFormula(0.0, lambda v, dt, up: 5.8 + WIND_W_S_M3K * v, "included"),
     },
     "inside": {
-        "iso-6946": Convection(1.0, _by_direction(INSIDE_CONVECTION_W_M2K)),
-        "walton": Convection(1.0, lambda v, dt, up: natural_w_m2k(dt, up)),
-        "khalifa": Convection(
+        "iso-6946": FilmFormula(1.0, _by_direction(INSIDE_CONVECTION_W_M2K)),
+        "walton": FilmFormula(1.0, lambda v, dt, up: natural_w_m2k(dt, up)),
+        "khalifa": FilmFormula(
             1.0,
             lambda v, dt, up: np.where(np.abs(up) > _SLANT, natural_w_m2k(dt, up), 2.30 * np.power(np.abs(dt), 0.24)),
         ),
-        "madding": Convection(0.0, lambda v, dt, up: 1.31 * np.cbrt(np.abs(dt))),
+        "madding": FilmFormula(0.0, lambda v, dt, up: 1.31 * np.cbrt(np.abs(dt))),
+        "iso-6946-combined": FilmFormula(0.0, _by_direction(_COMBINED), "included"),
     },
 }
-"""Formulas of the full balance by the side of the surface; radiation to what the surface sees is added to each.
+"""Formulas by the side of the surface.
 
 Outside: iso-6946, 4 + 4 v (ISO 6946, annex C); jurges, 5.8 + 3.94 v (Nusselt and Juerges 1922) and mcadams, 5.7 + 3.8 v
 (McAdams 1954), of one wind tunnel, with radiation and free convection in them, so that they are drawn only if weights
@@ -112,21 +116,15 @@ EnergyPlus). Windward and leeward are each drawn half as often, as surveys rarel
 mean the wind beside the surface, the others the wind that comes up to the building.
 Inside: iso-6946, hci by the direction of the heat flow; walton, `natural_w_m2k`; khalifa, 2.30 dT^0.24 for walls
 without a heater (Khalifa and Marshall 1990), elsewhere as walton; madding, 1.31 dT^(1/3) for all (Madding 2008), drawn
-only if weights name it."""
+only if weights name it.
+Simple models, which take all that a surface sees to be as warm as the air: iso-6946-combined, 1 / Rse, and inside 1 /
+Rsi by the direction of the heat flow; albatici-tonelli, 3.8054 v beside radiation to the air (Albatici and Tonelli
+2010); dallo, 5.8 + 3.8054 v (Dall'O, Sarto and Panza 2013)."""
 
 
-SIMPLE: Mapping[str, Mapping[str, Convection]] = {
-    "outside": {
-        "iso-6946-combined": Convection(0.0, lambda v, dt, up: 1.0 / OUTSIDE_RESISTANCE_M2K_W, "included"),
-        "albatici-tonelli": Convection(0.0, lambda v, dt, up: WIND_W_S_M3K * v, "air"),
-        "dallo": Convection(0.0, lambda v, dt, up: 5.8 + WIND_W_S_M3K * v, "included"),
-    },
-    "inside": {"iso-6946-combined": Convection(0.0, _by_direction(_COMBINED), "included")},
-}
-"""Models that take all that a surface sees to be as warm as the air, by the side of the surface.
-
-iso-6946-combined, 1 / Rse, and inside 1 / Rsi by the direction of the heat flow; albatici-tonelli, 3.8054 v beside
-radiation to the air (Albatici and Tonelli 2010); dallo, 5.8 + 3.8054 v (Dall'O, Sarto and Panza 2013)."""
+def simple_models(side: str) -> tuple[str, ...]:
+    """Return the names of the simple models in `FILMS`: the balance never draws them."""
+    return tuple(name for name, film in FILMS[side].items() if film.radiates != "seen")
 
 
 def surface_temperature_k(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -14,7 +14,6 @@ from thermoxels_ns.audit.calibration import Calibration, calibrated
 from thermoxels_ns.audit.conditions import BALANCE, Conditions, Survey, load_conditions
 from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
 from thermoxels_ns.audit.draws import (
-    ENDS,
     GEOMETRY,
     Draws,
     Interval,
@@ -26,17 +25,15 @@ from thermoxels_ns.audit.draws import (
 )
 from thermoxels_ns.audit.energy import EnergyResult, year_of
 from thermoxels_ns.audit.exchange import (
-    chunks,
-    exchange,
+    Exchange,
+    Parts,
     other_models,
-    part_totals,
     reference_doubts,
-    slopes,
     triangle_exchange,
     with_references,
 )
-from thermoxels_ns.audit.heat_flow import SIMPLE, temperature_factor
-from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
+from thermoxels_ns.audit.heat_flow import simple_models, temperature_factor
+from thermoxels_ns.audit.surface import WHY_NOT, AuditedSurface, audited_surface
 from thermoxels_ns.audit.weather import remembered_share
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction
@@ -55,8 +52,7 @@ SEVERE_SHARE, MODERATE_SHARE = 0.05, 0.01
 F_RSI_M2K_W = (0.13, 0.25)
 """Inside surface resistances Rsi of the temperature factors, [m2 K / W]; ISO 13788 judges mould by the second."""
 _LEAST_FLOW_W_M2 = 1e-9
-_FEW = 2000  # Number of draws that tell by how much a cause widens an interval, and of those of single triangles
-_OF_A_TRIANGLE = 10**6  # Argument `number` of `Draws.local`, larger than any part's number
+_FEW = 2000  # Number of draws that tell by how much a cause widens an interval
 
 LEAST_DIFFERENCE_K, MOST_WIND_M_S, LEAST_HOURS_WITHOUT_SUN, LEAST_HOURS_DRY = 10.0, 5.0, 2.0, 24.0
 """Limits of EN 13187: least difference of the airs, most wind, least hours since the sun and since wetness."""
@@ -142,9 +138,16 @@ class SurveyCheck:
     """Shortcomings of a survey, in words for the report."""
 
     asked: tuple[Asked, ...]  # The conditions that EN 13187 and ISO 6781-3 ask for, met or not
-    forbidden: tuple[str, ...]  # Sentences on conditions that EN 13187 does not allow
     doubts: tuple[str, ...]  # Sentences on what makes the figures less certain than their intervals say
     missing: tuple[str, ...]  # Names of facts that EN 13187 wants in a report and that the conditions do not state
+
+    @property
+    def forbidden(self) -> tuple[str, ...]:
+        """Sentences on conditions that EN 13187 does not allow."""
+        wrong = [one for one in self.asked if one.verdict == "not met"]
+        return tuple(
+            f"{one.what[0].upper()}{one.what[1:]}: {one.stated}. EN 13187 asks for {one.asked}." for one in wrong
+        )
 
 
 @dataclass(frozen=True)
@@ -168,12 +171,12 @@ class Audit(HasTables):
     budget: Mapping[str, float]
     """By cause, largest first, by how much the interval of `whole.loss_w` would be narrower if it were exact, [W]."""
     draws: int  # Number of draws behind each interval
-    failing_models: tuple[str, ...]  # Of `SIMPLE`, those by which `whole` has a U-value of 0 or less, not the balance
+    failing_models: tuple[str, ...]  # Simple ones by which `whole` has a U-value of 0 or less, not the balance
     remembered: Interval | None  # `remembered_share` over the stated ranges; None if no time constant is stated
     not_counted_m2: Mapping[str, float]  # Area of triangles that do not count, by the texts of `WHY_NOT`
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
-    triangle_u: FloatArray  # U-value and both ends of its interval, shape (f, 3), [W/(m2 K)]; NaN: does not count
+    triangle_u: FloatArray  # U-value, shape (f,), [W/(m2 K)]; NaN: does not count, or no U-value is known
 
     def __repr__(self) -> str:
         loss, u = self.whole.loss_w, self.whole.u_w_m2k
@@ -203,7 +206,7 @@ class Audit(HasTables):
         for name, values in {
             "surface_temperature_c": self.triangle_surface_c,
             "heat_flow_w_m2": self.triangle_flow_w_m2,
-            **dict(zip(("u_w_m2k", "u_low_w_m2k", "u_high_w_m2k"), self.triangle_u.T)),
+            "u_w_m2k": self.triangle_u,
             "counted": self.surface.counted.astype(np.uint8),
             "defect": numbers,
             **({} if calibration is None else {"measured_minus_computed_k": calibration.difference_k}),
@@ -241,82 +244,40 @@ def audit(
     not judged. Raises `AuditError` if the conditions do not fit the mesh.
     """
     surface = audited_surface(mesh, conditions, up)
-    groups = alike_triangles(surface)
     draws = with_references(surface, conditions, draw(conditions))
-    surface_c, flow = triangle_exchange(conditions, surface, groups, draws.stated)
-    found = find_defects(surface, surface_c, conditions.side == "outside", conditions.camera.repeatability.off_by)
-
-    patch, names = surface.selection.facet_patch, surface.selection.patch_names
-    storey, storey_names = _storey_of(surface, conditions), [*conditions.storeys, ""]
-    counted = np.flatnonzero(surface.counted)
-    patches = [int(n) for n in np.unique(patch[counted])]
-    storeys = [int(n) for n in np.unique(storey[counted]) if n >= 0]
-    parts = [counted[patch[counted] == n] for n in patches]
-    parts += [counted[storey[counted] == n] for n in storeys]
-    parts += [part for one in found for part in (one.zone, one.reference, one.spot)]
-    worst = np.flatnonzero(surface.counted & ~surface.rim)
-    worst = worst if len(worst) else counted
-    away = surface_c[worst] * (-1.0 if conditions.side == "inside" else 1.0)
-    parts += [surface.spot(worst, away), counted]
-    work = _Parts(conditions, surface, groups, draws, parts)
-
-    # Each patch has a reading error of its own; a storey has the errors of its patches, by the shares that lie in it.
-    rows = [*range(len(patches) + len(storeys)), len(parts) - 1]
-    of_patches = np.stack([_shares(surface, parts[row], parts[: len(patches)]) for row in rows])
-    own = of_patches @ work.own_w(draws, work.totals.flow_w[: len(patches)])
-    own_m2 = of_patches @ work.own_m2(draws, len(patches))
-    budget, shares = work.narrower(rows, of_patches)
-    observed = np.isin(patch, patches)
-    chosen = [(names[n], patch == n) for n in patches] + [(storey_names[n], (storey == n) & observed) for n in storeys]
-    elements = [
-        work.element(name, row, np.flatnonzero(every), own[n], own_m2[n], shares[n])
-        for n, (row, (name, every)) in enumerate(zip(rows, [*chosen, ("all that was observed", observed)]))
-    ]
-    whole, failing = elements[-1], _failing_models(conditions, elements)
-
-    first = len(patches) + len(storeys)
-    defects = [
-        work.defect(
-            one, first + 3 * n, work.own_error_k(first + n), storey_names[storey[one.spot[0]]], whole.loss_w.value
-        )
-        for n, one in enumerate(found)
-    ]
-    if least_bridge_w > 0.0:
-        why = f"It loses less than {least_bridge_w:g} W extra (--least-bridge-w)."
-        slight = [not one.not_counted and one.extra_w.value < least_bridge_w for one in defects]
-        defects = [replace(one, not_counted=why) if drop else one for one, drop in zip(defects, slight)]
-    order = sorted(range(len(found)), key=lambda n: (bool(defects[n].not_counted), -defects[n].extra_w.value))
-    found, defects = [found[n] for n in order], [defects[n] for n in order]
-    last, check, (remembered, told) = len(parts) - 2, check_survey(conditions), _remembered(conditions)
-    factors = work.temperature_factors(last, work.own_error_k(last))
-    loss = work.totals.flow_w[-1] + own[-1]
-    drawn = [(one.name, work.u(row, own[row], own_m2[row])) for row, one in enumerate(elements[: len(patches)])]
-    energy = year_of(
-        conditions, draws, [(name, elements[n].area_m2 + own_m2[n], u) for n, (name, u) in enumerate(drawn)]
-    )
-    psi = [(one, work.coefficients[first + 3 * n]) for n, one in zip(order, defects)]
+    stated = triangle_exchange(conditions, surface, draws)
+    off_by = conditions.camera.repeatability.off_by
+    found = find_defects(surface, stated.surface_c, conditions.side == "outside", off_by)
+    work = _Work(conditions, surface, draws, stated, found)
+    patches, storeys, whole, budget = work.elements()
+    failing = _failing_models(conditions, [one.element for one in (*patches, *storeys, whole)])
+    loss_w = whole.element.loss_w.value
+    bridges = [(one, *work.defect(number, one, loss_w, least_bridge_w)) for number, one in enumerate(found)]
+    bridges.sort(key=lambda item: (bool(item[1].not_counted), -item[1].extra_w.value))
+    factors = work.temperature_factors(len(work.flow_w) - 1, work.own_error_k(3 * len(found)))
+    check, (remembered, told) = check_survey(conditions), _remembered(conditions)
     left = {why: float(surface.area_m2[surface.why_not == n].sum()) for n, why in enumerate(WHY_NOT.values())}
     return Audit(
         conditions=conditions,
         surface=surface,
         check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, draws), *told)),
-        patches=tuple(elements[: len(patches)]),
-        storeys=tuple(elements[len(patches) : -1]),
-        whole=whole,
-        defects=tuple(defects),
-        found=tuple(found),
-        limits=_limits(conditions, drawn, psi, loss, factors),
-        energy=energy,
-        calibration=calibrated(conditions, surface, groups, draws),
+        patches=tuple(one.element for one in patches),
+        storeys=tuple(one.element for one in storeys),
+        whole=whole.element,
+        defects=tuple(one for _, one, _ in bridges),
+        found=tuple(one for one, _, _ in bridges),
+        limits=_limits(conditions, patches, [(one, psi) for _, one, psi in bridges], whole, factors),
+        energy=year_of(conditions, draws, [(one.element.name, one.area_m2, one.u) for one in patches]),
+        calibration=calibrated(conditions, surface, draws),
         f_rsi=tuple(interval_of(one) for one in factors),
         budget=budget,
         draws=draws.count - 1,
         failing_models=failing,
         remembered=remembered,
         not_counted_m2={why: area for why, area in left.items() if area > 0.0},
-        triangle_surface_c=surface_c,
-        triangle_flow_w_m2=flow,
-        triangle_u=work.triangle_u(),
+        triangle_surface_c=stated.surface_c,
+        triangle_flow_w_m2=stated.flow_w_m2,
+        triangle_u=stated.flow_w_m2 / draws.difference_k[0],
     )
 
 
@@ -332,121 +293,111 @@ def _largest_first(amounts: Mapping[str, float]) -> dict[str, float]:
     return dict(sorted(amounts.items(), key=lambda item: -item[1]))
 
 
-def _shares(surface: AuditedSurface, part: IntArray, patches: Sequence[IntArray]) -> FloatArray:
-    """Return the share of each patch's area that lies in a part, shape (patches,)."""
-    within = np.zeros(len(surface.area_m2))
-    within[part] = surface.area_m2[part]
-    return np.array([within[patch].sum() / surface.area_m2[patch].sum() for patch in patches])
+class _Drawn(NamedTuple):
+    """An element with draws of its heat flow, [W], area, [m2], and U-value, [W/(m2 K)], shape (k,) each."""
+
+    element: Element
+    flow_w: FloatArray
+    area_m2: FloatArray
+    u: FloatArray
 
 
-class _Parts:
-    """Heat flow and temperature of parts of the surface in every draw; a part is a set of triangles that count."""
+class _Work:
+    """Heat flow and temperature of elements and defects in every draw.
+
+    Elements are made of pieces; a piece is the part of one patch in one storey. The pieces of a patch share a reading
+    error and an error of the patch's border.
+    """
 
     def __init__(
         self,
         conditions: Conditions,
         surface: AuditedSurface,
-        groups: AlikeTriangles,
         draws: Draws,
-        parts: Sequence[IntArray],
+        stated: Exchange,
+        found: Sequence[FoundDefect],
     ) -> None:
-        self.conditions, self.surface, self.groups, self.draws = conditions, surface, groups, draws
-        self.parts, self.rows = parts, groups.rows([*parts], surface.area_m2)
-        self.totals = part_totals(conditions, groups, draws, self.rows)
-        self.coefficients = dict[int, FloatArray]()  # By the number of its zone: draws of a `Defect.coefficient`
-        self.u_by_model = dict[str, FloatArray]()  # U-values by each film model from the stated values, shape (parts,)
-        for model, chosen in other_models(conditions):
-            flow_w = part_totals(chosen, groups, draws.stated, self.rows).flow_w[:, 0]
-            self.u_by_model[model] = flow_w / draws.difference_k[0] / np.maximum(self.totals.area_m2, 1e-12)
+        self.conditions, self.surface, self.draws = conditions, surface, draws
+        self.storey_names, self.storey = [*conditions.storeys, ""], _storey_of(surface, conditions)
+        counted = np.flatnonzero(surface.counted)
+        several = len(self.storey_names)
+        key = surface.selection.facet_patch[counted] * several + self.storey[counted] + 1
+        pieces, self.piece = np.unique(key, return_inverse=True)  # `piece` is that of each triangle that counts
+        self.piece_patch, self.piece_storey = pieces // several, pieces % several - 1
+        self.patches, self.of_patch = np.unique(self.piece_patch, return_inverse=True)
+        self.storeys = np.unique(self.piece_storey[self.piece_storey >= 0])
+        parts = [counted[self.piece == n] for n in range(len(pieces))]
+        parts += [part for one in found for part in (one.zone, one.reference, one.spot)]
+        worst = np.flatnonzero(surface.counted & ~surface.rim)
+        worst = worst if len(worst) else counted
+        parts.append(surface.spot(worst, stated.surface_c[worst] * (-1.0 if conditions.side == "inside" else 1.0)))
+        self.parts = Parts(conditions, surface, draws, stated, parts)
+        self.surface_c, self.flow_w = self.parts.in_draws(draws)
 
-    def own_w(self, draws: Draws, flow_w: FloatArray) -> FloatArray:
-        """Draw by how much the flow of each of the first parts, `flow_w`, (p, k), is off on its own, (p, k), [W]."""
-        off, area_m2 = self.conditions.camera.repeatability.off_by, self.totals.area_m2[: len(flow_w), None]
-        read = np.stack([self.totals.slope_w_k[n] * draws.local(off, n) for n in range(len(flow_w))])
-        wider = self.own_m2(draws, len(flow_w)) / area_m2
-        return read + (flow_w + read) * wider
+    def elements(self) -> tuple[list[_Drawn], list[_Drawn], _Drawn, dict[str, float]]:
+        """Return the patches, the storeys, all that was observed, and `Audit.budget`."""
+        surface, conditions, patch, patches = self.surface, self.conditions, self.piece_patch, self.patches
+        of_facet, of_patch, count = surface.selection.facet_patch, self.of_patch, len(patch)
+        chosen = [*(patch == n for n in patches), *(self.piece_storey == n for n in self.storeys), patch >= 0]
+        members = np.array(chosen, np.float64)
+        area_m2, slope_w_k = self.parts.area_m2[:count], self.parts.slope_w_k[:count, None]
+        border_m2 = np.bincount(of_facet, surface.border_m2 * surface.counted)[patches]
+        wider = np.minimum(border_m2 / np.bincount(of_patch, area_m2), 0.9)
+        off_by = conditions.camera.repeatability.off_by
 
-    def own_m2(self, draws: Draws, patches: int) -> FloatArray:
-        """Draw by how much the area of each of the first parts, `patches`, is off, (patches, k), [m2]."""
-        most = [float(self.surface.border_m2[part].sum()) for part in self.parts[:patches]]
-        most = np.minimum(most, 0.9 * self.totals.area_m2[:patches])
-        return np.stack([one * draws.geometry(n) for n, one in enumerate(most.tolist())])
-
-    def u(self, row: int, error_w: FloatArray, error_m2: FloatArray) -> FloatArray:
-        """Return draws of the U-value of part `row`, (k,), [W/(m2 K)]; see `element` for its errors."""
-        area_m2 = self.totals.area_m2[row] + error_m2
-        return (self.totals.flow_w[row] + error_w) / area_m2 / self.draws.difference_k
-
-    def own_error_k(self, number: int) -> FloatArray:
-        """Draw the reading error that part `number` does not share with other parts, shape (k,), [K]."""
-        return self.draws.local(self.conditions.camera.repeatability.off_by, number)
-
-    def element(
-        self,
-        name: str,
-        row: int,
-        every: IntArray,
-        error_w: FloatArray,
-        error_m2: FloatArray,
-        width_shares: Mapping[str, float],
-    ) -> Element:
-        """Return the results of part `row`; `every` are its triangles.
-
-        `error_w`, [W], and `error_m2`, [m2], are draws of what its flow and its area are off by on their own, (k,).
-        """
-        surface, counted, area = self.surface, self.parts[row], float(self.totals.area_m2[row])
-        uncut = every[surface.why_not[every] != list(WHY_NOT).index("cut")]
-        flow_w = self.totals.flow_w[row] + error_w
-        return Element(
-            name=name,
-            area_m2=area,
-            area_range_m2=interval_of(area + error_m2),
-            unobserved_m2=max(float(surface.area_m2[uncut].sum()) - area, 0.0),
-            surface_c=interval_of(self.totals.surface_c[row]),
-            loss_w=interval_of(flow_w),
-            u_w_m2k=interval_of(self.u(row, error_w, error_m2)),
-            u_by_model={model: float(u[row]) for model, u in self.u_by_model.items()},
-            width_shares=width_shares,
-            unsupported_share=float(surface.area_m2[counted] @ surface.unsupported[counted]) / area,
-        )
-
-    def triangle_u(self) -> FloatArray:
-        """Return the U-value of each triangle and both ends of its interval; see `Audit.triangle_u`."""
-        few, found = self.draws.first(_FEW), []
-        slope = slopes(self.conditions, self.groups, few).flow_w_m2
-        off = few.local(self.conditions.camera.repeatability.off_by, _OF_A_TRIANGLE)
-        for part in chunks(len(self.groups.reading_c), few):
-            flow = exchange(self.conditions, self.groups.some(part), few).flow_w_m2
-            u = (flow + slope[part] * off) / few.difference_k
-            found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ENDS, axis=1).T], axis=1))
-        of = self.groups.of_triangle
-        u = np.concatenate(found)[of] + slope[of] * self.groups.off_k[:, None] / few.difference_k[0]
-        return np.where(self.surface.counted[:, None], u, np.nan)
-
-    def narrower(self, rows: list[int], of_patches: FloatArray) -> tuple[dict[str, float], list[dict[str, float]]]:
-        """Return `Audit.budget` and the `Element.width_shares` of parts, the last of which is all that was observed.
-
-        Each cause is frozen in turn. `of_patches`, (n, patches), is the share of each patch's own error in each part.
-        """
+        def drawn(draws: Draws, flow_w: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+            """Return flow, area and U-value of each element, (e, k), from flows of the pieces without their errors."""
+            off_k = np.stack([draws.local(off_by, n) for n in range(len(patches))])[of_patch]
+            size = np.stack([1.0 + one * draws.geometry(n) for n, one in enumerate(wider.tolist())])[of_patch]
+            flow_w, area = members @ ((flow_w + slope_w_k * off_k) * size), members @ (area_m2[:, None] * size)
+            return flow_w, area, flow_w / area / draws.difference_k
 
         def widths(draws: Draws) -> tuple[FloatArray, FloatArray]:
-            draws = with_references(self.surface, self.conditions, draws)
-            flow_w = part_totals(self.conditions, self.groups, draws, few_rows).flow_w
-            patches = of_patches.shape[1]
-            flow_w = flow_w + of_patches @ self.own_w(draws, flow_w[:patches])
-            off = of_patches @ self.own_m2(draws, patches) / self.totals.area_m2[rows, None]
-            u = flow_w / draws.difference_k / (1.0 + off) if self.conditions.outside_known else flow_w
-            return width_of(flow_w), width_of(u)
+            draws = with_references(surface, conditions, draws)
+            flow_w, _, u = drawn(draws, self.parts.in_draws(draws, count)[1])
+            return width_of(flow_w), width_of(u if conditions.outside_known else flow_w)
 
-        few_rows = self.rows[[*rows, *[len(self.parts) + row for row in rows]]]
-        few, budget, found = self.draws.first(_FEW), dict[str, float](), [dict[str, float]() for _ in rows]
+        few, budget, shares = self.draws.first(_FEW), dict[str, float](), [dict[str, float]() for _ in members]
         every_w, every_u = widths(few)
-        for cause in causes(self.conditions) + [GEOMETRY] * bool(self.surface.border_m2.any()):
-            flow_w, u = widths(few.frozen(cause))
-            budget[cause] = max(float(every_w[-1] - flow_w[-1]), 0.0)
-            for one, share in zip(found, np.maximum(1.0 - u / np.maximum(every_u, 1e-300), 0.0).tolist()):
+        for cause in causes(conditions) + [GEOMETRY] * bool(surface.border_m2.any()):
+            frozen_w, frozen_u = widths(few.frozen(cause))
+            budget[cause] = max(float(every_w[-1] - frozen_w[-1]), 0.0)
+            narrower = np.maximum(1.0 - frozen_u / np.maximum(every_u, 1e-300), 0.0).tolist()
+            for one, share in zip(shares, narrower):
                 one[cause] = share
-        return _largest_first(budget), [_largest_first(one) for one in found]
+
+        flow_w, area, u = drawn(self.draws, self.flow_w[:count])
+        surface_c = members @ (area_m2[:, None] * self.surface_c[:count]) / (members @ area_m2)[:, None]
+        models = dict[str, FloatArray]()  # U-value of each element by each film model, from the stated values, (e,)
+        for model, other in other_models(conditions):
+            flow = surface.area_m2 * triangle_exchange(other, surface, self.draws).flow_w_m2
+            flow_w_k = members @ np.bincount(self.piece, flow[surface.counted]) / self.draws.difference_k[0]
+            models[model] = flow_w_k / area[:, 0]
+        observed = np.isin(of_facet, patches)
+        named = [(surface.selection.patch_names[n], of_facet == n) for n in patches]
+        named += [(self.storey_names[n], (self.storey == n) & observed) for n in self.storeys]
+        found = list[_Drawn]()
+        for n, (name, where) in enumerate([*named, ("all that was observed", observed)]):
+            counted, uncut = where & surface.counted, where & (surface.why_not != list(WHY_NOT).index("cut"))
+            element = Element(
+                name=name,
+                area_m2=float(area[n, 0]),
+                area_range_m2=interval_of(area[n]),
+                unobserved_m2=max(float(surface.area_m2[uncut].sum() - area[n, 0]), 0.0),
+                surface_c=interval_of(surface_c[n]),
+                loss_w=interval_of(flow_w[n]),
+                u_w_m2k=interval_of(u[n]),
+                u_by_model={model: float(one[n]) for model, one in models.items()},
+                width_shares=_largest_first(shares[n]),
+                unsupported_share=float(surface.area_m2[counted & surface.unsupported].sum() / area[n, 0]),
+            )
+            found.append(_Drawn(element, flow_w[n], area[n], u[n]))
+        return found[: len(patches)], found[len(patches) : -1], found[-1], _largest_first(budget)
+
+    def own_error_k(self, number: int) -> FloatArray:
+        """Draw the reading error that a defect, or the coldest spot, does not share with others, shape (k,), [K]."""
+        first = len(self.patches) + len(self.storeys)
+        return self.draws.local(self.conditions.camera.repeatability.off_by, first + number)
 
     def temperature_factors(self, part: int, off_k: FloatArray) -> tuple[FloatArray, ...]:
         """Return draws of the temperature factors of a part for `F_RSI_M2K_W`, (k,); empty if seen from outside.
@@ -455,35 +406,37 @@ class _Parts:
         """
         if self.conditions.side == "outside":
             return ()
-        flow = self.totals.flow_w[part] + self.totals.slope_w_k[part] * off_k
-        flow = np.maximum(flow / max(self.totals.area_m2[part], 1e-12), _LEAST_FLOW_W_M2)
-        above = self.totals.surface_c[part] + off_k - self.draws["outside air"]
+        flow = self.flow_w[part] + self.parts.slope_w_k[part] * off_k
+        flow = np.maximum(flow / max(self.parts.area_m2[part], 1e-12), _LEAST_FLOW_W_M2)
+        above = self.surface_c[part] + off_k - self.draws["outside air"]
         return tuple(np.asarray(temperature_factor(above / flow, one)) for one in F_RSI_M2K_W)
 
-    def defect(self, one: FoundDefect, zone: int, off_k: FloatArray, storey: str, whole_w: float) -> Defect:
-        """Return the results of a defect. Part `zone` is its zone, `zone + 1` its reference, `zone + 2` its spot.
+    def defect(self, number: int, one: FoundDefect, whole_w: float, least_w: float) -> tuple[Defect, FloatArray]:
+        """Return the results of defect `number`, with draws of its `Defect.coefficient`.
 
         Extra heat flow is the flow of the zone minus the flow that the undisturbed surface near by would have on the
         area under the zone (psi = q_tb - q_uniform per metre, O'Grady and others 2017; areas are of the seen side).
-        `off_k` are draws of the defect's own reading error, (k,), [K]; `whole_w` is the observed heat loss, [W].
+        `whole_w` is the observed heat loss, `least_w` the least extra flow that counts, [W].
         """
-        surface, totals = self.surface, self.totals
+        surface, zone, off_k = self.surface, len(self.piece_patch) + 3 * number, self.own_error_k(number)
         calm, spot = zone + 1, zone + 2
-        flow_w = totals.flow_w[zone] + self.totals.slope_w_k[zone] * off_k
-        extra = flow_w - totals.flow_w[calm] / max(totals.area_m2[calm], 1e-12) * one.base_area_m2
+        extra = self.flow_w[zone] + self.parts.slope_w_k[zone] * off_k
+        extra = extra - self.flow_w[calm] / max(self.parts.area_m2[calm], 1e-12) * one.base_area_m2
         if surface.border_m2.any():  # both ends of its length lie within half a triangle's edge
             edge = float(np.sqrt(2.0 * surface.area_m2[one.core].mean()))
-            extra = extra * (1.0 + self.draws.geometry(zone) * min(edge / one.length_m, 0.9))
+            border = self.draws.geometry(len(self.patches) + len(self.storeys) + 3 * number)
+            extra = extra * (1.0 + border * min(edge / one.length_m, 0.9))
         per_kelvin = extra / self.draws.difference_k / (one.length_m if one.kind == "line" else 1.0)
-        self.coefficients[zone] = per_kelvin
         extra_w, f_rsi = interval_of(extra), tuple(map(interval_of, self.temperature_factors(spot, off_k)))
-        around_c = float(totals.surface_c[calm, 0])
-        area, spot_c = surface.area_m2[one.core], interval_of(totals.surface_c[spot] + off_k)
+        around_c, why = float(self.surface_c[calm, 0]), one.not_counted
+        if not why and max(extra_w.value, 0.0) < least_w:
+            why = f"It loses less than {least_w:g} W extra (--least-bridge-w)."
+        area, spot_c = surface.area_m2[one.core], interval_of(self.surface_c[spot] + off_k)
         x, y, z = np.average(surface.centroid_m[one.core], axis=0, weights=area).tolist()
-        return Defect(
+        defect = Defect(
             kind=one.kind,
             patch=surface.selection.patch_names[one.patch],
-            storey=storey,
+            storey=self.storey_names[self.storey[one.spot[0]]],
             centre_m=(x, y, z),
             height_m=float(np.average(surface.height_m[one.core], weights=area)),
             length_m=one.length_m,
@@ -495,8 +448,9 @@ class _Parts:
             coefficient=interval_of(per_kelvin),
             f_rsi=f_rsi,
             severity=_severity(self.conditions, extra_w, f_rsi, whole_w),
-            not_counted=one.not_counted,
+            not_counted=why,
         )
+        return defect, per_kelvin
 
 
 def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ...], whole_w: float) -> Severity:
@@ -511,12 +465,15 @@ def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ..
 
 def _limits(
     conditions: Conditions,
-    patches: Sequence[tuple[str, FloatArray]],
+    patches: Sequence[_Drawn],
     defects: Sequence[tuple[Defect, FloatArray]],
-    loss_w: FloatArray,
+    whole: _Drawn,
     f_rsi: tuple[FloatArray, ...],
 ) -> tuple[Limit, ...]:
-    """Judge draws, (k,), of U-values of patches by name, coefficients of defects, heat loss and temperature factors."""
+    """Judge U-values of patches, the coefficient of the worst linear bridge, heat loss and temperature factors.
+
+    Defects come with draws of their coefficients; draws have shape (k,).
+    """
     limits, found = conditions.limits, list[Limit]()
 
     def judge(name: str, limit: Measured, unit: str, drawn: FloatArray, at_most: bool = True) -> None:
@@ -527,10 +484,10 @@ def _limits(
         missed = missed if np.isfinite(value.value) else np.nan
         found.append(Limit(name, edge, unit, at_most, value, verdict, missed))
 
-    for name, u in patches:
-        chosen = [limit for pattern, limit in limits.u.items() if matching_names([name], pattern)]
+    for one in patches:
+        chosen = [limit for pattern, limit in limits.u.items() if matching_names([one.element.name], pattern)]
         if chosen:
-            judge(f"U-value of {name}", chosen[-1], "W/(m2 K)", u)
+            judge(f"U-value of {one.element.name}", chosen[-1], "W/(m2 K)", one.u)
     lines = [(one, drawn) for one, drawn in defects if one.kind == "line" and not one.not_counted]
     if limits.psi is not None and lines:
         worst, drawn = max(lines, key=lambda item: item[0].coefficient.value)
@@ -538,7 +495,7 @@ def _limits(
     if limits.f_rsi is not None and f_rsi:
         judge("lowest temperature factor for Rsi = 0.25", limits.f_rsi, "", f_rsi[-1], at_most=False)
     if limits.loss is not None:
-        judge("heat loss of what was observed", limits.loss, "W", loss_w)
+        judge("heat loss of what was observed", limits.loss, "W", whole.flow_w)
     return tuple(found)
 
 
@@ -547,10 +504,10 @@ def _failing_models(conditions: Conditions, elements: Sequence[Element]) -> tupl
 
     The last element is all that was observed. Such nights: Zhang, Lucchi and Garzulino 2026, after EN ISO 6781-1.
     """
-    chosen, failing = conditions.film.model, tuple[str, ...]()
+    chosen, simple, failing = conditions.film.model, simple_models(conditions.side), tuple[str, ...]()
     for one in elements:
-        u = {name: one.u_by_model.get(name, np.nan) for name in (*SIMPLE[conditions.side], BALANCE)}
-        failing = tuple(name for name in SIMPLE[conditions.side] if u[name] <= 0.0 < u[BALANCE])
+        u = {name: one.u_by_model.get(name, np.nan) for name in (*simple, BALANCE)}
+        failing = tuple(name for name in simple if u[name] <= 0.0 < u[BALANCE])
         if chosen in failing:
             expected = f"one that knows what the surface sees, which is not as warm as the air {conditions.side}"
             got = f"{chosen}, by which {one.name} has a U-value of {u[chosen]:.2f}; by the balance, {u[BALANCE]:.2f}"
@@ -586,13 +543,7 @@ def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tup
 
 def check_survey(conditions: Conditions) -> SurveyCheck:
     """Return what EN 13187 forbids and misses in the conditions of a survey, and what makes results doubtful."""
-    asked = asked_of_survey(conditions.survey, conditions)
-    forbidden = [
-        f"{one.what[0].upper()}{one.what[1:]}: {one.stated}. EN 13187 asks for {one.asked}."
-        for one in asked
-        if one.verdict == "not met"
-    ]
-    return SurveyCheck(asked, tuple(forbidden), _doubts(conditions), _missing(conditions))
+    return SurveyCheck(asked_of_survey(conditions.survey, conditions), _doubts(conditions), _missing(conditions))
 
 
 def _doubts(conditions: Conditions) -> tuple[str, ...]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
 
 from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
@@ -31,6 +31,18 @@ WHY_NOT = {
 """Reasons why a triangle does not count; the texts complete a sentence that begins with "triangles"."""
 
 chosen_names = partial(names_chosen, error=AuditError)  # `AuditError` if a pattern matches no name
+
+
+class Readings(NamedTuple):
+    """What the thermal camera read on n pieces of surface: here groups of triangles."""
+
+    reading_c: FloatArray  # Mean reading, not corrected, shape (n,), [degrees Celsius]
+    upward: FloatArray  # Upward part of the outward unit normal, shape (n,)
+    surface_entry: IntArray  # Place in `Conditions.surfaces` of the emissivity, shape (n,)
+
+    def some(self, part: slice) -> Readings:
+        """Return the pieces of surface in a slice."""
+        return Readings(self.reading_c[part], self.upward[part], self.surface_entry[part])
 
 
 @dataclass(frozen=True)
@@ -91,39 +103,27 @@ class AuditedSurface:
         half_edge = 0.5 * np.sqrt(2.0 * self.area_m2) * np.where(tags.photographs[:, 1] < _SUPPORTED, 2.0, 1.0)
         return 0.25 * np.pi * half_edge * np.bincount(sides // 3, length, len(facets))
 
+    @cached_property
+    def alike(self) -> tuple[Readings, IntArray]:
+        """Groups of triangles that count and share a patch and nearly the same reading and inclination, with their
+        means by area, and the group of each triangle, shape (f,); -1 where it does not count."""
+        which = np.flatnonzero(self.counted)
+        area, reading, upward = np.maximum(self.area_m2[which], 1e-300), self.reading_c[which], self.upward[which]
+        # All film and sky models depend on the inclination of a normal alone, not on its azimuth.
+        key, tilt = np.rint(reading / _STEP_K).astype(np.int64), np.rint((upward + 1.0) / _STEP_COSINE).astype(np.int64)
+        key = (key - key.min()) * (2 + round(2.0 / _STEP_COSINE)) + tilt
+        key = key * len(self.selection.patch_names) + self.selection.facet_patch[which]
+        _, first, group = np.unique(key, return_index=True, return_inverse=True)
+        total = np.bincount(group, area)
+        mean_c, mean_upward = (np.bincount(group, area * values) / total for values in (reading, upward))
+        of_triangle = np.full(len(self.counted), -1)
+        of_triangle[which] = group
+        return Readings(mean_c, mean_upward, self.surface_entry[which[first]]), of_triangle
+
     def spot(self, which: IntArray, amount: FloatArray) -> IntArray:
         """Return the triangles of `which`, (k,), of largest `amount`, (k,), whose areas just add up to `SPOT_M2`."""
         ranked = which[np.argsort(-amount, kind="stable")]
         return ranked[: int(np.searchsorted(np.cumsum(self.area_m2[ranked]), SPOT_M2 * (1.0 - 1e-9))) + 1]
-
-
-@dataclass(frozen=True)
-class AlikeTriangles:
-    """Groups of triangles that count; a group shares a patch, and nearly the same reading and inclination."""
-
-    reading_c: FloatArray  # Mean reading of each group, weighted by area, shape (g,), [degrees Celsius]
-    upward: FloatArray  # Mean upward part of the group's unit normals, shape (g,)
-    surface_entry: IntArray  # Place in `Conditions.surfaces` of the group's emissivity, shape (g,)
-    of_triangle: IntArray  # Group of each boundary triangle, shape (f,); -1 where a triangle does not count
-    off_k: FloatArray  # Reading of each triangle minus that of its group, shape (f,), [K]; 0 where it does not count
-
-    def some(self, part: slice) -> AlikeTriangles:
-        """Return the groups in the slice `part`, without triangles."""
-        none = np.zeros(0, dtype=np.int64)
-        values = self.reading_c[part], self.upward[part], self.surface_entry[part]
-        return AlikeTriangles(*values, none, none.astype(np.float64))
-
-    def rows(self, parts: list[IntArray], area_m2: FloatArray) -> sparse.csr_array:
-        """Return areas of `parts`, indices of triangles that count: shape (2 parts, g).
-
-        The first rows are each group's area in each part, [m2]; the second ones the same areas, each triangle's times
-        its `off_k`, [m2 K]: what is taken to change linearly with readings within a group.
-        """
-        row = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-        which = np.concatenate([*parts, np.zeros(0, dtype=np.int64)]).astype(np.int64)
-        area, place = area_m2[which], self.of_triangle[which]
-        values, at = np.append(area, area * self.off_k[which]), (np.append(row, row + len(parts)), np.tile(place, 2))
-        return sparse.coo_array((values, at), shape=(2 * len(parts), len(self.reading_c))).tocsr()
 
 
 def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float]) -> AuditedSurface:
@@ -176,28 +176,4 @@ def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, floa
         unsupported=unsupported & counted,
         surface_entry=entry_of_patch[patch],
         base_m=float((mesh.points_m @ np.array(up)).min()),
-    )
-
-
-def alike_triangles(surface: AuditedSurface) -> AlikeTriangles:
-    """Group the triangles that count by patch, reading and inclination."""
-    which = np.flatnonzero(surface.counted)
-    area, reading, upward = np.maximum(surface.area_m2[which], 1e-300), surface.reading_c[which], surface.upward[which]
-    # All film and sky models depend on the inclination of a normal alone, not on its azimuth.
-    key = np.rint(reading / _STEP_K).astype(np.int64)
-    key = (key - key.min()) * (2 + round(2.0 / _STEP_COSINE)) + np.rint((upward + 1.0) / _STEP_COSINE).astype(np.int64)
-    key = key * len(surface.selection.patch_names) + surface.selection.facet_patch[which]
-    _, first, group = np.unique(key, return_index=True, return_inverse=True)
-    total = np.bincount(group, area)
-    of_triangle = np.full(len(surface.counted), -1)
-    of_triangle[which] = group
-    mean_c = np.bincount(group, area * reading) / total
-    off_k = np.zeros(len(surface.counted))
-    off_k[which] = reading - mean_c[group]
-    return AlikeTriangles(
-        reading_c=mean_c,
-        upward=np.bincount(group, area * upward) / total,
-        surface_entry=surface.surface_entry[which[first]],
-        of_triangle=of_triangle,
-        off_k=off_k,
     )

@@ -41,15 +41,20 @@ def survey_weather(
             raise wrong(file, "date and time of the survey beside an .epw file", "none", remedy)
         found = read_weather(file, date, facing_deg=facing_deg)
         hours = found["hours"]
-        for name, values in found.items():
-            if name.endswith("_c") and not ((values > -90.0) & (values < 70.0)).all():
-                got = f"{values.min():g} to {values.max():g} C"
-                raise wrong(file, f"{name} from -90 to 70 C", got, "Leave out lines without a value.")
+        check_airs(file, found)
         if not hours[0] < 0.0 <= hours[-1]:
             expected, got = "hours that grow from below 0, the survey, to 0", f"{hours[0]:g} to {hours[-1]:g}"
             raise wrong(file, expected, got, "Count hours from the survey.")
     times = np.append(hours[hours < 0.0], 0.0)
     return {one: np.interp(times, hours, column) for one, column in found.items()}
+
+
+def check_airs(file: str, columns: dict[str, FloatArray]) -> None:
+    """Raise `RecordError` if a temperature of a weather file is none of air."""
+    for name, values in columns.items():
+        if name.endswith("_c") and not ((values > -90.0) & (values < 70.0)).all():
+            got = f"{values.min():g} to {values.max():g} C"
+            raise wrong(file, f"{name} from -90 to 70 C", got, "Leave out lines without a value.")
 
 
 def with_weather(content: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -175,8 +175,8 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
         photographs = photographs_of_defects(scene, scale, found, range_c)
         say(f"Photographs show {sum(not found.defects[number].not_counted for number in photographs)} of them.")
     if compared is not None:
-        for line in compared.lines():
-            say(line)
+        sure = [one.name for one in (*compared.elements, *compared.bridges) if one.significant]
+        say(f"Significant changes since the earlier survey: {', '.join(sure) or 'none'}.")
     shown = {"range_c": range_c, "most_u": most_u, "impossible": impossible, "compared": compared}
     names = _write(folder, options, found, photographs, shown, envelope)
     say(f"Written to {folder}: {', '.join(names)} ({clock.perf_counter() - begin:.1f} s)")

@@ -13,10 +13,10 @@ from thermoxels_ns.audit.conditions import Survey
 from thermoxels_ns.audit.draws import CONFIDENCE
 from thermoxels_ns.audit.envelope import Envelope
 from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit, asked_of_survey
-from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.version import __version__
 from thermoxels_ns.mesh.boundary.planes import FlatElement, plane_axes
-from thermoxels_ns.reports.audit_view import drawn_triangles, plotly_script, view_data
+from thermoxels_ns.reports.audit_view import drawn_triangles, numbered_defects, plotly_script, view_data
 from thermoxels_ns.reports.charts import gradient
 from thermoxels_ns.reports.page import Picture, Report, build_page, image_file
 
@@ -25,7 +25,6 @@ AuditPictures: TypeAlias = dict[str, list[bytes]]
 temperature is stated), "misfit" (measured minus computed temperature)."""
 
 MOST_DEFECTS = 12  # Number of defects that get a section of their own
-MOST_PAGE_BYTES = 15_000_000  # A page that would be larger has no 3-D view
 _ALL_AROUND = 0.35  # If the mean horizontal normal is shorter than this, the building was seen from all around
 
 
@@ -46,7 +45,7 @@ def audit_page(
 ) -> str:
     """Return the html text of an audit's page; `command` made the audit, `files` lie beside the page.
 
-    It has a 3-D view if it has pictures, is not meant for `paper` and does not exceed `MOST_PAGE_BYTES`.
+    It has a 3-D view if it has pictures and is not meant for `paper`.
 
     `photographs` are pictures of defects by place in `audit.defects`, whose colours span `range_c`; without `pictures`
     the page has no drawings. `most_u` is the U-value by name of an element from which on a value is marked impossible,
@@ -56,7 +55,11 @@ def audit_page(
     counted = [(number, one) for number, one in numbered if not one.not_counted]
     start = {} if asked is None else asked.stated()
     unknown = set() if asked is None else {one.name() for one in asked.unknown}
-    shown = dict[str, Any](
+    view = None
+    if pictures is not None and not paper:
+        view = {"plotly": plotly_script(), "data": view_data(audit, _views(audit)[0])}
+    return build_page(
+        "audit.html.j2",
         audit=audit,
         counted=counted,
         doubted=[(number, one) for number, one in numbered if one.not_counted],
@@ -79,18 +82,8 @@ def audit_page(
         mesh_name=mesh_name,
         command=command,
         files=files,
-        view=None,
-        view_left_out="",
+        view=view,
     )
-    view = None
-    if pictures is not None and not paper:
-        view = {"plotly": plotly_script(), "data": view_data(audit, _views(audit)[0])}
-    page = build_page("audit.html.j2", **shown | {"view": view})
-    if view is not None and len(page) > MOST_PAGE_BYTES:
-        size, most = f"{len(page) / 1e6:.0f}", f"{MOST_PAGE_BYTES / 1e6:.0f}"
-        why = f"A 3-D view is left out: with it, this page would have {size} MB, of {most} at most."
-        page = build_page("audit.html.j2", **shown | {"view_left_out": why})
-    return page
 
 
 def agreement_page(title: str, survey: Survey) -> str:
@@ -113,54 +106,44 @@ def gbxml(envelope: Envelope, title: str) -> str:
 
 
 def draw_audit(audit: Audit) -> AuditPictures:
-    """Draw all pictures; pictures of temperatures share one range of colours, triangles that do not count are grey."""
-    surface, calibration, up = audit.surface, audit.calibration, audit.surface.selection.up
-    shown = np.unique(surface.mesh.facets[surface.counted])
-    known = audit.conditions.outside_known
-    values, name, unit = audit.triangle_u[:, 0], "U-value", "W/(m² K)"
-    if not known:
-        values, name, unit = audit.triangle_flow_w_m2, "Heat flow", "W/m²"
-    surface_c, u = _at_nodes(audit, audit.triangle_surface_c), _at_nodes(audit, values)
-    temperatures: dict[str, Any] = {"up": up, "clim": np.quantile(surface_c[shown], (0.005, 0.995)).tolist()}
-    flows: dict[str, Any] = {"up": up, "clim": np.quantile(u[shown], (0.02, 0.98)).tolist(), "colour_map": "viridis"}
-    flows |= {"bar_title": f"{name} [{unit}]", "title": f"{name} by the stated values"}
+    """Draw all pictures: triangles from one or two sides, grey where they have no value.
+
+    In a view from inside, cut and unseen triangles are left out.
+    """
+    from thermoxels_ns.reports.mesh_pictures import image_of_surface
+
+    surface, mesh, known = audit.surface, audit.surface.mesh, audit.conditions.outside_known
+
+    def ends(values: FloatArray, cut: float) -> list[float]:
+        return np.nanquantile(values, (cut, 1.0 - cut)).tolist()
+
+    temperature_c, flow = audit.triangle_surface_c, audit.triangle_u if known else audit.triangle_flow_w_m2
+    name, unit = ("U-value", "W/(m² K)") if known else ("Heat flow", "W/m²")
+    title = "Surface temperature, corrected for emissivity and reflection"
+    kinds: dict[str, tuple[FloatArray, dict[str, Any]]] = {
+        "temperature": (temperature_c, {"clim": ends(temperature_c, 0.005), "title": title}),
+        "u_value": (flow, {"clim": ends(flow, 0.02), "colour_map": "viridis", "bar_title": f"{name} [{unit}]"}),
+    }
+    kinds["u_value"][1]["title"] = f"{name} by the stated values"
+    if audit.calibration is not None:
+        off_k = audit.calibration.difference_k
+        most = float(np.nanquantile(np.abs(off_k), 0.98)) or 1.0
+        look = {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "difference [K]"}
+        kinds["misfit"] = off_k, look | {"title": "Measured minus computed"}
     pictures: AuditPictures = {"temperature": [], "u_value": [], "misfit": []}
     for direction in _views(audit):
-        view = {"view_direction": direction.tolist()}
-        facing = surface.selection.facet_normal @ direction < 0.0
-        labels = _labels(audit, direction)
-        title = "Surface temperature, corrected for emissivity and reflection"
-        drawn = _picture(audit, facing, surface_c, title=title, labels=labels, **temperatures, **view)
-        pictures["temperature"].append(drawn)
-        pictures["u_value"].append(_picture(audit, facing, u, **flows, **view))
-        if calibration is not None:
-            off_k = _at_nodes(audit, calibration.difference_k)
-            most = float(np.quantile(np.abs(off_k[shown]), 0.98)) or 1.0
-            look: dict[str, Any] = {"up": up, "clim": (-most, most), "colour_map": "coolwarm"}
-            look |= {"bar_title": "difference [K]", "title": "Measured minus computed"}
-            pictures["misfit"].append(_picture(audit, facing, off_k, **look, **view))
+        chosen = (surface.selection.facet_normal @ direction < 0.0) & drawn_triangles(audit)
+        view = {"up": surface.selection.up, "view_direction": direction.tolist()}
+        for kind, (values, look) in kinds.items():
+            shown = values[chosen]
+            painted = [("does not count", "lightgrey", np.isnan(shown))]
+            labels = [(str(n), one.centre_m) for n, one, normal in numbered_defects(audit) if normal @ direction < 0.0]
+            labels = labels if kind == "temperature" else []
+            image = image_of_surface(
+                mesh.points_m, mesh.facets[chosen], shown, painted=painted, labels=labels, **look, **view
+            )
+            pictures[kind].append(image_file(image, "PNG"))
     return pictures
-
-
-def _at_nodes(audit: Audit, values: FloatArray) -> FloatArray:
-    """Return for each node the mean, by area, of `values` of its triangles that count, shape (n,); 0 without any."""
-    surface = audit.surface
-    facets, area = surface.mesh.facets[surface.counted], surface.area_m2[surface.counted]
-    weight, count = np.repeat(area, 3), len(surface.mesh.points_m)
-    known = np.nan_to_num(values[surface.counted])  # NaN where a calibration leaves out patches
-    total = np.bincount(facets.ravel(), weight * np.repeat(known, 3), count)
-    share = np.bincount(facets.ravel(), weight, count)
-    return total / np.where(share > 0.0, share, 1.0)
-
-
-def _labels(audit: Audit, direction: FloatArray) -> list[tuple[str, tuple[float, float, float]]]:
-    """Return number and centre, [m], of the defects that count and face a camera that looks along `direction`."""
-    surface, labels = audit.surface, []
-    for number, (one, found) in enumerate(zip(audit.defects, audit.found), start=1):
-        normal = surface.area_m2[found.core] @ surface.selection.facet_normal[found.core]
-        if not one.not_counted and normal @ direction < 0.0:
-            labels.append((str(number), one.centre_m))
-    return labels
 
 
 def _views(audit: Audit) -> list[FloatArray]:
@@ -178,13 +161,3 @@ def _views(audit: Audit) -> list[FloatArray]:
     if audit.conditions.side == "inside":  # floor and walls, then ceiling and walls
         return [-(corner + 0.5 * up), corner + 0.5 * up]
     return [-(corner + 0.5 * up), corner - 0.5 * up]
-
-
-def _picture(audit: Audit, chosen: BoolArray, values: FloatArray, **look: Any) -> bytes:
-    """Draw chosen triangles, grey if they do not count; without cut and unseen triangles in a view from inside."""
-    from thermoxels_ns.reports.mesh_pictures import image_of_surface
-
-    mesh = audit.surface.mesh
-    chosen = chosen & drawn_triangles(audit)
-    painted = [("does not count", "lightgrey", ~audit.surface.counted[chosen])]
-    return image_file(image_of_surface(mesh.points_m, mesh.facets[chosen], values, painted=painted, **look), "PNG")

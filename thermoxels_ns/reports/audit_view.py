@@ -5,12 +5,13 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+from collections.abc import Iterator
 from functools import cache
 from html import escape
 
 import numpy as np
 
-from thermoxels_ns.audit.run import Audit
+from thermoxels_ns.audit.run import Audit, Defect
 from thermoxels_ns.audit.surface import WHY_NOT
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.reports.numbers import interval_text
@@ -51,7 +52,7 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
     shown = which[counted]
     values = {
         ("Surface temperature", "°C", "Inferno", 0.005): audit.triangle_surface_c,
-        **({("U-value", "W/(m² K)", "Viridis", 0.02): audit.triangle_u[:, 0]} if known else {}),
+        **({("U-value", "W/(m² K)", "Viridis", 0.02): audit.triangle_u} if known else {}),
         ("Heat flow", "W/m²", "Viridis", 0.02): audit.triangle_flow_w_m2,
     }
     quantities = []
@@ -68,7 +69,6 @@ def view_data(audit: Audit, toward: FloatArray) -> str:
                 "patch": selection.facet_patch[shown].tolist(),
                 "patches": [escape(name) for name in selection.patch_names],
                 "quantities": quantities,
-                "u_ends": [_rounded(audit.triangle_u[shown, end]) for end in (1, 2)] if known else None,
                 "bridges": _marks(audit),
                 "up": list(selection.up),
                 "eye": (-1.9 * toward / np.linalg.norm(toward)).tolist(),
@@ -92,16 +92,21 @@ def _rounded(values: FloatArray) -> list[float | None]:
     return [value if np.isfinite(value) else None for value in values.round(2).tolist()]
 
 
-def _marks(audit: Audit) -> list[dict[str, object]]:
-    """Return number, text and place, [mm], of the bridges that count, a little before the surface."""
-    surface, marks = audit.surface, []
+def numbered_defects(audit: Audit) -> Iterator[tuple[int, Defect, FloatArray]]:
+    """Yield number, defect and mean outward unit normal, (3,), of each defect that counts."""
     for number, (one, found) in enumerate(zip(audit.defects, audit.found), start=1):
         if not one.not_counted:
-            normal = surface.area_m2[found.core] @ surface.selection.facet_normal[found.core]
-            length = float(np.linalg.norm(normal)) or 1.0
-            at = 1e3 * (np.array(one.centre_m) + _BEFORE_SURFACE_M * normal / length)
-            text = f"{number}: {escape(one.patch)}<br>{interval_text(one.extra_w, 'W')} extra<br>click for more"
-            marks.append({"number": number, "at": at.round().tolist(), "text": text})
+            normal = audit.surface.area_m2[found.core] @ audit.surface.selection.facet_normal[found.core]
+            yield number, one, normal / (float(np.linalg.norm(normal)) or 1.0)
+
+
+def _marks(audit: Audit) -> list[dict[str, object]]:
+    """Return number, text and place, [mm], of the bridges that count, a little before the surface."""
+    marks = []
+    for number, one, normal in numbered_defects(audit):
+        at = 1e3 * (np.array(one.centre_m) + _BEFORE_SURFACE_M * normal)
+        text = f"{number}: {escape(one.patch)}<br>{interval_text(one.extra_w, 'W')} extra<br>click for more"
+        marks.append({"number": number, "at": at.round().tolist(), "text": text})
     return marks
 
 

@@ -8,10 +8,9 @@ from dataclasses import fields
 import numpy as np
 
 from thermoxels_ns.fem.problem import effect_labels
-from thermoxels_ns.fem.quantities import Varying, values_at
-from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.heat.effects import Effect, FixedTemperature, InternalHeat
+from thermoxels_ns.heat.effects import Effect
 from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.run import HeatRun, mesh_error_in_words
 from thermoxels_ns.heat.scene import unit_of
@@ -34,7 +33,6 @@ def heat_page(
     solution = run.solution
     names = [f"{point_text(point)} m" for point in run.probes.points_m]
     over_time = isinstance(solution, HeatSolution)
-    selection, labels = Selection(run.problem.mesh, run.problem.up), effect_labels(run.problem)
     return build_page(
         "heat.html.j2",
         run=run,
@@ -47,7 +45,7 @@ def heat_page(
         mesh_name=mesh_name,
         mesh_error=mesh_error_in_words(solution),
         materials=materials_by_region(run.problem),
-        effects=[(label, _values(effect, selection)) for label, effect in zip(labels, run.problem.effects)],
+        effects=[(label, _values(effect)) for label, effect in zip(effect_labels(run.problem), run.problem.effects)],
         linear_steps=int(np.sum(solution.iterations)),
         newton_steps=int(np.sum(solution.newton_iterations)),
         report=report,
@@ -56,7 +54,7 @@ def heat_page(
     )
 
 
-def _values(effect: Effect, selection: Selection) -> str:
+def _values(effect: Effect) -> str:
     """Return the quantities of an effect as text with units, without quantities at their default."""
     shown = []
     for field in fields(effect)[1:]:  # type: ignore[arg-type]
@@ -65,17 +63,5 @@ def _values(effect: Effect, selection: Selection) -> str:
             continue
         name = field.name.rsplit("_w_m", 1)[0].removesuffix("_c").removesuffix("_m2k").replace("_", " ")
         unit = {"1": "", "C": " °C"}.get(unit, f" {unit_signs(unit)}")
-        if not isinstance(value, Varying):
-            shown.append(f"{name} {value:g}{unit}")
-        elif isinstance(effect, FixedTemperature):
-            shown.append(f"{name} varies")
-        else:
-            if isinstance(effect, InternalHeat):
-                places = selection.tet_places(selection.tets(effect.where))
-            else:
-                places = selection.facet_places(selection.facets(effect.where))
-            values = values_at(value, places, 0.0)
-            changes = ", changes with time" if value.in_time else ""
-            ends = dict.fromkeys(f"{end:.3g}" for end in (values.min(), values.max())) if len(values) else ("nowhere",)
-            shown.append(f"{name} {' to '.join(ends)}{unit}{changes}")
+        shown.append(f"{name} varies" if isinstance(value, Varying) else f"{name} {value:g}{unit}")
     return "; ".join(shown)

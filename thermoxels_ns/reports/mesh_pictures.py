@@ -68,7 +68,7 @@ def image_of_surface(
     Args:
         points_m: Nodes, shape (n, 3).
         facets: Triangles of the surface, shape (f, 3).
-        values: Nodal values, shape (n,), such as temperatures [degrees Celsius].
+        values: Values of nodes, shape (n,), or of triangles, (f,), such as temperatures [degrees Celsius].
         title: Text above the picture.
         clim: Values at the ends of the colour bar. If left out, the lowest and highest value; but if a few nodes
             stretch this range to more than twice the range of the middle 99 % of the nodes, the colours span the middle
@@ -98,8 +98,8 @@ def image_of_surface(
 
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # without a display VTK warns that it found no X server
     nodes = np.unique(facets)
-    shown = np.asarray(values[nodes], dtype=np.float64)
-    (low, high), note = colour_range(shown) if clim is None else (clim, "")
+    of_triangles = len(values) == len(facets) != len(points_m)
+    (low, high), note = colour_range(values if of_triangles else values[nodes]) if clim is None else (clim, "")
     if not high - low > 1e-3:  # the colours of a constant temperature span 1 K
         low, high = low - 0.5, high + 0.5
     plain = np.any([which for *_, which in painted], axis=0) if painted else np.zeros(len(facets), dtype=bool)
@@ -116,7 +116,8 @@ def image_of_surface(
         plotter.renderer.set_background("white")
         if not plain.all():
             surface = pv.PolyData.from_regular_faces(points_m, facets[~plain])
-            surface.point_data["value"] = values
+            data = surface.cell_data if of_triangles else surface.point_data
+            data["value"] = values[~plain] if of_triangles else values
             start = _DARKEST if colour_map == "inferno" else 0.0
             colours = ListedColormap(matplotlib.colormaps[colour_map](np.linspace(start, 1.0, 256)))
             place = {"vertical": True, "position_x": 0.86, "position_y": 0.2, "width": 0.06, "height": 0.6}
@@ -324,9 +325,7 @@ def draw_support(path: Path, mesh: TetMesh, look: Mapping[str, Any]) -> None:
     painted = [(*of, support == number) for number, of in enumerate(zip(SUPPORT.values(), _SUPPORT_COLOURS))]
     painted.append(("cut by the scene box or the region", "white", support < 0))
     up, ahead = _unit("up", look["up"]), -_towards_camera(look["up"], look["view_direction"])
+    views = {"Support by photographs": ahead, "From the other side": 2.0 * (ahead @ up) * up - ahead}
     beside = {"painted": painted, "up": up, "window_size": (700, 700)}
-    panels = [
-        image_of_mesh(mesh, title="Support by photographs", view_direction=ahead, **beside),
-        image_of_mesh(mesh, title="From the other side", view_direction=2.0 * (ahead @ up) * up - ahead, **beside),
-    ]
+    panels = [image_of_mesh(mesh, title=title, view_direction=view, **beside) for title, view in views.items()]
     write_picture(path, np.concatenate(panels, axis=1))

@@ -13,10 +13,8 @@
     const [x, y, z] = data.points.map(row => row.map(mm => mm / 1000));
     const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
     const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-    const ends = n => data.u_ends && data.u_ends[0][n] !== null && data.u_ends[1][n] !== null
-      ? ` (${data.u_ends[0][n]} to ${data.u_ends[1][n]})` : "";
     const told = data.patch.map((patch, n) => data.patches[patch] + data.quantities.map(one =>
-      `<br>${one.name} ${one.values[n]}${one.name === "U-value" ? ends(n) : ""} ${one.unit}`).join(""));
+      `<br>${one.name} ${one.values[n]} ${one.unit}`).join(""));
     const box = part("view-drawn"), chosen = part("view-quantity");
     data.quantities.forEach((one, n) => chosen.add(new Option(`${one.name}, ${one.unit}`, n)));
     const quantity = () => data.quantities[chosen.value];
