@@ -235,7 +235,7 @@ def test_what_cannot_be_used_is_refused_before_the_audit(export, tmp_path, capsy
     for name in ("mesh.vtu", "mesh-boundary.vtp", "conditions.yaml"):
         (tmp_path / name).symlink_to(export / name)
     (tmp_path / "export").mkdir()
-    (tmp_path / "export" / "summary.json").write_text("{}")  # results of another command are not replaced
+    (tmp_path / "export" / "answers.json").write_text("{}")  # results of another command are not replaced
     (tmp_path / "room.yaml").write_text(ROOM)
     (tmp_path / "room.json").write_text("{}")
     (tmp_path / "no-up.json").write_text(json.dumps({"conditions": {}, "up": ["x", "y", "z"]}))
