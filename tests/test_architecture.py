@@ -63,27 +63,27 @@ NEVER = {
 """Other packages that a room does not import, not even inside a function."""
 
 MOST_LINES = {
-    "audit": 3550,
-    "capture": 3810,
-    "commands": 2900,
+    "audit": 3445,
+    "capture": 3455,
+    "commands": 2590,
     "core": 1860,
-    "data": 2755,
-    "evaluation": 430,
+    "data": 2620,
+    "evaluation": 385,
     "fem": 2935,
     "field": 885,
     "heat": 2590,
-    "mesh": 5405,
+    "mesh": 4970,
     "multiview": 1870,
-    "radiometry": 1355,
+    "radiometry": 1320,
     "render": 1670,
-    "reports": 1400,
+    "reports": 1340,
     "synthetic": 2750,
     "training": 2805,
-    "root": 715,
+    "root": 650,
 }
 """Budget of lines of each room, comments and docstrings included: what it had when that was written down and 5 % more.
 Raising one is said in the message of the commit."""
-MOST_TEST_LINES = 29000
+MOST_TEST_LINES = 28600
 
 
 def room_of(module: str) -> str:
