@@ -80,7 +80,7 @@ MECHANISMS: Mapping[str, Without] = {
             ("thermoxels_ns.multiview.stereo", "plain_backdrop", lambda _, depth: 3 * (np.zeros(len(depth), bool),)),
         )
     ),
-    "ceilings": Without(replaced=(("thermoxels_ns.multiview.backdrop", "in_a_room", lambda *four: False),)),
+    "ceilings": Without(replaced=(("thermoxels_ns.multiview.backdrop", "what_is_above", lambda *four: "sky"),)),
     "carve": Without((f"{_MODEL}carve", "off")),
     "opened-rays": Without(replaced=((_CALLBACKS, "MOST_OPENED_RAYS", 1.0),)),
     "opaque-neighbours": Without(replaced=((_CALLBACKS, "OPAQUE_DEPTH", math.inf),)),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.multiview.backdrop import mean_colours, plain_backdrop, upwards
 from thermoxels_ns.multiview.differences import Differences
 from thermoxels_ns.multiview.evidence import PhotographEvidence
@@ -153,8 +154,10 @@ def test_a_plain_ceiling_is_no_sky_unless_it_is_colder_than_all_around():
     assert ceiling[is_ceiling].mean() > 0.8 and not ceiling[~is_ceiling].any()
     yard = replace(seen, thermal=np.where(is_ceiling, np.float32(0.1), seen.thermal))
     assert plain_backdrop(yard, depth)[0][is_ceiling].mean() > 0.8
+    beyond = replace(seen, thermal=np.where(is_ceiling, np.float32(np.nan), seen.thermal))  # too cold for the camera
+    assert plain_backdrop(beyond, depth)[0][is_ceiling].mean() > 0.8
     unknown = replace(seen, thermal=np.full_like(seen.thermal, np.nan))
-    assert not plain_backdrop(unknown, depth)[0].any()
+    assert not any(shown.any() for shown in plain_backdrop(unknown, depth)[::2])
     two = first_of(seen, 2)  # which show nothing that stands behind their cameras
     assert plain_backdrop(two, depth[: len(two.colours)])[0].any()
 
@@ -163,10 +166,17 @@ def test_a_ceiling_lies_on_the_hull_of_the_walls():
     seen, depth, is_ceiling = room()
     rays = feature_rays_to_depths(Depths(seen, depth, np.float32(0.02) * depth))
     evidence = PhotographEvidence(seen, depth, np.zeros_like(is_ceiling), is_ceiling, rays, None, None)
-    to_ceiling = evidence.plain_rays(10.0)
+    box = np.full(3, -4.0), np.full(3, 4.0)
+    to_ceiling = evidence.plain_rays(*box)
     assert to_ceiling is not None and len(to_ceiling.point) == is_ceiling.sum()
     assert np.abs(to_ceiling.points[:, 2] - 3.0).max() < 0.1
-    assert replace(evidence, feature_rays=None).plain_rays(10.0) is None
+    outside = np.random.default_rng(0).uniform((10.0, -9.0, 0.0), (20.0, 9.0, 9.0), (len(rays.point) // 20, 3))
+    through_a_window = FeatureRays(outside, np.arange(len(outside)), outside, np.zeros(len(outside)))
+    seen_outside = replace(evidence, feature_rays=rays.joined_with(through_a_window)).plain_rays(*box)
+    assert seen_outside is not None and np.abs(seen_outside.points[:, 2] - 3.0).max() < 0.1
+    assert replace(evidence, feature_rays=None).plain_rays(*box) is None
+    low = replace(rays, points=rays.points * (1.0, 1.0, 0.3))  # below the cameras, which see no ceiling from there
+    assert replace(evidence, feature_rays=low).plain_rays(*box) is None
 
 
 def test_what_looks_like_the_sky_beside_it_has_no_depth_of_its_own():

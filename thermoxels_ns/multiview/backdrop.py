@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import cv2
 import numpy as np
 
@@ -35,7 +37,7 @@ def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolA
     its colour and temperature are those that most such pixels have as a function of direction (harmonics of degree 2).
     Plain pixels of the same look that touch the backdrop, such as pixels below an object, show it too. Pixels beside
     the backdrop that look like it have wrong depths, taken from an outline (drawn courtyard: 2.6 % of all depths lie on
-    the sky, 0.5 % without these pixels). What would be a backdrop is a ceiling, if cameras stand `in_a_room`.
+    the sky, 0.5 % without these pixels). In a room it is a ceiling, see `what_is_above`.
     """
     open_above, plain = (np.zeros(len(photographs.colours), dtype=bool) for _ in range(2))
     directions, up = np.empty((len(open_above), 3)), upwards(photographs)
@@ -66,31 +68,40 @@ def plain_backdrop(photographs: Photographs, depth: Float32Array) -> tuple[BoolA
         alike[pixels] &= touched[label]
         around = cv2.dilate(alike[pixels].reshape(height, width).astype(np.uint8), np.ones((3, 3), np.uint8)).ravel()
         beside[pixels] &= (around > 0) & ~alike[pixels]
-    return (none, none, alike) if in_a_room(photographs, depth, alike, up) else (alike, beside, none)
+    above = what_is_above(photographs, np.where(beside, np.float32(np.nan), depth), alike, up)
+    return (
+        alike if above == "sky" else none,
+        none if above == "ceiling" else beside,
+        alike if above == "ceiling" else none,
+    )
 
 
-def in_a_room(photographs: Photographs, depth: Float32Array, plain: BoolArray, up: FloatArray) -> bool:
-    """Return whether cameras stand in a room, whose `plain` ceiling (pixels,) looks like a cloudy sky.
+def what_is_above(
+    photographs: Photographs, depth: Float32Array, plain: BoolArray, up: FloatArray
+) -> Literal["sky", "ceiling", "unknown"]:
+    """Return whether `plain` pixels (pixels,) show a sky or the ceiling of a room, which looks like a cloudy sky.
 
     In a room, known surfaces rise behind cameras too, as other photographs show (`SURROUNDED`). In a yard or a street
-    they do as well; there a sky is known by its temperature, which is below that of nearly all surfaces (`COLDER`).
-    `depth` is that of all pixels, NaN where unknown, (pixels,); `up` is a unit vector, (3,).
+    they do as well; there a sky is known by its temperature, which is below that of nearly all surfaces (`COLDER`) or
+    below all that the camera measures. Photographs without temperatures do not tell the two apart. `depth` is that of
+    all pixels, NaN where unknown, (pixels,); `up` is a unit vector, (3,).
     """
     (known,) = np.nonzero(np.isfinite(depth))
-    if not len(known):
-        return False
     some = known[:: max(1, len(known) // _SOME)]
     origins, along = photographs.of_pixels(some)
     points, rise, shares = origins + depth[some, None] * along, np.sin(np.deg2rad(RISE_DEG)), []
     for centre, forward in zip(photographs.centres, photographs.matrices[:, 2, :3]):
         away = points - centre
-        above = away @ up > rise * np.linalg.norm(away, axis=1)
-        shares.append(np.mean(above & (away @ forward < 0.0)))
+        behind = (away @ up > rise * np.linalg.norm(away, axis=1)) & (away @ forward < 0.0)
+        shares.append(np.count_nonzero(behind) / max(1, len(behind)))
     if np.median(shares) < SURROUNDED:
-        return False
+        return "sky"
     warm = photographs.thermal
     theirs, surfaces = (values[np.isfinite(values)] for values in (warm[plain], warm[known]))
-    return not (len(theirs) and len(surfaces) and np.median(theirs) < np.quantile(surfaces, COLDER))
+    if not len(surfaces):
+        return "unknown"
+    colder = not len(theirs) or np.median(theirs) < np.quantile(surfaces, COLDER)
+    return "sky" if colder else "ceiling"
 
 
 def upwards(photographs: Photographs) -> FloatArray:

@@ -26,6 +26,7 @@ LEAST_SHARE = 0.01  # Depths are used if at least this share of the pixels has a
 REFINED_SIDE = 640  # Pixels along the longer side of the photographs in which depths are refined
 BEYOND = 1e3  # Distance of a backdrop, in diagonals of the box
 TAIL = 0.5  # Points left out at either end of an axis for the hull on which a ceiling lies, [%]
+FEWEST_POINTS = 100  # Points in the box that such a hull needs
 CEILING_ERROR = 0.02  # Standard error of a ceiling's depth, of the depth; in a drawn living room 1.8 % in the median
 LEAST_GAIN = 0.01  # Gains are corrected if the root mean square of their logarithms is above this
 LEAST_OFFSET_K = 0.1  # Offsets of thermal images are corrected if their root mean square is above this, [K]
@@ -45,22 +46,23 @@ class PhotographEvidence:
     """Natural logarithm of the gain of each channel, (photographs, 3); None: gains were not corrected."""
     offset: FloatArray | None  # Offset of normalised temperature, (photographs,); None: offsets were not corrected
 
-    def plain_rays(self, diagonal: float) -> FeatureRays | None:
-        """Return rays through the backdrop to points far behind a box of this `diagonal`, or to points on a ceiling.
+    def plain_rays(self, lo: FloatArray, hi: FloatArray) -> FeatureRays | None:
+        """Return rays through the backdrop to points far behind the box from `lo` to `hi`, or to points on a ceiling.
 
         There is one ray per pixel; None if pixels are too few (`LEAST_SHARE`). A ceiling is taken to lie on the convex
-        hull of what is known of the room, without the outermost points along each axis (`TAIL`).
+        hull of what is known in the box, without the outermost points along each axis (`TAIL`).
         """
         (chosen,) = np.nonzero(self.backdrop | self.ceiling)
         if len(chosen) < LEAST_SHARE * len(self.backdrop):
             return None
         if not self.ceiling.any():
-            return rays_through(self.photographs, chosen, np.full(len(chosen), BEYOND * diagonal))
-        if self.feature_rays is None:
-            return None
+            return rays_through(self.photographs, chosen, np.full(len(chosen), BEYOND * np.linalg.norm(hi - lo)))
         from scipy.spatial import ConvexHull  # slow to import and only needed here
 
-        points = self.feature_rays.points
+        points = np.zeros((0, 3)) if self.feature_rays is None else self.feature_rays.points
+        points = points[((points >= lo) & (points <= hi)).all(axis=1)]  # a window shows things outside, too
+        if len(points) < FEWEST_POINTS:
+            return None
         low, high = np.percentile(points, (TAIL, 100.0 - TAIL), axis=0)
         hull = ConvexHull(points[((points >= low) & (points <= high)).all(axis=1)])
         origins, along = self.photographs.of_pixels(chosen)
@@ -70,6 +72,8 @@ class PhotographEvidence:
             with np.errstate(divide="ignore"):
                 depth = np.minimum(depth, np.where(outwards > 0.0, -(origins @ normal + offset) / outwards, np.inf))
         inside = (depth > 0.0) & np.isfinite(depth)
+        if inside.sum() < LEAST_SHARE * len(self.ceiling):
+            return None
         depth = depth[inside]
         return rays_through(self.photographs, chosen[inside], depth, CEILING_ERROR * depth)
 

@@ -193,7 +193,7 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
         model.feature_ray_sampler = FeatureRaySampler(depths, box, far, COARSE_LIGHT)
     elif depths is not None and tracks is not None:
         model.feature_ray_sampler = FeatureRaySampler(tracks.joined_with(depths), box, far)
-    plain_rays = found.plain_rays(float(np.linalg.norm(box[1] - box[0])))
+    plain_rays = found.plain_rays(*box)
     model.backdrop_ray_sampler = None if plain_rays is None else FeatureRaySampler(plain_rays, box)
     model.plain_areas = PlainAreas(found.photographs, np.isfinite(found.depth), found.backdrop)
     if trainer is None or trainer._start_step == 0:

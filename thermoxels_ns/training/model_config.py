@@ -46,7 +46,9 @@ class LossWeights:
     distortion: float = 0.1  # Gather each ray's weight in one short interval
     tracks: float = 0.05
     """Make feature rays end at their points: tracks of structure from motion, depths on which photographs agree."""
-    backdrop: float = 0.02  # Let rays through a plain backdrop (sky, a wall far behind) meet nothing in the box
+    backdrop: float = 0.02
+    """Let rays through a plain backdrop (sky, a wall far behind) meet nothing in the box, and rays to a plain ceiling
+    end on it."""
     bend: float = 0.001  # Keep surfaces flat in plain areas of photographs, where no depth is known
     surroundings: float = 1e-3  # Keep the surroundings transparent where colour at infinity explains the photographs
 
