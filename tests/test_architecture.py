@@ -73,7 +73,7 @@ MOST_LINES = {
     "field": 885,
     "heat": 2590,
     "mesh": 4970,
-    "multiview": 1870,
+    "multiview": 1885,
     "radiometry": 1320,
     "render": 1670,
     "reports": 1340,

@@ -29,12 +29,11 @@ class Synthetic:
     """Write a synthetic scene, whose shape and temperature are known exactly, as photographs and thermal images."""
 
     scene: tyro.conf.Positional[str]
-    """Name of the scene: hot-object, house-corner, sphere, courtyard, pipes, wall-object, facade, street, or random-N
-    or wild-N, which are made from the seed N; wild scenes have smooth, plain or textured
-    surroundings, and some have plain walls, mirroring panes or a thin railing. After the name, in any order: +sky=R,G,B
-    for a sky or backdrop of one colour (0 to 1), +street for houses and trees around, +room for a room around, +white
-    for white plaster under a white sky (house-corner only); for example house-corner+sky=0.55,0.57,0.60 or
-    random-3+street."""
+    """Name of the scene: hot-object, house-corner, sphere, courtyard, pipes, wall-object, living-room, facade, street,
+    or random-N or wild-N, which are made from the seed N; wild scenes have smooth, plain or textured surroundings, and
+    some have plain walls, mirroring panes or a thin railing. After the name, in any order: +sky=R,G,B for a sky or
+    backdrop of one colour (0 to 1), +street for houses and trees around, +room for a room around, +white for white
+    plaster under a white sky (house-corner only); for example house-corner+sky=0.55,0.57,0.60 or random-3+street."""
     output_dir: Path
     """Folder for the scene; made if it does not exist. An earlier synthetic scene in it is replaced."""
     layout: LayoutName = "thermoscenes"

@@ -14,7 +14,7 @@ from nerfstudio.configs.method_configs import all_methods
 
 from thermoxels_ns import config
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.json_values import write_json
+from thermoxels_ns.core.json_values import read_json, write_json
 from thermoxels_ns.core.yaml_records import read_yaml
 
 if sys.version_info >= (3, 11):
@@ -112,10 +112,13 @@ def test_yaml_that_cannot_be_used_is_refused(tmp_path, text):
         read_yaml(tmp_path / "a.yaml")
 
 
-def test_a_key_given_twice_is_found_among_many(tmp_path):
-    (tmp_path / "a").write_text("\n".join(f'"k{number}": 1' for number in [*range(3000), 7]))
+@pytest.mark.parametrize("read", [read_yaml, read_json])
+def test_a_key_given_twice_is_found_among_many(tmp_path, read):
+    rows = [f'"k{number}": 1' for number in [*range(3000), 7]]
+    text = "{" + ", \n".join(rows) + "}" if read is read_json else "\n".join(rows)
+    (tmp_path / "a").write_text(text)
     with pytest.raises(ThermoxelsError, match=r"a: expected a .*, got the key k7 twice"):
-        read_yaml(tmp_path / "a")
+        read(tmp_path / "a")
 
 
 def test_json_keeps_order_and_converts_numpy(tmp_path):

@@ -229,13 +229,13 @@ def _bridges(old: _Survey, new: _Survey) -> list[_Bridge]:
     for bridge, own, other in (*((one, new, old) for one in new.bridges), *((one, old, new) for one in gone)):
         zone, calm = other.from_other(bridge.zone), other.from_other(bridge.reference)
         share = float(other.area_m2[zone].sum() / own.area_m2[bridge.zone].sum())
-        if share < 0.5 or not len(calm):
+        both = own is new and any(same(one, bridge) for one in old.bridges)
+        if (share < 0.5 and not both) or not len(zone) or not len(calm):
             continue
         here, there = (bridge.zone, bridge.reference, bridge.base_area_m2), (zone, calm, bridge.base_area_m2 * share)
         if own is old:
             found.append(_Bridge(bridge, "went", here, there))
         else:
-            both = any(same(one, bridge) for one in old.bridges)
             found.append(_Bridge(bridge, "in both" if both else "appeared", there, here))
     return found
 

@@ -54,7 +54,7 @@ class ExportOptions:
     training rays that end on a surface meet within half a voxel of their end."""
     density_percentile: float | None = None
     """Voxels are solid if they are denser than this share of all voxels of the scene box, [%], 0 to 100; in the
-    Thermoxels paper 90 keeps the densest tenth."""
+    Thermoxels paper 90 keeps the densest tenth. --density-threshold goes before it."""
     close_gaps: int = 1
     """Fill gaps and pinholes up to twice this many voxels wide, which thin walls need to be continuous. 0: none."""
     region: Literal["auto", "all"] = "auto"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -55,13 +56,22 @@ def read_json(
     remedy: str = "Write it again, or pass another file.",
     error: type[ThermoxelsError] = ThermoxelsError,
 ) -> Any:
-    """Return the content of a json file; raises `error` if it is missing or damaged."""
+    """Return the content of a json file; raises `error` if it is missing or damaged, or an object has a key twice."""
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_unique)
     except (OSError, ValueError, RecursionError) as problem:
         if isinstance(problem, OSError) and path.exists():
             expected, remedy = "a file that can be read", remedy_of(problem, remedy)
         raise error(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of json, or raise ValueError for a key that occurs twice; json alone would drop the first."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+        raise ValueError(f"the key {twice} twice")
+    return found
 
 
 def read_json_object(path: Path, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> dict[str, Any]:

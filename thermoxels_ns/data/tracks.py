@@ -25,7 +25,7 @@ MOST_ERROR_PX = 2.0  # mean reprojection error above which a point is left out, 
 LEAST_ERROR_PX = 0.3  # a smaller reprojection error of a point is due to luck and is raised to this, [pixels]
 LEAST_PARALLAX_DEG = 2.0  # a point is left out if the largest angle between its rays is not above this
 MOST_BEHIND = 0.1  # if a larger share of sightings lies behind the camera, the tracks belong to other poses
-MOST_OFF = 0.01
+MOST_OFF = 0.002
 """A photograph is left out if an axis of its camera in the model is off the given one by more than this, or its place
 by more than this share of the cameras' distance from their middle."""
 LEAST_AGREEING = 0.7  # share of the photographs whose poses must agree; with fewer, the model belongs to other poses
@@ -156,7 +156,7 @@ def read_colmap_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> 
     if agree.sum() < max(3, LEAST_AGREEING * len(agree)):
         raise SceneError(
             f"its poses are others than those of {scene.json_path.name}: {int(agree.sum())} of {len(agree)} "
-            f"photographs agree within {MOST_OFF:.0%} (median {np.median(off):.1%})"
+            f"photographs agree within {MOST_OFF:.1%} (median {np.median(off):.1%})"
         )
     say(
         f"Tracks of the COLMAP model in {folder}: {len(points):,} points, {int(agree.sum())} of {len(scene.frames)} "

@@ -62,9 +62,9 @@ _UNIT_REMEDY = (
     f"(absolute_min_temperature, absolute_max_temperature) or, {_LINEAR_UNIT}."
 )
 _COUNTS_REMEDY = (
-    f"Pass --camera, or --celsius-per-count and --celsius-offset; in a scene give {_LINEAR_UNIT}, as the camera's "
-    "manual has them; counts from 0 to 65535 that span the bounds have (highest - lowest) / 65535 per count and an "
-    "offset of the lowest."
+    f"In a scene give {_LINEAR_UNIT}, as the camera's manual has them; for thermoxels capture pass --camera, or "
+    "--celsius-per-count and --celsius-offset. Counts from 0 to 65535 that span the bounds have "
+    "(highest - lowest) / 65535 per count and an offset of the lowest."
 )
 
 
