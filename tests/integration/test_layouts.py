@@ -46,4 +46,4 @@ def test_a_layout_is_trained_evaluated_and_exported(layout, tmp_path):
     succeed(*command, str(own))
     export = "ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", str(tmp_path / "inp")
     export = (*export, "--metres-per-unit", "1", "--formats", "inp", "--pictures", "False")
-    assert "leave inp out of --formats" in fail(*export) and not (tmp_path / "inp" / "mesh.inp").exists()
+    assert "Leave inp out of --formats" in fail(*export) and not (tmp_path / "inp" / "mesh.inp").exists()

@@ -107,13 +107,11 @@ def shown() -> dict[str, Any]:
     return {
         "photographs": 42,
         "targets": (MET, MISSED),
-        "others": (("Volume", "0.1 m³"),),
         "compared": (Compared("door", "W/(m2 K)", 3.6, Interval(4.0, 3.7, 4.2)), Compared("psi", "W/(m K)", 0.7, None)),
         "inputs": [(picture("white", "JPEG"), picture("black", "JPEG"))],
         "views": [(f"frame_eval_{n}", [picture(c) for c in ("red", "green", "blue", "yellow")]) for n in (1, 2)],
         "gradient": ["#000004", "#fcffa4"],
         "ends_c": [10.0, 30.0],
-        "heat": picture("grey"),
         "night": picture("navy"),
         "mesh": picture("brown"),
         "measured": picture("purple"),
@@ -130,7 +128,6 @@ def test_results_times_and_commands_are_shown(shown) -> None:
     for row in (
         ["PSNR", "27.00 dB", "≥ 26.00 dB", "yes"],
         ["ErrorIn K.", "1.20 °C", "≤ 1.00 °C", "no"],
-        ["Volume", "0.1 m³"],
         ["door", "3.60", "4.00 (3.70 to 4.20)\xa0W/(m²\xa0K)", "no"],
         ["psi", "0.70", "not found", "no"],
         ["Train", "30.0 s", ""],
@@ -152,7 +149,7 @@ def test_every_picture_is_embedded_in_the_order_of_its_place(shown) -> None:
     contents = [base64.b64decode(str(image["src"]).split("base64,")[1]) for image in images]
     expected = [*shown["inputs"][0], shown["mesh"], *shown["inputs"][0]]
     expected += [image for _, pictures in shown["views"] for image in pictures]
-    expected += [shown["heat"], shown["measured"], shown["night"]]
+    expected += [shown["measured"], shown["night"]]
     assert contents == expected and all(image["alt"] for image in images)
 
 
@@ -164,7 +161,6 @@ def test_nothing_is_fetched_and_words_stay_words(shown) -> None:
     assert not re.search(r"<script|https?:|@import|url\(|\bon\w+=", text)
     hostile = {
         "targets": (Target(HOSTILE, 1.0, 1.0, True, HOSTILE.replace("{", ""), HOSTILE),),
-        "others": ((HOSTILE, HOSTILE),),
         "compared": (Compared(HOSTILE, HOSTILE, 1.0, Interval(1.0, 0.5, 2.0)),),
         "views": [(HOSTILE, shown["views"][0][1])],
         "gradient": [HOSTILE, "red"],
@@ -175,6 +171,6 @@ def test_nothing_is_fetched_and_words_stay_words(shown) -> None:
     }
     text = build_page("demo.html.j2", **shown | hostile)
     assert "<script" not in text
-    # Target (name, figure, bound, meaning), figures (2), compared (name, unit), view, step, command and next (2);
+    # Target (name, figure, bound, meaning), compared (name, unit), view, step, command and next (2);
     # colours are no words.
-    assert "".join(Outline(text).words).count(HOSTILE) == 13
+    assert "".join(Outline(text).words).count(HOSTILE) == 11
