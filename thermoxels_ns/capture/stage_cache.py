@@ -122,7 +122,7 @@ def save(path: Path, record: Any) -> None:
     packed = io.BytesIO()  # in memory: an archive that numpy could not write to disk raises again when it is deleted
     np.savez(packed, **{name: np.asarray(value) for name, value in values.items()})  # type: ignore[arg-type]
     with replace_when_done(path) as temporary:
-        temporary.write_bytes(packed.getbuffer())
+        temporary.write_bytes(packed.getvalue())  # no view: one in an error's traceback crashed Python 3.12
 
 
 def load(path: Path, kind: type[_Record]) -> _Record:
