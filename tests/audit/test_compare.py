@@ -1,13 +1,15 @@
 """Two surveys of one house, between which a wall was insulated and a thermal bridge mended."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.support.audited_wall import INSIDE
 from tests.support.surveyed_house import AFTER, BAND_M, BAND_U, BEFORE, U, survey, turned
-from thermoxels_ns.audit.compare import Comparison, compare
+from thermoxels_ns.audit.compare import Comparison, _bridges, compare
 from thermoxels_ns.audit.conditions import OutsideAir
 from thermoxels_ns.audit.run import Audit, audit
 from thermoxels_ns.core.errors import AuditError
@@ -104,3 +106,19 @@ def test_meshes_that_do_not_fit_or_fit_twice_are_refused() -> None:
         compare(first, second)
     with pytest.raises(AuditError, match=r"^compare: expected two surveys"):
         compare(replace(one, conditions=INSIDE), one)
+
+
+def test_a_bridge_of_both_surveys_counts_also_where_the_earlier_saw_little_around_it() -> None:
+    """Four triangles, of which the earlier survey saw three; the bridge's own one is among them."""
+    area, every = np.ones(4), np.arange(4)
+
+    def survey(zone: list[int], partner: np.ndarray) -> Any:
+        bridge = SimpleNamespace(core=every[:1], zone=np.array(zone), reference=every[3:], base_area_m2=1.0)
+        return SimpleNamespace(
+            area_m2=area, partner=partner, bridges=[bridge], from_other=lambda which: every[np.isin(partner, which)]
+        )
+
+    partner = np.array([0, -1, -1, 3])
+    old, new = survey([0], partner), survey([0, 1, 2], partner)
+    (found,) = _bridges(old, new)
+    assert found.state == "in both" and found.before[0].tolist() == [0] and found.after[0].tolist() == [0, 1, 2]

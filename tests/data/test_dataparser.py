@@ -232,6 +232,16 @@ def half_in_kelvin(scene) -> None:
         np.save(scene.path / "thermal" / f"{name}.npy", np.eye(18, 24) + 20.0 + 273.15 * (number >= 5))
 
 
+def in_fahrenheit(scene) -> None:
+    (scene.path / "temperature_bounds.json").write_text(
+        '{"absolute_min_temperature": 15.0, "absolute_max_temperature": 25.0}'
+    )
+    for frame in scene.meta["frames"]:
+        name = Path(frame["file_path"]).stem
+        frame["thermal_file_path"] = f"thermal/{name}.npy"
+        np.save(scene.path / "thermal" / f"{name}.npy", np.full((18, 24), 84.0) + 0.1 * np.eye(18, 24))
+
+
 def test_kelvins_that_are_meant_are_read(scene_folder):
     scene = scene_folder()
     half_in_kelvin(scene)
@@ -364,6 +374,7 @@ OWN = {"w": 13, "h": 10, "fl_x": 9, "fl_y": 9, "cx": 6, "cy": 5}
         (give_twice, r"frame_train_000\.png more than once"),
         (turn_photograph, "frame 3.*EXIF orientation 6"),
         (half_in_kelvin, r"most of the other files, got 293\.15 C"),
+        (in_fahrenheit, r"near 15 to 25 C, .* got 84\.00 C in the middle.*correct the bounds"),
         (in_degrees_with_bounds_in_kelvins, r"20\.00 C in the middle"),
         (content_of("images/frame_train_001.png", b"no picture"), "frame_train_001"),
         (content_of("thermal/frame_eval_002.png", b""), "frame_eval_002"),

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.support.colmap_model import write_colmap_model
 from thermoxels_ns.core.camera import Camera
@@ -133,6 +134,13 @@ def test_some_wrong_poses_are_left_out_and_named_and_move_nothing(scene, capsys)
     assert frames[4].name in capsys.readouterr().out.replace("\n", "")
 
 
+def _turned(frames, degrees: float):
+    """The frames, looking so far to the side: 4 pixels with a focal length of 1000."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.0, np.radians(degrees), 0.0]).as_matrix()
+    return [replace(frame, pose=frame.pose @ turn) for frame in frames]
+
+
 def _changed(scene, name: str, change, **options) -> None:
     add_model(scene, **options)
     path = scene.path / "colmap/sparse/0" / name
@@ -143,6 +151,7 @@ def _changed(scene, name: str, change, **options) -> None:
     ("spoil", "said"),
     [
         (lambda s, f: add_model(s, frames=f[3:] + f[:3], names=[one.image.name for one in f]), "poses are others"),
+        (lambda s, f: add_model(s, frames=_turned(f, 0.25)), "poses are others"),
         (lambda s, f: add_model(s, names=[f"other_{n}.jpg" for n in range(6)]), "no photograph of this scene"),
         (lambda s, f: add_model(s, frames=f[:2]), "2 of 2 photographs agree"),
         (lambda s, f: _changed(s, "images.bin", lambda _: b"\x07"), "cannot be read"),

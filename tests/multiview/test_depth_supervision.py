@@ -62,6 +62,20 @@ def test_most_lines_of_a_scene_end_at_its_surface(untrained):
     assert np.median(off) < 0.02 and np.quantile(off, 0.9) < 0.06, np.quantile(off, [0.5, 0.9])
 
 
+def test_thermal_cameras_of_their_own_measure_the_sky(tmp_path):
+    """A pixel of unknown depth is looked up as if it showed something far away."""
+    write_boxed_scene(
+        make_scene("house-corner+sky=0.55,0.57,0.60"), tmp_path, 12, 1, width=128, height=96, own_thermal_camera=True
+    )
+    dataset: Any = train(tmp_path, 0, {}).datamanager.train_dataset
+    assert dataset.thermal_cameras is not None
+    found = evidence_of_photographs(dataset, 0.0, (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), print, False, False)
+    assert found is not None and found.backdrop.mean() > 0.1
+    warm = found.photographs.thermal
+    sky, body = (warm[chosen & np.isfinite(warm)] for chosen in (found.backdrop, np.isfinite(found.depth)))
+    assert len(sky) > 0.3 * found.backdrop.sum() and np.median(sky) < np.median(body)
+
+
 def attributes_of(datamanager: Any, steps: int = SHORTEST_RUN_WITH_DEPTHS) -> Any:
     first = steps // 2  # of a resumed training the steps before count too
     trainer = SimpleNamespace(_start_step=first, config=SimpleNamespace(max_num_iterations=steps - first))

@@ -154,6 +154,10 @@ def test_a_plain_ceiling_is_no_sky_unless_it_is_colder_than_all_around():
     assert ceiling[is_ceiling].mean() > 0.8 and not ceiling[~is_ceiling].any()
     yard = replace(seen, thermal=np.where(is_ceiling, np.float32(0.1), seen.thermal))
     assert plain_backdrop(yard, depth)[0][is_ceiling].mean() > 0.8
+    branches = is_ceiling & (np.arange(len(depth)) % 3 == 0)  # upright lines on the sky, with depths that are wrong
+    wrong = np.where(branches, np.float32(3.0), depth)
+    assert np.mean(branches[np.isfinite(wrong)]) > 0.06
+    assert plain_backdrop(yard, wrong)[0].any() and not plain_backdrop(yard, wrong)[2].any()
     beyond = replace(seen, thermal=np.where(is_ceiling, np.float32(np.nan), seen.thermal))  # too cold for the camera
     assert plain_backdrop(beyond, depth)[0][is_ceiling].mean() > 0.8
     unknown = replace(seen, thermal=np.full_like(seen.thermal, np.nan))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +14,7 @@ import numpy as np
 
 from thermoxels_ns.capture.settings import StageName
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder, write_npz
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.core.version import __version__
@@ -119,10 +118,7 @@ def save(path: Path, record: Any) -> None:
     for name, value in values.items():
         if isinstance(value, Camera):  # store all fields except the last one, the lens
             values[name] = tuple(getattr(value, each.name) for each in fields(value)[:-1])
-    packed = io.BytesIO()  # in memory: an archive that numpy could not write to disk raises again when it is deleted
-    np.savez(packed, **{name: np.asarray(value) for name, value in values.items()})  # type: ignore[arg-type]
-    with replace_when_done(path) as temporary:
-        temporary.write_bytes(packed.getvalue())  # no view: one in an error's traceback crashed Python 3.12
+    write_npz(path, {name: np.asarray(value) for name, value in values.items()})
 
 
 def load(path: Path, kind: type[_Record]) -> _Record:

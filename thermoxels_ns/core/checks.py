@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import math
 import os
 import shutil
@@ -159,8 +160,7 @@ def replace_when_done(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename the file there to `path` only if the block ends without an error.
 
     The temporary name keeps the suffix, by which writers choose their format; what a killed process left under it is
-    overwritten. Raises `OutputError` if the block or the
-    renaming ends in an error of the operating system.
+    overwritten. Raises `OutputError` if the block or the renaming ends in an error of the operating system.
     """
     final = Path(path)
     temporary = final.with_name(f".{final.stem}.part{final.suffix}")
@@ -175,6 +175,17 @@ def replace_when_done(path: Path | str) -> Iterator[Path]:
         # An error of the block says more than an error of removing the temporary file.
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays by name to a compressed .npz file, whole or not at all; raises `OutputError` if that fails.
+
+    They are packed in memory: an archive that numpy could not write to a full disk raises again when it is deleted.
+    """
+    packed = io.BytesIO()
+    np.savez_compressed(packed, **arrays)
+    with replace_when_done(path) as temporary:
+        temporary.write_bytes(packed.getvalue())  # no view: one in an error's traceback crashed Python 3.12
 
 
 def remove_file(path: Path | str) -> None:

@@ -34,9 +34,9 @@ SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learnin
 _FAR_SIDES = 16.0
 """Distance of the box from the origin, in longest sides of the box, beyond which a shift in single precision is wrong
 by more than a millionth of the box. National coordinates are so far away."""
+_COLDEST_SKY_K = 150.0  # a file's median may be this far below the declared lowest temperature: it shows a clear sky
 _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
-"""A file whose median is at least the first may hold kelvins; within the second of others it has the same unit."""
-_SHIFTS_K = (-ZERO_CELSIUS_K, ZERO_CELSIUS_K)
+"""A file whose median is at least the first holds kelvins if the median less 273.15 is within the second of others."""
 _MOST_FRAMES = 64  # training files in which stuck pixels are sought
 
 _BYTES_PER_PIXEL = 8  # Three colours, and of masked photographs the mask and the pixel's number
@@ -280,24 +280,25 @@ def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int
 
 
 def _refuse_other_units(middles_c: dict[Path, float], bounds_c: tuple[float, float] | None) -> None:
-    """Raise `ThermalFileError` for a file that holds kelvins among Celsius, or the reverse.
+    """Raise `ThermalFileError` for a file whose unit must be another than degrees Celsius.
 
-    Its median is far from the declared bounds, or without bounds from the medians of the other files, and 273.15
-    degrees more or less bring it there.
+    Its median is far from the declared bounds, or without bounds about 273.15 degrees above those of the other files.
     """
     usual = [middle for middle in middles_c.values() if middle < _LEAST_OF_KELVINS]
     if bounds_c is None and not usual:
         return
     low, high = bounds_c or 2 * (float(np.median(usual)),)
     for path, middle in middles_c.items():
-        near = [low - _SAME_PLACE_K <= middle + shift <= high + _SAME_PLACE_K for shift in (0.0, *_SHIFTS_K)]
-        if any(near) and not near[0]:
+        if bounds_c is None:
+            strange = middle >= _LEAST_OF_KELVINS and abs(middle - ZERO_CELSIUS_K - low) < _SAME_PLACE_K
+        else:
+            width = high - low
+            strange = not low - max(width, _COLDEST_SKY_K) <= middle <= high + max(width, _SAME_PLACE_K)
+        if strange:
             where = f"{BOUNDS_NAME} or --thermal-bounds says" if bounds_c else "in most of the other files"
             expected, got = f"temperatures near {low:g} to {high:g} C, as {where}", f"{middle:.2f} C in the middle"
-            remedy = (
-                "Subtract 273.15 if the file holds kelvins, or correct the bounds. If it is as hot as that, pass "
-                "--valid-range-c -100 1999."
-            )
+            other = "correct the bounds" if bounds_c else "pass --valid-range-c -100 1999 if it is as hot as that"
+            remedy = f"Subtract 273.15 if the file holds kelvins; else {other}."
             raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 
@@ -336,7 +337,7 @@ def survey_thermal_files(
             kept.setdefault((height, width), []).append(temperature_c)
         extremes[path] = (float(np.nanmin(temperature_c)), float(np.nanmax(temperature_c)))
         middles[path] = float(np.nanmedian(temperature_c))
-    if tuple(valid_range_c) == ThermalDataParserConfig.valid_range_c:
+    if bounds_c is not None or tuple(valid_range_c) == ThermalDataParserConfig.valid_range_c:
         _refuse_other_units(middles, bounds_c)
     dead = {shape: find_dead_pixels(np.stack(frames)) for shape, frames in kept.items()}
     dead = {shape: mask for shape, mask in dead.items() if mask.any()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -13,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import remedy_of, replace_when_done
+from thermoxels_ns.core.checks import remedy_of, write_npz
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_model, read_model, worlds_of_json
@@ -46,17 +45,14 @@ class SparseTracks:
 
 def write_tracks(path: Path, tracks: SparseTracks) -> None:
     """Write tracks to a compressed .npz file, whole or not at all; raises `OutputError` if it cannot be written."""
-    packed = io.BytesIO()  # numpy warns of a file whose writing was interrupted
-    np.savez_compressed(
-        packed,
-        points=tracks.points,
-        point_error_px=tracks.point_error_px.astype(np.float32),
-        frames=np.array(tracks.frames, dtype=np.str_),
-        sighting_frame=tracks.sighting_frame.astype(np.int32),
-        sighting_point=tracks.sighting_point.astype(np.int32),
-    )
-    with replace_when_done(path) as temporary:
-        temporary.write_bytes(packed.getbuffer())
+    arrays = {
+        "points": tracks.points,
+        "point_error_px": tracks.point_error_px.astype(np.float32),
+        "frames": np.array(tracks.frames, dtype=np.str_),
+        "sighting_frame": tracks.sighting_frame.astype(np.int32),
+        "sighting_point": tracks.sighting_point.astype(np.int32),
+    }
+    write_npz(path, arrays)
 
 
 def read_tracks(path: Path) -> SparseTracks:

@@ -29,9 +29,9 @@ _PROBE_STEP = 1e-4
 _REACH_SIGMAS, _LARGEST_REACH_SHARE = 2.5, 0.75
 _STEP_PX = 2.5
 _COARSE_FRAMES = 16
-_LEAST_POWER = (
-    0.1  # a shift at which less of the photographs' edges than this share of the most is in view does not win
-)
+_LEAST_POWER = 0.1
+"""A shift of the images does not win where they show less of the photographs' edges than this share of the most that
+any shift shows."""
 _CHANCE_DRAWS = 3
 
 

@@ -59,7 +59,7 @@ def run_in_process(work: Callable[..., _Result], arguments: tuple[Any, ...], say
                 "Check free space; where memory runs out, lower --threads, --image-size or --max-features; if that "
                 "does not help, begin anew with --from-stage poses."
             )
-            raise ThermoxelsError("COLMAP", expected="to end", got=problem, remedy=remedy) from problem
+            raise ThermoxelsError("COLMAP", expected="to finish its work", got=problem, remedy=remedy) from problem
 
 
 def _prepare(pipe: Connection) -> None:

@@ -94,9 +94,7 @@ class SolidCells:
     cells: BoolArray  # True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is
     dense: BoolArray  # True for voxels that the threshold chose
     threshold: float  # least density at the centre of a voxel that counts as dense, [1 / world unit]
-    steps: tuple[
-        SolidStep, ...
-    ]  # all steps in order; the first is the threshold, which says what rule chose it and why
+    steps: tuple[SolidStep, ...]  # all in order; the first is the threshold, which says what rule chose it and why
     component_sizes: IntArray  # number of voxels of each body in the region after gaps were closed, largest first
     within: BoolArray  # True for voxels, solid or not, in the region; the solid is cut at its border
     left_out: BoolArray  # True for dense voxels and closed gaps outside the region or in bodies that were too small
