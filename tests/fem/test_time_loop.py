@@ -13,9 +13,10 @@ from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, HeatFlux, Radiation
-from thermoxels_ns.heat.sky import moving_sun
+from thermoxels_ns.heat.scene_fields import Sun
 
 PAPER = TimeSteps(10, 60.0)
+SUN = Sun(datetime(2026, 1, 10, tzinfo=timezone.utc), 47.0, 0.0, (0.0, 1.0, 0.0), clear_sky="meinel")
 
 
 @pytest.mark.parametrize("temperature_c", [-273.15, -40.0, 0.1, 20.0, 1500.3])
@@ -37,7 +38,7 @@ def test_a_body_at_rest_in_the_dark_still_sees_the_sun_rise(concrete, outputs: i
     """Nothing flows at midnight; a step as long as an interval would end at midnight again."""
     mesh = box_mesh(*(planes(0.0, 0.2, step=0.1) for _ in range(3)))
     mesh = replace(mesh, temperature_c=np.full(len(mesh.points_m), 5.0))
-    sun = AbsorbedSolar(SIDES, 0.7, moving_sun(datetime(2026, 1, 10, tzinfo=timezone.utc), 47.0, 0.0, (0.0, 1.0, 0.0)))
+    sun = AbsorbedSolar(SIDES, 0.7, SUN.irradiance())
     problem = HeatProblem(mesh, concrete, effects=(Convection(SIDES, 10.0, 5.0), sun))
     days = solve_heat(problem, AdaptiveSteps(4 * 86400.0, outputs=outputs))
     assert days.steps >= 96  # one an hour at least

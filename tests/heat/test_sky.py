@@ -6,13 +6,13 @@ import pytest
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.quantities import Places, Varying, values_at
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4, AbsorbedSolar, Radiation
+from thermoxels_ns.heat.scene_fields import Sun
 from thermoxels_ns.heat.sky import (
     Sunlight,
     SunPosition,
     air_mass,
     facet_irradiance,
     meinel_clear_sky,
-    moving_sun,
     outdoor_radiation,
     sun_position,
     swinbank_sky_c,
@@ -95,7 +95,7 @@ def test_facets_by_orientation() -> None:
 def test_a_sun_that_moves() -> None:
     """Walls get the sun in turn, and as much over a day in the east as in the west."""
     start = datetime(2025, 6, 21, tzinfo=UTC)
-    effect = AbsorbedSolar(("*",), 0.5, moving_sun(start, 47.0, 0.0, NORTH))
+    effect = AbsorbedSolar(("*",), 0.5, Sun(start, 47.0, 0.0, NORTH, clear_sky="meinel").irradiance())
     irradiance = effect.irradiance_w_m2
     assert isinstance(irradiance, Varying) and irradiance.in_time
     walls = Places(np.zeros((2, 3)), np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), Z_UP)
@@ -105,7 +105,7 @@ def test_a_sun_that_moves() -> None:
     assert day[:20].max() == 0.0
     east, west = day.sum(axis=0)
     assert east == pytest.approx(west, rel=0.01)
-    given = moving_sun(start, 47.0, 0.0, NORTH, Sunlight(0.0, 100.0))
+    given = Sun(start, 47.0, 0.0, NORTH, direct_w_m2=0.0, diffuse_w_m2=100.0).irradiance()
     # Given light shines as long as the sun is up: a wall sees half of the sky.
     assert np.asarray(given.function(walls, 43200.0)).tolist() == [50.0, 50.0]
     assert np.asarray(given.function(walls, 0.0)).tolist() == [0.0, 0.0]

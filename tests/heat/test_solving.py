@@ -22,7 +22,7 @@ from thermoxels_ns.heat.effects import (
     Radiation,
 )
 from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.heat.sky import moving_sun
+from thermoxels_ns.heat.scene_fields import Sun
 from thermoxels_ns.heat.solving import Goals, solve_problem
 
 NEXT_SOLUTION = [*((0.9, 0.1 * step, step) for step in range(1, 11)), (2.0, 0.1, 1), (10.0, 0.5, 2)]
@@ -127,7 +127,8 @@ def test_beside_what_changes_with_time_nothing_is_left_out() -> None:
     pane = box_mesh(planes(0.0, 0.006, step=0.003), planes(0.0, 1.0, step=0.25), planes(0.0, 1.0, step=0.25))
     hours = np.arange(73.0)
     day = tabulated(3600.0 * hours, 20.0 + 5.0 * (1.0 - np.cos(2.0 * np.pi * hours / 24.0)))
-    sun = moving_sun(datetime(2026, 6, 21, tzinfo=timezone.utc), 50.0, 0.0, (-1.0, 0.0, 0.0))
+    june = datetime(2026, 6, 21, tzinfo=timezone.utc)
+    sun = Sun(june, 50.0, 0.0, (-1.0, 0.0, 0.0), clear_sky="meinel").irradiance()
     effects = (Convection(("x1",), 7.7, 20.0), Convection(("x0",), 25.0, day), AbsorbedSolar(("x0",), 0.7, sun))
     problem = HeatProblem(pane, CONCRETE, np.full(len(pane.points_m), 20.0), effects)
     found = solve_problem(problem, AdaptiveSteps(72 * 3600.0, 0.1, outputs=3), Goals(), lambda _: None)

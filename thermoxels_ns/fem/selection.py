@@ -31,6 +31,12 @@ class Selection:
         return facet_areas(self.mesh.points_m, self.mesh.facets)
 
     @cached_property
+    def patch_area_m2(self) -> dict[str, float]:
+        """Area of each patch by its name, [m2]; computed when first asked for."""
+        area_m2 = np.bincount(self.facet_patch, self.facet_area_m2, len(self.patch_names))
+        return dict(zip(self.patch_names, area_m2.tolist()))
+
+    @cached_property
     def facet_normal(self) -> FloatArray:
         """Outward unit normal of each boundary triangle, shape (f, 3); computed when first asked for."""
         return facet_normals(self.mesh.points_m, self.mesh.facets)

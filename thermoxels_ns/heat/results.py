@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.fem.linear_tets import lumped_mass
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.fem.solution import (
@@ -133,9 +134,7 @@ def region_behind_facets(mesh: TetMesh) -> IntArray:
 
 def volume_shares(mesh: TetMesh) -> FloatArray:
     """Return each node's share of the volume, shape (n,), with sum 1: a quarter of each tetrahedron around it."""
-    weights = np.bincount(
-        mesh.tets.ravel(), np.repeat(signed_volumes(mesh.points_m, mesh.tets) / 4.0, 4), len(mesh.points_m)
-    )
+    weights = lumped_mass(mesh.points_m, mesh.tets, np.ones(len(mesh.tets)))
     return weights / weights.sum()
 
 
@@ -182,9 +181,7 @@ def _patches(
 def _effects(
     problem: HeatProblem, solution: Solution, selection: Selection, lengths: FloatArray
 ) -> tuple[EffectResult, ...]:
-    by_patch = np.bincount(selection.facet_patch, selection.facet_area_m2, len(selection.patch_names))
-    area = dict(zip(selection.patch_names, by_patch.tolist()))
-    results = []
+    area, results = selection.patch_area_m2, []
     for effect, heat in zip(problem.effects, solution.effects):
         mean = float(heat.heat_w @ lengths / lengths.sum())
         groups = (heat.group_heat_w.T @ lengths / lengths.sum()).tolist()

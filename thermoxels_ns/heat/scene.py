@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import glob
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import fields, make_dataclass, replace
@@ -52,11 +52,10 @@ from thermoxels_ns.heat.scene_fields import (
     Surface,
     unclear,
 )
-from thermoxels_ns.heat.sky import Sunlight, Vector, fixed_sun, moving_sun, outdoor_radiation, swinbank_sky_c
+from thermoxels_ns.heat.sky import Vector, outdoor_radiation, swinbank_sky_c
 from thermoxels_ns.mesh.boundary.patches import DEFAULT_PATCHES
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-Value = TypeVar("Value")
 Section = TypeVar("Section", InsideAir | None, OutsideAir | None, Surface, Sun | None, Radiation, AbsorbedSolar)
 Shining = TypeVar("Shining", Radiation, AbsorbedSolar)
 
@@ -180,22 +179,22 @@ class HeatScene:
         Raises `HeatError` if the mesh lacks a patch that the scene names, a patch has no effect and is not named
         adiabatic, or two entries count the same exchange of heat.
         """
-        patches = ScenePatches(mesh)
-        named = self.on(mesh)._named_effects(patches)
-        where = [(name, patches.matching(name, effect.where)) for name, effect in named]
+        selection = Selection(mesh)
+        named = self.on(mesh)._named_effects(selection)
+        where = [(name, _patches(selection, name, effect.where)) for name, effect in named]
         self._check_counted_once(where)
-        patches.check_all_named(set().union(*(chosen for _, chosen in where)), self.adiabatic)
+        self._check_none_forgotten(selection.patch_area_m2, set().union(*(chosen for _, chosen in where)))
         return (*(effect for _, effect in named), *self.internal_heat)
 
-    def _named_effects(self, patches: ScenePatches) -> list[tuple[str, Effect]]:
+    def _named_effects(self, selection: Selection) -> list[tuple[str, Effect]]:
         """Return the effects on the surface, each after the name of the scene's entry from which it comes."""
         named: list[tuple[str, Effect]] = []
         if self.inside_air is not None:
             named.append(("inside_air", self.inside_air.convection()))
         if self.outside_air is not None:
             named.append(("outside_air", self.outside_air.convection()))
-        named += [("sky and ground", effect) for effect in self._sky_and_ground(patches)]
-        named += [("sun", effect) for effect in self._sunlight(patches)]
+        named += [("sky and ground", effect) for effect in self._sky_and_ground(selection)]
+        named += [("sun", effect) for effect in self._sunlight(selection)]
         for key in (field.name for field in fields(self) if field.name != "internal_heat"):
             entries = getattr(self, key)
             if isinstance(entries, tuple):
@@ -217,23 +216,22 @@ class HeatScene:
         different = {chosen[name] for name in used}
         return different.pop() if len(different) == 1 else chosen
 
-    def _sky_and_ground(self, patches: ScenePatches) -> list[Radiation]:
+    def _sky_and_ground(self, selection: Selection) -> list[Radiation]:
         sky_c = None if self.sky is None else self._sky_c(self.sky)
         ground_c = None if self.ground is None else self.ground.surface_c
         if sky_c is None and ground_c is None:
             return []
         return [
             Radiation(where, *outdoor_radiation(emissivity, sky_c=sky_c, ground_c=ground_c))
-            for where, emissivity in patches.of_surfaces(self.surfaces, lambda surface: surface.emissivity)
+            for where, emissivity in self._of_surfaces(selection, "emissivity")
         ]
 
-    def _sunlight(self, patches: ScenePatches) -> list[AbsorbedSolar]:
+    def _sunlight(self, selection: Selection) -> list[AbsorbedSolar]:
         if self.sun is None:
             return []
         reflectance = self.ground.reflectance if self.ground is not None and self.ground.reflectance else 0.0
-        irradiance = _irradiance(self.sun, reflectance)
-        reached = patches.matching("sun", self.sun.patches)
-        lit = patches.of_surfaces(self.surfaces, lambda surface: surface.absorptivity, reached)
+        irradiance = self.sun.irradiance(reflectance)
+        lit = self._of_surfaces(selection, "absorptivity", _patches(selection, "sun", self.sun.patches))
         return [AbsorbedSolar(where, absorptivity, irradiance) for where, absorptivity in lit]
 
     def _sky_c(self, sky: Sky) -> Quantity:
@@ -244,6 +242,41 @@ class HeatScene:
         if not isinstance(air, Varying):
             return _above(air, below_k)
         return replace(air, function=partial(_sky_above, air, below_k))
+
+    def _of_surfaces(
+        self, selection: Selection, key: Literal["emissivity", "absorptivity"], allowed: set[str] | None = None
+    ) -> list[tuple[tuple[str, ...], float]]:
+        """Return, for each value of the property `key` of surfaces, the patches that have it, as patterns, and it.
+
+        The last entry for a patch holds; `allowed` None: all patches.
+        """
+        chosen: dict[str, float] = {}
+        for number, surface in enumerate(self.surfaces, start=1):
+            given: float | None = getattr(surface, key)
+            if given is not None:
+                chosen |= dict.fromkeys(_patches(selection, f"surfaces entry {number}", surface.patches), given)
+        groups: dict[float, list[str]] = {}
+        for patch in selection.patch_names:
+            if patch in chosen and (allowed is None or patch in allowed):
+                groups.setdefault(chosen[patch], []).append(glob.escape(patch))
+        return [(tuple(names), number) for number, names in groups.items()]
+
+    def _check_none_forgotten(self, area_m2: dict[str, float], acting: set[str]) -> None:
+        """Raise `HeatError` for a patch with area that is neither in `acting` nor adiabatic."""
+        forgotten = [
+            patch
+            for patch, area in area_m2.items()
+            if area > 0.0 and patch not in acting and not any(fnmatchcase(patch, pattern) for pattern in self.adiabatic)
+        ]
+        if forgotten:
+            whole = sum(area_m2.values())
+            shares = (f"{patch} ({100.0 * area_m2[patch] / whole:.3g} % of the surface)" for patch in forgotten)
+            expected, got = "something that acts on every patch, or the patch named adiabatic", ", ".join(shares)
+            written = yaml.safe_dump(
+                [*self.adiabatic, *forgotten], default_flow_style=True, allow_unicode=True, width=math.inf
+            )
+            remedy = f"Name them in an entry that acts on them, or write adiabatic: {written.strip()}."
+            raise HeatError("heat scene", expected=expected, got=f"nothing on {got}", remedy=remedy)
 
     def _check_counted_once(self, where: list[tuple[str, set[str]]]) -> None:
         """Raise `HeatError` for two contacts with air or ground, or radiation counted twice, on one patch."""
@@ -270,6 +303,11 @@ class HeatScene:
                 continue
             got = f"{second} on {', '.join(shared)} as well"
             raise HeatError(first, expected=f"{what} once on each patch", got=got, remedy=remedy)
+
+
+def _patches(selection: Selection, name: str, patterns: Sequence[str]) -> set[str]:
+    """Return the patches that match any pattern of the entry `name`; `HeatError` if a pattern matches none."""
+    return chosen_names(f"{name}: patches", selection.patch_names, patterns)
 
 
 def _steps(content: Any) -> str:
@@ -373,65 +411,3 @@ def _above(air_c: float, below_k: float | None) -> float:
 
 def _sky_above(air: Varying, below_k: float | None, places: Places, time_s: float) -> float:
     return _above(float(np.max(air.function(places, time_s))), below_k)
-
-
-def _irradiance(sun: Sun, reflectance: float) -> Varying:
-    light = None if sun.direct_w_m2 is None else Sunlight(sun.direct_w_m2, sun.diffuse_w_m2)
-    if sun.start is None:
-        return fixed_sun(_given(sun.towards), _given(light), reflectance)
-    place = _given(sun.latitude_deg), _given(sun.longitude_deg)
-    return moving_sun(sun.start, *place, _given(sun.north), light, reflectance)
-
-
-def _given(value: Value | None) -> Value:
-    assert value is not None, "checked when the section was made"
-    return value
-
-
-class ScenePatches:
-    """The patches of a mesh by name, with the area of each."""
-
-    def __init__(self, mesh: TetMesh) -> None:
-        selection = Selection(mesh)
-        area = np.bincount(selection.facet_patch, weights=selection.facet_area_m2, minlength=len(selection.patch_names))
-        self.area_m2: dict[str, float] = dict(zip(selection.patch_names, area.tolist()))
-        """True area of each patch by its name, [m2]."""
-
-    def matching(self, name: str, patterns: Sequence[str]) -> set[str]:
-        """Return the patches that match any pattern of the entry `name`; `HeatError` if a pattern matches none."""
-        return chosen_names(f"{name}: patches", self.area_m2, patterns)
-
-    def of_surfaces(
-        self, surfaces: Sequence[Surface], value: Callable[[Surface], float | None], allowed: set[str] | None = None
-    ) -> list[tuple[tuple[str, ...], float]]:
-        """Return, for each value of a property, the patches that have this value, written as patterns, and the value.
-
-        `value` reads the property of a surface, if any; the last entry for a patch holds; `allowed` None: all patches.
-        """
-        chosen: dict[str, float] = {}
-        for number, surface in enumerate(surfaces, start=1):
-            given = value(surface)
-            if given is not None:
-                chosen |= dict.fromkeys(self.matching(f"surfaces entry {number}", surface.patches), given)
-        groups: dict[float, list[str]] = {}
-        for patch in self.area_m2:
-            if patch in chosen and (allowed is None or patch in allowed):
-                groups.setdefault(chosen[patch], []).append(glob.escape(patch))
-        return [(tuple(names), number) for number, names in groups.items()]
-
-    def check_all_named(self, acting: set[str], adiabatic: Sequence[str]) -> None:
-        """Raise `HeatError` for a patch with area that is neither in `acting` nor adiabatic: it was forgotten."""
-        whole = sum(self.area_m2.values())
-        forgotten = [
-            patch
-            for patch, area in self.area_m2.items()
-            if area > 0.0 and patch not in acting and not any(fnmatchcase(patch, pattern) for pattern in adiabatic)
-        ]
-        if forgotten:
-            shares = (f"{patch} ({100.0 * self.area_m2[patch] / whole:.3g} % of the surface)" for patch in forgotten)
-            expected, got = "something that acts on every patch, or the patch named adiabatic", ", ".join(shares)
-            written = yaml.safe_dump(
-                [*adiabatic, *forgotten], default_flow_style=True, allow_unicode=True, width=math.inf
-            )
-            remedy = f"Name them in an entry that acts on them, or write adiabatic: {written.strip()}."
-            raise HeatError("heat scene", expected=expected, got=f"nothing on {got}", remedy=remedy)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import field
+from datetime import timedelta
 from functools import partial
 from types import MappingProxyType
 from typing import Annotated, ClassVar, Literal, TypeAlias
@@ -26,7 +27,7 @@ from thermoxels_ns.heat.effects import (
     Fraction,
     Names,
 )
-from thermoxels_ns.heat.sky import Vector
+from thermoxels_ns.heat.sky import Sunlight, Vector, facet_irradiance, meinel_clear_sky, sun_position, towards_sun
 from thermoxels_ns.heat.weather_file import read_weather
 
 HeatDirection: TypeAlias = Literal["up", "horizontal", "down"]  # Direction in which heat flows
@@ -44,6 +45,7 @@ OUTSIDE_RESISTANCE_M2K_W = 0.04
 INSIDE_CONVECTION_W_M2K: Mapping[HeatDirection, float] = MappingProxyType({"up": 5.0, "horizontal": 2.5, "down": 0.7})
 """hci, coefficient of convection alone in a room by the direction of the heat flow, [W / (m2 K)] (ISO 6946)."""
 
+_SUN_RESOLUTION_S = 3600.0  # Resolution of the moving sun, [s]: in this time the sun moves by 15 degrees
 _HORIZONTAL = 0.5 + 1e-9  # Sine of 30 degrees, up to which a heat flow counts as horizontal, with room for round-off
 
 
@@ -82,6 +84,10 @@ class _Air:
     """Air whose temperature is a number, or changes with time as a file says; `HeatError` if the file is unfit."""
 
     air_c: Celsius  # Temperature of the air, [degrees Celsius], at least -273.15
+    coefficient: OutsideCoefficient | None = None  # Name of a heat transfer coefficient, see the classes below
+    coefficient_w_m2k: AtLeastZero | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
+    emissivity: Fraction | None = field(default=None, kw_only=True)
+    """Emissivity of the surfaces, 0 to 1, needed by iso-6946-separate alone."""
     air_series: str | None = field(default=None, kw_only=True)
     """A weather file beside the scene: csv with hours (since the start) and outside_c or inside_c among its columns, or
     .epw. The temperature is interpolated linearly, and constant before the first and after the last line; named
@@ -99,6 +105,9 @@ class _Air:
             )
             got = "none" if epw else "a date"
             raise unclear("air_start", "a date beside an .epw file, and none beside others", got, remedy)
+        check_one(coefficient=self.coefficient, coefficient_w_m2k=self.coefficient_w_m2k)
+        separate = self.coefficient == "iso-6946-separate"
+        check_only_if("emissivity", self.emissivity, separate, self.coefficient or "coefficient_w_m2k")
         _ = self.temperature  # raises `HeatError` for a file that cannot be read
 
     @property
@@ -135,16 +144,10 @@ class InsideAir(_Air):
     """Heat transfer coefficient by the orientation of each surface, after ISO 6946: iso-6946-combined (1 / Rsi,
     convection and radiation together), iso-6946-separate (hci + 4 eps sigma T^3 at the temperature of the air), or
     iso-6946-convection (hci alone, for scenes that name radiation themselves)."""
-    coefficient_w_m2k: AtLeastZero | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
-    emissivity: Fraction | None = None  # Emissivity of the surfaces, 0 to 1, needed by iso-6946-separate alone
     heat_flow: HeatFlow = "into-body"
     """into-body: the air is warmer than the surfaces, as in a heated room, and loses most to the ceiling; out-of-body:
     the air is colder. Named coefficients depend on this field."""
     patches: Names = INSIDE  # Patches that the air acts on, by name or pattern
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
 
     def convection(self) -> Convection:
         """Return the convection between the air of the room and the body."""
@@ -167,15 +170,12 @@ class OutsideAir(_Air):
     """Heat transfer coefficient: iso-6946-combined (1 / Rse = 25, convection and radiation together), iso-6946-separate
     (4 + 4 v + 4 eps sigma T^3 at the temperature of the air), iso-6946-convection (4 + 4 v alone, for scenes that
     name radiation themselves), or thermoxels-original (18.6 v^0.605, convection alone); v is the wind speed."""
-    coefficient_w_m2k: AtLeastZero | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
     wind_m_s: AtLeastZero | None = None
     """Wind speed v beside the surfaces, [m / s]; needed by all named coefficients but iso-6946-combined."""
-    emissivity: Fraction | None = None  # Emissivity of the surfaces, 0 to 1, needed by iso-6946-separate alone
     patches: Names = OUTSIDE  # Patches that the air acts on, by name or pattern
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
         windy = self.coefficient not in (None, "iso-6946-combined")
         check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
 
@@ -278,10 +278,29 @@ class Sun:
             got = f"{self.diffuse_w_m2:g}"
             raise unclear("diffuse_w_m2", "none beside clear_sky", got, "Remove one of the two.")
 
+    def irradiance(self, ground_reflectance: float = 0.0) -> Varying:
+        """Return the sunlight that falls on facets, [W / m2]; for `AbsorbedSolar.irradiance_w_m2`."""
+        resolution_s = math.inf if self.start is None else _SUN_RESOLUTION_S
+        return Varying(partial(_sunlight, self, ground_reflectance), self.start is not None, resolution_s)
 
-def _check_coefficient(named: str | None, number: float | None, emissivity: float | None) -> None:
-    check_one(coefficient=named, coefficient_w_m2k=number)
-    check_only_if("emissivity", emissivity, named == "iso-6946-separate", named or "coefficient_w_m2k")
+
+def _sunlight(sun: Sun, ground_reflectance: float, places: Places, time_s: float) -> FloatArray:
+    light = Sunlight(sun.direct_w_m2 or 0.0, sun.diffuse_w_m2)
+    if sun.start is None:
+        assert sun.towards is not None
+        x, y, z = (np.array(sun.towards) / np.linalg.norm(sun.towards)).tolist()
+        return facet_irradiance(places.normals, places.up, (x, y, z), light, ground_reflectance)
+    assert sun.latitude_deg is not None and sun.longitude_deg is not None and sun.north is not None
+    try:
+        moment = sun.start + timedelta(seconds=time_s)
+    except OverflowError:
+        expected, got = "a date of the years 1 to 9999", f"{sun.start} and {time_s:g} s"
+        raise unclear("sun", expected, got, "Follow the body for a shorter time.") from None
+    position = sun_position(moment, sun.latitude_deg, sun.longitude_deg)
+    if sun.clear_sky is not None:
+        light = meinel_clear_sky(position.elevation_deg, position.distance_au)
+    towards = towards_sun(position, places.up, sun.north)
+    return facet_irradiance(places.normals, places.up, towards, light, ground_reflectance)
 
 
 def check_one(**values: object) -> None:

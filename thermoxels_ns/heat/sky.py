@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta, timezone
+from datetime import datetime, timezone
 from functools import partial
 
 import numpy as np
@@ -21,7 +21,6 @@ SOLAR_CONSTANT_W_M2 = 1353.0
 """Sunlight above the atmosphere at the mean distance of the sun, [W / m2]: the value on which Meinel's fit is based.
 The modern value is 1361."""
 
-_RESOLUTION_S = 3600.0  # Resolution of the moving sun, [s]: in this time the sun moves by 15 degrees
 _EPOCH = datetime(2000, 1, 1, 12, tzinfo=timezone.utc)  # Moment from which the sun's formulae count days
 
 
@@ -98,35 +97,25 @@ class Sunlight:
     diffuse_w_m2: float  # Diffuse light from the sky on a surface that faces up, [W / m2], at least 0
 
 
-def sun_coordinates(moment: datetime) -> tuple[float, float, float]:
-    """Return right ascension and declination, [degrees], and distance, [astronomical units], of the sun.
-
-    The formulae are the low-precision ones of the Astronomical Almanac (US Naval Observatory): from 1800 to 2200 angles
-    are right to 1 arc minute. `moment` has a time zone.
-    """
-    days = _days(moment)
-    anomaly = math.radians(357.529 + 0.98560028 * days)
-    longitude = 280.459 + 0.98564736 * days + 1.915 * math.sin(anomaly) + 0.020 * math.sin(2.0 * anomaly)
-    along, obliquity = math.radians(longitude), math.radians(23.439 - 0.00000036 * days)
-    right_ascension = math.atan2(math.cos(obliquity) * math.sin(along), math.cos(along))
-    declination = math.asin(math.sin(obliquity) * math.sin(along))
-    distance = 1.00014 - 0.01671 * math.cos(anomaly) - 0.00014 * math.cos(2.0 * anomaly)
-    return math.degrees(right_ascension) % 360.0, math.degrees(declination), distance
-
-
 def sun_position(moment: datetime, latitude_deg: float, longitude_deg: float) -> SunPosition:
     """Return the sun's position at a moment with a time zone, right to 0.02 degrees from 1800 to 2200.
+
+    The formulae are the low-precision ones of the Astronomical Almanac (US Naval Observatory).
 
     >>> noon = sun_position(datetime(2025, 6, 21, 12, 2, tzinfo=timezone.utc), 47.0, 0.0)
     >>> round(noon.azimuth_deg), round(noon.elevation_deg, 1)
     (180, 66.4)
     """
+    days = (moment - _EPOCH).total_seconds() / 86400.0
+    anomaly = math.radians(357.529 + 0.98560028 * days)
+    ecliptic_longitude = 280.459 + 0.98564736 * days + 1.915 * math.sin(anomaly) + 0.020 * math.sin(2.0 * anomaly)
+    along, obliquity = math.radians(ecliptic_longitude), math.radians(23.439 - 0.00000036 * days)
+    right_ascension = math.atan2(math.cos(obliquity) * math.sin(along), math.cos(along))
+    declination = math.asin(math.sin(obliquity) * math.sin(along))
+    distance_au = 1.00014 - 0.01671 * math.cos(anomaly) - 0.00014 * math.cos(2.0 * anomaly)
+    sidereal_deg = 280.460625 + 360.98564736578 * days  # at Greenwich
+    hour = math.radians((sidereal_deg + longitude_deg - math.degrees(right_ascension)) % 360.0)
     latitude = math.radians(latitude_deg)
-    right_ascension_deg, declination_deg, distance_au = sun_coordinates(moment)
-    # Greenwich mean sidereal time (US Naval Observatory), in degrees.
-    sidereal = 280.460625 + 360.98564736578 * _days(moment)
-    hour = math.radians((sidereal + longitude_deg - right_ascension_deg) % 360.0)
-    declination = math.radians(declination_deg)
     east = -math.cos(declination) * math.sin(hour)
     north = math.sin(declination) * math.cos(latitude) - math.cos(declination) * math.cos(hour) * math.sin(latitude)
     height = math.sin(declination) * math.sin(latitude) + math.cos(declination) * math.cos(hour) * math.cos(latitude)
@@ -188,55 +177,6 @@ def facet_irradiance(
     diffuse = sunlight.diffuse_w_m2 * sky_view(normals, up)
     on_ground = sunlight.direct_w_m2 * height + sunlight.diffuse_w_m2
     return direct + diffuse + ground_reflectance * on_ground * ground_view(normals, up)
-
-
-def fixed_sun(towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0) -> Varying:
-    """Return the sunlight on facets from a sun fixed in direction `towards`; for `AbsorbedSolar.irradiance_w_m2`."""
-    x, y, z = _unit(towards).tolist()
-    return Varying(partial(_from_fixed_sun, (x, y, z), sunlight, ground_reflectance), in_time=False)
-
-
-def _from_fixed_sun(towards: Vector, light: Sunlight, reflectance: float, places: Places, _: float) -> FloatArray:
-    return facet_irradiance(places.normals, places.up, towards, light, reflectance)
-
-
-def moving_sun(
-    start: datetime,
-    latitude_deg: float,
-    longitude_deg: float,
-    north: Vector,
-    sunlight: Sunlight | None = None,
-    ground_reflectance: float = 0.0,
-) -> Varying:
-    """Return the sunlight on facets from the moving sun at a date and place; for `AbsorbedSolar.irradiance_w_m2`.
-
-    `start` is the moment of the time 0, with a time zone. Latitudes north and longitudes east are positive. `north` is
-    the direction north in the coordinates of the mesh. Without `sunlight` the light is that of `meinel_clear_sky`.
-    """
-    where = start, latitude_deg, longitude_deg, north
-    return Varying(partial(_from_moving_sun, where, sunlight, ground_reflectance), resolution_s=_RESOLUTION_S)
-
-
-def _from_moving_sun(
-    where: tuple[datetime, float, float, Vector],
-    light: Sunlight | None,
-    reflected: float,
-    places: Places,
-    time_s: float,
-) -> FloatArray:
-    try:
-        moment = where[0] + timedelta(seconds=time_s)
-    except OverflowError:
-        expected, remedy = "a date of the years 1 to 9999", "Follow the body for a shorter time."
-        raise HeatError("sun", expected=expected, got=f"{where[0]} and {time_s:g} s", remedy=remedy) from None
-    position = sun_position(moment, *where[1:3])
-    light = light or meinel_clear_sky(position.elevation_deg, position.distance_au)
-    return facet_irradiance(places.normals, places.up, towards_sun(position, places.up, where[3]), light, reflected)
-
-
-def _days(moment: datetime) -> float:
-    """Return the days since noon of 1 January 2000, UTC."""
-    return (moment - _EPOCH).total_seconds() / 86400.0
 
 
 def _unit(direction: Vector) -> FloatArray:
