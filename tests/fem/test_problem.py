@@ -82,6 +82,7 @@ MESHES: Refused = [
 ]
 PROBLEMS: Refused = [
     *(("up", lambda u=u: HeatProblem(BOX, CONCRETE, up=u)) for u in ((0.0, 0.0, 0.0), (1.0, 2.0))),
+    ("materials", lambda: HeatProblem(BOX, {"inner": CONCRETE})),
     *(("steady heat problem", lambda e=e: acting(*e)) for e in ((), (HeatFlux(("*",), 1.0),))),
     ("steady heat problem", lambda: acting(Convection(("*",), 0.0, 20.0))),
 ]

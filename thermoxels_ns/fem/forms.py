@@ -14,7 +14,7 @@ from scipy import sparse
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.problem import HeatProblem, Term, effect_labels
+from thermoxels_ns.fem.problem import Effect, HeatProblem, effect_labels
 from thermoxels_ns.fem.quantities import in_time, values_at
 from thermoxels_ns.fem.space import Space, sums_by_number
 
@@ -39,26 +39,25 @@ def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], 
 
 
 class _Boundary(ABC):
-    """The k boundary triangles on which a term acts, and integrals over the triangles.
+    """The k boundary triangles on which an effect acts, and integrals over the triangles.
 
     Temperatures are relative to a reference, so that round-off is relative to their differences. Every form returns
     heat flows per triangle, evaluated as in the equations, so that balances close to round-off.
     """
 
-    def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
-        selection, facets = space.selection, term.parts
-        self.effect, self.kind, self.parts, self._reference_c = effect, term.kind, facets, reference_c
-        self.quantities, self._factor = term.quantities, term.factor
-        self.load_in_time = any(map(in_time, term.quantities))
+    def __init__(self, label: str, effect: Effect, parts: IntArray, space: Space, reference_c: float) -> None:
+        self.effect, self.kind, self.parts, self._reference_c = label, effect.form, parts, reference_c
+        self.quantities = effect.quantities
+        self.load_in_time = any(map(in_time, self.quantities))
         """True if the heat flow changes with time even while the body's temperatures stay constant."""
-        self.nodes = space.facet_nodes(facets)
+        self.nodes = space.facet_nodes(parts)
         self._numbers, self._space = self.nodes.T.ravel(), space
-        self._shapes, self._area_m2 = space.facet_rule(facets)
-        self.places = selection.facet_places(facets)
+        self._shapes, self._area_m2 = space.facet_rule(parts)
+        self.places = space.selection.facet_places(parts)
         self._kept: dict[int, dict[float, Vector]] = {}
 
     def at(self, number: int, time_s: float) -> Vector:
-        """Return entry `number` of `Term.quantities`, evaluated at the centroid of each triangle, shape (k, 1)."""
+        """Return entry `number` of `Effect.quantities`, evaluated at the centroid of each triangle, shape (k, 1)."""
         quantity, kept = self.quantities[number], self._kept.setdefault(number, {})
         time_s = time_s if in_time(quantity) else 0.0
         return at_time(kept, time_s, lambda t: values_at(quantity, self.places, t)[:, None])
@@ -100,7 +99,7 @@ class _Exchange(_Boundary):
 
     def strength(self, time_s: float) -> Vector:
         """Return convection's h, [W / (m2 K)], or radiation's sigma eps, [W / (m2 K4)], per triangle, shape (k, 1)."""
-        return self._factor * self.at(0, time_s)
+        return self.at(0, time_s)
 
     def surroundings_k(self, time_s: float) -> Vector:
         """Return the temperature of the surroundings per triangle, relative to the reference, shape (k, 1), [K]."""
@@ -133,7 +132,7 @@ class ConvectionForm(_Exchange):
 
 
 class FluxForm(_Boundary):
-    """A given heat flux q into the body, the product of the term's quantities: a load."""
+    """A given heat flux q into the body, the product of the effect's quantities: a load."""
 
     def load(self, time_s: float) -> Vector:
         """Return integral(q phi_i) for each node i, shape (n,), [W]."""
@@ -147,10 +146,10 @@ class FluxForm(_Boundary):
 class SourceForm:
     """A given heat source s in tetrahedra, [W / m3]: a load."""
 
-    def __init__(self, effect: str, term: Term, space: Space, _: float) -> None:
-        self.effect, self.kind, self.parts, self._space = effect, term.kind, term.parts, space
-        self._source = term.quantities[0]
-        self._places, self._volumes = space.source_points(term.parts)
+    def __init__(self, label: str, effect: Effect, parts: IntArray, space: Space, _: float) -> None:
+        self.effect, self.kind, self.parts, self._space = label, effect.form, parts, space
+        self._source = effect.quantities[0]
+        self._places, self._volumes = space.source_points(parts)
         self.load_in_time = in_time(self._source)
 
     def load(self, time_s: float) -> Vector:
@@ -172,6 +171,10 @@ class RadiationForm(_Exchange):
     Temperatures below absolute zero, which occur only within a solver's iterations, count as |T|^3 T instead of T^4.
     The law is then monotone everywhere, the equations are those of a convex minimum, and their solution is unique.
     """
+
+    def strength(self, time_s: float) -> Vector:
+        """Return sigma eps per triangle, [W / (m2 K4)], shape (k, 1)."""
+        return self.at(2, time_s) * self.at(0, time_s)
 
     def load(self, relative_k: Vector, time_s: float) -> Vector:
         """Return integral(sigma eps (T_s^4 - T^4) phi_i) for each node i, shape (n,), [W]."""
@@ -195,14 +198,13 @@ class RadiationForm(_Exchange):
 class FixedForm:
     """Given temperatures of the nodes of k boundary triangles; these nodes are no unknowns."""
 
-    def __init__(self, effect: str, term: Term, space: Space, reference_c: float) -> None:
-        selection = space.selection
-        self.effect, self.kind, self.parts, self.reference_c = effect, term.kind, term.parts, reference_c
-        self.owners: IntArray = space.facet_nodes(term.parts)
+    def __init__(self, label: str, effect: Effect, parts: IntArray, space: Space, reference_c: float) -> None:
+        self.effect, self.kind, self.parts, self.reference_c = label, effect.form, parts, reference_c
+        self.owners: IntArray = space.facet_nodes(parts)
         """Nodes of each triangle, shape (k, m)."""
         self.nodes = np.unique(self.owners)
-        self._places, self._temperature = space.node_places(self.nodes), term.quantities[0]
-        self.area_m2: Vector = selection.facet_area_m2[term.parts]
+        self._places, self._temperature = space.node_places(self.nodes), effect.quantities[0]
+        self.area_m2: Vector = space.selection.facet_area_m2[parts]
         """Area of each triangle, shape (k,), [m2], by which a node's heat is shared among triangles."""
 
     def surroundings_k(self, time_s: float) -> Vector:
@@ -280,7 +282,7 @@ def effect_forms(problem: HeatProblem, space: Space, reference_c: float) -> tupl
     An effect that acts on no triangle or tetrahedron gets no form. Temperatures are relative to `reference_c`. Raises
     `HeatError` if the mesh lacks a patch or region of an effect.
     """
-    terms = [(label, effect.term(space.selection)) for label, effect in zip(effect_labels(problem), problem.effects)]
-    acting = [(label, term) for label, term in terms if len(term.parts)]
-    acting.sort(key=lambda labelled: list(_FORMS).index(labelled[1].kind))
-    return tuple(_FORMS[term.kind](label, term, space, reference_c) for label, term in acting)
+    named = zip(effect_labels(problem), problem.effects)
+    acting = [(label, effect, effect.parts(space.selection)) for label, effect in named]
+    acting.sort(key=lambda one: list(_FORMS).index(one[1].form))
+    return tuple(_FORMS[one[1].form](*one, space, reference_c) for one in acting if len(one[2]))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, ClassVar, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import Annotated, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -28,6 +28,8 @@ MOST_CONTRAST = 1e9
 
 Count: TypeAlias = Annotated[int, Field(ge=1, le=10_000_000)]  # Steps, or kept times: nineteen years of minutes
 Seconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1e300)]
+Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
+Text: TypeAlias = Annotated[str, Field(pattern=r"\S")]
 
 
 @record(HeatError)
@@ -94,31 +96,29 @@ class GivenSteps:
         return np.append(0.0, np.cumsum(self.lengths_s))
 
 
-@dataclass(frozen=True)
-class Term:
-    """The term that an effect adds to the heat equation; heat flows and fluxes are positive into the body."""
+class Effect:
+    """Something that acts on a body, such as convection: checked input that `forms` turns into vectors and matrices.
 
-    kind: Literal["convection", "flux", "radiation", "source", "fixed"]
-    parts: IntArray  # Numbers of the boundary triangles, for a source the tetrahedra, where the term acts, (k,)
-    quantities: tuple[Quantity, ...]
-    """convection: h, T_ambient of the flux h (T_ambient - T); flux: the factors whose product is the flux; radiation:
-    eps, T_s of the flux factor eps (T_s^4 - T^4); source: heat, [W / m3]; fixed: temperature of the nodes. Quantities
-    hold temperatures in degrees Celsius."""
-    factor: float = 1.0  # Stefan-Boltzmann constant for radiation, [W / (m2 K4)]; no other kind uses it
-
-
-class Effect(ABC):
-    """Something that acts on a body, such as convection: checked input that `term` turns into a `Term`.
-
-    A subclass is a dataclass; its fields are quantities, and the names of the `patches` or `regions` that it acts on.
+    A subclass is a dataclass, whose first field names the patches or regions that the effect acts on.
     """
 
     kind: ClassVar[str]  # Name of this kind of effect in reports
+    form: ClassVar[Literal["convection", "flux", "radiation", "source", "fixed"]]
+    """What the effect adds to the heat equation. Heat flows and fluxes are positive into the body."""
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """The numbers in the equation, by `form`; in these, temperatures are in degrees Celsius.
+
+        convection: h, T_ambient of the flux h (T_ambient - T). flux: the factors whose product is the flux. radiation:
+        eps, T_s, sigma of the flux sigma eps (T_s^4 - T^4). source: heat, [W / m3]. fixed: temperature of the nodes.
+        """
+        return tuple(vars(self).values())[1:]
 
     @property
     def where(self) -> tuple[str, ...]:
         """Names or patterns of the patches, or of the regions, that the effect acts on."""
-        return getattr(self, "patches", None) or getattr(self, "regions", ())
+        return next(iter(vars(self).values()))
 
     @property
     def label(self) -> str:
@@ -130,24 +130,36 @@ class Effect(ABC):
         """The quantities that change with time."""
         return tuple(one for one in vars(self).values() if isinstance(one, Varying) and one.in_time)
 
-    @abstractmethod
-    def term(self, selection: Selection) -> Term:
-        """Return the effect's term in the heat equation; raise `HeatError` if the mesh lacks what `where` names."""
+    def parts(self, selection: Selection) -> IntArray:
+        """Return the numbers of the triangles, of a source the tetrahedra, where the effect acts, shape (k,).
+
+        Raises `HeatError` if the mesh lacks what `where` names.
+        """
+        return (selection.tets if self.form == "source" else selection.facets)(self.where)
 
 
-@runtime_checkable
-class Conductor(Protocol):
-    """A material as the solver sees it, such as `heat.materials.Material`: two numbers above 0."""
+@record(HeatError)
+class Material:
+    """A uniform, isotropic solid with constant properties.
 
-    @property
-    def conductivity_w_mk(self) -> float:
-        """Thermal conductivity, [W / (m K)]."""
-        ...
+    >>> f"{Material('concrete', 1.7, 2200.0, 880.0).diffusivity_m2_s:.4e} m2/s"
+    '8.7810e-07 m2/s'
+    """
+
+    name: Text
+    conductivity_w_mk: Positive  # Thermal conductivity, [W / (m K)]
+    density_kg_m3: Positive  # Mass density, [kg / m3]
+    specific_heat_j_kgk: Positive  # Specific heat capacity, [J / (kg K)]
 
     @property
     def heat_capacity_j_m3k(self) -> float:
         """Heat that warms a cubic metre by a kelvin, rho c, [J / (m3 K)]."""
-        ...
+        return self.density_kg_m3 * self.specific_heat_j_kgk
+
+    @property
+    def diffusivity_m2_s(self) -> float:
+        """Thermal diffusivity k / (rho c), [m2 / s]."""
+        return self.conductivity_w_mk / self.heat_capacity_j_m3k
 
 
 @dataclass(frozen=True)
@@ -159,7 +171,7 @@ class HeatProblem:
     """
 
     mesh: TetMesh  # The body
-    material: Conductor | Mapping[str, Conductor]
+    material: Material | Mapping[str, Material]
     """Material of the whole body, or a mapping from the name of each region of the mesh to its material."""
     initial_temperature_c: FloatArray | None = None
     """Nodal temperature at the start, shape (n,), [degrees Celsius]; None: that of the mesh. A steady solver starts its
@@ -209,16 +221,21 @@ class HeatProblem:
         return self._of_tets("heat_capacity_j_m3k")
 
     def _of_tets(self, name: str) -> FloatArray:
-        if isinstance(self.material, Conductor):
+        if isinstance(self.material, Material):
             return np.full(len(self.mesh.tets), float(getattr(self.material, name)))
         known, names = self.material, self.mesh.region_names
         by_region = [float(getattr(known[region], name)) if region in known else np.nan for region in names]
         return np.array(by_region)[self.mesh.region]
 
     def _check_materials(self) -> None:
-        if isinstance(self.material, Conductor):
+        if isinstance(self.material, Material):
             return
         used = {self.mesh.region_names[number] for number in np.unique(self.mesh.region)}
+        missing = sorted(used - {*self.material})
+        if missing:
+            expected = f"a material for each of the regions {', '.join(sorted(used))}"
+            remedy = "Add them, or '*' for all others to a scene."
+            raise HeatError("materials", expected=expected, got=f"none for {', '.join(missing)}", remedy=remedy)
         conductivities = {name: self.material[name].conductivity_w_mk for name in used}
         least, most = (choose(conductivities, key=conductivities.__getitem__) for choose in (min, max))
         if conductivities[most] > MOST_CONTRAST * conductivities[least]:
@@ -242,12 +259,11 @@ class HeatProblem:
 
 def effect_labels(problem: HeatProblem) -> tuple[str, ...]:
     """Return the names of the effects for reports, all different: a second effect with the same label gets " (2)"."""
-    numbers: dict[str, int] = {}
-    for own in (effect.label for effect in problem.effects):
-        label, number = own, numbers.get(own, 1)
-        while label in numbers:
-            number += 1
-            label = f"{own} ({number})"
-        numbers[own] = number
-        numbers.setdefault(label, 1)
-    return tuple(numbers)
+    labels, again = dict[str, None](), Counter[str]()
+    for effect in problem.effects:
+        label = effect.label
+        while label in labels:
+            again[effect.label] += 1
+            label = f"{effect.label} ({again[effect.label] + 1})"
+        labels[label] = None
+    return tuple(labels)

@@ -19,7 +19,7 @@ class Places:
     """The k places where a quantity is evaluated: centroids of boundary triangles, points in tetrahedra, or nodes."""
 
     points_m: FloatArray  # Positions, shape (k, 3), [m]
-    normals: FloatArray  # Outward unit normals of the surface, shape (k, 3); 0 inside the body
+    normals: FloatArray  # Outward unit normals of the surface, shape (k, 3); 0 in tetrahedra and at nodes
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Unit vector that points up
 
     def __len__(self) -> int:

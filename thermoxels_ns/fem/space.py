@@ -148,19 +148,9 @@ class Space:
         return get_quadrature(RefTet, self.order)
 
     def node_places(self, nodes: Numbers) -> Places:
-        """Return the positions of nodes, each with the mean normal of the boundary around the node (0 inside)."""
-        total = self._normals[nodes]
-        length = np.sqrt(np.einsum("ki,ki->k", total, total))[:, None]
-        normals = np.divide(total, length, out=np.zeros_like(total), where=length > 0.0)
-        return Places(self.points_m[nodes], normals, self.selection.up)
-
-    @cached_property
-    def _normals(self) -> Vector:
-        """Sum over the boundary triangles around each node of normal times area, shape (n, 3), [m2]."""
-        selection = self.selection
-        owners = self.facet_nodes(np.arange(len(selection.mesh.facets)))
-        weighted = np.repeat(selection.facet_normal * selection.facet_area_m2[:, None], owners.shape[1], axis=0)
-        return np.stack([sums_by_number(owners.ravel(), part, self.num_nodes) for part in weighted.T], axis=1)
+        """Return the positions of nodes, without normals."""
+        points_m = self.points_m[nodes]
+        return Places(points_m, np.zeros_like(points_m), self.selection.up)
 
 
 def sums_by_number(numbers: Numbers, values: npt.NDArray, count: int) -> Vector:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import Annotated, ClassVar, Literal, TypeAlias
+from typing import Annotated, TypeAlias
 
 from pydantic import Field
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import STEFAN_BOLTZMANN_W_M2K4, ZERO_CELSIUS_K
 from thermoxels_ns.core.yaml_records import record
-from thermoxels_ns.fem.problem import Effect, Term
-from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.problem import Effect
+from thermoxels_ns.fem.quantities import Quantity, Varying
 
 HOTTEST_C = 10_000.0
 """Highest temperature that is accepted, [degrees Celsius]; above it a unit is wrong: the sun's surface has 5500."""
@@ -34,15 +32,6 @@ class SurfaceEffect(Effect):
     """
 
     patches: Names  # Names of boundary patches, or patterns such as exterior-*; * is the whole boundary
-
-    form: ClassVar[
-        Literal["convection", "flux", "fixed"]
-    ]  # The form of the equation below, into which the quantities go in the order of the fields
-
-    def term(self, selection: Selection) -> Term:
-        """Return the effect's equation on the triangles of its patches."""
-        quantities = tuple(getattr(self, field.name) for field in fields(self)[1:])
-        return Term(self.form, selection.facets(self.patches), quantities)
 
 
 @record(HeatError)
@@ -78,7 +67,10 @@ class Convection(SurfaceEffect):
 
 @record(HeatError)
 class Radiation(SurfaceEffect):
-    """Long-wave exchange with large surroundings such as the sky, the ground or a room (Stefan-Boltzmann law)."""
+    """Long-wave exchange with large surroundings such as the sky, the ground or a room (Stefan-Boltzmann law).
+
+    The heat flux into the body is k grad T . n = sigma eps (T_s^4 - T^4), T in kelvin.
+    """
 
     emissivity: Fraction | Varying
     """Emissivity of the surface, times the view factor of the surroundings if they do not fill its view; 0 to 1."""
@@ -87,11 +79,7 @@ class Radiation(SurfaceEffect):
     """Stefan-Boltzmann constant, [W / (m2 K4)]; the default is CODATA 2018's. Published benchmarks use 5.67e-8."""
 
     kind = "radiation"
-
-    def term(self, selection: Selection) -> Term:
-        """Return the term of the heat flux into the body, k grad T . n = sigma eps (T_s^4 - T^4), T in kelvin."""
-        quantities = self.emissivity, self.surroundings_c
-        return Term("radiation", selection.facets(self.patches), quantities, self.stefan_boltzmann_w_m2k4)
+    form = "radiation"
 
 
 @record(HeatError)
@@ -107,27 +95,26 @@ class AbsorbedSolar(SurfaceEffect):
 
 @record(HeatError)
 class GroundContact(SurfaceEffect):
-    """Heat exchange with the ground through a thermal resistance."""
+    """Heat exchange with the ground through a thermal resistance R, k grad T . n = (T_ground - T) / R."""
 
     resistance_m2k_w: AboveZero  # Thermal resistance between the surface and the undisturbed ground, [m2 K / W]
     ground_c: Celsius | Varying  # Temperature of the undisturbed ground, [degrees Celsius], at least -273.15
 
     kind = "ground contact"
+    form = "convection"
 
-    def term(self, selection: Selection) -> Term:
-        """Return the term of the heat flux into the body, k grad T . n = (T_ground - T) / R, R the resistance."""
-        return Term("convection", selection.facets(self.patches), (1.0 / self.resistance_m2k_w, self.ground_c))
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """1 / R and the temperature of the ground."""
+        return 1.0 / self.resistance_m2k_w, self.ground_c
 
 
 @record(HeatError)
 class InternalHeat(Effect):
-    """Heat that is set free inside the body."""
+    """Heat that is set free inside the body, the source s = `source_w_m3` in rho c dT/dt = div(k grad T) + s."""
 
     regions: Names  # Names of regions, or patterns; * is the whole body
     source_w_m3: float | Varying  # Heat set free per volume, [W / m3]; a negative value takes heat out
 
     kind = "internal heat"
-
-    def term(self, selection: Selection) -> Term:
-        """Return the term of the source s = `source_w_m3` in rho c dT/dt = div(k grad T) + s."""
-        return Term("source", selection.tets(self.regions), (self.source_w_m3,))
+    form = "source"

@@ -5,41 +5,13 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from functools import cache
-from typing import Annotated, Any, TypeAlias, cast
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.yaml_records import as_record, configs_folder, read_yaml, record
-from thermoxels_ns.fem.problem import HeatProblem
-
-Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
-Text: TypeAlias = Annotated[str, Field(pattern=r"\S")]
-
-
-@record(HeatError)
-class Material:
-    """A uniform, isotropic solid with constant properties.
-
-    >>> f"{Material('concrete', 1.7, 2200.0, 880.0).diffusivity_m2_s:.4e} m2/s"
-    '8.7810e-07 m2/s'
-    """
-
-    name: Text
-    conductivity_w_mk: Positive  # Thermal conductivity, [W / (m K)]
-    density_kg_m3: Positive  # Mass density, [kg / m3]
-    specific_heat_j_kgk: Positive  # Specific heat capacity, [J / (kg K)]
-
-    @property
-    def heat_capacity_j_m3k(self) -> float:
-        """Heat that warms a cubic metre by a kelvin, rho c, [J / (m3 K)]."""
-        return self.density_kg_m3 * self.specific_heat_j_kgk
-
-    @property
-    def diffusivity_m2_s(self) -> float:
-        """Thermal diffusivity k / (rho c), [m2 / s]."""
-        return self.conductivity_w_mk / self.heat_capacity_j_m3k
+from thermoxels_ns.fem.problem import HeatProblem, Material, Text
 
 
 @record(HeatError)
@@ -82,7 +54,6 @@ def material(name: str) -> Material:
 def materials_by_region(problem: HeatProblem) -> dict[str, Material]:
     """Return materials by the names of the regions of a problem; regions without a tetrahedron are left out."""
     names = [problem.mesh.region_names[number] for number in np.unique(problem.mesh.region)]
-    made_of = {
+    return {
         name: problem.material[name] if isinstance(problem.material, Mapping) else problem.material for name in names
     }
-    return cast(dict[str, Material], made_of)

@@ -203,18 +203,13 @@ class HeatScene:
         return named
 
     def material(self, mesh: TetMesh) -> Material | dict[str, Material]:
-        """Return the material of a mesh, by region if regions differ; `HeatError` if a region has none."""
+        """Return the material of a mesh, by region if regions differ; a region for which there is none is left out."""
         chosen: dict[str, Material] = {}
         for pattern, made_of in self.materials.items():
             matching = chosen_names("materials", mesh.region_names, (pattern,), "regions")
             chosen |= dict.fromkeys(matching, made_of)
-        used = {mesh.region_names[number] for number in np.unique(mesh.region)}
-        missing = sorted(used - set(chosen))
-        if missing:
-            expected = f"a material for each of the regions {', '.join(sorted(used))}"
-            raise unclear("materials", expected, f"none for {', '.join(missing)}", "Add them, or '*' for all others.")
-        different = {chosen[name] for name in used}
-        return different.pop() if len(different) == 1 else chosen
+        first, *others = (chosen.get(mesh.region_names[number]) for number in np.unique(mesh.region))
+        return first if first is not None and all(one == first for one in others) else chosen
 
     def _sky_and_ground(self, selection: Selection) -> list[Radiation]:
         sky_c = None if self.sky is None else self._sky_c(self.sky)
