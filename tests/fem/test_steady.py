@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy import sparse
@@ -106,15 +104,14 @@ def test_a_balance_through_time_that_is_wrong_is_seen(monkeypatch, effects, thic
     problem, steps, add = sheet(thickness_m, *effects), TimeSteps(3, step_s), HeatBalance.add
 
     def wrong(balance, step, step_s, **options) -> None:
-        heat_w = step.group_heat_w.copy()
-        heat_w[0] *= 1.0 + WRONG
-        add(balance, replace(step, group_heat_w=heat_w), step_s, **options)
+        step.group_heat_w[0] *= 1.0 + WRONG
+        add(balance, step, step_s, **options)
 
     monkeypatch.setattr(HeatBalance, "add", wrong)
     solution = solve_heat(problem, steps)
     share = moved_j(solution.effects[0]) / sum(moved_j(heat) for heat in solution.effects)
     # What the body stores in differences counts too, and is up to a hundred times as much as flows in a short time.
-    assert share > 0.1 and solution.energy_residual_of_spread > 0.005 * share * WRONG
+    assert share > 0.1 and solution.energy_residual > 0.005 * share * WRONG
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,11 @@ import pytest
 
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.fem.forms import ConvectionForm, effect_forms
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import (
     STEFAN_BOLTZMANN_W_M2K4,
@@ -106,19 +108,22 @@ EVERY = {
     "radiation": Radiation(("y1",), 0.9, -10.0),
     "source": InternalHeat(("*",), 100.0),
 }
-"""One effect for each kind of term."""
+"""One effect for each kind of form."""
 
 
 @pytest.mark.parametrize("absent", EVERY)
-def test_an_absent_effect_assembles_nothing(box, concrete, absent) -> None:
-    effects = tuple(effect for kind, effect in EVERY.items() if kind != absent)
-    bill = at_once(box, concrete, *effects).assembled
-    assert set(bill) == {"stiffness", "mass", *EVERY} - {absent}
-
-
-def test_what_is_constant_is_assembled_once_and_an_effect_without_triangles_never(box, concrete) -> None:
+def test_an_absent_effect_and_one_without_triangles_have_no_form(box, concrete, absent) -> None:
     nowhere = Convection(("other",), 8.0, 5.0), Radiation(("other",), 0.9, 5.0)
-    for acting, counts in (((), {}), ((EVERY["flux"], EVERY["convection"]), {"convection": 2, "flux": 1})):
-        solution = solve_heat(HeatProblem(box, concrete, effects=(*nowhere, *acting)), TimeSteps(20, 60.0))
-        assert solution.assembled == {"stiffness": 1, "mass": 1, **counts}
-        assert not any(heat.heat_w.any() for heat in solution.effects[:2])
+    effects = (*nowhere, *(effect for kind, effect in EVERY.items() if kind != absent))
+    problem = HeatProblem(box, concrete, effects=effects)
+    kinds = [form.kind for form in effect_forms(problem, Space(problem.selection), 0.0)]
+    assert sorted(kinds) == sorted(set(EVERY) - {absent})
+    assert not any(heat.heat_w.any() for heat in at_once(box, concrete, *effects).effects[:2])
+
+
+def test_what_is_constant_is_assembled_once(box, concrete, monkeypatch) -> None:
+    calls, matrix, load = list[str](), ConvectionForm.convection_matrix, ConvectionForm.load
+    monkeypatch.setattr(ConvectionForm, "convection_matrix", lambda *a: calls.append("matrix") or matrix(*a))
+    monkeypatch.setattr(ConvectionForm, "load", lambda *a: calls.append("load") or load(*a))
+    solve_heat(HeatProblem(box, concrete, effects=(EVERY["convection"],)), TimeSteps(20, 60.0))
+    assert sorted(calls) == ["load", "matrix"]

@@ -12,7 +12,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.runge_kutta import SDIRK2
-from thermoxels_ns.fem.steady import OVERSHOOT_K, solve_steady
+from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, HeatFlux, Radiation
 from thermoxels_ns.heat.materials import Material
@@ -105,7 +105,7 @@ def test_steps_say_when_a_temperature_leaves_its_range(options) -> None:
     jump = HeatProblem(body("sphere"), CONCRETE, effects=(FixedTemperature(("x1",), 100.0),))
     solution = solve_heat(jump, TimeSteps(2, 1e-2 * STEP_S), **options)
     beyond_k = 20.0 - float(solution.temperature_c.min())
-    said = re.search(r"In [12] a temperature left the range .*, by up to ([\d.]+) K", solution.status)
+    said = re.search(r"A temperature left its range by up to ([\d.]+) K", solution.status)
     assert beyond_k > 0.01 and said and float(said[1]) >= 0.94 * beyond_k
     # Long steps are smooth.
     assert options or "left" not in solve_heat(jump, TimeSteps(4, 20.0 * STEP_S)).status
@@ -141,9 +141,7 @@ def test_what_leaves_the_range_says_by_how_much(contrast, options) -> None:
     everywhere = np.concatenate([solution.temperature_c, solution.edge_temperature_c])
     beyond = np.maximum(LOW - everywhere, everywhere - HIGH)
     assert beyond.max() > 1.0
-    count = np.count_nonzero(beyond > OVERSHOOT_K)
-    said = f"The temperature of {count} of {len(everywhere)} nodes is up to {beyond.max():.2g} K out of the range"
-    assert said in solution.status and solution.energy_residual < 1e-9
+    assert f"left its range by up to {beyond.max():.2g} K" in solution.status and solution.energy_residual < 1e-9
     mild = solve_steady(problem("torus", 1.0, Convection(("*",), 8.0, 20.0), HeatFlux(("x0",), 10.0)), **options)
     assert "range" not in mild.status
 

@@ -25,7 +25,6 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin
-from thermoxels_ns.fem.problem import GivenSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import matching_names
 from thermoxels_ns.fem.steady import solve_steady
@@ -221,7 +220,7 @@ class _Wall:
         problem = scene(*map(Varying, airs)).problem(mesh, up=up)
         start_c = solve_steady(problem).temperature_c
         problem = replace(problem, initial_temperature_c=start_c)
-        found = solve_heat(problem, GivenSteps(np.diff(ends_s)), relative_tolerance=_LINEAR)
+        found = solve_heat(problem, np.diff(ends_s), relative_tolerance=_LINEAR)
         return found.temperature_c[-1][facets].mean(axis=1)
 
     def _photographed_side(self, draws: Draws, at_c: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -208,7 +208,6 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
         ],
         "built": [heat.effect for heat in solution.effects],
         "left_out": [asdict(entry) for entry in run.left_out],
-        "assembled": dict(solution.assembled),
         "newton_iterations": int(np.sum(solution.newton_iterations)),
         "linear_iterations": int(np.sum(solution.iterations)),
         "steps": getattr(solution, "steps", 0),

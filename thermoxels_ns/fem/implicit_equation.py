@@ -322,7 +322,7 @@ class ImplicitEquation:
         """Return the heat that is unbalanced at the temperatures `start_k` + `change_k`, both of shape (n,), [K]."""
         system, now_k = self._system, start_k + change_k
         pieces, conducted_w = system.pieces, system.conducted_heat(now_k)
-        parts_w = system.exchange_parts(now_k, time_s) if system.exchanges else [np.zeros(system.num_nodes)]
+        parts_w = system.exchange_parts(now_k, time_s)
         if np.isfinite(self._step_s):
             parts_w.append(-system.nodal_mass_j_k * change_k / self._step_s)
         kept_w, moved_w, fixed = np.sum(parts_w, axis=0), np.sum(np.abs(parts_w), axis=0), system.fixed.nodes

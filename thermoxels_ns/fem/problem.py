@@ -79,23 +79,6 @@ class AdaptiveSteps:
         return np.linspace(0.0, self.duration_s, self.outputs + 1)
 
 
-@dataclass(frozen=True)
-class GivenSteps:
-    """Time steps of given lengths."""
-
-    lengths_s: FloatArray  # Lengths of the steps, shape (k,), [s]
-
-    @property
-    def duration_s(self) -> float:
-        """Time over which the body is followed, [s]."""
-        return float(self.lengths_s.sum())
-
-    @property
-    def times_s(self) -> FloatArray:
-        """Time 0, then the end of every step, shape (k + 1,), [s]."""
-        return np.append(0.0, np.cumsum(self.lengths_s))
-
-
 class Effect:
     """Something that acts on a body, such as convection: checked input that `forms` turns into vectors and matrices.
 

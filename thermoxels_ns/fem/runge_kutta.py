@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = FloatArray
 
-_KEPT_EQUATIONS = 2  # Number of implicit equations that are kept with their matrices, each for one length of a stage
 _SAME_LENGTH = 1e-12  # Relative difference up to which two lengths of a stage count as equal
 
 
@@ -27,7 +27,7 @@ class Scheme:
     heat closes at any step length.
     """
 
-    name: str  # Name of the scheme, for messages
+    name: str  # Name of the scheme
     order: int  # Order p: at a given time the error is proportional to the step length to the power p
     weights: tuple[tuple[float, ...], ...]
     """The lower triangular matrix a, a row per stage; its last row is b. Sums of rows are the times of the stages as
@@ -39,11 +39,6 @@ class Scheme:
     def nodes(self) -> tuple[float, ...]:
         """c: time of each stage as a share of the step."""
         return tuple(map(math.fsum, self.weights))
-
-    @property
-    def ends(self) -> tuple[float, ...]:
-        """b: weights of the stages' heat flows in the whole step."""
-        return self.weights[-1]
 
 
 def _sdirk2() -> Scheme:
@@ -73,65 +68,63 @@ class Step:
 
     relative_k: Vector  # Temperatures at the end of the step, relative to the system's reference, shape (n,), [K]
     group_heat_w: Vector  # Mean heat flow into the body for each entry of `HeatSystem.groups`, (g,), [W]
+    range_k: tuple[float, float]  # Range of the surroundings, relative to the reference, see `surroundings_k`, [K]
     iterations: int  # Iterations of the linear solver in all stages
     newton_iterations: int  # Steps of Newton's method in all stages; 0 without radiation
-    error_k: float
-    """Estimated largest error that the step made, [K]; NaN if the scheme has no estimate or none was asked for."""
-    converged: bool  # True if all stages were solved; if False, `relative_k` is useless and heat flows are NaN
-    status: str  # Sentence on the solver in the last stage
-    unbalanced_w: float = 0.0  # Sum of the heat left unbalanced in the stages, [W]
+    unbalanced_w: float  # Sum of the heat left unbalanced in the stages, [W]
+    error_k: float  # Estimated largest error that the step made, [K]; NaN if none was asked for
 
 
 class RungeKutta:
-    """Takes single steps of any length with a scheme; matrices of the last used lengths are kept."""
+    """Takes single steps of any length with a scheme; the matrix of the last used length is kept."""
 
-    def __init__(self, system: HeatSystem, scheme: Scheme, *, relative_tolerance: float) -> None:
-        self.scheme, self.system, self._relative_tolerance = scheme, system, relative_tolerance
-        self._equations: dict[tuple[float, float], ImplicitEquation] = {}
+    def __init__(self, system: HeatSystem, scheme: Scheme, relative_tolerance: float) -> None:
+        self.system, self._scheme, self._relative_tolerance = system, scheme, relative_tolerance
+        self._kept: tuple[float, float, ImplicitEquation] | None = None
 
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
-        """Take one step from `start_k`, (n,), [K], relative to the reference; `Step.converged` tells if that worked."""
-        system, scheme = self.system, self.scheme
-        states, inner_w, nothing_w = list[Vector](), list[Vector](), np.zeros(system.num_nodes)
-        iterations = newton_iterations = 0
-        unbalanced_w, status = 0.0, ""
-        for number, (row, node) in enumerate(zip(scheme.weights, scheme.nodes)):
-            now_s, implicit = time_s + node * step_s, row[number]
+        """Take one step from `start_k`, (n,), [K], relative to the reference; `HeatError` if a stage is not solved."""
+        system, scheme, nothing_w = self.system, self._scheme, np.zeros(self.system.num_nodes)
+        states, inner_w, solutions = list[Vector](), list[Vector](), []
+        for row, node, implicit in zip(scheme.weights, scheme.nodes, np.diag(scheme.weights)):
+            now_s = time_s + node * step_s
             given_w = sum((weight / implicit * flow_w for weight, flow_w in zip(row, inner_w)), nothing_w)
             solution = self._equation(now_s, implicit * step_s).solve(start_k, now_s, given_w)
-            iterations += solution.iterations
-            newton_iterations += solution.newton_iterations
-            unbalanced_w += solution.unbalanced_w
-            status = solution.status
-            states.append(solution.relative_k)
             if not solution.converged:
-                unknown = np.full(len(system.groups), np.nan)
-                return Step(solution.relative_k, unknown, iterations, newton_iterations, np.nan, False, status)
-            if estimate or number + 1 < len(scheme.nodes):
-                stored_w = system.nodal_mass_j_k * solution.change_k / (implicit * step_s)
-                inner_w.append(stored_w - given_w)
-        heat_w = self._heat(start_k, states, time_s, step_s)
-        error_k = self._error(start_k, inner_w, time_s, step_s) if estimate and scheme.estimate else np.nan
-        return Step(states[-1], heat_w, iterations, newton_iterations, error_k, True, status, unbalanced_w)
+                remedy = "Use shorter steps or check the mesh's quality."
+                raise HeatError(f"The step from {time_s:.6g} s failed. {solution.status} {remedy}")
+            solutions.append(solution)
+            states.append(solution.relative_k)
+            inner_w.append(system.nodal_mass_j_k * solution.change_k / (implicit * step_s) - given_w)
+        (low, high), (then_low, then_high) = map(system.surroundings_k, (time_s, time_s + step_s))
+        return Step(
+            relative_k=states[-1],
+            group_heat_w=self._heat(start_k, states, time_s, step_s),
+            range_k=(min(low, then_low), max(high, then_high)),
+            iterations=sum(one.iterations for one in solutions),
+            newton_iterations=sum(one.newton_iterations for one in solutions),
+            unbalanced_w=sum(one.unbalanced_w for one in solutions),
+            error_k=self._error(start_k, inner_w, time_s, step_s) if estimate else math.nan,
+        )
 
     def _heat(self, start_k: Vector, states: list[Vector], time_s: float, step_s: float) -> Vector:
         """Return each group's mean heat flow, [W]; fixed nodes get the heat that balances storage and other flows."""
-        system, scheme, fixed = self.system, self.scheme, self.system.fixed
+        system, scheme, fixed = self.system, self._scheme, self.system.fixed
         if not system.groups:
             return np.zeros(0)
         kept_w = (system.nodal_mass_j_k * (states[-1] - start_k))[fixed.nodes] / step_s
         parts_w: Vector | float = 0.0
-        for weight, node, state in zip(scheme.ends, scheme.nodes, states):
+        for weight, node, state in zip(scheme.weights[-1], scheme.nodes, states):
             parts_w = parts_w + weight * system.part_heat_w(state, time_s + node * step_s)
             kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s)
         return system.by_group(np.concatenate([parts_w, fixed.facet_shares @ kept_w]))
 
     def _error(self, start_k: Vector, inner_w: list[Vector], time_s: float, step_s: float) -> float:
         """Return the largest error, [K], from the scheme of the next order; sums over pieces leave conduction out."""
-        system, scheme = self.system, self.scheme
+        system, scheme = self.system, self._scheme
         assert scheme.estimate is not None
         implicit = scheme.weights[-1][-1]
-        more = [float(part) / implicit for part in np.array(scheme.estimate) - np.array([0.0, *scheme.ends])]
+        more = [float(part) / implicit for part in np.array(scheme.estimate) - np.array([0.0, *scheme.weights[-1]])]
         exchanged_w = system.exchanged_heat(start_k, time_s)
         exchange_w = sum((part * flow_w for part, flow_w in zip(more[1:], inner_w)), more[0] * exchanged_w)
         difference_w = exchange_w - more[0] * system.conducted_heat(start_k)
@@ -143,14 +136,8 @@ class RungeKutta:
     def _equation(self, time_s: float, step_s: float) -> ImplicitEquation:
         time_s = time_s if self.system.matrix_in_time else 0.0
         # Lengths computed as differences of times differ in the last digits.
-        alike = (
-            key for key in self._equations if key[0] == time_s and math.isclose(key[1], step_s, rel_tol=_SAME_LENGTH)
-        )
-        key = next(alike, (time_s, step_s))
-        equation = self._equations.pop(key, None)
-        if equation is None:
-            equation = ImplicitEquation(self.system, time_s, step_s, relative_tolerance=self._relative_tolerance)
-        self._equations[key] = equation
-        while len(self._equations) > _KEPT_EQUATIONS:
-            del self._equations[next(iter(self._equations))]
+        if self._kept and self._kept[0] == time_s and math.isclose(self._kept[1], step_s, rel_tol=_SAME_LENGTH):
+            return self._kept[2]
+        equation = ImplicitEquation(self.system, time_s, step_s, relative_tolerance=self._relative_tolerance)
+        self._kept = time_s, step_s, equation
         return equation

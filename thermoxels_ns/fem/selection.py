@@ -57,11 +57,6 @@ class Selection:
         centroids = self.mesh.points_m[self.mesh.facets[facets]].mean(axis=1)
         return Places(centroids, self.facet_normal[facets], self.up)
 
-    def tet_places(self, tets: IntArray) -> Places:
-        """Return the centroids of tetrahedra as places without normals."""
-        centroids = self.mesh.points_m[self.mesh.tets[tets]].mean(axis=1)
-        return Places(centroids, np.zeros_like(centroids), self.up)
-
 
 def matching_names(names: Collection[str], pattern: str) -> list[str]:
     """Return the names that match a pattern; without `*`, `?` and `[` the pattern matches only the name equal to it.

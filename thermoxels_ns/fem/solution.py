@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
@@ -68,18 +67,15 @@ class HeatSolution:
     heat_content_j: FloatArray
     """Heat content above absolute zero at each time, 1^T M T with T in kelvin, shape (s + 1,), [J]."""
     energy_residual: float
-    """Largest change of the heat content that no heat flow accounts for, relative to the heat content at the start or
-    to all heat exchanged, whichever is more."""
-    energy_residual_of_spread: float
-    """The same change relative to the heat in the initial differences, sum m_i |T_i - mean T|, plus all heat
-    exchanged; 0 if heat flows account for every change."""
+    """Largest change of the heat content that no heat flow accounts for, relative to the heat in the initial
+    differences, sum m_i |T_i - mean T|, plus all heat exchanged."""
     status: str  # Sentences on how the steps converged
     iterations: IntArray  # Iterations of the linear solver in each interval, shape (s,)
     effects: tuple[EffectHeat, ...] = ()  # Heat that each effect of the problem brought, in the order of the problem
     newton_iterations: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
     steps: int = 0  # Number of steps
-    time_error_k: float = float("nan")
+    time_error_k: float = math.nan
     """Estimated largest error that the steps make in any temperature, [K]. Adaptive steps: the sum of their estimates;
     equal steps: from steps of twice the length, if asked for; else NaN."""
     unbalanced_w: float = 0.0  # Most heat that a step left unbalanced at all nodes, round-off included, [W]
@@ -87,8 +83,6 @@ class HeatSolution:
     """Most by which a temperature left the range of the start and of the surroundings, [K]; 0 if at most 0.01 K."""
     last_facet_heat: tuple[FacetHeat, ...] = ()
     """Heat flow of each effect through boundary triangles at the end, as if fixed nodes stored nothing."""
-    assembled: Counter[str] = field(default_factory=Counter)
-    """How often each kind of form was assembled: stiffness, mass, convection, flux, radiation, source, fixed."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +96,6 @@ class SteadySolution:
     status: str  # Sentences on how the iterations converged
     iterations: int  # Iterations of the linear solver
     newton_iterations: int  # Steps of Newton's method; 0 without radiation
-    assembled: Counter[str]  # How often each kind of form was assembled
     edge_temperature_c: FloatArray = field(default_factory=lambda: np.zeros(0))
     """Temperatures of the middles of the mesh's edges, in the order of `mesh_edges`, shape (e,), [degrees Celsius];
     empty with linear tetrahedra."""

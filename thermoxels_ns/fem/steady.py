@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation
@@ -50,7 +50,8 @@ def solve_steady(
     group_heat = heat_of_groups_w(system, relative_k)
     flows_w = 0.0 if system.is_still(relative_k, 0.0) else max(solution.flows_w, 0.5 * np.abs(group_heat).sum())
     temperature_c = relative_k + system.reference_c
-    overshoot_k, overshoot = _overshoot(system, relative_k)
+    low, high = system.surroundings_k(0.0)  # a steady state does not depend on its start
+    overshoot_k, overshoot = out_of_range(max(low - float(relative_k.min()), float(relative_k.max()) - high))
     return SteadySolution(
         temperature_c=temperature_c[:num_mesh_nodes],
         effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
@@ -58,7 +59,6 @@ def solve_steady(
         status=f"The steady state was found. {solution.status}{overshoot}",
         iterations=solution.iterations,
         newton_iterations=solution.newton_iterations,
-        assembled=system.assembled,
         edge_temperature_c=temperature_c[num_mesh_nodes:],
         unbalanced_w=solution.unbalanced_w,
         overshoot_k=overshoot_k,
@@ -66,18 +66,12 @@ def solve_steady(
     )
 
 
-def _overshoot(system: HeatSystem, relative_k: Vector) -> tuple[float, str]:
-    """Return how far temperatures leave the range of the surroundings, [K], and a sentence on this; else (0, "")."""
-    low, high = system.surroundings_k(0.0)  # a steady state does not depend on its start
-    beyond_k = np.maximum(low - relative_k, relative_k - high)
-    outside = int(np.count_nonzero(beyond_k > OVERSHOOT_K))
-    if not outside:
+def out_of_range(beyond_k: float) -> tuple[float, str]:
+    """Return how far temperatures leave their range, [K], and a sentence on this; (0, "") up to `OVERSHOOT_K`."""
+    if beyond_k <= OVERSHOOT_K:
         return 0.0, ""
-    most_k = float(beyond_k.max())
-    return most_k, (
-        f" The temperature of {outside} of {system.num_nodes} nodes is up to {most_k:.2g} K out of the range of the "
-        "surroundings: the mesh does not resolve a jump there."
-    )
+    said = f" A temperature left its range by up to {beyond_k:.2g} K: the mesh or the steps do not resolve a jump."
+    return beyond_k, said
 
 
 def heat_of_groups_w(system: HeatSystem, relative_k: Vector) -> Vector:
@@ -98,18 +92,16 @@ def refuse_too_cold(system: HeatSystem, relative_k: Vector) -> None:
 
 def _check_held(system: HeatSystem) -> None:
     """Raise `HeatError` if a connected piece has nothing that sets its temperature in a steady state."""
-    loose = np.flatnonzero(~system.exchanging_pieces(0.0))
+    pieces, forms = system.pieces, system.surface_forms
+    held = np.concatenate([system.fixed.nodes, *(form.exchanging_nodes(0.0) for form in forms)])
+    loose = np.flatnonzero(~pieces.touched(held))
     if len(loose):
+        sizes = np.bincount(pieces.number)
+        largest = loose[np.argmax(sizes[loose])]
+        points = system.space.points_m[pieces.number == largest]
+        low, high = (", ".join(f"{part:.4g}" for part in end) for end in (points.min(axis=0), points.max(axis=0)))
+        got = f"none on {len(loose)} of {pieces.count} pieces; the largest has {sizes[largest]} nodes in the box from "
+        got += f"({low}) to ({high}) m"
         remedy = "Remove the piece, give its boundary an effect, or follow it through time instead."
-        got = f"none on {len(loose)} of {system.pieces.count} pieces; {_largest(system, loose)}"
         expected = "convection, radiation, ground contact or a fixed temperature on every connected piece of a body"
         raise HeatError("steady heat problem", expected=expected, got=got, remedy=remedy)
-
-
-def _largest(system: HeatSystem, chosen: IntArray) -> str:
-    """Return words on the size and place of the largest of the pieces `chosen`."""
-    sizes = np.bincount(system.pieces.number, minlength=system.pieces.count)
-    piece = int(chosen[np.argmax(sizes[chosen])])
-    points = system.space.points_m[system.pieces.number == piece]
-    low, high = (", ".join(f"{part:.4g}" for part in corner) for corner in (points.min(axis=0), points.max(axis=0)))
-    return f"the largest has {sizes[piece]} nodes in the box from ({low}) to ({high}) m"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -87,8 +86,6 @@ class HeatSystem:
     def __init__(self, problem: HeatProblem, *, order: int = 1) -> None:
         """Turn effects into forms and assemble the stiffness; `order` 1: linear tetrahedra, 2: quadratic ones."""
         self.problem = problem
-        self.assembled: Counter[str] = Counter()
-        """How often each kind of form was assembled."""
         start = problem.start_c
         # The middle of the range, not the mean: exact for a uniform temperature.
         self.reference_c: float = 0.5 * (float(start.min()) + float(start.max()))
@@ -107,8 +104,6 @@ class HeatSystem:
         fixed = tuple(form for form in forms if isinstance(form, FixedForm))
         self.fixed: FixedNodes = FixedNodes(fixed, self.num_nodes)
         """Nodes whose temperature is given."""
-        self.assembled.update({"fixed": len(fixed)} if fixed else {})
-        self.assembled["stiffness"] += 1
         self.stiffness: sparse.csr_matrix = self.space.stiffness(problem.conductivity_w_mk)
         """Stiffness K, integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
         self.pieces: Pieces = Pieces(self.stiffness)
@@ -117,8 +112,6 @@ class HeatSystem:
         """True if the convection matrix R changes with time."""
         self.nonlinear: bool = bool(self._radiation)
         """True if there is radiation."""
-        self.exchanges: bool = bool(self._exchanging)
-        """True if there is convection, radiation, a flux or a source."""
         groups, numbers = list[tuple[str, str]](), [np.zeros(0, np.int64)]
         for form in self._every_form:
             names, of_part = problem.mesh.region_names, problem.mesh.region
@@ -143,7 +136,6 @@ class HeatSystem:
     @cached_property
     def nodal_mass_j_k(self) -> Vector:
         """Diagonal of the lumped mass matrix of linear tetrahedra, shape (n,), [J / K]."""
-        self.assembled["mass"] += 1
         mesh = self.problem.mesh
         return lumped_mass(mesh.points_m, mesh.tets, self.problem.heat_capacity_j_m3k)
 
@@ -159,7 +151,6 @@ class HeatSystem:
             return None
         total = sparse.csr_matrix(self.stiffness.shape)
         for form in self._convection:
-            self.assembled["convection"] += 1
             total = sparse.csr_matrix(total + form.convection_matrix(time_s))
         most = float(np.max(total.diagonal() / np.maximum(self.stiffness.diagonal(), _LEAST)))
         if not most <= MOST_TIMES_CONDUCTION:
@@ -186,7 +177,6 @@ class HeatSystem:
         def add_up(at_s: float) -> Vector:
             total = np.zeros(self.num_nodes)
             for form in forms:
-                self.assembled[form.kind] += 1
                 total += form.load(at_s)
             return total
 
@@ -196,7 +186,6 @@ class HeatSystem:
         """Return the net heat that radiation brings to each node, shape (n,), [W]."""
         total = np.zeros(self.num_nodes)
         for form in self._radiation:
-            self.assembled["radiation"] += 1
             total += form.load(relative_k, time_s)
         return total
 
@@ -204,7 +193,6 @@ class HeatSystem:
         """Return minus the derivative of `radiation_load` by the temperatures, shape (n, n), [W / K]."""
         total = sparse.csr_matrix((self.num_nodes, self.num_nodes))
         for form in self._radiation:
-            self.assembled["radiation"] += 1
             total = sparse.csr_matrix(total + form.slope(relative_k, time_s))
         return total
 
@@ -238,9 +226,7 @@ class HeatSystem:
     def net_heat_at_fixed(self, relative_k: Vector, time_s: float) -> Vector:
         """Return `net_heat` at the fixed nodes only, shape (d,), [W]."""
         nodes = self.fixed.nodes
-        if len(nodes) == 0:
-            return np.zeros(0)
-        return self.exchanged_heat(relative_k, time_s)[nodes] - self._fixed_rows @ self.pieces.without_means(relative_k)
+        return self.net_heat(relative_k, time_s)[nodes] if len(nodes) else np.zeros(0)
 
     def part_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Return the heat into each triangle or tetrahedron of every effect but fixed temperatures, [W]."""
@@ -265,27 +251,12 @@ class HeatSystem:
             if form.kind != "source"
         )
 
-    def exchanging_pieces(self, time_s: float) -> BoolArray:
-        """Return True for each piece whose temperature convection, radiation or fixed nodes determine, shape (p,)."""
-        marks = self.pieces.touched(self.fixed.nodes)
-        for form in self.surface_forms:
-            marks |= self.pieces.touched(form.exchanging_nodes(time_s))
-        return marks
-
     def is_still(self, relative_k: Vector, time_s: float) -> bool:
         """Return whether all temperatures, of body and surroundings, are equal up to `NOTHING` times absolute ones."""
         ends = np.array([*self.surroundings_k(time_s), relative_k.min(), relative_k.max()])
         ends = ends[np.isfinite(ends)]
         level_k = float(np.abs(ends).max()) + abs(self.reference_c + ZERO_CELSIUS_K)
         return float(np.ptp(ends)) <= NOTHING * level_k
-
-    def allowed_range_k(self, start_k: tuple[float, float], times_s: tuple[float, ...]) -> tuple[float, float]:
-        """Widen the range `start_k`, (lowest, highest), [K], by the temperatures of all surroundings at `times_s`.
-
-        No temperature leaves the range in a step. Cooling by a flux or source widens it to -inf, heating to inf.
-        """
-        ends = [start_k, *map(self.surroundings_k, times_s)]
-        return min(low for low, _ in ends), max(high for _, high in ends)
 
     def surroundings_k(self, time_s: float) -> tuple[float, float]:
         """Return lowest, highest temperature around the body, [K]; -inf if a flux or source cools, inf if it heats."""
@@ -301,7 +272,3 @@ class HeatSystem:
             heat_w = form.part_heat_w(np.zeros(0), time_s)
             low, high = -np.inf if np.any(heat_w < 0.0) else low, np.inf if np.any(heat_w > 0.0) else high
         return low, high
-
-    @cached_property
-    def _fixed_rows(self) -> sparse.csr_matrix:
-        return sparse.csr_matrix(self.stiffness[self.fixed.nodes])
