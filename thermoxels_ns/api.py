@@ -166,7 +166,6 @@ def solve(
     from thermoxels_ns.mesh.files.vtu import any_mesh
 
     around, allowed = scene if isinstance(scene, HeatScene) else load_heat_scene(scene), Goals(**goals)
-    allowed.check_fits(around.time)
     body, about = any_mesh(mesh, up)
     with threadpool_limits(1, "blas"):
         return run_scene(around, body, allowed, up=about.get("up"), probes_m=probes_m, export=about, say=say)

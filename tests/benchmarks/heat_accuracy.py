@@ -38,7 +38,7 @@ from thermoxels_ns.fem.runge_kutta import BACKWARD_EULER, SDIRK2
 from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.fem.tolerance import Tolerance, difference_between, solve_to_tolerance
+from thermoxels_ns.fem.tolerance import Goals, difference_between, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection
 
 DURATION_S = 32.0
@@ -141,8 +141,9 @@ class HeatAccuracy:
         error: Callable[[Any], ErrorSize],
     ) -> list[Row]:
         """Rows of all settings by hand and of the driver with each tolerance, which take turns."""
-        options: dict[str, Any] = {"duration_s": duration_s, "outputs": OUTPUTS, "log": lambda line: None}
-        driven = {("driver", f"{k}"): partial(solve_to_tolerance, given, Tolerance(k), **options) for k in tolerances}
+        time = None if duration_s is None else AdaptiveSteps(duration_s, outputs=OUTPUTS)
+        options: dict[str, Any] = {"time": time, "log": lambda line: None}
+        driven = {("driver", f"{k}"): partial(solve_to_tolerance, given, Goals(k), **options) for k in tolerances}
         seconds, results = take_turns({**by_hand, **driven}, self.repeats)
         rows, errors = [], {}
         for one in by_hand:

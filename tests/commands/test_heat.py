@@ -274,7 +274,6 @@ def test_a_tolerance_in_time_keeps_the_scenes_times(folder, tmp_path) -> None:
     [
         ({"tolerance": 0.0}, "tolerance_k: expected"),
         ({"flow_tolerance": 2.0}, "flow_tolerance: expected"),
-        ({"flow_tolerance": 0.1}, "flow_tolerance: expected"),
         ({"leave_out_below": -1.0}, "leave_out_below: expected"),
         ({"tolerance": 0.1, "leave_out_below": 0.1}, "leave_out_below: expected"),
         ({"memory_gb": 1e-5}, "memory of the heat problem: expected"),

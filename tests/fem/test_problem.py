@@ -47,7 +47,6 @@ def moved(values: np.ndarray, place: Any, value: float) -> np.ndarray:
 STEPS: Refused = [
     ("tolerance_k", lambda: Goals(tolerance_k=0.0)),
     ("flow_tolerance", lambda: Goals(flow_tolerance=1.5)),
-    ("flow_tolerance", lambda: Goals(flow_tolerance=0.1).check_fits(TimeSteps(1, 60.0))),
     ("leave_out_below", lambda: Goals(flow_tolerance=0.05, leave_out_below=0.01)),
     ("memory_gb", lambda: Goals(memory_gb=-1.0)),
     ("step_seconds", lambda: TimeSteps(10, 1e308)),

@@ -16,7 +16,7 @@ from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.tolerance import Tolerance, solve_to_tolerance
+from thermoxels_ns.fem.tolerance import Goals, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection, FixedTemperature
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -137,7 +137,7 @@ def test_a_tolerance_of_heat_flows_is_met_on_flat_cells() -> None:
 
     With 0.01 it was not met, for want of a solution: the estimate holds what is left of the singular edge.
     """
-    found = solve_to_tolerance(problem_of(GC10A, share=2.5), Tolerance(None, 0.03), log=lambda _: None)
+    found = solve_to_tolerance(problem_of(GC10A, share=2.5), Goals(None, 0.03), log=lambda _: None)
     error = abs(8.0 * float(found.solution.effects[0].heat_w[0]) / EXACT_GC10A_W - 1.0)
     assert "converged in" in found.solution.status
     assert found.met and found.settings.order == 2 and error < found.settings.error.heat_flow

@@ -54,7 +54,7 @@ class Heat:
     steady state is estimated all the same."""
     flow_tolerance: float | None = None
     """Largest error that the mean heat flow of any effect may have, as a share of all heat that flows through the body,
-    such as 0.01. A scene with a duration needs --tolerance as well; for a steady scene this option is enough."""
+    such as 0.01."""
     memory_gb: float = 4.0
     """Most memory that solving may take, [GiB]. A computation that needs more is refused before it starts."""
     allow_unmet: bool = False
@@ -122,7 +122,6 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
         memory_gb=options.memory_gb,
         allow_unmet=options.allow_unmet,
     )
-    goals.check_fits(scene.time)
     mesh = read_mesh(mesh_file)
     export = read_export_summary(mesh_file, say)
     up = export.get("up") if options.up is None else options.up
@@ -180,8 +179,8 @@ def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
         "accuracy": None
         if accuracy is None
         else {
-            "tolerance_k": accuracy.tolerance.temperature_k,
-            "flow_tolerance": accuracy.tolerance.heat_flow,
+            "tolerance_k": accuracy.goals.tolerance_k,
+            "flow_tolerance": accuracy.goals.flow_tolerance,
             "met": accuracy.met,
             "estimated_k": accuracy.settings.error.temperature_k,
             "estimated_flow": accuracy.settings.error.heat_flow,

@@ -49,11 +49,6 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
     )
 
 
-def refined_values(mesh: TetMesh, nodal: FloatArray) -> FloatArray:
-    """Return values at the nodes of `refine_mesh(mesh)` from `nodal`, the values at the nodes of `mesh`."""
-    return np.concatenate([nodal, mesh_edges(mesh.tets, len(mesh.points_m)).midpoints(nodal)])
-
-
 _OPPOSITE = ((4, 9), (6, 8), (7, 5))  # Pairs of middles of opposite edges; numbers 4 to 9 follow `TET_EDGES`
 
 

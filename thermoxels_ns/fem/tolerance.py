@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-import time
+import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
-from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
-from thermoxels_ns.fem.solution import ErrorSize, Solution, SteadySolution, mean_flows_w, share_of_heat
+from thermoxels_ns.core.yaml_records import record
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, Positive, TimeSteps
+from thermoxels_ns.fem.refine_mesh import refine_mesh
+from thermoxels_ns.fem.solution import ErrorSize, HeatSolution, Solution, SteadySolution, mean_flows_w, share_of_heat
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.time_loop import Progress, solve_heat
 
-DEFAULT_MEMORY_BYTES = 4 * 2**30  # Most memory that a solution may need, [bytes]
+LEAVE_OUT_BELOW = 0.005
+"""Largest share of all heat that the effects left out may bring together: half of the error that building physics
+allows for a heat flow (ISO 10211: 1 %)."""
 HALVED = 0.3
 """Share of an error that is left after the mesh size is halved. Theory says 1/4 where temperatures are
 smooth, and 0.4 at the edges of a notch of a right angle, where temperatures behave as r^(2/3)."""
@@ -33,31 +38,55 @@ _FINER_STEPS, _LEFT_BY_STEPS, _STEPS_SHARE = 0.25, 0.4, 0.5
 """Tolerance of the steps that tell the error of others, as a share of theirs; the share of the error that these leave
 (0.25^(2/3): errors of single steps, of third order, add up in a body that does not forget them; else 0.25); most of the
 allowed error that steps may make."""
+_NONE = ErrorSize(0.0, 0.0)
 _MOST_TRIES = 6  # Tolerances of steps that are tried; a larger error than allowed then counts as what it is
 _BYTES_PER_TET, _BYTES_PER_FACET = {1: 400.0, 2: 2600.0}, {1: 600.0, 2: 4000.0}
 """Most memory by order of the tetrahedra, [bytes], measured with convection and radiation; about half without both."""
 
 
-@dataclass(frozen=True)
-class Tolerance:
-    """Errors that a user allows, above 0; None: any error. At least one of the two is given."""
+@record(HeatError)
+class Goals:
+    """The errors and the memory that a solution may have; raises `HeatError` if numbers are out of range or clash."""
 
-    temperature_k: float | None = 0.05
-    """Largest error of the temperature at any node of the mesh, [K]. The default is half of the error that building
-    physics allows (ISO 10211: 0.1 K)."""
-    heat_flow: float | None = None
-    """Largest error of the mean heat flow that any effect brings, as a share of all heat that flows through the body;
-    building physics allows 0.01 (ISO 10211)."""
+    tolerance_k: Positive | None = None  # Largest allowed error of any temperature, [K]; None: any error
+    flow_tolerance: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
+    """Largest allowed error of the mean heat flow of any effect, as a share of all heat; None: any error."""
+    leave_out_below: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    """Share of all heat that effects left out may bring together; None: `LEAVE_OUT_BELOW`, or 0 beside a tolerance."""
+    memory_gb: Positive | None = 4.0  # Most memory that solving may take, [GiB]; None: any amount
+    allow_unmet: bool = False  # True: if a tolerance cannot be met, return the best solution that fits into memory
+
+    def __post_init__(self) -> None:
+        if self.estimated and self.leave_out_below:
+            expected, remedy = "0 or nothing beside a tolerance", "Remove one of the two."
+            raise HeatError("leave_out_below", expected=expected, got=f"{self.leave_out_below:g}", remedy=remedy)
+
+    @property
+    def estimated(self) -> bool:
+        """True if a tolerance is given, so that errors must be estimated."""
+        return self.tolerance_k is not None or self.flow_tolerance is not None
+
+    @property
+    def left_out_share(self) -> float:
+        """Largest share of all heat that the effects left out may bring together."""
+        if self.leave_out_below is not None:
+            return self.leave_out_below
+        return 0.0 if self.estimated else LEAVE_OUT_BELOW
+
+    @property
+    def memory_bytes(self) -> float:
+        """Most memory that solving may take, [bytes]."""
+        return np.inf if self.memory_gb is None else self.memory_gb * 2**30
 
     def excess(self, error: ErrorSize) -> float:
         """Return the larger ratio of an error, that of heat flow times `MARGIN`, to its allowed value; met up to 1."""
-        pairs = (error.temperature_k, self.temperature_k), (MARGIN * error.heat_flow, self.heat_flow)
+        pairs = (error.temperature_k, self.tolerance_k), (MARGIN * error.heat_flow, self.flow_tolerance)
         return max(found / allowed for found, allowed in pairs if allowed is not None)
 
     def describe(self) -> str:
         """Return the allowed errors as text, such as "0.05 K and 1 % of the heat flow"."""
-        parts = [] if self.temperature_k is None else [f"{self.temperature_k:g} K"]
-        parts += [] if self.heat_flow is None else [f"{100.0 * self.heat_flow:g} % of the heat flow"]
+        parts = [] if self.tolerance_k is None else [f"{self.tolerance_k:g} K"]
+        parts += [] if self.flow_tolerance is None else [f"{100.0 * self.flow_tolerance:g} % of the heat flow"]
         return " and ".join(parts)
 
 
@@ -88,7 +117,7 @@ class ToleratedSolution:
 
     solution: Solution  # Temperatures and heat flows; nodes of the given mesh come first
     problem: HeatProblem  # The problem that was solved: the given problem, or the same on a finer mesh
-    tolerance: Tolerance  # Errors that were allowed
+    goals: Goals  # Errors that were allowed
     settings: Level  # Order, refinements and steps of `solution`, and its estimated errors
     met: bool  # True if the estimated errors are within the tolerance
     status: str  # The outcome as a sentence, with the estimate and the seconds
@@ -98,16 +127,13 @@ class ToleratedSolution:
 
 def solve_to_tolerance(
     problem: HeatProblem,
-    tolerance: Tolerance,
+    goals: Goals,
+    time: TimeSteps | AdaptiveSteps | None = None,
     *,
-    duration_s: float | None = None,
-    outputs: int = 10,
-    memory_bytes: float = DEFAULT_MEMORY_BYTES,
-    allow_unmet: bool = False,
     log: Callable[[str], None] = print,
-    progress: Callable[[float, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> ToleratedSolution:
-    """Solve a problem on a mesh and in time steps so fine that the estimated errors are within `tolerance`.
+    """Solve a problem on a mesh and in time steps so fine that the estimated errors meet `goals`.
 
     The difference of two solutions tells the errors of both, because the error of the finer solution is a known share
     of the error of the coarser one (Richardson 1911): `TO_QUADRATIC` or `HALVED`.
@@ -120,49 +146,117 @@ def solve_to_tolerance(
 
     Args:
         problem: Body, materials, initial temperatures and effects.
-        tolerance: Allowed errors.
-        duration_s: Time to follow the body for, [s], which needs `tolerance.temperature_k`; None: the steady state.
-        outputs: Number of equal intervals at whose ends temperatures are kept and compared.
-        memory_bytes: Most memory that a solution may need, [bytes].
-        allow_unmet: Return the best solution that fits into memory, with `met` False, instead of raising.
+        goals: Allowed errors, one at least, and memory.
+        time: Duration, and the times at which temperatures are kept and compared; None: the steady state.
         log: Called with a line on each solution and a line on the outcome; print by default.
         progress: Called in each solution through time as `progress` of `solve_heat`.
 
     Raises:
         HeatError: The tolerance cannot be met within the memory, or a solution fails.
     """
-    if duration_s is None:
+    solved, begin_s = list[tuple[Level, HeatProblem, Solution]](), clock.perf_counter()
 
-        def solve_state(problem: HeatProblem, order: int) -> Solution:
-            return solve_steady(problem, order=order, relative_tolerance=_STEADY_TOLERANCE)
+    def lacks_memory(order: int, refinements: int) -> str:
+        """Return why a solution with the mesh size halved `refinements` times does not fit in memory, "" if it does."""
+        times = 1 if time is None else len(time.times_s)
+        needed = peak_bytes(problem, order=order, refinements=refinements, times=times)
+        where = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
+        what = f"P{order} on {where} needs about {describe_bytes(needed)}"
+        if needed <= goals.memory_bytes:
+            log(f"{what} at most.")
+            return ""
+        what += f", more than the {describe_bytes(goals.memory_bytes)} allowed (--memory-gb)"
+        if not solved:
+            remedy = "Allow more memory (--memory-gb), or use a coarser mesh."
+            raise HeatError("memory_bytes", expected="room for a first estimate", got=what, remedy=remedy)
+        return what
 
-        run = _Run(problem, tolerance, memory_bytes, log)
-        return run.close(_refine(run, solve_state, 2, 0), allow_unmet)
-    allowed_k = tolerance.temperature_k
-    assert allowed_k is not None, "steps in time are chosen by it"
-    run = _Run(problem, tolerance, memory_bytes, log, times=outputs + 1)
-    steps: list[AdaptiveSteps] = []
+    def keep(problem: HeatProblem, solution: Solution, refinements: int, error: ErrorSize, seconds: float) -> None:
+        """Put a solution whose mesh makes an `error` into `solved`."""
+        edges, steps_k = 0, None
+        if isinstance(solution, SteadySolution):
+            edges = len(solution.edge_temperature_c)
+        else:
+            steps_k = of_steps.temperature_k
+            solution = replace(solution, time_error_k=steps_k)
+        error = ErrorSize(error.temperature_k + of_steps.temperature_k, error.heat_flow + of_steps.heat_flow)
+        nodes = solution.temperature_c.shape[-1] + edges
+        level = Level(2 if edges else 1, refinements, steps_k, nodes, error, seconds)
+        solved.append((level, problem, solution))
+        log(level.describe())
 
-    def follow(problem: HeatProblem, steps: AdaptiveSteps) -> Solution:
-        return solve_heat(problem, steps, relative_tolerance=_STEP_TOLERANCE, progress=progress)
-
-    def solve_in_time(problem: HeatProblem, _: int) -> Solution:
-        if steps:
-            return follow(problem, steps[0])
-        tried = AdaptiveSteps(duration_s, allowed_k, outputs=outputs)
-        found = follow(problem, tried)
-        for _ in range(_MOST_TRIES):
-            finer = replace(tried, tolerance_k=_FINER_STEPS * tried.tolerance_k)
-            better = follow(problem, finer)
-            apart = difference_between(found, better, len(problem.mesh.points_m))
-            run.of_steps = richardson(apart, ErrorSize(_LEFT_BY_STEPS, _LEFT_BY_STEPS))[0]
-            if tolerance.excess(run.of_steps) <= _STEPS_SHARE:
+    order, refinements = (2, 0) if time is None else (1, 1)  # of the second solution
+    failure = lacks_memory(order, refinements)
+    if time is None:
+        before, steps, of_steps = solve_steady(problem, order=1, relative_tolerance=_STEADY_TOLERANCE), None, _NONE
+        finer = replace(problem, initial_temperature_c=before.temperature_c)
+    else:
+        before, steps, of_steps = _in_good_steps(problem, time, goals, progress)
+        finer = _halved(problem)
+    seconds = clock.perf_counter() - begin_s
+    while not failure:
+        first_s, start_s = seconds, clock.perf_counter()
+        try:
+            if steps is None:
+                solution = solve_steady(finer, order=order, relative_tolerance=_STEADY_TOLERANCE)
+            else:
+                solution = solve_heat(finer, steps, relative_tolerance=_STEP_TOLERANCE, progress=progress)
+            seconds = clock.perf_counter() - start_s
+        except HeatError as refusal:
+            if order == 1 or refinements:
+                failure = str(refusal)
                 break
-            tried, found = finer, better
-        steps.append(tried)
-        return found
+            log(f"P2 failed: {refusal} Linear tetrahedra of half the size follow.")
+            order = 1
+        else:
+            left = TO_QUADRATIC if (order, refinements) == (2, 0) else _LEFT[order]
+            coarse, fine = richardson(difference_between(before, solution, len(problem.mesh.points_m)), left)
+            if not solved:
+                keep(problem, before, 0, coarse, first_s)
+            keep(finer, solution, refinements, fine, seconds)
+            if any(goals.excess(level.error) <= 1.0 for level, _, _ in solved):
+                break
+            before = solution
+        refinements += 1
+        failure = lacks_memory(order, refinements)
+        if not failure:
+            finer = _halved(finer, None if time else before)
+    if not solved:
+        raise HeatError(failure)
+    # The smallest solution within the tolerance, or else the most exact one.
+    settings, chosen, solution = min(solved, key=lambda one: max(goals.excess(one[0].error), 1.0))
+    seconds, levels = clock.perf_counter() - begin_s, (*(one[0] for one in solved if one[2] is not solution), settings)
+    within = "Not within" if failure else "Within"
+    status = f"{within} {goals.describe()}: {settings.describe()}, {seconds:.2f} s in all."
+    if failure:
+        status += (
+            f" {failure.rstrip('.')}. Allow a larger error, or take what there is (--allow-unmet True); the worst "
+            "temperature is often at a sharp edge."
+        )
+        if time is None and goals.flow_tolerance is None:
+            status += " Heat flows are met far sooner: ask for them instead (--flow-tolerance 0.01)."
+        if not goals.allow_unmet:
+            raise HeatError(status)
+    log(status)
+    return ToleratedSolution(solution, chosen, goals, settings, not failure, status, seconds, levels)
 
-    return run.close(_refine(run, solve_in_time, 1, 1), allow_unmet)
+
+def _in_good_steps(
+    problem: HeatProblem, time: TimeSteps | AdaptiveSteps, goals: Goals, progress: Progress | None
+) -> tuple[HeatSolution, AdaptiveSteps, ErrorSize]:
+    """Return a solution in steps whose error is small enough, the steps, and their error, which finer steps tell."""
+    steps = AdaptiveSteps(time.duration_s, outputs=len(time.times_s) - 1)
+    steps = steps if goals.tolerance_k is None else replace(steps, tolerance_k=goals.tolerance_k)
+    found = solve_heat(problem, steps, relative_tolerance=_STEP_TOLERANCE, progress=progress)
+    for _ in range(_MOST_TRIES):
+        finer = replace(steps, tolerance_k=_FINER_STEPS * steps.tolerance_k)
+        better = solve_heat(problem, finer, relative_tolerance=_STEP_TOLERANCE, progress=progress)
+        apart = difference_between(found, better, len(problem.mesh.points_m))
+        error = richardson(apart, ErrorSize(_LEFT_BY_STEPS, _LEFT_BY_STEPS))[0]
+        if goals.excess(error) <= _STEPS_SHARE:
+            break
+        steps, found = finer, better
+    return found, steps, error
 
 
 def steady_error(problem: HeatProblem, solution: SteadySolution) -> ErrorSize:
@@ -215,119 +309,9 @@ def describe_bytes(amount: float) -> str:
     return f"{amount / 2**30:.2g} GiB" if amount >= 2**30 else f"{amount / 2**20:.{3 if amount >= 1e8 else 2}g} MiB"
 
 
-class _Run:
-    """The course of one `solve_to_tolerance`: the solutions so far, and the choice among them."""
-
-    def __init__(
-        self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable, times: int = 1
-    ) -> None:
-        self.given, self.tolerance, self._memory_bytes, self.say = problem, tolerance, memory_bytes, log
-        self._times = times
-        self.of_steps = ErrorSize(0.0, 0.0)
-        """Error that time steps make; 0 in steady states."""
-        self.solved: list[tuple[Level, HeatProblem, Solution]] = []
-        self._begin_s = time.perf_counter()
-
-    @property
-    def met(self) -> bool:
-        """True if the estimated error of any solution so far is allowed."""
-        return any(self.tolerance.excess(level.error) <= 1.0 for level, _, _ in self.solved)
-
-    def add(self, problem: HeatProblem, solution: Solution, seconds: float, error: ErrorSize, refinements: int) -> None:
-        """Keep a solution with the `error` of its mesh; `refinements` is how often the mesh size was halved for it."""
-        steady = isinstance(solution, SteadySolution)
-        edges = len(solution.edge_temperature_c) if steady else 0
-        nodes, steps_k = solution.temperature_c.shape[-1] + edges, None if steady else self.of_steps.temperature_k
-        solution = solution if steady else replace(solution, time_error_k=steps_k)
-        of_steps = self.of_steps
-        error = ErrorSize(error.temperature_k + of_steps.temperature_k, error.heat_flow + of_steps.heat_flow)
-        level = Level(2 if edges else 1, refinements, steps_k, nodes, error, seconds)
-        self.solved.append((level, problem, solution))
-        self.say(level.describe())
-
-    def lacks_memory(self, order: int, refinements: int) -> str:
-        """Return why a solution with the mesh size halved `refinements` times does not fit in memory, "" if it does."""
-        needed = peak_bytes(self.given, order=order, refinements=refinements, times=self._times)
-        where = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
-        what = f"P{order} on {where} needs about {describe_bytes(needed)}"
-        if needed <= self._memory_bytes:
-            self.say(f"{what} at most.")
-            return ""
-        return f"{what}, more than the {describe_bytes(self._memory_bytes)} allowed (--memory-gb)"
-
-    def close(self, failure: str, allow_unmet: bool) -> ToleratedSolution:
-        """Return the smallest solution within the tolerance, or if `failure` says why there is none the most exact one.
-
-        Raises:
-            HeatError: There is a `failure` and `allow_unmet` is False, or nothing was solved at all.
-        """
-        if not self.solved:
-            remedy = "Allow more memory (--memory-gb), or use a coarser mesh."
-            raise HeatError("memory_bytes", expected="room for a first estimate", got=failure, remedy=remedy)
-        excess = [self.tolerance.excess(level.error) for level, _, _ in self.solved]
-        sizes = (float(level.num_nodes) for level, _, _ in self.solved)
-        rank = [(size if over <= 1.0 else np.inf, over) for size, over in zip(sizes, excess)]
-        chosen = self.solved[rank.index(min(rank))]
-        levels = *(solved[0] for solved in self.solved if solved is not chosen), chosen[0]
-        last, seconds = chosen[0], time.perf_counter() - self._begin_s
-        allowed = self.tolerance.describe()
-        status = f"{'Not within' if failure else 'Within'} {allowed}: {last.describe()}, {seconds:.2f} s in all."
-        if failure:
-            status += (
-                f" {failure.rstrip('.')}. Allow a larger error, or take what there is (--allow-unmet True); the worst "
-                "temperature is often at a sharp edge."
-            )
-            if last.step_tolerance_k is None and self.tolerance.heat_flow is None:
-                status += " Heat flows are met far sooner: ask for them instead (--flow-tolerance 0.01)."
-        if failure and not allow_unmet:
-            raise HeatError(status)
-        self.say(status)
-        return ToleratedSolution(chosen[2], chosen[1], self.tolerance, last, not failure, status, seconds, levels)
-
-
 def _halved(problem: HeatProblem, start: Solution | None = None) -> HeatProblem:
     """Return the problem on a mesh of half the size; it starts from `start`, or if None from its own start."""
     nodal, edges = (problem.start_c if start is None else start.temperature_c), getattr(start, "edge_temperature_c", ())
-    start_c = np.concatenate([nodal, edges]) if len(edges) else refined_values(problem.mesh, nodal)
-    return replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
-
-
-def _refine(run: _Run, solve: Callable[[HeatProblem, int], Solution], order: int, refinements: int) -> str:
-    """Add finer and finer solutions to `run` until one is within the tolerance; return why none can be, or "".
-
-    `solve` takes a problem and the order of its tetrahedra. The first solution has linear ones on the given mesh, the
-    second has the `order` and `refinements` of the arguments.
-    """
-
-    def timed(problem: HeatProblem, order: int) -> tuple[Solution, float]:
-        begin_s = time.perf_counter()
-        return solve(problem, order), time.perf_counter() - begin_s
-
-    failure = run.lacks_memory(order, refinements)
-    if failure:
-        return failure
-    before, first_seconds = timed(run.given, 1)
-    steady = isinstance(before, SteadySolution)
-    problem = replace(run.given, initial_temperature_c=before.temperature_c) if steady else _halved(run.given)
-    while True:
-        try:
-            solution, seconds = timed(problem, order)
-        except HeatError as refusal:
-            if order == 1 or refinements:
-                return str(refusal)
-            run.say(f"P2 failed: {refusal} Linear tetrahedra of half the size follow.")
-            order = 1
-        else:
-            left = TO_QUADRATIC if (order, refinements) == (2, 0) else _LEFT[order]
-            coarse, fine = richardson(difference_between(before, solution, len(run.given.mesh.points_m)), left)
-            if not run.solved:
-                run.add(run.given, before, first_seconds, coarse, 0)
-            run.add(problem, solution, seconds, fine, refinements)
-            if run.met:
-                return ""
-            before = solution
-        refinements += 1
-        failure = run.lacks_memory(order, refinements)
-        if failure:
-            return failure
-        problem = _halved(problem, before if steady else None)
+    mesh = refine_mesh(replace(problem.mesh, temperature_c=nodal))
+    start_c = np.concatenate([nodal, edges]) if len(edges) else mesh.temperature_c
+    return replace(problem, mesh=mesh, initial_temperature_c=start_c)

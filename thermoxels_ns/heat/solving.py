@@ -6,82 +6,33 @@ import time as clock
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
 
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import HeatError, HeatMemoryError
-from thermoxels_ns.core.yaml_records import record
 from thermoxels_ns.fem.forms import FixedForm, FluxForm, SourceForm, effect_forms
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.solution import Solution, SteadySolution, mean_flows_w
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.time_loop import solve_heat
+from thermoxels_ns.fem.time_loop import Progress, solve_heat
 from thermoxels_ns.fem.tolerance import (
-    Tolerance,
+    Goals,
     ToleratedSolution,
     describe_bytes,
     peak_bytes,
     solve_to_tolerance,
     steady_error,
 )
-from thermoxels_ns.heat.effects import AboveZero, Fraction
 
 Say = Callable[[str], None]
 Time = TimeSteps | AdaptiveSteps | None  # Time steps in which a body is followed; None: its steady state
 
-LEAVE_OUT_BELOW = 0.005
-"""Largest share of all heat that the effects left out may bring together: half of the error that building physics
-allows for a heat flow (ISO 10211: 1 %)."""
 MOST_ESTIMATED = 300_000
 """Most tetrahedra for which the error of the mesh is estimated without being asked for. The estimate solves with
 quadratic tetrahedra, which take 60 times as long as linear ones (131,712 tetrahedra: 5.4 s instead of 0.09 s)."""
 SAY_EVERY_S = 10.0  # Least time between two lines of progress, [s]
-
-
-@record(HeatError)
-class Goals:
-    """The errors and the memory that a solution may have; raises `HeatError` if numbers are out of range or clash."""
-
-    tolerance_k: AboveZero | None = None  # Largest allowed error of any temperature, [K]; None: any error
-    flow_tolerance: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
-    """Largest allowed error of the mean heat flow of any effect, as a share of all heat; None: any error."""
-    leave_out_below: Fraction | None = None
-    """Share of all heat that effects left out may bring together; None: `LEAVE_OUT_BELOW`, or 0 beside a tolerance."""
-    memory_gb: AboveZero | None = 4.0  # Most memory that solving may take, [GiB]; None: any amount
-    allow_unmet: bool = False  # True: if a tolerance cannot be met, return the best solution that fits into memory
-
-    def __post_init__(self) -> None:
-        if self.estimated and self.leave_out_below:
-            expected, remedy = "0 or nothing beside a tolerance", "Remove one of the two."
-            raise HeatError("leave_out_below", expected=expected, got=f"{self.leave_out_below:g}", remedy=remedy)
-
-    @property
-    def estimated(self) -> bool:
-        """True if a tolerance is given, so that errors must be estimated."""
-        return self.tolerance_k is not None or self.flow_tolerance is not None
-
-    @property
-    def left_out_share(self) -> float:
-        """Largest share of all heat that the effects left out may bring together."""
-        if self.leave_out_below is not None:
-            return self.leave_out_below
-        return 0.0 if self.estimated else LEAVE_OUT_BELOW
-
-    @property
-    def memory_bytes(self) -> float:
-        """Most memory that solving may take, [bytes]."""
-        return np.inf if self.memory_gb is None else self.memory_gb * 2**30
-
-    def check_fits(self, time: Time) -> None:
-        """Raise `HeatError` if a solution through `time` has a tolerance of heat flows but none of temperature."""
-        if time is not None and self.flow_tolerance is not None and self.tolerance_k is None:
-            expected = "--tolerance beside it if the scene has a duration"
-            remedy = "Pass --tolerance too: steps in time are chosen by it."
-            raise HeatError("flow_tolerance", expected=expected, got="none", remedy=remedy)
 
 
 @dataclass(frozen=True)
@@ -108,11 +59,10 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
     """Solve a problem without its negligible effects; `say` is called with lines of progress.
 
     Effects that bring little heat at any temperature of start and surroundings are left out at first. If at the
-    solution these bring more than `goals.left_out_share` of all heat, the strongest are put back for a new solution.
+    solution these bring more than `goals.left_out_share` of all heat, all are solved for again.
 
     Raises `HeatError` if it needs more memory than allowed, the solver fails, or the tolerance cannot be met.
     """
-    goals.check_fits(time)
     if not goals.estimated:
         needed = peak_bytes(problem, times=1 if time is None else len(time.times_s))
         say(f"Memory: about {describe_bytes(needed)} at most.")
@@ -121,7 +71,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
             remedy = "Pass a larger --memory-gb, fewer steps or outputs, or export a coarser mesh."
             raise HeatMemoryError("memory of the heat problem", expected=expected, got=got, remedy=remedy)
     labels, left = effect_labels(problem), _weak(problem, time, goals.left_out_share)
-    while True:  # each solution leaves out less than the one before
+    while True:  # twice at most
         kept = replace(problem, effects=tuple(e for n, e in enumerate(problem.effects) if n not in left))
         shown = ", ".join(label for n, label in enumerate(labels) if n not in left)
         say(f"Effects: {shown or 'none, so no heat crosses the surface'}.")
@@ -137,19 +87,15 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
             return _with_mesh_error(found, goals)
         through_w = 0.5 * sum(map(abs, mean_flows_w(found.solution).values()))
         brings_w = _largest_w(problem, left, np.atleast_2d(found.solution.temperature_c))
-        # The smallest effects stay left out, as many as together bring no more heat than allowed.
-        order = sorted(left, key=brings_w.__getitem__)
-        total_w = np.cumsum([brings_w[n] for n in order])
-        still = [n for n, sum_w in zip(order, total_w) if sum_w <= goals.left_out_share * through_w]
-        if len(still) == len(left):
+        if sum(brings_w.values()) <= goals.left_out_share * through_w:
             shares = {n: brings_w[n] / through_w if through_w > 0.0 else 0.0 for n in left}
-            gone = tuple(LeftOut(labels[n], brings_w[n], shares[n]) for n in sorted(left))
+            gone = tuple(LeftOut(labels[n], brings_w[n], shares[n]) for n in left)
             for entry in gone:
                 say(f"Left out: {entry.effect}, up to {entry.heat_w:.3g} W, {entry.share:.2%} of all heat.")
             return _with_mesh_error(replace(found, left_out=gone), goals)
-        back = ", ".join(f"{labels[n]} (up to {brings_w[n]:.3g} W)" for n in sorted(set(left) - set(still)))
+        back = ", ".join(f"{labels[n]} (up to {brings_w[n]:.3g} W)" for n in left)
         say(f"Of {through_w:.3g} W that flow too much is left out: solved again with {back}.")
-        left = still
+        left = []
 
 
 def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
@@ -172,7 +118,7 @@ def _weak(problem: HeatProblem, time: Time, share: float) -> list[int]:
         left_w += power_w[number]
         if left_w <= share * (total_w - left_w) or left_w == 0.0:
             weak.append(number)
-    return weak
+    return sorted(weak)
 
 
 def _largest_w(problem: HeatProblem, chosen: Sequence[int], states_c: FloatArray) -> dict[int, float]:
@@ -201,18 +147,9 @@ def _solve(problem: HeatProblem, time: Time, goals: Goals, say: Say) -> SolvedPr
     if not goals.estimated:
         if time is None:
             return SolvedProblem(problem, solve_steady(problem), (), None)
-        solution = solve_heat(problem, time, estimate_steps=True, progress=_Progress(say))
+        solution = solve_heat(problem, time, estimate_steps=True, progress=_progress(say))
         return SolvedProblem(problem, solution, (), None)
-    found = solve_to_tolerance(
-        problem,
-        Tolerance(goals.tolerance_k, goals.flow_tolerance),
-        duration_s=None if time is None else time.duration_s,
-        outputs=1 if time is None else len(time.times_s) - 1,
-        memory_bytes=goals.memory_bytes,
-        allow_unmet=goals.allow_unmet,
-        log=say,
-        progress=_Progress(say),
-    )
+    found = solve_to_tolerance(problem, goals, time, log=say, progress=_progress(say))
     return SolvedProblem(found.problem, found.solution, (), found)
 
 
@@ -226,24 +163,14 @@ def _with_mesh_error(found: SolvedProblem, goals: Goals) -> SolvedProblem:
     return found
 
 
-class _Progress:
-    """Calls `say` every `SAY_EVERY_S` with the share of time done, and the time left at the pace since the last line.
+def _progress(say: Say) -> Progress:
+    """Return a function for `solve_heat` that says every `SAY_EVERY_S` how much of the time is done."""
+    said_s = clock.perf_counter()
 
-    Adaptive steps begin short, so that the pace since the start would promise too long a time.
-    """
+    def progress(share: float, steps: int) -> None:
+        nonlocal said_s
+        if clock.perf_counter() - said_s >= SAY_EVERY_S:
+            said_s = clock.perf_counter()
+            say(f"{share:.2%} of the time after {steps} steps.")
 
-    def __init__(self, say: Say) -> None:
-        self._say, self._share, self._said_share = say, 0.0, 0.0
-        self._called_s = self._said_s = clock.perf_counter()
-
-    def __call__(self, share: float, steps: int) -> None:
-        """Note the share of the duration that is done and the number of steps; say a line if the last one is old."""
-        if share < self._share:  # the next solution has begun
-            self._said_share, self._said_s = 0.0, self._called_s
-        self._share, self._called_s = share, clock.perf_counter()
-        took_s, done = self._called_s - self._said_s, share - self._said_share
-        if share < 1.0 and done > 0.0 and took_s >= SAY_EVERY_S:
-            left_s = took_s / done * (1.0 - share)
-            left = f"{left_s:.0f} s" if left_s < 120.0 else f"{left_s / 60.0:.0f} min"
-            self._say(f"{share:.2%} of the time after {steps} steps; about {left} left.")
-            self._said_share, self._said_s = share, self._called_s
+    return progress
