@@ -10,14 +10,13 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, HeatFlux
 from thermoxels_ns.heat.run import (
+    air_warnings,
     body_warnings,
-    doubtful_temperatures,
     inner_surface_warnings,
     patch_warnings,
     place_probes,
     run_scene,
     shell_warnings,
-    short_series,
 )
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import OUTSIDE, InsideAir, OutsideAir
@@ -150,19 +149,19 @@ def test_a_series_that_ends_before_the_run_is_named(tmp_path, time) -> None:
     path = tmp_path / "air.csv"
     path.write_text("hours,outside_c\n0,10\n1,12\n")
     airs = {"outside_air": OutsideAir(10.0, "iso-6946-combined", air_series=str(path))}
-    (warning,) = short_series(HeatScene(CONCRETE, time, **airs))
+    (warning,) = air_warnings(HeatScene(CONCRETE, time, **airs))
     scene = HeatScene(CONCRETE, time, adiabatic=("interior*", "cut"), **airs)
     assert warning in run_scene(scene, room(), Goals()).warnings
     assert "outside_air is from 0 to 1 hours" in warning and "from 0 to 2 hours" in warning
-    assert short_series(HeatScene(CONCRETE, TimeSteps(60, 60.0), **airs)) == ()
+    assert air_warnings(HeatScene(CONCRETE, TimeSteps(60, 60.0), **airs)) == ()
 
 
 def test_air_that_was_given_in_kelvin_is_named() -> None:
     airs = {"inside_air": InsideAir(293.15, "iso-6946-combined"), "outside_air": AIRS["outside_air"]}
-    (warning,) = doubtful_temperatures(HeatScene(CONCRETE, **airs))
+    (warning,) = air_warnings(HeatScene(CONCRETE, **airs))
     assert warning in run_scene(HeatScene(CONCRETE, **airs), room(), Goals()).warnings
     assert "The air of inside_air has 293.15 degrees Celsius" in warning and "give air_c: 20." in warning
-    assert doubtful_temperatures(HeatScene(CONCRETE, **AIRS)) == ()
+    assert air_warnings(HeatScene(CONCRETE, **AIRS)) == ()
 
 
 def both(first: TetMesh, second: TetMesh) -> TetMesh:

@@ -21,6 +21,7 @@ from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
 from thermoxels_ns.fem.tolerance import ToleratedSolution
+from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.results import (
     HeatResults,
     WallResult,
@@ -175,7 +176,7 @@ def run_scene(
     probes = place_probes(mesh, np.array(probes_m, dtype=np.float64).reshape(-1, 3))
     about_patches = patch_warnings(scene, mesh, problem.up)
     inner, harmless = ((), ()) if about_patches else inner_surface_warnings(scene, mesh, problem.up)
-    about_scene = (*short_series(scene), *doubtful_temperatures(scene))
+    about_scene = air_warnings(scene)
     over = [one.patch for one in layers if one.body_m2k_w > 1.05 * one.asked_m2k_w]
     if over:
         what = f"The body alone resists more than the audit found: {', '.join(over)}. There the heat loss is too low"
@@ -361,13 +362,18 @@ def with_layers(
     return replace(scene, outside_air=outside, convection=(*scene.convection, *effects)), tuple(layers)
 
 
-def short_series(scene: HeatScene) -> tuple[str, ...]:
-    """Return warnings on air series that do not cover the scene's time."""
-    if scene.time is None:
-        return ()
-    hours, warnings = scene.time.duration_s / 3600.0, []
-    for name, air in (("inside_air", scene.inside_air), ("outside_air", scene.outside_air)):
-        if air is None or air.air_series is None:
+def air_warnings(scene: HeatScene) -> tuple[str, ...]:
+    """Return warnings on airs that were probably given in kelvin, and on series that do not cover the scene's time."""
+    hours, warnings = scene.time.duration_s / 3600.0 if scene.time else 0.0, list[str]()
+    airs = [("inside_air", scene.inside_air), ("outside_air", scene.outside_air)]
+    airs += [(f"convection entry {number}", entry) for number, entry in enumerate(scene.convection, start=1)]
+    for name, air in airs:
+        if air is not None and isinstance(air.air_c, float) and _KELVIN_OF_AIR[0] <= air.air_c <= _KELVIN_OF_AIR[1]:
+            warnings.append(
+                f"The air of {name} has {air.air_c:g} degrees Celsius. If that is meant in kelvin, give air_c: "
+                f"{kelvin_to_celsius(air.air_c):g}."
+            )
+        if air is None or isinstance(air, Convection) or air.air_series is None:
             continue
         begin, end = air.series()[0][[0, -1]].tolist()
         if begin > 0.0 or end < hours * (1.0 - 1e-9):
@@ -377,18 +383,6 @@ def short_series(scene: HeatScene) -> tuple[str, ...]:
                 "series, or a shorter time."
             )
     return tuple(warnings)
-
-
-def doubtful_temperatures(scene: HeatScene) -> tuple[str, ...]:
-    """Return warnings on airs so hot in degrees Celsius that they were probably given in kelvin."""
-    airs = [("inside_air", scene.inside_air), ("outside_air", scene.outside_air)]
-    airs += [(f"convection entry {number}", entry) for number, entry in enumerate(scene.convection, start=1)]
-    return tuple(
-        f"The air of {name} has {air.air_c:g} degrees Celsius. If that is meant in kelvin, give air_c: "
-        f"{kelvin_to_celsius(air.air_c):g}."
-        for name, air in airs
-        if air is not None and isinstance(air.air_c, float) and _KELVIN_OF_AIR[0] <= air.air_c <= _KELVIN_OF_AIR[1]
-    )
 
 
 def body_warnings(mesh: TetMesh) -> tuple[str, ...]:
