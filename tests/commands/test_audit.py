@@ -57,7 +57,6 @@ def test_the_command_writes_answers_page_and_surface(done) -> None:
     assert sorted(path.name for path in done.iterdir()) == ["answers.json", "audit.html", "surface.vtp"]
     answers = json.loads((done / "answers.json").read_text())
     assert {one["name"] for one in answers["patches"]} == {"facade", "window"}
-    assert [one["name"] for one in answers["storeys"]] == ["ground floor", "upper floor"]
     assert [one["kind"] for one in answers["defects"]] == ["line"]
     loss = answers["whole"]["loss_w"]
     assert loss["low"] < loss["value"] < loss["high"]

@@ -304,8 +304,6 @@ class Conditions:
     outside: OutsideAir = field(default_factory=OutsideAir)  # May be left out if the surface was seen from inside
     leave_out: tuple[str, ...] = ()  # Names or patterns of patches that do not count, such as glass or metal
     references: tuple[Reference, ...] = ()  # If there are none, `Camera.offset` is used as stated
-    storeys: dict[str, Annotated[Measured, Unit("m")]] = field(default_factory=dict)
-    """Height of the floor of each storey above the lowest point of the mesh, [m], by name of the storey."""
     survey: Survey = field(default_factory=Survey)
     limits: Limits = field(default_factory=Limits)
     energy: Energy | None = None

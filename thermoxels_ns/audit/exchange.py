@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from thermoxels_ns.audit.conditions import FILM_MODELS, WINDLESS, Conditions, Film, FilmModel
+from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.audit.draws import FORMULA, Draws, emissivity_name
 from thermoxels_ns.audit.heat_flow import (
     FILMS,
@@ -173,18 +173,6 @@ def _convection_w_m2k(conditions: Conditions, draws: Draws, warmer_k: FloatArray
             if part > 0.0 and which.any():
                 found[:, which] += part * film.w_m2k(wind[which], warmer_k[:, which], upward)
     return found
-
-
-def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], ...]:
-    """Return the film models for which the conditions suffice, with conditions that use them; the stated one first."""
-    own = conditions.film
-    windless = conditions.side == "outside" and conditions.outside.wind is None
-    others: list[tuple[FilmModel, Conditions]] = [
-        (model, replace(conditions, film=Film(model, own.factor)))
-        for model in FILM_MODELS[conditions.side]
-        if model not in (own.model, "given") and (not windless or model in WINDLESS)
-    ]
-    return ((own.model, conditions), *others)
 
 
 def most_u_w_m2k(surface: AuditedSurface, conditions: Conditions, which: IntArray) -> float:

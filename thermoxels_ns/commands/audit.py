@@ -303,7 +303,7 @@ def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
         number = surface.selection.patch_names.index(one.name)
         on = every[surface.selection.facet_patch[every] == number]
         most[one.name] = most_u_w_m2k(surface, found.conditions, on)
-    most |= {one.name: max(most.values()) for one in (*found.storeys, found.whole)}
+    most[found.whole.name] = max(most.values())
     widest = [
         name
         for name, share in found.whole.width_shares.items()
@@ -328,7 +328,7 @@ def answers_of(
     from pydantic_core import to_jsonable_python
 
     calibration = found.calibration
-    same = ("conditions", "whole", "patches", "storeys", "defects", "limits", "f_rsi", "energy", "not_counted_m2")
+    same = ("conditions", "whole", "patches", "defects", "limits", "f_rsi", "energy", "not_counted_m2")
     named = ("found", "units", "refused", "moved_most_by", "misfit_k", "history_h", "doubt")
     told = {
         "mesh": options.mesh,
@@ -341,7 +341,7 @@ def answers_of(
         "missing_for_en_13187": found.check.missing,
         "asked_of_survey": found.check.asked,
         "loss_narrower_by_w": found.budget,
-        **{name: getattr(found, name) for name in ("draws", "failing_models", "remembered")},
+        **{name: getattr(found, name) for name in ("draws", "remembered")},
         **({} if envelope is None else {"envelope": envelope.figures()}),
         **({} if compared is None else {"compared": compared}),
     }

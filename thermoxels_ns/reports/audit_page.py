@@ -12,7 +12,7 @@ from thermoxels_ns.audit.compare import Comparison
 from thermoxels_ns.audit.conditions import Survey
 from thermoxels_ns.audit.draws import CONFIDENCE
 from thermoxels_ns.audit.envelope import Envelope
-from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit, asked_of_survey
+from thermoxels_ns.audit.run import F_RSI_M2K_W, Audit, asked_of_survey
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.version import __version__
 from thermoxels_ns.mesh.boundary.planes import FlatElement, plane_axes
@@ -75,8 +75,6 @@ def audit_page(
         compared=compared,
         photographs=defaultdict(tuple, photographs),
         confidence=100.0 * CONFIDENCE,
-        severe_share=SEVERE_SHARE,
-        moderate_share=MODERATE_SHARE,
         f_rsi_m2k_w=F_RSI_M2K_W,
         most_defects=MOST_DEFECTS,
         mesh_name=mesh_name,
