@@ -175,16 +175,14 @@ def _convection_w_m2k(conditions: Conditions, draws: Draws, warmer_k: FloatArray
     return found
 
 
-def most_u_w_m2k(surface: AuditedSurface, conditions: Conditions, which: IntArray) -> float:
-    """Return the U-value that the films of air on both sides allow without any wall, [W/(m2 K)].
+def most_u_w_m2k(surface: AuditedSurface, side: str) -> FloatArray:
+    """Return the U-value that the films of air on both sides allow without any wall, 1 / (Rsi + Rse) of ISO 6946, (f,).
 
-    1 / (Rsi + Rse) of ISO 6946, by the direction in which heat flows through each of the triangles `which`; the mean by
-    area. A larger U-value is impossible: an input clashes with the readings.
+    It follows from the direction in which heat flows through each triangle. A larger U-value is impossible: an input
+    clashes with the readings.
     """
-    upward = surface.upward[which] * (-1.0 if conditions.side == "outside" else 1.0)
-    inside = FILMS["inside"]["iso-6946-combined"].w_m2k(0.0, 0.0, upward)
-    allowed = 1.0 / (1.0 / inside + OUTSIDE_RESISTANCE_M2K_W)
-    return float(np.average(allowed, weights=surface.area_m2[which]))
+    upward = surface.upward * (-1.0 if side == "outside" else 1.0)
+    return 1.0 / (1.0 / FILMS["inside"]["iso-6946-combined"].w_m2k(0.0, 0.0, upward) + OUTSIDE_RESISTANCE_M2K_W)
 
 
 def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draws) -> Draws:

@@ -15,6 +15,7 @@ from thermoxels_ns.audit.conditions import BALANCE, Conditions, Film, Survey, lo
 from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
 from thermoxels_ns.audit.draws import (
     GEOMETRY,
+    REPEATABILITY,
     Draws,
     Interval,
     causes,
@@ -27,6 +28,7 @@ from thermoxels_ns.audit.energy import EnergyResult, year_of
 from thermoxels_ns.audit.exchange import (
     Exchange,
     Parts,
+    most_u_w_m2k,
     reference_doubts,
     triangle_exchange,
     with_references,
@@ -94,6 +96,7 @@ class Element:
     """By cause, largest first, the share by which the interval of the U-value (of the loss, where no U-value is known)
     would be narrower if the cause were known exactly, 0 to 1; shares need not add up to 1."""
     unsupported_share: float  # Share of the area whose position no photograph supports, 0 to 1
+    most_u_w_m2k: float  # U-value that the films of air allow without a wall, see `exchange.most_u_w_m2k`
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,24 @@ class Audit(HasTables):
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
     triangle_u: FloatArray  # U-value, shape (f,), [W/(m2 K)]; NaN: does not count, or no U-value is known
+
+    @property
+    def impossible(self) -> tuple[str, ...]:
+        """Sentences on U-values that reach beyond what the films of air allow, and on what to look at: none or one.
+
+        The sentence names the two inputs that widen the U-value's interval most: one of them clashes with the readings.
+        """
+        over = [one for one in self.patches if one.u_w_m2k.high > one.most_u_w_m2k]
+        if not over:
+            return ()
+        shares = self.whole.width_shares.items()
+        widest = [name for name, share in shares if share > 0.0 and name not in (GEOMETRY, REPEATABILITY)]
+        return (
+            f"Impossible: the U-value of {', '.join(one.name for one in over)} reaches beyond the "
+            f"{min(one.most_u_w_m2k for one in over):.1f} W/(m² K) that the films of air on both sides allow without a "
+            "wall (ISO 6946). What is stated clashes with the readings; look at "
+            f"{' and '.join(widest[:2]) or 'the airs and the camera'} first.",
+        )
 
     def __repr__(self) -> str:
         loss, u = self.whole.loss_w, self.whole.u_w_m2k
@@ -340,7 +361,7 @@ class _Work:
 
         flow_w, area, u = drawn(self.draws, self.flow_w[:count])
         surface_c = members @ (area_m2[:, None] * self.surface_c[:count]) / (members @ area_m2)[:, None]
-        observed = np.isin(of_facet, patches)
+        observed, most_u = np.isin(of_facet, patches), most_u_w_m2k(surface, conditions.side)
         named = [(surface.selection.patch_names[n], of_facet == n) for n in patches]
         found = list[_Drawn]()
         for n, (name, where) in enumerate([*named, ("all that was observed", observed)]):
@@ -355,6 +376,7 @@ class _Work:
                 u_w_m2k=interval_of(u[n]),
                 width_shares=_largest_first(shares[n]),
                 unsupported_share=float(surface.area_m2[counted & surface.unsupported].sum() / area[n, 0]),
+                most_u_w_m2k=float(np.average(most_u[counted], weights=surface.area_m2[counted])),
             )
             found.append(_Drawn(element, flow_w[n], area[n], u[n]))
         return found[:-1], found[-1], _largest_first(budget)

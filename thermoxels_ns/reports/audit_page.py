@@ -35,21 +35,16 @@ def audit_page(
     mesh_name: str,
     command: str,
     files: Sequence[str],
-    *,
     report: Report,
-    range_c: tuple[float, float] | None,
-    most_u: Mapping[str, float],
-    impossible: Sequence[str],
-    paper: bool = False,
     compared: Comparison | None = None,
+    paper: bool = False,
 ) -> str:
     """Return the html text of an audit's page; `command` made the audit, `files` lie beside the page.
 
     It has a 3-D view if it has pictures and is not meant for `paper`.
 
-    `photographs` are pictures of defects by place in `audit.defects`, whose colours span `range_c`; without `pictures`
-    the page has no drawings. `most_u` is the U-value by name of an element from which on a value is marked impossible,
-    `impossible` are sentences on such values; `compared` is what changed since an earlier survey.
+    `photographs` are pictures of defects by place in `audit.defects`; without `pictures` the page has no drawings.
+    `compared` is what changed since an earlier survey.
     """
     numbered, asked = list(enumerate(audit.defects, start=1)), audit.conditions.calibrate
     counted = [(number, one) for number, one in numbered if not one.not_counted]
@@ -69,9 +64,6 @@ def audit_page(
         pictures=pictures,
         report=report,
         gradient=gradient(),
-        range_c=range_c,
-        most_u=most_u,
-        impossible=impossible,
         compared=compared,
         photographs=defaultdict(tuple, photographs),
         confidence=100.0 * CONFIDENCE,
