@@ -7,11 +7,13 @@ import re
 import sys
 import zlib
 from dataclasses import replace
+from importlib.metadata import distribution
 from pathlib import Path
 
 import numpy as np
 import pytest
 import pyvista as pv
+from lxml import etree
 from PIL import Image, ImageFile
 
 from tests.support.audited_wall import INSIDE, STATED, audited_wall, photographed, solve_wall, true_draws
@@ -25,6 +27,10 @@ from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.mesh.files.formats import write_mesh
 from thermoxels_ns.reports.audit_page import draw_audit
 from thermoxels_ns.reports.audit_view import view_data
+
+GBXML = distribution("xgbxml").locate_file("xgbxml/schemas/GreenBuildingXML_Ver6.01.xsd")
+NAMESPACE = "{http://www.gbxml.org/schema}"
+POSITIVE = [f"{NAMESPACE}{tag}" for tag in ("Area", "Volume", "Height", "Width", "U-value")]
 
 
 @pytest.fixture(scope="module")
@@ -271,19 +277,38 @@ def test_bridges_below_a_bound_are_listed_but_count_for_nothing(export, done, tm
 
 
 def test_patches_are_proposed_taken_and_written_as_an_envelope(tmp_path, capsys) -> None:
+    """The demo's house, turned: its names of walls are other ones. The wall in the south is left out of the audit."""
     write_mesh(tmp_path / "mesh.vtu", house_corner())
     patches, picture = tmp_path / "new" / "patches.yaml", tmp_path / "new" / "patches.png"
     propose = ["audit", str(tmp_path / "mesh.vtu"), "--write-patches", str(patches), "--north", "1", "0", "0"]
     assert cli.main(propose) == 0
     assert "window-east-4" in capsys.readouterr().out and np.ptp(np.asarray(Image.open(picture))) > 100
     assert cli.main(propose) == 2 and "write_patches" in capsys.readouterr().err
-    text = (configs_folder() / "house-corner-conditions.yaml").read_text()
-    (tmp_path / "c.yaml").write_text(text.replace(", reveals]", "]").replace('"*-wall"', '"wall-*"'))
+    text = (configs_folder() / "house-corner-conditions.yaml").read_text().replace(", reveals]", ", wall-south]")
+    text = text.replace("title: The drawn house", "title: A <house> & garden").replace('"*-wall"', '"wall-*"')
+    (tmp_path / "c.yaml").write_text(text)
     words = (*("--patches", str(patches), "--envelope", "True"), *("--north", "1", "0", "0", "--pictures", "False"))
     answers, _ = audited(tmp_path / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "out", *words)
     assert {"wall-east", "roof", "ground", "door-north-1"} <= {one["name"] for one in answers["patches"]}
-    assert answers["envelope"]["wall-east"]["azimuth_deg"] == pytest.approx(90.0, abs=2.0)
-    assert (tmp_path / "out" / "envelope-gbxml.xml").read_bytes().startswith(b"<?xml")
+    truth = {"wall": (2.0, 2.4), "window": (4.8, 5.8), "door": (3.6, 3.6)}  # the wall has a band of 3.2 in its middle
+    told = answers["envelope"]
+    assert told["wall-south"]["u_w_m2k"] is None and told["floor"]["u_w_m2k"] is None
+    measured = {name: one["u_w_m2k"] for name, one in told.items() if name.split("-")[0] in truth and one["u_w_m2k"]}
+    assert len(measured) == 11 and all(told[name]["measured_share"] > 0.9 for name in measured)
+    for name, u in measured.items():
+        low, high = truth[name.split("-")[0]]
+        assert u["low"] < high and u["high"] > low, name
+
+    root = etree.parse(str(tmp_path / "out" / "envelope-gbxml.xml"))
+    etree.XMLSchema(etree.parse(str(GBXML))).assertValid(root)
+    assert all(float(one.text) > 0.0 for one in root.iter(*POSITIVE))
+    assert len([*root.iter(f"{NAMESPACE}Opening")]) == 8
+    made = {one.get("id"): one.findtext(f"{NAMESPACE}U-value") for one in root.iter(f"{NAMESPACE}Construction")}
+    assert float(made["wall-east-construction"]) == pytest.approx(told["wall-east"]["u_w_m2k"]["value"], abs=1e-4)
+    assert made["wall-south-construction"] is None
+    (wall,) = (one for one in root.iter(f"{NAMESPACE}Surface") if one.get("id") == "wall-east")
+    turned = [float(wall.findtext(f".//{NAMESPACE}{tag}")) for tag in ("Azimuth", "Tilt")]
+    assert turned == pytest.approx([90.0, 90.0], abs=2.0)
 
 
 def test_an_earlier_audit_is_compared_on_the_page_and_in_the_answers(export, done, tmp_path, capsys) -> None:
