@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.audit.defects import FoundDefect
 from thermoxels_ns.audit.draws import FORMULA, SEED, Draws, Interval, draw, interval_of, uncertain
-from thermoxels_ns.audit.exchange import Parts, triangle_exchange, with_references
+from thermoxels_ns.audit.exchange import Parts, with_references
 from thermoxels_ns.audit.run import Audit
 from thermoxels_ns.audit.surface import AuditedSurface
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
@@ -166,7 +166,7 @@ def _elements(surface: AuditedSurface, shared: BoolArray) -> tuple[dict[str, Int
 def _flows(audit: Audit, draws: Draws, surface: AuditedSurface, parts: list[IntArray]) -> tuple[FloatArray, FloatArray]:
     """Return draws of flows per kelvin through parts of `surface`, and of what own readings add to these, (p, k)."""
     conditions, draws = audit.conditions, with_references(audit.surface, audit.conditions, draws)
-    found = Parts(conditions, surface, draws, triangle_exchange(conditions, surface, draws), parts)
+    found = Parts(conditions, surface, draws, parts)
     off_k = np.stack([draws.local(conditions.camera.repeatability.off_by, n) for n in range(len(parts))])
     return found.in_draws(draws)[1] / draws.difference_k, found.slope_w_k[:, None] * off_k / draws.difference_k
 

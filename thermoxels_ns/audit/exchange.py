@@ -83,10 +83,9 @@ class Parts:
         conditions: Conditions,
         surface: AuditedSurface,
         draws: Draws,
-        stated: Exchange,
         which: Sequence[IntArray],
     ) -> None:
-        """Take the parts as indices of triangles; `stated` is the `triangle_exchange`."""
+        """Take the parts as indices of triangles."""
         self.conditions, (self.groups, of_triangle) = conditions, surface.alike
         row = np.repeat(np.arange(len(which)), [len(one) for one in which])
         every = np.concatenate([np.zeros(0, np.int64), *which])
@@ -98,7 +97,7 @@ class Parts:
         """Change of the stated flow per kelvin that all readings of a part are higher, shape (p,), [W/K]."""
         self._off = [
             np.bincount(row, area * own[every], len(which))[:, None] - self._rows @ of_group
-            for own, of_group in zip(stated, mean)
+            for own, of_group in zip(triangle_exchange(conditions, surface, draws), mean)
         ]
 
     def in_draws(self, draws: Draws, first: int | None = None) -> tuple[FloatArray, FloatArray]:

@@ -326,7 +326,7 @@ class _Work:
         worst = np.flatnonzero(surface.counted & ~surface.rim)
         worst = worst if len(worst) else counted
         parts.append(surface.spot(worst, stated.surface_c[worst] * (-1.0 if conditions.side == "inside" else 1.0)))
-        self.parts = Parts(conditions, surface, draws, stated, parts)
+        self.parts = Parts(conditions, surface, draws, parts)
         self.surface_c, self.flow_w = self.parts.in_draws(draws)
 
     def elements(self) -> tuple[list[_Drawn], _Drawn, dict[str, float]]:

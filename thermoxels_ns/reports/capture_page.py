@@ -8,10 +8,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from thermoxels_ns.capture.frames import measurement_rows
-from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.rig.images import read_photograph
 from thermoxels_ns.capture.rig.start import rig_frames
 from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame
 from thermoxels_ns.capture.scene_writer import scene_names
@@ -92,11 +91,8 @@ def overlay(frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: R
     """Draw a thermal image in colours over its photograph in grey, with edges in white, shape (height, width, 3)."""
     carried = thermal_in_photograph(frame, temperature_c, visible, rig)
     height, width = carried.shape
-    if isinstance(frame.photograph, np.ndarray):
-        picture = Image.fromarray(frame.photograph.astype(np.uint8)).convert("L")
-    else:
-        picture = open_photograph(frame.photograph).convert("L")
-    grey = np.asarray(picture.resize((width, height), Image.Resampling.BOX))
+    photograph = read_photograph(frame).astype(np.uint8)
+    grey = np.asarray(cv2.resize(photograph, (width, height), interpolation=cv2.INTER_AREA))
     base = np.repeat(grey[..., None], 3, axis=2).astype(np.float32)
     known = np.isfinite(carried)
     mixed = np.where(known[..., None], (1 - _COLOUR_SHARE) * base + _COLOUR_SHARE * colours(carried), base)
