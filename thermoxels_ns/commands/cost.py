@@ -66,7 +66,7 @@ class Cost:
 
 
 def run_cost(cost: Cost, screen: TextIO) -> None:
-    """Train and evaluate every setting that cost.csv does not hold, and write the table to `screen`. See `Cost`."""
+    """Train and evaluate every setting that cost.json does not hold, and write the table to `screen`. See `Cost`."""
 
     def say(line: str) -> None:
         print(line, file=screen)
