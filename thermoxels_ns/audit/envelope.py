@@ -1,4 +1,4 @@
-"""The envelope of an audited building for energy programs, with U-values."""
+"""The envelope of an audited building for energy programs, with U-values, and as HBJSON."""
 
 from __future__ import annotations
 
@@ -6,10 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from thermoxels_ns.audit.draws import Interval, draw, interval_of
 from thermoxels_ns.audit.exchange import Parts, with_references
 from thermoxels_ns.audit.run import Audit
-from thermoxels_ns.mesh.boundary.planes import Building
+from thermoxels_ns.mesh.boundary.planes import Building, FlatElement
+
+SHGC = 0.6
+"""Share of the sun's heat that windows are assumed to let in: HBJSON demands a number that no thermal image tells."""
+_LEAST_R_M2K_W, _MOST_WINDOW_U = 0.001, 12.0  # Limits of HBJSON for a layer and for a window
+_R_M2K_W = {"roof": 0.14, "wall": 0.17, "door": 0.17, "floor": 0.21}
+"""Surface resistances of ISO 6946, both sides, [m2 K / W]: programs add such to those of layers."""
 
 
 @dataclass(frozen=True)
@@ -48,3 +56,59 @@ def envelope_of(found: Audit, building: Building) -> Envelope:
         flow_w = flow_w + parts.slope_w_k[n] * draws.local(off_by, n)
         u[name] = interval_of(flow_w / parts.area_m2[n] / draws.difference_k)
     return Envelope(building, u, {name: float(surface.area_m2[which[name]].sum()) / area_m2[name] for name in which})
+
+
+def hbjson(envelope: Envelope, title: str) -> dict[str, Any]:
+    """Return a model of one room by honeybee-schema 2.3 (HBJSON); x points east, y north and z up.
+
+    U-values become constructions of one layer without mass, less the surface resistances of ISO 6946. What was not
+    measured has none, so programs take their default. Figures and intervals are in `user_data`.
+    """
+    building, figures = envelope.building, envelope.figures()
+    materials, constructions = list[dict[str, Any]](), list[dict[str, Any]]()
+    for one in building.every():
+        value = 0.0 if (u := envelope.u[one.name]) is None else u.value
+        if value > 0.0:
+            layer: dict[str, Any] = {"identifier": f"{one.name}-layer", "type": "EnergyMaterialNoMass"}
+            if one.kind == "window":
+                layer |= {"type": "EnergyWindowMaterialSimpleGlazSys", "u_factor": min(value, _MOST_WINDOW_U)}
+                layer |= {"shgc": SHGC, "user_data": {"shgc": "assumed"}}
+            else:
+                layer["r_value"] = max(1.0 / value - _R_M2K_W[one.kind], _LEAST_R_M2K_W)
+            materials.append(layer)
+            kind = f"{'Window' if one.kind == 'window' else 'Opaque'}ConstructionAbridged"
+            construction = {"type": kind, "identifier": one.name, "materials": [layer["identifier"]]}
+            constructions.append(construction)
+    given = {one["identifier"] for one in constructions}
+
+    def part(one: FlatElement, kind: str, boundary: str, **more: Any) -> dict[str, Any]:
+        energy = {
+            "type": f"{kind}EnergyPropertiesAbridged",
+            **({"construction": one.name} if one.name in given else {}),
+        }
+        return {
+            "type": kind,
+            "identifier": one.name,
+            "geometry": {"type": "Face3D", "boundary": np.round(one.outline_m, 5).tolist()},
+            "boundary_condition": {"type": boundary},
+            "properties": {"type": f"{kind}PropertiesAbridged", "energy": energy},
+            "user_data": figures[one.name],
+            **more,
+        }
+
+    faces = []
+    for one in building.elements:
+        windows = [part(hole, "Aperture", "Outdoors") for hole in one.openings if hole.kind == "window"]
+        doors = [part(hole, "Door", "Outdoors") for hole in one.openings if hole.kind == "door"]
+        kind = "RoofCeiling" if one.kind == "roof" else one.kind.capitalize()
+        touches = {"air": "Outdoors", "ground": "Ground", "cover": "Adiabatic"}[one.behind]
+        faces.append(part(one, "Face", touches, face_type=kind, apertures=windows, doors=doors))
+    inside = {"type": "RoomPropertiesAbridged", "energy": {"type": "RoomEnergyPropertiesAbridged"}}
+    energy = {"type": "ModelEnergyProperties", "constructions": constructions, "materials": materials}
+    named = {"display_name": title} if title else {}
+    return {
+        **{"type": "Model", "identifier": "envelope", **named, "version": "2.3.0", "units": "Meters"},
+        **{"tolerance": 0.01, "angle_tolerance": 1.0},
+        "rooms": [{"type": "Room", "identifier": "building", "faces": faces, "properties": inside}],
+        "properties": {"type": "ModelProperties", "energy": energy},
+    }

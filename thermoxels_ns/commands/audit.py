@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
@@ -38,8 +38,9 @@ if TYPE_CHECKING:
     from thermoxels_ns.reports.page import Picture
 
 ANSWERS, PAGE, DOCUMENT, SURFACE = "answers.json", "audit.html", "audit.pdf", "surface.vtp"
-ENVELOPE = "envelope-gbxml.xml"
 """Files that an audit writes."""
+ENVELOPES = {"hbjson": "envelope.hbjson", "gbxml": "envelope-gbxml.xml"}
+"""Files that an audit writes if `Audit.envelope` asks for them."""
 _PATCHES = {"wall": "tan", "roof": "indianred", "window": "deepskyblue", "door": "saddlebrown", "ground": "yellowgreen"}
 """Colours of proposed patches."""
 
@@ -93,8 +94,8 @@ class Audit:
     patches: Path | None = None
     """A yaml file of patches that replace those of the mesh, such as --write-patches wrote; what --patches of ns-export
     thermoxels-mesh reads."""
-    envelope: bool = False
-    """Write the building as flat elements with U-values for energy programs, as gbXML into envelope-gbxml.xml."""
+    envelope: tuple[Literal["hbjson", "gbxml"], ...] = ()
+    """Write the building as flat elements with U-values for energy programs: hbjson (Ladybug Tools), gbxml or both."""
     north: tuple[float, float, float] = (0.0, 1.0, 0.0)
     """Direction that points north in the coordinates of the mesh, for names of walls and for --envelope."""
 
@@ -141,7 +142,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     if not 0.0 <= least_w < math.inf:
         remedy = "Pass --least-bridge-w 0 to count all."
         raise AuditError("--least-bridge-w", expected="a number of watts, at least 0", got=least_w, remedy=remedy)
-    folder = result_folder(options.output_dir, (ANSWERS, PAGE, DOCUMENT, SURFACE, ENVELOPE), SURFACE)
+    folder = result_folder(options.output_dir, (ANSWERS, PAGE, DOCUMENT, SURFACE, *ENVELOPES.values()), SURFACE)
     lacking = why_no_pdf() if options.pdf else ""
     if lacking:
         say(f"Without audit.pdf: {lacking}")
@@ -331,6 +332,7 @@ def _write(
     """Write all files and return their names."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
+    from thermoxels_ns.audit.envelope import hbjson
     from thermoxels_ns.mesh.files.vtu import write_vtk
     from thermoxels_ns.reports.audit_page import audit_page, draw_audit, gbxml
     from thermoxels_ns.reports.page import identify, why_no_pdf, write_page, write_pdf
@@ -353,13 +355,18 @@ def _write(
     plain_values(answers, "answers", AuditError)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
     write_vtk(vtkXMLPolyDataWriter(), folder / SURFACE, found.to_pyvista())
-    remove_file(folder / ENVELOPE)
-    if envelope is not None:
-        write_page(folder / ENVELOPE, gbxml(envelope, found.conditions.title))
+    title = found.conditions.title
+    for kind, name in ENVELOPES.items():
+        if envelope is None or kind not in options.envelope:
+            remove_file(folder / name)
+        elif kind == "hbjson":
+            write_json(folder / name, hbjson(envelope, title))
+        else:
+            write_page(folder / name, gbxml(envelope, title))
     pictures = draw_audit(found) if options.pictures else None
     command, document = command_of("audit", options), options.pdf and not why_no_pdf()
     files = (PAGE, DOCUMENT, ANSWERS, SURFACE) if document else (PAGE, ANSWERS, SURFACE)
-    files += (ENVELOPE,) * options.envelope
+    files += tuple(ENVELOPES[one] for one in options.envelope)
     about = (found, pictures, photographs, options.mesh.name, command, files, report, compared)
     write_page(folder / PAGE, audit_page(*about))
     remove_file(folder / DOCUMENT)
