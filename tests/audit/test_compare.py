@@ -11,6 +11,7 @@ from tests.support.audited_wall import INSIDE
 from tests.support.surveyed_house import AFTER, BAND_M, BAND_U, BEFORE, U, survey, turned
 from thermoxels_ns.audit.compare import Comparison, _bridges, compare
 from thermoxels_ns.audit.conditions import OutsideAir
+from thermoxels_ns.audit.defects import FoundDefect
 from thermoxels_ns.audit.run import Audit, audit
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
@@ -110,15 +111,12 @@ def test_meshes_that_do_not_fit_or_fit_twice_are_refused() -> None:
 
 def test_a_bridge_of_both_surveys_counts_also_where_the_earlier_saw_little_around_it() -> None:
     """Four triangles, of which the earlier survey saw three; the bridge's own one is among them."""
-    area, every = np.ones(4), np.arange(4)
+    every = np.arange(4)
 
-    def survey(zone: list[int], partner: np.ndarray) -> Any:
-        bridge = SimpleNamespace(core=every[:1], zone=np.array(zone), reference=every[3:], base_area_m2=1.0)
-        return SimpleNamespace(
-            area_m2=area, partner=partner, bridges=[bridge], from_other=lambda which: every[np.isin(partner, which)]
-        )
+    def survey(zone: list[int]) -> Any:
+        bridge = FoundDefect("line", 0, every[:1], np.array(zone), every[3:], 1.0, 1.0, every[:1], "")
+        surface, counted = SimpleNamespace(area_m2=np.ones(4)), SimpleNamespace(not_counted="")
+        return SimpleNamespace(surface=surface, defects=[counted], found=[bridge])
 
-    partner = np.array([0, -1, -1, 3])
-    old, new = survey([0], partner), survey([0, 1, 2], partner)
-    (found,) = _bridges(old, new)
-    assert found.state == "in both" and found.before[0].tolist() == [0] and found.after[0].tolist() == [0, 1, 2]
+    ((state, found),) = _bridges(survey([0]), survey([0, 1, 2]), np.array([0, -1, -1, 3]))
+    assert state == "in both" and found.zone.tolist() == [0] and found.base_area_m2 == pytest.approx(1.0 / 3.0)

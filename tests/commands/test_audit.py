@@ -7,11 +7,13 @@ import re
 import sys
 import zlib
 from dataclasses import replace
+from importlib.metadata import distribution
 from pathlib import Path
 
 import numpy as np
 import pytest
 import pyvista as pv
+from lxml import etree
 from PIL import Image, ImageFile
 
 from tests.support.audited_wall import INSIDE, STATED, audited_wall, photographed, solve_wall, true_draws
@@ -25,6 +27,10 @@ from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.mesh.files.formats import write_mesh
 from thermoxels_ns.reports.audit_page import draw_audit
 from thermoxels_ns.reports.audit_view import view_data
+
+GBXML = distribution("xgbxml").locate_file("xgbxml/schemas/GreenBuildingXML_Ver6.01.xsd")
+NAMESPACE = "{http://www.gbxml.org/schema}"
+POSITIVE = [f"{NAMESPACE}{tag}" for tag in ("Area", "Volume", "Height", "Width", "U-value")]
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +63,6 @@ def test_the_command_writes_answers_page_and_surface(done) -> None:
     assert sorted(path.name for path in done.iterdir()) == ["answers.json", "audit.html", "surface.vtp"]
     answers = json.loads((done / "answers.json").read_text())
     assert {one["name"] for one in answers["patches"]} == {"facade", "window"}
-    assert [one["name"] for one in answers["storeys"]] == ["ground floor", "upper floor"]
     assert [one["kind"] for one in answers["defects"]] == ["line"]
     loss = answers["whole"]["loss_w"]
     assert loss["low"] < loss["value"] < loss["high"]
@@ -272,6 +277,7 @@ def test_bridges_below_a_bound_are_listed_but_count_for_nothing(export, done, tm
 
 
 def test_patches_are_proposed_taken_and_written_as_an_envelope(tmp_path, capsys) -> None:
+    """The demo's house, turned: its names of walls are other ones. The wall in the south is left out of the audit."""
     write_mesh(tmp_path / "mesh.vtu", house_corner())
     patches, picture = tmp_path / "new" / "patches.yaml", tmp_path / "new" / "patches.png"
     propose = ["audit", str(tmp_path / "mesh.vtu"), "--write-patches", str(patches), "--north", "1", "0", "0"]

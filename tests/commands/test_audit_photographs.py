@@ -10,7 +10,7 @@ from PIL import Image
 from tests.support.audited_wall import STATED, UP
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.audit.run import Audit, audit
-from thermoxels_ns.commands.audit_photographs import photographs_of_defects, shown_range_c
+from thermoxels_ns.commands.audit_photographs import photographs_of_defects
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.scene_file import read_scene_file
 
@@ -61,7 +61,7 @@ def scene(tmp_path_factory) -> Path:
 
 
 def pictures_of(scene: Path, found: Audit) -> dict:
-    return photographs_of_defects(read_scene_file(scene), SCALE, found, shown_range_c(found))
+    return photographs_of_defects(read_scene_file(scene), SCALE, found)
 
 
 def shown(image: bytes) -> np.ndarray:

@@ -1,5 +1,5 @@
-import csv
 import io
+import json
 import math
 import types
 from pathlib import Path
@@ -79,9 +79,8 @@ def start(scene, tmp_path, commands):
     return run
 
 
-def table(folder: Path) -> dict[str, dict[str, str]]:
-    with (folder / "cost.csv").open(newline="") as file:
-        return {row["setting"]: row for row in csv.DictReader(file)}
+def kept(tmp_path: Path) -> list[dict]:
+    return [*json.loads((tmp_path / "cost" / "cost.json").read_text()).values()]
 
 
 def test_settings_qualities_and_methods_are_what_a_user_would_type(start, commands):
@@ -117,65 +116,41 @@ def test_options_that_cannot_work_are_refused_before_anything_runs(start, comman
     assert commands.calls() == []
 
 
-def test_figures_of_the_runs_reach_the_table_and_models_go(start, tmp_path):
+def test_figures_of_the_runs_reach_the_table_and_models_go(start, scene, tmp_path, commands):
     shown = start(methods=("thermoxels", "plenoxels-t"), target_mae=0.5)
     folder = tmp_path / "cost"
-    rows = table(folder)
-    assert list(rows) == ["32:100", "64:400", "32:100, plenoxels-t", "64:400, plenoxels-t"]
-    small, large, other, _ = rows.values()
-    assert (small["psnr"], large["psnr"], other["psnr"]) == ("25", "40", "")
-    assert (small["thermal_mae_c"], small["fscore_128"], small["half_transparent"]) == ("0.8", "0.9", "0.02")
-    assert float(small["seconds"]) > 0
-    assert "| 32:100 | " in shown and " | 25.0 dB | 0.80 °C | 0.90 | 2.0% |" in shown
-    assert "Cheapest setting with a thermal MAE of at most 0.5 °C: 64:400" in shown
-    assert not any((folder / "models").iterdir())
+    small, large, other, _ = kept(tmp_path)
+    assert (small["psnr"], large["psnr"], other["psnr"]) == (25, 40, None)
+    assert (small["thermal_mae_c"], small["fscore_128"], small["half_transparent"]) == (0.8, 0.9, 0.02)
+    assert small["seconds"] > 0
+    assert (
+        "| 32:100 | " in shown and " | 25.0 dB | 0.80 °C | 0.90 | 2.0% |" in shown and "| 64:400, plenoxels-t" in shown
+    )
+    assert "Cheapest setting with a thermal MAE of at most 0.5 °C: 64:400" in shown and "Train with: ns-train " in shown
+    assert {path.name for path in folder.iterdir()} == {"cost.json", "logs", ".lock"}
     assert {path.name for path in (folder / "logs").iterdir()} >= {"32-100-train.log", "32-100-eval.log"}
+    train, evaluate = map(" ".join, commands.calls()[:2])
+    models = train.removeprefix(f"ns-train thermoxels --data {scene} --output-dir ").partition(" ")[0]
+    assert Path(models).parent == folder
+    assert evaluate.startswith(f"ns-eval --load-config {models}/32-100/thermoxels/run/config.yml --output-path ")
 
 
-def test_the_real_commands_get_what_they_need(start, scene, tmp_path, commands):
-    start(settings=("64:400",))
-    train, evaluate = map(" ".join, commands.calls())
-    assert train.startswith(f"ns-train thermoxels --data {scene} --output-dir {tmp_path / 'cost' / 'models'} ")
-    config = tmp_path / "cost" / "models" / "64-400" / "thermoxels" / "run" / "config.yml"
-    assert evaluate.startswith(f"ns-eval --load-config {config} --output-path ")
-
-
-def test_finished_runs_are_not_run_again(start, commands, tmp_path):
-    start()
-    before = (tmp_path / "cost" / "cost.csv").read_text()
-    assert len(commands.calls()) == 4
-    shown = start()
-    assert commands.calls() == []
-    assert (tmp_path / "cost" / "cost.csv").read_text() == before
-    assert "32:100 is in " in shown and "| 64:400 |" in shown
-    shown = start(settings=("32:100", "48:200"))
-    assert [call[0] for call in commands.calls()] == ["ns-train", "ns-eval"]
-    assert "| 64:400 |" not in shown and list(table(tmp_path / "cost")) == ["32:100", "64:400", "48:200"]
-
-
-def test_an_interrupted_start_goes_on_where_it_stopped(start, commands, tmp_path):
+def test_finished_runs_are_not_run_again_and_an_interrupted_start_goes_on(start, commands, tmp_path):
     commands.write("ns-eval", NS_EVAL.replace("results =", "assert run['steps'] < 400\nresults =", 1))
     with pytest.raises(ThermoxelsError, match=r"(?s)^cost: .*64:400: ns-eval: expected exit status 0.*Assert"):
         start()
-    # What was measured is kept all the same.
-    assert list(table(tmp_path / "cost")) == ["32:100"]
+    assert len(kept(tmp_path)) == 1  # what was measured is kept all the same
     commands.calls()
     commands.write("ns-eval", NS_EVAL)
-    start()
-    assert [call[0] for call in commands.calls()] == ["ns-train", "ns-eval"]
-    assert list(table(tmp_path / "cost")) == ["32:100", "64:400"]
-    commands.write("ns-eval", NS_EVAL.replace('"results": results', '"results": [1]'))
-    with pytest.raises(ThermoxelsError, match=r"48-100\.json: expected the results"):
-        start(settings=("48:100",))
-
-
-def test_a_damaged_list_of_runs_is_named(start, tmp_path):
-    start(settings=("32:100",))
-    path = tmp_path / "cost" / "cost.csv"
-    for content in ("setting\n32:100\n", path.read_text().replace(",0.9,", ",much,"), "\0", path.read_text() + "a,b"):
-        path.write_text(content)
-        with pytest.raises(ThermoxelsError, match=r"cost\.csv: expected the finished runs of an earlier start"):
-            start(settings=("32:100",))
+    shown = start()
+    assert [call[0] for call in commands.calls()] == ["ns-train", "ns-eval"] and len(kept(tmp_path)) == 2
+    assert "32:100 is in " in shown and "| 64:400 |" in shown
+    before = (tmp_path / "cost" / "cost.json").read_text()
+    assert "| 64:400 |" not in start(settings=("32:100",)) and commands.calls() == []
+    assert (tmp_path / "cost" / "cost.json").read_text() == before
+    (tmp_path / "cost" / "cost.json").write_text(before[:-9])
+    with pytest.raises(ThermoxelsError, match=r"cost\.json: expected .*Remove the file"):
+        start()
 
 
 def test_the_command_line(commands, scene, tmp_path, capsys):
@@ -187,15 +162,11 @@ def test_the_command_line(commands, scene, tmp_path, capsys):
     assert "Error: settings: expected voxels and steps" in capsys.readouterr().err
 
 
-def row(setting: str, seconds: float, mae: float) -> dict[str, str]:
-    return {
-        **dict.fromkeys(FIGURES, ""),
-        **{"setting": setting, "scene": "s", "training": "ns-train thermoxels"},
-        **{"seconds": str(seconds), "thermal_mae_c": str(mae)},
-    }
+def row(seconds: float, mae: float) -> dict:
+    return {**dict.fromkeys(FIGURES), "training": "ns-train thermoxels", "seconds": seconds, "thermal_mae_c": mae}
 
 
-FOUR = [row("draft", 10, 0.9), row("standard", 30, 0.35), row("fine", 60, 0.30), row("odd", 20, 0.32)]
+FOUR = {"draft": row(10, 0.9), "standard": row(30, 0.35), "fine": row(60, 0.30), "odd": row(20, 0.32)}
 
 
 @pytest.mark.parametrize(
@@ -216,5 +187,5 @@ def test_the_cheapest_setting_keeps_the_target(target_mae, name):
 
 
 def test_the_table_has_only_columns_with_figures():
-    lines = table_of(FOUR[:1])
+    lines = table_of({"draft": FOUR["draft"]})
     assert lines == ["| setting | ns-train | thermal MAE |", "|---|---:|---:|", "| draft | 10 s | 0.90 °C |"]

@@ -1,10 +1,14 @@
+import base64
 import json
 import math
+import re
+from io import BytesIO
 from pathlib import Path
 from runpy import run_path
 
 import pytest
 import tyro
+from PIL import Image
 
 from thermoxels_ns import cli
 from thermoxels_ns.audit.conditions import load_conditions
@@ -80,10 +84,10 @@ def quick_demo(fake_command, monkeypatch):
         "ns-render",
         after
         + picture
-        + "for output in ('gt-rgb', 'rgb', 'gt-thermal', 'thermal'):\n"
+        + "for shade, output in enumerate(('gt-rgb', 'rgb', 'gt-thermal', 'thermal'), 1):\n"
         + "    folder = os.path.join(after('--output-path'), 'test', output)\n"
         + "    os.makedirs(folder)\n"
-        + "    for n in (1, 2): Image.new('RGB', (16, 12)).save(f'{folder}/frame_eval_{n:05d}.png')",
+        + "    for n in (1, 2): Image.new('RGB', (16, 12), (shade, 0, 0)).save(f'{folder}/frame_eval_{n:05d}.png')",
     )
 
     def export(summary: dict) -> None:
@@ -92,7 +96,8 @@ def quick_demo(fake_command, monkeypatch):
             after
             + picture
             + "folder = after('--output-dir')\nos.makedirs(folder)\n"
-            + "for name in ('mesh', 'mesh-measured'): Image.new('RGB', (8, 6)).save(f'{folder}/{name}.png')\n"
+            + "for shade, name in ((10, 'mesh'), (20, 'mesh-measured')):\n"
+            + "    Image.new('RGB', (8, 6), (0, 0, shade)).save(f'{folder}/{name}.png')\n"
             + f"nan = float('nan')\njson.dump({summary}, open(f'{{folder}}/summary.json', 'w'))",
         )
 
@@ -123,7 +128,14 @@ def test_the_whole_demo_leaves_a_page(quick_demo, tmp_path, capfd):
         assert f"$ {word} " in out
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "Thermoxels demo: house-corner" in page
-    assert page.count("<img") == 3 + 2 * 6 + 4 * 2 + 1 + 1
+    pictures = [Image.open(BytesIO(base64.b64decode(one))) for one in re.findall(r"base64,([^\"]*)", page)]
+    assert len(pictures) == 3 + 2 * 6 + 4 * 2 + 1 + 1
+    shown = [picture.convert("RGB").getpixel((2, 2)) for picture in pictures]
+    assert shown[2] == (0, 0, 10) and shown[15:] == [*[(n, 0, 0) for n in (1, 2, 3, 4)] * 2, (0, 0, 20), (0, 0, 255)]
+    addresses = re.findall(r'(?:src|href)="([^"]*)"', page)
+    files = ("scene/", "outputs/", "eval.json", "renders/", "export/", "logs/", "audit/", "survey/", "heat/")
+    assert all(address.startswith(("data:", *files)) for address in addresses)
+    assert not re.search(r"<script|https?:|@import|url\(|\bon\w+=", page)
     assert ">-20.0<" in page and ">15.0\xa0°C<" in page  # the bounds of the house's temperatures
     assert page.count(">yes<") == 4 + len(true_u_of_patches(PATCHES)) + 1 and ">no<" not in page
     assert page.index(">Result<") < page.index("Audit: the truth beside the answer") < page.index("What went in")

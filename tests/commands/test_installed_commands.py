@@ -1,5 +1,4 @@
 import io
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -42,19 +41,6 @@ def test_output_of_a_command_comes_while_it_runs(fake_command, tmp_path, screen)
 
     run_command(["wait"], tmp_path / "wait.log", seen := Opener())
     assert seen.getvalue().splitlines()[-2:] == ["first", "second"]
-
-
-def test_a_command_draws_for_the_terminal_that_shows_it(fake_command, tmp_path, screen, monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    monkeypatch.setenv("COLUMNS", "77")
-    fake_command("ask", "print(os.environ.get('FORCE_COLOR'), os.environ.get('COLUMNS'))")
-    run_command(["ask"], tmp_path / "ask.log", Terminal())
-    assert (tmp_path / "ask.log").read_text() == "1 77\n"
-    run_command(["ask"], tmp_path / "ask.log", screen)
-    assert (tmp_path / "ask.log").read_text().startswith(f"{os.environ.get('FORCE_COLOR')} ")
 
 
 def test_memory_is_that_of_the_command(fake_command, tmp_path):

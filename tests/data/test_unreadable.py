@@ -10,7 +10,6 @@ from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig.images import read_photograph
 from thermoxels_ns.capture.rig_types import RigFrame
-from thermoxels_ns.commands.cost import read_table
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.core.yaml_records import read_yaml
@@ -29,7 +28,6 @@ def read_rig_photograph(path: Path) -> None:
 
 
 READERS = {
-    "cost.csv": read_table,
     "tracks.npz": read_tracks,
     "points.ply": _read_ply,
     "any.json": read_json,

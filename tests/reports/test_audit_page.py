@@ -28,10 +28,8 @@ def found():
 
 def page_of(found, **more) -> str:
     pictures = {"temperature": [PNG], "u_value": [PNG], "misfit": []}
-    about = {"report": Report("0-0-0", "1", (("mesh.vtu", "ab" * 32),)), "range_c": None, "most_u": {}}
-    return audit_page.audit_page(
-        found, pictures, {}, "mesh.vtu", "thermoxels audit", [], impossible=(), **about, **more
-    )
+    report = Report("0-0-0", "1", (("mesh.vtu", "ab" * 32),))
+    return audit_page.audit_page(found, pictures, {}, "mesh.vtu", "thermoxels audit", [], report, **more)
 
 
 def unpacked(text: str):

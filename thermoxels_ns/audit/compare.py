@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -13,12 +13,11 @@ from scipy.spatial.transform import Rotation
 from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.audit.defects import FoundDefect
 from thermoxels_ns.audit.draws import FORMULA, SEED, Draws, Interval, draw, interval_of, uncertain
-from thermoxels_ns.audit.exchange import Parts, triangle_exchange, with_references
+from thermoxels_ns.audit.exchange import Parts, with_references
 from thermoxels_ns.audit.run import Audit
 from thermoxels_ns.audit.surface import AuditedSurface
-from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import AuditError
-from thermoxels_ns.core.yaml_records import as_record, raising
 
 _DRAWS = 4000  # Ends of intervals scatter by about 1 % of the width
 _NEAR_M = 0.3  # Surface moves by less: insulation is thinner, and reconstructions err by less, [m]
@@ -76,27 +75,12 @@ class Pose(NamedTuple):
         return points_m @ self.turn.T + self.shift_m
 
 
-@raising(AuditError)
-def earlier_conditions(name: str, content: Mapping[str, Any]) -> Conditions:
-    """Return the `conditions` of an answers.json, without what a comparison does not need (limits, calibration)."""
-
-    def known(value: Any) -> Any:
-        if not isinstance(value, Mapping):
-            return value
-        # An air that was not known has the value null.
-        pairs = value.items()
-        return {key: known(one) for key, one in pairs if not (isinstance(one, dict) and one.get("value", 0) is None)}
-
-    unused = {"limits", "energy", "calibrate", "weather"}
-    return as_record(name, {key: known(one) for key, one in content.items() if key not in unused}, Conditions)
-
-
 def compare(before: Audit, after: Audit, difference_k: float | None = None) -> Comparison:
     """Return what changed between two audits of one building.
 
-    Elements are the patches of the later survey, on the surface that both saw. Losses are compared on the areas of the
-    later mesh and at `difference_k` between the airs, by default that of the later survey, [K]. Emissivities, the
-    film's factor and formula err alike in both, all else apart.
+    Elements are the patches of the later survey, on the surface that both saw: readings of the earlier survey are
+    carried over to the triangles of the later mesh beside them. Losses are compared at `difference_k` between the airs,
+    by default that of the later survey, [K]. Emissivities, the film's factor and formula err alike in both.
 
     Raises:
         AuditError: One survey is from inside and one from outside, a temperature outside is not known, or no position
@@ -114,50 +98,50 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
         got = " and ".join(films)
         raise AuditError("compare", expected="one film model in both surveys", got=got, remedy=remedy)
     difference_k = difference_k or after.conditions.difference_k
-    pose, residual_m, moved = aligned(before.surface, after.surface)
-    there = after.surface
-    counted = [np.flatnonzero(one.surface.counted) for one in (before, after)]
-    at_old = _places(pose(before.surface.centroid_m), before.surface.selection.facet_normal @ pose.turn.T)[counted[0]]
-    at_new = _places(there.centroid_m, there.selection.facet_normal)[counted[1]]
-    earlier = draw(before.conditions, _DRAWS, SEED)
-    later, common = _with_common(before.conditions, after.conditions, earlier)
-    old = _Survey(before, earlier, _partners(len(before.surface.counted), counted[0], at_old, counted[1], at_new))
-    new = _Survey(after, later, _partners(len(there.counted), counted[1], at_new, counted[0], at_old))
-    elements, only_after = new.elements(old)
+    first, second = before.surface, after.surface
+    pose, residual_m, moved = aligned(first, second)
+    at_first = _places(pose(first.centroid_m), first.selection.facet_normal @ pose.turn.T)
+    at_second = _places(second.centroid_m, second.selection.facet_normal)
+    partner, back = _partners(second, at_second, first, at_first), _partners(first, at_first, second, at_second)
+    elements, only_after = _elements(second, partner >= 0)
     if not elements:
         got = "no surface that both surveys saw"
         raise AuditError("compare", expected=_ONE_POSITION, got=got, remedy=_POSE_TOGETHER)
-    bridges, parts = _bridges(old, new), list(elements.values())
-    was = old.flows([*map(old.from_other, parts), *(part for one in bridges for part in one.before[:2])])
-    now = new.flows([*parts, *(part for one in bridges for part in one.after[:2])])
+    bridges, names, count = _bridges(before, after, partner), [*elements], len(elements)
+    parts = [*elements.values(), *(part for _, one in bridges for part in (one.zone, one.reference))]
+    earlier = draw(before.conditions, _DRAWS, SEED)
+    later, common = _with_common(before.conditions, after.conditions, earlier)
+    shared = replace(second, counted=partner >= 0)
+    carried = replace(shared, reading_c=first.reading_c[partner], surface_entry=first.surface_entry[partner])
+    flows = [_flows(before, earlier, carried, parts), _flows(after, later, shared, parts)]
+    areas = np.array([second.area_m2[part].sum() for part in parts])
 
-    def middle(part: IntArray) -> tuple[float, float, float]:
-        x, y, z = np.average(there.centroid_m[part], axis=0, weights=there.area_m2[part]).tolist()
-        return x, y, z
+    def changed(name: str, at: IntArray, drawn: list[FloatArray], size: float, **more: Any) -> Change:
+        """Return a change from draws of what it was and is, (k,) each; `size`, [m2] or [m], makes a loss of it."""
+        x, y, z = np.average(second.centroid_m[at], axis=0, weights=second.area_m2[at]).tolist()
+        change = interval_of(drawn[1] - drawn[0])
+        loss = Interval(*(size * difference_k * one for one in (change.value, change.low, change.high)))
+        sure = not change.low <= 0.0 <= change.high
+        was, now = map(interval_of, drawn)
+        about = {"state": "in both", "unit": "W/(m2 K)", "before": was, "after": now, **more}
+        return Change(name, at_m=(x, y, z), change=change, loss_change_w=loss, significant=sure, **about)
 
-    def change_of_u(name: str, part: IntArray, before: FloatArray, after: FloatArray, area_m2: float) -> Change:
-        return _change(name, "in both", middle(part), "W/(m2 K)", before, after, area_m2 * difference_k)
-
-    areas = now[0][: len(parts)]
-    u = [(flow + own)[: len(parts)] / area[: len(parts), None] for area, flow, own in (was, now)]
-    changes = [change_of_u(name, part, u[0][n], u[1][n], areas[n]) for n, (name, part) in enumerate(elements.items())]
-    mean_was, mean_now = (areas @ one / areas.sum() for one in u)
+    u = [(flow + own)[:count] / areas[:count, None] for flow, own in flows]
+    changes = [changed(name, parts[n], [one[n] for one in u], areas[n]) for n, name in enumerate(names)]
+    means = [areas[:count] @ one / areas[:count].sum() for one in u]
     found = list[Change]()
-    for n, one in enumerate(bridges):
-        bridge, zone = one.bridge, len(parts) + 2 * n
-        length, unit = (bridge.length_m, "W/(m K)") if bridge.kind == "line" else (1.0, "W/K")
-        drawn = [
-            (flow[zone] + own[zone] - flow[zone + 1] / area[zone + 1] * base_m2) / length
-            for (area, flow, own), (_, _, base_m2) in ((was, one.before), (now, one.after))
-        ]
-        patch = (old if one.state == "went" else new).surface.selection.patch_names[bridge.patch]
-        name = f"{'thermal bridge' if bridge.kind != 'area' else 'defect'} ({bridge.kind}) in {patch}"
-        found.append(_change(name, one.state, middle(one.after[0]), unit, drawn[0], drawn[1], length * difference_k))
+    for n, (state, one) in enumerate(bridges):
+        zone, calm = count + 2 * n, count + 2 * n + 1
+        length, unit = (one.length_m, "W/(m K)") if one.kind == "line" else (1.0, "W/K")
+        drawn = [(flow[zone] + own[zone] - flow[calm] / areas[calm] * one.base_area_m2) / length for flow, own in flows]
+        patch = (before if state == "went" else after).surface.selection.patch_names[one.patch]
+        name = f"{'thermal bridge' if one.kind != 'area' else 'defect'} ({one.kind}) in {patch}"
+        found.append(changed(name, one.zone, drawn, length, state=state, unit=unit))
     return Comparison(
-        whole=change_of_u("all that both saw", np.concatenate(parts), mean_was, mean_now, float(areas.sum())),
+        whole=changed("all that both saw", np.concatenate(parts[:count]), means, float(areas[:count].sum())),
         elements=_ranked(changes),
         bridges=_ranked(found),
-        only_before=old.elements(new)[1],
+        only_before=_elements(first, back >= 0)[1],
         only_after=only_after,
         difference_k=difference_k,
         common=common,
@@ -166,94 +150,57 @@ def compare(before: Audit, after: Audit, difference_k: float | None = None) -> C
     )
 
 
-Place = tuple[IntArray, IntArray, float]
-"""Triangles of a bridge's zone and of the undisturbed surface near by, and the area without the bridge, [m2]."""
-
-
-class _Bridge(NamedTuple):
-    """A bridge that the later survey found, or the earlier one alone, and its place in both."""
-
-    bridge: FoundDefect
-    state: State
-    before: Place
-    after: Place
-
-
-class _Survey:
-    """One survey, its draws, and the triangle of the other survey beside each of its triangles, -1 without one."""
-
-    def __init__(self, audit: Audit, draws: Draws, partner: IntArray) -> None:
-        self.audit, self.surface, self.partner, self.area_m2 = audit, audit.surface, partner, audit.surface.area_m2
-        self.draws = with_references(self.surface, audit.conditions, draws)
-        pairs = zip(audit.defects, audit.found)
-        self.bridges = [bridge for defect, bridge in pairs if not defect.not_counted]
-
-    def from_other(self, which: IntArray) -> IntArray:
-        """Return the triangles whose partners in the other survey are among `which`."""
-        return np.flatnonzero(np.isin(self.partner, which))
-
-    def elements(self, other: _Survey) -> tuple[dict[str, IntArray], tuple[str, ...]]:
-        """Return the triangles of each patch that the other survey saw, too, and names of patches it did not."""
-        shared, alone, counted = dict[str, IntArray](), list[str](), self.surface.counted
-        patch, names = self.surface.selection.facet_patch, self.surface.selection.patch_names
-        for number in np.unique(patch[counted]):
-            every = np.flatnonzero(counted & (patch == number))
-            part = every[self.partner[every] >= 0]
-            seen = self.area_m2[part].sum() >= _SEEN_SHARE * self.area_m2[every].sum()
-            if seen and len(other.from_other(part)):
-                shared[names[number]] = part
-            else:
-                alone.append(names[number])
-        return shared, tuple(alone)
-
-    def flows(self, parts: list[IntArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return areas of parts, (p,), and draws of flows per kelvin and of what own readings add to these, (p, k)."""
-        conditions, stated = self.audit.conditions, triangle_exchange(self.audit.conditions, self.surface, self.draws)
-        found = Parts(conditions, self.surface, self.draws, stated, parts)
-        off_by, difference_k = conditions.camera.repeatability.off_by, self.draws.difference_k
-        off_k = np.stack([self.draws.local(off_by, n) for n in range(len(parts))])
-        _, flow_w = found.in_draws(self.draws)
-        own_w = found.slope_w_k[:, None] * off_k
-        return np.maximum(found.area_m2, 1e-12), flow_w / difference_k, own_w / difference_k
-
-
-def _bridges(old: _Survey, new: _Survey) -> list[_Bridge]:
-    """Return the bridges of two surveys whose places both saw; a bridge that both found has the later one's place."""
-
-    def same(before: FoundDefect, after: FoundDefect) -> bool:
-        shared = new.area_m2[after.core[np.isin(new.partner[after.core], before.core)]].sum()
-        return bool(shared >= _OVERLAP * min(old.area_m2[before.core].sum(), new.area_m2[after.core].sum()))
-
-    found = list[_Bridge]()
-    gone = [one for one in old.bridges if not any(same(one, other) for other in new.bridges)]
-    for bridge, own, other in (*((one, new, old) for one in new.bridges), *((one, old, new) for one in gone)):
-        zone, calm = other.from_other(bridge.zone), other.from_other(bridge.reference)
-        share = float(other.area_m2[zone].sum() / own.area_m2[bridge.zone].sum())
-        both = own is new and any(same(one, bridge) for one in old.bridges)
-        if (share < 0.5 and not both) or not len(zone) or not len(calm):
-            continue
-        here, there = (bridge.zone, bridge.reference, bridge.base_area_m2), (zone, calm, bridge.base_area_m2 * share)
-        if own is old:
-            found.append(_Bridge(bridge, "went", here, there))
+def _elements(surface: AuditedSurface, shared: BoolArray) -> tuple[dict[str, IntArray], tuple[str, ...]]:
+    """Return the `shared` triangles of each patch that the other survey saw, too, and names of patches it did not."""
+    seen, alone, patch = dict[str, IntArray](), list[str](), surface.selection.facet_patch
+    for number in np.unique(patch[surface.counted]):
+        every, name = surface.counted & (patch == number), surface.selection.patch_names[number]
+        part = every & shared
+        if part.any() and surface.area_m2[part].sum() >= _SEEN_SHARE * surface.area_m2[every].sum():
+            seen[name] = np.flatnonzero(part)
         else:
-            found.append(_Bridge(bridge, "in both" if both else "appeared", there, here))
-    return found
+            alone.append(name)
+    return seen, tuple(alone)
 
 
-def _change(
-    name: str,
-    state: State,
-    at_m: tuple[float, float, float],
-    unit: str,
-    before: FloatArray,
-    after: FloatArray,
-    per_unit_w: float,
-) -> Change:
-    """Return a change from draws, (k,), of what it was and is; times `per_unit_w` it is a change of the loss, [W]."""
-    change = interval_of(after - before)
-    loss = Interval(*(per_unit_w * one for one in (change.value, change.low, change.high)))
-    sure = not change.low <= 0.0 <= change.high
-    return Change(name, state, at_m, unit, interval_of(before), interval_of(after), change, loss, sure)
+def _flows(audit: Audit, draws: Draws, surface: AuditedSurface, parts: list[IntArray]) -> tuple[FloatArray, FloatArray]:
+    """Return draws of flows per kelvin through parts of `surface`, and of what own readings add to these, (p, k)."""
+    conditions, draws = audit.conditions, with_references(audit.surface, audit.conditions, draws)
+    found = Parts(conditions, surface, draws, parts)
+    off_k = np.stack([draws.local(conditions.camera.repeatability.off_by, n) for n in range(len(parts))])
+    return found.in_draws(draws)[1] / draws.difference_k, found.slope_w_k[:, None] * off_k / draws.difference_k
+
+
+def _bridges(before: Audit, after: Audit, partner: IntArray) -> list[tuple[State, FoundDefect]]:
+    """Return the bridges of both surveys, on what both saw of the later mesh; one that both found is the later one.
+
+    `partner` is the triangle of the earlier mesh beside each of the later one, (f,), or -1.
+    """
+    area_m2 = after.surface.area_m2
+
+    def carried(audit: Audit, to: Callable[[IntArray], IntArray]) -> Iterator[tuple[float, FoundDefect]]:
+        """Yield each bridge on the triangles that `to` returns, and their share of its zone."""
+        for defect, one in zip(audit.defects, audit.found):
+            if not defect.not_counted:
+                core, zone, calm = map(to, (one.core, one.zone, one.reference))
+                share = float(area_m2[zone].sum() / audit.surface.area_m2[one.zone].sum())
+                base_m2 = share * one.base_area_m2
+                yield share, replace(one, core=core, zone=zone, reference=calm, base_area_m2=base_m2)
+
+    def same(one: FoundDefect, other: FoundDefect) -> bool:
+        smaller = min(area_m2[one.core].sum(), area_m2[other.core].sum())
+        return bool(area_m2[np.intersect1d(one.core, other.core)].sum() >= _OVERLAP * smaller > 0.0)
+
+    was = [*carried(before, lambda part: np.flatnonzero(np.isin(partner, part)))]
+    now = [*carried(after, lambda part: part[partner[part] >= 0])]
+    found = list[tuple[float, State, FoundDefect]]()
+    for share, one in now:
+        if any(same(one, other) for _, other in was):
+            found.append((1.0, "in both", one))
+        else:
+            found.append((share, "appeared", one))
+    found.extend((share, "went", one) for share, one in was if not any(same(one, other) for _, other in now))
+    return [(state, one) for share, state, one in found if share >= 0.5 and len(one.zone) and len(one.reference)]
 
 
 def _ranked(changes: Sequence[Change]) -> tuple[Change, ...]:
@@ -284,13 +231,17 @@ def _places(points_m: FloatArray, normal: FloatArray) -> FloatArray:
     return np.concatenate([points_m, _NEAR_M * normal], axis=1)
 
 
-def _partners(count: int, which: IntArray, at: FloatArray, others: IntArray, others_at: FloatArray) -> IntArray:
-    """Return for `which` triangles of a survey the nearest of the `others` that faces the same way, or -1, (count,)."""
-    nearest = np.asarray(KDTree(others_at).query(at)[1], dtype=np.int64)
-    apart = np.linalg.norm(at[:, :3] - others_at[nearest, :3], axis=1)
-    same = (apart <= _NEAR_M) & (np.einsum("ij,ij->i", at[:, 3:], others_at[nearest, 3:]) >= _FACES * _NEAR_M**2)
-    found = np.full(count, -1)
-    found[which[same]] = others[nearest[same]]
+def _partners(surface: AuditedSurface, at: FloatArray, other: AuditedSurface, other_at: FloatArray) -> IntArray:
+    """Return the nearest triangle of another survey that faces the same way as each of a survey, or -1, (f,).
+
+    Both have to count; `at` and `other_at` are their `_places`.
+    """
+    which, others, found = np.flatnonzero(surface.counted), np.flatnonzero(other.counted), np.full(len(at), -1)
+    nearest = others[KDTree(other_at[others]).query(at[which])[1]]
+    apart = np.linalg.norm(at[which, :3] - other_at[nearest, :3], axis=1)
+    facing = np.einsum("ij,ij->i", at[which, 3:], other_at[nearest, 3:]) >= _FACES * _NEAR_M**2
+    same = facing & (apart <= _NEAR_M)
+    found[which[same]] = nearest[same]
     return found
 
 

@@ -32,15 +32,8 @@ Hours: TypeAlias = Annotated[Measured, Unit("h")]
 Conductivity: TypeAlias = Annotated[Measured, Unit("W/(m K)", 0.0, above=True)]
 
 Side = Literal["outside", "inside"]
-FilmModel: TypeAlias = str
-"""Name of a model of heat exchange at a surface; the formulas stand in `thermoxels_ns.audit.heat_flow`."""
-
-BALANCE: FilmModel = "balance"  # Radiation to what each triangle sees, and convection by formulas that are drawn
-FILM_MODELS: Mapping[Side, tuple[FilmModel, ...]] = {
-    "outside": (BALANCE, *FILMS["outside"], "given"),
-    "inside": (BALANCE, *FILMS["inside"], "given"),
-}
-WINDLESS: tuple[FilmModel, ...] = ("iso-6946-combined", "given")  # Need no wind speed for an outer surface
+BALANCE = "balance"  # Film model: radiation to what each triangle sees, and convection by formulas that are drawn
+_WINDLESS = ("iso-6946-combined", "given")  # Film models that need no wind speed for an outer surface
 
 EXAMPLE = "conditions-example.yaml"
 MOST_UNKNOWN = 4  # Largest number of properties that one calibration may search for
@@ -117,7 +110,7 @@ class Surroundings:
 class Film:
     """The model of heat exchange between surface and surroundings, with its uncertainty."""
 
-    model: FilmModel = BALANCE
+    model: str = BALANCE  # That, "given", or the name of a formula in `thermoxels_ns.audit.heat_flow.FILMS`
     factor: Annotated[Measured, Unit("1", 0.0)] = Measured(1.0)
     """Multiplies convection; all heat for dallo and iso-6946-combined."""
     coefficient: Annotated[Measured, Unit("W/(m2 K)", 0.0)] | None = None  # Convection coefficient; model "given" only
@@ -304,8 +297,6 @@ class Conditions:
     outside: OutsideAir = field(default_factory=OutsideAir)  # May be left out if the surface was seen from inside
     leave_out: tuple[str, ...] = ()  # Names or patterns of patches that do not count, such as glass or metal
     references: tuple[Reference, ...] = ()  # If there are none, `Camera.offset` is used as stated
-    storeys: dict[str, Annotated[Measured, Unit("m")]] = field(default_factory=dict)
-    """Height of the floor of each storey above the lowest point of the mesh, [m], by name of the storey."""
     survey: Survey = field(default_factory=Survey)
     limits: Limits = field(default_factory=Limits)
     energy: Energy | None = None
@@ -314,7 +305,8 @@ class Conditions:
     title: str = ""
 
     def __post_init__(self) -> None:
-        known, model, inside, outside = FILM_MODELS[self.side], self.film.model, self.inside.air, self.outside.air
+        known, model = (BALANCE, *FILMS[self.side], "given"), self.film.model
+        inside, outside = self.inside.air, self.outside.air
         if model not in known:
             name, remedy = f"film: model of surfaces seen from {self.side}", f"Write model: {known[0]}, for example."
             raise AuditError(name, expected=f"one of {', '.join(known)}", got=model, remedy=remedy)
@@ -323,7 +315,7 @@ class Conditions:
         if strange:
             remedy = f"Choose from {', '.join(formulas)}."
             raise AuditError("film: weights", expected=f"formulas for {self.side}", got=strange[0], remedy=remedy)
-        if self.side == "outside" and model not in WINDLESS and self.outside.wind is None:
+        if self.side == "outside" and model not in _WINDLESS and self.outside.wind is None:
             expected, remedy = f"a speed, because {model} needs it", "Add wind: 1.5 +- 0.5 m/s, for example."
             raise AuditError("outside: wind", expected=expected, got="none", remedy=remedy)
         needed = {"calibrate": self.calibrate is not None, "energy": self.energy is not None}

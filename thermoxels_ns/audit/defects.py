@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import KDTree
 
-from thermoxels_ns.audit.surface import WHY_NOT, AuditedSurface
+from thermoxels_ns.audit.surface import AuditedSurface
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.mesh.quality.checks import component_of, group_sides, triangles_across_edges
 
@@ -170,7 +170,6 @@ class _Zones:
         self.patch, self.at = surface.selection.facet_patch, surface.centroid_m
         self.normal = surface.selection.facet_normal
         self.edge_m = np.sqrt(2.0 * np.maximum(surface.area_m2, 0.0))
-        self.read = surface.counted | (surface.why_not == list(WHY_NOT).index("left out"))
         self.of_patch = {int(n): np.flatnonzero(sure & (self.patch == n)) for n in np.unique(self.patch[sure])}
         self.core_of = np.full(len(self.patch), -1)
         for number, core in enumerate(cores):
@@ -229,7 +228,7 @@ class _Zones:
         where that patch departs the other way.
         """
         surface, reach = self.surface, _BLURRED_EDGES * edge_m
-        others = np.flatnonzero(self.read & (self.patch != self.patch[core[0]]))
+        others = np.flatnonzero(surface.read & (self.patch != self.patch[core[0]]))
         if not len(others) or not len(reference):
             return False
         beside = KDTree(self.at[others])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.audit.draws import Interval, draw, interval_of
-from thermoxels_ns.audit.exchange import Parts, triangle_exchange, with_references
+from thermoxels_ns.audit.exchange import Parts, with_references
 from thermoxels_ns.audit.run import Audit
 from thermoxels_ns.mesh.boundary.planes import Building, FlatElement
 
@@ -50,7 +50,7 @@ def envelope_of(found: Audit, building: Building) -> Envelope:
     area_m2 = {one.name: max(float(surface.area_m2[one.facets].sum()), 1e-12) for one in building.every()}
     u = dict[str, Interval | None].fromkeys(which)
     seen = [name for name, part in which.items() if len(part) and conditions.outside_known]
-    parts = Parts(conditions, surface, draws, triangle_exchange(conditions, surface, draws), [which[n] for n in seen])
+    parts = Parts(conditions, surface, draws, [which[n] for n in seen])
     off_by = conditions.camera.repeatability.off_by
     for n, (name, flow_w) in enumerate(zip(seen, parts.in_draws(draws)[1])):
         flow_w = flow_w + parts.slope_w_k[n] * draws.local(off_by, n)

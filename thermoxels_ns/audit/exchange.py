@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from thermoxels_ns.audit.conditions import FILM_MODELS, WINDLESS, Conditions, Film, FilmModel
+from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.audit.draws import FORMULA, Draws, emissivity_name
 from thermoxels_ns.audit.heat_flow import (
     FILMS,
@@ -83,10 +83,9 @@ class Parts:
         conditions: Conditions,
         surface: AuditedSurface,
         draws: Draws,
-        stated: Exchange,
         which: Sequence[IntArray],
     ) -> None:
-        """Take the parts as indices of triangles; `stated` is the `triangle_exchange`."""
+        """Take the parts as indices of triangles."""
         self.conditions, (self.groups, of_triangle) = conditions, surface.alike
         row = np.repeat(np.arange(len(which)), [len(one) for one in which])
         every = np.concatenate([np.zeros(0, np.int64), *which])
@@ -98,7 +97,7 @@ class Parts:
         """Change of the stated flow per kelvin that all readings of a part are higher, shape (p,), [W/K]."""
         self._off = [
             np.bincount(row, area * own[every], len(which))[:, None] - self._rows @ of_group
-            for own, of_group in zip(stated, mean)
+            for own, of_group in zip(triangle_exchange(conditions, surface, draws), mean)
         ]
 
     def in_draws(self, draws: Draws, first: int | None = None) -> tuple[FloatArray, FloatArray]:
@@ -175,28 +174,14 @@ def _convection_w_m2k(conditions: Conditions, draws: Draws, warmer_k: FloatArray
     return found
 
 
-def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], ...]:
-    """Return the film models for which the conditions suffice, with conditions that use them; the stated one first."""
-    own = conditions.film
-    windless = conditions.side == "outside" and conditions.outside.wind is None
-    others: list[tuple[FilmModel, Conditions]] = [
-        (model, replace(conditions, film=Film(model, own.factor)))
-        for model in FILM_MODELS[conditions.side]
-        if model not in (own.model, "given") and (not windless or model in WINDLESS)
-    ]
-    return ((own.model, conditions), *others)
+def most_u_w_m2k(surface: AuditedSurface, side: str) -> FloatArray:
+    """Return the U-value that the films of air on both sides allow without any wall, 1 / (Rsi + Rse) of ISO 6946, (f,).
 
-
-def most_u_w_m2k(surface: AuditedSurface, conditions: Conditions, which: IntArray) -> float:
-    """Return the U-value that the films of air on both sides allow without any wall, [W/(m2 K)].
-
-    1 / (Rsi + Rse) of ISO 6946, by the direction in which heat flows through each of the triangles `which`; the mean by
-    area. A larger U-value is impossible: an input clashes with the readings.
+    It follows from the direction in which heat flows through each triangle. A larger U-value is impossible: an input
+    clashes with the readings.
     """
-    upward = surface.upward[which] * (-1.0 if conditions.side == "outside" else 1.0)
-    inside = FILMS["inside"]["iso-6946-combined"].w_m2k(0.0, 0.0, upward)
-    allowed = 1.0 / (1.0 / inside + OUTSIDE_RESISTANCE_M2K_W)
-    return float(np.average(allowed, weights=surface.area_m2[which]))
+    upward = surface.upward * (-1.0 if side == "outside" else 1.0)
+    return 1.0 / (1.0 / FILMS["inside"]["iso-6946-combined"].w_m2k(0.0, 0.0, upward) + OUTSIDE_RESISTANCE_M2K_W)
 
 
 def with_references(surface: AuditedSurface, conditions: Conditions, draws: Draws) -> Draws:

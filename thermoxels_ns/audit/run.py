@@ -11,10 +11,11 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.audit.calibration import Calibration, calibrated
-from thermoxels_ns.audit.conditions import BALANCE, Conditions, Survey, load_conditions
+from thermoxels_ns.audit.conditions import BALANCE, Conditions, Film, Survey, load_conditions
 from thermoxels_ns.audit.defects import DefectKind, FoundDefect, find_defects
 from thermoxels_ns.audit.draws import (
     GEOMETRY,
+    REPEATABILITY,
     Draws,
     Interval,
     causes,
@@ -27,7 +28,7 @@ from thermoxels_ns.audit.energy import EnergyResult, year_of
 from thermoxels_ns.audit.exchange import (
     Exchange,
     Parts,
-    other_models,
+    most_u_w_m2k,
     reference_doubts,
     triangle_exchange,
     with_references,
@@ -35,7 +36,7 @@ from thermoxels_ns.audit.exchange import (
 from thermoxels_ns.audit.heat_flow import simple_models, temperature_factor
 from thermoxels_ns.audit.surface import WHY_NOT, AuditedSurface, audited_surface
 from thermoxels_ns.audit.weather import remembered_share
-from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import AuditError
 from thermoxels_ns.core.measured import Measured
@@ -47,8 +48,6 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 if TYPE_CHECKING:
     from thermoxels_ns.mesh.files.vtu import pv
 
-SEVERE_SHARE, MODERATE_SHARE = 0.05, 0.01
-"""Least shares of the observed heat loss at which a defect is severe or moderate; no standard defines these shares."""
 F_RSI_M2K_W = (0.13, 0.25)
 """Inside surface resistances Rsi of the temperature factors, [m2 K / W]; ISO 13788 judges mould by the second."""
 _LEAST_FLOW_W_M2 = 1e-9
@@ -67,7 +66,6 @@ _NAMES = {
 
 Verdict = Literal["met", "not met", "cannot tell"]
 _NOT_OF_EN_13187 = ("purpose", "certificate", "parts_not_observed")  # Facts of a `Survey` that it does not ask for
-Severity = Literal["severe", "moderate", "slight", "uncertain"]
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ class Limit:
 
 @dataclass(frozen=True)
 class Element:
-    """Results for one part of the envelope: a patch, a storey, or all observed patches together."""
+    """Results for one part of the envelope: a patch, or all observed patches together."""
 
     name: str
     area_m2: float  # Area of the triangles that count
@@ -94,11 +92,11 @@ class Element:
     surface_c: Interval  # Mean surface temperature, [degrees Celsius]
     loss_w: Interval  # Heat flow from inside to outside, [W]
     u_w_m2k: Interval
-    u_by_model: Mapping[str, float]  # U-value by each film model, from the stated values, [W/(m2 K)]
     width_shares: Mapping[str, float]
     """By cause, largest first, the share by which the interval of the U-value (of the loss, where no U-value is known)
     would be narrower if the cause were known exactly, 0 to 1; shares need not add up to 1."""
     unsupported_share: float  # Share of the area whose position no photograph supports, 0 to 1
+    most_u_w_m2k: float  # U-value that the films of air allow without a wall, see `exchange.most_u_w_m2k`
 
 
 @dataclass(frozen=True)
@@ -107,7 +105,6 @@ class Defect:
 
     kind: DefectKind
     patch: str
-    storey: str  # Name of the storey; empty if the conditions name no storey there
     centre_m: tuple[float, float, float]  # Centroid of the core in the coordinates of the mesh
     height_m: float  # Mean height of the core above the lowest point of the mesh
     length_m: float  # Length of a line; largest extent of a point or an area
@@ -119,7 +116,6 @@ class Defect:
     coefficient: Interval
     """Of a line psi, [W/(m K)]; of a point chi, [W/K]; of an area its extra heat flow per kelvin, [W/K]."""
     f_rsi: tuple[Interval, ...]  # Temperature factors of the spot for `F_RSI_M2K_W`; empty if seen from outside
-    severity: Severity
     not_counted: str  # Sentence that says why the defect does not count; empty if the defect counts
 
 
@@ -154,13 +150,12 @@ class SurveyCheck:
 class Audit(HasTables):
     """All results of one audit, with the conditions and the surface that the results follow from.
 
-    It has the tables "patches", "storeys", "defects", "limits", "energy" and "savings"."""
+    It has the tables "patches", "defects", "limits", "energy" and "savings"."""
 
     conditions: Conditions
     surface: AuditedSurface
     check: SurveyCheck
     patches: tuple[Element, ...]
-    storeys: tuple[Element, ...]
     whole: Element
     defects: tuple[Defect, ...]  # By falling extra heat flow; defects that do not count come last
     found: tuple[FoundDefect, ...]  # Triangles of each defect, in the order of `defects`
@@ -171,12 +166,29 @@ class Audit(HasTables):
     budget: Mapping[str, float]
     """By cause, largest first, by how much the interval of `whole.loss_w` would be narrower if it were exact, [W]."""
     draws: int  # Number of draws behind each interval
-    failing_models: tuple[str, ...]  # Simple ones by which `whole` has a U-value of 0 or less, not the balance
     remembered: Interval | None  # `remembered_share` over the stated ranges; None if no time constant is stated
     not_counted_m2: Mapping[str, float]  # Area of triangles that do not count, by the texts of `WHY_NOT`
     triangle_surface_c: FloatArray  # Surface temperature, shape (f,), [degrees Celsius]; NaN: does not count
     triangle_flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (f,), [W/m2]; NaN: does not count
     triangle_u: FloatArray  # U-value, shape (f,), [W/(m2 K)]; NaN: does not count, or no U-value is known
+
+    @property
+    def impossible(self) -> tuple[str, ...]:
+        """Sentences on U-values that reach beyond what the films of air allow, and on what to look at: none or one.
+
+        The sentence names the two inputs that widen the U-value's interval most: one of them clashes with the readings.
+        """
+        over = [one for one in self.patches if one.u_w_m2k.high > one.most_u_w_m2k]
+        if not over:
+            return ()
+        shares = self.whole.width_shares.items()
+        widest = [name for name, share in shares if share > 0.0 and name not in (GEOMETRY, REPEATABILITY)]
+        return (
+            f"Impossible: the U-value of {', '.join(one.name for one in over)} reaches beyond the "
+            f"{min(one.most_u_w_m2k for one in over):.1f} W/(m² K) that the films of air on both sides allow without a "
+            "wall (ISO 6946). What is stated clashes with the readings; look at "
+            f"{' and '.join(widest[:2]) or 'the airs and the camera'} first.",
+        )
 
     def __repr__(self) -> str:
         loss, u = self.whole.loss_w, self.whole.u_w_m2k
@@ -185,9 +197,9 @@ class Audit(HasTables):
         return f"Audit({told}, U {u.value:.3g} W/(m2 K) ({u.low:.3g} to {u.high:.3g}), {defects} defects)"
 
     def tables(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the results by patch, storey, defect and limit; an interval has columns of its own for both ends."""
+        """Return the results by patch, defect and limit; an interval has columns of its own for both ends."""
         patches = lines_of((*self.patches, self.whole))
-        others = {name: lines_of(getattr(self, name)) for name in ("storeys", "defects", "limits")}
+        others = {name: lines_of(getattr(self, name)) for name in ("defects", "limits")}
         year = self.energy
         energy = [] if year is None else lines_of((*year.elements, year.whole))
         return {
@@ -249,10 +261,9 @@ def audit(
     off_by = conditions.camera.repeatability.off_by
     found = find_defects(surface, stated.surface_c, conditions.side == "outside", off_by)
     work = _Work(conditions, surface, draws, stated, found)
-    patches, storeys, whole, budget = work.elements()
-    failing = _failing_models(conditions, [one.element for one in (*patches, *storeys, whole)])
-    loss_w = whole.element.loss_w.value
-    bridges = [(one, *work.defect(number, one, loss_w, least_bridge_w)) for number, one in enumerate(found)]
+    patches, whole, budget = work.elements()
+    _check_film(conditions, surface, draws, [one.element for one in patches])
+    bridges = [(one, *work.defect(number, one, least_bridge_w)) for number, one in enumerate(found)]
     bridges.sort(key=lambda item: (bool(item[1].not_counted), -item[1].extra_w.value))
     factors = work.temperature_factors(len(work.flow_w) - 1, work.own_error_k(3 * len(found)))
     check, (remembered, told) = check_survey(conditions), _remembered(conditions)
@@ -262,7 +273,6 @@ def audit(
         surface=surface,
         check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, draws), *told)),
         patches=tuple(one.element for one in patches),
-        storeys=tuple(one.element for one in storeys),
         whole=whole.element,
         defects=tuple(one for _, one, _ in bridges),
         found=tuple(one for one, _, _ in bridges),
@@ -272,21 +282,12 @@ def audit(
         f_rsi=tuple(interval_of(one) for one in factors),
         budget=budget,
         draws=draws.count - 1,
-        failing_models=failing,
         remembered=remembered,
         not_counted_m2={why: area for why, area in left.items() if area > 0.0},
         triangle_surface_c=stated.surface_c,
         triangle_flow_w_m2=stated.flow_w_m2,
         triangle_u=stated.flow_w_m2 / draws.difference_k[0],
     )
-
-
-def _storey_of(surface: AuditedSurface, conditions: Conditions) -> IntArray:
-    """Return the place of each triangle's storey in `Conditions.storeys`, shape (f,); -1 below the lowest storey."""
-    begins = np.array([what.value for what in conditions.storeys.values()])
-    order = np.argsort(begins, kind="stable")
-    place = np.searchsorted(begins[order], surface.height_m + 1e-9, side="right")
-    return np.concatenate([[-1], order])[place].astype(np.int64)
 
 
 def _largest_first(amounts: Mapping[str, float]) -> dict[str, float]:
@@ -305,8 +306,7 @@ class _Drawn(NamedTuple):
 class _Work:
     """Heat flow and temperature of elements and defects in every draw.
 
-    Elements are made of pieces; a piece is the part of one patch in one storey. The pieces of a patch share a reading
-    error and an error of the patch's border.
+    The elements are the patches, each with a reading error and an error of its border of its own, and their sum.
     """
 
     def __init__(
@@ -318,37 +318,30 @@ class _Work:
         found: Sequence[FoundDefect],
     ) -> None:
         self.conditions, self.surface, self.draws = conditions, surface, draws
-        self.storey_names, self.storey = [*conditions.storeys, ""], _storey_of(surface, conditions)
         counted = np.flatnonzero(surface.counted)
-        several = len(self.storey_names)
-        key = surface.selection.facet_patch[counted] * several + self.storey[counted] + 1
-        pieces, self.piece = np.unique(key, return_inverse=True)  # `piece` is that of each triangle that counts
-        self.piece_patch, self.piece_storey = pieces // several, pieces % several - 1
-        self.patches, self.of_patch = np.unique(self.piece_patch, return_inverse=True)
-        self.storeys = np.unique(self.piece_storey[self.piece_storey >= 0])
-        parts = [counted[self.piece == n] for n in range(len(pieces))]
+        patch = surface.selection.facet_patch[counted]
+        self.patches = np.unique(patch)
+        parts = [counted[patch == n] for n in self.patches]
         parts += [part for one in found for part in (one.zone, one.reference, one.spot)]
         worst = np.flatnonzero(surface.counted & ~surface.rim)
         worst = worst if len(worst) else counted
         parts.append(surface.spot(worst, stated.surface_c[worst] * (-1.0 if conditions.side == "inside" else 1.0)))
-        self.parts = Parts(conditions, surface, draws, stated, parts)
+        self.parts = Parts(conditions, surface, draws, parts)
         self.surface_c, self.flow_w = self.parts.in_draws(draws)
 
-    def elements(self) -> tuple[list[_Drawn], list[_Drawn], _Drawn, dict[str, float]]:
-        """Return the patches, the storeys, all that was observed, and `Audit.budget`."""
-        surface, conditions, patch, patches = self.surface, self.conditions, self.piece_patch, self.patches
-        of_facet, of_patch, count = surface.selection.facet_patch, self.of_patch, len(patch)
-        chosen = [*(patch == n for n in patches), *(self.piece_storey == n for n in self.storeys), patch >= 0]
-        members = np.array(chosen, np.float64)
+    def elements(self) -> tuple[list[_Drawn], _Drawn, dict[str, float]]:
+        """Return the patches, all that was observed, and `Audit.budget`."""
+        surface, conditions, patches, count = self.surface, self.conditions, self.patches, len(self.patches)
+        of_facet, members = surface.selection.facet_patch, np.vstack([np.eye(count), np.ones(count)])
         area_m2, slope_w_k = self.parts.area_m2[:count], self.parts.slope_w_k[:count, None]
         border_m2 = np.bincount(of_facet, surface.border_m2 * surface.counted)[patches]
-        wider = np.minimum(border_m2 / np.bincount(of_patch, area_m2), 0.9)
+        wider = np.minimum(border_m2 / area_m2, 0.9)
         off_by = conditions.camera.repeatability.off_by
 
         def drawn(draws: Draws, flow_w: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-            """Return flow, area and U-value of each element, (e, k), from flows of the pieces without their errors."""
-            off_k = np.stack([draws.local(off_by, n) for n in range(len(patches))])[of_patch]
-            size = np.stack([1.0 + one * draws.geometry(n) for n, one in enumerate(wider.tolist())])[of_patch]
+            """Return flow, area and U-value of each element, (e, k), from flows of the patches without their errors."""
+            off_k = np.stack([draws.local(off_by, n) for n in range(count)])
+            size = np.stack([1.0 + one * draws.geometry(n) for n, one in enumerate(wider.tolist())])
             flow_w, area = members @ ((flow_w + slope_w_k * off_k) * size), members @ (area_m2[:, None] * size)
             return flow_w, area, flow_w / area / draws.difference_k
 
@@ -368,14 +361,8 @@ class _Work:
 
         flow_w, area, u = drawn(self.draws, self.flow_w[:count])
         surface_c = members @ (area_m2[:, None] * self.surface_c[:count]) / (members @ area_m2)[:, None]
-        models = dict[str, FloatArray]()  # U-value of each element by each film model, from the stated values, (e,)
-        for model, other in other_models(conditions):
-            flow = surface.area_m2 * triangle_exchange(other, surface, self.draws).flow_w_m2
-            flow_w_k = members @ np.bincount(self.piece, flow[surface.counted]) / self.draws.difference_k[0]
-            models[model] = flow_w_k / area[:, 0]
-        observed = np.isin(of_facet, patches)
+        observed, most_u = np.isin(of_facet, patches), most_u_w_m2k(surface, conditions.side)
         named = [(surface.selection.patch_names[n], of_facet == n) for n in patches]
-        named += [(self.storey_names[n], (self.storey == n) & observed) for n in self.storeys]
         found = list[_Drawn]()
         for n, (name, where) in enumerate([*named, ("all that was observed", observed)]):
             counted, uncut = where & surface.counted, where & (surface.why_not != list(WHY_NOT).index("cut"))
@@ -387,17 +374,16 @@ class _Work:
                 surface_c=interval_of(surface_c[n]),
                 loss_w=interval_of(flow_w[n]),
                 u_w_m2k=interval_of(u[n]),
-                u_by_model={model: float(one[n]) for model, one in models.items()},
                 width_shares=_largest_first(shares[n]),
                 unsupported_share=float(surface.area_m2[counted & surface.unsupported].sum() / area[n, 0]),
+                most_u_w_m2k=float(np.average(most_u[counted], weights=surface.area_m2[counted])),
             )
             found.append(_Drawn(element, flow_w[n], area[n], u[n]))
-        return found[: len(patches)], found[len(patches) : -1], found[-1], _largest_first(budget)
+        return found[:-1], found[-1], _largest_first(budget)
 
     def own_error_k(self, number: int) -> FloatArray:
         """Draw the reading error that a defect, or the coldest spot, does not share with others, shape (k,), [K]."""
-        first = len(self.patches) + len(self.storeys)
-        return self.draws.local(self.conditions.camera.repeatability.off_by, first + number)
+        return self.draws.local(self.conditions.camera.repeatability.off_by, len(self.patches) + number)
 
     def temperature_factors(self, part: int, off_k: FloatArray) -> tuple[FloatArray, ...]:
         """Return draws of the temperature factors of a part for `F_RSI_M2K_W`, (k,); empty if seen from outside.
@@ -411,21 +397,20 @@ class _Work:
         above = self.surface_c[part] + off_k - self.draws["outside air"]
         return tuple(np.asarray(temperature_factor(above / flow, one)) for one in F_RSI_M2K_W)
 
-    def defect(self, number: int, one: FoundDefect, whole_w: float, least_w: float) -> tuple[Defect, FloatArray]:
+    def defect(self, number: int, one: FoundDefect, least_w: float) -> tuple[Defect, FloatArray]:
         """Return the results of defect `number`, with draws of its `Defect.coefficient`.
 
         Extra heat flow is the flow of the zone minus the flow that the undisturbed surface near by would have on the
         area under the zone (psi = q_tb - q_uniform per metre, O'Grady and others 2017; areas are of the seen side).
-        `whole_w` is the observed heat loss, `least_w` the least extra flow that counts, [W].
+        `least_w` is the least extra flow that counts, [W].
         """
-        surface, zone, off_k = self.surface, len(self.piece_patch) + 3 * number, self.own_error_k(number)
+        surface, zone, off_k = self.surface, len(self.patches) + 3 * number, self.own_error_k(number)
         calm, spot = zone + 1, zone + 2
         extra = self.flow_w[zone] + self.parts.slope_w_k[zone] * off_k
         extra = extra - self.flow_w[calm] / max(self.parts.area_m2[calm], 1e-12) * one.base_area_m2
         if surface.border_m2.any():  # both ends of its length lie within half a triangle's edge
             edge = float(np.sqrt(2.0 * surface.area_m2[one.core].mean()))
-            border = self.draws.geometry(len(self.patches) + len(self.storeys) + 3 * number)
-            extra = extra * (1.0 + border * min(edge / one.length_m, 0.9))
+            extra = extra * (1.0 + self.draws.geometry(zone) * min(edge / one.length_m, 0.9))
         per_kelvin = extra / self.draws.difference_k / (one.length_m if one.kind == "line" else 1.0)
         extra_w, f_rsi = interval_of(extra), tuple(map(interval_of, self.temperature_factors(spot, off_k)))
         around_c, why = float(self.surface_c[calm, 0]), one.not_counted
@@ -436,7 +421,6 @@ class _Work:
         defect = Defect(
             kind=one.kind,
             patch=surface.selection.patch_names[one.patch],
-            storey=self.storey_names[self.storey[one.spot[0]]],
             centre_m=(x, y, z),
             height_m=float(np.average(surface.height_m[one.core], weights=area)),
             length_m=one.length_m,
@@ -447,20 +431,9 @@ class _Work:
             extra_w=extra_w,
             coefficient=interval_of(per_kelvin),
             f_rsi=f_rsi,
-            severity=_severity(self.conditions, extra_w, f_rsi, whole_w),
             not_counted=why,
         )
         return defect, per_kelvin
-
-
-def _severity(conditions: Conditions, extra: Interval, f_rsi: tuple[Interval, ...], whole_w: float) -> Severity:
-    limit = conditions.limits.f_rsi
-    if f_rsi and limit is not None and f_rsi[-1].high < limit.value:
-        return "severe"
-    if extra.low <= 0.0 or whole_w <= 0.0:
-        return "uncertain"
-    share = extra.value / whole_w
-    return "severe" if share >= SEVERE_SHARE else "moderate" if share >= MODERATE_SHARE else "slight"
 
 
 def _limits(
@@ -499,20 +472,28 @@ def _limits(
     return tuple(found)
 
 
-def _failing_models(conditions: Conditions, elements: Sequence[Element]) -> tuple[str, ...]:
-    """Return `Audit.failing_models`; raises `AuditError` if the chosen model fails for one of `elements`.
+def _check_film(conditions: Conditions, surface: AuditedSurface, draws: Draws, patches: Sequence[Element]) -> None:
+    """Raise `AuditError` if a simple film model gives a patch a U-value of 0 or less, and the balance one above 0.
 
-    The last element is all that was observed. Such nights: Zhang, Lucchi and Garzulino 2026, after EN ISO 6781-1.
+    Such nights: Zhang, Lucchi and Garzulino 2026, after EN ISO 6781-1.
     """
-    chosen, simple, failing = conditions.film.model, simple_models(conditions.side), tuple[str, ...]()
-    for one in elements:
-        u = {name: one.u_by_model.get(name, np.nan) for name in (*simple, BALANCE)}
-        failing = tuple(name for name in simple if u[name] <= 0.0 < u[BALANCE])
-        if chosen in failing:
+    chosen, balance_works = conditions.film.model, conditions.side == "inside" or conditions.outside.wind is not None
+    failing = [one for one in patches if one.u_w_m2k.value <= 0.0]
+    if chosen not in simple_models(conditions.side) or not failing or not balance_works:
+        return
+    balance = replace(conditions, film=Film(factor=conditions.film.factor))
+    flow_w = surface.area_m2 * triangle_exchange(balance, surface, draws).flow_w_m2
+    for one in failing:
+        patch = surface.selection.patch_names.index(one.name)
+        u = (
+            flow_w[surface.counted & (surface.selection.facet_patch == patch)].sum()
+            / one.area_m2
+            / draws.difference_k[0]
+        )
+        if u > 0.0:
             expected = f"one that knows what the surface sees, which is not as warm as the air {conditions.side}"
-            got = f"{chosen}, by which {one.name} has a U-value of {u[chosen]:.2f}; by the balance, {u[BALANCE]:.2f}"
+            got = f"{chosen}, by which {one.name} has a U-value of {one.u_w_m2k.value:.2f}; by the balance, {u:.2f}"
             raise AuditError("film: model", expected=expected, got=got, remedy=f"Write model: {BALANCE}.")
-    return failing
 
 
 def asked_of_survey(survey: Survey, conditions: Conditions | None = None) -> tuple[Asked, ...]:

@@ -75,11 +75,22 @@ class AuditedSurface:
         return self.centroid_m @ np.array(self.selection.up) - self.base_m
 
     @property
+    def read(self) -> BoolArray:
+        """True where thermal images measured a triangle that photographs show, left out or not, shape (f,)."""
+        return self.counted | (self.why_not == list(WHY_NOT).index("left out"))
+
+    @property
+    def range_c(self) -> tuple[float, float]:
+        """Lowest and highest reading where one was `read`, without stray ones, [degrees Celsius]."""
+        low, high = np.quantile(self.reading_c[self.read], (0.005, 0.995)).tolist()
+        return low, max(high, low + 0.1)
+
+    @property
     def rim(self) -> BoolArray:
         """True where a triangle counts but touches a triangle that is cut, unseen or without a reading, shape (f,)."""
         facets = self.mesh.facets
         unknown = np.zeros(len(self.mesh.points_m), dtype=bool)
-        unknown[facets[~self.counted & (self.why_not != list(WHY_NOT).index("left out"))]] = True
+        unknown[facets[~self.read]] = True
         return self.counted & unknown[facets].any(axis=1)
 
     @cached_property

@@ -112,7 +112,7 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     from thermoxels_ns.audit.conditions import EXAMPLE, load_conditions
     from thermoxels_ns.audit.envelope import envelope_of
     from thermoxels_ns.audit.run import audit
-    from thermoxels_ns.commands.audit_photographs import photographs_of_defects, shown_range_c
+    from thermoxels_ns.commands.audit_photographs import photographs_of_defects
     from thermoxels_ns.core.yaml_records import write_example
     from thermoxels_ns.data.scene_file import read_scene_file
     from thermoxels_ns.mesh.boundary.planes import find_building
@@ -159,26 +159,23 @@ def run_audit(options: Audit, say: Say = lambda _: None) -> Found | None:
     found = audit(mesh, conditions, up, least_w)
     envelope = None if building is None else envelope_of(found, building)
     compared = None if earlier is None else compare(earlier(), found, options.compare_difference)
-    most_u, impossible = impossible_u(found)
-    for words in (*found.check.forbidden, *found.check.doubts, *impossible):
+    for words in (*found.check.forbidden, *found.check.doubts, *found.impossible):
         say(f"Warning: {plain_names(words)}")
     if found.check.missing:
         say(f"Missing for a report after EN 13187: {', '.join(found.check.missing)}.")
     whole = found.whole
     say(f"Heat loss: {interval_text(whole.loss_w, 'W')}; U-value: {interval_text(whole.u_w_m2k, 'W/(m2 K)')}.")
     say(f"{sum(not one.not_counted for one in found.defects)} thermal bridges or defects.")
-    photographs, range_c = {}, None
+    photographs = {}
     if scene is not None:
         scale = (export.get("scale") or {}).get("metres_per_unit", 1.0)
         scale = check_positive("summary.json: metres_per_unit", scale, "Export the mesh again.", AuditError)
-        range_c = shown_range_c(found)
-        photographs = photographs_of_defects(scene, scale, found, range_c)
+        photographs = photographs_of_defects(scene, scale, found)
         say(f"Photographs show {sum(not found.defects[number].not_counted for number in photographs)} of them.")
     if compared is not None:
         sure = [one.name for one in (*compared.elements, *compared.bridges) if one.significant]
         say(f"Significant changes since the earlier survey: {', '.join(sure) or 'none'}.")
-    shown = {"range_c": range_c, "most_u": most_u, "impossible": impossible, "compared": compared}
-    names = _write(folder, options, found, photographs, shown, envelope)
+    names = _write(folder, options, found, photographs, envelope, compared)
     say(f"Written to {folder}: {', '.join(names)} ({clock.perf_counter() - begin:.1f} s)")
     return found
 
@@ -272,9 +269,10 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
 
     Raises `AuditError` or `MeshError` if a file is missing or damaged, or `difference_k` is not above 0.
     """
-    from thermoxels_ns.audit.compare import earlier_conditions
+    from thermoxels_ns.audit.conditions import Conditions
     from thermoxels_ns.audit.run import audit
     from thermoxels_ns.core.json_values import read_json_object
+    from thermoxels_ns.core.yaml_records import as_record, raising
     from thermoxels_ns.mesh.files.vtu import read_surface
 
     if difference_k is not None:
@@ -285,41 +283,14 @@ def read_earlier(path: Path, difference_k: float | None) -> Callable[[], Found]:
     if missing or not all(map(is_number, content["up"])):
         got, remedy = f"one without {' and '.join(missing) or 'up'}", f"{again} Audit again first."
         raise AuditError(str(path), expected="the answers.json of an audit", got=got, remedy=remedy)
-    conditions, mesh = earlier_conditions(path.name, content["conditions"]), read_surface(path.with_name(SURFACE))
+    unused = {"limits", "energy", "calibrate", "weather"}  # a comparison does not need them
+    with raising(AuditError):
+        stated = {key: one for key, one in content["conditions"].items() if key not in unused}
+        conditions = as_record(path.name, stated, Conditions)
+    mesh = read_surface(path.with_name(SURFACE))
     x, y, z = check_direction(f"{path}: up", content["up"], again, AuditError).tolist()
     least_w = content.get("least_bridge_w")
     return lambda: audit(mesh, conditions, (x, y, z), least_w if is_number(least_w) else 0.0)
-
-
-def impossible_u(found: Found) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return the U-value that no element exceeds, [W/(m2 K)] by name, and a sentence on intervals that reach beyond it.
-
-    The sentence names the two inputs that widen the U-value's interval most: one of these clashes with the readings.
-    """
-    from thermoxels_ns.audit.draws import GEOMETRY, REPEATABILITY
-    from thermoxels_ns.audit.exchange import most_u_w_m2k
-
-    surface, every, most = found.surface, np.flatnonzero(found.surface.counted), dict[str, float]()
-    for one in found.patches:
-        number = surface.selection.patch_names.index(one.name)
-        on = every[surface.selection.facet_patch[every] == number]
-        most[one.name] = most_u_w_m2k(surface, found.conditions, on)
-    most |= {one.name: max(most.values()) for one in (*found.storeys, found.whole)}
-    widest = [
-        name
-        for name, share in found.whole.width_shares.items()
-        if share > 0.0 and name not in (GEOMETRY, REPEATABILITY)
-    ]
-    inputs = " and ".join(widest[:2]) or "the airs and the camera"
-    over = [one.name for one in found.patches if one.u_w_m2k.high > most[one.name]]
-    if not over:
-        return most, ()
-    allowed = " to ".join(dict.fromkeys(f"{end(most[name] for name in over):.1f}" for end in (min, max)))
-    told = (
-        f"Impossible: the U-value of {', '.join(over)} reaches beyond the {allowed} W/(m² K) that the films of air on "
-    )
-    told += "both sides allow without a wall (ISO 6946). What is stated clashes with the readings; "
-    return most, (f"{told}look at {inputs} first.",)
 
 
 def answers_of(
@@ -329,7 +300,7 @@ def answers_of(
     from pydantic_core import to_jsonable_python
 
     calibration = found.calibration
-    same = ("conditions", "whole", "patches", "storeys", "defects", "limits", "f_rsi", "energy", "not_counted_m2")
+    same = ("conditions", "whole", "patches", "defects", "limits", "f_rsi", "energy", "not_counted_m2")
     named = ("found", "units", "refused", "moved_most_by", "misfit_k", "history_h", "doubt")
     told = {
         "mesh": options.mesh,
@@ -339,10 +310,11 @@ def answers_of(
         "calibration": None if calibration is None else {name: getattr(calibration, name) for name in named},
         "forbidden": found.check.forbidden,
         "doubts": found.check.doubts,
+        "impossible": found.impossible,
         "missing_for_en_13187": found.check.missing,
         "asked_of_survey": found.check.asked,
         "loss_narrower_by_w": found.budget,
-        **{name: getattr(found, name) for name in ("draws", "failing_models", "remembered")},
+        **{name: getattr(found, name) for name in ("draws", "remembered")},
         **({} if envelope is None else {"envelope": envelope.figures()}),
         **({} if compared is None else {"compared": compared}),
     }
@@ -354,8 +326,8 @@ def _write(
     options: Audit,
     found: Found,
     photographs: Mapping[int, tuple[Picture, ...]],
-    shown: Mapping[str, Any],
     envelope: Envelope | None,
+    compared: Comparison | None,
 ) -> tuple[str, ...]:
     """Write all files and return their names."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
@@ -379,8 +351,7 @@ def _write(
         north,
         *filter(None, [options.compare_difference]),
     )
-    answers = answers_of(options, found, envelope, shown["compared"])
-    answers |= {"report": asdict(report), "impossible": shown["impossible"]}
+    answers = answers_of(options, found, envelope, compared) | {"report": asdict(report)}
     plain_values(answers, "answers", AuditError)  # raises if json cannot hold the answers
     remove_file(folder / ANSWERS)
     write_vtk(vtkXMLPolyDataWriter(), folder / SURFACE, found.to_pyvista())
@@ -396,10 +367,10 @@ def _write(
     command, document = command_of("audit", options), options.pdf and not why_no_pdf()
     files = (PAGE, DOCUMENT, ANSWERS, SURFACE) if document else (PAGE, ANSWERS, SURFACE)
     files += tuple(ENVELOPES[one] for one in options.envelope)
-    about = (found, pictures, photographs, options.mesh.name, command, files)
-    write_page(folder / PAGE, audit_page(*about, report=report, **shown))
+    about = (found, pictures, photographs, options.mesh.name, command, files, report, compared)
+    write_page(folder / PAGE, audit_page(*about))
     remove_file(folder / DOCUMENT)
     if document:
-        write_pdf(folder / DOCUMENT, audit_page(*about, report=report, **shown, paper=True))
+        write_pdf(folder / DOCUMENT, audit_page(*about, paper=True))
     write_json(folder / ANSWERS, answers)
     return files

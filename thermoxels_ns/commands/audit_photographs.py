@@ -7,7 +7,6 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from thermoxels_ns.audit.run import Audit
-from thermoxels_ns.audit.surface import WHY_NOT
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
@@ -26,22 +25,14 @@ _BELOW_K, _COLDER = 0.5, 200  # Pixels colder than the range by this are grey, [
 _WIDTH = 480  # Width of a cut-out, [pixels]
 
 
-def shown_range_c(found: Audit) -> tuple[float, float]:
-    """Return lowest and highest reading on all surface that thermal images measured, without stray ones, [C]."""
-    surface = found.surface
-    read = surface.counted | (surface.why_not == list(WHY_NOT).index("left out"))
-    low, high = np.quantile(surface.reading_c[read], (0.005, 0.995)).tolist()
-    return low, max(high, low + 0.1)
-
-
 def photographs_of_defects(
-    scene: SceneFile, metres_per_unit: float, found: Audit, range_c: tuple[float, float]
+    scene: SceneFile, metres_per_unit: float, found: Audit
 ) -> dict[int, tuple[Picture, Picture]]:
     """Cut each defect out of photograph and thermal image that show it largest; return both by place in `found.found`.
 
-    `metres_per_unit` is the length of one unit of the scene's poses, [m]; the colours of thermal images span `range_c`,
-    [degrees Celsius]; what is colder is grey, as sky is. Defects that no photograph shows are left
-    out, and so are defects beyond `MOST_DEFECTS`.
+    `metres_per_unit` is the length of one unit of the scene's poses, [m]; the colours of thermal images span the range
+    of readings on the surface; what is colder is grey, as sky is. Defects that no photograph shows are left out, and so
+    are defects beyond `MOST_DEFECTS`.
     """
     frames = [frame for frame in scene.frames if frame.intrinsics.lens == "perspective"]
     surface = found.surface
@@ -55,7 +46,7 @@ def photographs_of_defects(
         if not scores or max(scores) <= 0.0:
             continue
         frame = frames[int(np.argmax(scores))]
-        shown = _cut_out(scene, frame, points, range_c)
+        shown = _cut_out(scene, frame, points, surface.range_c)
         if shown is not None:
             pictures[number] = ((shown[0], frame.image.name), (shown[1], "Thermal image, as the camera read it"))
     return pictures

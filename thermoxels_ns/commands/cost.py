@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 import shlex
-import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
+from tempfile import TemporaryDirectory
+from typing import Any, TextIO
 
 import tyro
 
 from thermoxels_ns.commands.installed_commands import PLAIN_TRAINING, run_command
-from thermoxels_ns.core.checks import check_positive, remedy_of, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import check_positive, hold_folder, writable_folder
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
-from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.json_values import read_json_object, write_json
 from thermoxels_ns.core.version import __version__
 
 FIGURES = {
@@ -30,13 +29,13 @@ FIGURES = {
     "surface_distance_m": ("surface distance", "{:.3f} m"),
     "half_transparent": ("half-transparent rays", "{:.1%}"),
 }
-"""Measured figures by their column in cost.csv, with the heading and form that the table shows. Time and memory are
+"""Measured figures by their name in cost.json, with the heading and form that the table shows. Time and memory are
 those of ns-train; the others are what ns-eval says of held-out views and, for drawn scenes, of the surface."""
-_KEY = ("setting", "scene", "version", "training")
-_TABLE = "cost.csv"
+_RUNS = "cost.json"
 _GROUPS = ("density", "sh", "temperature", "background", "corrections")
 
-Row = dict[str, str]
+Row = Mapping[str, Any]
+"""Figures of a run by name, None where there is none, and the command that trains it, `training`."""
 
 
 @dataclass
@@ -44,13 +43,13 @@ class Cost:
     """Train a scene at several settings and say what accuracy costs: a table of seconds and memory against errors of
     image, temperature and, for drawn scenes, surface.
 
-    Finished runs are kept in cost.csv in the output folder, so that an interrupted command goes on where it stopped;
+    Finished runs are kept in cost.json in the output folder, so that an interrupted command goes on where it stopped;
     remove the file to measure again. The machine should do nothing else, and have trained once before."""
 
     scene: tyro.conf.Positional[Path]
     """Scene folder."""
     output_dir: Path = Path("cost")
-    """Folder for cost.csv and logs."""
+    """Folder for cost.json and logs."""
     settings: tuple[str, ...] = ("32:400", "128:800")
     """Settings to train, each as resolution:steps: voxels along the longest side of the scene box, and training steps;
     the training schedule is scaled to both. May be empty."""
@@ -67,7 +66,7 @@ class Cost:
 
 
 def run_cost(cost: Cost, screen: TextIO) -> None:
-    """Train and evaluate every setting that cost.csv does not hold, and write the table to `screen`. See `Cost`."""
+    """Train and evaluate every setting that cost.json does not hold, and write the table to `screen`. See `Cost`."""
 
     def say(line: str) -> None:
         print(line, file=screen)
@@ -83,28 +82,26 @@ def run_cost(cost: Cost, screen: TextIO) -> None:
         raise ThermoxelsError("methods", expected="a method", got="none", remedy="Pass --methods thermoxels.")
     if not cost.scene.is_dir():
         raise SceneError("scene", expected="a scene folder", got=f"none at {cost.scene}", remedy="Correct the path.")
-    folder, scene, failed = writable_folder(cost.output_dir), str(cost.scene.resolve()), []
-    kept, rows = read_table(folder / _TABLE), []
-    for method in cost.methods:
-        for setting, words in options.items():
-            name = setting if method == cost.methods[0] else f"{setting}, {method}"
-            key = dict(zip(_KEY, (name, scene, __version__, shlex.join(["ns-train", method, *words]))))
-            row = next((one for one in kept if key.items() <= one.items()), None)
-            if row is None:
-                try:
-                    row = {**key, **_measure(cost.scene, method, words, name, folder, screen)}
-                except ThermoxelsError as problem:
-                    failed.append(f"{name}: {problem}")
-                    say(f"{name} failed: {problem}")
-                    continue
-                kept.append(row)
-                with replace_when_done(folder / _TABLE) as path, path.open("w", newline="", encoding="utf-8") as file:
-                    writer = csv.DictWriter(file, [*_KEY, *FIGURES])
-                    writer.writeheader()
-                    writer.writerows(kept)
-            else:
-                say(f"{name} is in {folder / _TABLE} already; remove the file to measure again.")
-            rows.append(row)
+    folder, scene, rows, failed = writable_folder(cost.output_dir), str(cost.scene.resolve()), dict[str, Row](), []
+    path, remedy = folder / _RUNS, "Remove the file to measure again, or choose another --output-dir."
+    with hold_folder(folder / ".lock", "Wait for it, or pass another --output-dir.", say):
+        runs = read_json_object(path, remedy) if path.is_file() else {}
+        for method in cost.methods:
+            for setting, words in options.items():
+                name = setting if method == cost.methods[0] else f"{setting}, {method}"
+                training = shlex.join(["ns-train", method, *words, "--data", scene])
+                run = f"Thermoxels {__version__}: {training}"
+                if run in runs:
+                    say(f"{name} is in {path} already; remove the file to measure again.")
+                else:
+                    try:
+                        runs[run] = _measure(cost.scene, method, words, name, folder, screen)
+                    except ThermoxelsError as problem:
+                        failed.append(f"{name}: {problem}")
+                        say(f"{name} failed: {problem}")
+                        continue
+                    write_json(path, runs)
+                rows[name] = {"training": training, **runs[run]}
     for line in [*table_of(rows), "", *([] if cost.target_mae is None else [cheapest(rows, cost.target_mae)])]:
         say(line)
     if failed:
@@ -129,67 +126,39 @@ def training_options(setting: str) -> tuple[str, ...]:
     return (*words, "--pipeline.model.view-dependence-from", str(schedule.view_dependence_from))
 
 
-def table_of(rows: Sequence[Row]) -> list[str]:
-    """Return the lines of a Markdown table; columns that are empty in all rows are left out."""
-    names = [name for name in FIGURES if any(row[name] for row in rows)]
+def table_of(rows: Mapping[str, Row]) -> list[str]:
+    """Return the lines of a Markdown table of rows by setting; columns that are empty in all rows are left out."""
+    names = [name for name in FIGURES if any(row[name] is not None for row in rows.values())]
     lines = [" | ".join(["| setting", *(FIGURES[name][0] for name in names)]) + " |", "|---|" + "---:|" * len(names)]
-    for row in rows:
-        cells = [FIGURES[name][1].format(float(row[name])) if row[name] else "-" for name in names]
-        lines.append(" | ".join([f"| {row['setting']}", *cells]) + " |")
+    for setting, row in rows.items():
+        cells = ["-" if row[name] is None else FIGURES[name][1].format(row[name]) for name in names]
+        lines.append(" | ".join([f"| {setting}", *cells]) + " |")
     return lines
 
 
-def cheapest(rows: Sequence[Row], target_mae: float) -> str:
+def cheapest(rows: Mapping[str, Row], target_mae: float) -> str:
     """Return a sentence on the fastest setting whose thermal MAE is at most the target, [degrees Celsius]."""
     wanted = f"a thermal MAE of at most {target_mae:g} °C"
-    able = [row for row in rows if row["thermal_mae_c"] and float(row["thermal_mae_c"]) <= target_mae]
+    able = [
+        name for name, row in rows.items() if row["thermal_mae_c"] is not None and row["thermal_mae_c"] <= target_mae
+    ]
     if not able:
         return f"No measured setting has {wanted}. Measure more steps or voxels with --settings, or relax the target."
-    best = min(able, key=lambda row: float(row["seconds"]))
-    return f"Cheapest setting with {wanted}: {best['setting']}. Train with: {best['training']} --data {best['scene']}"
+    best = min(able, key=lambda name: rows[name]["seconds"])
+    return f"Cheapest setting with {wanted}: {best}. Train with: {rows[best]['training']}"
 
 
-def _measure(scene: Path, method: str, words: Sequence[str], name: str, folder: Path, screen: TextIO) -> dict[str, str]:
-    """Train a setting, evaluate it, remove the model, and return all figures as texts, empty where there is none."""
-    name = re.sub(r"[^0-9A-Za-z.-]+", "-", name)
-    models, logs = (writable_folder(folder / part) for part in ("models", "logs"))
-    train = ["ns-train", method, "--data", str(scene), "--output-dir", str(models), "--experiment-name", name]
-    config, output = models / name / method / "run" / "config.yml", logs / f"{name}.json"
-    evaluate = ["ns-eval", "--load-config", str(config), "--output-path", str(output)]
-    shutil.rmtree(models / name, ignore_errors=True)
-    try:
+def _measure(
+    scene: Path, method: str, words: Sequence[str], name: str, folder: Path, screen: TextIO
+) -> dict[str, float | None]:
+    """Train a setting, evaluate it, remove the model, and return all figures, None where there is none."""
+    name, logs = re.sub(r"[^0-9A-Za-z.-]+", "-", name), writable_folder(folder / "logs")
+    output = logs / f"{name}.json"
+    with TemporaryDirectory(dir=folder) as models:
+        train = ["ns-train", method, "--data", str(scene), "--output-dir", models, "--experiment-name", name]
         trained = run_command([*train, *PLAIN_TRAINING, *words], logs / f"{name}-train.log", screen)
+        config = str(Path(models) / name / method / "run" / "config.yml")
+        evaluate = ["ns-eval", "--load-config", config, "--output-path", str(output)]
         run_command(evaluate, logs / f"{name}-eval.log", screen)
-    finally:
-        shutil.rmtree(models / name, ignore_errors=True)
-    expected, remedy = "the results of ns-eval", "Start the command again; finished runs are kept."
-    content = read_json(output, expected, remedy)
-    try:
-        found = trained._asdict() | content["results"]
-        figures = {figure: float(found.get(figure, math.nan)) for figure in FIGURES}
-    except (ValueError, KeyError, TypeError, AttributeError) as problem:
-        got = f"{type(problem).__name__}: {problem}"
-        raise ThermoxelsError(str(output), expected=expected, got=got, remedy=remedy) from problem
-    return {figure: "" if math.isnan(value) else f"{value:.6g}" for figure, value in figures.items()}
-
-
-def read_table(path: Path) -> list[Row]:
-    """Return the finished runs in cost.csv, none without the file; raise `ThermoxelsError` for a damaged file."""
-    if not path.is_file():
-        return []
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file, strict=True)
-            rows = list(reader)
-        if reader.fieldnames != [*_KEY, *FIGURES]:
-            raise ValueError("other columns")
-        for row in rows:
-            if None in row or None in row.values():
-                raise ValueError(f"a line of another length, {row['setting']}")
-            for name in FIGURES:
-                float(row[name] or "nan")
-    except (OSError, ValueError, TypeError, csv.Error) as problem:
-        expected, got = "the finished runs of an earlier start", f"{type(problem).__name__}: {problem}"
-        remedy = remedy_of(problem, "Remove the file to measure again, or choose another --output-dir.")
-        raise ThermoxelsError(str(path), expected=expected, got=got, remedy=remedy) from problem
-    return rows
+    found = trained._asdict() | read_json_object(output, "Start the command again; finished runs are kept.")["results"]
+    return {figure: value if math.isfinite(value := found.get(figure, math.nan)) else None for figure in FIGURES}

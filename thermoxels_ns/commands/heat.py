@@ -225,7 +225,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     from thermoxels_ns.reports.page import identify, write_page
 
     answers = plain_values(answers_of(options, run), "answers", HeatError)  # raises if json cannot hold the answers
-    shown, pictures = run.nodes, list[str]()
+    shown, pictures = run.nodes, HEAT_PICTURES if options.pictures else ()
     remove_file(folder / ANSWERS)
     _write_series(folder / SERIES, run)  # first: marks the folder as a heat run's for `result_folder`
     for name in (PAGE, STEADY, *HEAT_PICTURES):
@@ -237,7 +237,7 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
         states = shown_states(run.solution.times_s, options.vtk_times)
         write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution, states)
     if options.pictures:
-        pictures = draw_surface(folder, shown.mesh, shown.states_c, shown.times_s, run.problem.up)
+        draw_surface(folder, shown.mesh, shown.states_c, shown.times_s, run.problem.up)
     drawn = {name: (folder / name).read_bytes() for name in pictures}
     shown_in = STEADY if isinstance(run.solution, SteadySolution) else THROUGH_TIME
     files = [PAGE, ANSWERS, SERIES, shown_in, *pictures]

@@ -77,8 +77,6 @@ def run_command(words: Sequence[str], log: Path, screen: TextIO | None = None) -
         raise ThermoxelsError(words[0], expected=f"a command in {folder}", got="none", remedy=remedy)
     environment = dict(os.environ, PYTHONUNBUFFERED="1", PYTHONIOENCODING="utf-8")
     if screen is not None:
-        if screen.isatty():
-            environment |= {"FORCE_COLOR": "1", "COLUMNS": str(shutil.get_terminal_size().columns)}
         screen.write(f"$ {shlex.join(words)}\n")
     start, peak_memory_gb = time.monotonic(), math.nan
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")  # output so far may end within a character

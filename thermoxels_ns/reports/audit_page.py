@@ -12,7 +12,7 @@ from thermoxels_ns.audit.compare import Comparison
 from thermoxels_ns.audit.conditions import Survey
 from thermoxels_ns.audit.draws import CONFIDENCE
 from thermoxels_ns.audit.envelope import Envelope
-from thermoxels_ns.audit.run import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE, Audit, asked_of_survey
+from thermoxels_ns.audit.run import F_RSI_M2K_W, Audit, asked_of_survey
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.version import __version__
 from thermoxels_ns.mesh.boundary.planes import FlatElement, plane_axes
@@ -35,21 +35,16 @@ def audit_page(
     mesh_name: str,
     command: str,
     files: Sequence[str],
-    *,
     report: Report,
-    range_c: tuple[float, float] | None,
-    most_u: Mapping[str, float],
-    impossible: Sequence[str],
-    paper: bool = False,
     compared: Comparison | None = None,
+    paper: bool = False,
 ) -> str:
     """Return the html text of an audit's page; `command` made the audit, `files` lie beside the page.
 
     It has a 3-D view if it has pictures and is not meant for `paper`.
 
-    `photographs` are pictures of defects by place in `audit.defects`, whose colours span `range_c`; without `pictures`
-    the page has no drawings. `most_u` is the U-value by name of an element from which on a value is marked impossible,
-    `impossible` are sentences on such values; `compared` is what changed since an earlier survey.
+    `photographs` are pictures of defects by place in `audit.defects`; without `pictures` the page has no drawings.
+    `compared` is what changed since an earlier survey.
     """
     numbered, asked = list(enumerate(audit.defects, start=1)), audit.conditions.calibrate
     counted = [(number, one) for number, one in numbered if not one.not_counted]
@@ -69,14 +64,9 @@ def audit_page(
         pictures=pictures,
         report=report,
         gradient=gradient(),
-        range_c=range_c,
-        most_u=most_u,
-        impossible=impossible,
         compared=compared,
         photographs=defaultdict(tuple, photographs),
         confidence=100.0 * CONFIDENCE,
-        severe_share=SEVERE_SHARE,
-        moderate_share=MODERATE_SHARE,
         f_rsi_m2k_w=F_RSI_M2K_W,
         most_defects=MOST_DEFECTS,
         mesh_name=mesh_name,

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from thermoxels_ns.capture.frames import measurement_rows
-from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.rig.images import read_photograph
 from thermoxels_ns.capture.rig.start import rig_frames
 from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame
 from thermoxels_ns.capture.scene_writer import scene_names
@@ -21,17 +20,17 @@ from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import printable
 from thermoxels_ns.radiometry.thermal_pixels import MIN_FRAMES
-from thermoxels_ns.reports.charts import PERCENTILES, bars, colours, histogram
+from thermoxels_ns.reports.charts import PERCENTILES, colours
 from thermoxels_ns.reports.page import build_page, image_file, write_page
 
 _DEPTH_STEP = 4  # Spacing of the pixels at which depth is looked up, [pixels]; depth is interpolated in between
 _COLOUR_SHARE = 0.55  # Opacity of the thermal colours over the photograph
 _SHOWN = 6  # Number of frames with an overlay
-_SAMPLED_PIXELS = 4000  # About the number of pixels of each thermal image that enter the histogram
+_SAMPLED_PIXELS = 4000  # About the number of pixels of each thermal image whose temperatures are counted
 
-Overlay = tuple[str, bytes, bytes, bytes, str]
-"""Name of a frame; JPEG files of the overlay with the rig's start value, the overlay with the rig that was found, and
-the thermal image alone; and a caption on the colours of the thermal image."""
+Overlay = tuple[str, bytes, bytes, str]
+"""Name of a frame; JPEG files of the overlay with the rig that was found and of the thermal image alone; and a caption
+on the colours of the thermal image."""
 
 
 def write_capture_page(result: CaptureResult) -> None:
@@ -41,16 +40,13 @@ def write_capture_page(result: CaptureResult) -> None:
     overlays: list[Overlay] = []
     for index in np.unique(np.linspace(0, len(paired) - 1, min(_SHOWN, len(paired))).round().astype(int)).tolist():
         temperature_c = scene.drift.corrected(index, np.load(scene.frames[index].thermal))
-        start, found = (
-            image_file(overlay(paired[index], temperature_c, scene.model.camera, rig))
-            for rig in (result.start, scene.rig)
-        )
+        found = image_file(overlay(paired[index], temperature_c, scene.model.camera, scene.rig))
         known = temperature_c[np.isfinite(temperature_c)]
         low, high = (float(each) for each in np.percentile(known, PERCENTILES)) if known.size else (0.0, 1.0)
         alone = image_file(colours(temperature_c, (low, high)))
         title = f"{names[index]}: {scene.frames[index].name}"
         ends = f": {low:.1f} °C and less are black, {high:.1f} °C and more are bright yellow" if known.size else ""
-        overlays.append((title, start, found, alone, f"thermal image{ends}"))
+        overlays.append((title, found, alone, f"thermal image{ends}"))
     samples, masked, pixels = [], 0, 0
     for index, frame in enumerate(scene.frames):
         temperature_c = scene.drift.corrected(index, np.load(frame.thermal)).ravel()
@@ -95,11 +91,8 @@ def overlay(frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: R
     """Draw a thermal image in colours over its photograph in grey, with edges in white, shape (height, width, 3)."""
     carried = thermal_in_photograph(frame, temperature_c, visible, rig)
     height, width = carried.shape
-    if isinstance(frame.photograph, np.ndarray):
-        picture = Image.fromarray(frame.photograph.astype(np.uint8)).convert("L")
-    else:
-        picture = open_photograph(frame.photograph).convert("L")
-    grey = np.asarray(picture.resize((width, height), Image.Resampling.BOX))
+    photograph = read_photograph(frame).astype(np.uint8)
+    grey = np.asarray(cv2.resize(photograph, (width, height), interpolation=cv2.INTER_AREA))
     base = np.repeat(grey[..., None], 3, axis=2).astype(np.float32)
     known = np.isfinite(carried)
     mixed = np.where(known[..., None], (1 - _COLOUR_SHARE) * base + _COLOUR_SHARE * colours(carried), base)
@@ -115,9 +108,8 @@ def capture_page(
 
     `temperatures_c` is a sample of corrected temperatures; `masked_share` is the share of masked thermal pixels.
     """
-    scene, rig, drift = result.scene, result.scene.rig, result.scene.drift
+    scene, rig = result.scene, result.scene.rig
     errors, known_c = scene.model.sighting_error_px(), temperatures_c[np.isfinite(temperatures_c)]
-    label = "temperature, °C; how many pixels of a sample, without the coldest and hottest 0.1 %"
     off = {**rig.standard_errors, "focal": rig.standard_errors["log_focal"] * rig.thermal_camera.fl_x}
     frames = []
     for index, (name, frame) in enumerate(zip(scene_names(len(scene.frames)), scene.model.frames)):
@@ -135,16 +127,12 @@ def capture_page(
         shift=float(np.linalg.norm(rig.visible_to_thermal[:3, 3])),
         errors=errors,
         median_error=np.median(errors) if errors.size else math.nan,
-        error_chart=histogram(errors, "reprojection error, pixels of the photographs", (0.0, 99.0)),
         frames=frames,
         up_words=", ".join(f"{value:.3f}" for value in np.round(scene.up.direction, 3) + 0.0),
-        temperatures_c=known_c,
-        median_c=np.median(known_c) if known_c.size else math.nan,
-        temperature_chart=histogram(known_c, label, (0.1, 99.9)),
+        quantiles_c=np.quantile(known_c, (0.0, 0.001, 0.5, 0.999, 1.0)).tolist() if known_c.size else [],
         measurement=measurement_rows(scene.frames),
         masked_share=masked_share,
         min_frames=MIN_FRAMES,
-        drift_chart=bars(drift.offsets_k.tolist(), "frame; how much it reads too high, K") if drift.used else "",
     )
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from io import StringIO
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,65 +13,11 @@ from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.reports.numbers import time_unit
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-INK, SOFT, LINE, ACCENT = "#1d2430", "#9aa3ae", "#e1e5ea", "#b3431e"
+INK, SOFT, LINE = "#1d2430", "#9aa3ae", "#e1e5ea"
 """Colours of the pages' style sheet, ``templates/page.css``."""
 
 PERCENTILES = (2.0, 98.0)  # Percentiles of a thermal image's temperatures at its darkest and brightest colour
 _MOST_CURVES = 8  # Most probes or effects in one plot; more curves look alike
-
-
-@contextmanager
-def chart(width: float, height: float, rows: int = 1) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Yield a figure, `width` by `height` inches, in the look of the pages, with `rows` axes one above the other."""
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    look: Any = {"svg.hashsalt": "thermoxels", "svg.fonttype": "none", "font.size": 10}
-    look |= {"axes.spines.top": False, "axes.spines.right": False}
-    with rc_context(look):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        FigureCanvasSVG(figure)
-        axes = np.atleast_1d(figure.subplots(rows, 1, sharex=True)).tolist()
-        for axis in axes:
-            axis.grid(color=LINE, linewidth=0.6)
-            axis.set_axisbelow(True)
-        yield figure, axes
-
-
-def svg_text(figure: Figure) -> str:
-    """Return a figure as the text of an svg element; equal figures give equal text."""
-    text = StringIO()
-    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
-    svg = text.getvalue()
-    return svg[svg.index("<svg") :].rstrip()
-
-
-def histogram(values: npt.NDArray, label: str, percentiles: tuple[float, float] = (0.0, 100.0)) -> str:
-    """Return an svg element with a histogram of finite values between two percentiles, `label` below; "" if none."""
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return ""
-    low, high = np.percentile(values, percentiles).tolist()
-    with chart(7.0, 2.2) as (figure, (axis,)):
-        axis.hist(values, bins=60, range=(low, high), color=ACCENT, alpha=0.8)
-        axis.set_xlabel(label)
-        return svg_text(figure)
-
-
-def bars(values: Sequence[float], label: str) -> str:
-    """Return an svg element with one bar per value, up or down from zero, and `label` below; "" without values."""
-    if not len(values):
-        return ""
-    with chart(7.0, 2.2) as (figure, (axis,)):
-        axis.bar(np.arange(1, len(values) + 1), values, color=ACCENT, alpha=0.8)
-        axis.axhline(0.0, color=SOFT, linewidth=0.8)
-        axis.set_xlabel(label)
-        return svg_text(figure)
 
 
 def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatArray, probe_names: Sequence[str]) -> str:
@@ -81,11 +26,20 @@ def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatAr
     `mean_c` is the mean of the volume, shape (s + 1,); `probes_c` has shape (s + 1, p); both are in [degrees Celsius].
     Heat flows are means over the intervals between the s + 1 times.
     """
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    look: Any = {"svg.hashsalt": "thermoxels", "svg.fonttype": "none", "font.size": 10}
+    look |= {"axes.spines.top": False, "axes.spines.right": False}
     unit, length_s = time_unit(float(solution.times_s[-1]))
     times, states = solution.times_s / length_s, solution.temperature_c
     strongest = sorted(solution.effects, key=lambda heat: -np.abs(heat.heat_w).max(initial=0.0))
     acting = [heat for heat in strongest if np.any(heat.heat_w)][:_MOST_CURVES]
-    with chart(10.5, 7.0, rows=2) as (figure, (above, below)):
+    with rc_context(look):
+        figure = Figure(figsize=(10.5, 7.0), layout="constrained")
+        FigureCanvasSVG(figure)
+        above, below = figure.subplots(2, 1, sharex=True)
         above.fill_between(times, states.min(axis=1), states.max(axis=1), color="#e9dcd6", label="coldest to hottest")
         above.plot(times, mean_c, label="mean of the volume", color=INK, linewidth=2)
         for name, values in list(zip(probe_names, probes_c.T))[:_MOST_CURVES]:
@@ -99,7 +53,11 @@ def plot_over_time(solution: HeatSolution, mean_c: FloatArray, probes_c: FloatAr
         for axis, label in ((above, "temperature [°C]"), (below, "heat flow into the body [W]")):
             axis.set_ylabel(label)
             axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8.5)
-        return svg_text(figure)
+            axis.grid(color=LINE, linewidth=0.6)
+            axis.set_axisbelow(True)
+        text = StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    return text.getvalue()[text.getvalue().index("<svg") :].rstrip()
 
 
 def gradient() -> str:

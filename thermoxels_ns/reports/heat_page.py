@@ -19,9 +19,7 @@ from thermoxels_ns.reports.numbers import point_text, unit_signs
 from thermoxels_ns.reports.page import Report, build_page
 
 _CAPTIONS = {
-    "surface-start.png": "The surface at the start.",
     "surface-end.png": "The surface at the end. Colours span the surface that photographs show.",
-    "surface-change.png": "What changed.",
     "cut.png": "Cut through the middle at the end. Colours span the whole body.",
 }
 

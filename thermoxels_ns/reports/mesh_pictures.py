@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 _MESH_AREA = (0.04, 0.16, 0.80, 0.90)
 _INK = "#202020"
 _SUPPORT_COLOURS: tuple[str, ...] = ("green", "gold", "red", "grey")
-_LEAST_CHANGE_K = 1e-3  # Smallest end of a colour bar of changes, [K]; the other end is its negative
-HEAT_PICTURES = ("surface-start.png", "surface-end.png", "surface-change.png", "cut.png")
-"""File names of the pictures of a heat run; a steady state only has the second and the last picture."""
+HEAT_PICTURES = ("surface-end.png", "cut.png")
+"""File names of the pictures of a heat run."""
 _MATTER = {"ambient": 0.5, "diffuse": 0.65, "smooth_shading": False}  # Light that keeps colours readable in the shade
 _DARKEST = 0.1  # Share of the colour map inferno left out at its dark end, where shading would look like cold
 
@@ -175,27 +174,6 @@ def _size_of(mesh: TetMesh, length_unit: str) -> str:
     return f"{size} {length_unit}, {len(mesh.tets):,} tetrahedra"
 
 
-def before_after_change(
-    states_c: FloatArray, times_s: FloatArray, shown: IntArray
-) -> list[tuple[FloatArray, dict[str, Any]]]:
-    """Return values, (n,), and arguments of `image_of_mesh` for pictures of the first state, the last and the change.
-
-    The two states share one range of colours. Colours span the values at the nodes `shown`. `states_c` has shape
-    (s, n), `times_s` has shape (s,).
-    """
-    before, after = states_c[0], states_c[-1]
-    first, last = duration_text(float(times_s[0])), duration_text(float(times_s[-1]))
-    same: dict[str, Any] = dict(zip(("clim", "note"), colour_range(np.concatenate([before[shown], after[shown]]))))
-    ends, note = colour_range((after - before)[shown])
-    end = max(abs(ends[0]), abs(ends[1]), _LEAST_CHANGE_K)
-    change = {"clim": (-end, end), "colour_map": "coolwarm", "bar_title": "change [K]", "note": note}
-    return [
-        (before, {"title": f"Surface temperature at {first}", **same}),
-        (after, {"title": f"Surface temperature at {last}", **same}),
-        (after - before, {"title": f"Change from {first} to {last}", **change}),
-    ]
-
-
 def colour_range(values: npt.NDArray[np.floating]) -> tuple[tuple[float, float], str]:
     """Return the values at both ends of a colour bar, and a note for below the picture.
 
@@ -257,8 +235,8 @@ def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], len
 
 def draw_surface(
     folder: Path, mesh: TetMesh, states_c: FloatArray, times_s: FloatArray, up: tuple[float, float, float]
-) -> list[str]:
-    """Draw the pictures `HEAT_PICTURES` of a heat run into a folder; return the names of the files.
+) -> None:
+    """Draw the pictures `HEAT_PICTURES` of the last state of a heat run into a folder.
 
     Colours of the surface span the part that photographs show, because the inside of a heated building is far warmer.
     States are nodal temperatures, shape (s, n), [degrees Celsius], at times of shape (s,), [s].
@@ -267,14 +245,11 @@ def draw_surface(
     if mesh.boundary is not None:
         seen = seen & mesh.boundary.seen
     shown = np.unique(mesh.facets[seen] if seen.any() else mesh.facets)
-    drawn = dict(zip(HEAT_PICTURES, before_after_change(states_c, times_s, shown)))
-    when = f" at {duration_text(float(times_s[-1]))}"
-    if len(times_s) == 1:
-        when = ", steady"
-        values, how = drawn[HEAT_PICTURES[1]]
-        drawn = {HEAT_PICTURES[1]: (values, how | {"title": f"Surface temperature{when}"})}
-    for name, (values, how) in drawn.items():
-        write_picture(folder / name, image_of_mesh(mesh, values, up=up, **how))
+    when = ", steady" if len(times_s) == 1 else f" at {duration_text(float(times_s[-1]))}"
+    clim, note = colour_range(states_c[-1][shown])
+    title = f"Surface temperature{when}"
+    image = image_of_mesh(mesh, states_c[-1], up=up, title=title, clim=clim, note=note)
+    write_picture(folder / HEAT_PICTURES[0], image)
     points, facets, values, view = cut_open(mesh, states_c[-1], up)
     look: Any = {
         "title": f"Cut through the middle{when}",
@@ -282,8 +257,7 @@ def draw_surface(
         "up": up,
         "view_direction": view,
     }
-    write_picture(folder / HEAT_PICTURES[3], image_of_surface(points, facets, values, **look))
-    return [*drawn, HEAT_PICTURES[3]]
+    write_picture(folder / HEAT_PICTURES[1], image_of_surface(points, facets, values, **look))
 
 
 def cut_open(
