@@ -70,7 +70,8 @@ def write(folder: Path, poses: list[np.ndarray], room: list[float], block: bool,
 
 def found(folder: Path) -> tuple[np.ndarray, str]:
     file = read_scene_file(folder)
-    evidence = find_scene_box(file, None, [n for n, frame in enumerate(file.frames) if "train" in frame.name])
+    training = [n for n, frame in enumerate(file.frames) if "train" in frame.name]
+    evidence = find_scene_box(file, None, training, None)
     return evidence.box(), evidence.source
 
 

@@ -27,7 +27,7 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
 from thermoxels_ns.data.layouts import BOUNDS_NAME, LayoutName
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
-from thermoxels_ns.data.tracks import TrackSource, find_feature_rays
+from thermoxels_ns.data.tracks import TrackSource, feature_rays, find_tracks
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixels, read_thermal_file
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
@@ -85,7 +85,7 @@ class ThermalDataParserConfig(DataParserConfig):
     tracks: TrackSource = "auto"
     """Source of tracks: which photographs saw which points in structure from motion. Tracks tell training what is air.
     auto: the file that the json names (tracks_file_path), else a COLMAP model in the scene's folder (in colmap or
-    sparse) whose poses are those of the json. given: only the file. off: no tracks."""
+    sparse) whose poses are those of the json. Their points tell where the scene box is, too. off: no tracks."""
     refine_poses: PoseSource = "auto"
     """Poses to train with. auto: poses adjusted to features that photographs share (bundle adjustment), if the scene
     has no tracks and the adjusted poses fit better than the json's; else the json's. given: the json's."""
@@ -211,10 +211,12 @@ class ThermalDataParser(DataParser):
         CONSOLE.print(f"Layout {file.layout} (--layout takes another).", markup=False)
         names = [frame.name for frame in file.frames]
         split = split_frames(names, file.meta, config.eval_mode, config.eval_interval, file.left_out)
-        rays, given, fitted = find_feature_rays(file, split.train, config.tracks, CONSOLE.print), file, {}
+        tracks = None if config.tracks == "off" else find_tracks(file, CONSOLE.print)
+        rays = None if tracks is None else feature_rays(tracks, [file.frames[index] for index in split.train])
+        given, fitted = file, {}
         if rays is None and config.refine_poses == "auto":
             file, fitted = refine_poses(given, split.train, CONSOLE.print)
-        evidence = find_scene_box(file, config.scene_box, split.train)
+        evidence = find_scene_box(file, config.scene_box, split.train, tracks)
         box = evidence.box()
         translation, longest = -box.mean(axis=0), float((box[1] - box[0]).max())
         if np.abs(box).max() > _FAR_SIDES * longest:

@@ -13,9 +13,8 @@ from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.snapshot import Views, as_pinholes
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model, worlds_of_json
 from thermoxels_ns.data.scene_file import Frame, SceneFile
-from thermoxels_ns.data.tracks import FEWEST_VIEWS, MOST_ERROR_PX, TRACKS_KEY, read_tracks
+from thermoxels_ns.data.tracks import SparseTracks
 
 Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 
@@ -79,12 +78,14 @@ class BoxEvidence:
         return float(np.quantile(sizes[np.isfinite(sizes)], quantile)) if np.isfinite(sizes).any() else float("inf")
 
 
-def find_scene_box(scene: SceneFile, option: Sequence[Sequence[float]] | None, training: Sequence[int]) -> BoxEvidence:
+def find_scene_box(
+    scene: SceneFile, option: Sequence[Sequence[float]] | None, training: Sequence[int], tracks: SparseTracks | None
+) -> BoxEvidence:
     """Return the best evidence of where the scene box is.
 
     The first available counts: `option`, ``scene_box`` in the json (both in input coordinates), sparse points
-    (``ply_file_path``, ``tracks_file_path``, or a COLMAP model in one of `COLMAP_FOLDERS`), depths on which the
-    photographs that train (indices `training`) agree, the cameras. The same folder and split give the same result.
+    (``ply_file_path``, or those of `tracks`), depths on which the photographs that train (indices `training`) agree,
+    the cameras. The same folder and split give the same result.
 
     Raises:
         SceneError: A given box has no volume or is not finite, or a file cannot be read.
@@ -98,15 +99,10 @@ def find_scene_box(scene: SceneFile, option: Sequence[Sequence[float]] | None, t
     if "ply_file_path" in scene.meta:
         path = scene.folder / str(scene.meta["ply_file_path"])
         return BoxEvidence(f"the points of {path.name}", frames, points=_read_ply(path))
-    if TRACKS_KEY in scene.meta:
-        tracks = read_tracks(scene.folder / str(scene.meta[TRACKS_KEY]))
-        views = np.bincount(tracks.sighting_point, minlength=len(tracks.points))
-        good = (views >= FEWEST_VIEWS) & (tracks.point_error_px <= MOST_ERROR_PX)
-        points = tracks.points[good] if np.count_nonzero(good) >= _FEWEST_POINTS else tracks.points
-        return BoxEvidence("the points of structure from motion", frames, points=points)
-    for folder in COLMAP_FOLDERS:
-        if any((scene.folder / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
-            return BoxEvidence(f"the points of {folder}", frames, points=_read_colmap(folder, scene))
+    if tracks is not None:
+        good = tracks.well_seen()
+        points = good if len(good) >= _FEWEST_POINTS else tracks.points
+        return BoxEvidence(f"the points of {tracks.source}", frames, points=points)
     points, photographs = _points_of_photographs([frames[index] for index in training])
     if len(points) < _FEWEST_DEPTHS:
         return BoxEvidence("the cameras (no scene_box, no sparse points, no depths that photographs agree on)", frames)
@@ -250,24 +246,3 @@ def _read_ply(path: Path) -> FloatArray:
         remedy = remedy_of(problem, _REMEDY)
         raise SceneError(str(path), expected="a readable .ply", got=problem, remedy=remedy) from problem
     return points
-
-
-def _read_colmap(folder: str, scene: SceneFile) -> FloatArray:
-    """Return the points (n, 3) of a COLMAP model in the coordinates of the json.
-
-    The json may be in COLMAP's world or in one with other axes (``applied_transform``). The camera centres in both
-    decide which. Raises `SceneError` if they do not fit, so that a stale model cannot give a wrong box.
-    """
-    model = read_model(scene.folder / folder)
-    centres = {Path(image.name).name: np.asarray(image.projection_center()) for image in model.images.values()}
-    known = [(centres[frame.image.name], frame.pose[:3, 3]) for frame in scene.frames if frame.image.name in centres]
-    in_colmap, in_json = (np.array(side).reshape(-1, 3) for side in (zip(*known) if known else ([], [])))
-    for transform in worlds_of_json(scene.meta) if known else []:
-        off = np.linalg.norm(in_colmap @ transform[:3, :3].T + transform[:3, 3] - in_json, axis=1)
-        spread = np.linalg.norm(in_json - in_json.mean(axis=0), axis=1).max()
-        if np.median(off) <= 0.01 * max(spread, 1e-9):
-            points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-            return points @ transform[:3, :3].T + transform[:3, 3]
-    remedy = _REMEDY
-    got = f"{len(known)} photographs in common, at other places" if known else "no photograph in common"
-    raise SceneError(folder, expected="a COLMAP model with the camera centres of the json", got=got, remedy=remedy)
