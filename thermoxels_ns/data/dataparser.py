@@ -13,7 +13,7 @@ from typing import Any, Literal, Optional
 import numpy as np
 import numpy.typing as npt
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -224,7 +224,7 @@ class ThermalDataParser(DataParser):
             translation = translation.astype(np.float32).astype(np.float64)
         scale = SCENE_SIZE / longest
         pixel_size = evidence.pixel_size(box)
-        if math.isinf(pixel_size) and any(frame.intrinsics.lens == "perspective" for frame in file.frames):
+        if math.isinf(pixel_size):
             expected = f"photographs that look at the scene box, from {evidence.source}"
             remedy = (
                 "Check that poses are camera to world with x right, y up, z back, or pass --scene-box with its corners "
@@ -392,15 +392,12 @@ def _cameras(intrinsics: list[Camera], poses: torch.Tensor) -> Cameras:
         width=column("width", torch.int64),
         height=column("height", torch.int64),
         distortion_params=torch.tensor([one.distortion for one in intrinsics], dtype=torch.float32),
-        camera_type=torch.tensor([[CameraType[one.lens.upper()].value] for one in intrinsics]),
     )
 
 
 def _same_cameras(first: Cameras, second: Cameras) -> bool:
     """Return whether two sets of cameras have the same pixels with the same rays through them, up to rounding."""
-    return all(
-        torch.equal(getattr(first, name), getattr(second, name)) for name in ("width", "height", "camera_type")
-    ) and all(
+    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in ("width", "height")) and all(
         torch.allclose(getattr(first, name), getattr(second, name), rtol=1e-6, atol=1e-7)
         for name in ("fx", "fy", "cx", "cy", "distortion_params", "camera_to_worlds")
     )
@@ -501,8 +498,7 @@ def refine_poses(
     began = time.perf_counter()
     frames = scene.frames
     others = [number for number in range(len(frames)) if number not in set(training)]
-    usable = all(frame.intrinsics.lens == "perspective" for frame in frames)
-    if not usable or not FEWEST_PHOTOGRAPHS <= len(training) <= MOST_PHOTOGRAPHS:
+    if not FEWEST_PHOTOGRAPHS <= len(training) <= MOST_PHOTOGRAPHS:
         return scene, {}
     from thermoxels_ns.multiview.bundle_adjustment import adjust_poses, features_of, find_tracks
 

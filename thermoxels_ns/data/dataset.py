@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from jaxtyping import Bool, Float
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
@@ -51,11 +51,9 @@ class ThermalDataset(InputDataset):
         """True if photographs and thermal images share cameras, so that one ray carries a colour and a temperature."""
         return self.thermal_cameras is None
 
-    def camera(self, image_idx: int, thermal: bool = False) -> Camera | None:
-        """Return the camera of a photograph, or with `thermal` that in `thermal_cameras`; None if not perspective."""
+    def camera(self, image_idx: int, thermal: bool = False) -> Camera:
+        """Return the camera of a photograph, or with `thermal` that in `thermal_cameras`."""
         cameras: Any = self.thermal_cameras if thermal else self.cameras
-        if int(cameras.camera_type[image_idx]) != CameraType.PERSPECTIVE.value:
-            return None
         width, height = (int(getattr(cameras, name)[image_idx]) for name in ("width", "height"))
         fx, fy, cx, cy = (float(getattr(cameras, name)[image_idx]) for name in ("fx", "fy", "cx", "cy"))
         lens = [] if cameras.distortion_params is None else cameras.distortion_params[image_idx].tolist()

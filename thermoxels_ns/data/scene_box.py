@@ -12,7 +12,7 @@ import numpy as np
 from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.snapshot import Views, as_pinholes
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.data.tracks import SparseTracks
 
@@ -61,7 +61,7 @@ class BoxEvidence:
         """Return the width that a pixel covers at the typical distance of surfaces in `box`, in input units.
 
         This is the median over the points in the box and the photographs that have them in view; without points, the
-        width of a pixel in the middle of the nearer half of the box. Infinite if no perspective camera sees the box.
+        width of a pixel in the middle of the nearer half of the box. Infinite if no camera sees the box.
         """
         low, high = box
         if self.points is not None:
@@ -70,8 +70,8 @@ class BoxEvidence:
             steps = (np.arange(_PROBES) + 0.5) / _PROBES
             grid = np.stack(np.meshgrid(*3 * [steps], indexing="ij"), axis=-1).reshape(-1, 3)
             points, quantile = low + grid * (high - low), _NEARER_HALF
-        frames = [f for f in _spread(self.frames, _MOST_PHOTOGRAPHS) if f.intrinsics.lens == "perspective"]
-        if not frames or not len(points):
+        frames = _spread(self.frames, _MOST_PHOTOGRAPHS)
+        if not len(points):
             return float("inf")
         depth = _depths_in_view(points[:: max(len(points) // _MOST_POINTS, 1)], frames)
         sizes = depth / np.array([[f.intrinsics.fl_x] for f in frames])
@@ -114,10 +114,7 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
     """Return points (n, 3) on which photographs agree, in input coordinates, and how many photographs are compared."""
     from thermoxels_ns.multiview import photographs, stereo  # its kernels are slow to load and only needed here
 
-    frames = [frame for frame in frames if frame.intrinsics.lens == "perspective"]
     frames = _spread(frames, _STEREO_PHOTOGRAPHS)
-    if not frames:
-        return np.zeros((0, 3)), 0
     pinholes = []
     for frame in frames:
         picture, shown = frame.read_picture("RGB", 2 * _STEREO_SIDE)
@@ -169,9 +166,7 @@ def _views(frames: Sequence[Frame]) -> Views:
     focal = np.array([(lens.fl_x, lens.fl_y) for lens in lenses])
     centre = np.array([(lens.cx, lens.cy) for lens in lenses])
     size = np.array([(lens.width, lens.height) for lens in lenses])
-    fisheye = np.array([lens.lens == "fisheye" for lens in lenses])
-    poses = np.stack([frame.pose[:3] for frame in frames])
-    return Views(poses, focal, *as_pinholes(fisheye, focal, centre, size))
+    return Views(np.stack([frame.pose[:3] for frame in frames]), focal, centre, size)
 
 
 def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array:
@@ -179,9 +174,7 @@ def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array
     depth = np.full((len(frames), len(points)), np.nan, dtype=np.float32)
     for row, frame in zip(depth, frames):
         camera, local = frame.intrinsics, (points - frame.pose[:3, 3]) @ frame.pose[:3, :3] * (1.0, -1.0, -1.0)
-        shown = local[:, 2] > 0.0
-        if camera.lens == "perspective":
-            shown &= camera.contains(camera.project(local))
+        shown = (local[:, 2] > 0.0) & camera.contains(camera.project(local))
         row[shown] = local[shown, 2]
     return depth
 
