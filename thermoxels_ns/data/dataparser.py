@@ -19,7 +19,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
-from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError, ThermalFileError
 from thermoxels_ns.core.feature_rays import FeatureRays
@@ -28,7 +28,7 @@ from thermoxels_ns.data.layouts import BOUNDS_NAME, LayoutName
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
 from thermoxels_ns.data.tracks import TrackSource, feature_rays, find_tracks
-from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixels, read_thermal_file
+from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, read_thermal_file
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
 _FAR_SIDES = 16.0
@@ -37,8 +37,6 @@ by more than a millionth of the box. National coordinates are so far away."""
 _COLDEST_SKY_K = 150.0  # a file's median may be this far below the declared lowest temperature: it shows a clear sky
 _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
 """A file whose median is at least the first holds kelvins if the median less 273.15 is within the second of others."""
-_MOST_FRAMES = 64  # training files in which stuck pixels are sought
-
 _BYTES_PER_PIXEL = 8  # Three colours, and of masked photographs the mask and the pixel's number
 LONGEST_SIDE = 640  # pixels along the longer side of the pictures in which features are sought
 MOST_PHOTOGRAPHS = 500  # with more, poses stay as given: the normal equations would take minutes
@@ -123,7 +121,7 @@ class ThermalDataParser(DataParser):
     The metadata of its outputs hold: ``temperature_range`` (`TemperatureRange`; None for photographs alone),
     ``thermal_filenames`` (None for photographs alone), ``thermal_cameras`` (`Cameras`; None if all pairs share camera
     and resolution), ``thermal_unit``, ``valid_range_c``,
-    ``thermal_dead_pixels`` (masks of stuck pixels by shape of the image), ``image_scale`` (1 / downscale_factor),
+    ``image_scale`` (1 / downscale_factor),
     ``thermal_averaged`` (pixels of a thermal image that become one, along a side),
     ``pixel_size`` (width of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the
     scene box in input coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None unless train has tracks).
@@ -231,17 +229,16 @@ class ThermalDataParser(DataParser):
                 "in their coordinates: xmin ymin zmin xmax ymax zmax."
             )
             raise SceneError("cameras", expected=expected, got="none that has it in view", remedy=remedy)
-        training, shapes, temperatures, dead = [file.frames[index] for index in split.train], {}, None, {}
+        training, shapes, temperatures = [file.frames[index] for index in split.train], {}, None
         if file.has_thermal:
             paths, those = ([f.thermal for f in some if f.thermal is not None] for some in (file.frames, training))
-            surveyed = survey_thermal_files(paths, file.unit, config.valid_range_c, file.bounds_c, set(those))
-            shapes, temperatures, dead = surveyed
+            settings = file.unit, config.valid_range_c, file.bounds_c
+            shapes, temperatures = survey_thermal_files(paths, *settings, set(those))
             _refuse_several_sizes(file.frames, shapes)
         metadata = {
             "temperature_range": temperatures,
             "thermal_unit": file.unit,
             "valid_range_c": tuple(config.valid_range_c),
-            "thermal_dead_pixels": dead,
             "pixel_size": scale * pixel_size,
             "input_box": tuple(map(tuple, box.tolist())),
             "scene_name": file.folder.resolve().name,
@@ -310,21 +307,18 @@ def survey_thermal_files(
     valid_range_c: tuple[float, float],
     bounds_c: tuple[float, float] | None,
     training: Collection[Path],
-) -> tuple[dict[Path, tuple[int, int]], TemperatureRange, dict[tuple[int, int], BoolArray]]:
-    """Read every thermal file; return its shape (h, w) by path, the temperature range, and masks of stuck pixels.
+) -> tuple[dict[Path, tuple[int, int]], TemperatureRange]:
+    """Read every thermal file; return its shape (h, w) by path, and the temperature range.
 
-    A mask holds for all files of its shape; a shape without stuck pixels has none. Range and stuck pixels come from the
-    files in `training` alone. The range is that of the scene, `bounds_c` [degrees Celsius], where given, widened to the
-    extremes of the training files.
+    The range is that of the scene, `bounds_c` [degrees Celsius], where given, widened to the extremes of the files in
+    `training`.
 
     Raises:
         ThermalFileError: A file cannot be read or has no valid pixel, or its median tells of another unit.
     """
     shapes: dict[Path, tuple[int, int]] = {}
-    extremes: dict[Path, tuple[float, float]] = {}
     middles: dict[Path, float] = {}
-    kept: dict[tuple[int, int], list[Float32Array]] = {}
-    step = -(-len(training) // _MOST_FRAMES)
+    low, high = bounds_c or (math.inf, -math.inf)
     for path in paths:
         temperature_c = read_thermal_file(path, unit, valid_range_c).temperature_c
         height, width = temperature_c.shape
@@ -335,24 +329,11 @@ def survey_thermal_files(
             raise ThermalFileError(str(path), expected=expected, got="no valid pixel", remedy=remedy)
         if path not in training:
             continue
-        if len(extremes) % step == 0:
-            kept.setdefault((height, width), []).append(temperature_c)
-        extremes[path] = (float(np.nanmin(temperature_c)), float(np.nanmax(temperature_c)))
+        low, high = min(low, float(np.nanmin(temperature_c))), max(high, float(np.nanmax(temperature_c)))
         middles[path] = float(np.nanmedian(temperature_c))
     if bounds_c is not None or tuple(valid_range_c) == ThermalDataParserConfig.valid_range_c:
         _refuse_other_units(middles, bounds_c)
-    dead = {shape: find_dead_pixels(np.stack(frames)) for shape, frames in kept.items()}
-    dead = {shape: mask for shape, mask in dead.items() if mask.any()}
-    for path in extremes:
-        if shapes[path] in dead:  # a stuck pixel may hold the file's extreme
-            live = read_thermal_file(path, unit, valid_range_c).temperature_c[~dead[shapes[path]]]
-            if np.isfinite(live).any():
-                extremes[path] = (float(np.nanmin(live)), float(np.nanmax(live)))
-    lows, highs = zip(*extremes.values())
-    low, high = min(lows), max(highs)
-    if bounds_c is not None:
-        low, high = min(low, bounds_c[0]), max(high, bounds_c[1])
-    return shapes, TemperatureRange.spanning(low, high), dead
+    return shapes, TemperatureRange.spanning(low, high)
 
 
 def _thermal_intrinsics(frame: Frame, shapes: Mapping[Path, tuple[int, int]]) -> Camera:

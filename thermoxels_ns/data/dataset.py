@@ -138,11 +138,7 @@ class ThermalDataset(InputDataset):
         if image_idx not in self._thermal:
             path, given = self.metadata["thermal_filenames"][image_idx], self.metadata
             image = read_thermal_file(path, given["thermal_unit"], given["valid_range_c"])
-            valid, report = np.isfinite(image.temperature_c), image.report
-            dead = given["thermal_dead_pixels"].get(valid.shape)
-            if dead is not None:
-                report = report + PixelReport(dead=int((valid & dead).sum()))
-                valid &= ~dead
+            valid = np.isfinite(image.temperature_c)
             # float32 would lose 16-bit steps of a narrow range far from 0 C.
             normalised = self.temperature_range.normalise(image.temperature_c.astype(np.float64))
             thermal = np.where(valid, normalised, 0.0)
@@ -150,7 +146,7 @@ class ThermalDataset(InputDataset):
                 thermal, valid = _averaged(thermal, valid, side)
             thermal = thermal.astype(np.float32)
             tensors = torch.from_numpy(thermal)[..., None], torch.from_numpy(valid)[..., None]
-            self._thermal[image_idx] = (*tensors, report)
+            self._thermal[image_idx] = (*tensors, image.report)
         return self._thermal[image_idx]
 
     def _resized(self, picture: Image.Image, image_idx: int, filter_: Image.Resampling) -> Image.Image:

@@ -109,7 +109,6 @@ class PixelReport:
     saturated: int = 0
     """Pixels at the end of a linear scale (count 0 or 65535 for 16 bit), or outside FLIR's calibrated range."""
     out_of_range: int = 0  # pixels below absolute zero or outside the valid range
-    dead: int = 0  # pixels with valid values that are stuck at one value in all frames
 
     def __add__(self, other: PixelReport) -> PixelReport:
         return PixelReport(*map(sum, zip(astuple(self), astuple(other))))
@@ -117,11 +116,11 @@ class PixelReport:
     @property
     def masked(self) -> int:
         """Number of all pixels without a usable temperature."""
-        return self.nan + self.saturated + self.out_of_range + self.dead
+        return self.nan + self.saturated + self.out_of_range
 
     def __str__(self) -> str:
         share = 100.0 * self.masked / max(self.pixels, 1)
-        kinds = f"{self.nan} NaN, {self.saturated} saturated, {self.out_of_range} out of range, {self.dead} dead"
+        kinds = f"{self.nan} NaN, {self.saturated} saturated, {self.out_of_range} out of range"
         return f"{self.masked} of {self.pixels} pixels masked ({share:.2f} %): {kinds}"
 
 
