@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.support.colmap_model import write_colmap_model
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, matched_names
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import read_scene_file
@@ -17,7 +17,6 @@ from thermoxels_ns.data.tracks import (
     MOST_ERROR_PX,
     TRACKS_KEY,
     SparseTracks,
-    _matched,
     feature_rays,
     find_tracks,
     write_tracks,
@@ -164,10 +163,13 @@ def test_errors_are_pixels_of_the_photographs_and_the_worst_that_counts_where_co
 
 def test_photographs_of_one_name_are_told_apart_by_their_folders():
     images = ["left/1.jpg", "right/1.jpg", "2.jpg"]
-    assert _matched(images, ["images/right/1.jpg", "images/left/1.jpg", "images/2.jpg"]) == [(1, 0), (0, 1), (2, 2)]
-    assert _matched(images, ["images/1.jpg", "2.jpg"]) == [(2, 1)]
-    assert _matched(["1.jpg"], ["a/1.jpg", "b/1.jpg"]) == []
-    assert _matched(["1.jpg", "left/1.jpg"], ["images/left/1.jpg", "images/1.jpg"]) == [(1, 0), (0, 1)]
+    assert matched_names(images, ["images/right/1.jpg", "images/left/1.jpg", "images/2.jpg"]) == [
+        (1, 0),
+        (0, 1),
+        (2, 2),
+    ]
+    assert matched_names(images, ["images/1.jpg", "2.jpg"]) == [(2, 1)]
+    assert matched_names(["1.jpg"], ["a/1.jpg", "b/1.jpg"]) == matched_names(["1.jpg", "1.png"], ["1.jpg"]) == []
 
 
 def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_world(tracked):

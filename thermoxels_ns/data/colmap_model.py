@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -65,3 +66,24 @@ def lens_entries(model: str, parameters: Iterable[float]) -> dict[str, float]:
     """
     values = dict(zip(PARAMETERS.get(model, ()), map(float, parameters)))
     return values | dict.fromkeys(("fl_x", "fl_y"), values.pop("f")) if "f" in values else values
+
+
+def matched_names(images: Sequence[str], files: Sequence[str]) -> list[tuple[int, int]]:
+    """Return the pairs (image, file) of indices that belong to the same photograph, by names without their suffixes.
+
+    The file's name ends with the image's, folders included. The longest such image is taken; images that then belong to
+    several files, and images of one name, are left out.
+
+    >>> matched_names(["1.jpg", "left/1.jpg"], ["images/left/1.png", "images/1.png"])
+    [(1, 0), (0, 1)]
+    """
+    names = [PurePosixPath(image).with_suffix("").as_posix() for image in images]
+    often = Counter(names)
+    number = {name: place for place, name in enumerate(names) if often[name] == 1}
+    pairs = []
+    for place, file in enumerate(files):
+        parts = PurePosixPath(file).with_suffix("").parts
+        endings = ("/".join(parts[first:]) for first in range(len(parts)))
+        pairs += [(number[ending], place) for ending in endings if ending in number][:1]
+    once = Counter(image for image, _ in pairs)
+    return [pair for pair in pairs if once[pair[0]] == 1]

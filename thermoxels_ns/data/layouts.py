@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_model, lens_entries, read_model
+from thermoxels_ns.data.colmap_model import (
+    COLMAP_FOLDERS,
+    camera_to_world,
+    is_model,
+    lens_entries,
+    matched_names,
+    read_model,
+)
+from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES
 
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")
 BOUNDS_NAME = "temperature_bounds.json"
@@ -105,33 +112,22 @@ def _signs_of_thermal(folder: Path, content: dict[str, Any]) -> str:
 
 
 def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, Any], list[str]]:
-    """Return what a transforms.json would say of a COLMAP model's photographs in ``folder / root``, found by name, else
-    by stem, and the names of those that are not there. Subfolders train, val and test become split lists."""
+    """Return what a transforms.json would say of a COLMAP model's photographs in ``folder / root``, and the names of
+    those that are not there or not clear (`matched_names`). Subfolders train, val and test become split lists."""
     cameras, images, _ = read_model(place)
-    exact, files = dict[str, list[str]](), defaultdict[str, list[str]](list)
-    for path in sorted((folder / root).rglob("*")):
-        within = path.relative_to(folder / root)
-        if path.is_file():
-            exact[within.as_posix()] = [path.relative_to(folder).as_posix()]
-            for key in {within.name, f"{within.stem}.*"}:
-                files[key].append(path.relative_to(folder).as_posix())
-    frames, left_out = [], []
-    taken = {exact[image.name][0] for image in images.values() if image.name in exact}
-    for image in sorted(images.values(), key=lambda image: image.name):
-        name = PurePosixPath(image.name)
-        found = exact.get(image.name) or next((files[key] for key in (name.name, f"{name.stem}.*") if key in files), [])
-        if image.name not in exact:
-            found = [one for one in found if one not in taken]  # such as thermal images that COLMAP saw too
-        if len(found) > 1:
-            got, remedy = ", ".join(found), "Rename them in the folder and in COLMAP, and run COLMAP again."
-            raise SceneError(f"{place}: {name}", expected="one photograph of this name", got=got, remedy=remedy)
-        if not found:
-            left_out.append(str(name))
-            continue
-        camera = cameras[image.camera_id]
-        lens = {"camera_model": camera.model, "w": camera.width, "h": camera.height}
-        lens |= lens_entries(camera.model, camera.params)
-        frames.append({"file_path": found[0], "transform_matrix": camera_to_world(image).tolist(), **lens})
+    there = (path for path in sorted((folder / root).rglob("*")) if path.suffix.lower() in THERMAL_SUFFIXES)
+    files = [path.relative_to(folder).as_posix() for path in there]
+    posed = sorted(images.values(), key=lambda image: image.name)
+    file_of = dict(matched_names([image.name for image in posed], files))
+    left_out = [image.name for number, image in enumerate(posed) if number not in file_of]
+    frames = []
+    for number, image in enumerate(posed):
+        if number in file_of:
+            camera = cameras[image.camera_id]
+            lens = {"camera_model": camera.model, "w": camera.width, "h": camera.height}
+            lens |= lens_entries(camera.model, camera.params)
+            pose = camera_to_world(image).tolist()
+            frames.append({"file_path": files[file_of[number]], "transform_matrix": pose, **lens})
     if not frames:
         got = f"{len(images)} others, such as {', '.join(left_out[:2]) or 'none'}"
         remedy = "Put the photographs there that COLMAP saw, with the names that it saw."

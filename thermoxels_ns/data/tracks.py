@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import zipfile
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -15,7 +14,7 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import remedy_of, write_npz
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_model, read_model
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_model, matched_names, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.data.transforms_json import read_pose
 
@@ -112,7 +111,7 @@ def read_colmap_tracks(scene: SceneFile, folder: str, say: Callable[[str], None]
         SceneError: The model is damaged, is not of these photographs, or too few of its poses agree.
     """
     cameras, images, points = read_model(scene.folder / folder)
-    pairs = _matched([image.name for image in images.values()], [frame.name for frame in scene.frames])
+    pairs = matched_names([image.name for image in images.values()], [frame.name for frame in scene.frames])
     if not pairs:
         there, here = next((image.name for image in images.values()), "none"), scene.frames[0].name
         names = f"such as {there} there and {here} here"
@@ -203,17 +202,3 @@ def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray
     across = np.linalg.norm(np.cross(directions, mean[point]), axis=1)
     np.maximum.at(off, point, np.arctan2(across, (directions * mean[point]).sum(axis=1)))
     return 2.0 * off
-
-
-def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, int]]:
-    """Return the pairs (image, frame) of indices that belong to the same photograph: the frame's name ends with the
-    image's, folders included. The longest such image is taken; images that then belong to several frames are left out.
-    """
-    number = {image: place for place, image in enumerate(images)}
-    pairs = []
-    for place, frame in enumerate(frames):
-        parts = PurePosixPath(frame).parts
-        endings = ("/".join(parts[first:]) for first in range(len(parts)))
-        pairs += [(number[ending], place) for ending in endings if ending in number][:1]
-    once = Counter(image for image, _ in pairs)
-    return [pair for pair in pairs if once[pair[0]] == 1]
