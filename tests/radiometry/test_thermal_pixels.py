@@ -80,12 +80,6 @@ def test_npy_and_csv_are_celsius(tmp_path):
         np.testing.assert_array_equal(got, values.astype(np.float32))
 
 
-def test_below_absolute_zero_is_masked_whatever_the_range(tmp_path):
-    np.save(tmp_path / "a.npy", np.array([[-273.2, -273.1]]))
-    read = read_thermal_file(tmp_path / "a.npy", CELSIUS, valid_range_c=(-1e4, 1e4))
-    assert np.isnan(read.temperature_c).tolist() == [[True, False]] and read.report.out_of_range == 1
-
-
 def test_counts_without_unit_wrong_shapes_unknown_suffixes_and_pages_are_refused(tmp_path):
     save(tmp_path / "a.png", np.ones((3, 3), np.uint16))
     (tmp_path / "a.seq").write_bytes(b"x")

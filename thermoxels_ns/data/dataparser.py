@@ -28,7 +28,7 @@ from thermoxels_ns.data.layouts import BOUNDS_NAME, LayoutName
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
 from thermoxels_ns.data.tracks import TrackSource, feature_rays, find_tracks
-from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, read_thermal_file
+from thermoxels_ns.radiometry.thermal_pixels import VALID_RANGE_C, ThermalUnit, read_thermal_file
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
 _FAR_SIDES = 16.0
@@ -78,8 +78,6 @@ class ThermalDataParserConfig(DataParserConfig):
     the first n frames, so that the ends of the sequence stay in training."""
     missing_thermal: Literal["error", "skip"] = "error"
     """What happens to a frame without a thermal image. error: stop. skip: leave the frame out and print its name."""
-    valid_range_c: tuple[float, float] = (-100.0, 2000.0)
-    """Temperatures outside this range are masked, in degrees Celsius."""
     tracks: TrackSource = "auto"
     """Source of tracks: which photographs saw which points in structure from motion. Tracks tell training what is air.
     auto: the file that the json names (tracks_file_path), else a COLMAP model in the scene's folder (in colmap or
@@ -120,8 +118,7 @@ class ThermalDataParser(DataParser):
 
     The metadata of its outputs hold: ``temperature_range`` (`TemperatureRange`; None for photographs alone),
     ``thermal_filenames`` (None for photographs alone), ``thermal_cameras`` (`Cameras`; None if all pairs share camera
-    and resolution), ``thermal_unit``, ``valid_range_c``,
-    ``image_scale`` (1 / downscale_factor),
+    and resolution), ``thermal_unit``, ``image_scale`` (1 / downscale_factor),
     ``thermal_averaged`` (pixels of a thermal image that become one, along a side),
     ``pixel_size`` (width of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the
     scene box in input coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None unless train has tracks).
@@ -195,10 +192,6 @@ class ThermalDataParser(DataParser):
 
     def _read_scene(self) -> _Scene:
         config = self.config
-        low, high = config.valid_range_c
-        if not -ZERO_CELSIUS_K <= low < high:
-            expected, got = "a lower and a higher temperature in degrees Celsius", f"{low} and {high}"
-            raise SceneError("valid_range_c", expected=expected, got=got, remedy="Pass --valid-range-c -100 2000.")
         if not config.photographs_gb > 0.0:
             got, remedy = config.photographs_gb, "Pass --photographs-gb 1."
             raise SceneError("photographs_gb", expected="a number above 0", got=got, remedy=remedy)
@@ -232,13 +225,11 @@ class ThermalDataParser(DataParser):
         training, shapes, temperatures = [file.frames[index] for index in split.train], {}, None
         if file.has_thermal:
             paths, those = ([f.thermal for f in some if f.thermal is not None] for some in (file.frames, training))
-            settings = file.unit, config.valid_range_c, file.bounds_c
-            shapes, temperatures = survey_thermal_files(paths, *settings, set(those))
+            shapes, temperatures = survey_thermal_files(paths, file.unit, file.bounds_c, set(those))
             _refuse_several_sizes(file.frames, shapes)
         metadata = {
             "temperature_range": temperatures,
             "thermal_unit": file.unit,
-            "valid_range_c": tuple(config.valid_range_c),
             "pixel_size": scale * pixel_size,
             "input_box": tuple(map(tuple, box.tolist())),
             "scene_name": file.folder.resolve().name,
@@ -296,7 +287,7 @@ def _refuse_other_units(middles_c: dict[Path, float], bounds_c: tuple[float, flo
         if strange:
             where = f"{BOUNDS_NAME} or --thermal-bounds says" if bounds_c else "in most of the other files"
             expected, got = f"temperatures near {low:g} to {high:g} C, as {where}", f"{middle:.2f} C in the middle"
-            other = "correct the bounds" if bounds_c else "pass --valid-range-c -100 1999 if it is as hot as that"
+            other = "correct the bounds" if bounds_c else "pass its lowest and highest degrees, --thermal-bounds"
             remedy = f"Subtract 273.15 if the file holds kelvins; else {other}."
             raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
@@ -304,7 +295,6 @@ def _refuse_other_units(middles_c: dict[Path, float], bounds_c: tuple[float, flo
 def survey_thermal_files(
     paths: Sequence[Path],
     unit: ThermalUnit,
-    valid_range_c: tuple[float, float],
     bounds_c: tuple[float, float] | None,
     training: Collection[Path],
 ) -> tuple[dict[Path, tuple[int, int]], TemperatureRange]:
@@ -320,19 +310,18 @@ def survey_thermal_files(
     middles: dict[Path, float] = {}
     low, high = bounds_c or (math.inf, -math.inf)
     for path in paths:
-        temperature_c = read_thermal_file(path, unit, valid_range_c).temperature_c
+        temperature_c = read_thermal_file(path, unit).temperature_c
         height, width = temperature_c.shape
         shapes[path] = (height, width)
         if not np.isfinite(temperature_c).any():
-            expected = f"temperatures from {valid_range_c[0]} to {valid_range_c[1]} C"
-            remedy = "Check thermal_unit or temperature_bounds.json, or widen --valid-range-c."
+            expected = "temperatures from {:g} to {:g} C".format(*VALID_RANGE_C)
+            remedy = "Check thermal_unit or temperature_bounds.json."
             raise ThermalFileError(str(path), expected=expected, got="no valid pixel", remedy=remedy)
         if path not in training:
             continue
         low, high = min(low, float(np.nanmin(temperature_c))), max(high, float(np.nanmax(temperature_c)))
         middles[path] = float(np.nanmedian(temperature_c))
-    if bounds_c is not None or tuple(valid_range_c) == ThermalDataParserConfig.valid_range_c:
-        _refuse_other_units(middles, bounds_c)
+    _refuse_other_units(middles, bounds_c)
     return shapes, TemperatureRange.spanning(low, high)
 
 

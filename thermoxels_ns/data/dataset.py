@@ -137,7 +137,7 @@ class ThermalDataset(InputDataset):
             return torch.zeros(size), torch.zeros(size, dtype=torch.bool), PixelReport()
         if image_idx not in self._thermal:
             path, given = self.metadata["thermal_filenames"][image_idx], self.metadata
-            image = read_thermal_file(path, given["thermal_unit"], given["valid_range_c"])
+            image = read_thermal_file(path, given["thermal_unit"])
             valid = np.isfinite(image.temperature_c)
             # float32 would lose 16-bit steps of a narrow range far from 0 C.
             normalised = self.temperature_range.normalise(image.temperature_c.astype(np.float64))
