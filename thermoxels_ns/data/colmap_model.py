@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from os.path import splitext
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -65,7 +66,9 @@ def lens_entries(model: str, parameters: Iterable[float]) -> dict[str, float]:
     {'cx': 320.0, 'cy': 240.0, 'fl_x': 500.0, 'fl_y': 500.0}
     """
     values = dict(zip(PARAMETERS.get(model, ()), map(float, parameters)))
-    return values | dict.fromkeys(("fl_x", "fl_y"), values.pop("f")) if "f" in values else values
+    if "f" in values:
+        values["fl_x"] = values["fl_y"] = values.pop("f")
+    return values
 
 
 def matched_names(images: Sequence[str], files: Sequence[str]) -> list[tuple[int, int]]:
@@ -77,12 +80,12 @@ def matched_names(images: Sequence[str], files: Sequence[str]) -> list[tuple[int
     >>> matched_names(["1.jpg", "left/1.jpg"], ["images/left/1.png", "images/1.png"])
     [(1, 0), (0, 1)]
     """
-    names = [PurePosixPath(image).with_suffix("").as_posix() for image in images]
+    names = [PurePosixPath(splitext(image)[0]).as_posix() for image in images]
     often = Counter(names)
     number = {name: place for place, name in enumerate(names) if often[name] == 1}
     pairs = []
     for place, file in enumerate(files):
-        parts = PurePosixPath(file).with_suffix("").parts
+        parts = PurePosixPath(splitext(file)[0]).parts
         endings = ("/".join(parts[first:]) for first in range(len(parts)))
         pairs += [(number[ending], place) for ending in endings if ending in number][:1]
     once = Counter(image for image, _ in pairs)
