@@ -72,7 +72,7 @@ def found(folder: Path) -> tuple[np.ndarray, str]:
     file = read_scene_file(folder)
     training = [n for n, frame in enumerate(file.frames) if "train" in frame.name]
     evidence = find_scene_box(file, None, training, None)
-    return evidence.box(), evidence.source
+    return evidence.box, evidence.source
 
 
 @pytest.mark.parametrize("across", [False, True])

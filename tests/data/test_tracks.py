@@ -78,7 +78,7 @@ def test_points_of_a_model_wherever_it_may_lie_make_lines_and_the_box(scene_fold
     lines = lines_of(scene).metadata["feature_rays"]
     assert len(lines.points) == 30 and len(lines.origins) == 5 * 30  # the one that evaluates is left out
     evidence = find_scene_box(read_scene_file(scene.path), None, range(len(NAMES)), tracks)
-    box = evidence.box()
+    box = evidence.box
     assert evidence.source == f"the points of {where}"
     assert (box[0] < POINTS.min(axis=0)).all() and (box[1] > POINTS.max(axis=0)).all() and np.abs(box).max() < 0.6
 

@@ -207,16 +207,16 @@ class ThermalDataParser(DataParser):
         given, fitted = file, {}
         if rays is None and config.refine_poses == "auto":
             file, fitted = refine_poses(given, split.train, CONSOLE.print)
-        evidence = find_scene_box(file, config.scene_box, split.train, tracks)
-        box = evidence.box()
+        found = find_scene_box(file, config.scene_box, split.train, tracks)
+        box = found.box
         translation, longest = -box.mean(axis=0), float((box[1] - box[0]).max())
         if np.abs(box).max() > _FAR_SIDES * longest:
             # nerfstudio keeps dataparser_transform in single precision; unrounded, the two would differ by metres.
             translation = translation.astype(np.float32).astype(np.float64)
         scale = SCENE_SIZE / longest
-        pixel_size = evidence.pixel_size(box)
+        pixel_size = found.pixel_size(file.frames)
         if math.isinf(pixel_size):
-            expected = f"photographs that look at the scene box, from {evidence.source}"
+            expected = f"photographs that look at the scene box, from {found.source}"
             remedy = (
                 "Check that poses are camera to world with x right, y up, z back, or pass --scene-box with its corners "
                 "in their coordinates: xmin ymin zmin xmax ymax zmax."
@@ -243,12 +243,9 @@ class ThermalDataParser(DataParser):
         size = f"{' x '.join(f'{side:.3g}' for side in sides.tolist())} {'m' if metres else 'units'}"
         CONSOLE.print(
             f"Scene {metadata['scene_name']}: {len(names)} frames, {len(split.train)} train, "
-            f"{len({*split.val, *split.test})} evaluate ({split.how}); box from {evidence.source}, {size}; "
+            f"{len({*split.val, *split.test})} evaluate ({split.how}); box from {found.source}, {size}; "
             + (f"{temperatures.min_c:.2f} to {temperatures.max_c:.2f} C." if temperatures else "no temperatures.")
         )
-        if file.bounds_swapped and file.bounds_c is not None:
-            said = "{} has its lowest temperature above its highest; read as {:g} to {:g} C."
-            CONSOLE.print(said.format(BOUNDS_NAME, *file.bounds_c), style="bold yellow")
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
         return scene

@@ -37,40 +37,27 @@ _CONVERGING = 0.5  # Cameras look outwards if the place they look at is nearer t
 
 
 @dataclass(frozen=True, eq=False)
-class BoxEvidence:
-    """Evidence of where the scene box is, in input coordinates: its corners, else points, else the cameras alone."""
+class FoundBox:
+    """The scene box in input coordinates, and what it was found from."""
 
-    source: str  # Source of the evidence, in words
-    frames: Sequence[Frame]
-    corners: Box | None = None  # None: not given
+    source: str  # What the box was found from, in words
+    box: Box
     points: FloatArray | None = None  # Points of the scene, shape (n, 3); None: not known
 
-    def box(self) -> Box:
-        """Return the scene box: `corners`, else `box_of_points`, else `box_of_cameras`.
-
-        Raises:
-            SceneError: The box has no volume, or points or cameras do not suffice to find it.
-        """
-        if self.corners is not None:
-            return self.corners
-        if self.points is not None:
-            return box_of_points(self.points, self.frames)
-        return box_of_cameras(self.frames)
-
-    def pixel_size(self, box: Box) -> float:
-        """Return the width that a pixel covers at the typical distance of surfaces in `box`, in input units.
+    def pixel_size(self, frames: Sequence[Frame]) -> float:
+        """Return the width that a pixel covers at the typical distance of surfaces in the box, in input units.
 
         This is the median over the points in the box and the photographs that have them in view; without points, the
         width of a pixel in the middle of the nearer half of the box. Infinite if no camera sees the box.
         """
-        low, high = box
+        low, high = self.box
         if self.points is not None:
             points, quantile = self.points[((self.points >= low) & (self.points <= high)).all(axis=1)], 0.5
         else:
             steps = (np.arange(_PROBES) + 0.5) / _PROBES
             grid = np.stack(np.meshgrid(*3 * [steps], indexing="ij"), axis=-1).reshape(-1, 3)
             points, quantile = low + grid * (high - low), _NEARER_HALF
-        frames = _spread(self.frames, _MOST_PHOTOGRAPHS)
+        frames = _spread(frames, _MOST_PHOTOGRAPHS)
         if not len(points):
             return float("inf")
         depth = _depths_in_view(points[:: max(len(points) // _MOST_POINTS, 1)], frames)
@@ -80,34 +67,36 @@ class BoxEvidence:
 
 def find_scene_box(
     scene: SceneFile, option: Sequence[Sequence[float]] | None, training: Sequence[int], tracks: SparseTracks | None
-) -> BoxEvidence:
-    """Return the best evidence of where the scene box is.
+) -> FoundBox:
+    """Return the scene box and what it was found from.
 
     The first available counts: `option`, ``scene_box`` in the json (both in input coordinates), sparse points
     (``ply_file_path``, or those of `tracks`), depths on which the photographs that train (indices `training`) agree,
     the cameras. The same folder and split give the same result.
 
     Raises:
-        SceneError: A given box has no volume or is not finite, or a file cannot be read.
+        SceneError: A box has no volume or is not finite, a file cannot be read, or neither points nor cameras suffice.
     """
     frames = scene.frames
     if option is not None:
-        return BoxEvidence("the option scene_box", frames, _checked(option, "scene_box"))
+        return FoundBox("the option scene_box", _checked(option, "scene_box"))
     if "scene_box" in scene.meta:
         name = f"{scene.json_path.name}: scene_box"
-        return BoxEvidence(name, frames, _checked(scene.meta["scene_box"], name))
+        return FoundBox(name, _checked(scene.meta["scene_box"], name))
     if "ply_file_path" in scene.meta:
         path = scene.folder / str(scene.meta["ply_file_path"])
-        return BoxEvidence(f"the points of {path.name}", frames, points=_read_ply(path))
+        points = _read_ply(path)
+        return FoundBox(f"the points of {path.name}", box_of_points(points, frames), points)
     if tracks is not None:
         good = tracks.well_seen()
         points = good if len(good) >= _FEWEST_POINTS else tracks.points
-        return BoxEvidence(f"the points of {tracks.source}", frames, points=points)
+        return FoundBox(f"the points of {tracks.source}", box_of_points(points, frames), points)
     points, photographs = _points_of_photographs([frames[index] for index in training])
     if len(points) < _FEWEST_DEPTHS:
-        return BoxEvidence("the cameras (no scene_box, no sparse points, no depths that photographs agree on)", frames)
+        source = "the cameras (no scene_box, no sparse points, no depths that photographs agree on)"
+        return FoundBox(source, box_of_cameras(frames))
     source = f"{len(points)} depths on which {photographs} photographs agree"
-    return BoxEvidence(source, frames, points=points)
+    return FoundBox(source, box_of_points(points, frames), points)
 
 
 def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
