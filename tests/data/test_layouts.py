@@ -36,7 +36,8 @@ def written(tmp_path_factory) -> Callable[[str], Path]:
 
     def folder(layout: str) -> Path:
         if not (root / layout).is_dir():
-            options = {"layout": layout, "photo_format": "png", "progress": False}
+            own = layout == "thermalnerf"
+            options = {"layout": layout, "own_thermal_camera": own, "photo_format": "png", "progress": False}
             scene_folder.write_scene(scene, root / layout, 5, 2, 40, 30, **options)
         return root / layout
 
@@ -60,6 +61,7 @@ def test_a_layout_loads_by_name_alone(written, layout, capsys):
         np.testing.assert_allclose(frame.pose, other.pose, atol=1e-9)
         assert frame.intrinsics == other.intrinsics
         assert layout == "rgb" if frame.thermal is None else frame.thermal.stem == frame.image.stem
+        assert (frame.thermal_pose is not None) == (frame.thermal_intrinsics is not None) == (layout == "thermalnerf")
     for split in ("train", "val"):
         outputs, expected = parsed(written(layout), split), parsed(usual, split)
         assert [path.stem for path in outputs.image_filenames] == [path.stem for path in expected.image_filenames]
@@ -67,7 +69,7 @@ def test_a_layout_loads_by_name_alone(written, layout, capsys):
     assert torch.equal(dataset.get_data(0)["image"], same.get_data(0)["image"])
     if layout == "rgb":
         assert dataset.temperature_range is None and not dataset.get_data(0)["thermal_valid"].any()
-    else:
+    elif layout != "thermalnerf":  # whose thermal camera is another one
         warm = [one.temperature_range.to_celsius(one.get_thermal(0)[0]) for one in (dataset, same)]
         torch.testing.assert_close(warm[0], warm[1], atol=2e-3, rtol=0)
     assert f"Layout {layout}: " in capsys.readouterr().out
@@ -118,6 +120,12 @@ def jpeg_ls(folder: Path) -> None:
     (rgbt(folder) / "raw_images" / "frame_train_00002.jpg").write_bytes(file.jpeg())
 
 
+def lose_frame(folder: Path) -> None:
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"].pop()
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
 def lose(pattern: str) -> Callable[[Path], object]:
     return lambda folder: [path.unlink() for path in folder.glob(pattern)]
 
@@ -135,6 +143,8 @@ def twice(folder: Path) -> None:
         ("rgbt-scenes", jpeg_ls, r"frame_train_00002\.jpg.*JPEG-LS.*--missing-thermal skip", None),
         ("thermoscenes", lose("thermal/*"), "none with one.*--layout rgb", {"layout": "rgb"}),
         ("thermalmix", lose("warped_thermal/*00001.npy"), "--missing-thermal", {"missing_thermal": "skip"}),
+        ("thermalnerf", lose_frame, "7 photographs and 6 thermal", {"layout": "rgb"}),
+        ("thermalnerf", lose(BOUNDS_NAME), "--thermal-bounds", {"thermal_bounds": (10.0, 30.0)}),
         ("colmap", twice, "photographs in .*images", None),
         ("colmap", lose("images/*"), "photographs in .*images", None),
         ("colmap", lose("sparse/0/points3D.txt"), "COLMAP model in sparse/0", None),
@@ -161,6 +171,16 @@ def test_photographs_that_only_the_model_has_are_named(copied):
     assert read_scene_file(folder).left_out == ["frame_train_00002.png"]
 
 
+def test_thermal_images_of_other_names_are_paired_in_their_order(copied):
+    folder = copied("thermalnerf")
+    for path in folder.glob("images_thermal/*"):
+        path.rename(path.with_name(f"warm_{path.name}"))
+    text = (folder / "transforms.json").read_text().replace("images_thermal/", "images_thermal/warm_")
+    (folder / "transforms.json").write_text(text)
+    for frame in read_scene_file(folder).frames:
+        assert frame.thermal is not None and frame.thermal.name == f"warm_{frame.image.name}"
+
+
 def test_a_writer_refuses_what_its_layout_cannot_say(tmp_path, written):
     scene = scene_folder.make_scene("sphere")
     with pytest.raises(SceneError, match="own_thermal_camera"):
@@ -171,6 +191,17 @@ def test_a_writer_refuses_what_its_layout_cannot_say(tmp_path, written):
     (folder / "truth.json").unlink()
     with pytest.raises(SceneError, match="other photographs"):
         scene_folder.write_scene(scene, folder, 3, 1, 40, 30, layout="colmap")
+
+
+def test_a_held_out_thermal_image_holds_its_pair_out(copied):
+    folder = copied("thermalnerf")
+    content = json.loads((folder / "transforms.json").read_text())
+    warm = [frame["file_path"] for frame in content["frames"] if frame.get("is_thermal")]
+    cold = [frame["file_path"] for frame in content["frames"] if not frame.get("is_thermal")]
+    (folder / "transforms.json").write_text(json.dumps(content | {"test_filenames": [cold[0], f"./{warm[2]}"]}))
+    named = {path.name for path in parsed(folder, "test", eval_mode="lists").image_filenames}
+    assert named == {Path(cold[0]).name, Path(cold[2]).name}
+    assert named.isdisjoint(path.name for path in parsed(folder, eval_mode="lists").image_filenames)
 
 
 def test_a_json_without_frames_says_what_a_colmap_model_cannot(copied):

@@ -14,7 +14,7 @@ from thermoxels_ns.synthetic.scene_folder import LayoutName, make_scene, write_s
 @pytest.mark.parametrize("layout", sorted({*get_args(LayoutName)} - {"thermoscenes"}))
 def test_a_layout_is_trained_evaluated_and_exported(layout, tmp_path):
     scene, folder, warm = make_scene("hot-object"), tmp_path / "scene", layout != "rgb"
-    options = {"photo_format": "png", "progress": False, "own_thermal_camera": layout == "nerfstudio"}
+    options = {"photo_format": "png", "progress": False, "own_thermal_camera": layout == "thermalnerf"}
     write_scene(scene, folder, 10, 2, 64, 48, layout=layout, **options)
     said = succeed(
         *("ns-train", "thermoxels", "--output-dir", str(tmp_path), "--experiment-name", "tiny", "--timestamp", "run"),

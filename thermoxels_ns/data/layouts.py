@@ -20,8 +20,9 @@ from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES
 
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")
 BOUNDS_NAME = "temperature_bounds.json"
-LayoutName = Literal["thermoscenes", "nerfstudio", "rgb", "rgbt-scenes", "thermalmix", "colmap"]
+LayoutName = Literal["thermalnerf", "thermoscenes", "nerfstudio", "rgb", "rgbt-scenes", "thermalmix", "colmap"]
 _FRAMES = "frames with "
+_THERMAL_CAMERA = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class Layout:
 
 
 LAYOUTS = (
+    Layout("thermalnerf", (f"{_FRAMES}is_thermal",), ("images_thermal",)),
     Layout("thermoscenes", (BOUNDS_NAME, "msx")),
     Layout("nerfstudio", ("thermal", f"{_FRAMES}thermal_file_path")),
     Layout("thermalmix", ("warped_thermal",), ("warped_thermal",), ("rgb", "images")),
@@ -89,6 +91,8 @@ def find_source(data: Path, wanted: LayoutName | None = None) -> SceneSource:
         if layout.photographs:
             posed, left_out = _content_of_model(folder, origin, root)
             content = content | posed if "frames" not in content else posed
+        elif "is_thermal" in keys:
+            content = _paired(content, origin.name, alone=not layout.thermal)
         thermal = next((folder / name for name in layout.thermal if (folder / name).is_dir()), None)
         if not layout.thermal and wanted is None and (found := _signs_of_thermal(folder, content)):
             remedy = "Put thermal images into thermal/, named as their photographs, or pass --layout rgb."
@@ -137,3 +141,36 @@ def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, A
         for side in ("val", "test")
     }
     return {"frames": frames} | {key: names for key, names in lists.items() if names}, left_out
+
+
+def _paired(content: dict[str, Any], name: str, alone: bool) -> dict[str, Any]:
+    """Return the content of a ThermalNeRF json with one frame per pair: photograph i of n and thermal image n + i, or
+    the thermal image with its stem; photographs `alone` without. Raise `SceneError` for unequal numbers of both."""
+    frames = content["frames"]
+    if not all(isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames):
+        return content  # the reader of frames says which is wrong
+    thermal = [frame for frame in frames if frame.get("is_thermal")]
+    photographs = [frame for frame in frames if not frame.get("is_thermal")]
+    if len(thermal) != len(photographs) and not alone:
+        got = f"{len(photographs)} photographs and {len(thermal)} thermal images"
+        remedy = "Remove the frames without a partner, or pass --layout rgb to train on photographs alone."
+        raise SceneError(f"{name}: is_thermal", expected="as many of both kinds", got=got, remedy=remedy)
+    by_stem = {PurePosixPath(frame["file_path"]).stem: frame for frame in thermal}
+    pairs, partner = photographs if alone else [], dict[str, str]()
+    for photograph, warm in zip([] if alone else photographs, thermal):
+        warm = by_stem.get(PurePosixPath(photograph["file_path"]).stem, warm)
+        pair = {**photograph, "thermal_file_path": warm["file_path"]}
+        partner[PurePosixPath(warm["file_path"]).as_posix()] = photograph["file_path"]
+        if "fl_x" in warm:
+            pair["thermal_camera"] = {key: both[key] for key in _THERMAL_CAMERA if key in (both := {**content, **warm})}
+        if warm.get("transform_matrix") != photograph.get("transform_matrix"):
+            pair["thermal_transform_matrix"] = warm.get("transform_matrix")
+        pairs.append(pair)
+    lists = {key: names for key, names in content.items() if key.endswith("_filenames") and isinstance(names, list)}
+    left = {PurePosixPath(frame["file_path"]).as_posix() for frame in thermal}
+    for key, names in lists.items():  # a thermal image that a list names stands for its pair
+        written = [PurePosixPath(name).as_posix() if isinstance(name, str) else name for name in names]
+        lists[key] = list(
+            dict.fromkeys(partner.get(name, name) for name in written if name in partner or name not in left)
+        )
+    return content | {"frames": pairs} | lists

@@ -24,13 +24,14 @@ from thermoxels_ns.synthetic.raycast import first_surface, render_view
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 _Frames = list[dict[str, Any]]
-LayoutName = Literal["thermoscenes", "nerfstudio", "rgbt-scenes", "thermalmix", "colmap", "rgb"]
+LayoutName = Literal["thermoscenes", "nerfstudio", "thermalnerf", "rgbt-scenes", "thermalmix", "colmap", "rgb"]
 PhotoFormat = Literal["jpeg", "png"]  # JPEG as cameras write, of quality 92 by default; PNG, which loses nothing
 
 _IN_DEGREES = ("nerfstudio", "thermalmix")  # layouts whose thermal images are .npy; those of the others are 16-bit PNG
 _FOLDERS: dict[LayoutName, tuple[str, str, str]] = {
     "thermoscenes": ("images", "thermal", ""),
     "nerfstudio": ("images", "thermal", ""),
+    "thermalnerf": ("images", "images_thermal", ""),
     "rgbt-scenes": ("rgb/{}", "thermal/{}", "sparse/0"),
     "thermalmix": ("rgb", "warped_thermal", "colmap_sparse/0"),
     "colmap": ("images", "thermal", "sparse/0"),
@@ -86,7 +87,7 @@ def write_scene(
     photographs, thermals, model = _FOLDERS[layout]
     if own_thermal_camera and (model or not thermals):
         expected = "one camera for both, which is all that this layout can say"
-        remedy = "Leave --own-thermal-camera out, or pass --layout nerfstudio."
+        remedy = "Leave --own-thermal-camera out, or pass --layout thermalnerf."
         raise SceneError("own_thermal_camera", expected=expected, got=f"True and layout {layout}", remedy=remedy)
     imperfections.check()
     camera = scene.camera(width, height)
@@ -129,9 +130,11 @@ def write_scene(
         named = {"absolute_min_temperature": bounds[0], "absolute_max_temperature": bounds[1]}
         write_json(target / _BOUNDS, named)
     transforms: dict[str, Any] = flaws.given_camera(camera).entries()
-    if layout != "thermoscenes":  # thermal images belong to the photographs of the same name
+    if layout == "thermalnerf":
+        frames = _separate_frames(frames, transforms, thermal_camera.entries())
+    elif layout != "thermoscenes":  # thermal images belong to the photographs of the same name
         frames = [{key: value for key, value in frame.items() if key != "thermal_file_path"} for frame in frames]
-    if own_thermal_camera:
+    if own_thermal_camera and layout != "thermalnerf":
         transforms["thermal_camera"] = thermal_camera.entries()
     transforms |= {"metres_per_unit": 1.0, "up": [0, 0, 1], "frames": frames}
     truth = {"synthetic_scene": scene.name, "scene_box": scene.scene_box, "seed": seed}
@@ -141,6 +144,19 @@ def write_scene(
     else:
         write_json(target / _JSON, transforms)
     return target
+
+
+def _separate_frames(frames: _Frames, camera: dict[str, Any], own: dict[str, Any]) -> _Frames:
+    """Return the frames of pairs as ThermalNeRF has them: all photographs, then all thermal images, each with its
+    camera. The keys of `camera`, the photographs', are removed from it."""
+    poses = [frame.get("thermal_transform_matrix", frame["transform_matrix"]) for frame in frames]
+    kept = {key: camera.pop(key) for key in own if key != "camera_model"}
+    seen = [{k: frame[k] for k in ("file_path", "transform_matrix")} | kept | {"is_thermal": 0} for frame in frames]
+    warm = [
+        {"file_path": frame["thermal_file_path"], "transform_matrix": pose} | own | {"is_thermal": 1}
+        for frame, pose in zip(frames, poses)
+    ]
+    return seen + warm
 
 
 def _write_colmap_model(
