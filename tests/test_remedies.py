@@ -74,7 +74,7 @@ def test_the_first_page_of_help_is_one_screen_of_options_that_there_are(monkeypa
         "--scene-box -1 -1 -1 1 1 1",
         "--eval-mode interval --eval-interval 2",
         "--downscale-factor=2",
-        "--valid_range_c -100 1999",
+        "--thermal_bounds -10 300",
     ],
 )
 @pytest.mark.parametrize("around", ["thermoxels {} --data S --vis tensorboard", "plenoxels-t --data S thermal-data {}"])

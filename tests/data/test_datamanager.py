@@ -3,13 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
 
-from tests.support.scene_folders import look_at_origin
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.data.datamanager import ThermalDataManager, ThermalDataManagerConfig, views_of_cameras
+from thermoxels_ns.data.datamanager import ThermalDataManager, ThermalDataManagerConfig
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.ray_sampler import CameraRays
 
@@ -47,9 +45,8 @@ def check_rays(bundle, reference) -> torch.Tensor:
     return pixels
 
 
-@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
-def test_shared_camera_one_ray_carries_both_targets(scene_folder, model):
-    scene = scene_folder(distortion=DISTORTION, camera_model=model)
+def test_shared_camera_one_ray_carries_both_targets(scene_folder):
+    scene = scene_folder(distortion=DISTORTION)
     served = manager(scene.path, train_num_rays_per_batch=700)
     bundle, batch = served.next_train(3)
     assert bundle.shape == (700,) and served.get_train_rays_per_batch() == 700
@@ -133,14 +130,6 @@ def test_masked_pixels_are_never_drawn(scene_folder):
     assert len(gridded) == 8 * 25
 
 
-def test_optical_axis_of_a_fisheye_lens_is_finite():
-    """A pixel centre exactly on the axis, where nerfstudio's rays are 0 / 0."""
-    cameras = Cameras(torch.eye(4)[None, :3], 5.0, 5.0, 2.5, 1.5, 5, 3, camera_type=CameraType.FISHEYE)
-    columns = CameraRays(cameras).columns(torch.arange(15))
-    assert torch.equal(columns["directions"][7], torch.tensor([0.0, 0.0, -1.0]))
-    assert all(torch.isfinite(columns[name]).all() for name in ("directions", "pixel_area"))
-
-
 def test_frames_of_different_resolutions_and_lenses(scene_folder):
     scene = scene_folder(frames=5, distortion=DISTORTION)
     name = scene.names[0]
@@ -195,11 +184,6 @@ def test_photographs_scaled_by_the_datamanager_keep_their_thermal_images(scene_f
     assert int(item["thermal_camera"].width) == 24
 
 
-def cameras(kind: CameraType, width: int, height: int, fx: float, fy: float) -> Cameras:
-    poses = np.stack([look_at_origin(angle)[:3] for angle in (0.3, 2.0)]).astype(np.float32)
-    return Cameras(torch.from_numpy(poses), fx, fy, 0.45 * width, 0.55 * height, width, height, camera_type=kind)
-
-
 def directions(views: Views, number: int) -> np.ndarray:
     """Unit directions in the world through the centres of all pixels of a view, shape (h, w, 3)."""
     width, height = views.size[number]
@@ -231,18 +215,6 @@ def test_every_pixel_looks_along_its_training_ray(scene_folder, own_camera):
     np.testing.assert_allclose(centres, rays["origins"], atol=1e-6)
     assert views.size.tolist() == [[24, 18]] * 8 + [[12, 10]] * (8 if own_camera else 0)
     assert views.camera_to_world.dtype == views.focal.dtype == views.centre.dtype == np.float64
-
-
-def test_a_fisheye_lens_spans_its_angles():
-    """120 and 60 degrees across and along: the border pixels are just within, the image of the pinhole ends there."""
-    lens = cameras(CameraType.FISHEYE, 120, 60, 120 / np.deg2rad(120), 60 / np.deg2rad(60))
-    views = views_of_cameras(lens)
-    for number in range(2):
-        middle_row = lens.generate_rays(number, keep_shape=True).directions[33].numpy()
-        middle_column = lens.generate_rays(number, keep_shape=True).directions[:, 54].numpy()
-        assert views.shows(number, middle_row).all() and views.shows(number, middle_column).all()
-    ends = np.rad2deg(np.arctan2([views.centre[0], views.size[0] - views.centre[0]], views.focal[0]))
-    np.testing.assert_allclose(ends, [[54, 33], [66, 27]], atol=0.5)
 
 
 @pytest.mark.cuda

@@ -117,12 +117,6 @@ def test_the_parser_gives_adjusted_poses_and_those_that_held_out_photographs_say
     np.testing.assert_allclose(rig[1], rig[0], atol=1e-5)
 
 
-def test_lenses_without_a_plane_keep_their_poses(scenes, monkeypatch):
-    scene, training, _ = split(scenes["off"])
-    scene.frames[0] = replace(scene.frames[0], intrinsics=replace(scene.frames[0].intrinsics, lens="fisheye"))
-    assert refine_poses(scene, training, lambda _: None) == (scene, {})
-
-
 def test_masked_features_move_no_pose(scenes, tmp_path):
     Image.new("L", (32, 24)).save(tmp_path / "nothing.png")
     scene, training, _ = split(scenes["off"])

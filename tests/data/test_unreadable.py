@@ -40,8 +40,8 @@ READERS = {
     "card.png": lambda path: identify(path, path.parent),
     "photograph.jpg": open_photograph,
     "rig.jpg": read_rig_photograph,
-    "points3D.bin": lambda path: read_model(path.parent),
-    "images.txt": lambda path: read_model(path.parent),
+    "cameras.bin": lambda path: read_model(path.parent),
+    "cameras.txt": lambda path: read_model(path.parent),
     "step.ckpt": load_checkpoint,
 }
 

@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 
 from tests.support.plane_photographs import EYES, FOCAL, LATTICE, PLANE, SIZE, photographs, texture
 from thermoxels_ns.core.threads import set_num_threads
@@ -183,14 +183,12 @@ class Frames(ThermalDataset):
     """A dataset of pictures whose red and green say where a pixel's ray goes: x and y on the plane at depth 1."""
 
     def __init__(self, width: int, height: int, distortion: list[float] | None, masked: bool = False):
-        focal, kinds = 0.8 * width, CameraType.PERSPECTIVE
+        focal = 0.8 * width
         self.thermal_cameras: Any = object()  # of their own
         poses = torch.eye(4)[None, :3].repeat(40, 1, 1)
         poses[:, 0, 3] = torch.arange(40.0)
         lens = None if distortion is None else torch.tensor([distortion])
-        self.cameras = Cameras(
-            poses, focal, focal, width / 2, height / 2, width, height, distortion_params=lens, camera_type=kinds
-        )
+        self.cameras = Cameras(poses, focal, focal, width / 2, height / 2, width, height, distortion_params=lens)
         directions = self.cameras.generate_rays(camera_indices=0).directions
         x, y = directions[..., 0] / -directions[..., 2], directions[..., 1] / -directions[..., 2]
         picture = torch.stack((0.5 + 0.4 * x, 0.5 + 0.4 * y, torch.zeros_like(x)), -1)
@@ -227,16 +225,10 @@ def test_read_photographs_are_pinholes(distortion, width, height):
         assert shown[..., 1] == pytest.approx(0.5 + 0.4 * y, abs=0.6 * pixel + 0.004)
 
 
-def test_read_photographs_have_their_masks_and_other_lenses_are_left_out():
+def test_read_photographs_have_their_masks():
     read = read_photographs(Frames(600, 450, None, masked=True), most=32, longest_side=400)
     rows = np.isnan(read.colours[: np.prod(read.sizes[0])].reshape(*read.sizes[0][::-1], 3)).all((1, 2))
     assert rows[:75].all() and not rows[76:].any()
-    frames, kinds = Frames(60, 40, None), torch.full((40, 1), CameraType.FISHEYE.value)
-    frames.cameras.camera_type = kinds
-    assert read_photographs(frames) is None
-    kinds[3:9] = CameraType.PERSPECTIVE.value
-    read = read_photographs(frames)
-    assert read is not None and read.centres[:, 0].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
 
 
 @pytest.mark.parametrize("exposure", [0.0, 0.15])

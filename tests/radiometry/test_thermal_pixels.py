@@ -8,7 +8,6 @@ from PIL import Image
 
 from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.core.errors import ThermalFileError
-from thermoxels_ns.data.dataparser import survey_thermal_files
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixels, read_thermal_file
 from thermoxels_ns.radiometry.thermogram import read_thermogram
 
@@ -81,12 +80,6 @@ def test_npy_and_csv_are_celsius(tmp_path):
         np.testing.assert_array_equal(got, values.astype(np.float32))
 
 
-def test_below_absolute_zero_is_masked_whatever_the_range(tmp_path):
-    np.save(tmp_path / "a.npy", np.array([[-273.2, -273.1]]))
-    read = read_thermal_file(tmp_path / "a.npy", CELSIUS, valid_range_c=(-1e4, 1e4))
-    assert np.isnan(read.temperature_c).tolist() == [[True, False]] and read.report.out_of_range == 1
-
-
 def test_counts_without_unit_wrong_shapes_unknown_suffixes_and_pages_are_refused(tmp_path):
     save(tmp_path / "a.png", np.ones((3, 3), np.uint16))
     (tmp_path / "a.seq").write_bytes(b"x")
@@ -104,19 +97,6 @@ def test_counts_without_unit_wrong_shapes_unknown_suffixes_and_pages_are_refused
     ):
         with pytest.raises(ThermalFileError, match=said):
             read_thermal_file(tmp_path / name, unit)
-
-
-@pytest.mark.parametrize("first", [0, 1])
-def test_dead_pixels_are_found_whichever_frames_of_a_long_scene_train(tmp_path, first):
-    random = np.random.default_rng(0)
-    paths = [tmp_path / f"{number:03d}.npy" for number in range(70)]
-    for path in paths:
-        frame = 20.0 + random.random((8, 9))
-        frame[3, 4] = 90.0
-        np.save(path, frame)
-    _, temperatures, dead = survey_thermal_files(paths, CELSIUS, (-100.0, 2000.0), None, set(paths[first::2]))
-    assert np.argwhere(dead[8, 9]).tolist() == [[3, 4]]
-    assert temperatures.max_c < 21.0
 
 
 def test_quiet_background_is_not_dead():

@@ -20,10 +20,9 @@ def write_colmap_model(
     error: float = 0.5,
     lens: str = "SIMPLE_RADIAL",
     turn: npt.NDArray | None = None,
-    scale: float = 1.0,
     shift: npt.ArrayLike = (0.0, 0.0, 0.0),
 ) -> None:
-    """Write cameras (poses with OpenGL axes) and points in a world that is turned, scaled and moved."""
+    """Write cameras (poses with OpenGL axes) and points in a world that is turned and moved."""
     turn = np.eye(3) if turn is None else turn
     model = pycolmap.Reconstruction()
     params = {
@@ -36,7 +35,7 @@ def write_colmap_model(
         seen = (points - pose[:3, 3]) @ pose[:3, :3] * (1, -1, -1)
         world = np.empty((3, 4))
         world[:, :3] = (turn @ pose[:3, :3] * (1, -1, -1)).T
-        world[:, 3] = -world[:, :3] @ (scale * turn @ pose[:3, 3] + shift)
+        world[:, 3] = -world[:, :3] @ (turn @ pose[:3, 3] + shift)
         image = pycolmap.Image(name=name, image_id=number, camera_id=1)
         image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in camera.project(seen)])
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(world))
@@ -44,7 +43,7 @@ def write_colmap_model(
         track = pycolmap.Track()
         for image_id in range(1, len(names) + 1):
             track.add_element(image_id, number)
-        model.add_point3D(scale * turn @ point + shift, track, np.zeros(3, dtype=np.uint8))
+        model.add_point3D(turn @ point + shift, track, np.zeros(3, dtype=np.uint8))
     for point in model.points3D.values():
         point.error = error
     folder.mkdir(parents=True, exist_ok=True)

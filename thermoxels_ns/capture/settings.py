@@ -35,8 +35,6 @@ class CaptureSettings(RadiometryOptions):
     """Number of threads for finding and matching features."""
     seed: int = 0
     """Seed of all random choices; the same seed gives the same poses."""
-    known_distance: tuple[str, float, float, float, float, float] | None = None
-    """A measured length: name of a photograph, pixel x y of one end, pixel x y of the other end, length in metres."""
     marker_side_m: float | None = None
     """Side of the black square of printed ArUco markers (dictionary 4x4, numbers 0 to 49) in the scene, in metres."""
     marker_error_m: float | None = None

@@ -6,7 +6,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -113,11 +113,11 @@ def _read(file: Path) -> str | None:
 
 
 def save(path: Path, record: Any) -> None:
-    """Write a dataclass (fields: arrays, numbers, texts, tuples, perspective cameras) as .npz, atomically."""
+    """Write a dataclass (fields: arrays, numbers, texts, tuples, cameras) as .npz, atomically."""
     values = {each.name: getattr(record, each.name) for each in fields(record)}
     for name, value in values.items():
-        if isinstance(value, Camera):  # store all fields except the last one, the lens
-            values[name] = tuple(getattr(value, each.name) for each in fields(value)[:-1])
+        if isinstance(value, Camera):
+            values[name] = astuple(value)
     write_npz(path, {name: np.asarray(value) for name, value in values.items()})
 
 

@@ -20,12 +20,7 @@ from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.scene_writer import SCENE_CONTENT, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.poses import find_poses
-from thermoxels_ns.capture.sfm.scale_and_up import (
-    scale_from_distance,
-    scale_from_gps,
-    scale_from_markers,
-    upright,
-)
+from thermoxels_ns.capture.sfm.scale_and_up import scale_from_gps, scale_from_markers, upright
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import (
     CACHE_FOLDER,
@@ -186,8 +181,7 @@ class _Capture:
     def scale(self, found: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
         """Return the scale, or None and the reason for None."""
         settings = self.settings
-        markers = [settings.marker_side_m, settings.marker_error_m]
-        depends = {"known": settings.known_distance, "markers": markers}
+        depends = {"markers": [settings.marker_side_m, settings.marker_error_m]}
 
         def work(folder: Path) -> None:
             scale, missing = self._metric_scale(found, frames)
@@ -198,10 +192,8 @@ class _Capture:
         return None if content["scale"] is None else SceneScale(**content["scale"]), content["missing"]
 
     def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[SceneScale | None, str]:
-        """Return metres per unit from a known distance, else markers, else GPS; or None and the reason for None."""
+        """Return metres per unit from markers, else from GPS; or None and the reason for None."""
         settings = self.settings
-        if settings.known_distance is not None:
-            return scale_from_distance(model, settings.known_distance), ""
         if settings.marker_side_m is not None:
             photographs = {frame.name: frame.photograph for frame in frames}
             return scale_from_markers(model, photographs, settings.marker_side_m, settings.marker_error_m)

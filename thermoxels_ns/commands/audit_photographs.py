@@ -34,7 +34,7 @@ def photographs_of_defects(
     of readings on the surface; what is colder is grey, as sky is. Defects that no photograph shows are left out, and so
     are defects beyond `MOST_DEFECTS`.
     """
-    frames = [frame for frame in scene.frames if frame.intrinsics.lens == "perspective"]
+    frames = scene.frames
     surface = found.surface
     every = surface.centroid_m / metres_per_unit
     hidden_behind = [_nearest(frame, every) for frame in frames]

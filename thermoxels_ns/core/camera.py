@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import SceneError
-
-Lens = Literal["perspective", "fisheye"]
 
 _UNDISTORT_STEPS = 20  # Fixed-point steps that remove distortion
 _MOST_PIXELS = 1_000_000  # Most pixels along a side
@@ -24,7 +22,7 @@ class Camera:
 
     Poses passed to methods, (3, 4) or (4, 4), are camera to world with x right, y up, z back (OpenGL), as in
     transforms.json. Points in camera axes have x right, y down, z ahead (OpenCV). The centre of the top left pixel is
-    at (0.5, 0.5). `project`, `rays` and `directions` are right for perspective lenses only.
+    at (0.5, 0.5).
     """
 
     width: int
@@ -39,7 +37,6 @@ class Camera:
     p2: float = 0.0  # Tangential distortion, as in OpenCV
     k3: float = 0.0  # Sixth order
     k4: float = 0.0  # Eighth order
-    lens: Lens = "perspective"
 
     def __post_init__(self) -> None:
         numbers = (self.fl_x, self.fl_y, self.cx, self.cy, *self.distortion)

@@ -11,23 +11,6 @@ from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 
-_WIDEST = np.deg2rad(80.0)  # Largest angle to each side that a pinhole shows in place of a fisheye lens
-
-
-def as_pinholes(
-    fisheye: BoolArray, focal: FloatArray, centre: FloatArray, size: IntArray
-) -> tuple[FloatArray, IntArray]:
-    """Return principal points and sizes, (c, 2), of pinholes that show what lenses of the same `focal` lengths do.
-
-    A fisheye lens (True in `fisheye`, (c,)) becomes a pinhole whose image spans the same angles along both axes, but at
-    most 80 degrees to each side; others stay as they are. All in [pixels].
-    """
-    before = focal * np.tan(np.clip(centre / focal, -_WIDEST, _WIDEST))
-    behind = focal * np.tan(np.clip((size - centre) / focal, -_WIDEST, _WIDEST))
-    wide = np.ceil(before + behind).astype(np.int64)
-    return np.where(fisheye[:, None], before, centre), np.where(fisheye[:, None], wide, size)
-
-
 SHOWN_WELL = 0.15
 """Least visibility of a place that is shown well, relative to what cameras were pointed at. In nine synthetic scenes
 with a street or room around, this keeps all of the scene and removes half of what is around; in synthetic rooms seen

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Mapping
-from pathlib import Path
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from os.path import splitext
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
 
 _PARTS = ("cameras", "images", "points3D")
 COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "colmap_sparse/0", "sparse/0", "sparse")
 """Places of a COLMAP model in a scene's folder; the first that holds a model counts."""
-
-_LEAST_CAMERA_BYTES = 48  # Size of a camera with three parameters in cameras.bin; cameras with more are larger
-_LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""Swap of axes by old versions of ns-process-data, before the json had applied_transform."""
+PARAMETERS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+}
+"""Order of the parameters of COLMAP's lens models, by their keys in transforms.json; f is both focal lengths."""
 
 
 def is_model(folder: Path) -> bool:
@@ -26,70 +32,61 @@ def is_model(folder: Path) -> bool:
     return all(any((folder / f"{part}.{suffix}").is_file() for suffix in ("bin", "txt")) for part in _PARTS)
 
 
-def read_model(folder: Path) -> Any:
-    """Read the COLMAP model in a folder as a `pycolmap.Reconstruction`, or raise `SceneError` if it cannot be read."""
-    import pycolmap  # slow to import and only needed here
+def read_model(folder: Path) -> tuple[dict[int, Any], dict[int, Any], dict[int, Any]]:
+    """Read the COLMAP model in a folder: cameras, posed images and points, each by its number in the model.
 
-    said = _incomplete(folder)
-    if not said:
-        try:
-            return pycolmap.Reconstruction(str(folder))
-        except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
-            said = (str(problem).strip() or repr(problem)).splitlines()[-1]
-    expected, got = "a COLMAP model (cameras, images, points3D as .bin or .txt)", f"one that cannot be read: {said}"
-    remedy = "Copy it again, or run COLMAP again; it lies in a folder such as sparse/0."
-    raise SceneError(str(folder), expected=expected, got=got, remedy=remedy)
+    These are records of nerfstudio's reader, which notices a file that is cut off; pycolmap reads such a points3D.bin
+    for ever. Raises `SceneError` if a file cannot be read.
+    """
+    from nerfstudio.data.utils import colmap_parsing_utils  # only needed here
+
+    kind = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+    try:
+        model: Any = colmap_parsing_utils.read_model(str(folder), kind)
+    except Exception as problem:  # a damaged file raises struct.error, KeyError, ValueError, MemoryError and others
+        expected = "a COLMAP model (cameras, images, points3D as .bin or .txt)"
+        got = f"one that cannot be read: {str(problem).strip() or repr(problem)}"
+        remedy = remedy_of(problem, "Copy it again, or run COLMAP again; it lies in a folder such as sparse/0.")
+        raise SceneError(str(folder), expected=expected, got=got, remedy=remedy) from problem
+    return model
 
 
 def camera_to_world(image: Any) -> FloatArray:
-    """Return the camera-to-world pose (4, 4) of a pycolmap image, with camera axes x right, y up, z back (OpenGL)."""
+    """Return the camera-to-world pose (4, 4) of an image of `read_model`, in OpenGL axes (x right, y up, z back)."""
     pose = np.eye(4)
-    pose[:3] = image.cam_from_world().inverse().matrix()
+    pose[:3, :3] = image.qvec2rotmat().T
+    pose[:3, 3] = -pose[:3, :3] @ image.tvec
     return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def worlds_of_json(meta: Mapping[str, Any]) -> list[FloatArray]:
-    """Return the matrices (4, 4) that may bring COLMAP's world to that of the poses in a json, `meta`.
+def lens_entries(model: str, parameters: Iterable[float]) -> dict[str, float]:
+    """Return the parameters of a lens by their keys in transforms.json; empty for a model that is not read.
 
-    That is the json's ``applied_transform``; without one, no change or the swap of axes of old ns-process-data.
+    >>> lens_entries("SIMPLE_PINHOLE", [500.0, 320.0, 240.0])
+    {'cx': 320.0, 'cy': 240.0, 'fl_x': 500.0, 'fl_y': 500.0}
     """
-    if "applied_transform" in meta:
-        from thermoxels_ns.data.transforms_json import read_pose  # loads PIL, which the help of commands does not need
+    values = dict(zip(PARAMETERS.get(model, ()), map(float, parameters)))
+    if "f" in values:
+        values["fl_x"] = values["fl_y"] = values.pop("f")
+    return values
 
-        return [read_pose(meta["applied_transform"], "applied_transform", turned=False)]
-    return [np.eye(4), _LEGACY_TRANSFORM]
 
+def matched_names(images: Sequence[str], files: Sequence[str]) -> list[tuple[int, int]]:
+    """Return the pairs (image, file) of indices that belong to the same photograph, by names without their suffixes.
 
-def _incomplete(folder: Path) -> str:
-    """Return which file of a COLMAP model cannot be opened, or ends before its last camera or point; or "".
+    The file's name ends with the image's, folders included. The longest such image is taken; images that then belong to
+    several files, and images of one name, are left out.
 
-    pycolmap says of an unreadable file that it is no model, reads a truncated cameras.bin without a word, and a
-    truncated points3D.bin for ever.
+    >>> matched_names(["1.jpg", "left/1.jpg"], ["images/left/1.png", "images/1.png"])
+    [(1, 0), (0, 1)]
     """
-    for name in ("cameras", "frames", "images", "points3D"):
-        for path in (folder / f"{name}.txt", folder / f"{name}.bin"):
-            try:
-                data = path.read_bytes() if path.is_file() else None
-            except OSError as problem:
-                return f"{path.name}: {problem.strerror}; check its permissions and the disk"
-            whole = {"points3D.bin": _complete_points, "cameras.bin": _complete_cameras}.get(path.name)
-            if data is not None and whole is not None and not whole(data):
-                return f"{path.name} ends before its last entry, as after an interrupted copy"
-    return ""
-
-
-def _complete_cameras(data: bytes) -> bool:
-    """Return whether cameras.bin is long enough for the cameras that it announces, of three parameters at least."""
-    return len(data) >= 8 and len(data) >= 8 + _LEAST_CAMERA_BYTES * struct.unpack_from("<Q", data)[0]
-
-
-def _complete_points(data: bytes) -> bool:
-    """Return whether the points that points3D.bin announces are there: 43 bytes, a count, and 8 bytes per sighting."""
-    try:
-        (count,), end = struct.unpack_from("<Q", data), 8
-        for _ in range(count):
-            (sightings,) = struct.unpack_from("<Q", data, end + 43)
-            end += 51 + 8 * sightings
-    except struct.error:  # a number lies behind the end of the data
-        return False
-    return end <= len(data)
+    names = [PurePosixPath(splitext(image)[0]).as_posix() for image in images]
+    often = Counter(names)
+    number = {name: place for place, name in enumerate(names) if often[name] == 1}
+    pairs = []
+    for place, file in enumerate(files):
+        parts = PurePosixPath(splitext(file)[0]).parts
+        endings = ("/".join(parts[first:]) for first in range(len(parts)))
+        pairs += [(number[ending], place) for ending in endings if ending in number][:1]
+    once = Counter(image for image, _ in pairs)
+    return [pair for pair in pairs if once[pair[0]] == 1]

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
@@ -20,7 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.snapshot import Views, as_pinholes
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.ray_sampler import RaySampler, draw_generator
@@ -165,9 +165,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
 def views_of_cameras(cameras: Cameras) -> Views:
     """Return pinhole views without distortion that approximate `cameras`, in the same order.
 
-    Lens distortion is ignored, so a view may end a little inside or outside the border of a distorted photograph. A
-    fisheye lens becomes a pinhole with the same focal length whose image spans the same angles along both axes, at most
-    80 degrees to each side.
+    Lens distortion is ignored, so a view may end a little inside or outside the border of a distorted photograph.
     """
     cameras = cameras.to("cpu")
 
@@ -175,8 +173,4 @@ def views_of_cameras(cameras: Cameras) -> Views:
         return np.stack([getattr(cameras, name).numpy().reshape(-1).astype(kind) for name in (first, second)], axis=1)
 
     pose = cameras.camera_to_worlds.numpy().astype(np.float64)
-    focal, centre, size = pairs("fx", "fy"), pairs("cx", "cy"), pairs("width", "height", np.int64)
-    kind = cameras.camera_type.numpy().reshape(-1)
-
-    fisheye = kind == CameraType.FISHEYE.value
-    return Views(pose, focal, *as_pinholes(fisheye, focal, centre, size))
+    return Views(pose, pairs("fx", "fy"), pairs("cx", "cy"), pairs("width", "height", np.int64))

@@ -13,13 +13,13 @@ from typing import Any, Literal, Optional
 import numpy as np
 import numpy.typing as npt
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 
-from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError, ThermalFileError
 from thermoxels_ns.core.feature_rays import FeatureRays
@@ -27,8 +27,8 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
 from thermoxels_ns.data.layouts import BOUNDS_NAME, LayoutName
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
-from thermoxels_ns.data.tracks import TrackSource, find_feature_rays
-from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, find_dead_pixels, read_thermal_file
+from thermoxels_ns.data.tracks import TrackSource, feature_rays, find_tracks
+from thermoxels_ns.radiometry.thermal_pixels import VALID_RANGE_C, ThermalUnit, read_thermal_file
 
 SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
 _FAR_SIDES = 16.0
@@ -37,8 +37,6 @@ by more than a millionth of the box. National coordinates are so far away."""
 _COLDEST_SKY_K = 150.0  # a file's median may be this far below the declared lowest temperature: it shows a clear sky
 _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
 """A file whose median is at least the first holds kelvins if the median less 273.15 is within the second of others."""
-_MOST_FRAMES = 64  # training files in which stuck pixels are sought
-
 _BYTES_PER_PIXEL = 8  # Three colours, and of masked photographs the mask and the pixel's number
 LONGEST_SIDE = 640  # pixels along the longer side of the pictures in which features are sought
 MOST_PHOTOGRAPHS = 500  # with more, poses stay as given: the normal equations would take minutes
@@ -80,12 +78,10 @@ class ThermalDataParserConfig(DataParserConfig):
     the first n frames, so that the ends of the sequence stay in training."""
     missing_thermal: Literal["error", "skip"] = "error"
     """What happens to a frame without a thermal image. error: stop. skip: leave the frame out and print its name."""
-    valid_range_c: tuple[float, float] = (-100.0, 2000.0)
-    """Temperatures outside this range are masked, in degrees Celsius."""
     tracks: TrackSource = "auto"
     """Source of tracks: which photographs saw which points in structure from motion. Tracks tell training what is air.
     auto: the file that the json names (tracks_file_path), else a COLMAP model in the scene's folder (in colmap or
-    sparse) whose poses are those of the json. given: only the file. off: no tracks."""
+    sparse) whose poses are those of the json. Their points tell where the scene box is, too. off: no tracks."""
     refine_poses: PoseSource = "auto"
     """Poses to train with. auto: poses adjusted to features that photographs share (bundle adjustment), if the scene
     has no tracks and the adjusted poses fit better than the json's; else the json's. given: the json's."""
@@ -122,8 +118,7 @@ class ThermalDataParser(DataParser):
 
     The metadata of its outputs hold: ``temperature_range`` (`TemperatureRange`; None for photographs alone),
     ``thermal_filenames`` (None for photographs alone), ``thermal_cameras`` (`Cameras`; None if all pairs share camera
-    and resolution), ``thermal_unit``, ``valid_range_c``,
-    ``thermal_dead_pixels`` (masks of stuck pixels by shape of the image), ``image_scale`` (1 / downscale_factor),
+    and resolution), ``thermal_unit``, ``image_scale`` (1 / downscale_factor),
     ``thermal_averaged`` (pixels of a thermal image that become one, along a side),
     ``pixel_size`` (width of a pixel at the distance of most of the scene, in nerfstudio's world), ``input_box`` (the
     scene box in input coordinates), ``scene_name`` and ``feature_rays`` (`FeatureRays`; None unless train has tracks).
@@ -197,10 +192,6 @@ class ThermalDataParser(DataParser):
 
     def _read_scene(self) -> _Scene:
         config = self.config
-        low, high = config.valid_range_c
-        if not -ZERO_CELSIUS_K <= low < high:
-            expected, got = "a lower and a higher temperature in degrees Celsius", f"{low} and {high}"
-            raise SceneError("valid_range_c", expected=expected, got=got, remedy="Pass --valid-range-c -100 2000.")
         if not config.photographs_gb > 0.0:
             got, remedy = config.photographs_gb, "Pass --photographs-gb 1."
             raise SceneError("photographs_gb", expected="a number above 0", got=got, remedy=remedy)
@@ -211,35 +202,34 @@ class ThermalDataParser(DataParser):
         CONSOLE.print(f"Layout {file.layout} (--layout takes another).", markup=False)
         names = [frame.name for frame in file.frames]
         split = split_frames(names, file.meta, config.eval_mode, config.eval_interval, file.left_out)
-        rays, given, fitted = find_feature_rays(file, split.train, config.tracks, CONSOLE.print), file, {}
+        tracks = None if config.tracks == "off" else find_tracks(file, CONSOLE.print)
+        rays = None if tracks is None else feature_rays(tracks, [file.frames[index] for index in split.train])
+        given, fitted = file, {}
         if rays is None and config.refine_poses == "auto":
             file, fitted = refine_poses(given, split.train, CONSOLE.print)
-        evidence = find_scene_box(file, config.scene_box, split.train)
-        box = evidence.box()
+        found = find_scene_box(file, config.scene_box, split.train, tracks)
+        box = found.box
         translation, longest = -box.mean(axis=0), float((box[1] - box[0]).max())
         if np.abs(box).max() > _FAR_SIDES * longest:
             # nerfstudio keeps dataparser_transform in single precision; unrounded, the two would differ by metres.
             translation = translation.astype(np.float32).astype(np.float64)
         scale = SCENE_SIZE / longest
-        pixel_size = evidence.pixel_size(box)
-        if math.isinf(pixel_size) and any(frame.intrinsics.lens == "perspective" for frame in file.frames):
-            expected = f"photographs that look at the scene box, from {evidence.source}"
+        pixel_size = found.pixel_size(file.frames)
+        if math.isinf(pixel_size):
+            expected = f"photographs that look at the scene box, from {found.source}"
             remedy = (
                 "Check that poses are camera to world with x right, y up, z back, or pass --scene-box with its corners "
                 "in their coordinates: xmin ymin zmin xmax ymax zmax."
             )
             raise SceneError("cameras", expected=expected, got="none that has it in view", remedy=remedy)
-        training, shapes, temperatures, dead = [file.frames[index] for index in split.train], {}, None, {}
+        training, shapes, temperatures = [file.frames[index] for index in split.train], {}, None
         if file.has_thermal:
             paths, those = ([f.thermal for f in some if f.thermal is not None] for some in (file.frames, training))
-            surveyed = survey_thermal_files(paths, file.unit, config.valid_range_c, file.bounds_c, set(those))
-            shapes, temperatures, dead = surveyed
+            shapes, temperatures = survey_thermal_files(paths, file.unit, file.bounds_c, set(those))
             _refuse_several_sizes(file.frames, shapes)
         metadata = {
             "temperature_range": temperatures,
             "thermal_unit": file.unit,
-            "valid_range_c": tuple(config.valid_range_c),
-            "thermal_dead_pixels": dead,
             "pixel_size": scale * pixel_size,
             "input_box": tuple(map(tuple, box.tolist())),
             "scene_name": file.folder.resolve().name,
@@ -253,12 +243,9 @@ class ThermalDataParser(DataParser):
         size = f"{' x '.join(f'{side:.3g}' for side in sides.tolist())} {'m' if metres else 'units'}"
         CONSOLE.print(
             f"Scene {metadata['scene_name']}: {len(names)} frames, {len(split.train)} train, "
-            f"{len({*split.val, *split.test})} evaluate ({split.how}); box from {evidence.source}, {size}; "
+            f"{len({*split.val, *split.test})} evaluate ({split.how}); box from {found.source}, {size}; "
             + (f"{temperatures.min_c:.2f} to {temperatures.max_c:.2f} C." if temperatures else "no temperatures.")
         )
-        if file.bounds_swapped and file.bounds_c is not None:
-            said = "{} has its lowest temperature above its highest; read as {:g} to {:g} C."
-            CONSOLE.print(said.format(BOUNDS_NAME, *file.bounds_c), style="bold yellow")
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
         return scene
@@ -297,7 +284,7 @@ def _refuse_other_units(middles_c: dict[Path, float], bounds_c: tuple[float, flo
         if strange:
             where = f"{BOUNDS_NAME} or --thermal-bounds says" if bounds_c else "in most of the other files"
             expected, got = f"temperatures near {low:g} to {high:g} C, as {where}", f"{middle:.2f} C in the middle"
-            other = "correct the bounds" if bounds_c else "pass --valid-range-c -100 1999 if it is as hot as that"
+            other = "correct the bounds" if bounds_c else "pass its lowest and highest degrees, --thermal-bounds"
             remedy = f"Subtract 273.15 if the file holds kelvins; else {other}."
             raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
@@ -305,52 +292,34 @@ def _refuse_other_units(middles_c: dict[Path, float], bounds_c: tuple[float, flo
 def survey_thermal_files(
     paths: Sequence[Path],
     unit: ThermalUnit,
-    valid_range_c: tuple[float, float],
     bounds_c: tuple[float, float] | None,
     training: Collection[Path],
-) -> tuple[dict[Path, tuple[int, int]], TemperatureRange, dict[tuple[int, int], BoolArray]]:
-    """Read every thermal file; return its shape (h, w) by path, the temperature range, and masks of stuck pixels.
+) -> tuple[dict[Path, tuple[int, int]], TemperatureRange]:
+    """Read every thermal file; return its shape (h, w) by path, and the temperature range.
 
-    A mask holds for all files of its shape; a shape without stuck pixels has none. Range and stuck pixels come from the
-    files in `training` alone. The range is that of the scene, `bounds_c` [degrees Celsius], where given, widened to the
-    extremes of the training files.
+    The range is that of the scene, `bounds_c` [degrees Celsius], where given, widened to the extremes of the files in
+    `training`.
 
     Raises:
         ThermalFileError: A file cannot be read or has no valid pixel, or its median tells of another unit.
     """
     shapes: dict[Path, tuple[int, int]] = {}
-    extremes: dict[Path, tuple[float, float]] = {}
     middles: dict[Path, float] = {}
-    kept: dict[tuple[int, int], list[Float32Array]] = {}
-    step = -(-len(training) // _MOST_FRAMES)
+    low, high = bounds_c or (math.inf, -math.inf)
     for path in paths:
-        temperature_c = read_thermal_file(path, unit, valid_range_c).temperature_c
+        temperature_c = read_thermal_file(path, unit).temperature_c
         height, width = temperature_c.shape
         shapes[path] = (height, width)
         if not np.isfinite(temperature_c).any():
-            expected = f"temperatures from {valid_range_c[0]} to {valid_range_c[1]} C"
-            remedy = "Check thermal_unit or temperature_bounds.json, or widen --valid-range-c."
+            expected = "temperatures from {:g} to {:g} C".format(*VALID_RANGE_C)
+            remedy = "Check thermal_unit or temperature_bounds.json."
             raise ThermalFileError(str(path), expected=expected, got="no valid pixel", remedy=remedy)
         if path not in training:
             continue
-        if len(extremes) % step == 0:
-            kept.setdefault((height, width), []).append(temperature_c)
-        extremes[path] = (float(np.nanmin(temperature_c)), float(np.nanmax(temperature_c)))
+        low, high = min(low, float(np.nanmin(temperature_c))), max(high, float(np.nanmax(temperature_c)))
         middles[path] = float(np.nanmedian(temperature_c))
-    if bounds_c is not None or tuple(valid_range_c) == ThermalDataParserConfig.valid_range_c:
-        _refuse_other_units(middles, bounds_c)
-    dead = {shape: find_dead_pixels(np.stack(frames)) for shape, frames in kept.items()}
-    dead = {shape: mask for shape, mask in dead.items() if mask.any()}
-    for path in extremes:
-        if shapes[path] in dead:  # a stuck pixel may hold the file's extreme
-            live = read_thermal_file(path, unit, valid_range_c).temperature_c[~dead[shapes[path]]]
-            if np.isfinite(live).any():
-                extremes[path] = (float(np.nanmin(live)), float(np.nanmax(live)))
-    lows, highs = zip(*extremes.values())
-    low, high = min(lows), max(highs)
-    if bounds_c is not None:
-        low, high = min(low, bounds_c[0]), max(high, bounds_c[1])
-    return shapes, TemperatureRange.spanning(low, high), dead
+    _refuse_other_units(middles, bounds_c)
+    return shapes, TemperatureRange.spanning(low, high)
 
 
 def _thermal_intrinsics(frame: Frame, shapes: Mapping[Path, tuple[int, int]]) -> Camera:
@@ -390,15 +359,12 @@ def _cameras(intrinsics: list[Camera], poses: torch.Tensor) -> Cameras:
         width=column("width", torch.int64),
         height=column("height", torch.int64),
         distortion_params=torch.tensor([one.distortion for one in intrinsics], dtype=torch.float32),
-        camera_type=torch.tensor([[CameraType[one.lens.upper()].value] for one in intrinsics]),
     )
 
 
 def _same_cameras(first: Cameras, second: Cameras) -> bool:
     """Return whether two sets of cameras have the same pixels with the same rays through them, up to rounding."""
-    return all(
-        torch.equal(getattr(first, name), getattr(second, name)) for name in ("width", "height", "camera_type")
-    ) and all(
+    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in ("width", "height")) and all(
         torch.allclose(getattr(first, name), getattr(second, name), rtol=1e-6, atol=1e-7)
         for name in ("fx", "fy", "cx", "cy", "distortion_params", "camera_to_worlds")
     )
@@ -499,8 +465,7 @@ def refine_poses(
     began = time.perf_counter()
     frames = scene.frames
     others = [number for number in range(len(frames)) if number not in set(training)]
-    usable = all(frame.intrinsics.lens == "perspective" for frame in frames)
-    if not usable or not FEWEST_PHOTOGRAPHS <= len(training) <= MOST_PHOTOGRAPHS:
+    if not FEWEST_PHOTOGRAPHS <= len(training) <= MOST_PHOTOGRAPHS:
         return scene, {}
     from thermoxels_ns.multiview.bundle_adjustment import adjust_poses, features_of, find_tracks
 

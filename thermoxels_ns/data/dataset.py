@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from jaxtyping import Bool, Float
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
@@ -51,11 +51,9 @@ class ThermalDataset(InputDataset):
         """True if photographs and thermal images share cameras, so that one ray carries a colour and a temperature."""
         return self.thermal_cameras is None
 
-    def camera(self, image_idx: int, thermal: bool = False) -> Camera | None:
-        """Return the camera of a photograph, or with `thermal` that in `thermal_cameras`; None if not perspective."""
+    def camera(self, image_idx: int, thermal: bool = False) -> Camera:
+        """Return the camera of a photograph, or with `thermal` that in `thermal_cameras`."""
         cameras: Any = self.thermal_cameras if thermal else self.cameras
-        if int(cameras.camera_type[image_idx]) != CameraType.PERSPECTIVE.value:
-            return None
         width, height = (int(getattr(cameras, name)[image_idx]) for name in ("width", "height"))
         fx, fy, cx, cy = (float(getattr(cameras, name)[image_idx]) for name in ("fx", "fy", "cx", "cy"))
         lens = [] if cameras.distortion_params is None else cameras.distortion_params[image_idx].tolist()
@@ -139,12 +137,8 @@ class ThermalDataset(InputDataset):
             return torch.zeros(size), torch.zeros(size, dtype=torch.bool), PixelReport()
         if image_idx not in self._thermal:
             path, given = self.metadata["thermal_filenames"][image_idx], self.metadata
-            image = read_thermal_file(path, given["thermal_unit"], given["valid_range_c"])
-            valid, report = np.isfinite(image.temperature_c), image.report
-            dead = given["thermal_dead_pixels"].get(valid.shape)
-            if dead is not None:
-                report = report + PixelReport(dead=int((valid & dead).sum()))
-                valid &= ~dead
+            image = read_thermal_file(path, given["thermal_unit"])
+            valid = np.isfinite(image.temperature_c)
             # float32 would lose 16-bit steps of a narrow range far from 0 C.
             normalised = self.temperature_range.normalise(image.temperature_c.astype(np.float64))
             thermal = np.where(valid, normalised, 0.0)
@@ -152,7 +146,7 @@ class ThermalDataset(InputDataset):
                 thermal, valid = _averaged(thermal, valid, side)
             thermal = thermal.astype(np.float32)
             tensors = torch.from_numpy(thermal)[..., None], torch.from_numpy(valid)[..., None]
-            self._thermal[image_idx] = (*tensors, report)
+            self._thermal[image_idx] = (*tensors, image.report)
         return self._thermal[image_idx]
 
     def _resized(self, picture: Image.Image, image_idx: int, filter_: Image.Resampling) -> Image.Image:

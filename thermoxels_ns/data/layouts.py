@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_model, read_model
+from thermoxels_ns.data.colmap_model import (
+    COLMAP_FOLDERS,
+    camera_to_world,
+    is_model,
+    lens_entries,
+    matched_names,
+    read_model,
+)
+from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES
 
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")
 BOUNDS_NAME = "temperature_bounds.json"
 LayoutName = Literal["thermalnerf", "thermoscenes", "nerfstudio", "rgb", "rgbt-scenes", "thermalmix", "colmap"]
 _FRAMES = "frames with "
-_NAMES_OF_PARAMETER = {"f": ("fl_x", "fl_y"), "fx": ("fl_x",), "fy": ("fl_y",), "k": ("k1",)}
-"""Keys of transforms.json by COLMAP's names of the parameters of its cameras; all others have the same name."""
 _THERMAL_CAMERA = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
 
 
@@ -111,36 +116,24 @@ def _signs_of_thermal(folder: Path, content: dict[str, Any]) -> str:
 
 
 def _content_of_model(folder: Path, place: Path, root: str) -> tuple[dict[str, Any], list[str]]:
-    """Return what a transforms.json would say of a COLMAP model's photographs in ``folder / root``, found by name, else
-    by stem, and the names of those that are not there. Subfolders train, val and test become split lists."""
-    model = read_model(place)
-    exact, files = dict[str, list[str]](), defaultdict[str, list[str]](list)
-    for path in sorted((folder / root).rglob("*")):
-        within = path.relative_to(folder / root)
-        if path.is_file():
-            exact[within.as_posix()] = [path.relative_to(folder).as_posix()]
-            for key in {within.name, f"{within.stem}.*"}:
-                files[key].append(path.relative_to(folder).as_posix())
-    frames, left_out = [], []
-    taken = {exact[image.name][0] for image in model.images.values() if image.name in exact}
-    for image in sorted(model.images.values(), key=lambda image: image.name):
-        name = PurePosixPath(image.name)
-        found = exact.get(image.name) or next((files[key] for key in (name.name, f"{name.stem}.*") if key in files), [])
-        if image.name not in exact:
-            found = [one for one in found if one not in taken]  # such as thermal images that COLMAP saw too
-        if len(found) > 1:
-            got, remedy = ", ".join(found), "Rename them in the folder and in COLMAP, and run COLMAP again."
-            raise SceneError(f"{place}: {name}", expected="one photograph of this name", got=got, remedy=remedy)
-        if not found or not image.has_pose:
-            left_out.append(str(name))
-            continue
-        camera = model.cameras[image.camera_id]
-        lens = {"camera_model": camera.model.name, "w": camera.width, "h": camera.height}
-        for parameter, value in zip(camera.params_info.split(", "), map(float, camera.params)):
-            lens |= dict.fromkeys(_NAMES_OF_PARAMETER.get(parameter, (parameter,)), value)
-        frames.append({"file_path": found[0], "transform_matrix": camera_to_world(image).tolist(), **lens})
+    """Return what a transforms.json would say of a COLMAP model's photographs in ``folder / root``, and the names of
+    those that are not there or not clear (`matched_names`). Subfolders train, val and test become split lists."""
+    cameras, images, _ = read_model(place)
+    there = (path for path in sorted((folder / root).rglob("*")) if path.suffix.lower() in THERMAL_SUFFIXES)
+    files = [path.relative_to(folder).as_posix() for path in there]
+    posed = sorted(images.values(), key=lambda image: image.name)
+    file_of = dict(matched_names([image.name for image in posed], files))
+    left_out = [image.name for number, image in enumerate(posed) if number not in file_of]
+    frames = []
+    for number, image in enumerate(posed):
+        if number in file_of:
+            camera = cameras[image.camera_id]
+            lens = {"camera_model": camera.model, "w": camera.width, "h": camera.height}
+            lens |= lens_entries(camera.model, camera.params)
+            pose = camera_to_world(image).tolist()
+            frames.append({"file_path": files[file_of[number]], "transform_matrix": pose, **lens})
     if not frames:
-        got = f"{len(model.images)} others, such as {', '.join(left_out[:2]) or 'none'}"
+        got = f"{len(images)} others, such as {', '.join(left_out[:2]) or 'none'}"
         remedy = "Put the photographs there that COLMAP saw, with the names that it saw."
         raise SceneError(str(place), expected=f"photographs in {folder / root}", got=got, remedy=remedy)
     lists = {

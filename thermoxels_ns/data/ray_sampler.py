@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
@@ -23,7 +23,6 @@ Streams = Literal["both", "rgb", "thermal"]
 _BITS = {"both": RGB_STREAM | THERMAL_STREAM, "rgb": RGB_STREAM, "thermal": THERMAL_STREAM}
 _CHUNK = 1 << 17
 _GRID_RAYS = 1 << 14  # most rays of a bundle of `grid`
-_FISHEYE = CameraType.FISHEYE.value
 
 
 class RaySampler:
@@ -203,7 +202,7 @@ class CameraRays:
         self._areas = (1.0 / (self.cameras.fx * self.cameras.fy)).to(self.device)
 
         # Cameras with equal rows in `models` have equal directions in camera axes.
-        names = ["fx", "fy", "cx", "cy", "width", "height", "camera_type", "distortion_params"]
+        names = ["fx", "fy", "cx", "cy", "width", "height", "distortion_params"]
         parts = [part.double() for name in names if (part := getattr(self.cameras, name)) is not None]
         models = torch.cat(parts, dim=-1).numpy()
         _, first, self_model = np.unique(models, axis=0, return_index=True, return_inverse=True)
@@ -250,8 +249,7 @@ class CameraRays:
     def _camera_axes(self, index: int) -> Float[Tensor, "pixels 3"]:
         """Return the ray directions in camera axes of all pixels of one camera.
 
-        On the optical axis of a fisheye lens, where nerfstudio divides 0 by 0, it is the axis. Raises `SceneError` if
-        the distortion cannot be undone in another pixel.
+        Raises `SceneError` if the distortion cannot be undone in a pixel.
         """
         still = self.cameras[index : index + 1]
         still.camera_to_worlds = torch.eye(4)[None, :3]
@@ -263,11 +261,8 @@ class CameraRays:
             directions[part] = still.generate_rays(torch.zeros_like(part)[:, None], coords=coords[part]).directions
         lost = ~torch.isfinite(directions).all(dim=1)
         if bool(lost.any()):
-            off = (coords[lost] - torch.cat([still.cy, still.cx], dim=-1)).abs().amax(dim=1)
-            if int(still.camera_type) != _FISHEYE or float(off.max()) >= 1e-3:
-                expected = "a lens distortion that can be undone in every pixel"
-                got = f"{int(lost.sum())} pixels without a finite ray"
-                remedy = "Check k1 to p2, or undistort the photographs."
-                raise SceneError(f"camera of photograph {index}", expected=expected, got=got, remedy=remedy)
-            directions[lost] = torch.tensor([0.0, 0.0, -1.0])
+            expected = "a lens distortion that can be undone in every pixel"
+            got = f"{int(lost.sum())} pixels without a finite ray"
+            remedy = "Check k1 to p2, or undistort the photographs."
+            raise SceneError(f"camera of photograph {index}", expected=expected, got=got, remedy=remedy)
         return directions

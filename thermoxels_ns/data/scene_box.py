@@ -12,10 +12,9 @@ import numpy as np
 from thermoxels_ns.core.arrays import Float32Array, FloatArray
 from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.snapshot import Views, as_pinholes
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model, worlds_of_json
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.data.scene_file import Frame, SceneFile
-from thermoxels_ns.data.tracks import FEWEST_VIEWS, MOST_ERROR_PX, TRACKS_KEY, read_tracks
+from thermoxels_ns.data.tracks import SparseTracks
 
 Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 
@@ -38,90 +37,73 @@ _CONVERGING = 0.5  # Cameras look outwards if the place they look at is nearer t
 
 
 @dataclass(frozen=True, eq=False)
-class BoxEvidence:
-    """Evidence of where the scene box is, in input coordinates: its corners, else points, else the cameras alone."""
+class FoundBox:
+    """The scene box in input coordinates, and what it was found from."""
 
-    source: str  # Source of the evidence, in words
-    frames: Sequence[Frame]
-    corners: Box | None = None  # None: not given
+    source: str  # What the box was found from, in words
+    box: Box
     points: FloatArray | None = None  # Points of the scene, shape (n, 3); None: not known
 
-    def box(self) -> Box:
-        """Return the scene box: `corners`, else `box_of_points`, else `box_of_cameras`.
-
-        Raises:
-            SceneError: The box has no volume, or points or cameras do not suffice to find it.
-        """
-        if self.corners is not None:
-            return self.corners
-        if self.points is not None:
-            return box_of_points(self.points, self.frames)
-        return box_of_cameras(self.frames)
-
-    def pixel_size(self, box: Box) -> float:
-        """Return the width that a pixel covers at the typical distance of surfaces in `box`, in input units.
+    def pixel_size(self, frames: Sequence[Frame]) -> float:
+        """Return the width that a pixel covers at the typical distance of surfaces in the box, in input units.
 
         This is the median over the points in the box and the photographs that have them in view; without points, the
-        width of a pixel in the middle of the nearer half of the box. Infinite if no perspective camera sees the box.
+        width of a pixel in the middle of the nearer half of the box. Infinite if no camera sees the box.
         """
-        low, high = box
+        low, high = self.box
         if self.points is not None:
             points, quantile = self.points[((self.points >= low) & (self.points <= high)).all(axis=1)], 0.5
         else:
             steps = (np.arange(_PROBES) + 0.5) / _PROBES
             grid = np.stack(np.meshgrid(*3 * [steps], indexing="ij"), axis=-1).reshape(-1, 3)
             points, quantile = low + grid * (high - low), _NEARER_HALF
-        frames = [f for f in _spread(self.frames, _MOST_PHOTOGRAPHS) if f.intrinsics.lens == "perspective"]
-        if not frames or not len(points):
+        frames = _spread(frames, _MOST_PHOTOGRAPHS)
+        if not len(points):
             return float("inf")
         depth = _depths_in_view(points[:: max(len(points) // _MOST_POINTS, 1)], frames)
         sizes = depth / np.array([[f.intrinsics.fl_x] for f in frames])
         return float(np.quantile(sizes[np.isfinite(sizes)], quantile)) if np.isfinite(sizes).any() else float("inf")
 
 
-def find_scene_box(scene: SceneFile, option: Sequence[Sequence[float]] | None, training: Sequence[int]) -> BoxEvidence:
-    """Return the best evidence of where the scene box is.
+def find_scene_box(
+    scene: SceneFile, option: Sequence[Sequence[float]] | None, training: Sequence[int], tracks: SparseTracks | None
+) -> FoundBox:
+    """Return the scene box and what it was found from.
 
     The first available counts: `option`, ``scene_box`` in the json (both in input coordinates), sparse points
-    (``ply_file_path``, ``tracks_file_path``, or a COLMAP model in one of `COLMAP_FOLDERS`), depths on which the
-    photographs that train (indices `training`) agree, the cameras. The same folder and split give the same result.
+    (``ply_file_path``, or those of `tracks`), depths on which the photographs that train (indices `training`) agree,
+    the cameras. The same folder and split give the same result.
 
     Raises:
-        SceneError: A given box has no volume or is not finite, or a file cannot be read.
+        SceneError: A box has no volume or is not finite, a file cannot be read, or neither points nor cameras suffice.
     """
     frames = scene.frames
     if option is not None:
-        return BoxEvidence("the option scene_box", frames, _checked(option, "scene_box"))
+        return FoundBox("the option scene_box", _checked(option, "scene_box"))
     if "scene_box" in scene.meta:
         name = f"{scene.json_path.name}: scene_box"
-        return BoxEvidence(name, frames, _checked(scene.meta["scene_box"], name))
+        return FoundBox(name, _checked(scene.meta["scene_box"], name))
     if "ply_file_path" in scene.meta:
         path = scene.folder / str(scene.meta["ply_file_path"])
-        return BoxEvidence(f"the points of {path.name}", frames, points=_read_ply(path))
-    if TRACKS_KEY in scene.meta:
-        tracks = read_tracks(scene.folder / str(scene.meta[TRACKS_KEY]))
-        views = np.bincount(tracks.sighting_point, minlength=len(tracks.points))
-        good = (views >= FEWEST_VIEWS) & (tracks.point_error_px <= MOST_ERROR_PX)
-        points = tracks.points[good] if np.count_nonzero(good) >= _FEWEST_POINTS else tracks.points
-        return BoxEvidence("the points of structure from motion", frames, points=points)
-    for folder in COLMAP_FOLDERS:
-        if any((scene.folder / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
-            return BoxEvidence(f"the points of {folder}", frames, points=_read_colmap(folder, scene))
+        points = _read_ply(path)
+        return FoundBox(f"the points of {path.name}", box_of_points(points, frames), points)
+    if tracks is not None:
+        good = tracks.well_seen()
+        points = good if len(good) >= _FEWEST_POINTS else tracks.points
+        return FoundBox(f"the points of {tracks.source}", box_of_points(points, frames), points)
     points, photographs = _points_of_photographs([frames[index] for index in training])
     if len(points) < _FEWEST_DEPTHS:
-        return BoxEvidence("the cameras (no scene_box, no sparse points, no depths that photographs agree on)", frames)
+        source = "the cameras (no scene_box, no sparse points, no depths that photographs agree on)"
+        return FoundBox(source, box_of_cameras(frames))
     source = f"{len(points)} depths on which {photographs} photographs agree"
-    return BoxEvidence(source, frames, points=points)
+    return FoundBox(source, box_of_points(points, frames), points)
 
 
 def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
     """Return points (n, 3) on which photographs agree, in input coordinates, and how many photographs are compared."""
     from thermoxels_ns.multiview import photographs, stereo  # its kernels are slow to load and only needed here
 
-    frames = [frame for frame in frames if frame.intrinsics.lens == "perspective"]
     frames = _spread(frames, _STEREO_PHOTOGRAPHS)
-    if not frames:
-        return np.zeros((0, 3)), 0
     pinholes = []
     for frame in frames:
         picture, shown = frame.read_picture("RGB", 2 * _STEREO_SIDE)
@@ -173,9 +155,7 @@ def _views(frames: Sequence[Frame]) -> Views:
     focal = np.array([(lens.fl_x, lens.fl_y) for lens in lenses])
     centre = np.array([(lens.cx, lens.cy) for lens in lenses])
     size = np.array([(lens.width, lens.height) for lens in lenses])
-    fisheye = np.array([lens.lens == "fisheye" for lens in lenses])
-    poses = np.stack([frame.pose[:3] for frame in frames])
-    return Views(poses, focal, *as_pinholes(fisheye, focal, centre, size))
+    return Views(np.stack([frame.pose[:3] for frame in frames]), focal, centre, size)
 
 
 def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array:
@@ -183,9 +163,7 @@ def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> Float32Array
     depth = np.full((len(frames), len(points)), np.nan, dtype=np.float32)
     for row, frame in zip(depth, frames):
         camera, local = frame.intrinsics, (points - frame.pose[:3, 3]) @ frame.pose[:3, :3] * (1.0, -1.0, -1.0)
-        shown = local[:, 2] > 0.0
-        if camera.lens == "perspective":
-            shown &= camera.contains(camera.project(local))
+        shown = (local[:, 2] > 0.0) & camera.contains(camera.project(local))
         row[shown] = local[shown, 2]
     return depth
 
@@ -250,24 +228,3 @@ def _read_ply(path: Path) -> FloatArray:
         remedy = remedy_of(problem, _REMEDY)
         raise SceneError(str(path), expected="a readable .ply", got=problem, remedy=remedy) from problem
     return points
-
-
-def _read_colmap(folder: str, scene: SceneFile) -> FloatArray:
-    """Return the points (n, 3) of a COLMAP model in the coordinates of the json.
-
-    The json may be in COLMAP's world or in one with other axes (``applied_transform``). The camera centres in both
-    decide which. Raises `SceneError` if they do not fit, so that a stale model cannot give a wrong box.
-    """
-    model = read_model(scene.folder / folder)
-    centres = {Path(image.name).name: np.asarray(image.projection_center()) for image in model.images.values()}
-    known = [(centres[frame.image.name], frame.pose[:3, 3]) for frame in scene.frames if frame.image.name in centres]
-    in_colmap, in_json = (np.array(side).reshape(-1, 3) for side in (zip(*known) if known else ([], [])))
-    for transform in worlds_of_json(scene.meta) if known else []:
-        off = np.linalg.norm(in_colmap @ transform[:3, :3].T + transform[:3, 3] - in_json, axis=1)
-        spread = np.linalg.norm(in_json - in_json.mean(axis=0), axis=1).max()
-        if np.median(off) <= 0.01 * max(spread, 1e-9):
-            points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-            return points @ transform[:3, :3].T + transform[:3, 3]
-    remedy = _REMEDY
-    got = f"{len(known)} photographs in common, at other places" if known else "no photograph in common"
-    raise SceneError(folder, expected="a COLMAP model with the camera centres of the json", got=got, remedy=remedy)

@@ -66,7 +66,6 @@ class SceneFile:
     bounds_c: tuple[float, float] | None  # lowest and highest temperature of temperature_bounds.json, [degrees Celsius]
     meta: dict[str, Any]  # the json (split lists, scene_box, ply_file_path, ...), or what stands for it
     left_out: list[str] = field(default_factory=list)  # names of frames that missing_thermal="skip" left out
-    bounds_swapped: bool = False  # True if temperature_bounds.json has the lowest temperature above the highest
     layout: str = ""  # the layout and where its parts are, in words
 
     @property
@@ -159,19 +158,17 @@ def read_scene_file(
         raise SceneError(f"{json_path.name}: mask_path", expected=expected, got=got, remedy=remedy)
     scale_from_scene_file(meta)
     up_from_scene_file(meta)
-    bounds, swapped = _read_bounds(folder) if thermal_bounds is None else thermal_bounds, False
+    bounds = _read_bounds(folder) if thermal_bounds is None else thermal_bounds
     if thermal_bounds is not None and not -ZERO_CELSIUS_K <= thermal_bounds[0] < thermal_bounds[1] <= _HOTTEST_C:
         expected, got = "degrees Celsius of black and, higher, of white", "{:g} and {:g}".format(*thermal_bounds)
         remedy = "Pass --thermal-bounds -5 42, for example."
         raise SceneError("thermal_bounds", expected=expected, got=got, remedy=remedy)
-    if bounds is not None and bounds[0] > bounds[1]:  # some published scenes have the two keys swapped
-        bounds, swapped = (bounds[1], bounds[0]), True
     frames.sort(key=lambda frame: frame.name)
     unit = _unit({} if thermal_bounds else meta, json_path, bounds)
     read = "photographs alone" if alone else f"thermal images {f'in {place}' if there else 'named in the json'}"
     words = f"{source.layout.name}: poses from {json_path.relative_to(folder).as_posix()}, {read}"
     left_out = [*source.left_out, *left_out]
-    return SceneFile(folder, json_path, frames, unit, bounds, meta, left_out, swapped, words)
+    return SceneFile(folder, json_path, frames, unit, bounds, meta, left_out, words)
 
 
 def _read_bounds(folder: Path) -> tuple[float, float] | None:
@@ -189,7 +186,7 @@ def _read_bounds(folder: Path) -> tuple[float, float] | None:
         expected = f"{keys[0]} and {keys[1]}, degrees Celsius from absolute zero to {_HOTTEST_C:.0f}"
         remedy = "Correct the file, or remove it if the thermal files hold degrees Celsius."
         raise SceneError(str(path), expected=expected, got=dict(zip(keys, given)), remedy=remedy)
-    return bounds[0], bounds[1]
+    return min(bounds), max(bounds)  # some published scenes have the two keys swapped
 
 
 def _unit(meta: dict[str, Any], json_path: Path, bounds: tuple[float, float] | None) -> ThermalUnit:

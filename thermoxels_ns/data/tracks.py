@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import zipfile
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -15,8 +14,9 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import remedy_of, write_npz
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_model, read_model, worlds_of_json
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, is_model, matched_names, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
+from thermoxels_ns.data.transforms_json import read_pose
 
 TRACKS_KEY = "tracks_file_path"  # key of transforms.json that names the file of tracks
 FEWEST_VIEWS = 3  # photographs that must see a point: two photographs agree on many wrong points
@@ -28,7 +28,7 @@ MOST_OFF = 0.002
 """A photograph is left out if an axis of its camera in the model is off the given one by more than this, or its place
 by more than this share of the cameras' distance from their middle."""
 LEAST_AGREEING = 0.7  # share of the photographs whose poses must agree; with fewer, the model belongs to other poses
-TrackSource = Literal["auto", "given", "off"]
+TrackSource = Literal["auto", "off"]
 _REMEDY = f"Write the scene again with thermoxels capture, or remove {TRACKS_KEY} from the json to train without it."
 
 
@@ -41,6 +41,12 @@ class SparseTracks:
     frames: tuple[str, ...]  # names of photographs, as ``file_path`` in transforms.json
     sighting_frame: IntArray  # index into `frames` of each sighting, shape (s,)
     sighting_point: IntArray  # index into `points` of each sighting, shape (s,)
+    source: str = "tracks"  # name of the file or of the folder of the COLMAP model, which the file does not hold
+
+    def well_seen(self) -> FloatArray:
+        """Return the points (m, 3) that enough photographs see with a small enough error (see `feature_rays`)."""
+        views = np.bincount(self.sighting_point, minlength=len(self.points))
+        return self.points[(views >= FEWEST_VIEWS) & (self.point_error_px <= MOST_ERROR_PX)]
 
 
 def write_tracks(path: Path, tracks: SparseTracks) -> None:
@@ -75,79 +81,59 @@ def read_tracks(path: Path) -> SparseTracks:
         shapes = ", ".join(f"{name} {array.dtype}{array.shape}" for name, array in zip(names, arrays))
         raise SceneError(path.name, expected="points, frames and pairs of their numbers", got=shapes, remedy=_REMEDY)
     places = points.astype(np.float64), error.astype(np.float64)
-    return SparseTracks(*places, tuple(map(str, frames)), frame.astype(np.int64), point.astype(np.int64))
+    return SparseTracks(*places, tuple(map(str, frames)), frame.astype(np.int64), point.astype(np.int64), path.name)
 
 
-def find_feature_rays(
-    scene: SceneFile, training: Sequence[int], source: TrackSource, say: Callable[[str], None]
-) -> FeatureRays | None:
-    """Return the feature rays of the photographs that train, in input coordinates; None if there are no tracks.
+def find_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> SparseTracks | None:
+    """Return the tracks of a scene in input coordinates; None if it has none.
 
-    `training` holds indices of frames. "auto" takes the file of tracks that the json names, else a COLMAP model in the
-    scene's folder; if it cannot be used, `say` receives the reason. "given": only the file; "off": None.
-
-    Raises:
-        SceneError: The file that the json names cannot be used, or does not fit the poses.
+    They are in the file that the json names, else in the COLMAP model in the scene's folder (`read_colmap_tracks`). If
+    the model cannot be used, `say` receives the reason. Raises `SceneError` if the file cannot be used.
     """
-    frames = [scene.frames[index] for index in training]
-    if source == "off":
-        return None
     if TRACKS_KEY in scene.meta:
-        path = scene.folder / str(scene.meta[TRACKS_KEY])
-        return feature_rays(read_tracks(path), frames, path.name)
+        return read_tracks(scene.folder / str(scene.meta[TRACKS_KEY]))
+    folder = next((name for name in COLMAP_FOLDERS if is_model(scene.folder / name)), None)
     try:
-        found = read_colmap_tracks(scene, say) if source == "auto" else None
-        remedy = "Give it the photographs and poses of the json, or move it away."
-        return None if found is None else feature_rays(found, frames, "its tracks", remedy)
+        return None if folder is None else read_colmap_tracks(scene, folder, say)
     except SceneError as problem:
-        say(f"Tracks: the COLMAP model in the scene's folder is not used (--tracks off leaves it alone): {problem}")
+        say(f"Tracks: the COLMAP model in {folder} is not used (--tracks off leaves it alone): {problem}")
         return None
 
 
-def read_colmap_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> SparseTracks | None:
-    """Return the tracks of the COLMAP model in a scene's folder, in input coordinates; None if there is no model.
+def read_colmap_tracks(scene: SceneFile, folder: str, say: Callable[[str], None]) -> SparseTracks:
+    """Return the tracks of the COLMAP model in a folder of a scene, in input coordinates.
 
-    Photographs are matched by name. The json's poses must be in the model's world, or in one of `worlds_of_json`. Two
-    poses of a photograph agree if they differ by less than `MOST_OFF`. Sightings of photographs whose poses do not
-    agree are left out, and `say` receives their names.
+    Photographs are matched by name. The json's poses must be those of the model, moved by the json's
+    ``applied_transform`` if it has one. Two poses of a photograph agree if they differ by less than `MOST_OFF`.
+    Sightings of photographs whose poses do not agree are left out, and `say` receives their names.
 
     Raises:
         SceneError: The model is damaged, is not of these photographs, or too few of its poses agree.
     """
-    folder = next((name for name in COLMAP_FOLDERS if is_model(scene.folder / name)), None)
-    if folder is None:
-        return None
-    model = read_model(scene.folder / folder)
-    if any(point.error < 0.0 for point in model.points3D.values()):  # not computed
-        model.update_point_3d_errors()
-    images = [image for image in model.images.values() if image.has_pose]
-    pairs = _matched([image.name for image in images], [frame.name for frame in scene.frames])
+    cameras, images, points = read_model(scene.folder / folder)
+    pairs = matched_names([image.name for image in images.values()], [frame.name for frame in scene.frames])
     if not pairs:
-        there, here = next((image.name for image in images), "none"), scene.frames[0].name
+        there, here = next((image.name for image in images.values()), "none"), scene.frames[0].name
         names = f"such as {there} there and {here} here"
         raise SceneError(f"it has no photograph of this scene, or several of one name ({names})")
-    images, frames = [images[image] for image, _ in pairs], [scene.frames[frame] for _, frame in pairs]
-    if not all(camera.width for camera in model.cameras.values()):
-        raise SceneError("it has a camera whose photographs are 0 pixels wide")
-    number = {image.image_id: place for place, image in enumerate(images)}
-    points = np.array([point.xyz for point in model.points3D.values()], dtype=np.float64).reshape(-1, 3)
-    seen = [
-        (place, number[element.image_id])
-        for place, one in enumerate(model.points3D.values())
-        for element in one.track.elements
-        if element.image_id in number
-    ]
+    listed = list(images.values())
+    found, frames = [listed[image] for image, _ in pairs], [scene.frames[frame] for _, frame in pairs]
+    number = {image.id: place for place, image in enumerate(found)}
+    # A track may hold two features of one photograph.
+    seen = [(place, number[i]) for place, one in enumerate(points.values()) for i in {*one.image_ids} & number.keys()]
     if not seen:
         raise SceneError("it has no points that photographs of this scene see")
-    # A track may hold two features of one photograph.
-    point, frame = np.unique(np.array(seen, dtype=np.int64), axis=0).T
-    widths = [f.intrinsics.width / model.cameras[image.camera_id].width for f, image in zip(frames, images)]
-    error_px = np.array([one.error for one in model.points3D.values()], dtype=np.float64) * float(np.median(widths))
-    poses, given = np.stack(list(map(camera_to_world, images))), np.stack([one.pose for one in frames])
+    point, frame = np.array(sorted(seen), dtype=np.int64).T
+    widths = [f.intrinsics.width / max(cameras[image.camera_id].width, 1) for f, image in zip(frames, found)]
+    error_px = np.array([float(one.error) for one in points.values()])
+    # COLMAP writes -1 for an error that it did not compute; such a point counts as the worst that is used.
+    error_px = np.where(error_px < 0.0, MOST_ERROR_PX, error_px * float(np.median(widths)))
+    world = np.eye(4)
+    if "applied_transform" in scene.meta:
+        world = read_pose(scene.meta["applied_transform"], "applied_transform", turned=False)
+    poses, given = world @ np.stack(list(map(camera_to_world, found))), np.stack([one.pose for one in frames])
     spread = np.linalg.norm(given[:, :3, 3] - given[:, :3, 3].mean(axis=0), axis=1).max()
-    unit = np.array([1.0, 1.0, 1.0, max(spread, 1e-300)])
-    tried = [(np.abs(((w @ poses - given) / unit)[:, :3]).max(axis=(1, 2)), w) for w in worlds_of_json(scene.meta)]
-    off, world = min(tried, key=lambda one: np.median(one[0]))
+    off = np.abs(((poses - given) / [1.0, 1.0, 1.0, max(spread, 1e-300)])[:, :3]).max(axis=(1, 2))
     agree = off <= MOST_OFF
     if agree.sum() < max(3, LEAST_AGREEING * len(agree)):
         raise SceneError(
@@ -161,14 +147,12 @@ def read_colmap_tracks(scene: SceneFile, say: Callable[[str], None] = print) -> 
     if not agree.all():
         strays = ", ".join(one.name for one, good in zip(frames, agree) if not good)
         say(f"Tracks: other poses than COLMAP's, left out: {strays}")
-    moved = points @ world[:3, :3].T + world[:3, 3]
-    kept = agree[frame]
-    return SparseTracks(moved, error_px, tuple(one.name for one in frames), frame[kept], point[kept])
+    moved = np.array([one.xyz for one in points.values()]) @ world[:3, :3].T + world[:3, 3]
+    kept, names = agree[frame], tuple(one.name for one in frames)
+    return SparseTracks(moved, error_px, names, frame[kept], point[kept], folder)
 
 
-def feature_rays(
-    tracks: SparseTracks, frames: Sequence[Frame], name: str = "tracks", remedy: str = _REMEDY
-) -> FeatureRays:
+def feature_rays(tracks: SparseTracks, frames: Sequence[Frame]) -> FeatureRays:
     """Return the feature rays from `frames` (at least one) to the points in `tracks` whose places are well known.
 
     A point counts if at least `FEWEST_VIEWS` frames see it, from directions more than `LEAST_PARALLAX_DEG` apart, with
@@ -177,15 +161,14 @@ def feature_rays(
     ray's length is that of triangulation: reprojection error / focal length / sine of the angle, times the length.
 
     Raises:
-        SceneError: No frame is in `tracks`, or `tracks` are of other poses; the message has `name` and `remedy`.
+        SceneError: No frame is in `tracks`, or `tracks` are of other poses.
     """
     place = {frame.name: number for number, frame in enumerate(frames)}
     number = np.array([place.get(known, -1) for known in tracks.frames], dtype=np.int64)
     if not (number >= 0).any():
         got = f"{len(tracks.frames)} others, such as {', '.join(tracks.frames[:2]) or 'none'}"
-        raise SceneError(name, expected="photographs of this scene", got=got, remedy=remedy)
+        raise SceneError(tracks.source, expected="photographs of this scene", got=got, remedy=_REMEDY)
     known = np.isfinite(tracks.points).all(axis=1) & (tracks.point_error_px <= MOST_ERROR_PX)
-    known &= tracks.point_error_px >= 0.0  # COLMAP writes -1 for an error that it did not compute
     used = (number[tracks.sighting_frame] >= 0) & known[tracks.sighting_point]
     # Sorted by point, each pair once: a photograph that sees a point twice counts once.
     pairs = np.unique(tracks.sighting_point[used] * len(frames) + number[tracks.sighting_frame[used]])
@@ -197,7 +180,7 @@ def feature_rays(
     if behind.sum() > MOST_BEHIND * len(behind):
         expected = "points in front of the photographs that see them"
         got = f"{behind.mean():.0%} of the sightings behind: the poses are others"
-        raise SceneError(name, expected=expected, got=got, remedy=remedy)
+        raise SceneError(tracks.source, expected=expected, got=got, remedy=_REMEDY)
     frame, point, line = frame[~behind], point[~behind], line[~behind]
     length = np.linalg.norm(line, axis=1)
     angle = _parallax(line / np.maximum(length, 1e-300)[:, None], point, len(tracks.points))
@@ -219,17 +202,3 @@ def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray
     across = np.linalg.norm(np.cross(directions, mean[point]), axis=1)
     np.maximum.at(off, point, np.arctan2(across, (directions * mean[point]).sum(axis=1)))
     return 2.0 * off
-
-
-def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, int]]:
-    """Return the pairs (image, frame) of indices that belong to the same photograph: the frame's name ends with the
-    image's, folders included. The longest such image is taken; images that then belong to several frames are left out.
-    """
-    number = {image: place for place, image in enumerate(images)}
-    pairs = []
-    for place, frame in enumerate(frames):
-        parts = PurePosixPath(frame).parts
-        endings = ("/".join(parts[first:]) for first in range(len(parts)))
-        pairs += [(number[ending], place) for ending in endings if ending in number][:1]
-    once = Counter(image for image, _ in pairs)
-    return [pair for pair in pairs if once[pair[0]] == 1]

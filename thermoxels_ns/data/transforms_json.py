@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.core.camera import Camera, Lens
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import is_number
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.decoders import errors_name
@@ -21,15 +21,7 @@ _MOST_DISTORTION = 10.0
 """Largest shift of an image corner by one term of the distortion, in distances of the corner from the middle."""
 MOST_UNITS = 1e8  # largest coordinate of a camera; the earth's radius is 6.4e6 m
 DAMAGED_PHOTOGRAPH = "The file is damaged; copy it again or remove the frame."
-_LENS_OF_MODEL: dict[str, Lens] = {
-    "SIMPLE_PINHOLE": "perspective",
-    "PINHOLE": "perspective",
-    "SIMPLE_RADIAL": "perspective",
-    "RADIAL": "perspective",
-    "OPENCV": "perspective",
-    "OPENCV_FISHEYE": "fisheye",
-}
-"""Lens by nerfstudio's camera model, for models whose rays all start in one point."""
+_CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
 def read_pose(values: Any, where: str, turned: bool = True) -> FloatArray:
@@ -70,9 +62,8 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
     values = {**meta, **entry}
     remedy = "Correct the json."
     model = values.get("camera_model", "OPENCV")
-    lens = _LENS_OF_MODEL.get(model) if isinstance(model, str) else None
-    if lens is None:
-        expected = "PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or OPENCV_FISHEYE"
+    if model not in _CAMERA_MODELS:
+        expected = f"one of {', '.join(_CAMERA_MODELS)}"
         undistort = "Undistort the photographs to a pinhole camera."
         if model == "EQUIRECTANGULAR":
             undistort = "Cut each panorama into perspective photographs, each with its pose."
@@ -95,7 +86,7 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         names = _NUMBERS[6:]
         listed = values.get("distortion_params", [values.get(key, 0.0) for key in names])
         numbers |= {key: float(value) for key, value in zip(names, listed, strict=True)}
-        camera = Camera(width, height, **numbers, lens=lens)
+        camera = Camera(width, height, **numbers)
     except KeyError as problem:
         expected, got = "intrinsics fl_x, fl_y, cx, cy, w, h", f"no {problem.args[0]}"
         raise SceneError(where, expected=expected, got=got, remedy=remedy) from problem

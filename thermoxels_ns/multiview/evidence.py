@@ -78,14 +78,12 @@ class PhotographEvidence:
         return rays_through(self.photographs, chosen[inside], depth, CEILING_ERROR * depth)
 
 
-def depths_of_dataset(dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike) -> Depths | None:
+def depths_of_dataset(dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike) -> Depths:
     """Return the depths of a `ThermalDataset`'s photographs in the box from `lo` to `hi` and behind it.
 
-    Depths nearer than `near` are not considered. Lengths are in world units. Return None if no camera is perspective.
+    Depths nearer than `near` are not considered. Lengths are in world units.
     """
     photographs = read_photographs(dataset, near)
-    if photographs is None:
-        return None
     return depths_of(photographs, lo, hi, larger=read_photographs(dataset, near, longest_side=REFINED_SIDE))
 
 
@@ -97,16 +95,14 @@ def evidence_of_photographs(
     say: Callable[[str], None],
     gains: bool = True,
     offsets: bool = True,
-) -> PhotographEvidence | None:
-    """Compare the photographs of a `ThermalDataset` and return the evidence; None if no camera is perspective.
+) -> PhotographEvidence:
+    """Compare the photographs of a `ThermalDataset` and return the evidence.
 
     Depths are sought farther than `near`, in the box from `lo` to `hi` and behind it, [world units]. Gains and offsets
     are estimated, and corrected if they matter, where `gains` and `offsets` are True. `say` receives the findings.
     """
     began = time.perf_counter()
     depths = depths_of_dataset(dataset, near, lo, hi)
-    if depths is None:
-        return None
     photographs = depths.photographs
     few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
     temperatures = dataset.temperature_range

@@ -65,19 +65,15 @@ class Photographs:
 
 def read_photographs(
     dataset: Any, near: float = 0.0, most: int = MOST_PHOTOGRAPHS, longest_side: int = LONGEST_SIDE
-) -> Photographs | None:
+) -> Photographs:
     """Read at most `most` evenly spaced photographs of a `ThermalDataset` as small pinhole pictures.
 
     Photographs with a side longer than `longest_side` [pixels] are averaged down to this size. `near` is that of
-    `Photographs`. Return None if no camera of the dataset is perspective.
+    `Photographs`.
     """
-    usable = np.flatnonzero([dataset.camera(index) is not None for index in range(len(dataset))])
-    if len(usable) > most:
-        usable = usable[np.linspace(0, len(usable) - 1, most).round().astype(int)]
-    if not len(usable):
-        return None
-    pinholes = [_photograph(dataset, int(index), longest_side) for index in usable]
-    return replace(gathered(pinholes, [dataset.pose(index)[:, 3] for index in usable], near), index=usable)
+    chosen = np.linspace(0, len(dataset) - 1, min(most, len(dataset))).round().astype(int)
+    pinholes = [_photograph(dataset, int(index), longest_side) for index in chosen]
+    return replace(gathered(pinholes, [dataset.pose(index)[:, 3] for index in chosen], near), index=chosen)
 
 
 Pinhole = tuple[Float32Array, Float32Array, FloatArray]
@@ -123,8 +119,6 @@ def thermal_at(dataset: Any, photographs: Photographs, depth: Float32Array) -> F
     points, number = origins + depth[sure, None] * along, photographs.numbers[sure]
     for place, index in enumerate(photographs.index.tolist()):
         camera, own = dataset.camera(index, thermal=True), number == place
-        if camera is None:  # another lens than a perspective one
-            continue
         pixels = camera.project_world(dataset.pose(index, thermal=True), points[own])
         warm, valid = (values.numpy()[..., 0] for values in dataset.get_thermal(index))
         shown = camera.contains(pixels)

@@ -16,7 +16,6 @@ from PIL import Image, TiffImagePlugin
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray
 from thermoxels_ns.core.errors import ThermalFileError
-from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.radiometry.decoders import (
     JPEG_START,
     PNG_START,
@@ -108,8 +107,7 @@ class PixelReport:
     nan: int = 0  # pixels that are not a number, infinite or fully transparent in the file
     saturated: int = 0
     """Pixels at the end of a linear scale (count 0 or 65535 for 16 bit), or outside FLIR's calibrated range."""
-    out_of_range: int = 0  # pixels below absolute zero or outside the valid range
-    dead: int = 0  # pixels with valid values that are stuck at one value in all frames
+    out_of_range: int = 0  # pixels outside `VALID_RANGE_C`
 
     def __add__(self, other: PixelReport) -> PixelReport:
         return PixelReport(*map(sum, zip(astuple(self), astuple(other))))
@@ -117,11 +115,11 @@ class PixelReport:
     @property
     def masked(self) -> int:
         """Number of all pixels without a usable temperature."""
-        return self.nan + self.saturated + self.out_of_range + self.dead
+        return self.nan + self.saturated + self.out_of_range
 
     def __str__(self) -> str:
         share = 100.0 * self.masked / max(self.pixels, 1)
-        kinds = f"{self.nan} NaN, {self.saturated} saturated, {self.out_of_range} out of range, {self.dead} dead"
+        kinds = f"{self.nan} NaN, {self.saturated} saturated, {self.out_of_range} out of range"
         return f"{self.masked} of {self.pixels} pixels masked ({share:.2f} %): {kinds}"
 
 
@@ -153,9 +151,7 @@ def detect_format(path: Path) -> ThermalFormat:
     raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 
-def read_thermal_file(
-    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = VALID_RANGE_C
-) -> ThermalImage:
+def read_thermal_file(path: Path, unit: ThermalUnit) -> ThermalImage:
     """Read the temperatures of a file whose `unit` is known; its content tells the format, not its name.
 
     A FLIR R-JPEG is converted by the calibration and settings in the file; `unit` is ignored. Counts need a unit:
@@ -170,7 +166,7 @@ def read_thermal_file(
     with errors_name(path, _EXPECTED, _REMEDY, ThermalFileError):
         found = detect_format(path)
         if found == "FLIR R-JPEG":
-            return masked_image(read_flir_jpeg(path).temperature_c(), valid_range_c)
+            return masked_image(read_flir_jpeg(path).temperature_c())
         if found == "NPY":
             values = _read_npy(path)
         elif found == "CSV":
@@ -203,21 +199,16 @@ def read_thermal_file(
         raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
     if no_data is not None:
         celsius[no_data] = np.nan
-    return masked_image(celsius, valid_range_c, saturated & np.isfinite(celsius))
+    return masked_image(celsius, saturated & np.isfinite(celsius))
 
 
-def masked_image(
-    temperature_c: npt.NDArray[np.floating],
-    valid_range_c: tuple[float, float] = VALID_RANGE_C,
-    saturated: BoolArray | None = None,
-) -> ThermalImage:
+def masked_image(temperature_c: npt.NDArray[np.floating], saturated: BoolArray | None = None) -> ThermalImage:
     """Set temperatures (height, width) [degrees C] to NaN if not finite, saturated or out of range, and count these."""
     if saturated is None:
         saturated = np.zeros(temperature_c.shape, dtype=bool)
     nan = ~np.isfinite(temperature_c) & ~saturated
-    low, high = max(valid_range_c[0], -ZERO_CELSIUS_K), valid_range_c[1]
     with np.errstate(invalid="ignore"):
-        inside = (temperature_c >= low) & (temperature_c <= high)
+        inside = (temperature_c >= VALID_RANGE_C[0]) & (temperature_c <= VALID_RANGE_C[1])
     outside = ~inside & ~nan & ~saturated
     masked = np.where(nan | saturated | outside, np.nan, temperature_c).astype(np.float32)
     report = PixelReport(masked.size, int(nan.sum()), int(saturated.sum()), int(outside.sum()))

@@ -183,8 +183,6 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
     with threadpool_limits(1, "blas"):  # same bits for any number of threads
         wanted = config.exposure == "auto", config.per_image_offset == "auto" and datamanager.config.streams != "rgb"
         found = evidence_of_photographs(datamanager.train_dataset, near, lattice.lo, lattice.hi, CONSOLE.log, *wanted)
-    if found is None:
-        return None
     if trainer is None or trainer._start_step == 0:
         assert found.photographs.index is not None
         model.correct_photographs(found.photographs.index, found.log_gain, found.offset)

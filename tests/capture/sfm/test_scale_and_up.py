@@ -1,5 +1,4 @@
 import io
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,12 +12,10 @@ from thermoxels_ns.capture.photograph import GpsFix
 from thermoxels_ns.capture.sfm.scale_and_up import (
     find_up,
     local_metres,
-    scale_from_distance,
     scale_from_gps,
     scale_from_markers,
 )
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
-from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.synthetic.scene_truth import look_at
 
 UNIT_M = 0.37
@@ -75,36 +72,6 @@ def test_gps_that_says_nothing_is_not_used(fixes, words):
     scale, why = scale_from_gps(0.01 * np.random.default_rng(1).normal(size=(5, 3)), fixes)
     assert scale is None
     assert words in why
-
-
-@pytest.mark.parametrize(("every", "accuracy"), [(0, 1e-3), (8, 0.01)])
-def test_a_measured_length_on_a_wall_gives_the_scale_though_some_points_are_nearer(every, accuracy):
-    model = ring_model(unit_m=UNIT_M)
-    ends = np.array([[-0.8, 1.0, 0.6], [0.9, 1.0, 1.4]])
-    pixels = CAMERA.project(model.in_camera(3, ends / UNIT_M))
-    metres = float(np.linalg.norm(ends[1] - ends[0]))
-    centre, points = model.centres[3], model.points.copy()
-    if every:  # where the photograph shows them, and at half the depth
-        points[::every] = centre + 0.5 * (points[::every] - centre)
-    frames = tuple(f"day/IMG_{number}.jpg" for number in range(len(model.frames)))
-    known = ("IMG_3.jpg", *pixels.ravel(), metres)
-    scale = scale_from_distance(replace(model, points=points, frames=frames), known)
-    assert scale.metres_per_unit == pytest.approx(UNIT_M, rel=accuracy)
-    assert scale.standard_error is not None and scale.standard_error < 0.01 * UNIT_M
-
-
-@pytest.mark.parametrize(
-    ("known", "words"),
-    [
-        (("nobody.jpg", 10, 10, 20, 20, 1.0), "nobody.jpg"),
-        (("f1", 320, 470, 320, 200, 1.0), "scene points around"),
-        (("f1", 320, 200, 320, 481, 1.0), "pixels inside"),
-        (("f1", 320, 200, 300, 200, 0.0), "known distance"),
-    ],
-)
-def test_a_wrong_length_is_refused(known, words):
-    with pytest.raises(ThermoxelsError, match=words):
-        scale_from_distance(ring_model(), known)
 
 
 def wall_photographs(model: SfmModel, places: list[float], folder: Path, unit_m: float = 1.0) -> dict[str, Path]:

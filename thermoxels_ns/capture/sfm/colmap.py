@@ -13,10 +13,11 @@ from typing import Any, TypeVar
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.data.colmap_model import camera_to_world
+from thermoxels_ns.data.colmap_model import lens_entries
 
 Say = Callable[[str], None]
 _Result = TypeVar("_Result")
@@ -24,12 +25,6 @@ _Result = TypeVar("_Result")
 _FATAL_ONLY = 3
 _POLL_S = 0.1
 _pipe: Connection  # of the new process
-FIELDS: dict[str, tuple[str, ...]] = {
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
-}
-"""COLMAP's lens models that --lens offers, and the order of their parameters; f is both focal lengths."""
 
 
 def run_in_process(work: Callable[..., _Result], arguments: tuple[Any, ...], say: Say = lambda _: None) -> _Result:
@@ -94,10 +89,7 @@ def model_of_colmap(reconstruction: Any, frame_of_image: Mapping[str, str], size
     by_name = {image.name: image for image in reconstruction.images.values() if image.has_pose}
     posed = [by_name[name] for name in frame_of_image if name in by_name]
     camera = reconstruction.cameras[posed[0].camera_id]
-    values: dict[str, Any] = dict(zip(FIELDS[camera.model.name], map(float, camera.params)))
-    focal = values.pop("f", None)
-    if focal is not None:
-        values |= {"fl_x": focal, "fl_y": focal}
+    values: dict[str, Any] = lens_entries(camera.model.name, camera.params)
     found = Camera(int(camera.width), int(camera.height), **values)
     factor = np.array([size[0] / found.width, size[1] / found.height])
     ids = sorted(reconstruction.points3D)
@@ -105,7 +97,7 @@ def model_of_colmap(reconstruction: Any, frame_of_image: Mapping[str, str], size
     number = {i: n for n, i in enumerate(ids)}
     poses, frames, seen, pixels = [], [], [], []
     for index, image in enumerate(posed):
-        poses.append(camera_to_world(image))
+        poses.append(np.vstack([image.cam_from_world().inverse().matrix(), [0.0, 0.0, 0.0, 1.0]]) @ OPENGL_FROM_OPENCV)
         # A scene point may have two features in one photograph; only the first feature is kept.
         own = {number[f.point3D_id]: f.xy for f in reversed(image.points2D) if f.has_point3D()}
         order = sorted(own)

@@ -11,11 +11,12 @@ from PIL import Image
 
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.colmap import FIELDS, model_of_colmap, run_in_process
+from thermoxels_ns.capture.sfm.colmap import model_of_colmap, run_in_process
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.colmap_model import PARAMETERS
 
 MIN_FRAMES = 3  # smallest number of photographs that are reconstructed
 _SAID_EVERY = 10
@@ -57,7 +58,7 @@ def find_poses(
     if focal_px is not None:
         start = {"cx": small[0] / 2.0, "cy": small[1] / 2.0}
         start |= dict.fromkeys(("f", "fl_x", "fl_y"), focal_px * small[0] / size[0])
-        params = ",".join(str(start.get(name, 0.0)) for name in FIELDS[settings.lens])
+        params = ",".join(str(start.get(name, 0.0)) for name in PARAMETERS[settings.lens])
     run_in_process(_find_and_match, (folder, list(frame_of_image), params, settings), say)
     model = run_in_process(_map, (folder, frame_of_image, size, settings.seed), say)
     if model is None or len(model.frames) < MIN_FRAMES:

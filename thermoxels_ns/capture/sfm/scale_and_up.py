@@ -1,4 +1,4 @@
-"""Finds the metres per unit of a model (from GPS, a measured distance or markers), and the direction of up."""
+"""Finds the metres per unit of a model, from GPS or markers, and the direction of up."""
 
 from __future__ import annotations
 
@@ -17,14 +17,11 @@ from thermoxels_ns.capture.photograph import GpsFix, open_photograph
 from thermoxels_ns.capture.rig_types import FloatArray
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.checks import check_positive
-from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.scene_scale import SceneScale
 
 _EARTH_RADIUS_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563
 _WORST_GPS = 0.3  # largest relative standard error of a scale from GPS that is accepted
 _LEAST_FIXES = 4
-_NEAR_POINTS = 12  # most scene points around a pixel that the pixel's depth is computed from
-_NEAR_SHARE = 0.08  # largest distance of these points from the pixel, as a share of the photograph's longest side
 _MARKER_DICTIONARY = cv2.aruco.DICT_4X4_50
 _MARKER_ERROR_PX = 2.0
 """A marker whose corners miss their rays by more than this (median) counts as moved and is not used, [pixels]."""
@@ -87,37 +84,6 @@ def local_metres(fixes: Sequence[GpsFix]) -> FloatArray:
     return np.stack([east, north_radius * (latitude - middle), altitude - altitude.mean()], axis=1)
 
 
-def scale_from_distance(model: SfmModel, known: tuple[str, float, float, float, float, float]) -> SceneScale:
-    """Find the scale from the measured distance between two points that one photograph shows.
-
-    The depth at each of the two pixels is that of a plane through the scene points around the pixel: inverse depth is
-    linear in the pixel, fitted by weighted least squares.
-
-    Args:
-        model: Poses and scene points.
-        known: Name of the photograph, x and y of one end, x and y of the other [pixels], distance [m].
-
-    Raises:
-        ThermoxelsError: The photograph has no pose, a pixel lies outside or has no scene points around it, or the
-            distance is not above 0.
-    """
-    name, x0, y0, x1, y1, metres = known
-    check_positive("known distance", metres, "Pass the measured length in metres.")
-    named = [frame for frame in model.frames if name in (frame, Path(frame).name, Path(frame).stem)]
-    if not named:
-        remedy = f"Pass one of them, such as {model.frames[0]}."
-        raise SceneError("known distance", expected="a photograph whose pose was found", got=name, remedy=remedy)
-    index = model.frames.index(named[0])
-    (first, error), (second, other_error) = (_surface_point(model, index, pixel) for pixel in ((x0, y0), (x1, y1)))
-    apart = float(np.linalg.norm(second - first))
-    if not apart > 0:
-        raise SceneError("known distance", expected="two different points", got="one", remedy="Pass two pixels.")
-    along = (second - first) / apart
-    relative = math.hypot(error @ along / apart, other_error @ along / apart)
-    source = f"From {metres:g} m measured between two points in {name}."
-    return SceneScale(metres / apart, metres / apart * relative, source)
-
-
 def scale_from_markers(
     model: SfmModel, photographs: Mapping[str, Path], side_m: float, standard_error_m: float | None = None
 ) -> tuple[SceneScale | None, str]:
@@ -173,36 +139,6 @@ def _similarity(model: FloatArray, metres: FloatArray, weight: FloatArray) -> tu
     scale = float(size @ sign) / max(float(share @ (a * a).sum(axis=1)), 1e-300)
     rotated = a @ (left * sign @ right).T
     return scale, np.linalg.norm(b - scale * rotated, axis=1)
-
-
-def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
-    """Return the world point (3,) that a pixel shows, and its standard error as a vector (3,) along the ray."""
-    camera = model.camera
-    if not (0 <= pixel[0] <= camera.width and 0 <= pixel[1] <= camera.height):
-        remedy = "Count x to the right and y down from the upper left corner."
-        expected = f"pixels inside {camera.width} x {camera.height}"
-        raise SceneError("known distance", expected=expected, got=pixel, remedy=remedy)
-    points, pixels = model.seen_by(index)
-    apart = np.linalg.norm(pixels - pixel, axis=1)
-    near = np.argsort(apart, kind="stable")[:_NEAR_POINTS]
-    near = near[apart[near] <= _NEAR_SHARE * max(camera.width, camera.height)]
-    if len(near) < 4:
-        remedy = "Measure between points with texture around them."
-        raise SceneError("known distance", expected=f"scene points around pixel {pixel}", got=len(near), remedy=remedy)
-    inverse = 1.0 / model.in_camera(index, model.points[points[near]])[:, 2]
-    weight = 1.0 / (1.0 + apart[near] / (np.median(apart[near]) + 1e-9))
-    table = np.column_stack([np.ones(len(near)), (pixels[near] - pixel) / camera.width])
-    plane, off, keep = np.zeros(3), np.zeros(len(near)), np.ones(len(near), dtype=bool)
-    for _ in range(3):  # points far off the plane through the others do not count
-        used = (weight * keep)[:, None]
-        plane = np.linalg.lstsq(table * used, inverse * used[:, 0], rcond=1e-6)[0]
-        off = np.abs(table @ plane - inverse)
-        keep = off <= 3.0 * 1.4826 * float(np.median(off)) + 1e-12
-    at, usual = float(plane[0]), float(np.median(inverse))
-    at = at if at > 0.25 * usual else usual  # a plane far behind the points gives no depth; take their median
-    ray = _ray_of_depth_1(model, index, pixel)
-    error = float(np.sqrt(np.mean(off[keep] ** 2))) / at**2 / math.sqrt(max(int(keep.sum()) - 3, 1))
-    return model.centres[index] + ray / at, ray * error
 
 
 def _ray_of_depth_1(model: SfmModel, index: int, pixel: npt.ArrayLike) -> FloatArray:
