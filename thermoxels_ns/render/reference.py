@@ -110,12 +110,6 @@ def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "ray
     )
 
 
-def ray_sparsity(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> Float[Tensor, " rays"]:
-    """Return the Cauchy sparsity of each ray, sum_i log(1 + 2 s_i^2) over its steps (Plenoxels, eq. 5; SNeRG)."""
-    terms = torch.log1p(2.0 * density.clamp(max=1e9) ** 2)
-    return torch.sum(torch.where(deltas > 0, terms, torch.zeros_like(terms)), -1)
-
-
 def ray_distortion(
     weights: Float[Tensor, "rays steps"],
     t: Float[Tensor, "rays steps"],
@@ -180,11 +174,9 @@ def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayR
     thermal_weight = weight if options.thermal_moves_density else weight.detach()
     expected = (along.weights * steps.t).sum(-1)
     depth = torch.where(along.accumulation > 0, expected / along.accumulation.clamp(min=1e-30), torch.inf)
-    distortion = sparsity = None
+    distortion = None
     if options.distortion_scale:
         distortion = ray_distortion(along.weights, steps.t, steps.deltas, options.distortion_scale)
-    if options.sparsity:
-        sparsity = ray_sparsity(marched.density, steps.deltas)
     corners, parameters = grid.voxels.tables(grid.density.device)[0], grid.row_parameters()
     variation = {
         name: total_variation(parameters[name], corners[a:b], options.colour_channels if name == "sh" else None)
@@ -197,7 +189,6 @@ def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayR
         along.accumulation,
         depth,
         distortion,
-        sparsity,
         variation,
     )
 

@@ -200,7 +200,6 @@ class ThermoxelsModel(Model):
         return replace(
             self._options(),
             distortion_scale=2.0 * self.unit if self._distortion_weight() > 0 else None,
-            sparsity=self.loss_weights.sparsity > 0,
             colour_channels=None if self.config.sh_degree is None else 3 * num_coefficients(self.config.sh_degree),
             variation=self._blocks(self.grid, 1_000_003),
         )
@@ -323,8 +322,6 @@ class ThermoxelsModel(Model):
             if around is not None:
                 value = value + SURROUNDINGS_VARIATION * around.variation.get(name, 0.0)
             terms[f"tv_{name}_loss"] = getattr(weights, f"tv_{name}") * value
-        if box.sparsity is not None:
-            terms["sparsity_loss"] = weights.sparsity * box.sparsity.mean()
         if weights.beta:
             terms["beta_loss"] = weights.beta * losses.beta_loss(box.accumulation)
         if box.distortion is not None:

@@ -255,7 +255,7 @@ def compile_kernels(say: Callable[[str], None]) -> None:
         origins = 3.0 * torch.nn.functional.normalize(torch.randn(4, 3, generator=generator), dim=-1)
         request = RayRequest(origins, torch.nn.functional.normalize(-origins, dim=-1))
         variation = {name: (0, 2) for name in grid.row_parameters()}
-        options = RenderOptions(distortion_scale=1.0, sparsity=True, variation=variation)
+        options = RenderOptions(distortion_scale=1.0, variation=variation)
         seen = render_rays(grid, request, options, "fused")
         assert seen.rgb is not None
         (seen.rgb.sum() + seen.thermal.sum() + sum(seen.variation.values())).backward()
