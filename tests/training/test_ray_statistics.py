@@ -72,10 +72,10 @@ def test_weight_lies_in_the_surface_and_sums_to_the_rays(backend):
 
 def test_corner_temperature_is_measured_where_rays_came_and_only_there(backend):
     scene = slab(backend)
-    seen = field_evidence(scene, rays_along_minus_x()).temperature
+    seen = field_evidence(scene, rays_along_minus_x())
     shape = scene.grid.lattice.shape
-    weight, thermal = seen.weight.view(shape), seen.thermal.view(shape)
-    assert float(seen.weight.sum()) == pytest.approx(1600, rel=1e-4)
+    weight, thermal = seen.thermal_weight.view(shape), seen.thermal.view(shape)
+    assert float(seen.thermal_weight.sum()) == pytest.approx(1600, rel=1e-4)
     assert float(weight[:2].max()) < 1e-3 and float(weight[3].min()) > 0
     inner = thermal[3, 1:-1, 1:-1]  # away from the rim a linear temperature is its own average
     expected = scene.grid.temperature.data.view(shape)[3, 1:-1, 1:-1]
@@ -88,9 +88,9 @@ def test_corners_that_differ_in_turn_are_averaged(backend):
     shape = scene.grid.lattice.shape
     index = torch.stack(torch.meshgrid(*[torch.arange(n) for n in shape], indexing="ij"), -1)
     scene.grid.temperature.data = (0.5 + 0.2 * (1 - 2 * (index.sum(-1) % 2))).reshape(-1, 1).float()
-    seen = field_evidence(scene, rays_along_minus_x()).temperature
+    seen = field_evidence(scene, rays_along_minus_x())
     inner = seen.thermal.view(shape)[3:5, 1:-1, 1:-1]
-    assert float((inner - 0.5).abs().max()) < 0.6 * 0.2 and float(seen.weight.view(shape)[3:5].min()) > 0
+    assert float((inner - 0.5).abs().max()) < 0.6 * 0.2 and float(seen.thermal_weight.view(shape)[3:5].min()) > 0
 
 
 def test_what_leaks_through_a_surface_measures_nothing_and_ends_nothing_behind_it(backend):
@@ -101,7 +101,7 @@ def test_what_leaks_through_a_surface_measures_nothing_and_ends_nothing_behind_i
     ends, leaked = (v.view(6, 6, 6).sum((1, 2)) for v in (evidence.voxel_ends, evidence.voxel_weight))
     assert float(ends.sum()) == 1600 and float(ends[3:5].sum()) == 1600
     assert float(leaked[:3].sum()) == pytest.approx(160, rel=0.02)
-    weight = evidence.temperature.weight.view(7, 7, 7)
+    weight = evidence.thermal_weight.view(7, 7, 7)
     assert float(weight[:3].max()) == 0.0 and float(weight[4].min()) > 0.0
 
 
@@ -164,7 +164,7 @@ def test_rays_that_end_on_nothing_have_no_half_depth_but_weight(backend):
     evidence = field_evidence(scene, rays_along_minus_x())
     assert len(evidence.half_depth_density) == 0
     assert float(evidence.voxel_weight.sum()) == pytest.approx(0.45 * 1600, rel=0.02)
-    assert float(evidence.temperature.weight.max()) == 0.0
+    assert float(evidence.thermal_weight.max()) == 0.0
 
 
 def test_rays_of_photographs_are_evidence_but_measure_no_temperature(backend):
@@ -176,14 +176,14 @@ def test_rays_of_photographs_are_evidence_but_measure_no_temperature(backend):
             yield bundle
 
     colour = field_evidence(scene, bundles(lambda _: RGB_STREAM))
-    assert float(colour.temperature.weight.max()) == 0.0 and len(colour.half_depth_density) == 1600
-    assert torch.equal(colour.temperature.thermal, scene.grid.temperature.data[:, 0].clamp(0, 1))
+    assert float(colour.thermal_weight.max()) == 0.0 and len(colour.half_depth_density) == 1600
+    assert torch.equal(colour.thermal, scene.grid.temperature.data[:, 0].clamp(0, 1))
     assert float(colour.voxel_weight.sum()) == pytest.approx(1600, rel=1e-4)
     # The first three of six bundles carry both streams.
     half = field_evidence(scene, bundles(lambda number: RGB_STREAM | THERMAL_STREAM if number < 3 else RGB_STREAM))
     thermal = field_evidence(scene, [b for n, b in enumerate(rays_along_minus_x()) if n < 3])
-    assert torch.equal(half.temperature.weight, thermal.temperature.weight)
-    assert torch.equal(half.temperature.thermal, thermal.temperature.thermal)
+    assert torch.equal(half.thermal_weight, thermal.thermal_weight)
+    assert torch.equal(half.thermal, thermal.thermal)
     assert torch.equal(half.voxel_weight, colour.voxel_weight)
 
 

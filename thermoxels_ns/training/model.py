@@ -473,7 +473,7 @@ class ThermoxelsModel(Model):
         grid, colour, evidence = self.grid, None, None
         seen = field_evidence(self, rays)
         # Corners without a row get the middle of the range; nothing reads these values.
-        thermal = grid.corner_values(seen.temperature.thermal.float(), fill=0.5)
+        thermal = grid.corner_values(seen.thermal.float(), fill=0.5)
         if grid.sh is not None and grid.sh_degree is not None:
             constant = harmonics(grid.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # degree 0 is the same in all directions
             mean = grid.sh.view(len(grid.sh), 3, num_coefficients(grid.sh_degree))[..., 0] * constant
@@ -487,7 +487,7 @@ class ThermoxelsModel(Model):
             grid.lattice,
             density=grid.corner_density().float().cpu().numpy(),
             temperature_c=self.temperature_range.to_celsius(thermal).cpu().numpy(),
-            observed_weight=grid.corner_values(seen.temperature.weight.float()).cpu().numpy(),
+            observed_weight=grid.corner_values(seen.thermal_weight.float()).cpu().numpy(),
             voxel_density=grid.voxel_density().float().cpu().numpy(),
             colour=colour,
             evidence=evidence,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -30,6 +30,14 @@ class RaySampler(Protocol):
         ...
 
 
+def _sampled(model: RaySampler, rays: Iterable[RayBundle]) -> Iterator[tuple[RayBundle, Tensor, GridSamples]]:
+    """Yield each batch of rays, its directions on the device of the grid, and its samples."""
+    device = model.grid.density.device
+    for bundle in rays:
+        directions = bundle.directions.to(device)
+        yield bundle, directions, model.sample_rays(bundle.origins.to(device), directions)
+
+
 @dataclass(frozen=True)
 class VoxelWeights:
     """Statistics of the weights of rays for each kept voxel."""
@@ -45,8 +53,7 @@ def voxel_weights(model: RaySampler, rays: Iterable[RayBundle]) -> VoxelWeights:
     density = model.grid.density
     largest = torch.zeros(len(model.grid.voxels), device=density.device)
     ends = torch.zeros(len(model.grid.voxels), dtype=torch.bool, device=density.device)
-    for bundle in rays:
-        samples = model.sample_rays(bundle.origins.to(density.device), bundle.directions.to(density.device))
+    for _, _, samples in _sampled(model, rays):
         largest.scatter_reduce_(0, samples.at.number, samples.weight.to(largest.dtype), reduce="amax")
         ends[samples.at.number[_half_way(samples)]] = True
     return VoxelWeights(largest, ends)
@@ -69,10 +76,8 @@ def share_of_rays_opened(model: RaySampler, rays: Iterable[RayBundle], keep: Boo
 
     A ray is opened if more than half of its weight lies in voxels that are False in `keep`.
     """
-    device = model.grid.density.device
     hit, opened = 0, 0
-    for bundle in rays:
-        samples = model.sample_rays(bundle.origins.to(device), bundle.directions.to(device))
+    for _, _, samples in _sampled(model, rays):
         lost = torch.zeros_like(samples.transmittance)
         goes = ~keep[samples.at.number]
         lost.index_add_(0, samples.ray[goes], samples.weight[goes].to(lost.dtype))
@@ -90,21 +95,15 @@ _END_STEPS = 5
 
 
 @dataclass(frozen=True)
-class CornerTemperature:
-    """The temperature that thermal rays see around each corner of a kept voxel."""
-
-    thermal: Float[Tensor, " rows"]
-    """Normalised temperature, clipped to [0, 1]; the stored value at corners that no thermal ray reaches."""
-    weight: Float[Tensor, " rows"]
-    """Sum of the weights of the first-hit samples around the corner, shared out by trilinear weights, [rays]."""
-
-
-@dataclass(frozen=True)
 class FieldEvidence:
     """Statistics of training rays about the trained field, for the mesher."""
 
     rays: int  # Number of rays
-    temperature: CornerTemperature  # Temperatures that the thermal rays see
+    thermal: Float[Tensor, " rows"]
+    """Normalised temperature that thermal rays see around each corner of a kept voxel, clipped to [0, 1]; the stored
+    value at corners that no thermal ray reaches."""
+    thermal_weight: Float[Tensor, " rows"]
+    """Sum of the weights of the first-hit samples around each corner, shared out by trilinear weights, [rays]."""
     voxel_weight: Float[Tensor, " voxels"]  # Sum of the weights of all rays in each kept voxel, [rays]
     voxel_ends: Float[Tensor, " voxels"]
     """Number of rays that end on something (opacity above one half) and complete half of their weight in each kept
@@ -131,9 +130,7 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
     ends = torch.zeros_like(voxels)
     half_depth = [centre_density.view(-1)[:0]]
     seen = 0
-    for bundle in rays:
-        directions = bundle.directions.to(device)
-        samples = model.sample_rays(bundle.origins.to(device), directions)
+    for bundle, directions, samples in _sampled(model, rays):
         seen += len(directions)
         voxels.index_add_(0, samples.at.number, samples.weight.double())
         half_way = _half_way(samples)
@@ -152,7 +149,7 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
     weight = corners[:, 1]
     stored = grid.temperature[:, 0]
     thermal = torch.where(weight > 0, corners[:, 0] / weight.clamp(min=1e-30), stored)
-    return FieldEvidence(seen, CornerTemperature(thermal.clamp(0, 1), weight), voxels, ends, torch.cat(half_depth))
+    return FieldEvidence(seen, thermal.clamp(0, 1), weight, voxels, ends, torch.cat(half_depth))
 
 
 def _density_met(
@@ -173,11 +170,8 @@ def _density_met(
 @torch.no_grad()
 def backdrop_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> tuple[float, Float[Tensor, "n 3"]]:
     """Return the share and the directions (n, 3) of the rays that leave the box with more than half of their light."""
-    device = model.grid.density.device
-    seen, open_directions = 0, [torch.zeros(0, 3, device=device)]
-    for bundle in rays:
-        directions = bundle.directions.to(device)
-        samples = model.sample_rays(bundle.origins.to(device), directions)
+    seen, open_directions = 0, [torch.zeros(0, 3, device=model.grid.density.device)]
+    for _, directions, samples in _sampled(model, rays):
         open_directions.append(directions[samples.transmittance > 0.5])
         seen += len(directions)
     found = torch.cat(open_directions)
