@@ -23,7 +23,7 @@ from thermoxels_ns.multiview.backdrop import mean_colours
 from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs
 from thermoxels_ns.multiview.votes import air_voxels, hardly_shown
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
-from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
+from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.plain_areas import PlainAreas
 from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 
@@ -94,7 +94,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         datamanager: Any = attributes.pipeline.datamanager
         grid, prefix = model.seen_surroundings.grid, "surroundings_"
         rays = datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE)
-        largest = voxel_weights(SurroundingsSampler(model), rays).largest.cpu().numpy()
+        largest = voxel_weights(grid, model.sample_surroundings, rays).largest.cpu().numpy()
         keep = grid.voxels.dilated(largest > (model.config.prune_threshold if step else 0.0), 1)
         if not keep.any():
             model.backdrop_on[2], keep[0] = False, True  # one voxel stays: parameters need a row
@@ -217,7 +217,8 @@ def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilatio
     def rays():
         return datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE)
 
-    weights, voxels, opened = voxel_weights(model, rays()), model.grid.voxels, 1.0
+    field = model.grid, model.sample_rays
+    weights, voxels, opened = voxel_weights(*field, rays()), model.grid.voxels, 1.0
     density = model.grid.voxel_density().view(-1)[model.grid.cells].cpu().numpy()
     opaque = density * voxels.lattice.voxel_size > OPAQUE_DEPTH
     for attempt in range(PRUNING_ATTEMPTS):
@@ -226,7 +227,7 @@ def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilatio
         if not chosen.any():
             continue
         keep = voxels.dilated(chosen, dilation) | (voxels.dilated(chosen, 1) & opaque)
-        opened = share_of_rays_opened(model, rays(), torch.from_numpy(keep).to(weights.largest.device))
+        opened = share_of_rays_opened(*field, rays(), torch.from_numpy(keep).to(weights.largest.device))
         if opened <= MOST_OPENED_RAYS:
             kept, total = int(keep.sum()), math.prod(voxels.lattice.cell_shape)
             said = (
@@ -244,10 +245,10 @@ def decide_backdrop(model: ThermoxelsModel, datamanager) -> None:
 
     The decision is repeated at every change of the lattice, because surfaces may form late.
     """
-    config = model.config
+    config, field = model.config, (model.grid, model.sample_rays)
     rgb_on, thermal_on, _ = model.backdrop_on.tolist()
     if config.background == "auto" and rgb_on:
-        unsaturated, _ = backdrop_evidence(model, datamanager.training_rays(RGB_STREAM, RAYS_PER_IMAGE))
+        unsaturated, _ = backdrop_evidence(*field, datamanager.training_rays(RGB_STREAM, RAYS_PER_IMAGE))
         keep = unsaturated >= FEWEST_OPEN_RAYS
         model.backdrop_on[0] = keep
         CONSOLE.log(
@@ -255,7 +256,7 @@ def decide_backdrop(model: ThermoxelsModel, datamanager) -> None:
             f"{unsaturated:.2%} of RGB rays leave the box unsaturated"
         )
     if config.thermal_background == "auto" and thermal_on and model.background_thermal is not None:
-        unsaturated, directions = backdrop_evidence(model, datamanager.training_rays(THERMAL_STREAM, RAYS_PER_IMAGE))
+        unsaturated, directions = backdrop_evidence(*field, datamanager.training_rays(THERMAL_STREAM, RAYS_PER_IMAGE))
         sky = model.background_thermal(directions)
         difference = float(sky.abs().mean()) if len(sky) else 0.0
         learned = unsaturated >= FEWEST_OPEN_RAYS and difference > FEWEST_SKY_DIFFERENCE

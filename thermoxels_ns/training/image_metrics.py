@@ -117,8 +117,8 @@ def thermal_metrics(
     Returns:
         `thermal_psnr`, `thermal_ssim`, `thermal_hssim` of normalised images, and mean absolute errors in kelvin (the
         size of a degree Celsius): `thermal_mae_c` over all valid pixels; `thermal_mae_hit_c` where opacity exceeds one
-        half; `thermal_mae_box_c` in the box; `thermal_mae_debiased_c` after the
-        image's mean error is subtracted. A metric over no pixel is NaN.
+        half; `thermal_mae_box_c` in the box; `thermal_mae_debiased_c` after the image's mean error is subtracted. A
+        metric over no pixel is NaN.
     """
     filled_p, filled_t = (torch.where(valid, image, torch.zeros_like(image)) for image in (predicted, target))
     error_k = (predicted - target) * span_k

@@ -226,6 +226,13 @@ class ThermoxelsModel(Model):
         """Return the samples of rays in kept voxels of the box with their weights, for statistics."""
         return sample_rays(self.grid, self._request(origins, directions), self._options(), self.config.backend)
 
+    def sample_surroundings(self, origins: Tensor, directions: Tensor) -> GridSamples:
+        """Return the samples in the surroundings; each straight piece of a ray counts as a ray, the box hides none."""
+        assert self.surroundings is not None
+        cut = self.surroundings.segments(origins, directions)
+        request = RayRequest(cut.origins, cut.directions, 0.0, cut.lengths)
+        return sample_rays(self.surroundings.grid, request, RenderOptions(), self.config.backend)
+
     def render_rays(self, request: RayRequest, options: RenderOptions) -> SceneRender:
         """Return what rays see of the box, the surroundings and infinity."""
         rgb_on, thermal_on, _ = self.backdrop_on.tolist()
@@ -464,7 +471,7 @@ class ThermoxelsModel(Model):
         elsewhere; corners without a row are grey.
         """
         grid, colour, evidence = self.grid, None, None
-        seen = field_evidence(self, rays)
+        seen = field_evidence(grid, self.sample_rays, rays)
         # Corners without a row get the middle of the range; nothing reads these values.
         thermal = grid.corner_values(seen.thermal.float(), fill=0.5)
         if grid.sh is not None and grid.sh_degree is not None:
@@ -496,20 +503,6 @@ def _seen_and_measured(
     if outputs.get(name) is None or not len(chosen):
         return None
     return outputs[name].index_select(0, chosen), batch[target].index_select(0, chosen)
-
-
-class SurroundingsSampler:
-    """A `RaySampler` of the surroundings: each straight piece of a ray counts as a ray, and the box hides nothing."""
-
-    def __init__(self, model: ThermoxelsModel) -> None:
-        assert model.surroundings is not None
-        self.grid, self._surroundings, self._config = model.surroundings.grid, model.surroundings, model.config
-
-    def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
-        """Return the samples of the pieces of rays in kept voxels of the surroundings."""
-        cut = self._surroundings.segments(origins, directions)
-        request = RayRequest(cut.origins, cut.directions, 0.0, cut.lengths)
-        return sample_rays(self.grid, request, RenderOptions(), self._config.backend)
 
 
 class TemperatureReading(nn.Module):

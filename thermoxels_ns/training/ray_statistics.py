@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -16,26 +15,18 @@ from thermoxels_ns.field.interpolation import TrilinearPoints, splat
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.renderers import GridSamples
 
-
-class RaySampler(Protocol):
-    """A model with a voxel grid that can be sampled along rays."""
-
-    @property
-    def grid(self) -> VoxelGrid:
-        """The voxel grid that rays sample."""
-        ...
-
-    def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
-        """Return the samples of rays (n, 3) in kept voxels with their weights."""
-        ...
+Sampler = Callable[[Tensor, Tensor], GridSamples]
+"""A function from origins and directions of rays, (n, 3) each, to their samples in kept voxels of a grid."""
 
 
-def _sampled(model: RaySampler, rays: Iterable[RayBundle]) -> Iterator[tuple[RayBundle, Tensor, GridSamples]]:
+def _sampled(
+    grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]
+) -> Iterator[tuple[RayBundle, Tensor, GridSamples]]:
     """Yield each batch of rays, its directions on the device of the grid, and its samples."""
-    device = model.grid.density.device
+    device = grid.density.device
     for bundle in rays:
         directions = bundle.directions.to(device)
-        yield bundle, directions, model.sample_rays(bundle.origins.to(device), directions)
+        yield bundle, directions, sample(bundle.origins.to(device), directions)
 
 
 @dataclass(frozen=True)
@@ -48,12 +39,12 @@ class VoxelWeights:
 
 
 @torch.no_grad()
-def voxel_weights(model: RaySampler, rays: Iterable[RayBundle]) -> VoxelWeights:
+def voxel_weights(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) -> VoxelWeights:
     """Return for each kept voxel the largest weight of a sample on any ray, and whether some ray ends in the voxel."""
-    density = model.grid.density
-    largest = torch.zeros(len(model.grid.voxels), device=density.device)
-    ends = torch.zeros(len(model.grid.voxels), dtype=torch.bool, device=density.device)
-    for _, _, samples in _sampled(model, rays):
+    device = grid.density.device
+    largest = torch.zeros(len(grid.voxels), device=device)
+    ends = torch.zeros(len(grid.voxels), dtype=torch.bool, device=device)
+    for _, _, samples in _sampled(grid, sample, rays):
         largest.scatter_reduce_(0, samples.at.number, samples.weight.to(largest.dtype), reduce="amax")
         ends[samples.at.number[_half_way(samples)]] = True
     return VoxelWeights(largest, ends)
@@ -71,13 +62,15 @@ def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
 
 
 @torch.no_grad()
-def share_of_rays_opened(model: RaySampler, rays: Iterable[RayBundle], keep: Bool[Tensor, " voxels"]) -> float:
+def share_of_rays_opened(
+    grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle], keep: Bool[Tensor, " voxels"]
+) -> float:
     """Of the rays with opacity above one half, return the share that pruning to `keep` would open.
 
     A ray is opened if more than half of its weight lies in voxels that are False in `keep`.
     """
     hit, opened = 0, 0
-    for _, _, samples in _sampled(model, rays):
+    for _, _, samples in _sampled(grid, sample, rays):
         lost = torch.zeros_like(samples.transmittance)
         goes = ~keep[samples.at.number]
         lost.index_add_(0, samples.ray[goes], samples.weight[goes].to(lost.dtype))
@@ -114,7 +107,7 @@ class FieldEvidence:
 
 
 @torch.no_grad()
-def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidence:
+def field_evidence(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) -> FieldEvidence:
     """Return the evidence of training rays about the trained field, found in one pass.
 
     The temperature of a corner is a mean over samples of thermal rays, weighted by their share of the pixel; stored
@@ -122,7 +115,6 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
     of rays of opacity above one half, before half of the light is spent, so that light which leaks through a surface
     measures nothing behind it. A ray without a stream (see `core.feature_rays`) counts as thermal.
     """
-    grid = model.grid
     device = grid.density.device
     centre_density = grid.voxel_density()
     corners = torch.zeros(grid.voxels.num_rows, 2, device=device)
@@ -130,7 +122,7 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
     ends = torch.zeros_like(voxels)
     half_depth = [centre_density.view(-1)[:0]]
     seen = 0
-    for bundle, directions, samples in _sampled(model, rays):
+    for bundle, directions, samples in _sampled(grid, sample, rays):
         seen += len(directions)
         voxels.index_add_(0, samples.at.number, samples.weight.double())
         half_way = _half_way(samples)
@@ -168,10 +160,12 @@ def _density_met(
 
 
 @torch.no_grad()
-def backdrop_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> tuple[float, Float[Tensor, "n 3"]]:
+def backdrop_evidence(
+    grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]
+) -> tuple[float, Float[Tensor, "n 3"]]:
     """Return the share and the directions (n, 3) of the rays that leave the box with more than half of their light."""
-    seen, open_directions = 0, [torch.zeros(0, 3, device=model.grid.density.device)]
-    for _, directions, samples in _sampled(model, rays):
+    seen, open_directions = 0, [torch.zeros(0, 3, device=grid.density.device)]
+    for _, directions, samples in _sampled(grid, sample, rays):
         open_directions.append(directions[samples.transmittance > 0.5])
         seen += len(directions)
     found = torch.cat(open_directions)
