@@ -81,7 +81,9 @@ def test_transmittance_keeps_its_digits_over_512_samples():
     error = (single.weight.double() - exact.weight).abs() / exact.weight
     assert float(error.max()) < 1e-5 and 0 < float(exact.weight[-1]) < 1e-17
     assert float(single.transmittance) == pytest.approx(float(exact.transmittance), rel=1e-5)
-    reference = assert_twins_agree(grid, ALONG, replace(EVERYTHING, thermal_moves_density=True))
+    # The rays alone move no density of a wall so opaque; its total variation gives the gradients a size to compare.
+    options = replace(EVERYTHING, thermal_moves_density=True, variation={"density": (0, 256)})
+    reference = assert_twins_agree(grid, ALONG, options)
     assert float(reference.values["transmittance"]) < 1e-16
 
 
