@@ -47,6 +47,9 @@ from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.plain_areas import PlainAreas, bend_loss
 from thermoxels_ns.training.ray_statistics import field_evidence
 
+FEATURE_RAYS = 512  # Feature rays (to depths or to points of structure from motion) that each step draws
+EARLY_STOP = 1e-5  # A ray ends where less than this share of its light is left, by which its pixel may be off
+VARIATION_SHARE = 0.1  # Share of the kept voxels over which each step computes total variation
 SURROUNDINGS = (48, 12)
 """Voxels of the surroundings at the start: across a face of the box, and from a face to infinity. They are split when
 the voxels of the box are."""
@@ -104,7 +107,7 @@ class ThermoxelsModel(Model):
             config.density_activation,
         )
         wants_rgb = config.sh_degree is not None and config.background != "off"
-        self.background_rgb = SphereImage(config.background_height) if wants_rgb else None
+        self.background_rgb = SphereImage() if wants_rgb else None
         self.background_thermal = SkyTemperature() if config.thermal_background != "minimum" else None
         start = (*SURROUNDINGS, SURROUNDINGS_DENSITY, config.density_activation, wants_rgb)
         self.surroundings = Surroundings(torch.from_numpy(box), *start) if config.surroundings == "on" else None
@@ -191,7 +194,9 @@ class ThermoxelsModel(Model):
 
     def _options(self) -> RenderOptions:
         c = self.config
-        return RenderOptions(c.steps_per_voxel, c.smallest_weight, c.early_stop, c.thermal_density_gradient)
+        return RenderOptions(
+            smallest_weight=c.smallest_weight, early_stop=EARLY_STOP, thermal_moves_density=c.thermal_density_gradient
+        )
 
     def _training_options(self) -> RenderOptions:
         """Return the options with which a training step renders: those of images and what the loss terms need."""
@@ -206,7 +211,7 @@ class ThermoxelsModel(Model):
         """Return the blocks of a grid whose total variation this step computes, by the name of the parameter."""
         generator = torch.Generator().manual_seed(self.config.seed * stream + self.step)
         return {
-            name: losses.random_block(len(grid.voxels), self.config.tv_share, generator)
+            name: losses.random_block(len(grid.voxels), VARIATION_SHARE, generator)
             for name in grid.row_parameters()
             if getattr(self.loss_weights, f"tv_{name}")
         }
@@ -318,7 +323,7 @@ class ThermoxelsModel(Model):
                 seen = torch.where(measured >= SATURATED, torch.minimum(seen, measured), seen)
             terms["rgb_loss"] = weights.rgb * losses.rgb_loss(seen, measured)
         if weights.thermal and (pair := _seen_and_measured(outputs, batch, "thermal", "thermal")) is not None:
-            terms["thermal_loss"] = weights.thermal * losses.thermal_loss(*pair, self.config.thermal_l2_share)
+            terms["thermal_loss"] = weights.thermal * losses.thermal_loss(*pair)
         if not self.training:
             return terms
         render: SceneRender = outputs["render"]
@@ -346,12 +351,11 @@ class ThermoxelsModel(Model):
             if weight and sampler is not None:
                 generator = torch.Generator().manual_seed((self.config.seed + 1) * 2_000_003 + self.step)
                 step = 0.0 if self.seen_surroundings is None else self.seen_surroundings.step
-                request = sampler.request(self.config.track_rays, near, voxel, generator, self.device, step)
+                request = sampler.request(FEATURE_RAYS, near, voxel, generator, self.device, step)
                 known[f"{name}_loss"] = request, partial(self._feature_ray_loss, weight, sampler)
         if weights.bend and self.plain_areas:  # None, or without any, in a scene without plain areas
             generator = torch.Generator().manual_seed((self.config.seed + 1) * 5_000_011 + self.step)
-            most = max(1, self.config.track_rays // 4)
-            request, length = self.plain_areas.request(most, near, generator, self.device)
+            request, length = self.plain_areas.request(FEATURE_RAYS // 4, near, generator, self.device)
             known["bend_loss"] = (
                 request,
                 lambda seen: weights.bend * bend_loss(seen.box.depth, seen.box.accumulation, length, voxel),
