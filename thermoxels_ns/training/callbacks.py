@@ -1,4 +1,4 @@
-"""Callbacks that change the grid during training: carve, refine, prune, widen colour, decide on backgrounds."""
+"""Callbacks of a training: carve, refine, prune, widen colour, decide on backgrounds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.data.datamanager import views_of_cameras
-from thermoxels_ns.field.refine import RowChange, prune, refine
+from thermoxels_ns.field.refine import RowChange, prune, refine, widen_colour
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import mean_colours
 from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs
@@ -141,14 +141,15 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             carve(step)
 
     def widen(step: int) -> None:
-        """Widen colour if its step is reached, also in a resumed training, and tell the optimiser."""
+        """Let the grid store all harmonics of colour once their step is reached, and tell the optimiser."""
         assert attributes.optimizers is not None
-        old, change = model.grid.sh, model.widen_colour()
-        if old is not None and change is not None:
-            optimizer: Any = attributes.optimizers.optimizers["sh"]
-            assert model.grid.sh is not None
-            optimizer.change_columns(old, model.grid.sh, change)
-            attributes.optimizers.parameters["sh"] = [model.grid.sh]
+        old, stored, degree = model.grid.sh, model.grid.sh_degree, model.config.sh_degree
+        if stored is None or degree is None or stored >= degree:
+            return
+        if int(model.trained_steps) >= model.config.view_dependence_from:
+            change, optimizer = widen_colour(model.grid, degree), attributes.optimizers.optimizers["sh"]
+            optimizer.change_columns(old, model.grid.sh, change)  # type: ignore[attr-defined]
+            attributes.optimizers.parameters["sh"] = [model.grid.sh]  # type: ignore[list-item]
 
     early = min(steps | decisions) // 3
     return [

@@ -28,7 +28,7 @@ from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.kept_voxels import check_memory
-from thermoxels_ns.field.refine import ColumnChange, RowChange, refine, widen_colour
+from thermoxels_ns.field.refine import RowChange, refine
 from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, Surroundings
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
@@ -166,17 +166,6 @@ class ThermoxelsModel(Model):
         voxels, channels = len(self.grid.voxels) * factor**3, self.config.row_channels(max(lattice.cell_shape))
         CONSOLE.log(f"memory: {check_memory(lattice, voxels, channels, self.config.memory_budget_gb)}")
         return refine(self.grid, factor)
-
-    def widen_colour(self) -> ColumnChange | None:
-        """Let the grid store all harmonics of colour if step `view_dependence_from` is reached.
-
-        Returns:
-            Change of the columns of colour; None if the columns stay as they are.
-        """
-        degree, stored = self.config.sh_degree, self.grid.sh_degree
-        if degree is None or stored is None or int(self.trained_steps) < self.config.view_dependence_from:
-            return None
-        return widen_colour(self.grid, degree) if stored < degree else None
 
     def update_to_step(self, step: int) -> None:
         """Set the step of training, on which weights, random blocks and random rays depend."""
