@@ -6,6 +6,7 @@ import pytest
 import tyro
 import yaml
 from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.utils import writer
 
 from tests.support.boxed_scene import write_boxed_scene
 from tests.support.unreadable import files_end_after
@@ -13,7 +14,7 @@ from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.errors import CheckpointError, OutputError, ThermoxelsError
 from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.schedule import QUALITIES, schedule_for
-from thermoxels_ns.training.trainer import ThermoxelsTrainer, writer
+from thermoxels_ns.training.trainer import ThermoxelsTrainer
 
 DRAFT = ("--quality", "draft")
 
@@ -83,7 +84,7 @@ def test_where_a_training_begins_and_ends_is_said(scene, checkpoints, tmp_path, 
     made = trainer(scene, tmp_path, *options, *file)
     made.setup()
     assert (made._start_step, made.config.max_num_iterations) == steps
-    assert said in words(capsys) and writer.GLOBAL_BUFFER["max_iter"] == sum(steps)
+    assert said in words(capsys)
 
 
 @pytest.mark.parametrize(

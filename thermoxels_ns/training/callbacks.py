@@ -1,9 +1,12 @@
-"""Callbacks of a training: carve, refine, prune, widen colour, decide on backgrounds."""
+"""Callbacks of a training: carve, refine, prune, widen colour, decide on backgrounds, tell its progress."""
 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from dataclasses import replace
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -32,6 +35,7 @@ FEWEST_SKY_DIFFERENCE = 0.01
 """Share of the temperature range by which the learned sky must differ from the scene's minimum to be kept."""
 MOST_OPENED_RAYS = 0.01  # Of the rays of opacity above one half, the largest share that pruning may open
 OPAQUE_DEPTH = 0.7  # Optical depth across a voxel from which the voxel counts as opaque: half of the light is lost
+PROGRESS_LINES, LONGEST_SILENCE_S = 20, 60.0  # A line of progress at each such part of the steps, or after so long
 PRUNING_ATTEMPTS = 4  # Number of thresholds tried before pruning fails
 RAYS_PER_IMAGE = 4096  # Training rays per image from which statistics are made
 SHORTEST_RUN_WITH_DEPTHS = 400
@@ -44,9 +48,11 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     evidence = follow_depths(model, attributes)
     factors = model.config.refinements()
     steps = {*factors, *model.config.prune_at, *model.config.thin_at}
-    end = None
+    end, told = None, list[TrainingCallback]()
     if attributes.trainer is not None:
-        end = attributes.trainer._start_step + attributes.trainer.config.max_num_iterations
+        first = attributes.trainer._start_step
+        end = first + attributes.trainer.config.max_num_iterations
+        told = [TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], progress(first, end))]
         late = sorted(step for step in steps if step >= end)
         if late:
             CONSOLE.log(f"the run ends before step {end}: no refinement or pruning at {', '.join(map(str, late))}")
@@ -158,7 +164,30 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         TrainingCallback(before, change_surroundings, iters=tuple({0, early})),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
         TrainingCallback(before, widen),
+        *told,
     ]
+
+
+def progress(first: int, end: int) -> Callable[[int], None]:
+    """Return a function to call after each step from `first` to before `end`, which prints a line of progress at times.
+
+    The line says how many steps are done and how long the others take at the pace since the line before. It comes at
+    each twentieth of the steps and after a minute without one, the same on a terminal and in a file.
+    """
+    said_s, said = time.monotonic(), first + 1
+
+    def tell(step: int) -> None:
+        nonlocal said_s, said
+        done, now = step + 1, time.monotonic()
+        if done == first + 1:  # kernels may have been compiled in the first step
+            said_s = now
+        elif done * PROGRESS_LINES // end > said * PROGRESS_LINES // end or now - said_s > LONGEST_SILENCE_S:
+            left = timedelta(seconds=round((end - done) * (now - said_s) / (done - said)))
+            more = f"; at this pace {left} more" if done < end else ""
+            CONSOLE.print(f"step {done:,} of {end:,} ({100 * done / end:.0f} %){more}", highlight=False)
+            said_s, said = now, done
+
+    return tell
 
 
 def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> PhotographEvidence | None:
