@@ -84,7 +84,7 @@ def test_every_output_is_drawn_for_who_chooses_it(trained: Trained, tmp_path) ->
         port = probe.getsockname()[1]
     script, log = Path(sys.executable).with_name("ns-viewer"), tmp_path / "log"
     command = [str(script), "--load-config", str(trained.config), "--viewer.websocket-port", str(port)]
-    outputs = ("thermal", "temperature_c", "depth", "accumulation", "rgb")
+    outputs = ("thermal", "temperature_c", "degrees", "depth", "accumulation", "rgb")
     before = files_below(trained.config.parent)
     with log.open("w") as file:
         viewer = subprocess.Popen(

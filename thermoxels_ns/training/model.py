@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -14,10 +13,10 @@ import numpy.typing as npt
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.base_model import Model
 from nerfstudio.utils import colormaps
 from nerfstudio.utils.rich_utils import CONSOLE
-from nerfstudio.viewer.viewer_elements import ViewerButton, ViewerClick, ViewerControl, ViewerText
 from torch import Tensor, nn
 
 from thermoxels_ns.core.arrays import IntArray
@@ -35,6 +34,7 @@ from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.render.reference import intersect_box
 from thermoxels_ns.render.renderers import GridSamples, Scene, SceneRender, render_scene, sample_rays, split_render
 from thermoxels_ns.training import losses
+from thermoxels_ns.training.degrees_view import DegreesView
 from thermoxels_ns.training.image_metrics import (
     SATURATED,
     fitted_gain,
@@ -86,7 +86,7 @@ class ThermoxelsModel(Model):
             raise SceneError("scene", expected="thermal images with a temperature range", got="none", remedy=remedy)
         bounds_c = torch.tensor([temperatures.min_c, temperatures.max_c], dtype=torch.float64)
         self.register_buffer("temperature_bounds_c", bounds_c)
-        self.temperature_reading = TemperatureReading(self._read_ray) if self.has_temperatures else None
+        self.degrees_view = DegreesView(temperatures, self._read_ray) if self.has_temperatures else None
         if 0.0 < voxel < math.inf:
             pixels = config.voxel_pixels * longest / config.resolutions[-1] / voxel
             CONSOLE.log(
@@ -443,6 +443,13 @@ class ThermoxelsModel(Model):
             metrics["psnr_fitted"] = psnr((gain * predicted).clamp(max=1.0), target)
         return metrics
 
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Return the outputs of a camera's image, in a viewer also ``degrees``, see `DegreesView.picture`."""
+        outputs = super().get_outputs_for_camera(camera, obb_box)
+        if self.degrees_view is not None and self.degrees_view.shown:
+            outputs["degrees"] = self.degrees_view.picture(outputs["temperature_c"])
+        return outputs
+
     def _read_ray(self, origin: Tensor, direction: Tensor) -> tuple[float, float]:
         """Return the temperature, [degrees Celsius], that a ray ends on and its opacity; both arguments are (1, 3)."""
         direction = torch.nn.functional.normalize(direction.to(self.device, torch.float32), dim=-1)
@@ -496,33 +503,6 @@ def _seen_and_measured(
     if outputs.get(name) is None or not len(chosen):
         return None
     return outputs[name].index_select(0, chosen), batch[target].index_select(0, chosen)
-
-
-class TemperatureReading(nn.Module):
-    """A control of the viewer that reads the temperature where one clicks.
-
-    It is a module without parameters because nerfstudio looks for controls in the modules of a pipeline. `read` is a
-    function of a ray's origin and direction, both (1, 3), to the temperature at its end, [degrees Celsius], and its
-    opacity, 0 to 1.
-    """
-
-    def __init__(self, read: Callable[[Tensor, Tensor], tuple[float, float]]) -> None:
-        super().__init__()
-        self._read_ray = read
-        self.button = ViewerButton("Read a temperature: press, then click", self._await_click)
-        self.reading = ViewerText("Reading", "", disabled=True)
-        self.control = ViewerControl()
-
-    def _await_click(self, _: ViewerButton) -> None:
-        self.reading.value = "click into the picture"
-        self.control.register_pointer_cb("click", self._read)
-
-    def _read(self, click: ViewerClick) -> None:
-        self.control.unregister_pointer_cb()
-        lock = self.control.viewer.train_lock or contextlib.nullcontext()
-        with lock, torch.no_grad():
-            degrees, opacity = self._read_ray(torch.tensor([click.origin]), torch.tensor([click.direction]))
-        self.reading.value = f"{degrees:.2f} C" if opacity >= 0.5 else "nothing there"
 
 
 ThermoxelsModelConfig.model_class = ThermoxelsModel
