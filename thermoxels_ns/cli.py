@@ -29,7 +29,7 @@ class Synthetic:
     """Write a synthetic scene, whose shape and temperature are known exactly, as photographs and thermal images."""
 
     scene: tyro.conf.Positional[str]
-    """Name of the scene: hot-object, house-corner, sphere, courtyard, pipes, living-room, street,
+    """Name of the scene: hot-object, house-corner, sphere, courtyard, pipes, wall-object, living-room, facade, street,
     or random-N or wild-N, which are made from the seed N; wild scenes have smooth, plain or textured surroundings, and
     some have plain walls, mirroring panes or a thin railing. After the name, in any order: +sky=R,G,B for a sky or
     backdrop of one colour (0 to 1), +street for houses and trees around, +room for a room around, +white for white

@@ -32,7 +32,7 @@ class PhotographDepths:
 
     output: Path
     """Folder for scenes; one that is there is not written again."""
-    scenes: tuple[str, ...] = ("house-corner", "courtyard", "house-corner+white", "wild-4", "street")
+    scenes: tuple[str, ...] = ("house-corner", "courtyard", "house-corner+white", "facade", "street")
     """Synthetic scenes by name."""
 
     def main(self) -> None:

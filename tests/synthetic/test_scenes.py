@@ -105,7 +105,7 @@ def test_cameras_stand_free_and_frame_the_scene(name: str) -> None:
         assert min(scene.around.solid.signed_distance(at).min() for at in (poses[:, :3, 3], inside)) > 0.0
     pixels = np.array([camera.project_world(pose, points) for pose in poses])
     spread = np.ptp(pixels, axis=1) / (320, 240)
-    if name != "street":  # cameras walk past it
+    if name not in ("facade", "street"):  # cameras walk past these
         assert camera.contains(pixels.reshape(-1, 2)).all()
     if name in SCENE_NAMES:
         assert (spread * (320, 240)).max(axis=1).min() > 0.4 * 320
@@ -185,14 +185,10 @@ def test_other_names_are_refused(name: str) -> None:
 
 
 def test_what_stands_behind_has_parallax_and_hides_what_is_farther() -> None:
-    scene = make_scene("hot-object+room")
-    assert scene.around is not None
-    wall = BoxSolid((((-25.0, 0.7, -25.0), (25.0, 0.8, 25.0)),))
+    scene = make_scene("wall-object")
     eye = np.array([0.0, -2.0, 0.1])
     camera, pose = Camera(3, 3, 9.0, 9.0, 1.5, 1.5), look_at(eye, np.add(eye, [0.0, 1.0, 0.0]))
-    along_x = dataclasses.replace(
-        scene.around, solid=wall, surface_temperature_c=lambda points: np.asarray(points)[:, 0]
-    )
+    along_x = dataclasses.replace(scene.around, surface_temperature_c=lambda points: np.asarray(points)[:, 0])
     bare = dataclasses.replace(scene, around=along_x, solid=make_scene("sphere").solid)
     aside = look_at((3.0, -2.0, 0.1), (3.0, -1.0, 0.1))
     view = render_view(bare, aside, camera, samples_per_axis=1)

@@ -23,17 +23,18 @@ from thermoxels_ns.synthetic.appearance import (
     sky_rgb,
     sky_temperature_c,
 )
-from thermoxels_ns.synthetic.random_plan import Plan, Range, Wall, distance_to
+from thermoxels_ns.synthetic.random_plan import HAIR, Plan, Range, Wall, distance_to
 from thermoxels_ns.synthetic.random_scene import (
     painted_scene,
     random_scene,
     random_seed,
+    surrounded,
     warm_scene,
     with_room,
     with_street,
 )
 from thermoxels_ns.synthetic.scene_truth import CameraRing, CameraWalk, SyntheticScene, rings_around
-from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere
+from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, Vector
 
 HOUSE = "house-corner"
 _HOUSE_AIR_C, _HOUSE_ROOM_C, _HOUSE_COEFFICIENT = 0.0, 20.0, 8.0
@@ -321,6 +322,53 @@ def _of_nearest(points: npt.ArrayLike, *bodies: tuple[Any, ...]) -> FloatArray:
     return np.choose(np.argmin(far, axis=0), [degrees for degrees, *_ in bodies])
 
 
+_ROOM_C, _AIR_C, _SKY_DROP_K = 20.0, 4.0, 25.0
+
+
+def wall_object() -> SyntheticScene:
+    """Build an object of a few connected shapes on a small stand, before a plain grey wall.
+
+    The object is textured and 22 to 45 C warm, the wall and the room are 20 C; cameras stand in a half ring in front.
+    """
+    plan = Plan(np.random.default_rng(5))
+    stand, body, arm, metal = (
+        plan.add_paint(Paint(base, 0.28))
+        for base in ((0.50, 0.42, 0.34), (0.66, 0.40, 0.28), (0.36, 0.50, 0.58), (0.70, 0.60, 0.32))
+    )
+    trunk: Box = ((-24.0, -10.0, 20.0), (12.0, 10.0, 52.0))
+    plan.put(((-28.0, -20.0, 0.0), (34.0, 20.0, 8.0)), stand, 0.0)
+    plan.put(((-14.0, -12.0, 8.0), (10.0, 12.0, 20.0)), stand, 0.2)
+    plan.put(trunk, body, 0.6)
+    plan.put(((12.0, -6.0, 34.0), (32.0, 6.0, 44.0)), arm, 0.4)
+    plan.put(Cylinder((22.0, 0.0, 53.0 + HAIR), 9.0, 16.0, 1), metal, 1.0)
+    plan.put(Cylinder((-8.0, 0.0, 59.0 + HAIR), 7.0, 14.0, 2), arm, 0.5)
+    plan.put(Sphere((-8.0, 0.0, 77.0 + 2.0 * HAIR), 11.0), metal, 0.9)
+    plan.spot(trunk, 1.0, 14.0)
+    paint = Paint((0.55, 0.55, 0.55), 0.0)
+    scene = warm_scene(
+        plan.scaled(0.012),
+        texture_seed=23,
+        light=SunLight((0.3, -0.8, 0.6), ambient=0.7),
+        surface_c=(_ROOM_C + 2.0, 45.0),
+        name="wall-object",
+        temperature_bounds_c=(_ROOM_C, 45.0),
+        background_rgb=plain(paint.base),
+        background_temperature_c=everywhere(_ROOM_C),
+        rings=rings_around(
+            (0.04, 0.0), (0.52, 1.75, 0.25), (0.52, 1.85, 0.8), (0.5, 1.65, 1.45), start_deg=-160.0, span_deg=140.0
+        ),
+        focal_share=0.98,
+    )
+    # A large upright wall stands behind, at the temperature of the air; the background past its edges has its colour.
+    behind_m, half_m = 0.7, 25.0
+    wall = Plan(np.random.default_rng(0), paints=[paint])
+    wall.put(((-half_m, behind_m, -half_m), (half_m, behind_m + 0.1, half_m)), 0)
+    scene = surrounded(scene, wall, seed=0, range_k=0.0)
+    assert scene.around is not None
+    seen = scene.around.colour([[0.0, behind_m, 0.0]], [[0.0, -1.0, 0.0]])[0]
+    return dataclasses.replace(scene, background_rgb=plain(seen.tolist()))
+
+
 def living_room() -> SyntheticScene:
     """Build a furnished room of 5.2 x 4.2 x 2.7 m, photographed from inside, with white walls and a plain ceiling.
 
@@ -370,19 +418,33 @@ def living_room() -> SyntheticScene:
     )
 
 
+def facade() -> SyntheticScene:
+    """Build the textured front of a house with windows, ledges, a door and a strip of ground, under a plain sky.
+
+    Cameras walk along in front of the house; no camera stands behind it.
+    """
+    return _front("facade", Paint((0.70, 0.60, 0.46), 0.25), mirror=0.0, sky=(0.62, 0.72, 0.84), railing=False)
+
+
 def street() -> SyntheticScene:
     """Build a front of plain plaster with mirroring panes and a balcony with a railing of 2 cm bars, in a street.
 
-    The front is 10.4 m wide and 7.6 m high; three lines of cameras lead past it, and none stands behind it. Textured
-    houses stand all round: also behind the cameras, where the panes mirror them.
+    Textured houses stand all round: also behind the cameras, where the panes mirror them.
     """
-    air_c, drop_k = 4.0, 25.0
+    scene = _front("street", Paint((0.80, 0.76, 0.68), 0.0), mirror=0.6, sky=None, railing=True)
+    return with_street(scene, seed=1)
+
+
+def _front(name: str, wall: Paint, mirror: float, sky: Vector | None, railing: bool) -> SyntheticScene:
+    """Return a scene of a front, 10.4 m wide and 7.6 m high, past which three lines of cameras lead."""
     plan = Plan(np.random.default_rng(8))
+    glass_paint = Paint((0.22, 0.30, 0.40), 0.0 if railing else 0.16, mirror)
+    ground_paint, stone_paint = Paint((0.46, 0.45, 0.42), 0.26), Paint((0.58, 0.55, 0.50), 0.22)
     paints = (
-        Paint((0.80, 0.76, 0.68), 0.0),
-        Paint((0.46, 0.45, 0.42), 0.26),
-        Paint((0.58, 0.55, 0.50), 0.22),
-        Paint((0.22, 0.30, 0.40), 0.0, mirror=0.6),
+        wall,
+        ground_paint,
+        stone_paint,
+        glass_paint,
         Paint((0.42, 0.24, 0.16), 0.2),
         Paint((0.30, 0.32, 0.34), 0.1),
     )
@@ -396,25 +458,27 @@ def street() -> SyntheticScene:
             x = -40.0 + 20.0 * column
             if (column, low) == (2, 12.0):
                 plan.recess((1, -1, 0.0), (-7.0, 7.0), (7.0, 31.0), 3.5, door, 0.6)
-            else:
-                plan.recess((1, -1, 0.0), (x - 6.0, x + 6.0), (low, low + 18.0), 3.5, glass, 0.7 + 0.05 * column)
-    _balcony(plan, stone, metal)
-    scene = warm_scene(
+                continue
+            plan.recess((1, -1, 0.0), (x - 6.0, x + 6.0), (low, low + 18.0), 3.5, glass, 0.7 + 0.05 * column)
+            if not railing:
+                plan.put(((x - 8.0, -3.2, low - 3.2), (x + 8.0, 0.0, low)), stone, 0.25)
+    if railing:
+        _balcony(plan, stone, metal)
+    return warm_scene(
         plan.scaled(0.1),
         texture_seed=29,
         light=SunLight((0.4, -0.7, 0.6)),
-        surface_c=(air_c, 18.0),
-        name="street",
-        temperature_bounds_c=(air_c - drop_k, 18.0),
-        background_rgb=sky_rgb,
-        background_temperature_c=lambda directions: sky_temperature_c(directions, air_c, drop_k),
+        surface_c=(_AIR_C, 18.0),
+        name=name,
+        temperature_bounds_c=(_AIR_C - _SKY_DROP_K, 18.0),
+        background_rgb=sky_rgb if sky is None else plain(sky),
+        background_temperature_c=lambda directions: sky_temperature_c(directions, _AIR_C, _SKY_DROP_K),
         rings=tuple(
             CameraWalk(((-x, y, z), (x, y, z)), ((-aim, 0.0, 3.4), (aim, 0.0, 3.4)))
             for x, y, z, aim in ((6.5, -12.0, 1.7, 1.0), (7.5, -11.0, 4.2, 2.0), (5.0, -9.5, 2.6, 2.8))
         ),
         focal_share=0.8,
     )
-    return with_street(scene, seed=1)
 
 
 def _balcony(plan: Plan, stone: int, metal: int) -> None:
@@ -435,10 +499,17 @@ _BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
     "sphere": sphere,
     "courtyard": courtyard,
     "pipes": pipes,
+    "wall-object": wall_object,
     "living-room": living_room,
+    "facade": facade,
     "street": street,
 }
-DEVELOPMENT_NAMES = ("living-room", "street")  # names of hand-drawn scenes that are hard, for development
+DEVELOPMENT_NAMES = (
+    "wall-object",
+    "living-room",
+    "facade",
+    "street",
+)  # names of hand-drawn scenes that are hard, for development
 SCENE_NAMES = tuple(name for name in _BUILDERS if name not in DEVELOPMENT_NAMES)
 """Names of the other hand-drawn scenes; `make_scene` also knows `DEVELOPMENT_NAMES`, `random-N` and `wild-N`."""
 
