@@ -19,7 +19,7 @@ from thermoxels_ns.mesh.files.formats import write_mesh
 
 METRICS = (
     *("psnr", "psnr_8", "ssim", "thermal_psnr", "thermal_ssim", "thermal_hssim"),
-    *("thermal_mae_c", "thermal_mae_hit_c", "thermal_mae_debiased_c"),
+    *("thermal_mae_c", "thermal_mae_hit_c", "thermal_mae_roi_c", "thermal_mae_debiased_c"),
     *("psnr_box", "thermal_mae_box_c", "half_transparent", "fscore", "precision", "recall", "fscore_128"),
     *("depth_error", "depth_off_share", "sky_filled"),
 )

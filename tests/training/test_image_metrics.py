@@ -16,7 +16,7 @@ def test_constant_shift_is_an_error_in_degrees_that_debiasing_removes():
     target, valid, opaque = images()
     result = metrics.thermal_metrics(target, target, valid, opaque, opaque > 0, span_k=40.0)
     assert result["thermal_ssim"] == pytest.approx(1.0) and result["thermal_hssim"] == pytest.approx(1.0)
-    assert all(result[f"thermal_mae_{k}"] == 0.0 for k in ("c", "hit_c", "debiased_c"))
+    assert all(result[f"thermal_mae_{k}"] == 0.0 for k in ("c", "hit_c", "roi_c", "debiased_c"))
     result = metrics.thermal_metrics(target + 0.05, target, valid, opaque, opaque > 0, span_k=40.0)
     assert result["thermal_mae_c"] == pytest.approx(2.0, rel=1e-5)
     assert result["thermal_mae_debiased_c"] == pytest.approx(0.0, abs=1e-5)
@@ -31,6 +31,14 @@ def test_only_valid_and_hit_pixels_count():
     result = metrics.thermal_metrics(predicted, target, valid, opaque, opaque > 0, span_k=10.0)
     assert result["thermal_mae_hit_c"] == 0.0
     assert result["thermal_mae_c"] == pytest.approx(10 / 38, rel=1e-5)
+
+
+def test_hot_region_is_the_hot_side():
+    temperature = torch.full((20, 20, 1), 10.0)
+    temperature[5:9, 5:9] = 60.0
+    temperature += torch.linspace(0, 1, 20)[:, None, None]
+    valid = torch.ones_like(temperature, dtype=torch.bool)
+    assert torch.equal(metrics.hot_region(temperature, valid), temperature > 30)
 
 
 def test_flat_images_and_images_without_a_valid_pixel_give_no_nan_where_a_number_exists():

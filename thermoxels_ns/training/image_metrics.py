@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -96,6 +98,20 @@ def hssim(
     return float((similarity if valid is None else similarity[window_mean(valid.float()) == 1]).mean())
 
 
+def hot_region(temperature_c: Float[Tensor, "h w 1"], valid: Bool[Tensor, "h w 1"]) -> Bool[Tensor, "h w 1"]:
+    """Return the valid pixels hotter than Otsu's threshold (Otsu 1979), or all valid pixels of a flat image."""
+    values = temperature_c[valid]
+    if values.numel() == 0:
+        return valid
+    low, span = values.min(), values.max() - values.min()
+    if float(span) < 1e-6:
+        return valid
+    grey = ((temperature_c - low) / span * 255).round()
+    levels = np.ascontiguousarray(grey[valid].to(torch.uint8).cpu().numpy()[:, None])
+    threshold, _ = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    return valid & (grey > threshold)
+
+
 def thermal_metrics(
     predicted: Float[Tensor, "h w 1"],
     target: Float[Tensor, "h w 1"],
@@ -117,8 +133,8 @@ def thermal_metrics(
     Returns:
         `thermal_psnr`, `thermal_ssim`, `thermal_hssim` of normalised images, and mean absolute errors in kelvin (the
         size of a degree Celsius): `thermal_mae_c` over all valid pixels; `thermal_mae_hit_c` where opacity exceeds one
-        half; `thermal_mae_box_c` in the box; `thermal_mae_debiased_c` after the image's mean error is subtracted. A
-        metric over no pixel is NaN.
+        half; `thermal_mae_box_c` in the box; `thermal_mae_roi_c` in `hot_region`; `thermal_mae_debiased_c` after the
+        image's mean error is subtracted. A metric over no pixel is NaN.
     """
     filled_p, filled_t = (torch.where(valid, image, torch.zeros_like(image)) for image in (predicted, target))
     error_k = (predicted - target) * span_k
@@ -130,5 +146,6 @@ def thermal_metrics(
         "thermal_mae_c": float(error_k[valid].abs().mean()),
         "thermal_mae_hit_c": float(error_k[valid & (accumulation > 0.5)].abs().mean()),
         "thermal_mae_box_c": float(error_k[valid & in_box].abs().mean()),
+        "thermal_mae_roi_c": float(error_k[hot_region(target, valid)].abs().mean()),
         "thermal_mae_debiased_c": float((error_k - error_k[valid].mean())[valid].abs().mean()),
     }
