@@ -1,4 +1,6 @@
 import math
+import sys
+import types
 
 import pytest
 import torch
@@ -84,6 +86,20 @@ def test_blocks_are_means_of_their_valid_pixels():
 def test_ssim_of_small_images(size):
     image = torch.rand(*size, 3)
     assert metrics.ssim(image, image) == pytest.approx(1.0)
+
+
+def test_lpips_is_asked_only_when_installed(monkeypatch):
+    """With a stand-in for the optional package: images are handed over as (1, 3, h, w) in [-1, 1]."""
+    seen = []
+
+    def network(a, b):
+        seen.append((a.shape, float(a.min()), float(b.max())))
+        return torch.tensor(0.25)
+
+    monkeypatch.setitem(sys.modules, "lpips", types.SimpleNamespace())
+    monkeypatch.setattr(metrics.lpips, "network", network, raising=False)
+    assert metrics.lpips(torch.zeros(8, 8, 3), torch.ones(8, 8, 3)) == 0.25
+    assert seen == [((1, 3, 8, 8), -1.0, 1.0)]
 
 
 def test_invalid_pixels_do_not_flatter_the_structure():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+
 import cv2
 import numpy as np
 import torch
@@ -149,3 +151,21 @@ def thermal_metrics(
         "thermal_mae_roi_c": float(error_k[hot_region(target, valid)].abs().mean()),
         "thermal_mae_debiased_c": float((error_k - error_k[valid].mean())[valid].abs().mean()),
     }
+
+
+def lpips_available() -> bool:
+    """Return whether the optional package for LPIPS is installed (`pip install thermoxels-ns[lpips]`)."""
+    return importlib.util.find_spec("lpips") is not None
+
+
+def lpips(predicted: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float:
+    """Return the learned perceptual distance (Zhang et al. 2018, AlexNet); the first call may download weights."""
+    import lpips as package  # type: ignore[import-not-found]
+
+    def prepare(image: Tensor) -> Tensor:
+        return image.permute(2, 0, 1)[None].cpu() * 2 - 1
+
+    if not hasattr(lpips, "network"):
+        lpips.network = package.LPIPS(net="alex", verbose=False)  # type: ignore[attr-defined]
+    with torch.no_grad():
+        return float(lpips.network(prepare(predicted), prepare(target)))  # type: ignore[attr-defined]

@@ -38,6 +38,8 @@ from thermoxels_ns.training.degrees_view import DegreesView
 from thermoxels_ns.training.image_metrics import (
     SATURATED,
     fitted_gain,
+    lpips,
+    lpips_available,
     psnr,
     psnr_of_blocks,
     ssim,
@@ -395,6 +397,8 @@ class ThermoxelsModel(Model):
             metrics["psnr_8"] = psnr_of_blocks(predicted, target, mask)
             in_box = outputs["in_box"] > 0 if mask is None else (outputs["in_box"] > 0) & mask
             metrics["psnr_box"] = psnr(predicted, target, in_box.expand_as(target))
+            if lpips_available():
+                metrics["lpips"] = lpips(predicted, target)
             images["img"] = torch.cat((target, predicted), dim=1)
         seen = outputs
         if batch.get("thermal_camera") is not None:
