@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -15,7 +15,6 @@ from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.optimizers import FusedAdamConfig, RowAdamConfig, RowRMSpropConfig
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline, ThermoxelsPipelineConfig
-from thermoxels_ns.training.progress import ProgressConfig
 from thermoxels_ns.training.schedule import QUALITIES
 from thermoxels_ns.training.trainer import LOCAL_HOST, ThermoxelsTrainerConfig
 
@@ -45,7 +44,7 @@ def _trainer(
         steps_per_eval_all_images=0,
         mixed_precision=False,
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
-        logging=LoggingConfig(local_writer=ProgressConfig(), profiler="none"),
+        logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
         pipeline=ThermoxelsPipelineConfig(
             datamanager=ThermalDataManagerConfig(
                 dataparser=ThermalDataParserConfig(), train_num_rays_per_batch=4096, thermal_num_rays_per_batch=2048

@@ -64,11 +64,11 @@ class Without:
     """Module, attribute in it (dots lead into classes), and what takes its place."""
 
 
-def _without_ends(model: Any, rays: Any) -> Any:
+def _without_ends(*given: Any) -> Any:
     """Weights of voxels none of which is kept because rays end in it."""
     from thermoxels_ns.training.ray_statistics import voxel_weights
 
-    weights = voxel_weights(model, rays)
+    weights = voxel_weights(*given)
     return replace(weights, ends=weights.ends & False)
 
 

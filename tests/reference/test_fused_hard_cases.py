@@ -55,7 +55,7 @@ def test_huge_density_is_opaque_with_finite_gradients(renderer, sigma):
         assert bool((seen.values["accumulation"][hit] == 1.0).all())
         assert float(seen.values["transmittance"][hit].max()) < 1e-30
         torch.testing.assert_close(seen.values["thermal"][hit, 0], torch.full((int(hit.sum()),), 0.4).double())
-        for value in (seen.values[name][hit] for name in ("rgb", "depth", "distortion", "sparsity")):
+        for value in (seen.values[name][hit] for name in ("rgb", "depth", "distortion")):
             assert bool(torch.isfinite(value).all())
         assert all(bool(torch.isfinite(g).all()) for g in seen.gradients.values())
         assert float(seen.gradients["temperature"].norm()) > 0
@@ -81,7 +81,9 @@ def test_transmittance_keeps_its_digits_over_512_samples():
     error = (single.weight.double() - exact.weight).abs() / exact.weight
     assert float(error.max()) < 1e-5 and 0 < float(exact.weight[-1]) < 1e-17
     assert float(single.transmittance) == pytest.approx(float(exact.transmittance), rel=1e-5)
-    reference = assert_twins_agree(grid, ALONG, replace(EVERYTHING, thermal_moves_density=True))
+    # The rays alone move no density of a wall so opaque; its total variation gives the gradients a size to compare.
+    options = replace(EVERYTHING, thermal_moves_density=True, variation={"density": (0, 256)})
+    reference = assert_twins_agree(grid, ALONG, options)
     assert float(reference.values["transmittance"]) < 1e-16
 
 
@@ -209,7 +211,7 @@ def test_rays_through_nothing_see_nothing_and_pull_at_no_temperature(renderer, a
     seen = RENDERERS[renderer](grid, rays, EVERYTHING)
     assert bool((seen.transmittance == 1).all()) and bool((seen.accumulation == 0).all())
     assert bool(torch.isinf(seen.depth).all())
-    assert float(seen.distortion.abs().max()) == 0.0 and float(seen.sparsity.abs().max()) == 0.0
+    assert float(seen.distortion.abs().max()) == 0.0
     (seen.rgb.sum() + seen.thermal.sum()).backward()
     for parameter in grid.row_parameters().values():
         assert parameter.grad is None or float(parameter.grad.to_dense().abs().max()) == 0.0

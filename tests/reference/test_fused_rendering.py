@@ -49,20 +49,18 @@ def test_everything_at_once(sh_degree, temperature_degree, activation, kept):
     [
         RenderOptions(),
         RenderOptions(distortion_scale=0.7),
-        RenderOptions(sparsity=True),
         RenderOptions(variation={"temperature": (3, 4)}),
-        RenderOptions(variation={"density": (0, 100), "sh": (50, 51)}, sparsity=True),
+        RenderOptions(variation={"density": (0, 100), "sh": (50, 51)}),
         RenderOptions(steps_per_voxel=0.7, smallest_weight=1e-3, distortion_scale=2.0),
         RenderOptions(steps_per_voxel=5.3, smallest_weight=1e-2),
     ],
-    ids=["plain", "distortion", "sparsity", "one variation", "two variations", "coarse steps", "fine steps"],
+    ids=["plain", "distortion", "one variation", "two variations", "coarse steps", "fine steps"],
 )
 def test_each_term_alone(options, moves):
     grid = random_grid(1, 1, "softplus", 0.4)
     options = replace(options, thermal_moves_density=moves)
     reference = assert_twins_agree(grid, random_request(grid), options)
     assert ("distortion" in reference.values) is (options.distortion_scale is not None)
-    assert ("sparsity" in reference.values) is options.sparsity
 
 
 @pytest.mark.parametrize("rgb", [None, True, False])
@@ -117,7 +115,7 @@ def test_near_and_far(near, far):
 
 
 def test_values_at_the_limit_of_exp_have_no_gradient():
-    """Raw density above 15 stays at e^15; in a tiny box such a step is not yet opaque, and sparsity sees it too."""
+    """Raw density above 15 stays at e^15; in a tiny box such a step is not yet opaque."""
     lattice = Lattice((0.0, 0.0, 0.0), 1e-6, (5, 5, 5))
     grid = random_grid(0, 0, "exp", 1.0, lattice, density=17.0)
     assert 0.1 < float((grid.density > 15).double().mean()) < 0.95

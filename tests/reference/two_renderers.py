@@ -16,8 +16,8 @@ from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
 
 Renderer = Callable[[VoxelGrid, RayRequest, RenderOptions], RayRender]
 RENDERERS: dict[str, Renderer] = {"reference": reference.render, "fused": fused.render}
-PER_RAY = ("rgb", "thermal", "transmittance", "accumulation", "depth", "distortion", "sparsity")
-EVERYTHING = RenderOptions(distortion_scale=2.0, sparsity=True)
+PER_RAY = ("rgb", "thermal", "transmittance", "accumulation", "depth", "distortion")
+EVERYTHING = RenderOptions(distortion_scale=2.0)
 
 
 def keep_only(grid: VoxelGrid, cells: np.ndarray) -> VoxelGrid:
@@ -101,7 +101,7 @@ def see(renderer: str, grid: VoxelGrid, request: RayRequest, options: RenderOpti
     values |= {f"variation of {name}": value for name, value in render.variation.items()}
     values = {name: value for name, value in values.items() if value is not None}
     # Sizes that differ by orders of magnitude would hide each other's errors.
-    scale = {"sparsity": 1e-3, "thermal": 1.0 if options.thermal_moves_density else 3.0}
+    scale = {"thermal": 1.0 if options.thermal_moves_density else 3.0}
     loss = torch.zeros((), dtype=dtype)
     for name, value in values.items():
         push = torch.rand(value.shape, generator=generator) * scale.get(name, 1.0)

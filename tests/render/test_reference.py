@@ -12,8 +12,6 @@ from thermoxels_ns.render import reference
 from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.render.reference import sample_box
 
-LO, HI = torch.tensor([-1.0, -1.0, -1.0]), torch.tensor([1.0, 1.0, 1.0])
-
 
 def test_renders_are_the_sums_of_the_paper():
     """Eq. 1 and 2 with all voxels kept: colour, temperature, opacity, expected distance."""
@@ -21,15 +19,17 @@ def test_renders_are_the_sums_of_the_paper():
     rays = in_double(random_request(grid, 12, mixed=False))
     seen = reference.render(grid, rays, RenderOptions())
     lo, hi = (torch.tensor(v, dtype=torch.float64) for v in (grid.lattice.lo, grid.lattice.hi))
-    steps = sample_box(rays.origins, rays.directions, lo, hi, grid.lattice.voxel_size / 2, rays.near, rays.far)
+    distances, deltas = sample_box(
+        rays.origins, rays.directions, lo, hi, grid.lattice.voxel_size / 2, rays.near, rays.far
+    )
     assert seen.rgb is not None and int((seen.accumulation > 0.1).sum()) > 6
     for r in range(12):
-        real = steps.deltas[r] > 0
-        points = rays.origins[r] + steps.t[r][real][:, None] * rays.directions[r]
+        real = deltas[r] > 0
+        points = rays.origins[r] + distances[r][real][:, None] * rays.directions[r]
         at, along = grid.locate(points), rays.directions[r].expand_as(points)
         rows = torch.cat((grid.rgb_at(at, along), grid.thermal_at(at, along)), 1).tolist()
         left, total, distance = 1.0, [0.0] * 4, 0.0
-        columns = grid.density_at(at), steps.deltas[r][real], steps.t[r][real]
+        columns = grid.density_at(at), deltas[r][real], distances[r][real]
         for density, delta, t, row in zip(*(column.tolist() for column in columns), rows):
             weight = left * -math.expm1(-density * delta)
             total = [c + weight * v for c, v in zip(total, row)]

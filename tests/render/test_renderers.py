@@ -77,7 +77,7 @@ def test_rays_of_several_requests_see_together_what_they_see_alone():
         replace(rays, near=0.3, rgb_rays=odd),
         RayRequest(rays.origins[:7], rays.directions[:7], 0.1, torch.full((7,), 1.5), None, odd[:7]),
     ]
-    options = RenderOptions(distortion_scale=2.0, sparsity=True)
+    options = RenderOptions(distortion_scale=2.0)
     together = split_render(requests, lambda joined: render_scene(made, joined, options, "fused"))
     for part, one in zip(together, requests, strict=True):
         alone = render_scene(made, one, options, "fused")

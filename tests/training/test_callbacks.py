@@ -17,7 +17,8 @@ from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.multiview.votes import air_voxels
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.synthetic.scene_truth import look_at
-from thermoxels_ns.training.callbacks import coarse_to_fine_callbacks, prune_by_rays
+from thermoxels_ns.training import callbacks
+from thermoxels_ns.training.callbacks import coarse_to_fine_callbacks, progress, prune_by_rays
 from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.optimizers import RowAdam
@@ -222,3 +223,16 @@ def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is(voxel_pixels
     assert model.config.resolutions == ((8,) if voxel_pixels else (8, 32))
     assert given.trainer.saved == ([(8,)] if voxel_pixels else []), "what is resumed knows it"
     assert model.grid.lattice.cell_shape == (8, 8, 8) and model.grid.voxels.all_kept
+
+
+def test_progress_is_told_at_each_twentieth_and_after_a_silence(monkeypatch, capsys):
+    """Steps of two seconds, but the first, in which kernels compile, and one of a minute and a half."""
+    clock = iter([0.0, *(30.0 + 2.0 * step + 90.0 * (step > 104) for step in range(100, 200))])
+    monkeypatch.setattr(callbacks.time, "monotonic", lambda: next(clock))
+    tell = progress(100, 200)
+    for step in range(100, 200):
+        tell(step)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "step 106 of 200 (53 %); at this pace 0:31:20 more", "after a silence"
+    assert lines[1] == "step 110 of 200 (55 %); at this pace 0:03:00 more"
+    assert lines[-1] == "step 200 of 200 (100 %)" and len(lines) == 11

@@ -7,7 +7,7 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RenderOptions
-from thermoxels_ns.render.reference import ray_distortion, ray_sparsity, total_variation
+from thermoxels_ns.render.reference import ray_distortion, total_variation
 from thermoxels_ns.render.renderers import render_rays
 from thermoxels_ns.training import losses
 from thermoxels_ns.training.losses import FeatureRaySampler, feature_ray_loss
@@ -74,13 +74,6 @@ def test_beta_is_nil_for_decided_rays_and_dearest_at_one_half():
     assert float(decided) == pytest.approx(0.0, abs=1e-12)
     costs = [float(losses.beta_loss(torch.tensor([a]))) for a in (0.1, 0.5, 0.9)]
     assert costs[1] > costs[0] > 0 and costs[1] > costs[2] > 0
-
-
-def test_sparsity_ignores_padding_and_stays_finite():
-    density = torch.tensor([[1.0, float("inf")], [2.0, 0.0]])
-    found = ray_sparsity(density, torch.tensor([[0.1, 0.0], [0.1, 0.1]]))
-    np.testing.assert_allclose(found.numpy(), np.log([3.0, 9.0]), rtol=1e-6)
-    assert torch.isfinite(ray_sparsity(density, torch.full((2, 2), 0.1))).all()
 
 
 CPU = torch.device("cpu")

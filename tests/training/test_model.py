@@ -203,15 +203,11 @@ def test_decisions_about_the_background_are_in_the_checkpoint():
         ({"refine_at": (5,)}, "resolutions and refine_at"),
         ({"loss_overrides": {"tv": 1.0}}, r"loss_overrides\.tv: expected one of rgb, thermal"),
         *(({"loss_overrides": {"rgb": value}}, "loss_overrides rgb") for value in (float("nan"), -1.0)),
-        *(({"steps_per_voxel": value}, "steps_per_voxel") for value in (0.0, float("inf"), float("nan"))),
         *(({"start_density": value}, "start_density") for value in (0.0, -1.0)),
         ({"near_plane": -5.0}, "near_plane"),
-        ({"thermal_l2_share": 3.0}, "thermal_l2_share"),
         ({"prune_threshold": float("nan")}, "prune_threshold"),
         ({"smallest_weight": 0.5}, "smallest_weight"),
-        ({"background_height": 1}, "background_height"),
         ({"prune_at": (0,)}, "prune_at"),
-        ({"tv_share": 0.0}, "tv_share"),
     ],
 )
 def test_values_that_cannot_work_are_refused(options, named):

@@ -1,5 +1,5 @@
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -10,19 +10,19 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.refine import prune
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
-from thermoxels_ns.render.renderers import Backend, GridSamples, sample_rays
-from thermoxels_ns.training.ray_statistics import backdrop_evidence, field_evidence, voxel_weights
+from thermoxels_ns.render.renderers import Backend, sample_rays
+from thermoxels_ns.training.ray_statistics import Sampler, backdrop_evidence, field_evidence, voxel_weights
 
 
-@dataclass
-class Scene:
+class Scene(NamedTuple):
     """A grid and the sampling that the model does with it."""
 
     grid: VoxelGrid
-    backend: Backend
+    sample_rays: Sampler
 
-    def sample_rays(self, origins, directions) -> GridSamples:
-        return sample_rays(self.grid, RayRequest(origins, directions), RenderOptions(), self.backend)
+
+def sampled(grid: VoxelGrid, backend: Backend) -> Scene:
+    return Scene(grid, lambda *rays: sample_rays(grid, RayRequest(*rays), RenderOptions(), backend))
 
 
 @pytest.fixture(params=["fused", "reference"])
@@ -36,7 +36,7 @@ def slab(backend: Backend = "fused") -> Scene:
     corners = torch.as_tensor(grid.lattice.corner_positions(), dtype=torch.float32).reshape(-1, 3)
     grid.density.data = torch.where(corners[:, :1] < 0.01, 500.0, 0.0)
     grid.temperature.data = 0.5 + 0.25 * corners[:, 1:2]
-    return Scene(grid, backend)
+    return sampled(grid, backend)
 
 
 def rays_along_minus_x(n: int = 40, chunk: int = 300):
@@ -61,7 +61,7 @@ def test_weight_lies_in_the_surface_and_sums_to_the_rays(backend):
     """Of the kept voxels alone, in their order: those on one side of the slab are stored."""
     scene = slab(backend)
     prune(scene.grid, scene.grid.voxels.cells % 6 < 3)
-    weights, total = voxel_weights(scene, rays_along_minus_x()), total_weight(scene)
+    weights, total = voxel_weights(*scene, rays_along_minus_x()), total_weight(scene)
     assert weights.largest.shape == weights.ends.shape == total.shape == (108,)
     by_layer, ends = total.view(6, 18).sum(1), weights.ends.view(6, 18)
     assert bool(ends[3].all()) and not bool(ends[:3].any()) and not bool(ends[4:].any())
@@ -72,10 +72,10 @@ def test_weight_lies_in_the_surface_and_sums_to_the_rays(backend):
 
 def test_corner_temperature_is_measured_where_rays_came_and_only_there(backend):
     scene = slab(backend)
-    seen = field_evidence(scene, rays_along_minus_x()).temperature
+    seen = field_evidence(*scene, rays_along_minus_x())
     shape = scene.grid.lattice.shape
-    weight, thermal = seen.weight.view(shape), seen.thermal.view(shape)
-    assert float(seen.weight.sum()) == pytest.approx(1600, rel=1e-4)
+    weight, thermal = seen.thermal_weight.view(shape), seen.thermal.view(shape)
+    assert float(seen.thermal_weight.sum()) == pytest.approx(1600, rel=1e-4)
     assert float(weight[:2].max()) < 1e-3 and float(weight[3].min()) > 0
     inner = thermal[3, 1:-1, 1:-1]  # away from the rim a linear temperature is its own average
     expected = scene.grid.temperature.data.view(shape)[3, 1:-1, 1:-1]
@@ -88,29 +88,29 @@ def test_corners_that_differ_in_turn_are_averaged(backend):
     shape = scene.grid.lattice.shape
     index = torch.stack(torch.meshgrid(*[torch.arange(n) for n in shape], indexing="ij"), -1)
     scene.grid.temperature.data = (0.5 + 0.2 * (1 - 2 * (index.sum(-1) % 2))).reshape(-1, 1).float()
-    seen = field_evidence(scene, rays_along_minus_x()).temperature
+    seen = field_evidence(*scene, rays_along_minus_x())
     inner = seen.thermal.view(shape)[3:5, 1:-1, 1:-1]
-    assert float((inner - 0.5).abs().max()) < 0.6 * 0.2 and float(seen.weight.view(shape)[3:5].min()) > 0
+    assert float((inner - 0.5).abs().max()) < 0.6 * 0.2 and float(seen.thermal_weight.view(shape)[3:5].min()) > 0
 
 
 def test_what_leaks_through_a_surface_measures_nothing_and_ends_nothing_behind_it(backend):
     """A first wall of optical depth 2.3 lets 10 % through to a second one, in which no ray ends."""
     scene = slab(backend)
     layers(scene, {4: -3 * math.log(0.1), 1: 500.0, 0: 500.0})
-    evidence = field_evidence(scene, rays_along_minus_x())
+    evidence = field_evidence(*scene, rays_along_minus_x())
     ends, leaked = (v.view(6, 6, 6).sum((1, 2)) for v in (evidence.voxel_ends, evidence.voxel_weight))
     assert float(ends.sum()) == 1600 and float(ends[3:5].sum()) == 1600
     assert float(leaked[:3].sum()) == pytest.approx(160, rel=0.02)
-    weight = evidence.temperature.weight.view(7, 7, 7)
+    weight = evidence.thermal_weight.view(7, 7, 7)
     assert float(weight[:3].max()) == 0.0 and float(weight[4].min()) > 0.0
 
 
 def test_rays_that_leave_the_box_are_found(backend):
     scene = slab(backend)
     scene.grid.density.data[:] = 0.0
-    unsaturated, directions = backdrop_evidence(scene, rays_along_minus_x())
+    unsaturated, directions = backdrop_evidence(*scene, rays_along_minus_x())
     assert unsaturated == 1.0 and len(directions) == 1600
-    assert backdrop_evidence(slab(backend), rays_along_minus_x())[0] == 0.0
+    assert backdrop_evidence(*slab(backend), rays_along_minus_x())[0] == 0.0
 
 
 def layers(scene: Scene, density: dict[int, float]) -> None:
@@ -128,7 +128,7 @@ def test_evidence_spends_every_ray_s_opacity_and_no_more(backend):
     bundles = list(rays_along_minus_x())
     opacity = sum(float((1 - scene.sample_rays(b.origins, b.directions).transmittance).sum()) for b in bundles)
     assert 0.1 * 1600 < opacity < 0.9 * 1600
-    evidence = field_evidence(scene, bundles)
+    evidence = field_evidence(*scene, bundles)
     assert evidence.rays == 1600
     assert float(evidence.voxel_weight.sum()) == pytest.approx(opacity, rel=1e-5)
     torch.testing.assert_close(evidence.voxel_weight.float(), total_weight(scene), rtol=1e-4, atol=1e-4)
@@ -139,7 +139,7 @@ def test_half_depth_has_the_density_of_the_wall_that_each_ray_ends_on(backend):
     scene = slab(backend)
     y = torch.as_tensor(scene.grid.lattice.corner_positions()[..., 1]).reshape(-1, 1)
     scene.grid.density.data *= torch.where(y > 0.01, 2.0, torch.where(y < -0.01, 1.0, 1.5))
-    found = field_evidence(scene, rays_along_minus_x()).half_depth_density
+    found = field_evidence(*scene, rays_along_minus_x()).half_depth_density
     # In the layer in front of the last solid corners half of the corners are solid.
     centres = torch.tensor([250.0, 250.0, 312.5, 437.5, 500.0, 500.0])
     origins = torch.cat([bundle.origins for bundle in rays_along_minus_x()])
@@ -154,17 +154,17 @@ def test_half_depth_lies_behind_a_thin_veil_alone(backend, let_through, wall, fo
     one that takes 90 % before a wall a thousand times as dense, two voxels behind it."""
     scene, veil = slab(backend), -3 * math.log(let_through)
     layers(scene, {4: veil, 1: wall, 0: wall})
-    density = field_evidence(scene, rays_along_minus_x()).half_depth_density
+    density = field_evidence(*scene, rays_along_minus_x()).half_depth_density
     torch.testing.assert_close(density, torch.full((1600,), found or veil / 2))
 
 
 def test_rays_that_end_on_nothing_have_no_half_depth_but_weight(backend):
     scene = slab(backend)
     layers(scene, {2: -3 * math.log(0.55)})
-    evidence = field_evidence(scene, rays_along_minus_x())
+    evidence = field_evidence(*scene, rays_along_minus_x())
     assert len(evidence.half_depth_density) == 0
     assert float(evidence.voxel_weight.sum()) == pytest.approx(0.45 * 1600, rel=0.02)
-    assert float(evidence.temperature.weight.max()) == 0.0
+    assert float(evidence.thermal_weight.max()) == 0.0
 
 
 def test_rays_of_photographs_are_evidence_but_measure_no_temperature(backend):
@@ -175,15 +175,15 @@ def test_rays_of_photographs_are_evidence_but_measure_no_temperature(backend):
             bundle.metadata["stream"] = torch.full((len(bundle), 1), bits(number), dtype=torch.uint8)
             yield bundle
 
-    colour = field_evidence(scene, bundles(lambda _: RGB_STREAM))
-    assert float(colour.temperature.weight.max()) == 0.0 and len(colour.half_depth_density) == 1600
-    assert torch.equal(colour.temperature.thermal, scene.grid.temperature.data[:, 0].clamp(0, 1))
+    colour = field_evidence(*scene, bundles(lambda _: RGB_STREAM))
+    assert float(colour.thermal_weight.max()) == 0.0 and len(colour.half_depth_density) == 1600
+    assert torch.equal(colour.thermal, scene.grid.temperature.data[:, 0].clamp(0, 1))
     assert float(colour.voxel_weight.sum()) == pytest.approx(1600, rel=1e-4)
     # The first three of six bundles carry both streams.
-    half = field_evidence(scene, bundles(lambda number: RGB_STREAM | THERMAL_STREAM if number < 3 else RGB_STREAM))
-    thermal = field_evidence(scene, [b for n, b in enumerate(rays_along_minus_x()) if n < 3])
-    assert torch.equal(half.temperature.weight, thermal.temperature.weight)
-    assert torch.equal(half.temperature.thermal, thermal.temperature.thermal)
+    half = field_evidence(*scene, bundles(lambda number: RGB_STREAM | THERMAL_STREAM if number < 3 else RGB_STREAM))
+    thermal = field_evidence(*scene, [b for n, b in enumerate(rays_along_minus_x()) if n < 3])
+    assert torch.equal(half.thermal_weight, thermal.thermal_weight)
+    assert torch.equal(half.thermal, thermal.thermal)
     assert torch.equal(half.voxel_weight, colour.voxel_weight)
 
 
@@ -192,14 +192,14 @@ def behind_plane(place: float, backend: Backend) -> Scene:
     grid = VoxelGrid(Lattice.covering((-1, -1, -1), (1, 1, 1), 8), sh_degree=None, activation="exp")
     corners = torch.as_tensor(grid.lattice.corner_positions(), dtype=torch.float32).reshape(-1, 3)
     grid.density.data = 60.0 * (place - corners[:, :1]) / 0.25
-    return Scene(grid, backend)
+    return sampled(grid, backend)
 
 
 @pytest.mark.parametrize("place", [0.02, 0.06, 0.1, 0.16, 0.19, 0.23])
 def test_rays_meet_the_solid_wherever_in_a_voxel_a_sharp_surface_lies(backend, place):
     """The voxel between x = 0 and 0.25 is empty at its centre if the surface lies before 0.125."""
     scene = behind_plane(place, backend)
-    evidence = field_evidence(scene, rays_along_minus_x())
+    evidence = field_evidence(*scene, rays_along_minus_x())
     centre = scene.grid.voxel_density()
     assert len(evidence.half_depth_density) == 1600
     assert bool((centre[4] > 1e3).all()) == (place > 0.125)

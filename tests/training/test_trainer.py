@@ -6,16 +6,15 @@ import pytest
 import tyro
 import yaml
 from nerfstudio.configs.base_config import ViewerConfig
-from numba import njit
+from nerfstudio.utils import writer
 
 from tests.support.boxed_scene import write_boxed_scene
 from tests.support.unreadable import files_end_after
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.errors import CheckpointError, OutputError, ThermoxelsError
 from thermoxels_ns.synthetic.scene_folder import make_scene
-from thermoxels_ns.training import pipeline
 from thermoxels_ns.training.schedule import QUALITIES, schedule_for
-from thermoxels_ns.training.trainer import ThermoxelsTrainer, writer
+from thermoxels_ns.training.trainer import ThermoxelsTrainer
 
 DRAFT = ("--quality", "draft")
 
@@ -85,7 +84,7 @@ def test_where_a_training_begins_and_ends_is_said(scene, checkpoints, tmp_path, 
     made = trainer(scene, tmp_path, *options, *file)
     made.setup()
     assert (made._start_step, made.config.max_num_iterations) == steps
-    assert said in words(capsys) and writer.GLOBAL_BUFFER["max_iter"] == sum(steps)
+    assert said in words(capsys)
 
 
 @pytest.mark.parametrize(
@@ -267,14 +266,3 @@ def test_a_disk_without_room_for_a_checkpoint_is_refused_first(scene, tmp_path, 
         OutputError, match=r"output folder: expected .* MB of space for results in .*, got 1 MB of free"
     ):
         configured(scene, tmp_path).save_config()
-
-
-def test_kernels_are_said_to_compile_only_when_they_do(monkeypatch):
-    said: list[str] = []
-    pipeline.compile_kernels(said.append)  # perhaps for the first time
-    render, said = pipeline.render_rays, []
-    pipeline.compile_kernels(said.append)
-    assert said == []
-    monkeypatch.setattr(pipeline, "render_rays", lambda *given: (njit(lambda x: x + 1)(1), render(*given))[1])
-    pipeline.compile_kernels(said.append)
-    assert len(said) == 1

@@ -93,11 +93,14 @@ def _recorded_samples(
         options.smallest_weight,
         options.early_stop,
         options.distortion_scale or 0.0,
-        int(options.sparsity),
         int(options.thermal_moves_density),
     )
-    sizes = [(count if volume.sh.shape[1] else 0, 3), (count, 1), *[count] * 3]
-    sizes += [count if options.distortion_scale else 0, count if options.sparsity else 0]
+    sizes = [
+        (count if volume.sh.shape[1] else 0, 3),
+        (count, 1),
+        *[count] * 3,
+        count if options.distortion_scale else 0,
+    ]
     sums = Sums(*[np.empty(size, dtype) for size in sizes])
     return RecordedSamples(rays, volume, settings, *_record(rays, volume, settings, sums))
 
@@ -142,7 +145,7 @@ def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayR
     """
     out = _Render.apply(grid.density, grid.sh, grid.temperature, grid, request, options)
     assert isinstance(out, tuple)
-    rgb, thermal, transmittance, accumulation, depth, distortion, sparsity, *variation = out
+    rgb, thermal, transmittance, accumulation, depth, distortion, *variation = out
     return RayRender(
         rgb if grid.sh is not None else None,
         thermal,
@@ -150,7 +153,6 @@ def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayR
         accumulation,
         depth,
         distortion if options.distortion_scale else None,
-        sparsity if options.sparsity else None,
         dict(zip(options.variation, variation)),
     )
 
@@ -174,7 +176,7 @@ class _Render(torch.autograd.Function):
         if ctx.recorded is None:
             raise RuntimeError("a fused render can be differentiated once: its records hold the gradients afterwards")
         recorded, ctx.recorded = ctx.recorded, None
-        rgb, thermal, transmittance, accumulation, depth, distortion, sparsity, *pushes = grad_outputs
+        rgb, thermal, transmittance, accumulation, depth, distortion, *pushes = grad_outputs
         sums, records = recorded.sums, recorded.records
         left = _gradient(transmittance, sums.transmittance)
         if accumulation is not None:
@@ -185,13 +187,12 @@ class _Render(torch.autograd.Function):
             left,
             _gradient(depth, sums.depth) * (sums.accumulation > 0.0) / np.maximum(sums.accumulation, 1e-30),
             _gradient(distortion, sums.distortion),
-            _gradient(sparsity, sums.sparsity),
         )
         of_samples = SampleGradients(
             *(records.offset, records.used, records.number, records.fraction),
             *(records.density, records.transmittance, records.rgb, np.empty(len(records.number), np.uint8)),
         )
-        if any(gradient is not None for gradient in grad_outputs[:7]):
+        if any(gradient is not None for gradient in grad_outputs[:6]):
             inputs = recorded.rays, recorded.volume, recorded.settings, records, grads, sums.depth, of_samples
             run_ranges(lambda a, b: kernels_backward.find_sample_gradients(a, b, *inputs), len(records.used))
         else:

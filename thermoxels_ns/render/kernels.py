@@ -87,7 +87,6 @@ class Settings(NamedTuple):
     smallest_weight: float
     early_stop: float
     distortion_scale: float  # Length that counts as 1 in the distortion, world units; 0: no distortion is computed
-    sparsity: int  # 1: the sparsity is computed; 0: it is not
     thermal_moves_density: int  # 1: density gets a gradient from temperature; 0: it does not
 
 
@@ -131,7 +130,6 @@ class Sums(NamedTuple):
     accumulation: Floats  # (rays,)
     depth: Floats  # (rays,), world units
     distortion: Floats  # (rays,); (0,) where `Settings.distortion_scale` is 0
-    sparsity: Floats  # (rays,); (0,) where `Settings.sparsity` is 0
 
 
 @kernel
@@ -304,7 +302,7 @@ def march_rays(
         length = leave - enter
         path = path_of(rays, r, volume)
         expected, left, depth_sum = 0.0, 1.0, 0.0
-        weight_sum, moment_sum, distortion, sparsity = 0.0, 0.0, 0.0, 0.0
+        weight_sum, moment_sum, distortion = 0.0, 0.0, 0.0
         start, i = n, 0
         records.offset[r] = start
         while i >= 0 and left >= settings.early_stop:
@@ -345,9 +343,6 @@ def march_rays(
                     distortion += 2.0 * weight * (t * weight_sum - moment_sum) + weight * weight * delta / 3.0
                     weight_sum += weight
                     moment_sum += weight * t
-                if settings.sparsity:
-                    limited = min(density, 1e9)
-                    sparsity += math.log1p(2.0 * limited * limited)
                 n += 1
                 if left < settings.early_stop:
                     break
@@ -357,8 +352,6 @@ def march_rays(
         sums.depth[r] = expected / opacity if opacity > 0.0 else math.inf
         if settings.distortion_scale > 0.0:
             sums.distortion[r] = distortion / settings.distortion_scale
-        if settings.sparsity:
-            sums.sparsity[r] = sparsity
     return wrong, n
 
 

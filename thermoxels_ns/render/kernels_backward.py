@@ -43,7 +43,6 @@ class RayGradients(NamedTuple):
     transmittance: Floats  # Gradient for the transmittance minus that for the accumulation, 1 - transmittance
     depth: Floats  # Gradient for the depth, divided by the accumulation; 0 where this is 0
     distortion: Floats
-    sparsity: Floats
 
 
 @kernel
@@ -120,10 +119,6 @@ def find_sample_gradients(
             slope = gain * left - behind - end_term
             behind += gain * weight
             slope = slope * delta if density * delta < OPAQUE else 0.0
-            if settings.sparsity:
-                limited = min(density, 1e9)
-                if density < 1e9:
-                    slope += grads.sparsity[r] * 4.0 * limited / (1.0 + 2.0 * limited * limited)
             if volume.activation == RELU:
                 slope = slope if density > 0.0 else 0.0
             elif volume.activation == SOFTPLUS:

@@ -46,7 +46,6 @@ class RenderOptions:
     colour_channels: int | None = None
     """Number of channels over which the total variation of colour is averaged; channels that the grid does not store
     yet count as 0. None: the stored channels."""
-    sparsity: bool = False  # True: compute the Cauchy sparsity of each ray, over its samples
     variation: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Blocks of kept voxels whose total variation is computed, by parameter: first number, and one behind the last."""
 
@@ -61,7 +60,6 @@ class RayRender:
     accumulation: Float[Tensor, " rays"]  # Opacity, 1 - transmittance, with all digits when it is small
     depth: Float[Tensor, " rays"]  # Weighted mean distance, world units; infinite at opacity 0
     distortion: Float[Tensor, " rays"] | None = None  # See `reference.ray_distortion`; None where not requested
-    sparsity: Float[Tensor, " rays"] | None = None  # Sum of log(1 + 2 density^2) over the samples of each ray
     variation: dict[str, Float[Tensor, ""]] = field(default_factory=dict)  # Total variation by parameter name
 
 

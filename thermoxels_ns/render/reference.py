@@ -16,15 +16,6 @@ from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import GridSamples, RayRender, RayRequest, RenderOptions
 
 
-@dataclass(frozen=True)
-class RaySteps:
-    """Steps along rays, with one sample in the middle of each step, padded to the ray with most steps."""
-
-    t: Float[Tensor, "rays steps"]  # Distance of each sample (the middle of its step) from the ray origin, world units
-    deltas: Float[Tensor, "rays steps"]
-    """Length of each step, world units; 0 for padding. The lengths of a ray sum to its length inside the box."""
-
-
 def intersect_box(
     origins: Float[Tensor, "rays 3"],
     directions: Float[Tensor, "rays 3"],
@@ -60,14 +51,19 @@ def sample_box(
     step: float,
     near: float | Float[Tensor, " rays"] = 0.0,
     far: Float[Tensor, " rays"] | None = None,
-) -> RaySteps:
-    """Cut the part of each ray inside the box into steps of length `step`; the last step may be shorter."""
+) -> tuple[Float[Tensor, "rays steps"], Float[Tensor, "rays steps"]]:
+    """Cut the part of each ray inside the box into steps of length `step`; the last step may be shorter.
+
+    Returns:
+        Distance from the ray origin to the middle of each step, and length of each step, world units. Rays are padded
+        with steps of length 0; the lengths of a ray sum to its length inside the box.
+    """
     t_enter, t_leave, _ = intersect_box(origins, directions, lo, hi, near, far)
     length = t_leave - t_enter
     num_steps = max(1, int(torch.ceil(length.amax() / step)) if len(length) else 1)
     starts = torch.arange(num_steps, dtype=origins.dtype, device=origins.device) * step
     deltas = torch.clamp(length[:, None] - starts, min=0.0, max=step)
-    return RaySteps(t=t_enter[:, None] + starts + 0.5 * deltas, deltas=deltas)
+    return t_enter[:, None] + starts + 0.5 * deltas, deltas
 
 
 OPAQUE_OPTICAL_DEPTH = 100.0
@@ -75,19 +71,12 @@ OPAQUE_OPTICAL_DEPTH = 100.0
 SMALLEST_VARIATION = 1e-10  # Number added under the root of the total variation to keep its gradient finite
 
 
-@dataclass(frozen=True)
-class RayWeights:
-    """The shares of each ray's light that end in each of its steps and behind the last step."""
+def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> tuple[Tensor, Tensor]:
+    """Return the weights w_i = exp(-sum_{j<i} s_j d_j) (1 - exp(-s_i d_i)) and the optical depth sum_i s_i d_i of rays.
 
-    weights: Float[Tensor, "rays steps"]  # Share of its ray's light that ends in each step
-    transmittance: Float[Tensor, " rays"]  # Share of the light that is left behind the last step
-    accumulation: Float[Tensor, " rays"]  # Opacity, 1 - transmittance, with all digits when it is small
+    Densities s, lengths d and weights have shape (rays, steps), optical depths (rays,).
 
-
-def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> RayWeights:
-    """Return the weights w_i = exp(-sum_{j<i} s_j d_j) (1 - exp(-s_i d_i)) for densities s and lengths d.
-
-    This is eq. 1 of the paper, with s in 1 / world unit. Weights and transmittance of a ray sum to 1. An infinite
+    This is eq. 1 of the paper, with s in 1 / world unit. Weights and exp(-optical depth) of a ray sum to 1. An infinite
     density is opaque, but a step of length 0 has no weight. Optical depths are summed and 1 - exp(-x) is -expm1(-x), so
     that neither opaque rays nor small densities lose digits.
 
@@ -103,17 +92,7 @@ def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "ray
     )
     total = torch.cumsum(optical_depth, dim=-1)
     before = torch.cat((torch.zeros_like(total[:, :1]), total[:, :-1]), dim=-1)
-    return RayWeights(
-        weights=torch.exp(-before) * -torch.expm1(-optical_depth),
-        transmittance=torch.exp(-total[:, -1]),
-        accumulation=-torch.expm1(-total[:, -1]),
-    )
-
-
-def ray_sparsity(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> Float[Tensor, " rays"]:
-    """Return the Cauchy sparsity of each ray, sum_i log(1 + 2 s_i^2) over its steps (Plenoxels, eq. 5; SNeRG)."""
-    terms = torch.log1p(2.0 * density.clamp(max=1e9) ** 2)
-    return torch.sum(torch.where(deltas > 0, terms, torch.zeros_like(terms)), -1)
+    return torch.exp(-before) * -torch.expm1(-optical_depth), total[:, -1]
 
 
 def ray_distortion(
@@ -137,54 +116,53 @@ def ray_distortion(
 
 @dataclass(frozen=True)
 class Marched:
-    """Samples of rays through the box, with their densities and weights."""
+    """Samples of rays through the box, one in the middle of each step, with their weights."""
 
-    steps: RaySteps
-    density: Float[Tensor, "rays steps"]  # Density at the samples, 0 outside kept voxels, [1 / world unit]
-    along: RayWeights
+    t: Float[Tensor, "rays steps"]  # Distance of each sample from the ray origin, world units
+    deltas: Float[Tensor, "rays steps"]  # Length of each step, world units; 0 for padding
+    weights: Float[Tensor, "rays steps"]  # Share of its ray's light that ends in each step
+    optical_depth: Float[Tensor, " rays"]  # exp(-optical_depth) is the share of light behind the last step
     active: Int64[Tensor, " n"]  # Flat indices (into rays x steps) of the samples in kept voxels, ascending
     ray: Int64[Tensor, " n"]  # Ray of each sample in `active`
     at: TrilinearPoints  # Voxel of each sample in `active`, and the place in the voxel
 
 
 def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> Marched:
-    """Return the samples of rays through a grid with their densities and weights."""
+    """Return the samples of rays through a grid with their weights."""
     origins, directions, lattice = request.origins, request.directions, grid.lattice
     lo = torch.tensor(lattice.lo, dtype=origins.dtype, device=origins.device)
     hi = torch.tensor(lattice.hi, dtype=origins.dtype, device=origins.device)
     step = lattice.voxel_size / options.steps_per_voxel
-    steps = sample_box(origins, directions, lo, hi, step, request.near, request.far)
-    active = (steps.deltas > 0).flatten().nonzero()[:, 0]
-    ray = active // steps.t.shape[1]
-    positions = origins[ray] + directions[ray] * steps.t.flatten()[active][:, None]
+    t, deltas = sample_box(origins, directions, lo, hi, step, request.near, request.far)
+    active = (deltas > 0).flatten().nonzero()[:, 0]
+    ray = active // t.shape[1]
+    positions = origins[ray] + directions[ray] * t.flatten()[active][:, None]
     at = grid.locate(positions)
     kept = at.kept()  # a point that rounding puts outside the box counts to the nearest voxel, as in the kernels
     active, ray, at = active[kept], ray[kept], at.select(kept)
-    density = torch.zeros_like(steps.t).flatten().index_put((active,), grid.density_at(at)).view_as(steps.t)
-    return Marched(steps, density, ray_weights(density, steps.deltas), active, ray, at)
+    density = torch.zeros_like(t).flatten().index_put((active,), grid.density_at(at)).view_as(t)
+    return Marched(t, deltas, *ray_weights(density, deltas), active, ray, at)
 
 
 def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
     """Return what rays see of a grid, in plain torch; faster renderers are tested against this function."""
     marched = march(grid, request, options)
-    steps, along, ray = marched.steps, marched.along, marched.ray
-    weight = along.weights.flatten()[marched.active]
+    weights, t, ray = marched.weights, marched.t, marched.ray
+    weight = weights.flatten()[marched.active]
 
     def summed(values_at: Callable[..., Tensor], wants: Tensor | None, weight: Tensor, channels: int) -> Tensor:
         """Return sum_i w_i c_i of each ray that wants the value, over samples above the smallest weight; else 0."""
         chosen = weight.detach() > options.smallest_weight
         chosen = (chosen if wants is None else chosen & wants[ray]).nonzero()[:, 0]
         values = values_at(marched.at.select(chosen), request.directions[ray[chosen]]) * weight[chosen][:, None]
-        return values.new_zeros((len(steps.t), channels)).index_add(0, ray[chosen], values)
+        return values.new_zeros((len(t), channels)).index_add(0, ray[chosen], values)
 
     thermal_weight = weight if options.thermal_moves_density else weight.detach()
-    expected = (along.weights * steps.t).sum(-1)
-    depth = torch.where(along.accumulation > 0, expected / along.accumulation.clamp(min=1e-30), torch.inf)
-    distortion = sparsity = None
+    opacity = -torch.expm1(-marched.optical_depth)
+    depth = torch.where(opacity > 0, (weights * t).sum(-1) / opacity.clamp(min=1e-30), torch.inf)
+    distortion = None
     if options.distortion_scale:
-        distortion = ray_distortion(along.weights, steps.t, steps.deltas, options.distortion_scale)
-    if options.sparsity:
-        sparsity = ray_sparsity(marched.density, steps.deltas)
+        distortion = ray_distortion(weights, t, marched.deltas, options.distortion_scale)
     corners, parameters = grid.voxels.tables(grid.density.device)[0], grid.row_parameters()
     variation = {
         name: total_variation(parameters[name], corners[a:b], options.colour_channels if name == "sh" else None)
@@ -193,11 +171,10 @@ def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayR
     return RayRender(
         summed(grid.rgb_at, request.rgb_rays, weight, 3) if grid.sh is not None else None,
         summed(grid.thermal_at, request.thermal_rays, thermal_weight, 1),
-        along.transmittance,
-        along.accumulation,
+        torch.exp(-marched.optical_depth),
+        opacity,
         depth,
         distortion,
-        sparsity,
         variation,
     )
 
@@ -205,10 +182,10 @@ def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayR
 def samples(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> GridSamples:
     """Return the samples of rays in kept voxels with their weights; neither colour nor temperature is read."""
     marched = march(grid, request, options)
-    weights = marched.along.weights
+    weights = marched.weights
     before = torch.cumsum(weights, -1) - weights
     weight, before = weights.flatten()[marched.active], before.flatten()[marched.active]
-    return GridSamples(marched.ray, marched.at, weight, before, marched.along.transmittance)
+    return GridSamples(marched.ray, marched.at, weight, before, torch.exp(-marched.optical_depth))
 
 
 def total_variation(

@@ -1,9 +1,12 @@
-"""Callbacks that change the grid during training: carve, refine, prune, widen colour, decide on backgrounds."""
+"""Callbacks of a training: carve, refine, prune, widen colour, decide on backgrounds, tell its progress."""
 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from dataclasses import replace
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -17,13 +20,13 @@ from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.data.datamanager import views_of_cameras
-from thermoxels_ns.field.refine import RowChange, prune, refine
+from thermoxels_ns.field.refine import RowChange, prune, refine, widen_colour
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import mean_colours
 from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs
 from thermoxels_ns.multiview.votes import air_voxels, hardly_shown
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
-from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
+from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.plain_areas import PlainAreas
 from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 
@@ -32,6 +35,7 @@ FEWEST_SKY_DIFFERENCE = 0.01
 """Share of the temperature range by which the learned sky must differ from the scene's minimum to be kept."""
 MOST_OPENED_RAYS = 0.01  # Of the rays of opacity above one half, the largest share that pruning may open
 OPAQUE_DEPTH = 0.7  # Optical depth across a voxel from which the voxel counts as opaque: half of the light is lost
+PROGRESS_LINES, LONGEST_SILENCE_S = 20, 60.0  # A line of progress at each such part of the steps, or after so long
 PRUNING_ATTEMPTS = 4  # Number of thresholds tried before pruning fails
 RAYS_PER_IMAGE = 4096  # Training rays per image from which statistics are made
 SHORTEST_RUN_WITH_DEPTHS = 400
@@ -44,9 +48,11 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     evidence = follow_depths(model, attributes)
     factors = model.config.refinements()
     steps = {*factors, *model.config.prune_at, *model.config.thin_at}
-    end = None
+    end, told = None, list[TrainingCallback]()
     if attributes.trainer is not None:
-        end = attributes.trainer._start_step + attributes.trainer.config.max_num_iterations
+        first = attributes.trainer._start_step
+        end = first + attributes.trainer.config.max_num_iterations
+        told = [TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], progress(first, end))]
         late = sorted(step for step in steps if step >= end)
         if late:
             CONSOLE.log(f"the run ends before step {end}: no refinement or pruning at {', '.join(map(str, late))}")
@@ -94,7 +100,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         datamanager: Any = attributes.pipeline.datamanager
         grid, prefix = model.seen_surroundings.grid, "surroundings_"
         rays = datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE)
-        largest = voxel_weights(SurroundingsSampler(model), rays).largest.cpu().numpy()
+        largest = voxel_weights(grid, model.sample_surroundings, rays).largest.cpu().numpy()
         keep = grid.voxels.dilated(largest > (model.config.prune_threshold if step else 0.0), 1)
         if not keep.any():
             model.backdrop_on[2], keep[0] = False, True  # one voxel stays: parameters need a row
@@ -141,14 +147,15 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             carve(step)
 
     def widen(step: int) -> None:
-        """Widen colour if its step is reached, also in a resumed training, and tell the optimiser."""
+        """Let the grid store all harmonics of colour once their step is reached, and tell the optimiser."""
         assert attributes.optimizers is not None
-        old, change = model.grid.sh, model.widen_colour()
-        if old is not None and change is not None:
-            optimizer: Any = attributes.optimizers.optimizers["sh"]
-            assert model.grid.sh is not None
-            optimizer.change_columns(old, model.grid.sh, change)
-            attributes.optimizers.parameters["sh"] = [model.grid.sh]
+        old, stored, degree = model.grid.sh, model.grid.sh_degree, model.config.sh_degree
+        if stored is None or degree is None or stored >= degree:
+            return
+        if int(model.trained_steps) >= model.config.view_dependence_from:
+            change, optimizer = widen_colour(model.grid, degree), attributes.optimizers.optimizers["sh"]
+            optimizer.change_columns(old, model.grid.sh, change)  # type: ignore[attr-defined]
+            attributes.optimizers.parameters["sh"] = [model.grid.sh]  # type: ignore[list-item]
 
     early = min(steps | decisions) // 3
     return [
@@ -157,7 +164,30 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         TrainingCallback(before, change_surroundings, iters=tuple({0, early})),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
         TrainingCallback(before, widen),
+        *told,
     ]
+
+
+def progress(first: int, end: int) -> Callable[[int], None]:
+    """Return a function to call after each step from `first` to before `end`, which prints a line of progress at times.
+
+    The line says how many steps are done and how long the others take at the pace since the line before. It comes at
+    each twentieth of the steps and after a minute without one, the same on a terminal and in a file.
+    """
+    said_s, said = time.monotonic(), first + 1
+
+    def tell(step: int) -> None:
+        nonlocal said_s, said
+        done, now = step + 1, time.monotonic()
+        if done == first + 1:  # kernels may have been compiled in the first step
+            said_s = now
+        elif done * PROGRESS_LINES // end > said * PROGRESS_LINES // end or now - said_s > LONGEST_SILENCE_S:
+            left = timedelta(seconds=round((end - done) * (now - said_s) / (done - said)))
+            more = f"; at this pace {left} more" if done < end else ""
+            CONSOLE.print(f"step {done:,} of {end:,} ({100 * done / end:.0f} %){more}", highlight=False)
+            said_s, said = now, done
+
+    return tell
 
 
 def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> PhotographEvidence | None:
@@ -215,7 +245,8 @@ def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilatio
     def rays():
         return datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE)
 
-    weights, voxels, opened = voxel_weights(model, rays()), model.grid.voxels, 1.0
+    field = model.grid, model.sample_rays
+    weights, voxels, opened = voxel_weights(*field, rays()), model.grid.voxels, 1.0
     density = model.grid.voxel_density().view(-1)[model.grid.cells].cpu().numpy()
     opaque = density * voxels.lattice.voxel_size > OPAQUE_DEPTH
     for attempt in range(PRUNING_ATTEMPTS):
@@ -224,7 +255,7 @@ def prune_by_rays(model: ThermoxelsModel, datamanager, threshold: float, dilatio
         if not chosen.any():
             continue
         keep = voxels.dilated(chosen, dilation) | (voxels.dilated(chosen, 1) & opaque)
-        opened = share_of_rays_opened(model, rays(), torch.from_numpy(keep).to(weights.largest.device))
+        opened = share_of_rays_opened(*field, rays(), torch.from_numpy(keep).to(weights.largest.device))
         if opened <= MOST_OPENED_RAYS:
             kept, total = int(keep.sum()), math.prod(voxels.lattice.cell_shape)
             said = (
@@ -242,10 +273,10 @@ def decide_backdrop(model: ThermoxelsModel, datamanager) -> None:
 
     The decision is repeated at every change of the lattice, because surfaces may form late.
     """
-    config = model.config
+    config, field = model.config, (model.grid, model.sample_rays)
     rgb_on, thermal_on, _ = model.backdrop_on.tolist()
     if config.background == "auto" and rgb_on:
-        unsaturated, _ = backdrop_evidence(model, datamanager.training_rays(RGB_STREAM, RAYS_PER_IMAGE))
+        unsaturated, _ = backdrop_evidence(*field, datamanager.training_rays(RGB_STREAM, RAYS_PER_IMAGE))
         keep = unsaturated >= FEWEST_OPEN_RAYS
         model.backdrop_on[0] = keep
         CONSOLE.log(
@@ -253,7 +284,7 @@ def decide_backdrop(model: ThermoxelsModel, datamanager) -> None:
             f"{unsaturated:.2%} of RGB rays leave the box unsaturated"
         )
     if config.thermal_background == "auto" and thermal_on and model.background_thermal is not None:
-        unsaturated, directions = backdrop_evidence(model, datamanager.training_rays(THERMAL_STREAM, RAYS_PER_IMAGE))
+        unsaturated, directions = backdrop_evidence(*field, datamanager.training_rays(THERMAL_STREAM, RAYS_PER_IMAGE))
         sky = model.background_thermal(directions)
         difference = float(sky.abs().mean()) if len(sky) else 0.0
         learned = unsaturated >= FEWEST_OPEN_RAYS and difference > FEWEST_SKY_DIFFERENCE

@@ -27,7 +27,7 @@ from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.kept_voxels import check_memory
-from thermoxels_ns.field.refine import ColumnChange, RowChange, refine, widen_colour
+from thermoxels_ns.field.refine import RowChange, refine
 from thermoxels_ns.field.surroundings import SkyTemperature, SphereImage, Surroundings
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
@@ -49,6 +49,9 @@ from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.plain_areas import PlainAreas, bend_loss
 from thermoxels_ns.training.ray_statistics import field_evidence
 
+FEATURE_RAYS = 512  # Feature rays (to depths or to points of structure from motion) that each step draws
+EARLY_STOP = 1e-5  # A ray ends where less than this share of its light is left, by which its pixel may be off
+VARIATION_SHARE = 0.1  # Share of the kept voxels over which each step computes total variation
 SURROUNDINGS = (48, 12)
 """Voxels of the surroundings at the start: across a face of the box, and from a face to infinity. They are split when
 the voxels of the box are."""
@@ -106,7 +109,7 @@ class ThermoxelsModel(Model):
             config.density_activation,
         )
         wants_rgb = config.sh_degree is not None and config.background != "off"
-        self.background_rgb = SphereImage(config.background_height) if wants_rgb else None
+        self.background_rgb = SphereImage() if wants_rgb else None
         self.background_thermal = SkyTemperature() if config.thermal_background != "minimum" else None
         start = (*SURROUNDINGS, SURROUNDINGS_DENSITY, config.density_activation, wants_rgb)
         self.surroundings = Surroundings(torch.from_numpy(box), *start) if config.surroundings == "on" else None
@@ -166,17 +169,6 @@ class ThermoxelsModel(Model):
         CONSOLE.log(f"memory: {check_memory(lattice, voxels, channels, self.config.memory_budget_gb)}")
         return refine(self.grid, factor)
 
-    def widen_colour(self) -> ColumnChange | None:
-        """Let the grid store all harmonics of colour if step `view_dependence_from` is reached.
-
-        Returns:
-            Change of the columns of colour; None if the columns stay as they are.
-        """
-        degree, stored = self.config.sh_degree, self.grid.sh_degree
-        if degree is None or stored is None or int(self.trained_steps) < self.config.view_dependence_from:
-            return None
-        return widen_colour(self.grid, degree) if stored < degree else None
-
     def update_to_step(self, step: int) -> None:
         """Set the step of training, on which weights, random blocks and random rays depend."""
         self.step = step
@@ -193,14 +185,15 @@ class ThermoxelsModel(Model):
 
     def _options(self) -> RenderOptions:
         c = self.config
-        return RenderOptions(c.steps_per_voxel, c.smallest_weight, c.early_stop, c.thermal_density_gradient)
+        return RenderOptions(
+            smallest_weight=c.smallest_weight, early_stop=EARLY_STOP, thermal_moves_density=c.thermal_density_gradient
+        )
 
     def _training_options(self) -> RenderOptions:
         """Return the options with which a training step renders: those of images and what the loss terms need."""
         return replace(
             self._options(),
             distortion_scale=2.0 * self.unit if self._distortion_weight() > 0 else None,
-            sparsity=self.loss_weights.sparsity > 0,
             colour_channels=None if self.config.sh_degree is None else 3 * num_coefficients(self.config.sh_degree),
             variation=self._blocks(self.grid, 1_000_003),
         )
@@ -209,7 +202,7 @@ class ThermoxelsModel(Model):
         """Return the blocks of a grid whose total variation this step computes, by the name of the parameter."""
         generator = torch.Generator().manual_seed(self.config.seed * stream + self.step)
         return {
-            name: losses.random_block(len(grid.voxels), self.config.tv_share, generator)
+            name: losses.random_block(len(grid.voxels), VARIATION_SHARE, generator)
             for name in grid.row_parameters()
             if getattr(self.loss_weights, f"tv_{name}")
         }
@@ -228,6 +221,13 @@ class ThermoxelsModel(Model):
     def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
         """Return the samples of rays in kept voxels of the box with their weights, for statistics."""
         return sample_rays(self.grid, self._request(origins, directions), self._options(), self.config.backend)
+
+    def sample_surroundings(self, origins: Tensor, directions: Tensor) -> GridSamples:
+        """Return the samples in the surroundings; each straight piece of a ray counts as a ray, the box hides none."""
+        assert self.surroundings is not None
+        cut = self.surroundings.segments(origins, directions)
+        request = RayRequest(cut.origins, cut.directions, 0.0, cut.lengths)
+        return sample_rays(self.surroundings.grid, request, RenderOptions(), self.config.backend)
 
     def render_rays(self, request: RayRequest, options: RenderOptions) -> SceneRender:
         """Return what rays see of the box, the surroundings and infinity."""
@@ -314,7 +314,7 @@ class ThermoxelsModel(Model):
                 seen = torch.where(measured >= SATURATED, torch.minimum(seen, measured), seen)
             terms["rgb_loss"] = weights.rgb * losses.rgb_loss(seen, measured)
         if weights.thermal and (pair := _seen_and_measured(outputs, batch, "thermal", "thermal")) is not None:
-            terms["thermal_loss"] = weights.thermal * losses.thermal_loss(*pair, self.config.thermal_l2_share)
+            terms["thermal_loss"] = weights.thermal * losses.thermal_loss(*pair)
         if not self.training:
             return terms
         render: SceneRender = outputs["render"]
@@ -323,8 +323,6 @@ class ThermoxelsModel(Model):
             if around is not None:
                 value = value + SURROUNDINGS_VARIATION * around.variation.get(name, 0.0)
             terms[f"tv_{name}_loss"] = getattr(weights, f"tv_{name}") * value
-        if box.sparsity is not None:
-            terms["sparsity_loss"] = weights.sparsity * box.sparsity.mean()
         if weights.beta:
             terms["beta_loss"] = weights.beta * losses.beta_loss(box.accumulation)
         if box.distortion is not None:
@@ -344,12 +342,11 @@ class ThermoxelsModel(Model):
             if weight and sampler is not None:
                 generator = torch.Generator().manual_seed((self.config.seed + 1) * 2_000_003 + self.step)
                 step = 0.0 if self.seen_surroundings is None else self.seen_surroundings.step
-                request = sampler.request(self.config.track_rays, near, voxel, generator, self.device, step)
+                request = sampler.request(FEATURE_RAYS, near, voxel, generator, self.device, step)
                 known[f"{name}_loss"] = request, partial(self._feature_ray_loss, weight, sampler)
         if weights.bend and self.plain_areas:  # None, or without any, in a scene without plain areas
             generator = torch.Generator().manual_seed((self.config.seed + 1) * 5_000_011 + self.step)
-            most = max(1, self.config.track_rays // 4)
-            request, length = self.plain_areas.request(most, near, generator, self.device)
+            request, length = self.plain_areas.request(FEATURE_RAYS // 4, near, generator, self.device)
             known["bend_loss"] = (
                 request,
                 lambda seen: weights.bend * bend_loss(seen.box.depth, seen.box.accumulation, length, voxel),
@@ -478,9 +475,9 @@ class ThermoxelsModel(Model):
         elsewhere; corners without a row are grey.
         """
         grid, colour, evidence = self.grid, None, None
-        seen = field_evidence(self, rays)
+        seen = field_evidence(grid, self.sample_rays, rays)
         # Corners without a row get the middle of the range; nothing reads these values.
-        thermal = grid.corner_values(seen.temperature.thermal.float(), fill=0.5)
+        thermal = grid.corner_values(seen.thermal.float(), fill=0.5)
         if grid.sh is not None and grid.sh_degree is not None:
             constant = harmonics(grid.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # degree 0 is the same in all directions
             mean = grid.sh.view(len(grid.sh), 3, num_coefficients(grid.sh_degree))[..., 0] * constant
@@ -494,7 +491,7 @@ class ThermoxelsModel(Model):
             grid.lattice,
             density=grid.corner_density().float().cpu().numpy(),
             temperature_c=self.temperature_range.to_celsius(thermal).cpu().numpy(),
-            observed_weight=grid.corner_values(seen.temperature.weight.float()).cpu().numpy(),
+            observed_weight=grid.corner_values(seen.thermal_weight.float()).cpu().numpy(),
             voxel_density=grid.voxel_density().float().cpu().numpy(),
             colour=colour,
             evidence=evidence,
@@ -510,20 +507,6 @@ def _seen_and_measured(
     if outputs.get(name) is None or not len(chosen):
         return None
     return outputs[name].index_select(0, chosen), batch[target].index_select(0, chosen)
-
-
-class SurroundingsSampler:
-    """A `RaySampler` of the surroundings: each straight piece of a ray counts as a ray, and the box hides nothing."""
-
-    def __init__(self, model: ThermoxelsModel) -> None:
-        assert model.surroundings is not None
-        self.grid, self._surroundings, self._config = model.surroundings.grid, model.surroundings, model.config
-
-    def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
-        """Return the samples of the pieces of rays in kept voxels of the surroundings."""
-        cut = self._surroundings.segments(origins, directions)
-        request = RayRequest(cut.origins, cut.directions, 0.0, cut.lengths)
-        return sample_rays(self.grid, request, RenderOptions(), self._config.backend)
 
 
 ThermoxelsModelConfig.model_class = ThermoxelsModel

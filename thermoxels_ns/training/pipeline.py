@@ -19,14 +19,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from thermoxels_ns.core.config_loader import ModuleWith
 from thermoxels_ns.core.errors import CheckpointError, SceneError
 from thermoxels_ns.core.feature_rays import RGB_STREAM, THERMAL_STREAM
-from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.core.threads import set_num_threads
-from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
-from thermoxels_ns.render.renderers import choose_backend, render_rays
+from thermoxels_ns.render.renderers import choose_backend
 from thermoxels_ns.training.model import ThermoxelsModel
-from thermoxels_ns.training.optimizers import RowAdam
 
 _GRID = "_model.grid."
 _ACTIVATION = f"{_GRID}activation_index"
@@ -64,8 +60,7 @@ class ThermoxelsPipeline(VanillaPipeline):
         if "OMP_NUM_THREADS" not in os.environ:
             torch.set_num_threads(max(1, (os.cpu_count() or 2) // 2))
         super().__init__(config, *args, **kwargs)
-        if choose_backend(self.model.config.backend, self.model.grid.density.device) == "fused":
-            compile_kernels(CONSOLE.log)
+        choose_backend(self.model.config.backend, self.model.grid.density.device)  # refused before the first step
         streams = getattr(config.datamanager, "streams", "both")
         if streams == "thermal" and (self.model.grid.sh is not None or not self.model.config.thermal_density_gradient):
             expected = "thermal images alone only for a model without colour whose density they move"
@@ -230,33 +225,3 @@ def load_checkpoint(path: Any, **options: Any) -> dict[str, Any]:
             got, remedy = problem.strerror, "Check its permissions and the disk."
         expected = "a checkpoint that can be read, of tensors and numbers"
         raise CheckpointError(str(path), expected=expected, got=got, remedy=remedy) from problem
-
-
-def compile_kernels(say: Callable[[str], None]) -> None:
-    """Run every kernel of training once, so that numba compiles and caches it; call `say` if numba has to compile."""
-    from numba.core import event
-
-    class Once(event.Listener):
-        """Calls `say` at the first compilation; loading a cached kernel is none."""
-
-        told = False
-
-        def on_start(self, event: Any) -> None:
-            if not self.told:
-                say("compiling the kernels for this processor: 10 to 30 s, the first time")
-            self.told = True
-
-        def on_end(self, event: Any) -> None:
-            pass
-
-    with event.install_listener("numba:compile", Once()):
-        grid = VoxelGrid(Lattice((-1.0, -1.0, -1.0), 1.0, (3, 3, 3)))
-        generator = torch.Generator().manual_seed(0)
-        origins = 3.0 * torch.nn.functional.normalize(torch.randn(4, 3, generator=generator), dim=-1)
-        request = RayRequest(origins, torch.nn.functional.normalize(-origins, dim=-1))
-        variation = {name: (0, 2) for name in grid.row_parameters()}
-        options = RenderOptions(distortion_scale=1.0, sparsity=True, variation=variation)
-        seen = render_rays(grid, request, options, "fused")
-        assert seen.rgb is not None
-        (seen.rgb.sum() + seen.thermal.sum() + sum(seen.variation.values())).backward()
-        RowAdam(list(grid.parameters())).step()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -16,18 +15,18 @@ from thermoxels_ns.field.interpolation import TrilinearPoints, splat
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.renderers import GridSamples
 
+Sampler = Callable[[Tensor, Tensor], GridSamples]
+"""A function from origins and directions of rays, (n, 3) each, to their samples in kept voxels of a grid."""
 
-class RaySampler(Protocol):
-    """A model with a voxel grid that can be sampled along rays."""
 
-    @property
-    def grid(self) -> VoxelGrid:
-        """The voxel grid that rays sample."""
-        ...
-
-    def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
-        """Return the samples of rays (n, 3) in kept voxels with their weights."""
-        ...
+def _sampled(
+    grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]
+) -> Iterator[tuple[RayBundle, Tensor, GridSamples]]:
+    """Yield each batch of rays, its directions on the device of the grid, and its samples."""
+    device = grid.density.device
+    for bundle in rays:
+        directions = bundle.directions.to(device)
+        yield bundle, directions, sample(bundle.origins.to(device), directions)
 
 
 @dataclass(frozen=True)
@@ -40,13 +39,12 @@ class VoxelWeights:
 
 
 @torch.no_grad()
-def voxel_weights(model: RaySampler, rays: Iterable[RayBundle]) -> VoxelWeights:
+def voxel_weights(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) -> VoxelWeights:
     """Return for each kept voxel the largest weight of a sample on any ray, and whether some ray ends in the voxel."""
-    density = model.grid.density
-    largest = torch.zeros(len(model.grid.voxels), device=density.device)
-    ends = torch.zeros(len(model.grid.voxels), dtype=torch.bool, device=density.device)
-    for bundle in rays:
-        samples = model.sample_rays(bundle.origins.to(density.device), bundle.directions.to(density.device))
+    device = grid.density.device
+    largest = torch.zeros(len(grid.voxels), device=device)
+    ends = torch.zeros(len(grid.voxels), dtype=torch.bool, device=device)
+    for _, _, samples in _sampled(grid, sample, rays):
         largest.scatter_reduce_(0, samples.at.number, samples.weight.to(largest.dtype), reduce="amax")
         ends[samples.at.number[_half_way(samples)]] = True
     return VoxelWeights(largest, ends)
@@ -64,15 +62,15 @@ def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
 
 
 @torch.no_grad()
-def share_of_rays_opened(model: RaySampler, rays: Iterable[RayBundle], keep: Bool[Tensor, " voxels"]) -> float:
+def share_of_rays_opened(
+    grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle], keep: Bool[Tensor, " voxels"]
+) -> float:
     """Of the rays with opacity above one half, return the share that pruning to `keep` would open.
 
     A ray is opened if more than half of its weight lies in voxels that are False in `keep`.
     """
-    device = model.grid.density.device
     hit, opened = 0, 0
-    for bundle in rays:
-        samples = model.sample_rays(bundle.origins.to(device), bundle.directions.to(device))
+    for _, _, samples in _sampled(grid, sample, rays):
         lost = torch.zeros_like(samples.transmittance)
         goes = ~keep[samples.at.number]
         lost.index_add_(0, samples.ray[goes], samples.weight[goes].to(lost.dtype))
@@ -90,21 +88,15 @@ _END_STEPS = 5
 
 
 @dataclass(frozen=True)
-class CornerTemperature:
-    """The temperature that thermal rays see around each corner of a kept voxel."""
-
-    thermal: Float[Tensor, " rows"]
-    """Normalised temperature, clipped to [0, 1]; the stored value at corners that no thermal ray reaches."""
-    weight: Float[Tensor, " rows"]
-    """Sum of the weights of the first-hit samples around the corner, shared out by trilinear weights, [rays]."""
-
-
-@dataclass(frozen=True)
 class FieldEvidence:
     """Statistics of training rays about the trained field, for the mesher."""
 
     rays: int  # Number of rays
-    temperature: CornerTemperature  # Temperatures that the thermal rays see
+    thermal: Float[Tensor, " rows"]
+    """Normalised temperature that thermal rays see around each corner of a kept voxel, clipped to [0, 1]; the stored
+    value at corners that no thermal ray reaches."""
+    thermal_weight: Float[Tensor, " rows"]
+    """Sum of the weights of the first-hit samples around each corner, shared out by trilinear weights, [rays]."""
     voxel_weight: Float[Tensor, " voxels"]  # Sum of the weights of all rays in each kept voxel, [rays]
     voxel_ends: Float[Tensor, " voxels"]
     """Number of rays that end on something (opacity above one half) and complete half of their weight in each kept
@@ -115,7 +107,7 @@ class FieldEvidence:
 
 
 @torch.no_grad()
-def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidence:
+def field_evidence(grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]) -> FieldEvidence:
     """Return the evidence of training rays about the trained field, found in one pass.
 
     The temperature of a corner is a mean over samples of thermal rays, weighted by their share of the pixel; stored
@@ -123,7 +115,6 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
     of rays of opacity above one half, before half of the light is spent, so that light which leaks through a surface
     measures nothing behind it. A ray without a stream (see `core.feature_rays`) counts as thermal.
     """
-    grid = model.grid
     device = grid.density.device
     centre_density = grid.voxel_density()
     corners = torch.zeros(grid.voxels.num_rows, 2, device=device)
@@ -131,9 +122,7 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
     ends = torch.zeros_like(voxels)
     half_depth = [centre_density.view(-1)[:0]]
     seen = 0
-    for bundle in rays:
-        directions = bundle.directions.to(device)
-        samples = model.sample_rays(bundle.origins.to(device), directions)
+    for bundle, directions, samples in _sampled(grid, sample, rays):
         seen += len(directions)
         voxels.index_add_(0, samples.at.number, samples.weight.double())
         half_way = _half_way(samples)
@@ -152,7 +141,7 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
     weight = corners[:, 1]
     stored = grid.temperature[:, 0]
     thermal = torch.where(weight > 0, corners[:, 0] / weight.clamp(min=1e-30), stored)
-    return FieldEvidence(seen, CornerTemperature(thermal.clamp(0, 1), weight), voxels, ends, torch.cat(half_depth))
+    return FieldEvidence(seen, thermal.clamp(0, 1), weight, voxels, ends, torch.cat(half_depth))
 
 
 def _density_met(
@@ -171,13 +160,12 @@ def _density_met(
 
 
 @torch.no_grad()
-def backdrop_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> tuple[float, Float[Tensor, "n 3"]]:
+def backdrop_evidence(
+    grid: VoxelGrid, sample: Sampler, rays: Iterable[RayBundle]
+) -> tuple[float, Float[Tensor, "n 3"]]:
     """Return the share and the directions (n, 3) of the rays that leave the box with more than half of their light."""
-    device = model.grid.density.device
-    seen, open_directions = 0, [torch.zeros(0, 3, device=device)]
-    for bundle in rays:
-        directions = bundle.directions.to(device)
-        samples = model.sample_rays(bundle.origins.to(device), directions)
+    seen, open_directions = 0, [torch.zeros(0, 3, device=grid.density.device)]
+    for _, directions, samples in _sampled(grid, sample, rays):
         open_directions.append(directions[samples.transmittance > 0.5])
         seen += len(directions)
     found = torch.cat(open_directions)

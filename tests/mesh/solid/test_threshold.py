@@ -140,7 +140,9 @@ class Layers:
         y, z = np.meshgrid(*[np.linspace(0.05, 7.95, 40)] * 2, indexing="ij")
         origins = torch.tensor(np.stack([np.full_like(y, 24.0), y, z], -1).reshape(-1, 3) * LAYERS.voxel_size).float()
         directions = torch.tensor([-1.0, 0.0, 0.0]).expand_as(origins)
-        seen = field_evidence(self, [RayBundle(origins, directions, torch.ones(len(origins), 1))])
+        seen = field_evidence(
+            self.grid, self.sample_rays, [RayBundle(origins, directions, torch.ones(len(origins), 1))]
+        )
         weight, ends = (v.view(LAYERS.cell_shape).float().numpy() for v in (seen.voxel_weight, seen.voxel_ends))
         zero = np.zeros(LAYERS.shape, np.float32)
         evidence = RayEvidence(weight, seen.half_depth_density.numpy(), ends)
