@@ -127,7 +127,7 @@ def test_the_area_is_that_of_the_surface_or_of_its_staircase(snapshot_of, mode):
     turn = rotation(6)
     mesh = build_mesh(ball(snapshot_of), DENSE, linear_map(2.0 * turn), mode).mesh
     boundary = mesh.boundary
-    assert boundary is not None and boundary.seen.all()  # without cameras nothing is known to be hidden
+    assert boundary.seen.all()  # without cameras nothing is known to be hidden
     radius = 5.3 + np.log(2.0) / 3.0  # where density is one half, [voxels]; a voxel is 0.5 * 2 wide
     more, bound = {"conforming": (1.0, 0.03), "voxel": (1.5, 0.1)}[mode]
     assert facet_areas(mesh.points_m, mesh.facets).sum() == pytest.approx(more * 4 * np.pi * radius**2, rel=bound)

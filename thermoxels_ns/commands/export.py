@@ -87,9 +87,9 @@ class ExportOptions:
     known_distance_error: float | None = None
     """Standard error of the known distance, including the position errors of the two points, [m]; the summary then
     states the standard errors of area and volume."""
-    formats: tuple[Literal["vtu", "xdmf", "msh", "inp", "stl", "ply", "glb"], ...] = ("vtu", "glb")
+    formats: tuple[Literal["vtu", "xdmf", "msh", "inp", "glb"], ...] = ("vtu", "glb")
     """Files to write the mesh to: vtu (ParaView), xdmf (FEniCSx), msh (Gmsh), inp (CalculiX, Abaqus: ten steps of 60 s
-    in concrete, to be changed in the file), stl, ply (surface), glb (browsers, phones)."""
+    in concrete, to be changed in the file), glb (surface: browsers, phones)."""
     pictures: bool = True
     """Write PNG pictures of the mesh coloured by temperature, and of how photographs support its surface."""
 
@@ -256,8 +256,7 @@ def export_scene(
     """
     from thermoxels_ns.commands import export_summary
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, write_mesh
-    from thermoxels_ns.mesh.files.solvers import HeatStep, check_start
-    from thermoxels_ns.mesh.files.surface import check_single_precision
+    from thermoxels_ns.mesh.files.solvers import check_start
     from thermoxels_ns.mesh.tetrahedra import support_of_facets
 
     check_options(options)
@@ -265,8 +264,6 @@ def export_scene(
     made = mesh_of_scene(run, options)
     mesh, report, unit = made.built.mesh, made.report, made.unit
     suffixes = [f".{name}" for name in options.formats]
-    if {".stl", ".ply"} & {*suffixes}:
-        check_single_precision(mesh)
     if ".inp" in suffixes:
         check_start(mesh)
     voxel_size = run.snapshot.lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(made.to_mesh[:3, :3]))))
@@ -295,7 +292,7 @@ def export_scene(
         "up": made.up,
         "up_source": made.up_source,
         "region": region,
-        "mesh": export_summary.mesh_summary(made.built, report, made.scale, voxel_size),
+        "mesh": export_summary.mesh_summary(made.built, report, made.scale),
         "corrections": run.corrections,
         **({} if truth is None else {"truth": truth}),
         "files": [*files, _SUMMARY],
@@ -303,12 +300,12 @@ def export_scene(
     plain_values(summary, "summary", MeshError)  # raises if json cannot hold the summary
 
     remove_file(folder / _SUMMARY)
-    write_json(folder / _QUALITY, report.as_mapping())  # first: marks the folder as an export's for `prepare_folder`
+    # First: marks the folder as an export's for `prepare_folder`.
+    write_json(folder / _QUALITY, {"criteria": [asdict(criterion) for criterion in report.criteria]})
     for name in {*_mesh_files(MESH_FORMATS), *_PICTURES} - set(files):
         remove_file(folder / name)
-    in_concrete = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)  # the run of the Thermoxels paper
     for suffix in suffixes:
-        write_mesh(folder / f"mesh{suffix}", mesh, heat_step=in_concrete, up=made.up)
+        write_mesh(folder / f"mesh{suffix}", mesh, up=made.up)
     if options.pictures:
         _draw(folder, run, made)
     write_json(folder / _SUMMARY, summary)
@@ -359,7 +356,6 @@ def with_support(
     from thermoxels_ns.multiview.votes import supporting_photographs
 
     mesh = built.mesh
-    assert mesh.boundary is not None
     middle = apply_transform(np.linalg.inv(to_mesh), mesh.points_m[mesh.facets].mean(axis=1))
     normal = facet_normals(mesh.points_m, mesh.facets) @ to_mesh[:3, :3] / np.cbrt(abs(np.linalg.det(to_mesh[:3, :3])))
     photographs = depths.photographs

@@ -9,7 +9,7 @@ import numpy as np
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_patches, apply_regions
+from thermoxels_ns.mesh.boundary.patches import PatchRules, apply_regions, with_patches
 from thermoxels_ns.mesh.boundary.visibility import seen_facets
 from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of
 from thermoxels_ns.mesh.quality.report import BoundaryMode
@@ -24,7 +24,7 @@ from thermoxels_ns.mesh.temperature import (
     interpolate_corners,
     tet_conductances,
 )
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh, facet_normals
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_normals
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
 
 _NO_RULES = PatchRules()
@@ -37,7 +37,7 @@ class BuiltMesh:
     mesh: TetMesh
     solid: SolidCells
     unobserved_parts: int  # number of connected parts left out because no thermal ray saw any of their nodes
-    unobserved_voxels: int  # number of voxels of these parts; `solid.component_sizes` counts them, `solid.cells` not
+    unobserved_voxels: int  # number of voxels of these parts; `solid.cells` does not hold them
     observed_range_c: tuple[float, float] | None
     """Lowest and highest temperature of the field's measured corners, [degrees Celsius]; all nodes are within it. None:
     no temperatures."""
@@ -135,10 +135,8 @@ def build_mesh(
         region_names=region_names,
         colour=colour,
     )
-    tags, idle_patches = _tagged(mesh, points, solid, snapshot, transform[:3, :3] / scale, up, rules)
-    return BuiltMesh(
-        replace(mesh, boundary=tags), solid, parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
-    )
+    tagged, idle_patches = _tagged(mesh, points, solid, snapshot, transform[:3, :3] / scale, up, rules)
+    return BuiltMesh(tagged, solid, parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions))
 
 
 def _bodies_at(cells: BoolArray, points: FloatArray) -> BoolArray:
@@ -168,8 +166,8 @@ def _tagged(
     rotation: FloatArray,
     up: tuple[float, float, float],
     rules: PatchRules,
-) -> tuple[Boundary, tuple[str, ...]]:
-    """Return the tags of all boundary triangles and the idle rules; without cameras all triangles count as seen."""
+) -> tuple[TetMesh, tuple[str, ...]]:
+    """Return the mesh with tags of all boundary triangles, and the idle rules; without cameras all count as seen."""
     normal = facet_normals(mesh.points_m, mesh.facets)
     seen = np.ones(len(mesh.facets), dtype=bool)
     if snapshot.views is not None:
@@ -182,16 +180,8 @@ def _tagged(
         inner = ~seen & grow(solid.rooms, 1)[tuple(beside.T)]
         # In a building with rooms, what faces none is outside, seen or not, as below the lowest floor.
         outside = ~inner if np.count_nonzero(inner) > 0.5 * np.count_nonzero(~seen) else seen
-    patch, names, idle = apply_patches(
-        rules,
-        centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
-        normals=normal,
-        up=up,
-        seen=outside,
-        on_box=mesh.facet_tags == FACET_BOX,
-        colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),
-    )
-    return Boundary(seen=seen, patch=patch, patch_names=names), idle
+    tagged = replace(mesh, boundary=replace(mesh.boundary, seen=seen))
+    return with_patches(tagged, rules, up, outside)
 
 
 def apply_transform(matrix: FloatArray, points: FloatArray) -> FloatArray:

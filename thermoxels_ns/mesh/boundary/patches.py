@@ -162,18 +162,6 @@ def facing(normals: FloatArray, up: npt.ArrayLike) -> IntArray:
     return np.where(cosine > _COS_45, 0, np.where(cosine < -_COS_45, 2, 1)).astype(np.int64)
 
 
-def default_patches(
-    normals: FloatArray, up: npt.ArrayLike, seen: BoolArray, on_box: BoolArray
-) -> tuple[IntArray, tuple[str, ...]]:
-    """Return each triangle's default patch, shape (f,), and the names of all default patches.
-
-    The patch is "cut" where `on_box` is True, else "exterior" where `seen` is True and "interior" where it is False,
-    followed by the direction of `facing`, as in "exterior-up". The arguments are those of `apply_patches`.
-    """
-    patch = np.where(seen, 0, len(FACINGS)) + facing(normals, up)
-    return np.where(on_box, DEFAULT_PATCHES.index("cut"), patch).astype(np.int64), DEFAULT_PATCHES
-
-
 def apply_patches(
     rules: PatchRules,
     *,
@@ -184,10 +172,13 @@ def apply_patches(
     on_box: BoolArray,
     colours: npt.NDArray | None = None,
 ) -> Applied:
-    """Return each triangle's patch: by the last rule that it meets, else by `default_patches`, whose names come first.
+    """Return each triangle's patch: by the last rule that it meets, else one of `DEFAULT_PATCHES`.
+
+    The default patch is "cut" where `on_box` is True, else "exterior" where `seen` is True and "interior" where it is
+    False, followed by the direction of `facing`, as in "exterior-up".
 
     Args:
-        rules: The user's rules; without any, the default patches come back.
+        rules: The user's rules.
         centroids_m: Centroid of each boundary triangle, shape (f, 3), [m].
         normals: Outward unit normals in the axes of the centroids, shape (f, 3).
         up: Up direction in the axes of the centroids.
@@ -198,8 +189,8 @@ def apply_patches(
     Raises:
         MeshError: A rule has a colour but `colours` is None, or `up` is no direction.
     """
-    patch, names = default_patches(normals, up, seen, on_box)
     direction = facing(normals, up)
+    patch = np.where(on_box, DEFAULT_PATCHES.index("cut"), np.where(seen, 0, len(FACINGS)) + direction)
     everywhere = np.ones(len(patch), dtype=bool)
     parts = {"exterior": ~on_box & seen, "interior": ~on_box & ~seen, "cut": on_box}
     facings = {name: direction == number for number, name in enumerate(FACINGS)}
@@ -210,20 +201,22 @@ def apply_patches(
         return facings.get(rule.facing or "any", everywhere)
 
     allowed = [parts.get(rule.only or "all", everywhere) & faces(rule) for rule in rules.patches]
-    return _applied(rules.patches, "patch", allowed, patch, names, centroids_m, colours)
+    return _applied(rules.patches, "patch", allowed, patch, DEFAULT_PATCHES, centroids_m, colours)
 
 
-def with_patches(mesh: TetMesh, rules: PatchRules, up: npt.ArrayLike) -> tuple[TetMesh, tuple[str, ...]]:
-    """Return a tagged mesh with patches by a user's rules in place of its own, and the idle rules."""
-    if mesh.boundary is None:
-        remedy = "Export it with ns-export thermoxels-mesh."
-        raise MeshError("mesh", expected="one whose boundary has tags", got="one without", remedy=remedy)
+def with_patches(
+    mesh: TetMesh, rules: PatchRules, up: npt.ArrayLike, outside: BoolArray | None = None
+) -> tuple[TetMesh, tuple[str, ...]]:
+    """Return a mesh with patches by a user's rules in place of its own, and the idle rules.
+
+    `outside`, shape (f,), is True for triangles that count as exterior; None: those that cameras see.
+    """
     patch, names, idle = apply_patches(
         rules,
         centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
         normals=facet_normals(mesh.points_m, mesh.facets),
         up=up,
-        seen=mesh.boundary.seen,
+        seen=mesh.boundary.seen if outside is None else outside,
         on_box=mesh.facet_tags == FACET_BOX,
         colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),
     )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from thermoxels_ns.mesh.quality.checks import (
     group_sides,
 )
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh, facet_areas
+from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas
 
 BoundaryMode = Literal["conforming", "voxel"]
 """How the boundary of a mesh runs: "conforming" along the level set of the density, "voxel" along voxel faces."""
@@ -51,14 +51,12 @@ class Criterion:
 
 @dataclass(frozen=True)
 class QualityReport:
-    """Figures of the quality of a mesh, and its result for each quality criterion."""
+    """Figures of the quality of a mesh, and its result for each quality criterion; lengths are in the mesh's unit."""
 
     boundary_mode: BoundaryMode  # how the boundary was made
-    length_unit: str  # unit of length of the nodes' positions; where it is not "m", read [m] below as this unit
     num_nodes: int
     num_tets: int
     num_facets: int
-    num_box_facets: int  # number of boundary triangles with the tag `FACET_BOX`
     num_non_manifold_edges: int  # number of boundary edges with more than two boundary triangles
     volume_m3: float  # sum of the signed volumes, [m^3]
     area_m2: float  # sum of the boundary triangles' areas, [m^2]
@@ -69,13 +67,6 @@ class QualityReport:
     def unmet(self) -> tuple[str, ...]:
         """Return the names of the criteria that this mesh does not meet."""
         return tuple(criterion.name for criterion in self.criteria if not criterion.kept)
-
-    def as_mapping(self) -> dict[str, Any]:
-        """Return the report as a dictionary for json."""
-        mapping = asdict(self)
-        mapping["dihedral_range_deg"] = dict(zip(("min", "max"), self.dihedral_range_deg))
-        mapping["promises"] = list(mapping.pop("criteria"))
-        return mapping
 
 
 def check_mesh(
@@ -135,11 +126,9 @@ def check_mesh(
             raise MeshError(f"mesh {criterion.name}", expected=expected, got=got, remedy=remedy)
     return QualityReport(
         boundary_mode=boundary_mode,
-        length_unit=length_unit,
         num_nodes=len(points),
         num_tets=len(tets),
         num_facets=len(mesh.facets),
-        num_box_facets=int(np.count_nonzero(mesh.facet_tags == FACET_BOX)),
         num_non_manifold_edges=int(np.count_nonzero(sides.sizes > 2)),
         volume_m3=float(volumes.sum()),
         area_m2=float(facet_areas(points, mesh.facets).sum()),
