@@ -7,7 +7,7 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 from thermoxels_ns.mesh.build import BuiltMesh, build_mesh
-from thermoxels_ns.mesh.quality.report import check_mesh
+from thermoxels_ns.mesh.quality.checks import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import facet_areas
 

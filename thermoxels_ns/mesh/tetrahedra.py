@@ -64,7 +64,7 @@ class TetMesh:
         return not bool(np.isnan(self.temperature_c).all())
 
     def check(self, name: str = "mesh", remedy: str = "Build the mesh with thermoxels_ns.mesh.build.") -> None:
-        """Check that the arrays fit each other; `quality.report.check_mesh` checks the geometry.
+        """Check that the arrays fit each other; `quality.checks.check_mesh` checks the geometry.
 
         Messages begin with `name` and end with `remedy`.
 
