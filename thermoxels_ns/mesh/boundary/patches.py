@@ -68,12 +68,7 @@ class Colour:
     """Condition of a rule: the element's colour is at most `max_distance` from `rgb`."""
 
     rgb: tuple[_Byte, _Byte, _Byte]  # Red, green and blue, whole numbers from 0 to 255
-    max_distance: Annotated[float, Field(gt=0)] = math.inf  # Largest Euclidean distance to `rgb`, on the same scale
-
-    def distance(self, colours: npt.NDArray) -> FloatArray:
-        """Return the distances (n,) of colours (n, 3), in [0, 1], to `rgb`; infinite if beyond `max_distance`."""
-        distance = np.linalg.norm(colours - np.array(self.rgb) / 255.0, axis=1)
-        return np.where(distance <= self.max_distance / 255.0, distance, np.inf)
+    max_distance: Annotated[float, Field(gt=0)]  # Largest Euclidean distance to `rgb`, on the same scale
 
 
 @dataclass(frozen=True)
@@ -83,8 +78,7 @@ class RegionRule:
     name: str  # Name of the patch or region; several rules may have one name
     box: Box | None = None
     plane: Plane | None = None
-    nearest_colour: Colour | None = None
-    """Of all rules with a colour whose other conditions hold, an element meets only the one with the nearest colour."""
+    colour: Colour | None = None
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -261,7 +255,7 @@ def _applied(
     count, remedy = len(start), f"Pass one centroid per element that gets a {kind}."
     check_shape("centroids", centroids, (count, 3), remedy, MeshError)
     check_finite("centroids", centroids, remedy, MeshError)
-    closest, winner, matches = np.full(count, np.inf), np.full(count, -1), []
+    owner = np.full(count, -1, dtype=np.int64)
     for number, (rule, mask) in enumerate(zip(rules, allowed)):
         inside = mask.copy()
         if rule.box is not None:
@@ -269,19 +263,15 @@ def _applied(
         if rule.plane is not None:
             distance = (centroids - rule.plane.point) @ np.array(rule.plane.normal)
             inside &= (distance >= 0.0) & (distance <= rule.plane.depth * math.hypot(*rule.plane.normal))
-        if rule.nearest_colour is not None:
+        if rule.colour is not None:
             if colours is None:
-                expected = "a mesh with colours, because its rule is by nearest_colour"
+                expected = "a mesh with colours, because its rule is by colour"
                 remedy = "Use box or plane, or a model that was trained on colour photographs."
                 raise MeshError(f"{kind} {rule.name}", expected=expected, got="a mesh without", remedy=remedy)
-            distance = np.where(inside, rule.nearest_colour.distance(colours), np.inf)
-            wins = np.isfinite(distance) & (distance <= closest)
-            closest[wins], winner[wins] = distance[wins], number
-        matches.append(inside)
+            away = np.linalg.norm(255.0 * colours - np.array(rule.colour.rgb), axis=1)
+            inside &= away <= rule.colour.max_distance
+        owner[inside] = number
 
-    owner = np.full(count, -1, dtype=np.int64)
-    for number, (rule, match) in enumerate(zip(rules, matches)):
-        owner[match if rule.nearest_colour is None else winner == number] = number
     all_names = tuple(dict.fromkeys((*names, *(rule.name for rule in rules))))
     index = np.append([all_names.index(rule.name) for rule in rules], 0).astype(np.int64)[owner]
     followed = np.bincount(owner[owner >= 0], minlength=len(rules)) > 0
