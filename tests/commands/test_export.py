@@ -183,6 +183,11 @@ def test_impossible_dataparser_transforms_are_refused(transform, scale) -> None:
         ({"formats": ("inp",)}, "scale"),
         ({"wall_thickness": 0.3}, "scale"),
         ({"density_percentile": 101.0}, "density_percentile"),
+        ({"density_threshold": -0.1}, "density_threshold"),
+        ({"close_gaps": -1}, "close_gaps"),
+        ({"region_box": (0.0, 0.0, 0.0, 1.0, 0.0, 1.0)}, "region_box"),
+        ({"interior": "filled"}, "interior"),
+        ({"wall_thickness": 0.0}, "wall_thickness"),
         ({"up": (0.0, 0.0, 0.0)}, "up"),
     ],
 )

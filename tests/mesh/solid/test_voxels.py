@@ -211,29 +211,3 @@ def test_a_wall_thickness_is_in_metres_and_takes_the_place_of_filling(facade):
 def test_a_wall_thicker_than_the_scene_is_refused(facade):
     with pytest.raises(MeshError, match=r"^wall_thickness"):
         select_solid(facade, SolidSelection(wall_thickness=50.0), 0.2)
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"density_threshold": -0.1},
-        {"close_gaps": -1},
-        {"region_box": (0.0, 0.0, 0.0, 1.0, 0.0, 1.0)},
-        {"interior": "filled"},
-        {"wall_thickness": 0.0},
-    ],
-)
-def test_bad_selection_is_refused(bad):
-    """Others are refused in the tests of the command."""
-    with pytest.raises(MeshError, match=f"^{next(iter(bad))}: expected"):
-        SolidSelection(**bad)
-
-
-def test_without_rays_the_default_is_half_an_optical_depth_per_voxel_at_any_resolution():
-    """Solid where density x voxel size >= 0.5, so the same field gives the same body on a finer lattice."""
-    for voxel in (0.5, 0.125):
-        lattice = Lattice((0.0, 0.0, 0.0), voxel, (3, 2, 2))
-        density = np.full((3, 2, 2), 0.501 / voxel, dtype=np.float32)
-        density[0] = 0.45 / voxel  # the first voxel's centre is at 0.4755
-        snapshot = GridSnapshot(lattice, density, np.zeros_like(density), np.ones_like(density))
-        assert select_solid(snapshot, SolidSelection(close_gaps=0)).cells[:, 0, 0].tolist() == [False, True]
