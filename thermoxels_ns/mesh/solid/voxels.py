@@ -161,18 +161,17 @@ def select_solid(
             remark = f"A wall {asked} is thinner than one and a half voxels; the seen surface stays as thick as it is."
         cells = step("wall", wall, remark)
         if selection.interior == "hollow":
-            found = interior(opaque | cells, snapshot.lattice, snapshot.views, SEAL, within)
-            rooms = found.inside & ~cells
+            rooms = interior(opaque | cells, snapshot.lattice, snapshot.views, SEAL, within) & ~cells
             depth = np.asarray(ndimage.distance_transform_edt(cells | rooms | ~within))
             remark = "Where no camera looks, as below the lowest floor, the rooms are closed by a wall as thick."
             cells = step("close rooms", cells | (rooms & (depth <= thickness)), remark)
             rooms &= ~cells
     elif selection.interior == "solid":
-        found = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
-        remark = "Enclosed cavities are filled, and what cameras cannot look into within the hull of its body."
-        if found.rooms:
-            remark += f" {found.rooms} cavities with a camera in them stay empty."
-        cells = step("interior", cells | found.inside, remark)
+        inside = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
+        remark = (
+            "Enclosed cavities without a camera are filled, and what cameras cannot look into within a body's hull."
+        )
+        cells = step("interior", cells | inside, remark)
     return SolidCells(
         cells=cells,
         dense=chosen.cells,
