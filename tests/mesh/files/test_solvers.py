@@ -142,7 +142,6 @@ def test_vtk_reads_body_and_boundary(tmp_path, tagged_mesh):
     assert np.array_equal(boundary.cell_data["patch"], tagged_mesh.boundary.patch + 1)
     for grid in grids.values():
         assert np.array_equal(grid.point_data["temperature_c"], tagged_mesh.temperature_c)
-        assert np.array_equal(grid.point_data["temperature_k"], tagged_mesh.temperature_c + 273.15)
         assert np.array_equal(grid.point_data["observed"], tagged_mesh.observed)
         assert grid.point_data["colour"].shape == tagged_mesh.colour.shape
 

@@ -46,7 +46,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as ``NAME.xdmf`` and ``NAME.h5``.
 
     The grid "mesh" holds the tetrahedra with `region` per cell; the grid "facets" holds the boundary triangles with
-    `patch` per triangle. Both hold `temperature_c`, `temperature_k`, `observed` and, if the mesh has colours, `colour`
+    `patch` per triangle. Both hold `temperature_c`, `observed` and, if the mesh has colours, `colour`
     per node. Regions and patches are numbered from 1, as in .msh files; an ``Information`` element of each grid lists
     the names. In FEniCSx::
 
@@ -107,7 +107,7 @@ def _index(regions: Sequence[str], patches: Sequence[str], arrays: dict[str, npt
             f'<Topology TopologyType="{kind}" {size}>{data(cells)}</Topology>',
             f'<Geometry GeometryType="XYZ">{data("points_m")}</Geometry>',
             values(tag, "Cell"),  # FEniCSx reads the first attribute of a grid as its tags
-            *(values(one, "Node") for one in ("temperature_c", "temperature_k", "observed", "colour") if one in arrays),
+            *(values(one, "Node") for one in ("temperature_c", "observed", "colour") if one in arrays),
             "</Grid>",
         )
         return "\n".join(lines)

@@ -20,7 +20,6 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, plain_os_errors, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import HeatError, MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values, read_json_object
-from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.mesh.boundary.patches import DEFAULT_REGION, PatchRules, with_patches
 from thermoxels_ns.mesh.quality.checks import boundary_facets, component_of, count_wrong_facets, group_faces
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
@@ -49,7 +48,7 @@ _MOST_COMPRESSION = 1040  # largest ratio by which zlib can compress, 1032, and 
 def write_vtu(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as a VTK unstructured grid (.vtu, read by ParaView, pyvista and meshio).
 
-    Point arrays are `temperature_c` [degrees Celsius], `temperature_k` [K] and `observed` (1: measured, 0: extended)
+    Point arrays are `temperature_c` [degrees Celsius] and `observed` (1: measured, 0: extended)
     where temperatures are known, and `colour` (red, green, blue as bytes) where colours are. The cell array is
     `region`; field arrays `region:NAME` hold the number of each region, from 1 as in every format.
 
@@ -270,11 +269,10 @@ def blocks_of(mesh: TetMesh, about: Mapping[str, Any]) -> pv.MultiBlock:
 
 
 def node_arrays(mesh: TetMesh) -> dict[str, npt.NDArray]:
-    """Return arrays per node by name: `temperature_c`, `temperature_k`, `observed`, and `colour` in bytes, if known."""
+    """Return arrays per node by name: `temperature_c`, `observed`, and `colour` in bytes, if known."""
     arrays: dict[str, npt.NDArray] = {}
     if mesh.has_temperatures:
         arrays["temperature_c"] = mesh.temperature_c
-        arrays["temperature_k"] = celsius_to_kelvin(mesh.temperature_c)
         arrays["observed"] = mesh.observed.astype(np.uint8)
     if mesh.colour is not None:
         arrays["colour"] = np.floor(np.clip(mesh.colour, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
@@ -318,8 +316,7 @@ def boundary_surface(mesh: TetMesh) -> pv.PolyData:
     data = pv.PolyData.from_regular_faces(mesh.points_m[nodes], triangles)
     data.point_data["node"] = nodes
     for name, values in node_arrays(mesh).items():
-        if name != "temperature_k":
-            data.point_data[name] = values[nodes]
+        data.point_data[name] = values[nodes]
     for name, values in arrays.items():
         data.cell_data[name] = values
     names = vtkStringArray()  # pyvista's own way takes ASCII names only

@@ -231,22 +231,16 @@ def _where_rays_end(evidence: RayEvidence, density: FloatArray, voxel: float) ->
     low, high = (depth / voxel for depth in OPTICAL_DEPTH_BOUNDS)
     threshold = min(max(float(np.quantile(met, 1.0 - SHARE_OF_RAYS, method="lower")), low), high)
     # Densities are float32, and the voxel whose density became the threshold must reach it.
-    cells = dense = density >= np.float32(threshold)
+    cells = density >= np.float32(threshold)
     if evidence.voxel_ends is not None:
         passed = (evidence.voxel_ends <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
-        cells = dense & ~(passed & (density * voxel < OPAQUE_OPTICAL_DEPTH))
-    held = float(weight[cells].sum(dtype=np.float64) / max(weight.sum(dtype=np.float64), 1e-300))
+        cells &= ~(passed & (density * voxel < OPAQUE_OPTICAL_DEPTH))
     share = float(np.mean(met >= np.float32(threshold)))
-    bound = {low: ", the least that is not half-transparent", high: ", the most that is asked"}.get(threshold, "")
-    count, left_out = np.count_nonzero(dense) - np.count_nonzero(cells), ""
-    if count:
-        left_out = f"{count} voxels that dense are left out: hardly any ray ends in them and they are not opaque. "
     return Threshold(
         cells,
         threshold,
         f"Automatic: {share:.0%} of the {len(met)} training rays that end on something meet, within half a voxel of "
-        f"there, a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel{bound}). "
-        f"{left_out}Those that are solid hold {held:.0%} of the weight that rays spent.",
+        f"there, a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel).",
     )
 
 
