@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from thermoxels_ns.mesh.files.glb import write_glb
-from thermoxels_ns.mesh.files.solvers import heavy_data_path, write_inp, write_msh, write_xdmf
+from thermoxels_ns.mesh.files.solvers import write_inp, write_msh, write_xdmf
 from thermoxels_ns.mesh.files.vtu import boundary_path, write_boundary_vtp, write_vtu
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -21,8 +21,8 @@ def mesh_file_paths(path: Path | str) -> list[Path]:
     ['house.xdmf', 'house.h5']
     """
     path = Path(path)
-    second = {".vtu": boundary_path, ".xdmf": heavy_data_path}.get(path.suffix)
-    return [path] if second is None else [path, second(path)]
+    second = {".vtu": [boundary_path(path)], ".xdmf": [path.with_suffix(".h5")]}
+    return [path, *second.get(path.suffix, [])]
 
 
 def write_mesh(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:

@@ -33,15 +33,6 @@ _CONDUCTIVITY_W_MK, _DENSITY_KG_M3, _SPECIFIC_HEAT_J_KGK = 1.7, 2200.0, 880.0  #
 _REAL = "%.12E"  # Abaqus reads fields of at most 20 characters
 
 
-def heavy_data_path(path: Path | str) -> Path:
-    """Return the path of the HDF5 file that belongs to an .xdmf file.
-
-    >>> heavy_data_path("house/mesh.xdmf").as_posix()
-    'house/mesh.h5'
-    """
-    return Path(path).with_suffix(".h5")
-
-
 def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as ``NAME.xdmf`` and ``NAME.h5``.
 
@@ -71,7 +62,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
         "patch": (tags.patch + 1).astype(np.int32),
         **node_arrays(mesh),
     }
-    data_file = heavy_data_path(path)
+    data_file = path.with_suffix(".h5")
     text = _index(mesh.region_names, tags.patch_names, arrays, escape(data_file.name))
 
     writable_folder(path.parent)
