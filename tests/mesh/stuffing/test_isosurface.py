@@ -11,9 +11,8 @@ from tests.support.stuffed_shapes import (
     on_surface,
     tet_mesh,
     turn,
-    volumes_and_angles,
 )
-from thermoxels_ns.mesh.quality.checks import MeshFigures, check_mesh
+from thermoxels_ns.mesh.quality.checks import MeshFigures, check_mesh, dihedral_range_deg
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
 from thermoxels_ns.mesh.stuffing.lattice import bcc_lattice, coarse_interior
@@ -201,7 +200,7 @@ def test_angles_of_the_coarse_part(coarsest):
     edges = np.linalg.norm(points[tets[:, 1:]] - points[tets[:, :1]], axis=-1)
     assert min(8, coarsest) <= edges.max() <= coarsest
     assert signed_volumes(points, tets).min() > 0.0
-    assert volumes_and_angles(points, tets)[1:] == pytest.approx((45.0, 120.0), abs=1e-9)
+    assert dihedral_range_deg(points, tets) == pytest.approx((45.0, 120.0), abs=1e-9)
 
 
 def test_place_in_the_lattice_does_not_matter():

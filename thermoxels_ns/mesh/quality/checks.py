@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
+from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks, signed_volumes
 from thermoxels_ns.mesh.tetrahedra import TetMesh, facet_areas, facet_normals
 
 OUTWARD_FACES: IntArray = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
@@ -185,6 +185,15 @@ def count_tets_in_other_bodies(mesh: TetMesh) -> int:
     return found
 
 
+def dihedral_range_deg(points: FloatArray, tets: IntArray) -> tuple[float, float]:
+    """Return the smallest and the largest angle between two faces of a tetrahedron, [degrees]."""
+    least, most = 1.0, -1.0
+    for _, shapes in shapes_in_chunks(points, tets):
+        cosines = shapes.dihedral_cosines()
+        least, most = min(least, cosines.min()), max(most, cosines.max())
+    return float(np.degrees(np.arccos(most))), float(np.degrees(np.arccos(least)))
+
+
 @dataclass(frozen=True)
 class MeshFigures:
     """Figures of a sound mesh."""
@@ -208,11 +217,7 @@ def check_mesh(mesh: TetMesh) -> MeshFigures:
     """
     mesh.check()
     points, tets = mesh.points_m, mesh.tets
-    volumes, least_cosine, most_cosine = np.empty(len(tets)), 1.0, -1.0
-    for which, shapes in shapes_in_chunks(points, tets):
-        volumes[which], cosines = shapes.volumes, shapes.dihedral_cosines()
-        least_cosine, most_cosine = min(least_cosine, cosines.min()), max(most_cosine, cosines.max())
-    faces, sides = group_faces(tets), group_sides(mesh.facets)
+    volumes, faces, sides = signed_volumes(points, tets), group_faces(tets), group_sides(mesh.facets)
     cracks = int(np.count_nonzero(faces.sizes > 2)) + count_overlaps(points, mesh.facets, sides)
     cracks += count_twin_nodes(points) + len(points) - np.count_nonzero(np.bincount(tets.ravel()))
     for name, expected, wrong in (
@@ -223,10 +228,9 @@ def check_mesh(mesh: TetMesh) -> MeshFigures:
         if wrong:
             remedy = "The mesh is damaged: build it again, and report this if it persists."
             raise MeshError(f"mesh {name}", expected=expected, got=f"{wrong:,} that are wrong", remedy=remedy)
-    smallest, largest = np.degrees(np.arccos([most_cosine, least_cosine])).tolist()
     return MeshFigures(
         volume_m3=float(volumes.sum()),
         area_m2=float(facet_areas(points, mesh.facets).sum()),
-        dihedral_range_deg=(smallest, largest),
+        dihedral_range_deg=dihedral_range_deg(points, tets),
         num_non_manifold_edges=int(np.count_nonzero(sides.sizes > 2)),
     )
