@@ -117,10 +117,7 @@ def select_solid(
     voxel_m = metres_per_world_unit * snapshot.lattice.voxel_size
     wall_m, longest_m = selection.wall_thickness, max(snapshot.lattice.cell_shape) * voxel_m
     if wall_m is not None and wall_m > longest_m:
-        remedy, expected = (
-            "Pass it in metres, and check --metres-per-unit.",
-            f"at most the scene box, {longest_m:.3g} m",
-        )
+        expected, remedy = f"at most the scene box, {longest_m:.3g} m", "Pass metres, and check --metres-per-unit."
         raise MeshError("wall_thickness", expected=expected, got=f"{wall_m:g} m", remedy=remedy)
     density = snapshot.centre_density()
     chosen = dense_voxels(snapshot, density, selection)
@@ -168,9 +165,7 @@ def select_solid(
             rooms &= ~cells
     elif selection.interior == "solid":
         inside = interior(opaque, snapshot.lattice, snapshot.views, SEAL, within)
-        remark = (
-            "Enclosed cavities without a camera are filled, and what cameras cannot look into within a body's hull."
-        )
+        remark = "Cavities without a camera are filled, and what cameras cannot look into within the hull of a body."
         cells = step("interior", cells | inside, remark)
     return SolidCells(
         cells=cells,
