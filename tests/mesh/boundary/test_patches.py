@@ -150,7 +150,7 @@ def test_the_example_is_read_and_does_what_its_comments_say() -> None:
         ("patches: [{name: a, colour: {rgb: [0, 0, 256], max_distance: 9}}]", "rgb"),
         ("patches: [{name: a, colour: {rgb: [0.5, 0, 0], max_distance: 9}}]", "rgb"),
         ("patches: [{name: a, colour: {rgb: [9, 0, 0], max_distance: 0}}]", "max_distance"),
-        ("patches: [{name: a, colour: {rgb: [9, 0, 0]}}]", "max_distance"),
+        ("patches: [{name: a, colour: {rgb: [9, 0, 0]}}]", "colour"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path: Path, text: str, where: str) -> None:
